@@ -1,0 +1,42 @@
+# `make demo` and `make test` need Python 3.11+ and make only; everything else is installed as wheels into .venv/.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+TEST_DATA := $(wildcard ../shared/data)
+ifneq ($(TEST_DATA),)
+export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
+endif
+
+.PHONY: demo test lint bench acceptance acceptance-all clean
+.DEFAULT_GOAL := test
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "zlocus needs Python 3.11 or newer: make PYTHON=python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary=:all: --editable '.[dev]'
+	touch $@
+
+demo: $(STAMP)
+	$(BIN)/zlocus demo --overwrite
+
+test: lint
+	$(BIN)/python -m pytest -n 2
+
+lint: $(STAMP)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(STAMP)
+	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only
+
+acceptance: $(STAMP)
+	$(BIN)/python benchmarks/acceptance.py
+
+acceptance-all: $(STAMP)
+	$(BIN)/python benchmarks/acceptance.py --slow
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache .benchmarks build dist demo
+	find src tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
