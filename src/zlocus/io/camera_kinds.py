@@ -1,0 +1,74 @@
+"""The kinds of camera a `scene.yaml` can name. A new kind is one class, in a file of its own, and a line in `KINDS`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from pydantic import FiniteFloat
+from pyproj import CRS
+
+from zlocus.io.cameras import read_rpc
+from zlocus.io.strict import StrictModel
+from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.model import SensorModel
+from zlocus.sensors.rpc import RpcCoefficients, RpcModel
+
+
+class CameraSource(Protocol):
+    """A camera that has been read, before the scene's CRS is known."""
+
+    def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
+        """Longitude and latitude (degrees) of the image's centre; None for a camera that knows only its own frame."""
+        ...
+
+    def sensor(self, crs: CRS) -> SensorModel:
+        """The sensor model in the scene's frame."""
+        ...
+
+
+class Camera(StrictModel, ABC):
+    """The `camera` entry of a view: `kind` and what that kind needs."""
+
+    @abstractmethod
+    def read(self, folder: Path, image: Path) -> CameraSource:
+        """The camera of an image; relative paths start at `folder`, that of the scene file."""
+
+
+@dataclass(frozen=True)
+class RpcSource:
+    """An RPC and the shift (column, row) px laid over it."""
+
+    rpc: RpcCoefficients
+    shift: tuple[float, float] | None = None
+
+    def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
+        """See `CameraSource`; at the RPC's height offset."""
+        xy = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
+        # The CRS plays no part in the geographic direction.
+        model = RpcModel(self.rpc, CRS.from_epsg(3857))
+        lon, lat = model.geographic_from_image(xy, np.array([self.rpc.height_off]))
+        return (float(lon[0]), float(lat[0])) if np.isfinite(lon[0]) else None
+
+    def sensor(self, crs: CRS) -> SensorModel:
+        """See `CameraSource`."""
+        model = RpcModel(self.rpc, crs)
+        return model if self.shift is None else ShiftedModel(model, column=self.shift[0], row=self.shift[1])
+
+
+class RpcCamera(Camera):
+    """An RPC: from `file`, else found beside or in the image. shift: pixels (column, row) added to what it projects."""
+
+    kind: Literal["rpc"] = "rpc"
+    file: str | None = None
+    shift: tuple[FiniteFloat, FiniteFloat] | None = None
+
+    def read(self, folder: Path, image: Path) -> RpcSource:
+        """See `Camera`."""
+        return RpcSource(read_rpc(image, None if self.file is None else folder / self.file), self.shift)
+
+
+KINDS: dict[str, type[Camera]] = {"rpc": RpcCamera}

@@ -1,0 +1,160 @@
+"""Images read by window: one grey channel as float32 and a mask of valid pixels."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.windows import Window
+
+from zlocus.errors import InputError
+from zlocus.io.opening import open_raster
+from zlocus.scene import ImageWindow
+
+# Source: ITU-R BT.601, luma of red, green, blue.
+LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}
+CHECK_ROWS = 512
+
+
+@dataclass(frozen=True)
+class RasterImage:
+    """An image file as an `ImageSource`.
+
+    The grey channel is the luminance (Rec. 601) where the file declares red, green and blue bands, otherwise the first
+    band. Not valid are: the declared nodata value, pixels off in an internal or side-car mask or fully transparent in
+    an alpha band, NaN and infinities. An integer image that declares no nodata value is valid everywhere: 0 is a
+    legal grey value and is never taken for nodata.
+
+    The file is opened for each read: a handle of GDAL must not be shared between threads, opening costs about
+    1 ms, and so the object is a plain value that threads and processes can share and that holds no cache.
+
+    bands : 1-based indices of the bands that are read, with `weights`.
+    """
+
+    path: Path
+    shape: tuple[int, int]
+    dtype: str
+    n_bands: int
+    nodata: float | None
+    bands: tuple[int, ...]
+    weights: tuple[float, ...]
+
+    def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+        """The window of rows x cols pixels that starts at (row, col); it lies inside the image.
+
+        Raises
+        ------
+        InputError
+            When the file can no longer be read, or has another size than when it was opened.
+        """
+        inside = 0 <= row <= row + rows <= self.shape[0] and 0 <= col <= col + cols <= self.shape[1]
+        assert inside, f"window {row, col, rows, cols} leaves {self.path.name} of {self.shape}"
+        with open_raster(self.path) as source:
+            if source.shape != self.shape:
+                raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
+            return self._read(source, Window(col, row, cols, rows))
+
+    def _read(self, source: rasterio.DatasetReader, window: Window) -> ImageWindow:
+        pixels = np.zeros((int(window.height), int(window.width)), np.float32)
+        valid = np.ones(pixels.shape, bool)
+        for band, weight in zip(self.bands, self.weights, strict=True):
+            values = source.read(band, window=window, out_dtype=np.float32)
+            finite = np.isfinite(values)
+            valid &= finite
+            values[~finite] = 0.0
+            pixels += values if weight == 1.0 else np.float32(weight) * values
+        valid &= self._mask(source, window)
+        pixels[~valid] = 0.0
+        return ImageWindow(pixels, valid)
+
+    def _mask(self, source: rasterio.DatasetReader, window: Window) -> NDArray[np.bool_]:
+        """(r, c) bool. A colour pixel is nodata when all its bands are."""
+        mask = np.zeros((int(window.height), int(window.width)), bool)
+        for band in self.bands:
+            if source.mask_flag_enums[band - 1] == [MaskFlags.all_valid]:
+                return np.ones(mask.shape, bool)
+            mask |= source.read_masks(band, window=window) > 0
+        return mask
+
+
+def open_image(path: Path) -> RasterImage:
+    """The image of a file, found complete: every block lies inside the file and the last one decodes.
+
+    Raises
+    ------
+    InputError
+        For no such file, a folder, no image, a truncated file, complex or palette pixels.
+    """
+    path = Path(path)
+    with open_raster(path) as source:
+        if source.count == 0:
+            raise InputError(f"{path} holds no image band (it may be a container). Give one of the images in it.")
+        if "complex" in source.dtypes[0]:
+            raise InputError(f"{path} holds complex numbers. Convert it to intensity first.")
+        if source.colorinterp[0] == ColorInterp.palette:
+            raise InputError(f"{path} holds colour numbers of a palette. Expand it: gdal_translate -expand gray.")
+        bands, weights = _grey_bands(source)
+        image = RasterImage(path, source.shape, source.dtypes[0], source.count, source.nodata, bands, weights)
+        _check_complete(source, path)
+        last = list(source.block_windows(bands[0]))[-1][1]
+        image._read(source, last)
+        return image
+
+
+def check_content(image: RasterImage) -> None:
+    """Refuse an image with nothing to match: all nodata, or one value everywhere.
+
+    Read by strips until two different valid values are met, so that an ordinary image costs one strip.
+
+    Raises
+    ------
+    InputError
+        When no two valid pixels differ.
+    """
+    rows, cols = image.shape
+    first: float | None = None
+    for row in range(0, rows, CHECK_ROWS):
+        window = image.read(row, 0, min(CHECK_ROWS, rows - row), cols)
+        values = window.pixels[window.valid]
+        if not values.size:
+            continue
+        first = float(values[0]) if first is None else first
+        if (values != first).any():
+            return
+    if first is None:
+        raise InputError(
+            f"{image.path} has no valid pixel (nodata = {image.nodata}). Check its nodata value, or leave it out."
+        )
+    raise InputError(f"{image.path} has the value {first:g} everywhere: nothing to match. Leave it out.")
+
+
+def _grey_bands(source: rasterio.DatasetReader) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Band indices and their weights: red, green, blue where all three are declared, else the first band."""
+    index = {meaning: band for band, meaning in zip(source.indexes, source.colorinterp, strict=True)}
+    if all(colour in index for colour in LUMINANCE):
+        return tuple(index[colour] for colour in LUMINANCE), tuple(LUMINANCE.values())
+    return (1,), (1.0,)
+
+
+def _check_complete(source: rasterio.DatasetReader, path: Path) -> None:
+    """Compare the offsets and sizes of all TIFF blocks with the length of the file, decoding nothing."""
+    if source.driver not in ("GTiff", "COG"):
+        return
+    length = os.path.getsize(path)
+    block_rows, block_cols = source.block_shapes[0]
+    n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
+    for band in source.indexes if source.interleaving == rasterio.enums.Interleaving.band else (1,):
+        for y in range(n_down):
+            for x in range(n_across):
+                offset = source.get_tag_item(f"BLOCK_OFFSET_{x}_{y}", "TIFF", bidx=band)
+                size = source.get_tag_item(f"BLOCK_SIZE_{x}_{y}", "TIFF", bidx=band)
+                if offset is not None and int(offset) + int(size or 0) > length:
+                    raise InputError(
+                        f"{path} is truncated: it has {length} bytes, and pixels of row {y * block_rows} on lie behind "
+                        "its end. Copy it again from its source."
+                    )

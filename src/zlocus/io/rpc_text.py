@@ -1,0 +1,108 @@
+"""RPC side-car files in text: `_RPC.TXT` (key: value) and `.RPB` (key = value;).
+
+Both count pixels as RPC00B does, (0, 0) at the centre of the first pixel, so that nothing is shifted here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from zlocus.errors import InputError
+from zlocus.sensors.rpc import RpcCoefficients
+
+SCALARS = (
+    "LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF",
+    "LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE",
+)  # fmt: skip
+POLYNOMIALS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
+ADVICE = "Get the RPC from its source again."
+RPB_NAMES = {
+    "lineOffset": "LINE_OFF", "sampOffset": "SAMP_OFF", "latOffset": "LAT_OFF", "longOffset": "LONG_OFF",
+    "heightOffset": "HEIGHT_OFF", "lineScale": "LINE_SCALE", "sampScale": "SAMP_SCALE", "latScale": "LAT_SCALE",
+    "longScale": "LONG_SCALE", "heightScale": "HEIGHT_SCALE", "lineNumCoef": "LINE_NUM_COEFF",
+    "lineDenCoef": "LINE_DEN_COEFF", "sampNumCoef": "SAMP_NUM_COEFF", "sampDenCoef": "SAMP_DEN_COEFF",
+}  # fmt: skip
+
+
+def read_rpc_txt(path: Path) -> RpcCoefficients:
+    """The RPC of a `_RPC.TXT` file: `LINE_OFF: +018339.50 pixels`, `LINE_NUM_COEFF_1: ...`."""
+    fields: dict[str, str] = {}
+    for line in _text(path).splitlines():
+        name, separator, rest = line.partition(":")
+        if separator:
+            fields[name.strip().upper()] = rest.split()[0] if rest.split() else ""
+    for name in POLYNOMIALS:
+        terms = [fields[key] for i in range(1, 21) if (key := f"{name}_{i}") in fields]
+        if terms:
+            fields[name] = " ".join(terms)
+    return rpc_from_fields(fields, path)
+
+
+def read_rpb(path: Path) -> RpcCoefficients:
+    """The RPC of an `.RPB` file: `lineOffset = 18339;`, `lineNumCoef = (a, b, ...);`."""
+    text = _text(path)
+    specification = re.search(r'SpecId\s*=\s*"(\w+)"', text, re.IGNORECASE)
+    if specification and specification[1].upper() != "RPC00B":
+        raise InputError(
+            f"{path} is an {specification[1]} model, of another term order. Only RPC00B is read; convert it."
+        )
+    fields = {
+        RPB_NAMES[name]: value.strip().strip("()").replace(",", " ")
+        for name, value in re.findall(r"(\w+)\s*=\s*(\([^)]*\)|[^;(]+);", text)
+        if name in RPB_NAMES
+    }
+    return rpc_from_fields(fields, path)
+
+
+def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
+    """Coefficients from text fields of the names RPC files use; checked.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the field that is missing, not a finite number, a zero scale, or not 20 numbers long.
+    """
+    scalar = {name: _numbers(fields, name, 1, path)[0] for name in SCALARS}
+    polynomial = {name: _numbers(fields, name, 20, path) for name in POLYNOMIALS}
+    for name in SCALARS[5:]:
+        if scalar[name] == 0.0:
+            raise InputError(f"{path}: {name} of the RPC is 0. {ADVICE}")
+    for name in ("LINE_DEN_COEFF", "SAMP_DEN_COEFF"):
+        if polynomial[name][0] == 0.0:
+            raise InputError(f"{path}: {name}_1 of the RPC is 0, a pole at its centre. {ADVICE}")
+    return RpcCoefficients(
+        line_off=scalar["LINE_OFF"], samp_off=scalar["SAMP_OFF"],
+        lat_off=scalar["LAT_OFF"], lon_off=scalar["LONG_OFF"], height_off=scalar["HEIGHT_OFF"],
+        line_scale=scalar["LINE_SCALE"], samp_scale=scalar["SAMP_SCALE"],
+        lat_scale=scalar["LAT_SCALE"], lon_scale=scalar["LONG_SCALE"], height_scale=scalar["HEIGHT_SCALE"],
+        line_num=polynomial["LINE_NUM_COEFF"], line_den=polynomial["LINE_DEN_COEFF"],
+        samp_num=polynomial["SAMP_NUM_COEFF"], samp_den=polynomial["SAMP_DEN_COEFF"],
+    )  # fmt: skip
+
+
+def _numbers(fields: Mapping[str, str], name: str, count: int, path: Path) -> tuple[float, ...]:
+    """The `count` finite numbers of a field."""
+    text = fields.get(name, "").split()
+    if not text:
+        raise InputError(f"{path}: the RPC has no {name}. {ADVICE}")
+    if len(text) != count:
+        raise InputError(f"{path}: {name} of the RPC has {len(text)} numbers, not {count}. {ADVICE}")
+    for number in text:
+        try:
+            finite = np.isfinite(float(number))
+        except ValueError:
+            finite = False
+        if not finite:
+            raise InputError(f"{path}: {name} of the RPC holds {number!r}, not a finite number. {ADVICE}")
+    return tuple(float(number) for number in text)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii", errors="replace")
+    except OSError as error:
+        raise InputError(f"The RPC file {path} cannot be read: {error.strerror}. Check the path.") from error

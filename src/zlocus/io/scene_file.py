@@ -1,0 +1,252 @@
+"""Scenes from files: a list of images with their own cameras, or one `scene.yaml` (schema 1).
+
+schema: 1
+frame: {crs: "EPSG:32631"}             # optional: else the UTM zone of the scene's centre
+area: {bounds: [xmin, ymin, xmax, ymax]}   # optional, in that CRS
+heights: [zmin, zmax]                  # optional, ellipsoidal metres
+views:
+  - name: nadir
+    image: img_n1.tif                  # relative to this file
+    camera: {kind: rpc, file: other_RPC.TXT, shift: [0.3, -1.2]}   # file and shift are optional
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, FiniteFloat, SerializeAsAny, model_validator
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from zlocus.errors import ConfigError, InputError, OutputError
+from zlocus.io.camera_kinds import KINDS, Camera, CameraSource, RpcCamera
+from zlocus.io.images import RasterImage, open_image
+from zlocus.io.opening import existing_file
+from zlocus.io.strict import StrictModel, validated
+from zlocus.scene import Scene, View
+
+SCENE_SUFFIXES = (".yaml", ".yml")
+
+
+class Frame(StrictModel):
+    """The CRS all views share."""
+
+    crs: str
+
+
+class Area(StrictModel):
+    """The part of the ground asked for. bounds : xmin, ymin, xmax, ymax in the frame's CRS."""
+
+    bounds: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Area:
+        xmin, ymin, xmax, ymax = self.bounds
+        if not (xmin < xmax and ymin < ymax):
+            raise ValueError("bounds are xmin, ymin, xmax, ymax with xmin < xmax and ymin < ymax")
+        return self
+
+
+class ViewEntry(StrictModel):
+    """One image and its camera. name : unique."""
+
+    name: str = Field(min_length=1)
+    image: str
+    camera: SerializeAsAny[Camera]
+
+
+class SceneFile(StrictModel):
+    """A `scene.yaml`, schema 1."""
+
+    schema_version: Literal[1] = Field(1, alias="schema")
+    frame: Frame | None = None
+    area: Area | None = None
+    heights: tuple[FiniteFloat, FiniteFloat] | None = None
+    views: tuple[ViewEntry, ...]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SceneFile:
+        if self.heights is not None and not self.heights[0] < self.heights[1]:
+            raise ValueError("heights are zmin, zmax with zmin < zmax")
+        names = [view.name for view in self.views]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"the view name {name!r} is used twice")
+        if self.area is not None and self.frame is None:
+            raise ValueError("area needs frame: {crs: EPSG:n}, whose coordinates its bounds are")
+        return self
+
+
+def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
+    """The scene of some images with RPC, or of one `scene.yaml`.
+
+    crs : a projected CRS in metres, whose horizontal part becomes the frame; it overrides that of the file. By default
+    the WGS84 UTM zone of the scene's centre.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing, damaged or given twice, an image without a camera, fewer than two images.
+    ConfigError
+        For a CRS that is not projected in metres.
+    """
+    paths = [Path(path) for path in inputs]
+    scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
+    if scene_files and len(paths) > 1:
+        raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
+    if scene_files:
+        return _from_scene_file(scene_files[0], crs)
+    views = [(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
+    return _build(views, Path(), crs)
+
+
+def read_scene_file(path: Path) -> SceneFile:
+    """A `scene.yaml`, checked, its images and cameras unread.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key and what is allowed there.
+    """
+    path = existing_file(path, "scene file")
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
+    for index, view in enumerate(document.get("views") or []):
+        if isinstance(view, dict) and "camera" in view:
+            view["camera"] = _camera(view["camera"], path, f"views[{index}].camera")
+    return validated(SceneFile, document, path)
+
+
+def write_scene_file(path: Path, scene_file: SceneFile) -> None:
+    """Write a `scene.yaml`: a temporary name first, then renamed, so that it is whole or not there.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be written.
+    """
+    document = scene_file.model_dump(mode="json", by_alias=True, exclude_none=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
+
+
+def checked_crs(crs: CRS) -> CRS:
+    """The horizontal part of a projected CRS in metres.
+
+    Raises
+    ------
+    ConfigError
+        For any other CRS, saying what to use instead.
+    """
+    flat = crs.to_2d()
+    advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
+    if not flat.is_projected:
+        kind = "geographic (degrees)" if flat.is_geographic else "not projected"
+        raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is {kind}. {advice}, or leave --crs out.")
+    if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
+        raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is in {flat.axis_info[0].unit_name}. {advice}.")
+    return flat
+
+
+def utm_zone(lon: float, lat: float) -> CRS:
+    """The WGS84 UTM zone of a place (degrees), the 6-degree bands without the exceptions of Norway and Svalbard."""
+    zone = int((lon + 180.0) % 360.0 // 6.0) + 1
+    return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+
+
+def _from_scene_file(path: Path, crs: CRS | None) -> Scene:
+    scene_file = read_scene_file(path)
+    frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
+    if scene_file.area is not None and crs is not None and crs != frame:
+        raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
+    views = [(view.name, path.parent / view.image, view.camera) for view in scene_file.views]
+    bounds = None if scene_file.area is None else scene_file.area.bounds
+    return _build(views, path.parent, crs or frame, bounds, scene_file.heights)
+
+
+def _frame_crs(frame: Frame, path: Path) -> CRS:
+    try:
+        return CRS.from_user_input(frame.crs)
+    except CRSError as error:
+        raise InputError(f"{path}: frame.crs {frame.crs!r} is no CRS. Write it as EPSG:n.") from error
+
+
+def _build(
+    entries: Sequence[tuple[str, Path, Camera]],
+    folder: Path,
+    crs: CRS | None,
+    bounds: tuple[float, float, float, float] | None = None,
+    heights: tuple[float, float] | None = None,
+) -> Scene:
+    """Open images and cameras, then fix the frame."""
+    crs = None if crs is None else checked_crs(crs)
+    _check_distinct([path for _, path, _ in entries])
+    images = [open_image(path) for _, path, _ in entries]
+    if len(entries) < 2:
+        given = f"only {entries[0][1]} was given" if entries else "none was given"
+        raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
+    sources = [camera.read(folder, path) for _, path, camera in entries]
+    crs = _default_crs(images, sources) if crs is None else crs
+    views = tuple(
+        View(name, path, image, source.sensor(crs))
+        for (name, path, _), image, source in zip(entries, images, sources, strict=True)
+    )
+    return Scene(views, crs, bounds, heights)
+
+
+def _default_crs(images: Sequence[RasterImage], sources: Sequence[CameraSource]) -> CRS:
+    """The UTM zone of the mean of the images' centres (longitudes across the date line are neighbours)."""
+    centres = []
+    for image, source in zip(images, sources, strict=True):
+        centre = source.centre(image.shape)
+        if centre is None:
+            raise InputError(
+                f"The camera of {image.path} does not place its centre on the Earth. Check it, or give --crs."
+            )
+        centres.append(centre)
+    first = centres[0][0]
+    lon = first + sum((lon - first + 180.0) % 360.0 - 180.0 for lon, _ in centres) / len(centres)
+    return utm_zone(lon, sum(lat for _, lat in centres) / len(centres))
+
+
+def _check_distinct(paths: Sequence[Path]) -> None:
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise InputError(f"{path} is given twice. Each image counts once; remove one.")
+        seen.add(path.resolve())
+
+
+def _unique_names(paths: Sequence[Path]) -> list[str]:
+    """A name per image: its stem, else parent/stem, else the path without suffix, whichever is unique first."""
+    names = [path.stem for path in paths]
+    for depth in (1, 2):
+        doubled = {name for name in names if names.count(name) > 1}
+        for i, path in enumerate(paths):
+            if names[i] in doubled:
+                whole = path.resolve()
+                names[i] = f"{whole.parent.name}/{whole.stem}" if depth == 1 else whole.with_suffix("").as_posix()
+    return names
+
+
+def _camera(value: Any, path: Path, where: str) -> Any:
+    """The camera entry by its kind; anything that is not a mapping is left to the model to refuse."""
+    if not isinstance(value, dict):
+        return value
+    kind = value.get("kind")
+    if kind not in KINDS:
+        raise InputError(f"{path}: {where}.kind is {kind!r}. Allowed: {', '.join(KINDS)}.")
+    return validated(KINDS[kind], value, path, where)

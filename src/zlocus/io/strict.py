@@ -1,0 +1,51 @@
+"""Documents checked by pydantic: unknown keys are refused at every level, and what is wrong is said in a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+
+from zlocus.errors import InputError
+
+
+class StrictModel(BaseModel):
+    """A mapping whose keys are all known; frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, value: Any) -> Any:
+        allowed = {name: field.alias or name for name, field in cls.model_fields.items()}
+        if isinstance(value, dict):
+            unknown = [str(key) for key in value if key not in allowed and key not in allowed.values()]
+            if unknown:
+                raise ValueError(f"unknown key {', '.join(unknown)}; allowed here: {', '.join(allowed.values())}")
+        return value
+
+
+Document = TypeVar("Document", bound=StrictModel)
+
+
+def validated(model: type[Document], document: Any, path: Path, where: str = "") -> Document:
+    """The model of a document read from `path`, of which it is the part called `where`.
+
+    Raises
+    ------
+    InputError
+        For the first thing that is wrong: file, key, what stands there and what is allowed.
+    """
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = where
+        for part in first["loc"]:
+            key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+        if first["type"] == "missing":
+            raise InputError(f"{path}: the key {key} is missing. Add it.") from error
+        message = first["msg"].removeprefix("Value error, ")
+        value = "" if isinstance(first["input"], dict) else f" (there: {first['input']!r})"
+        raise InputError(f"{path}: {key or 'the document'}: {message}{value}.") from error

@@ -1,0 +1,136 @@
+"""What is matched, where, in which frame: views and the CRS they share."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from zlocus.errors import GeometryError, ZlocusWarning
+from zlocus.sensors.model import FloatArray, SensorModel
+
+
+@dataclass(frozen=True)
+class ImageWindow:
+    """Pixels of a window. pixels : (r, c) float32, 0 where not valid; valid : (r, c) bool."""
+
+    pixels: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+
+class ImageSource(Protocol):
+    """An image that is read by window, never whole (implemented in `zlocus.io.images`)."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        ...
+
+    def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+        """The window that starts at (row, col); it lies inside the image."""
+        ...
+
+
+@dataclass(frozen=True)
+class View:
+    """One image with its sensor model in the scene's frame."""
+
+    name: str
+    path: Path
+    image: ImageSource
+    sensor: SensorModel
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Views that share a frame: projected easting, northing and ellipsoidal height in metres.
+
+    bounds : (xmin, ymin, xmax, ymax) of the area asked for, in `crs`; None is the ground seen by two views or more.
+    heights : (zmin, zmax) m, ellipsoidal, searched; None is found from the tie points.
+    """
+
+    views: tuple[View, ...]
+    crs: CRS
+    bounds: tuple[float, float, float, float] | None = None
+    heights: tuple[float, float] | None = None
+
+
+def footprint(view: View, z: float, per_side: int = 8) -> FloatArray:
+    """The image's outline on the ground at height z (m, ellipsoidal), counter-clockwise or clockwise, not closed.
+
+    Runs along the outer edges of the border pixels, `per_side` points a side, because the sides of a line scanner's
+    image are curves. Returns (4 * per_side, 2) m; points the sensor cannot map are left out.
+    """
+    rows, cols = view.image.shape
+    t = np.arange(per_side) / per_side
+    zero, one = np.zeros(per_side), np.ones(per_side)
+    column = np.concatenate([t, one, 1 - t, zero]) * cols - 0.5
+    row = np.concatenate([zero, t, one, 1 - t]) * rows - 0.5
+    xyz = view.sensor.ground_from_image(np.column_stack([column, row]), np.full(len(column), float(z)))
+    return np.asarray(xyz[np.isfinite(xyz).all(axis=1), :2])
+
+
+def ground_sample_distance(view: View, z: float) -> float:
+    """Metres on the ground at height z per pixel at the image's centre: geometric mean of both directions.
+
+    NaN where the sensor cannot map the centre.
+    """
+    rows, cols = view.image.shape
+    column, row = (cols - 1) / 2, (rows - 1) / 2
+    xy = np.array([[column - 0.5, row], [column + 0.5, row], [column, row - 0.5], [column, row + 0.5]])
+    left, right, up, down = view.sensor.ground_from_image(xy, np.full(4, float(z)))[:, :2]
+    (ax, ay), (bx, by) = right - left, down - up
+    return float(np.sqrt(abs(ax * by - ay * bx)))
+
+
+def check_overlap(scene: Scene, heights: float | Sequence[float]) -> None:
+    """Refuse a scene without two views of the same ground; warn of views that share none.
+
+    heights : m, ellipsoidal; views overlap when their footprints do at any of them (a footprint moves with the height,
+    so give several where the height of the ground is not known).
+
+    Raises
+    ------
+    GeometryError
+        When no two footprints overlap; names the views and where they lie.
+    """
+    # shapely costs 0.1 s to import, and only this check needs it.
+    from shapely import MultiPoint
+
+    levels = np.atleast_1d(np.asarray(heights, float))
+    n_views = len(scene.views)
+    overlap = np.zeros(n_views, bool)
+    for z in levels:
+        hulls = [MultiPoint(footprint(view, z)).convex_hull for view in scene.views]
+        for i, j in combinations(range(n_views), 2):
+            if hulls[i].intersection(hulls[j]).area > 0:
+                overlap[[i, j]] = True
+    at = f"at heights of {levels.min():g} to {levels.max():g} m" if len(levels) > 1 else f"at {levels[0]:g} m"
+    if not overlap.any():
+        where = "; ".join(f"{view.name} {_extent(hull.bounds)}" for view, hull in zip(scene.views, hulls, strict=True))
+        raise GeometryError(
+            f"No two images see the same ground {at} ({scene.crs.to_string()}): {where}. "
+            "Check that they show the same place and that each RPC belongs to its image."
+        )
+    for view, overlaps in zip(scene.views, overlap, strict=True):
+        if not overlaps:
+            warnings.warn(
+                f"{view.name} ({view.path}) overlaps no other image {at}. Leave it out, or check its RPC.",
+                ZlocusWarning,
+                stacklevel=2,
+            )
+
+
+def _extent(bounds: tuple[float, ...]) -> str:
+    """Bounds for a message."""
+    if not bounds or not np.isfinite(bounds).all():
+        return "nowhere"
+    xmin, ymin, xmax, ymax = bounds
+    return f"E {xmin:.0f} to {xmax:.0f} m, N {ymin:.0f} to {ymax:.0f} m"
