@@ -1,0 +1,252 @@
+"""The command line: options in, one sentence out for whatever goes wrong.
+
+Heavy modules are imported inside the commands, so that `zlocus --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import shutil
+import sys
+import textwrap
+import traceback
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+
+import typer
+
+from zlocus import __version__
+from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
+from zlocus.progress import progress_for
+from zlocus.request import DsmRequest, check_output
+
+if TYPE_CHECKING:
+    from zlocus.evaluation.evaluate import Evaluation
+    from zlocus.options import RunConfig
+
+EXIT_OWN_FAULT = 1
+EXIT_INTERRUPTED = 130
+DEMO_ACCURACY = "accuracy.json"
+P = ParamSpec("P")
+R = TypeVar("R")
+
+app = typer.Typer(
+    name="zlocus",
+    help="Digital surface models from images, by multi-view vertical line locus matching.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def explained(command: Callable[P, R]) -> Callable[P, R]:
+    """A command whose errors become one sentence on stderr and an exit status (ZLOCUS_DEBUG=1: the trace too)."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return command(*args, **kwargs)
+        except ZlocusError as error:
+            raise _failed(str(error), error.exit_status) from error
+        except KeyboardInterrupt as error:
+            raise _failed("Interrupted.", EXIT_INTERRUPTED) from error
+        except (typer.Exit, BrokenPipeError):
+            raise
+        except Exception as error:
+            what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
+            advice = "This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the trace, and report it."
+            raise _failed(f"Unexpected {what}. {advice}", EXIT_OWN_FAULT) from error
+
+    return run
+
+
+def _failed(sentence: str, status: int) -> typer.Exit:
+    if os.environ.get("ZLOCUS_DEBUG"):
+        traceback.print_exc()
+    _say(f"zlocus: {sentence}")
+    return typer.Exit(status)
+
+
+def _say(sentence: str) -> None:
+    """To stderr, broken between words on a terminal, on one line elsewhere."""
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns
+        sentence = textwrap.fill(sentence, width, break_long_words=False, break_on_hyphens=False)
+    print(sentence, file=sys.stderr)
+
+
+def _show_warning(show: Callable[..., Any]) -> Callable[..., Any]:
+    """Our own warnings as sentences, those of libraries as they are."""
+
+    def show_warning(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
+        if issubclass(category, ZlocusWarning):
+            _say(f"zlocus: {message}")
+        else:
+            show(message, category, *args, **kwargs)
+
+    return show_warning
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"zlocus {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
+    ] = False,
+) -> None:
+    """Options before the command."""
+
+
+@app.command()
+@explained
+def demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the scene and the result.")] = Path("demo"),
+) -> None:
+    """Render the built-in scene, run everything, and report the accuracy against its truth."""
+    # A folder of an earlier demo may be used again, one of any other run not.
+    check_output(out, overwrite=(out / DEMO_ACCURACY).exists())
+    from zlocus.pipeline import run_demo
+
+    result = run_demo(out, progress_for(sys.stderr))
+    (out / DEMO_ACCURACY).write_text(json.dumps(result.evaluation.as_dict(), indent=2) + "\n", encoding="utf-8")
+    print(f"Accuracy of {result.out} against the rendered truth:")
+    _print_evaluation(result.evaluation)
+
+
+@app.command()
+@explained
+def dsm(
+    inputs: Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")],
+    resolution: Annotated[
+        float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")
+    ] = None,
+    bounds: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            help="Area in the CRS of the grid. Default: ground seen by two images or more.",
+            metavar="XMIN YMIN XMAX YMAX",
+        ),
+    ] = None,
+    like: Annotated[
+        Path | None, typer.Option(help="Take CRS, transform and shape from a raster.", metavar="RASTER")
+    ] = None,
+    area: Annotated[Path | None, typer.Option(help="Polygons to work in.", metavar="VECTOR")] = None,
+    mask: Annotated[Path | None, typer.Option(help="Polygons to leave out.", metavar="VECTOR")] = None,
+    heights: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Range searched, m above the ellipsoid. Default: found from tie points.", metavar="ZMIN ZMAX"
+        ),
+    ] = None,
+    dem: Annotated[Path | None, typer.Option(help="Search around the heights of a raster.", metavar="RASTER")] = None,
+    reference: Annotated[
+        str | None, typer.Option(help="Name of the view that leads. Default: the most nadir.", metavar="VIEW")
+    ] = None,
+    views: Annotated[str, typer.Option(help="Views used for a cell.", metavar="auto|all")] = "auto",
+    method: Annotated[str, typer.Option(help="How heights are decided.", metavar="mvll-sgm|mvll")] = "mvll-sgm",
+    vertical: Annotated[str, typer.Option(help="Heights are above this.", metavar="ellipsoid")] = "ellipsoid",
+    fill: Annotated[str, typer.Option(help="What to do with small gaps.", metavar="none|interpolate")] = "none",
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Count a surface with too few heights as a success.")
+    ] = False,
+    workers: Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")] = 1,
+    memory: Annotated[float | None, typer.Option(help="Most memory to use, GB.", metavar="GB")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")] = False,
+    config: Annotated[
+        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Make a surface from images."""
+    request = DsmRequest(
+        inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, bounds=bounds, like=like, area=area, mask=mask,
+        heights=heights, dem=dem, reference=reference, views=views, method=method, vertical=vertical, fill=fill,
+        partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
+    )  # fmt: skip
+    check_output(out, overwrite)
+    run_config = _run_config(config)
+    from zlocus.pipeline import run_dsm
+
+    result = run_dsm(request, run_config, progress_for(sys.stderr))
+    print(f"{result.out}: {100 * result.coverage:.1f} % of the cells seen by two images or more have a height.")
+
+
+@app.command()
+@explained
+def evaluate(
+    dsm: Annotated[Path, typer.Argument(help="Surface to judge.", metavar="DSM")],
+    reference: Annotated[Path, typer.Argument(help="Reference heights on a projected grid.", metavar="REFERENCE")],
+    classes: Annotated[
+        Path | None,
+        typer.Option(help="Classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
+    ] = None,
+    align: Annotated[
+        bool, typer.Option("--align", help="First find and remove the best shift; it is reported.")
+    ] = False,
+    margin: Annotated[float, typer.Option(help="Rim of the reference left out, m.", metavar="M")] = 10.0,
+    threshold: Annotated[float, typer.Option(help="An error below this is within, m.", metavar="M")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Compare a surface with a reference surface."""
+    from zlocus.evaluation.evaluate import evaluate as compare
+
+    evaluation = compare(dsm, reference, classes=classes, align=align, margin_m=margin, threshold_m=threshold)
+    if as_json:
+        print(json.dumps(evaluation.as_dict(), indent=2))
+    else:
+        _print_evaluation(evaluation)
+
+
+@app.command()
+@explained
+def config(
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Default: print.")] = None,
+) -> None:
+    """Write a complete commented configuration."""
+    from zlocus.io.config import write_config
+    from zlocus.options import RunConfig
+
+    text = write_config(RunConfig())
+    if out is None:
+        print(text, end="")
+        return
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise OutputError(f"{out} exists already and may hold your settings. Choose another name with -o.") from error
+    except OSError as error:
+        raise OutputError(f"{out} cannot be written: {error.strerror}. Choose another name with -o.") from error
+
+
+def _run_config(path: Path | None) -> RunConfig:
+    from zlocus.io.config import read_config
+    from zlocus.options import RunConfig
+
+    return RunConfig() if path is None else read_config(path)
+
+
+def _print_evaluation(evaluation: Evaluation) -> None:
+    from zlocus.evaluation.table import evaluation_table
+
+    print(evaluation_table(evaluation))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit; `arguments` default to those of the process."""
+    warnings.showwarning = _show_warning(warnings.showwarning)
+    app(arguments, prog_name="zlocus")

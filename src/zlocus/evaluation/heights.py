@@ -1,0 +1,80 @@
+"""A raster of heights, looked up at ground points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from affine import Affine
+from rasterio.crs import CRS
+from rasterio.errors import RasterioError
+
+from zlocus.errors import InputError
+from zlocus.sensors.model import FloatArray
+
+# What other programs write where they have no height, without declaring it.
+LOWEST_M, HIGHEST_M = -1e4, 1e5
+
+
+@dataclass(frozen=True)
+class HeightRaster:
+    """Heights on a grid. z : (r, c) float64, m, NaN where there is none."""
+
+    path: Path
+    z: FloatArray
+    transform: Affine
+    crs: CRS | None
+
+    def nearest(self, xy: FloatArray) -> FloatArray:
+        """Height of the cell that holds each point. xy : (n, 2) in the raster's CRS -> (n,) m, NaN outside."""
+        cell = np.floor(self.cells(xy)).astype(int)
+        inside = np.all((cell >= 0) & (cell < self.z.shape), axis=1)
+        z = np.full(len(xy), np.nan)
+        z[inside] = self.z[cell[inside, 0], cell[inside, 1]]
+        return z
+
+    def bilinear(self, xy: FloatArray) -> FloatArray:
+        """Height between the four cell centres around each point; as `nearest` where one of the four is missing."""
+        cell = self.cells(xy) - 0.5
+        corner = np.floor(cell).astype(int)
+        down, right = (cell - corner).T
+        inside = np.all((corner >= 0) & (corner < np.array(self.z.shape) - 1), axis=1)
+        row, col = np.where(inside[:, None], corner, 0).T
+        upper = self.z[row, col] * (1 - right) + self.z[row, col + 1] * right
+        lower = self.z[row + 1, col] * (1 - right) + self.z[row + 1, col + 1] * right
+        z = upper * (1 - down) + lower * down
+        return np.where(inside & np.isfinite(z), z, self.nearest(xy))
+
+    def cells(self, xy: FloatArray) -> FloatArray:
+        """(row, col) with (0, 0) at the outer corner of the first cell. (n, 2) -> (n, 2)."""
+        inverse = ~self.transform
+        x, y = xy[:, 0], xy[:, 1]
+        col = inverse.a * x + inverse.b * y + inverse.c
+        row = inverse.d * x + inverse.e * y + inverse.f
+        return np.column_stack([row, col])
+
+
+def read_heights(path: Path) -> HeightRaster:
+    """The first band of a raster as heights.
+
+    Raises
+    ------
+    InputError
+        The file is missing, cannot be read, or is too small to hold a surface.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Check the name.")
+    try:
+        with rasterio.open(path) as source:
+            z = source.read(1).astype(np.float64)
+            nodata, transform, crs = source.nodata, source.transform, source.crs
+    except (RasterioError, OSError) as error:
+        raise InputError(f"{path} cannot be read as a raster of heights: {error}. Check the file.") from error
+    if min(z.shape) < 2:
+        raise InputError(f"{path} has {z.shape[0]} x {z.shape[1]} cells, too few for a surface. Check the file.")
+    if nodata is not None:
+        z[z == nodata] = np.nan
+    z[(z < LOWEST_M) | (z > HIGHEST_M)] = np.nan
+    return HeightRaster(path, z, transform, crs)

@@ -1,0 +1,109 @@
+"""A reference surface as blocks of about half a metre, each with the heights that count as right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import RasterioError
+
+from zlocus.errors import ConfigError, InputError
+from zlocus.evaluation.heights import HeightRaster
+from zlocus.sensors.model import FloatArray
+
+BLOCK_M = 0.5
+EDGE_SPREAD_M = 0.5
+CLASS_NAMES = {"ground": (0, 1), "building": (2,), "tree": (3,)}
+
+
+@dataclass(frozen=True)
+class TruthBlocks:
+    """Blocks of a reference surface.
+
+    xy : (n, 2) float64, centres in the reference's CRS. heights : (n, k) float64, m, the block's cells.
+    classes : (n,) uint8 class of the block's first cell, or None.
+    """
+
+    xy: FloatArray
+    heights: FloatArray
+    classes: NDArray[np.uint8] | None
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean height. (n,) m."""
+        return np.asarray(self.heights.mean(axis=1))
+
+    @property
+    def is_edge(self) -> NDArray[np.bool_]:
+        """Blocks that hold a jump: either side of it is right. (n,)."""
+        return np.asarray(np.ptp(self.heights, axis=1) > EDGE_SPREAD_M)
+
+    def errors(self, z: FloatArray) -> FloatArray:
+        """Errors of heights z (n,) m at the centres: against the mean, at an edge against the nearest member."""
+        nearest = np.abs(self.heights - np.nan_to_num(z)[:, None]).argmin(axis=1)
+        member = np.take_along_axis(self.heights, nearest[:, None], axis=1)[:, 0]
+        return z - np.where(self.is_edge, member, self.mean)
+
+    def members(self, name: str) -> NDArray[np.bool_]:
+        """Blocks of a class of `CLASS_NAMES`. (n,)."""
+        if self.classes is None:
+            raise ValueError("these blocks were read without classes")
+        return np.isin(self.classes, CLASS_NAMES[name])
+
+
+def truth_blocks(reference: HeightRaster, margin_m: float, classes: NDArray[np.uint8] | None) -> TruthBlocks:
+    """The blocks of a reference whose cells all have a height, away from its rim.
+
+    classes : (r, c) on the reference's grid.
+
+    Raises
+    ------
+    InputError
+        A geographic reference, one without a height, or one the margin leaves nothing of.
+    """
+    if reference.crs is not None and reference.crs.is_geographic:
+        raise InputError(f"{reference.path} is in degrees ({reference.crs}). Reproject it to a CRS in metres first.")
+    transform = reference.transform
+    size = max(1, round(BLOCK_M / abs(transform.a)))
+    rows, cols = reference.z.shape[0] // size, reference.z.shape[1] // size
+    cells = reference.z[: rows * size, : cols * size]
+    heights = cells.reshape(rows, size, cols, size).transpose(0, 2, 1, 3).reshape(rows * cols, size * size)
+    row, col = (index.ravel() * size for index in np.mgrid[:rows, :cols])
+    centre_row, centre_col = row + size / 2, col + size / 2
+    x = transform.a * centre_col + transform.b * centre_row + transform.c
+    y = transform.d * centre_col + transform.e * centre_row + transform.f
+    left, top = transform.c, transform.f
+    right, bottom = transform * (reference.z.shape[1], reference.z.shape[0])
+    keep = (x > left + margin_m) & (x < right - margin_m) & (y > bottom + margin_m) & (y < top - margin_m)
+    if not keep.any():
+        raise InputError(f"A margin of {margin_m:g} m leaves nothing of {reference.path}. Give a smaller --margin.")
+    keep &= np.isfinite(heights).all(axis=1)
+    if not keep.any():
+        raise InputError(f"{reference.path} has no height inside its margin of {margin_m:g} m. Check its nodata value.")
+    chosen = None if classes is None else classes[row[keep], col[keep]]
+    return TruthBlocks(np.column_stack([x[keep], y[keep]]), heights[keep], chosen)
+
+
+def read_classes(path: Path, reference: HeightRaster) -> NDArray[np.uint8]:
+    """Classes on the reference's grid. (r, c).
+
+    Raises
+    ------
+    InputError
+        The file is missing, cannot be read or is empty of classes.
+    ConfigError
+        It lies on another grid.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Check the name.")
+    try:
+        with rasterio.open(path) as source:
+            classes, transform = source.read(1), source.transform
+    except (RasterioError, OSError) as error:
+        raise InputError(f"{path} cannot be read as a raster of classes: {error}. Check the file.") from error
+    if classes.shape != reference.z.shape or not transform.almost_equals(reference.transform):
+        raise ConfigError(f"{path} is not on the grid of {reference.path}. Resample it to that grid first.")
+    return np.asarray(classes)

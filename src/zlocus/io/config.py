@@ -1,0 +1,153 @@
+"""The configuration file: a complete commented TOML out, strict TOML or YAML in."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import textwrap
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import Field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from zlocus.errors import ConfigError
+from zlocus.options import RunConfig
+
+COMMENT_WIDTH = 100
+HEADING = "# Every option of zlocus. What is left out keeps its default; read with --config FILE."
+T = TypeVar("T")
+
+
+def config_as_dict(config: Any) -> dict[str, Any]:
+    """The options as nested plain values, every one present (None: unset), as `run.json` keeps them."""
+    values: dict[str, Any] = {}
+    for f in fields(config):
+        value = getattr(config, f.name)
+        values[f.name] = (
+            config_as_dict(value) if is_dataclass(value) else list(value) if isinstance(value, tuple) else value
+        )
+    return values
+
+
+def config_from_dict(values: Mapping[str, Any], where: str) -> RunConfig:
+    """The configuration that `values` describe; what they leave out keeps its default.
+
+    where : what the values come from, for messages.
+
+    Raises
+    ------
+    ConfigError
+        An unknown key, a value of the wrong type or out of range.
+    """
+    return _build(RunConfig, values, where, prefix="")
+
+
+def read_config(path: Path) -> RunConfig:
+    """The configuration in a TOML file, or a YAML file where the name ends in .yaml or .yml.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or see `config_from_dict`.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ConfigError(f"{path} cannot be read: {reason}. `zlocus config -o FILE` writes a complete one.") from error
+    try:
+        values = yaml.safe_load(text) or {} if path.suffix.lower() in (".yaml", ".yml") else tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not a valid configuration file: {reason}. Mend that line.") from error
+    return config_from_dict(values, str(path))
+
+
+def write_config(config: RunConfig) -> str:
+    """Every option as commented TOML; `read_config` gives back an equal configuration."""
+    return "\n".join([HEADING, *_lines(config, prefix="")]) + "\n"
+
+
+def _build(kind: type[T], values: Any, where: str, prefix: str) -> T:
+    """An options class from plain values, its stages first."""
+    if not isinstance(values, Mapping):
+        name = f"{where}: {prefix.rstrip('.')}" if prefix else where
+        raise ConfigError(f"{name} must hold named options, not {values!r}. See `zlocus config`.")
+    known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
+    types = get_type_hints(kind)
+    chosen: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in known:
+            raise ConfigError(_unknown(str(name), list(known), where, prefix))
+        if is_dataclass(types[name]):
+            chosen[name] = _build(types[name], value, where, f"{prefix}{name}.")
+        else:
+            chosen[name] = _typed(types[name], value, f"{where}: {prefix}{name}")
+    try:
+        return kind(**chosen)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def _typed(kind: Any, value: Any, where: str) -> Any:
+    """`value` as the option's type: an integer passes for a float, a list for a tuple, nothing else is converted."""
+    try:
+        # As JSON, pydantic's strict mode knows lists but no tuples: just what TOML and YAML can say.
+        return TypeAdapter(kind).validate_json(json.dumps(value), strict=True)
+    except (ValidationError, TypeError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else "Input should be a plain value"
+        raise ConfigError(f"{where} = {value!r} is of the wrong type: {reason[0].lower()}{reason[1:]}.") from error
+
+
+def _unknown(name: str, known: list[str], where: str, prefix: str) -> str:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    advice = f"Did you mean {prefix}{near[0]}?" if near else f"Known here: {', '.join(known)}."
+    return f"{where}: {prefix}{name} is not an option. {advice}"
+
+
+def _lines(options: Any, prefix: str) -> Iterator[str]:
+    """Lines of one stage: its own options first, as TOML wants it, then the stages inside it."""
+    stages = [f for f in fields(options) if is_dataclass(getattr(options, f.name))]
+    for f in fields(options):
+        if f not in stages:
+            yield from _option_lines(f, getattr(options, f.name))
+    for f in stages:
+        yield ""
+        yield from _comment(f.metadata["doc"])
+        yield f"[{prefix}{f.name}]"
+        yield from _lines(getattr(options, f.name), f"{prefix}{f.name}.")
+
+
+def _option_lines(f: Field[Any], value: Any) -> Iterator[str]:
+    yield ""
+    yield from _comment(f"{f.metadata['doc']} {_allowed(f.metadata)}".rstrip())
+    yield f"# {f.name} =   (unset)" if value is None else f"{f.name} = {_toml(value)}"
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ")
+
+
+def _allowed(meta: Mapping[str, Any]) -> str:
+    """Range and unit of an option in brackets; empty where it has neither."""
+    low, high, unit, choices = meta.get("low"), meta.get("high"), meta.get("unit", ""), meta.get("choices")
+    if choices is not None:
+        return f"[{' | '.join(choices)}]"
+    if low is None and high is None:
+        return f"[{unit}]" if unit else ""
+    limits = f"{low} to {high}" if None not in (low, high) else f"at least {low}" if high is None else f"at most {high}"
+    return f"[{limits} {unit}".rstrip() + "]"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return repr(value)

@@ -1,0 +1,164 @@
+"""Where a run stands: bars with the time left on a terminal, plain lines elsewhere, or nothing."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol, TextIO
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichBars
+    from rich.progress import TaskID
+
+LINE_INTERVAL_S = 10.0
+
+
+class Stage(Protocol):
+    """A part of a run that knows how much of it is done."""
+
+    def advance(self, n: float = 1) -> None:
+        """Count n more steps as done."""
+        ...
+
+
+class Progress(Protocol):
+    """What a run reports to.
+
+    >>> with progress.stage("Matching", total=len(tiles)) as stage:
+    ...     stage.advance()
+    """
+
+    def stage(self, name: str, total: float | None = None) -> AbstractContextManager[Stage]:
+        """A stage of `total` steps (None: not known), done when its block ends."""
+        ...
+
+    def note(self, sentence: str) -> None:
+        """Something the user should know, such as the corrections applied."""
+        ...
+
+
+class SilentProgress:
+    """Reports nothing."""
+
+    @contextmanager
+    def stage(self, name: str, total: float | None = None) -> Iterator[Stage]:
+        """See `Progress`."""
+        yield _SilentStage()
+
+    def note(self, sentence: str) -> None:
+        """See `Progress`."""
+
+
+class _SilentStage:
+    def advance(self, n: float = 1) -> None:
+        pass
+
+
+@dataclass
+class LineProgress:
+    """One line when a stage ends, and one every ten seconds of a long one: for logs."""
+
+    stream: TextIO
+
+    @contextmanager
+    def stage(self, name: str, total: float | None = None) -> Iterator[Stage]:
+        """See `Progress`."""
+        start = time.monotonic()
+        yield _LineStage(self, name, total, start, start)
+        self.note(f"{name}: done in {_duration(time.monotonic() - start)}")
+
+    def note(self, sentence: str) -> None:
+        """See `Progress`."""
+        print(sentence, file=self.stream, flush=True)
+
+
+@dataclass
+class _LineStage:
+    progress: LineProgress
+    name: str
+    total: float | None
+    start: float
+    last_line: float
+    done: float = 0.0
+
+    def advance(self, n: float = 1) -> None:
+        self.done += n
+        now = time.monotonic()
+        if not self.total or not 0 < self.done < self.total or now - self.last_line < LINE_INTERVAL_S:
+            return
+        self.last_line = now
+        left = (now - self.start) * (self.total - self.done) / self.done
+        self.progress.note(f"{self.name}: {100 * self.done / self.total:.0f} %, {_duration(left)} left")
+
+
+@dataclass
+class BarProgress:
+    """Bars with the time left, one per stage; stages may be nested."""
+
+    _bars: RichBars | None = field(default=None, init=False)
+    _depth: int = field(default=0, init=False)
+
+    @contextmanager
+    def stage(self, name: str, total: float | None = None) -> Iterator[Stage]:
+        """See `Progress`."""
+        bars = self._bars or _new_bars()
+        if self._depth == 0:
+            self._bars = bars
+            bars.start()
+        self._depth += 1
+        task = bars.add_task(name, total=total)
+        try:
+            yield _BarStage(bars, task)
+            done = total if total is not None else 1
+            bars.update(task, total=done, completed=done)
+        finally:
+            self._depth -= 1
+            if self._depth == 0:
+                bars.stop()
+                self._bars = None
+
+    def note(self, sentence: str) -> None:
+        """See `Progress`."""
+        if self._bars is not None:
+            self._bars.console.print(sentence, markup=False, highlight=False)
+        else:
+            print(sentence, file=sys.stderr)
+
+
+@dataclass
+class _BarStage:
+    bars: RichBars
+    task: TaskID
+
+    def advance(self, n: float = 1) -> None:
+        self.bars.advance(self.task, n)
+
+
+def _new_bars() -> RichBars:
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichBars
+
+    columns = (
+        TextColumn("{task.description:<14}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    return RichBars(*columns, console=Console(stderr=True))
+
+
+def _duration(seconds: float) -> str:
+    """Seconds as a person says them: 4.2 s, 3 min 5 s, 2 h 10 min."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def progress_for(stream: TextIO) -> Progress:
+    """Bars where `stream` is a terminal, lines elsewhere."""
+    return BarProgress() if stream.isatty() else LineProgress(stream)

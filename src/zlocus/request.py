@@ -1,0 +1,150 @@
+"""What one run is asked to do: inputs, grid, heights, views, and where the result goes."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from zlocus.errors import ConfigError, InputError, OutputError
+
+SCENE_SUFFIXES = (".yaml", ".yml")
+RUN_FILES = ("run.json", "dsm.tif")
+VIEWS = ("auto", "all")
+METHODS = ("mvll-sgm", "mvll")
+VERTICALS = ("ellipsoid",)
+FILLS = ("none", "interpolate")
+
+
+@dataclass(frozen=True)
+class DsmRequest:
+    """A surface to be made. `None` means: not given, to be found by the run.
+
+    inputs : two or more images with a camera, or one scene file.
+    resolution : cell size, m. crs : grid's CRS. bounds : (xmin, ymin, xmax, ymax) in the grid's CRS, m.
+    like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
+    heights : (zmin, zmax), m above the ellipsoid. dem : raster the heights are searched around.
+    reference : name of the view that leads. memory_gb : most memory the tiles may take together, GB.
+    partial : a surface with too few heights counts as a success.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range, or two that exclude each other.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    resolution: float | None = None
+    crs: str | None = None
+    bounds: tuple[float, float, float, float] | None = None
+    like: Path | None = None
+    area: Path | None = None
+    mask: Path | None = None
+    heights: tuple[float, float] | None = None
+    dem: Path | None = None
+    reference: str | None = None
+    views: str = "auto"
+    method: str = "mvll-sgm"
+    vertical: str = "ellipsoid"
+    fill: str = "none"
+    partial: bool = False
+    workers: int = 1
+    memory_gb: float | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        self._check_inputs()
+        self._check_grid()
+        self._check_heights()
+        for name, value, choices in (
+            ("views", self.views, VIEWS),
+            ("method", self.method, METHODS),
+            ("vertical", self.vertical, VERTICALS),
+            ("fill", self.fill, FILLS),
+        ):
+            if value not in choices:
+                raise ConfigError(f"--{name} {value} is not known; choose from {', '.join(choices)}.")
+        if self.workers < 1:
+            raise ConfigError(f"--workers {self.workers} is too few; give 1 or more.")
+        _check_positive("--memory", self.memory_gb, "GB")
+
+    @property
+    def is_scene_file(self) -> bool:
+        """Whether the input is one scene file rather than images."""
+        return len(self.inputs) == 1 and _is_scene_file(self.inputs[0])
+
+    def _check_inputs(self) -> None:
+        if self.is_scene_file:
+            return
+        scene_files = [path for path in self.inputs if _is_scene_file(path)]
+        if scene_files:
+            raise InputError(
+                f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs."
+            )
+        if len(self.inputs) < 2:
+            given = f"only {self.inputs[0]} is given" if self.inputs else "none is given"
+            raise InputError(f"A surface needs two images or more, and {given}. Add images, or give one scene.yaml.")
+        seen = set()
+        for path in self.inputs:
+            if path.resolve() in seen:
+                raise InputError(f"{path} is given twice, and an image cannot be matched with itself. Name it once.")
+            seen.add(path.resolve())
+
+    def _check_grid(self) -> None:
+        _check_positive("--resolution", self.resolution, "m")
+        given = {"--resolution": self.resolution, "--crs": self.crs, "--bounds": self.bounds}
+        extra = [name for name, value in given.items() if value is not None]
+        if self.like is not None and extra:
+            raise ConfigError(f"--like {self.like} fixes the whole grid already. Leave out {' and '.join(extra)}.")
+        if self.bounds is not None:
+            xmin, ymin, xmax, ymax = self.bounds
+            if not all(map(math.isfinite, self.bounds)) or xmin >= xmax or ymin >= ymax:
+                numbers = " ".join(f"{value:.12g}" for value in self.bounds)
+                raise ConfigError(
+                    f"--bounds {numbers} holds no area. Give XMIN YMIN XMAX YMAX, the smaller values first."
+                )
+
+    def _check_heights(self) -> None:
+        if self.heights is None:
+            return
+        if self.dem is not None:
+            raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
+        zmin, zmax = self.heights
+        if not (math.isfinite(zmin) and math.isfinite(zmax)) or zmin >= zmax:
+            raise ConfigError(f"--heights {zmin:.12g} {zmax:.12g} is an empty range. Give ZMIN ZMAX, the lower first.")
+
+
+def _is_scene_file(path: Path) -> bool:
+    return path.suffix.lower() in SCENE_SUFFIXES
+
+
+def _check_positive(name: str, value: float | None, unit: str) -> None:
+    if value is not None and not (math.isfinite(value) and value > 0):
+        raise ConfigError(f"{name} {value:g} is not a size. Give a number of {unit} above 0.")
+
+
+def check_output(out: Path, overwrite: bool) -> None:
+    """Make sure, before any work, that a run may write to `out`; leaves the disk as it was.
+
+    Raises
+    ------
+    OutputError
+        `out` is a file, cannot be written, or holds another run and `overwrite` is False.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")
+    held = [name for name in RUN_FILES if (out / name).exists()]
+    if held and not overwrite:
+        raise OutputError(f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite.")
+    parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    try:
+        # Only an attempt tells for sure: permission bits say nothing of read-only disks.
+        with tempfile.TemporaryDirectory(prefix=".zlocus-", dir=parent):
+            pass
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise OutputError(f"{out} cannot be written: {parent} says {reason}. Choose another folder with -o.") from error
