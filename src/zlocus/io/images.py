@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
 from zlocus.errors import InputError
-from zlocus.io.opening import open_raster
+from zlocus.io.opening import check_complete, open_raster
 from zlocus.scene import ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
@@ -100,7 +99,7 @@ def open_image(path: Path) -> RasterImage:
             raise InputError(f"{path} holds colour numbers of a palette. Expand it: gdal_translate -expand gray.")
         bands, weights = _grey_bands(source)
         image = RasterImage(path, source.shape, source.dtypes[0], source.count, source.nodata, bands, weights)
-        _check_complete(source, path)
+        check_complete(source, path)
         last = list(source.block_windows(bands[0]))[-1][1]
         image._read(source, last)
         return image
@@ -139,22 +138,3 @@ def _grey_bands(source: rasterio.DatasetReader) -> tuple[tuple[int, ...], tuple[
     if all(colour in index for colour in LUMINANCE):
         return tuple(index[colour] for colour in LUMINANCE), tuple(LUMINANCE.values())
     return (1,), (1.0,)
-
-
-def _check_complete(source: rasterio.DatasetReader, path: Path) -> None:
-    """Compare the offsets and sizes of all TIFF blocks with the length of the file, decoding nothing."""
-    if source.driver not in ("GTiff", "COG"):
-        return
-    length = os.path.getsize(path)
-    block_rows, block_cols = source.block_shapes[0]
-    n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
-    for band in source.indexes if source.interleaving == rasterio.enums.Interleaving.band else (1,):
-        for y in range(n_down):
-            for x in range(n_across):
-                offset = source.get_tag_item(f"BLOCK_OFFSET_{x}_{y}", "TIFF", bidx=band)
-                size = source.get_tag_item(f"BLOCK_SIZE_{x}_{y}", "TIFF", bidx=band)
-                if offset is not None and int(offset) + int(size or 0) > length:
-                    raise InputError(
-                        f"{path} is truncated: it has {length} bytes, and pixels of row {y * block_rows} on lie behind "
-                        "its end. Copy it again from its source."
-                    )

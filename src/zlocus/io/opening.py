@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import warnings
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import rasterio
+from rasterio.enums import Interleaving
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.errors import InputError
@@ -49,20 +51,47 @@ def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetRea
                 dataset = rasterio.open(path)
         except (RasterioError, OSError) as error:
             raise InputError(
-                f"{path} cannot be opened as a raster: {_reason(error)}. Check that it is a complete GeoTIFF (or another format "
-                "of GDAL)."
+                f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
+                "GeoTIFF (or another format of GDAL)."
             ) from error
         with dataset:
             try:
                 yield dataset
             except RasterioError as error:
                 raise InputError(
-                    f"{path} cannot be read: {_reason(error)}. It is damaged or truncated; copy it again from its "
+                    f"{path} cannot be read: {reason(error)}. It is damaged or truncated; copy it again from its "
                     "source."
                 ) from error
 
 
-def _reason(error: BaseException) -> str:
+def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
+    """Compare the offsets and sizes of all TIFF blocks with the length of the file, decoding nothing.
+
+    Other formats pass.
+
+    Raises
+    ------
+    InputError
+        When pixels lie behind the end of the file.
+    """
+    if source.driver not in ("GTiff", "COG"):
+        return
+    length = os.path.getsize(path)
+    block_rows, block_cols = source.block_shapes[0]
+    n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
+    for band in source.indexes if source.interleaving == Interleaving.band else (1,):
+        for y in range(n_down):
+            for x in range(n_across):
+                offset = source.get_tag_item(f"BLOCK_OFFSET_{x}_{y}", "TIFF", bidx=band)
+                size = source.get_tag_item(f"BLOCK_SIZE_{x}_{y}", "TIFF", bidx=band)
+                if offset is not None and int(offset) + int(size or 0) > length:
+                    raise InputError(
+                        f"{path} is truncated: it has {length} bytes, and pixels of row {y * block_rows} on lie behind "
+                        "its end. Copy it again from its source."
+                    )
+
+
+def reason(error: BaseException) -> str:
     """GDAL's own words: those of the first error of the chain, without a full stop."""
     while error.__cause__ is not None:
         error = error.__cause__

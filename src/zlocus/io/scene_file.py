@@ -24,6 +24,7 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, InputError, OutputError
 from zlocus.io.camera_kinds import KINDS, Camera, CameraSource, RpcCamera
+from zlocus.io.crs import checked_crs, utm_zone
 from zlocus.io.images import RasterImage, open_image
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import StrictModel, validated
@@ -141,30 +142,6 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
-
-
-def checked_crs(crs: CRS) -> CRS:
-    """The horizontal part of a projected CRS in metres.
-
-    Raises
-    ------
-    ConfigError
-        For any other CRS, saying what to use instead.
-    """
-    flat = crs.to_2d()
-    advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
-    if not flat.is_projected:
-        kind = "geographic (degrees)" if flat.is_geographic else "not projected"
-        raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is {kind}. {advice}, or leave --crs out.")
-    if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
-        raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is in {flat.axis_info[0].unit_name}. {advice}.")
-    return flat
-
-
-def utm_zone(lon: float, lat: float) -> CRS:
-    """The WGS84 UTM zone of a place (degrees), the 6-degree bands without the exceptions of Norway and Svalbard."""
-    zone = int((lon + 180.0) % 360.0 // 6.0) + 1
-    return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
 
 
 def _from_scene_file(path: Path, crs: CRS | None) -> Scene:

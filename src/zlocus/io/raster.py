@@ -1,0 +1,160 @@
+"""Products as Cloud Optimized GeoTIFF: written whole or by blocks, there complete or not at all."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from rasterio._err import CPLE_BaseError
+from rasterio.errors import RasterioError
+from rasterio.windows import Window
+
+from zlocus.errors import InputError, OutputError
+from zlocus.io.opening import BLOCK_CACHE_MB, check_complete, open_raster, reason
+
+BLOCK_SIZE = 512
+# Deflate is read everywhere; the level trades little size for much time above 6. One thread: the same bytes each time.
+COG_OPTIONS = {"BLOCKSIZE": BLOCK_SIZE, "COMPRESS": "DEFLATE", "LEVEL": 6, "BIGTIFF": "IF_SAFER", "NUM_THREADS": 1}
+FLOAT_PREDICTOR, INTEGER_PREDICTOR = "FLOATING_POINT", "STANDARD"
+
+
+class RasterSink:
+    """A raster of a grid that is written block by block; `close` makes it a COG under its own name.
+
+    Until then the cells wait in an uncompressed tiled file beside it (never in memory), so blocks may come in any
+    order, of any size, from any thread. Cells never written have the nodata value, or 0 where there is none. As a
+    context it closes at the end and aborts on an exception.
+
+    path : of the COG. geobox : its grid. dtype : of the cells.
+    nodata : value that means no data; None where all cells mean something.
+    descriptions : name of each band, as many as there are bands. units : of all bands, "" for none.
+    has_mask : whether an internal mask is written with the blocks (for images, where no value can be spared).
+
+    Raises
+    ------
+    OutputError
+        From any method, when the file cannot be written (folder, permission, full disk); what was begun is removed.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        geobox: GeoBox,
+        dtype: np.typing.DTypeLike,
+        *,
+        nodata: float | None = None,
+        descriptions: tuple[str, ...] = ("",),
+        units: str = "",
+        has_mask: bool = False,
+    ) -> None:
+        self.path, self.dtype, self.has_mask = Path(path), np.dtype(dtype), has_mask
+        self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part.tif")
+        self._cog = self.path.with_name(f".{self.path.name}.{os.getpid()}.cog.tif")
+        self._lock = threading.Lock()
+        rows, cols = geobox.shape
+        profile = {
+            "driver": "GTiff", "width": cols, "height": rows, "count": len(descriptions), "dtype": self.dtype.name,
+            "crs": None if geobox.crs is None else geobox.crs.to_wkt(), "transform": geobox.transform, "nodata": nodata,
+            "tiled": True, "blockxsize": BLOCK_SIZE, "blockysize": BLOCK_SIZE, "BIGTIFF": "IF_SAFER", "SPARSE_OK": True,
+        }  # fmt: skip
+        with self._guard():
+            self._dataset = rasterio.open(self._part, "w", **profile)
+            for band, description in enumerate(descriptions, 1):
+                self._dataset.set_band_description(band, description)
+            self._dataset.units = (units,) * len(descriptions)
+
+    def write(self, row: int, col: int, array: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> None:
+        """Put a block with its first cell at (row, col).
+
+        array : (r, c) or (bands, r, c). mask : (r, c) bool, True is valid; None is all valid.
+        """
+        bands = array if array.ndim == 3 else array[np.newaxis]
+        window = Window(col, row, bands.shape[2], bands.shape[1])
+        with self._lock, self._guard():
+            self._dataset.write(bands.astype(self.dtype, copy=False), window=window)
+            if self.has_mask:
+                valid = np.ones(bands.shape[1:], bool) if mask is None else mask
+                self._dataset.write_mask(valid, window=window)
+
+    def close(self) -> None:
+        """Convert to COG and rename to `path`."""
+        floating = self.dtype.kind == "f"
+        options = COG_OPTIONS | {
+            "PREDICTOR": FLOAT_PREDICTOR if floating else INTEGER_PREDICTOR,
+            # Flags and counts must not be averaged; heights and grey values may.
+            "OVERVIEW_RESAMPLING": "AVERAGE" if floating or self.has_mask else "NEAREST",
+        }
+        with self._guard():
+            self._dataset.close()
+            _check_written(self._part)
+            rasterio.shutil.copy(self._part, self._cog, driver="COG", **options)
+            _check_written(self._cog)
+            os.replace(self._cog, self.path)
+            self._part.unlink()
+
+    def abort(self) -> None:
+        """Remove everything that was begun; harmless after `close`."""
+        self._dataset.close()
+        self._remove()
+
+    def _remove(self) -> None:
+        for path in (self._part, self._cog):
+            path.unlink(missing_ok=True)
+
+    @contextmanager
+    def _guard(self) -> Iterator[None]:
+        """GDAL's settings for writing, and its errors (of several unrelated kinds) as one."""
+        try:
+            with rasterio.Env(GDAL_CACHEMAX=BLOCK_CACHE_MB, GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED=False):
+                yield
+        except (RasterioError, CPLE_BaseError, InputError, OSError, SystemError) as error:
+            self._remove()
+            raise OutputError(
+                f"{self.path} cannot be written: {reason(error)}. Check the folder, its permissions and the space left."
+            ) from error
+
+    def __enter__(self) -> RasterSink:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+
+def write_cog(
+    path: Path,
+    array: NDArray[Any],
+    geobox: GeoBox,
+    *,
+    nodata: float | None = None,
+    descriptions: tuple[str, ...] | None = None,
+    units: str = "",
+    mask: NDArray[np.bool_] | None = None,
+) -> None:
+    """Write a whole raster as COG. array : (r, c) or (bands, r, c); mask : (r, c), True is valid. See `RasterSink`."""
+    if descriptions is None:
+        descriptions = ("",) * (1 if array.ndim == 2 else len(array))
+    with RasterSink(
+        path, geobox, array.dtype, nodata=nodata, descriptions=descriptions, units=units, has_mask=mask is not None
+    ) as sink:
+        sink.write(0, 0, array, mask)
+
+
+def _check_written(path: Path) -> None:
+    """GDAL does not report every failed write of a full disk: see that all blocks are there."""
+    with open_raster(path) as dataset:
+        check_complete(dataset, path)
