@@ -1,0 +1,221 @@
+"""Judging a surface: definitions on small known cases, and agreement with an independent judge on rendered scenes."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine, from_origin
+from rasterio.warp import Resampling, reproject
+
+from zlocus.errors import ConfigError, InputError
+from zlocus.evaluation.evaluate import evaluate
+from zlocus.evaluation.statistics import error_statistics
+from zlocus.evaluation.table import evaluation_table
+
+CRS = "EPSG:32632"
+WEST, NORTH = 500000.0, 5200000.0
+SHIFT_TOLERANCE_M = 0.03
+FIGURES = ("complete", "within", "median", "nmad", "rmse", "le90")
+
+
+def write(path, z, transform=None, crs=CRS, nodata=None):
+    """A one-band raster, of half-metre cells unless said."""
+    transform = transform or from_origin(WEST, NORTH, 0.5, 0.5)
+    profile = {"driver": "GTiff", "height": z.shape[0], "width": z.shape[1], "count": 1, "dtype": z.dtype}
+    with rasterio.open(path, "w", crs=crs, transform=transform, nodata=nodata, **profile) as sink:
+        sink.write(z, 1)
+    return path
+
+
+@pytest.fixture
+def hills():
+    """Rolling ground without edges: height of x, y in m from the corner."""
+    return lambda x, y: (100 + 3 * np.sin(x / 7) + 2 * np.cos(y / 5) + 0.02 * x * y / 10).astype(np.float32)
+
+
+def grid(n, step=0.5):
+    """x, y of n x n cell centres, m east and south of the corner."""
+    at = (np.arange(n) + 0.5) * step
+    return np.meshgrid(at, at)
+
+
+def test_figures_of_known_errors():
+    errors = np.array([0.0, 0.2, -0.2, 0.4, 2.0, np.nan, np.nan, np.nan, np.nan, np.nan])
+    figures = error_statistics(errors, threshold_m=1.0)
+    assert (figures.n, figures.completeness, figures.within) == (10, 0.5, 0.4)
+    assert figures.median == pytest.approx(0.2)
+    assert figures.nmad == pytest.approx(1.4826 * 0.2)
+    assert figures.rmse == pytest.approx(math.sqrt((0.04 + 0.04 + 0.16 + 4) / 5))
+    assert figures.le90 == pytest.approx(0.4 + 0.6 * 1.6)
+
+
+def test_nothing_found_is_missing_and_not_within():
+    figures = error_statistics(np.full(4, np.nan), 1.0)
+    assert (figures.completeness, figures.within) == (0.0, 0.0)
+    assert figures.as_dict()["nmad"] is None
+
+
+def test_missing_cells_count_against_completeness_and_within(tmp_path, hills):
+    truth = hills(*grid(100))
+    dsm = truth.copy()
+    dsm[:50] = np.nan
+    result = evaluate(write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth), margin_m=0)
+    assert result.all.completeness == result.all.within == pytest.approx(0.5, abs=0.01)
+    assert result.all.rmse == 0
+
+
+@pytest.mark.parametrize("nodata", [-9999.0, None])
+def test_nodata_is_no_height(tmp_path, hills, nodata):
+    truth = hills(*grid(60))
+    dsm = truth.copy()
+    dsm[:, 30:] = -9999.0 if nodata else -32767.0
+    result = evaluate(write(tmp_path / "d.tif", dsm, nodata=nodata), write(tmp_path / "t.tif", truth), margin_m=0)
+    assert result.all.completeness == pytest.approx(0.5, abs=0.02)
+
+
+def test_either_side_of_an_edge_is_right(tmp_path):
+    # Blocks of 2 x 2 quarter-metre cells; a wall runs through the middle of a column of blocks.
+    truth = np.full((80, 80), 10.0, np.float32)
+    truth[:, 41:] = 20.0
+    quarter = from_origin(WEST, NORTH, 0.25, 0.25)
+    reference = write(tmp_path / "t.tif", truth, quarter)
+    for low_or_high in (10.0, 20.0):
+        dsm = np.repeat(np.where(np.arange(40) < 20, 10.0, 20.0)[None], 40, axis=0).astype(np.float32)
+        dsm[:, 20] = low_or_high
+        assert evaluate(write(tmp_path / "d.tif", dsm), reference, margin_m=0).all.rmse == 0
+    dsm[:, 20] = 15.0
+    assert evaluate(write(tmp_path / "d.tif", dsm), reference, margin_m=0).all.rmse == pytest.approx(5 / math.sqrt(40))
+
+
+def test_classes_are_judged_apart(tmp_path, hills):
+    truth = hills(*grid(80))
+    classes = np.repeat(np.arange(4, dtype=np.uint8), 20)[:, None] * np.ones((1, 80), np.uint8)
+    dsm = truth + np.where(classes == 2, 0.5, np.where(classes == 3, 2.0, 0.0)).astype(np.float32)
+    result = evaluate(
+        write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth), margin_m=0,
+        classes=write(tmp_path / "c.tif", classes),
+    )  # fmt: skip
+    assert [result.classes[name].n for name in ("ground", "building", "tree")] == [3200, 1600, 1600]
+    assert result.classes["ground"].rmse == 0
+    assert result.classes["building"].median == pytest.approx(0.5, abs=1e-4)
+    assert result.classes["tree"].within == 0
+
+
+def test_margin_and_threshold(tmp_path, hills):
+    truth = hills(*grid(100))
+    dsm = truth + np.float32(0.3)
+    dsm[10:90, 10:90] -= np.float32(0.3)
+    paths = write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth)
+    assert evaluate(*paths, margin_m=5).all.n == 80 * 80
+    assert evaluate(*paths, margin_m=5).all.rmse == 0
+    assert evaluate(*paths, margin_m=0, threshold_m=0.2).all.within == pytest.approx(0.64)
+
+
+def test_align_finds_a_planted_shift_and_reports_it(tmp_path, hills):
+    east, north, up = 1.23, -0.68, 0.75
+    truth = write(tmp_path / "t.tif", hills(*grid(160)))
+    moved = write(
+        tmp_path / "d.tif", hills(*grid(160)) + np.float32(up), from_origin(WEST + east, NORTH + north, 0.5, 0.5)
+    )
+    plain = evaluate(moved, truth)
+    aligned = evaluate(moved, truth, align=True)
+    assert plain.shift is None
+    assert plain.all.nmad > 0.2
+    found = (aligned.shift.east_m, aligned.shift.north_m, aligned.shift.up_m)
+    np.testing.assert_allclose(found, (east, north, up), atol=SHIFT_TOLERANCE_M)
+    assert aligned.all.nmad < 0.02
+    assert f"{aligned.shift.up_m:+.3f} m up" in evaluation_table(aligned)
+
+
+def test_a_surface_in_another_crs(tmp_path, hills):
+    truth = write(tmp_path / "t.tif", hills(*grid(200)))
+    other = np.full((400, 400), np.nan, np.float32)
+    at = Affine(0.5, 0, 42000.0, 0, -0.5, 0)
+    with rasterio.open(truth) as source:
+        x, y = rasterio.warp.transform(CRS, "EPSG:32633", [WEST], [NORTH])
+        at = from_origin(x[0] - 30, y[0] + 30, 0.5, 0.5)
+        reproject(
+            rasterio.band(source, 1), other, dst_transform=at, dst_crs="EPSG:32633", dst_nodata=np.nan,
+            resampling=Resampling.bilinear,
+        )  # fmt: skip
+    result = evaluate(write(tmp_path / "d.tif", other, at, "EPSG:32633"), truth)
+    assert result.all.completeness > 0.99
+    assert result.all.rmse < 0.2
+
+
+def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
+    good = write(tmp_path / "good.tif", hills(*grid(80)))
+    far = write(tmp_path / "far.tif", hills(*grid(80)), from_origin(WEST + 5000, NORTH, 0.5, 0.5))
+    degrees = write(tmp_path / "deg.tif", hills(*grid(80)), from_origin(9, 47, 1e-5, 1e-5), "EPSG:4326")
+    empty = write(tmp_path / "empty.tif", np.full((80, 80), np.nan, np.float32))
+    tiny = write(tmp_path / "tiny.tif", np.zeros((1, 5), np.float32))
+    classes = write(tmp_path / "c.tif", np.zeros((40, 80), np.uint8))
+    text = tmp_path / "text.tif"
+    text.write_text("not an image")
+    for error, says, arguments in (
+        (InputError, "missing.tif does not exist", (tmp_path / "missing.tif", good, {})),
+        (InputError, "missing.tif does not exist", (good, tmp_path / "missing.tif", {})),
+        (InputError, "text.tif cannot be read", (text, good, {})),
+        (InputError, "do not overlap", (far, good, {})),
+        (InputError, "is in degrees", (good, degrees, {})),
+        (InputError, "has no height", (good, empty, {})),
+        (InputError, "nothing to align", (empty, good, {"align": True})),
+        (InputError, "too few", (tiny, good, {})),
+        (InputError, "leaves nothing", (good, good, {"margin_m": 100.0})),
+        (ConfigError, "is negative", (good, good, {"margin_m": -1.0})),
+        (ConfigError, "is not a size", (good, good, {"threshold_m": 0.0})),
+        (ConfigError, "is not on the grid", (good, good, {"classes": classes})),
+        (InputError, "nowhere.tif does not exist", (good, good, {"classes": tmp_path / "nowhere.tif"})),
+        (InputError, "cannot be read as a raster of classes", (good, good, {"classes": text})),
+    ):
+        with pytest.raises(error, match=says) as caught:
+            evaluate(arguments[0], arguments[1], **arguments[2])
+        assert "\n" not in str(caught.value)
+
+
+def test_an_empty_surface_is_judged_not_refused(tmp_path, hills):
+    good = write(tmp_path / "good.tif", hills(*grid(80)))
+    empty = write(tmp_path / "empty.tif", np.full((80, 80), np.nan, np.float32))
+    result = evaluate(empty, good)
+    assert result.all.completeness == 0.0
+    assert evaluation_table(result).splitlines()[1].split()[-1] == "-"
+    json.dumps(result.as_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("align", [False, True])
+def test_agrees_with_the_independent_judge(tmp_path, shared_data, align):
+    judge = shared_data.parent / "tools" / "evaluate_dsm.py"
+    if not judge.exists():
+        pytest.skip(f"no independent judge at {judge}")
+    scene = shared_data / "rendered-city"
+    rows, cols = slice(100, 700), slice(200, 760)
+    with rasterio.open(scene / "truth_dsm.tif") as source:
+        truth = source.read(1)[rows, cols]
+        at = source.transform * Affine.translation(cols.start, rows.start)
+    with rasterio.open(scene / "truth_class.tif") as source:
+        classes = source.read(1)[rows, cols]
+    rng = np.random.default_rng(7)
+    dsm = truth[::2, ::2] + rng.normal(0, 0.3, truth[::2, ::2].shape).astype(np.float32)
+    dsm[rng.random(dsm.shape) < 0.05] = np.nan
+    dsm[rng.random(dsm.shape) < 0.05] += 5
+    shifted = Affine.translation(0.8, -0.45) * at * Affine.scale(2)
+    paths = [
+        write(tmp_path / "d.tif", dsm, shifted), write(tmp_path / "t.tif", truth, at),
+        write(tmp_path / "c.tif", classes, at),
+    ]  # fmt: skip
+    command = [sys.executable, judge, *paths[:2], "--class", paths[2], "--json", *(["--align"] if align else [])]
+    theirs = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    ours = evaluate(*paths[:2], classes=paths[2], align=align)
+    for name, figures in {"all": ours.all, **ours.classes}.items():
+        assert figures.n == theirs[name]["n"]
+        mine = figures.completeness, figures.within, figures.median, figures.nmad, figures.rmse, figures.le90
+        digits = (4, 4, 3, 3, 3, 3)
+        assert [round(v, d) for v, d in zip(mine, digits, strict=True)] == [theirs[name][key] for key in FIGURES]
+    if align:
+        assert [round(ours.shift.east_m, 3), round(ours.shift.north_m, 3)] == theirs["shift"]
