@@ -1,0 +1,166 @@
+"""One shift per image, solved jointly and robustly with the ground points of the ties."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from zlocus.options import OrientationOptions
+from zlocus.orientation.triangulate import GroundPoints, Observations, point_covariance, summed, triangulate
+from zlocus.sensors.model import FloatArray, SensorModel
+
+MAX_ITERATIONS = 15
+TOLERANCE_PX = 1e-3
+HUBER_SIGMAS = 1.5
+OUTLIER_SIGMAS = 4.0
+SMALLEST_SIGMA_PX = 0.02
+# A direction of the shifts counts as seen when its normalised information exceeds this / n_views**2: two images whose
+# loci differ by less than 3 degrees do not fix the shift along them, while the slow bends of a long chain of n images,
+# whose information falls as 5 / n**2, are kept.
+SEEN_INFORMATION = 0.01
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Shifts and the ties they were found from.
+
+    shift_px : (i, 2) column and row to add to what each model projects; n_seen: how many of the 2 i components the ties
+    show, the rest stay at zero; seen, points: the ties kept and their ground points with the shifts; before_px : (m, 2)
+    residuals of those ties with the models as delivered.
+    """
+
+    shift_px: FloatArray
+    n_seen: int
+    seen: Observations
+    points: GroundPoints
+    before_px: FloatArray
+
+    @property
+    def after_px(self) -> FloatArray:
+        """Residuals (m, 2) px with the shifts."""
+        return self.points.residual
+
+
+def adjust(
+    sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray, options: OrientationOptions
+) -> Adjustment:
+    """Shifts that make the rays of all ties meet, with Huber's loss, and the ties that remain.
+
+    xyz : (n, 3) m, first ground points. Observations further than 4 sigma (and at least `inlier_px`) from where the
+    rest of their tie puts them are dropped, then everything is solved again. With `model` "none" shifts stay zero.
+    """
+    shift, n_seen = np.zeros((len(sensors), 2)), 0
+    for _ in range(2):
+        if options.model == "shift":
+            shift, n_seen = solve_shifts(sensors, seen, xyz, options.prior_px, shift)
+        points = triangulate(sensors, moved(seen, shift), xyz)
+        seen, xyz = consistent(seen, points, options.inlier_px), points.xyz
+    seen, xyz = renumbered(seen, xyz)
+    points = triangulate(sensors, moved(seen, shift), xyz)
+    before = triangulate(sensors, seen, points.xyz)
+    return Adjustment(shift, n_seen, seen, points, before.residual)
+
+
+def solve_shifts(
+    sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray, prior_px: float, shift: FloatArray
+) -> tuple[FloatArray, int]:
+    """Robust shifts (i, 2) px, from those to start with, and the number of their directions that the ties show.
+
+    Iteratively reweighted least squares: every round triangulates with the present shifts and weights, then eliminates
+    the ground points from the normal equations (Schur complement) and solves for the shifts alone.
+    """
+    weight, by_ground, n_seen = np.ones(len(seen)), None, 0
+    for _ in range(MAX_ITERATIONS):
+        points = triangulate(sensors, moved(seen, shift), xyz, weight, by_ground)
+        sigma = robust_sigma(points.residual)
+        weight = huber_weight(points.residual, sigma)
+        normal, pull = reduced_normal_equations(seen, points, weight, len(sensors))
+        information = normal / sigma**2 + np.eye(len(normal)) / prior_px**2
+        basis = seen_directions(normal, np.bincount(seen.view, weight, len(sensors)).astype(float))
+        right = basis.T @ (pull / sigma**2 - shift.ravel() / prior_px**2)
+        step = basis @ np.linalg.solve(basis.T @ information @ basis, right)
+        shift, n_seen, xyz = shift + step.reshape(-1, 2), basis.shape[1], points.xyz
+        by_ground = points.by_ground
+        if np.abs(step).max(initial=0.0) < TOLERANCE_PX:
+            break
+    return shift, n_seen
+
+
+def reduced_normal_equations(
+    seen: Observations, points: GroundPoints, weight: FloatArray, n_views: int
+) -> tuple[FloatArray, FloatArray]:
+    """Normal matrix (2 i, 2 i) and right side (2 i,) of the shifts once the ground points are eliminated.
+
+    With A the shifts' block, E the shifts-by-points block and C the points' block: A - E C^-1 E^T.
+    """
+    from scipy.sparse import bsr_array, coo_array
+
+    usable = np.isfinite(points.residual).all(axis=1) & np.isfinite(points.xyz[seen.point, 0])
+    weight = np.where(usable, weight, 0.0)
+    by_ground = np.where(usable[:, None, None], points.by_ground, 0.0)
+    residual = np.where(usable[:, None], points.residual, 0.0)
+    n_points = len(points.xyz)
+    covariance = np.nan_to_num(point_covariance(by_ground, weight, seen.point, n_points))
+    blocks = bsr_array((covariance, np.arange(n_points), np.arange(n_points + 1)), shape=(3 * n_points, 3 * n_points))
+    rows = np.broadcast_to((2 * seen.view[:, None] + np.arange(2))[:, :, None], by_ground.shape)
+    columns = np.broadcast_to((3 * seen.point[:, None] + np.arange(3))[:, None, :], by_ground.shape)
+    values = by_ground * weight[:, None, None]
+    mixed = coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * n_views, 3 * n_points)).tocsr()
+    own = np.repeat(np.bincount(seen.view, weight, n_views), 2)
+    pull = summed(residual * weight[:, None], seen.view, n_views).ravel()
+    pull_of_points = summed(np.einsum("mji,mj->mi", values, residual), seen.point, n_points).ravel()
+    reduced = np.diag(own) - (mixed @ blocks @ mixed.T).toarray()
+    return reduced, pull - mixed @ (blocks @ pull_of_points)
+
+
+def seen_directions(normal: FloatArray, weight_of_view: FloatArray) -> FloatArray:
+    """Orthonormal basis (2 i, k) of the shifts that ties can tell from a change of the ground.
+
+    Information is judged per observation, so that an image with few ties counts like one with many; what is not seen
+    (a translation of the ground; for two images the shift along their loci; images without ties) stays exactly zero.
+    """
+    scale = np.repeat(np.sqrt(weight_of_view), 2)
+    linked = scale > 0.0
+    inverse = np.where(linked, 1.0 / np.where(linked, scale, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(normal * inverse[:, None] * inverse)
+    n_views = max(int((weight_of_view > 0.0).sum()), 1)
+    unseen = vectors[:, values < SEEN_INFORMATION / n_views**2]
+    hidden = np.where(linked[:, None], unseen * inverse[:, None], unseen)
+    left, _, _ = np.linalg.svd(hidden, full_matrices=True)
+    return np.asarray(left[:, hidden.shape[1] :])
+
+
+def moved(seen: Observations, shift: FloatArray) -> Observations:
+    """The observations as the uncorrected models would have projected them."""
+    return Observations(seen.view, seen.point, seen.xy - shift[seen.view])
+
+
+def robust_sigma(residual: FloatArray) -> float:
+    """Noise of one coordinate (px) from residuals (m, 2): the median length of Gaussian residuals is 1.18 sigma."""
+    length = np.hypot(*residual.T)
+    length = length[np.isfinite(length)]
+    return max(float(np.median(length)) / 1.1774 if len(length) else 0.0, SMALLEST_SIGMA_PX)
+
+
+def huber_weight(residual: FloatArray, sigma: float) -> FloatArray:
+    """Weights (m,) of Huber's loss for residuals (m, 2) px; 0 where a residual is not finite."""
+    length = np.hypot(*residual.T)
+    weight = HUBER_SIGMAS * sigma / np.maximum(length, HUBER_SIGMAS * sigma)
+    return np.where(np.isfinite(length), weight, 0.0)
+
+
+def consistent(seen: Observations, points: GroundPoints, inlier_px: float) -> Observations:
+    """Observations near where their tie puts them, of ties that keep two images or more."""
+    length = np.hypot(*points.residual.T)
+    limit = max(OUTLIER_SIGMAS * robust_sigma(points.residual), inlier_px)
+    keep = length <= limit
+    keep &= np.bincount(seen.point[keep], minlength=len(points.xyz))[seen.point] >= 2
+    return seen.kept(keep)
+
+
+def renumbered(seen: Observations, xyz: FloatArray) -> tuple[Observations, FloatArray]:
+    """The same with points numbered without gaps."""
+    used, point = np.unique(seen.point, return_inverse=True)
+    return Observations(seen.view, point, seen.xy), xyz[used]

@@ -1,0 +1,244 @@
+"""Orientation: from a scene to corrected pointing, residuals before and after, and the height range of the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from zlocus.errors import GeometryError
+from zlocus.options import OrientationOptions
+from zlocus.orientation.adjust import Adjustment, adjust
+from zlocus.orientation.locus import locate
+from zlocus.orientation.ties import Progress, Ties, find_ties
+from zlocus.orientation.triangulate import Observations
+from zlocus.scene import Scene, View
+from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.model import FloatArray
+
+FEWEST_FOR_RANGE = 20
+NEIGHBOURS = 8
+SUPPORTERS = 3
+STEEPEST = 1.5
+HEIGHT_SIGMAS = 4.0
+RANGE_PERCENT = (0.5, 99.5)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Lengths of an image's tie residuals, px; NaN without ties."""
+
+    median: float
+    rms: float
+    percent90: float
+
+    @classmethod
+    def of(cls, residual: FloatArray) -> Residuals:
+        """Statistics of residuals (m, 2) px."""
+        length = np.hypot(*residual.T)
+        if not len(length):
+            return cls(np.nan, np.nan, np.nan)
+        return cls(float(np.median(length)), float(np.sqrt(np.mean(length**2))), float(np.percentile(length, 90)))
+
+    def as_dict(self) -> dict[str, float | None]:
+        """For run.json."""
+        values = {"median": self.median, "rms": self.rms, "percent90": self.percent90}
+        return {name: round(value, 4) if np.isfinite(value) else None for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class ViewOrientation:
+    """What was found for one image: the shift (column, row) px added to what its model projects, and its residuals."""
+
+    name: str
+    shift_px: tuple[float, float]
+    n_ties: int
+    before: Residuals
+    after: Residuals
+
+
+@dataclass(frozen=True)
+class PairOrientation:
+    """Ties of two images and their median distance from the loci, px, before and after the shifts."""
+
+    views: tuple[str, str]
+    n_ties: int
+    across_before_px: float
+    across_after_px: float
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """Pointing corrections and the ties they rest on.
+
+    xyz : (n, 3) m, ground points of the ties with the shifts applied; sigma_z_m : (n,) their height precision;
+    seen: their observations; model: the kind of correction; n_seen: how many of the shifts' 2 i components the ties
+    could show; z_bounds: the heights (m) within which ties were looked for.
+    """
+
+    views: tuple[ViewOrientation, ...]
+    pairs: tuple[PairOrientation, ...]
+    xyz: FloatArray
+    sigma_z_m: FloatArray
+    seen: Observations
+    model: str
+    n_seen: int
+    z_bounds: tuple[float, float]
+
+    def apply(self, scene: Scene) -> Scene:
+        """The scene with corrected sensors."""
+        views = []
+        for view, found in zip(scene.views, self.views, strict=True):
+            moved = found.shift_px != (0.0, 0.0)
+            views.append(replace(view, sensor=ShiftedModel(view.sensor, *found.shift_px)) if moved else view)
+        return replace(scene, views=tuple(views))
+
+    @property
+    def unobservable(self) -> str:
+        """What the ties cannot tell, in a sentence."""
+        if self.model == "none":
+            return "No correction was asked for: the models are used as delivered."
+        total, alone = 2 * len(self.views), [v.name for v in self.views if not v.n_ties]
+        text = (
+            f"The ties show {self.n_seen} of the {total} components of the shifts; the other {total - self.n_seen} are "
+            "left at zero: a common translation of the ground and, where only two images overlap, the shift along the "
+            "locus, which is a height."
+        )
+        return text + (f" Without ties, so not corrected: {', '.join(alone)}." if alone else "")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For run.json."""
+        return {
+            "views": {
+                v.name: {
+                    "shift_px": [round(v.shift_px[0], 4), round(v.shift_px[1], 4)],
+                    "n_ties": v.n_ties,
+                    "residual_before_px": v.before.as_dict(),
+                    "residual_after_px": v.after.as_dict(),
+                }
+                for v in self.views
+            },
+            "pairs": [
+                {
+                    "views": list(p.views),
+                    "n_ties": p.n_ties,
+                    "across_before_px": round(p.across_before_px, 4),
+                    "across_after_px": round(p.across_after_px, 4),
+                }
+                for p in self.pairs
+            ],
+            "model": self.model,
+            "n_ties": len(self.xyz),
+            "unobservable": self.unobservable,
+        }
+
+
+def orient(
+    scene: Scene,
+    options: OrientationOptions,
+    z_range_hint: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+) -> Orientation:
+    """Tie points, then one shift per image, solved with the heights of the ties.
+
+    z_range_hint: heights in m that hold the ground, where they are known.
+    """
+    ties = find_ties(scene, options, z_range_hint, progress)
+    sensors = [view.sensor for view in scene.views]
+    adjusted = adjust(sensors, ties.seen, first_ground(scene, ties), options)
+    views = tuple(view_orientation(view, i, adjusted) for i, view in enumerate(scene.views))
+    sigma_px = np.sqrt(np.mean(adjusted.after_px**2)) if len(adjusted.seen) else np.nan
+    return Orientation(
+        views=views,
+        pairs=pair_orientations(scene, adjusted, ties.z_range),
+        xyz=adjusted.points.xyz,
+        sigma_z_m=adjusted.points.sigma_z * sigma_px,
+        seen=adjusted.seen,
+        model=options.model,
+        n_seen=adjusted.n_seen,
+        z_bounds=ties.z_range,
+    )
+
+
+def first_ground(scene: Scene, ties: Ties) -> FloatArray:
+    """Where each tie's first observation meets the tie's height, (n, 3) m."""
+    xyz = np.full((len(ties.z), 3), np.nan)
+    _, first = np.unique(ties.seen.point, return_index=True)
+    for i, view in enumerate(scene.views):
+        rows = first[ties.seen.view[first] == i]
+        point = ties.seen.point[rows]
+        xyz[point] = view.sensor.ground_from_image(ties.seen.xy[rows], ties.z[point])
+    return xyz
+
+
+def view_orientation(view: View, number: int, adjusted: Adjustment) -> ViewOrientation:
+    """One image's share of the result."""
+    mine = adjusted.seen.view == number
+    column, row = adjusted.shift_px[number]
+    before, after = Residuals.of(adjusted.before_px[mine]), Residuals.of(adjusted.after_px[mine])
+    return ViewOrientation(view.name, (float(column), float(row)), int(mine.sum()), before, after)
+
+
+def pair_orientations(scene: Scene, adjusted: Adjustment, z_range: tuple[float, float]) -> tuple[PairOrientation, ...]:
+    """Each pair's distances from the loci, over the ties that both its images see."""
+    seen, found = adjusted.seen, []
+    row_of = np.full((len(scene.views), len(adjusted.points.xyz)), -1)
+    row_of[seen.view, seen.point] = np.arange(len(seen))
+    for a in range(len(scene.views)):
+        for b in range(a + 1, len(scene.views)):
+            both = (row_of[a] >= 0) & (row_of[b] >= 0)
+            if not both.any():
+                continue  # such a pair has nothing to report
+            in_a, in_b = seen.xy[row_of[a][both]], seen.xy[row_of[b][both]]
+            sensors = scene.views[a].sensor, scene.views[b].sensor
+            before = locate(*sensors, in_a, in_b, z_range).across_px
+            after = locate(*sensors, in_a - adjusted.shift_px[a], in_b - adjusted.shift_px[b], z_range).across_px
+            names = (scene.views[a].name, scene.views[b].name)
+            found.append(PairOrientation(names, int(both.sum()), median_distance(before), median_distance(after)))
+    return tuple(found)
+
+
+def median_distance(across_px: FloatArray) -> float:
+    """Median length of distances (n,) px from loci, where there are loci; else NaN."""
+    known = across_px[np.isfinite(across_px)]
+    return float(np.median(np.abs(known))) if len(known) else np.nan
+
+
+def height_range(orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
+    """Lowest and highest height (m) to search, from the ties.
+
+    The 0.5 to 99.5 percentiles of the ties that their neighbours confirm, widened at both ends by `range_margin` times
+    their span (peaks and valleys between ties), then by `range_up_m` above (towers and trees carry few ties) and
+    `range_down_m` below. Too wide costs time at the coarsest level only; too narrow costs the tower.
+    """
+    trusted = supported(orientation.xyz, orientation.sigma_z_m)
+    if trusted.sum() < FEWEST_FOR_RANGE:
+        raise GeometryError(
+            f"Only {int(trusted.sum())} reliable tie points were found between "
+            f"{', '.join(v.name for v in orientation.views)}, too few to tell the height range of the ground "
+            f"({FEWEST_FOR_RANGE} are needed). Give --heights ZMIN ZMAX or --dem, or check that the images overlap."
+        )
+    low, high = np.percentile(orientation.xyz[trusted, 2], RANGE_PERCENT)
+    margin = options.range_margin * (high - low)
+    return float(low - margin - options.range_down_m), float(high + margin + options.range_up_m)
+
+
+def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """(n,) ties whose height agrees with three or more of their eight nearest neighbours.
+
+    Two heights agree when a slope of 1.5 between them, and four sigma of both, explain their difference.
+    """
+    from scipy.spatial import cKDTree
+
+    good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    trusted = np.zeros(len(xyz), bool)
+    if len(good) <= SUPPORTERS:
+        return trusted
+    found = cKDTree(xyz[good, :2]).query(xyz[good, :2], k=min(NEIGHBOURS + 1, len(good)))
+    distance, near = np.asarray(found[0]), np.asarray(found[1])
+    sigma = np.hypot(sigma_z_m[good][:, None], sigma_z_m[good][near[:, 1:]])
+    difference = np.abs(xyz[good, 2][:, None] - xyz[good, 2][near[:, 1:]])
+    agrees = difference <= STEEPEST * distance[:, 1:] + HEIGHT_SIGMAS * sigma
+    trusted[good] = agrees.sum(axis=1) >= SUPPORTERS
+    return trusted

@@ -1,0 +1,284 @@
+"""Tie points: ground points seen in two images or more, found by SIFT and judged by the sensor models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.errors import GeometryError
+from zlocus.options import OrientationOptions
+from zlocus.orientation.features import Features, detect, part_grid, parts
+from zlocus.orientation.locus import Loci, locate, trace
+from zlocus.orientation.ransac import find_shift
+from zlocus.orientation.triangulate import Observations
+from zlocus.scene import Scene, View
+from zlocus.sensors.model import FloatArray
+
+Progress = Callable[[str, float], None]
+
+BLOCK_PX = 128.0
+UNRELATED_DISTANCE = 0.9  # between RootSIFT descriptors of different ground; random pairs measure 0.9 to 1.2
+SAME_PLACE_PX = 2.0
+SAMPLE = 1000  # features of a pair's first search
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Matches of two images that agree with the sensor models up to one shift.
+
+    first, second : (k,) feature numbers; z : (k,) m, height of each; n_candidates: matches before RANSAC;
+    shift_px : (2,) by which the second image's points lie off their loci.
+    """
+
+    views: tuple[int, int]
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    z: FloatArray
+    n_candidates: int
+    shift_px: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+@dataclass(frozen=True)
+class Ties:
+    """Tie points of a scene.
+
+    seen: their observations; z : (n,) m, first height of each point; pairs: the matches they were built from;
+    z_range: the heights that were looked at, m.
+    """
+
+    seen: Observations
+    z: FloatArray
+    pairs: tuple[PairMatches, ...]
+    z_range: tuple[float, float]
+
+
+def find_ties(
+    scene: Scene,
+    options: OrientationOptions,
+    z_range_hint: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+) -> Ties:
+    """Tie points between all images that overlap.
+
+    Heights are looked for within `z_range_hint` (m) where given, else wherever the sensor models are made for. A pair
+    with fewer than `min_ties` agreeing matches is dropped.
+    """
+    z_range = widest_range(scene.views) if z_range_hint is None else z_range_hint
+    report = progress or (lambda _stage, _share: None)
+    wanted = shared_parts(scene.views, z_range, options.max_pointing_px)
+    features = []
+    for i, view in enumerate(scene.views):
+        features.append(detect(view.image, wanted[i], options))
+        report("features", (i + 1) / len(scene.views))
+    pairs = []
+    candidates = list(combinations(range(len(scene.views)), 2))
+    for done, (a, b) in enumerate(candidates):
+        matches = match_pair(scene.views, features, (a, b), z_range, options)
+        if len(matches) >= options.min_ties:
+            pairs.append(matches)
+        report("matches", (done + 1) / len(candidates))
+    return join_tracks(features, tuple(pairs), z_range)
+
+
+def widest_range(views: Sequence[View]) -> tuple[float, float]:
+    """The heights (m) for which all the views' sensor models together were made."""
+    bounds = [bound for view in views if (bound := view.sensor.height_bounds()) is not None]
+    if not bounds:
+        raise GeometryError(
+            "The cameras do not say for which heights they are made: give --heights ZMIN ZMAX or --dem."
+        )
+    return min(low for low, _ in bounds), max(high for _, high in bounds)
+
+
+def shared_parts(views: Sequence[View], z_range: tuple[float, float], margin_px: float) -> list[NDArray[np.bool_]]:
+    """For each view the grid of its parts (see `features.parts`) that some other view may see too."""
+    wanted = [np.zeros(part_grid(view.image.shape), bool) for view in views]
+    for i, view in enumerate(views):
+        for part, (row, col, row_end, col_end) in parts(view.image.shape):
+            edge = np.linspace(0.0, 1.0, 5)
+            xy = np.stack(np.meshgrid(col + edge * (col_end - col), row + edge * (row_end - row)), axis=-1).reshape(
+                -1, 2
+            )
+            for other in (v for v in views if v is not view):
+                loci = trace(view.sensor, other.sensor, xy, z_range)
+                wanted[i][part] |= may_fall_inside(loci, other.image.shape, margin_px)
+    return wanted
+
+
+def may_fall_inside(loci: Loci, shape: tuple[int, int], margin_px: float) -> bool:
+    """Whether the box around some loci, widened by a margin, touches an image of that shape."""
+    ends = np.concatenate([loci.low, loci.high])
+    ends = ends[np.isfinite(ends).all(axis=1)]
+    if not len(ends):
+        return False
+    size = np.array([shape[1], shape[0]])
+    return bool((ends.max(axis=0) > -margin_px).all() and (ends.min(axis=0) < size + margin_px).all())
+
+
+def match_pair(
+    views: Sequence[View],
+    features: Sequence[Features],
+    pair: tuple[int, int],
+    z_range: tuple[float, float],
+    options: OrientationOptions,
+) -> PairMatches:
+    """Matches of two images, guided by the loci, that agree with one pointing shift.
+
+    Twice: first a sample of the features within `max_pointing_px` of the loci; then, with the shift and the heights
+    found, all features within twice `inlier_px`, where fewer rivals let more matches through.
+    """
+    a, b = pair
+    sensors = views[a].sensor, views[b].sensor
+    xy_a, xy_b = features[a].xy, features[b].xy
+    sample = np.arange(0, len(xy_a), max(len(xy_a) // SAMPLE, 1))
+    nothing = np.empty(0, np.int64)
+    empty = PairMatches(pair, nothing, nothing, np.empty(0), 0, np.zeros(2))
+    loci = trace(*sensors, xy_a[sample], z_range)
+    if not len(xy_b) or not may_fall_inside(loci, views[b].image.shape, options.max_pointing_px):
+        return empty
+    max_px = options.max_pointing_px
+    first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
+    found = locate(*sensors, xy_a[sample[first]], xy_b[second], z_range)
+    pointing = find_shift(found, max_px, options.inlier_px)
+    if pointing.inliers.sum() < options.min_ties:
+        return empty
+    likely = likely_range(found.z[pointing.inliers], z_range)
+    loci = trace(*sensors, xy_a, likely).moved(pointing.shift_px)
+    first, second = match_near_loci(loci, features[a], features[b], 2.0 * options.inlier_px, options.match_ratio)
+    found = locate(*sensors, xy_a[first], xy_b[second], likely)
+    n_candidates = len(first)
+    pointing = find_shift(found, max_px, options.inlier_px)
+    keep = pointing.inliers
+    return PairMatches(pair, first[keep], second[keep], found.z[keep], n_candidates, pointing.shift_px)
+
+
+def likely_range(z: FloatArray, z_range: tuple[float, float]) -> tuple[float, float]:
+    """Heights (m) worth a second look: those of nearly all matches z (n,), widened by their span, within `z_range`."""
+    low, high = np.percentile(z, (5.0, 95.0))
+    return max(z_range[0], low - (high - low) - 1.0), min(z_range[1], high + (high - low) + 1.0)
+
+
+def match_near_loci(
+    loci: Loci, in_a: Features, in_b: Features, max_px: float, ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Feature numbers (k,), (k,) of mutual best matches at most `max_px` from their locus.
+
+    A match is taken where its descriptor distance is below `ratio` times that of the best rival elsewhere near
+    the locus. Features are compared block by block, so time grows with their number, not its square.
+    """
+    best_of_a = np.full(len(in_a), -1)
+    sure_of_a = np.zeros(len(in_a), bool)
+    best_of_b = np.full(len(in_b), -1)
+    closest_of_b = np.full(len(in_b), np.inf)
+    low, high = loci.low, loci.high
+    x_b, y_b = np.ascontiguousarray(in_b.xy.T)
+    for block in blocks_along(low, high):
+        left, top = np.minimum(low[block], high[block]).min(axis=0) - max_px
+        right, bottom = np.maximum(low[block], high[block]).max(axis=0) + max_px
+        near = np.flatnonzero((x_b >= left) & (x_b <= right) & (y_b >= top) & (y_b <= bottom))
+        if not len(near):
+            continue
+        allowed = near_segments(low[block], high[block], in_b.xy[near], max_px)
+        distance = descriptor_distances(in_a.descriptors[block], in_b.descriptors[near])
+        distance[~allowed] = np.inf
+        best, sure = best_and_sure(distance, in_b.xy[near], ratio)
+        best_of_a[block] = near[best]
+        sure_of_a[block] = sure
+        closest = distance.argmin(axis=0)
+        closer = distance[closest, np.arange(len(near))] < closest_of_b[near]
+        closest_of_b[near[closer]] = distance[closest[closer], np.flatnonzero(closer)]
+        best_of_b[near[closer]] = block[closest[closer]]
+    first = np.flatnonzero(sure_of_a)
+    first = first[best_of_b[best_of_a[first]] == first]
+    return first, best_of_a[first]
+
+
+def blocks_along(low: FloatArray, high: FloatArray) -> list[NDArray[np.int64]]:
+    """Groups of loci (row numbers) whose middles lie in the same cell of a coarse grid; NaN loci are left out."""
+    usable = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1))
+    if not len(usable):
+        return []
+    cell = np.floor((low[usable] + high[usable]) / (2.0 * BLOCK_PX)).astype(np.int64)
+    _, number = np.unique(cell, axis=0, return_inverse=True)
+    order = np.argsort(number, kind="stable")
+    return np.split(usable[order], np.flatnonzero(np.diff(number[order])) + 1)
+
+
+def near_segments(low: FloatArray, high: FloatArray, xy: FloatArray, max_px: float) -> NDArray[np.bool_]:
+    """(n, k) whether points xy (k, 2) lie within `max_px` along and across of segments (n, 2) to (n, 2) px."""
+    chord = high - low
+    length = np.hypot(*chord.T)
+    unit = (chord / np.maximum(length, 1e-9)[:, None]).astype(np.float32)
+    start = np.einsum("nj,nj->n", low, unit)[:, None]
+    offset = (low[:, 0] * unit[:, 1] - low[:, 1] * unit[:, 0])[:, None]
+    xy = xy.astype(np.float32)
+    along = unit @ xy.T - start.astype(np.float32)
+    across = np.column_stack([unit[:, 1], -unit[:, 0]]) @ xy.T - offset.astype(np.float32)
+    return np.asarray((np.abs(across) <= max_px) & (along >= -max_px) & (along <= length[:, None] + max_px))
+
+
+def best_and_sure(
+    distance: NDArray[np.float32], xy: FloatArray, ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Each row's nearest candidate (n,) and whether it clearly beats the best one at another place.
+
+    distance : (n, k), inf where not allowed; xy : (k, 2) px of the candidates.
+    """
+    rows = np.arange(len(distance))
+    best = distance.argmin(axis=1)
+    nearest = distance[rows, best]
+    x, y = xy.astype(np.float32).T
+    same_place = (np.abs(x[best, None] - x) <= SAME_PLACE_PX) & (np.abs(y[best, None] - y) <= SAME_PLACE_PX)
+    rival = np.where(same_place, np.float32(np.inf), distance).min(axis=1)
+    return best, nearest < ratio * np.minimum(rival, UNRELATED_DISTANCE)
+
+
+def descriptor_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Euclidean distances (n, k) of unit vectors a (n, 128) and b (k, 128)."""
+    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * (a @ b.T), 0.0)))
+
+
+def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_range: tuple[float, float]) -> Ties:
+    """Tie points from the matches of all pairs: matches that share a feature belong to the same ground point.
+
+    A point that would be seen twice by one image is a contradiction and is dropped. Features at one place with several
+    orientations count as one.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
+    place = np.concatenate([same_place_numbers(f.xy) + start[i] for i, f in enumerate(features)])
+    one = np.concatenate([place[start[p.views[0]] + p.first] for p in pairs] or [np.empty(0, np.int64)])
+    two = np.concatenate([place[start[p.views[1]] + p.second] for p in pairs] or [np.empty(0, np.int64)])
+    heights = np.concatenate([p.z for p in pairs] or [np.empty(0)])
+    links = coo_array((np.ones(len(one), bool), (one, two)), shape=(start[-1], start[-1]))
+    _, track = connected_components(links, directed=False)
+    node = np.unique(np.concatenate([one, two]))
+    view = np.searchsorted(start, node, side="right") - 1
+    twice = np.unique(track[node] * len(features) + view, return_counts=True)
+    bad = np.unique(twice[0][twice[1] > 1] // len(features))
+    good = ~np.isin(track[node], bad)
+    node, view = node[good], view[good]
+    _, point = np.unique(track[node], return_inverse=True)
+    number = np.full(int(track.max(initial=-1)) + 1, -1)
+    number[track[node]] = point
+    of_match = number[track[one]]
+    kept = of_match >= 0
+    n_points = int(point.max(initial=-1)) + 1
+    z = np.bincount(of_match[kept], heights[kept], n_points) / np.bincount(of_match[kept], minlength=n_points)
+    xy = np.concatenate([f.xy for f in features])[node] if len(node) else np.empty((0, 2))
+    return Ties(Observations(view, point, xy), z, pairs, z_range)
+
+
+def same_place_numbers(xy: FloatArray) -> NDArray[np.int64]:
+    """For each feature (n, 2) px the number of the first feature at the same place."""
+    _, first, inverse = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
+    return np.asarray(first[inverse.ravel()])

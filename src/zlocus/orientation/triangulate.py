@@ -1,0 +1,117 @@
+"""Ground points from the image points that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.sensors.model import FloatArray, SensorModel
+
+MAX_ITERATIONS = 10
+TOLERANCE_PX = 1e-3
+RELINEARISE_PX = 5.0  # below such a step the old derivatives serve: sensors are nearly linear
+DIFFERENCE_M = 1.0
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Image points of ground points, one row per observation.
+
+    view, point : (m,) int, which image and which ground point; xy : (m, 2) px.
+    """
+
+    view: NDArray[np.int64]
+    point: NDArray[np.int64]
+    xy: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def kept(self, keep: NDArray[np.bool_]) -> Observations:
+        """The observations where `keep` (m,) is true; points keep their numbers."""
+        return Observations(self.view[keep], self.point[keep], self.xy[keep])
+
+
+@dataclass(frozen=True)
+class GroundPoints:
+    """Triangulated ground points and how well they explain their observations.
+
+    xyz : (n, 3) m, NaN where the rays do not meet; sigma_z : (n,) m of height per pixel of noise in each coordinate;
+    residual : (m, 2) px, observed minus projected; by_ground : (m, 2, 3) px per m.
+    """
+
+    xyz: FloatArray
+    sigma_z: FloatArray
+    residual: FloatArray
+    by_ground: FloatArray
+
+
+def triangulate(
+    sensors: Sequence[SensorModel],
+    seen: Observations,
+    xyz: FloatArray,
+    weight: FloatArray | None = None,
+    by_ground: FloatArray | None = None,
+) -> GroundPoints:
+    """Least-squares ground points by Gauss-Newton, all points at once.
+
+    xyz : (n, 3) m to start from; weight : (m,) of each observation (1 where not given); by_ground : (m, 2, 3) px per m,
+    derivatives from an earlier round near these points. Every point needs two observations with distinct rays; others
+    come out NaN.
+    """
+    weight = np.ones(len(seen)) if weight is None else weight
+    by_ground = ground_jacobian(sensors, seen, xyz) if by_ground is None else by_ground
+    step_px = 0.0
+    for _ in range(MAX_ITERATIONS):
+        if step_px > RELINEARISE_PX:
+            by_ground = ground_jacobian(sensors, seen, xyz)
+        inverse = point_covariance(by_ground, weight, seen.point, len(xyz))
+        residual = seen.xy - project_points(sensors, seen, xyz)
+        pull = summed(np.einsum("mji,mj,m->mi", by_ground, residual, weight), seen.point, len(xyz))
+        step = np.einsum("nij,nj->ni", inverse, pull)
+        xyz = xyz + step
+        moved_px = np.einsum("mji,mi->mj", by_ground, step[seen.point])
+        step_px = np.nanmax(np.abs(moved_px), initial=0.0)
+        if step_px <= TOLERANCE_PX:
+            break
+    return GroundPoints(xyz, np.sqrt(inverse[:, 2, 2]), residual - moved_px, by_ground)
+
+
+def project_points(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:
+    """Image positions (m, 2) px at which each observation's ground point is expected."""
+    xy = np.full((len(seen), 2), np.nan)
+    for i in np.unique(seen.view):
+        rows = np.flatnonzero(seen.view == i)
+        xy[rows] = sensors[i].image_from_ground(xyz[seen.point[rows]])
+    return xy
+
+
+def ground_jacobian(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:
+    """Central differences (m, 2, 3) of image position by ground position, px per m."""
+    columns = []
+    for axis in range(3):
+        offset = np.zeros(3)
+        offset[axis] = DIFFERENCE_M
+        ahead, behind = (project_points(sensors, seen, xyz + sign * offset) for sign in (1.0, -1.0))
+        columns.append((ahead - behind) / (2.0 * DIFFERENCE_M))
+    return np.stack(columns, axis=2)
+
+
+def point_covariance(by_ground: FloatArray, weight: FloatArray, point: NDArray[np.int64], n_points: int) -> FloatArray:
+    """Inverse normal matrices (n, 3, 3) m2 per px2 of the points; NaN where the rays do not fix one."""
+    normal = summed(np.einsum("mji,mjk,m->mik", by_ground, by_ground, weight).reshape(-1, 9), point, n_points)
+    normal = normal.reshape(-1, 3, 3)
+    scale = np.trace(normal, axis1=1, axis2=2)
+    with np.errstate(invalid="ignore"):
+        solvable = np.isfinite(scale) & (np.linalg.det(np.nan_to_num(normal)) > 1e-12 * np.nan_to_num(scale) ** 3)
+    inverse = np.full(normal.shape, np.nan)
+    inverse[solvable] = np.linalg.inv(normal[solvable])
+    return inverse
+
+
+def summed(values: FloatArray, point: NDArray[np.int64], n_points: int) -> FloatArray:
+    """Sums (n, k) over the observations of each point; values : (m, k)."""
+    return np.stack([np.bincount(point, column, n_points) for column in values.T], axis=1)
