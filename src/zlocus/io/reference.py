@@ -142,7 +142,7 @@ def _check_vertical(crs: CRS, path: Path, geoid: Path | None) -> None:
         raise InputError(f"The heights of {path} are in {vertical[0].axis_info[0].unit_name}. Convert them to metres.")
     if geoid is None:
         warnings.warn(
-            f"The heights of {path} are {vertical[0].name} by its CRS, but are taken as ellipsoidal. Give the geoid.",
+            f"The heights of {path} are {vertical[0].name} by its CRS but are taken as ellipsoidal. Give a geoid.",
             ZlocusWarning,
             stacklevel=3,
         )

@@ -154,12 +154,14 @@ class RpcModel:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Degrees and metres -> the RPC's normalised coordinates; longitudes across the date line are neighbours."""
         rpc = self.rpc
-        from_centre = np.remainder(lon - rpc.lon_off + 180.0, 360.0) - 180.0
-        return (
-            from_centre / rpc.lon_scale,
-            (lat - rpc.lat_off) / rpc.lat_scale,
-            (height - rpc.height_off) / rpc.height_scale,
-        )
+        # Points pyproj could not project are infinite; they become NaN.
+        with np.errstate(invalid="ignore", over="ignore"):
+            from_centre = np.remainder(lon - rpc.lon_off + 180.0, 360.0) - 180.0
+            return (
+                from_centre / rpc.lon_scale,
+                (lat - rpc.lat_off) / rpc.lat_scale,
+                (height - rpc.height_off) / rpc.height_scale,
+            )
 
     def _ratios(self, lon: FloatArray, lat: FloatArray, height: FloatArray) -> FloatArray:
         """Normalised ground (n,) -> normalised (sample, line) (n, 2)."""
