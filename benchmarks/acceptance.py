@@ -1,0 +1,315 @@
+"""The figures of the acceptance table, from the real commands on the shared scenes.
+
+    python benchmarks/acceptance.py [ROW ...] [--slow] [--keep FOLDER]
+
+Rows: see `ROWS`; without any, all but the slow ones. Exit status 1 when a row could not be run; a figure that falls
+short of its bar is shown as such and changes nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from pyproj import CRS, Transformer
+
+from zlocus.evaluation.evaluate import evaluate
+from zlocus.evaluation.heights import HeightRaster, read_heights
+from zlocus.io.scene_file import open_scene
+from zlocus.scene import Scene
+
+ROOT = Path(__file__).parents[1]
+ZLOCUS = Path(sys.executable).with_name("zlocus")
+RENDERED_VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
+LARGE_SIDE_CELLS = 4000
+COVERAGE_SHORT = 3
+# In a small process of its own: a child's peak memory counts from what its parent held when it was started.
+MEASURE = """
+import resource, subprocess, sys
+status = subprocess.call(sys.argv[2:])
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+with open(sys.argv[1], "w") as file:
+    print(used.ru_utime + used.ru_stime, used.ru_maxrss, file=file)
+sys.exit(status)
+"""
+
+
+class CannotRun(Exception):
+    """Why a row has no figures."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of the table. bar : lowest or highest value that passes, None where the figure is only reported."""
+
+    what: str
+    value: float
+    unit: str = ""
+    at_least: float | None = None
+    at_most: float | None = None
+
+    def cells(self) -> tuple[str, str, str, str]:
+        """What, figure, bar and verdict as text."""
+        unit = f" {self.unit}" if self.unit else ""
+        bar = "" if self.at_least is None else f">= {self.at_least:g}{unit}"
+        bar = bar if self.at_most is None else f"<= {self.at_most:g}{unit}"
+        above = self.at_least is None or self.value >= self.at_least
+        below = self.at_most is None or self.value <= self.at_most
+        verdict = "" if not bar else "pass" if above and below else "SHORT"
+        return self.what, f"{self.value:.4g}{unit}", bar, verdict
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a command took: CPU with that of its children, memory of its largest process (GB of 1024^3 bytes)."""
+
+    cpu_s: float
+    peak_gb: float
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where the scenes are and where results go."""
+
+    data: Path | None
+    out: Path
+
+    def scene(self, name: str) -> Path:
+        """Folder of a shared scene."""
+        if self.data is None:
+            raise CannotRun("ZLOCUS_TEST_DATA is not set")
+        folder = self.data / name
+        if not folder.is_dir():
+            raise CannotRun(f"{folder} is missing")
+        return folder
+
+    def judge(self, dsm: Path, scene: Path, *options: str) -> dict[str, dict[str, float]]:
+        """The shared judge's figures, which share no code with ours."""
+        script = scene.parents[1] / "tools" / "evaluate_dsm.py"
+        if not script.exists():
+            raise CannotRun(f"{script} is missing")
+        command = [sys.executable, script, dsm, scene / "truth_dsm.tif", "--class", scene / "truth_class.tif", "--json"]
+        return json.loads(subprocess.run([*command, *options], check=True, capture_output=True).stdout)
+
+
+def run(command: list[Any], accept: tuple[int, ...] = (0,), cwd: Path | None = None) -> Usage:
+    """Run a command to its end and measure it."""
+    with tempfile.TemporaryDirectory() as scratch:
+        usage = Path(scratch) / "usage"
+        measured = [sys.executable, "-c", MEASURE, str(usage), *map(str, command)]
+        done = subprocess.run(measured, capture_output=True, text=True, errors="replace", cwd=cwd)
+        if done.returncode not in accept:
+            said = (done.stderr.strip() or done.stdout.strip() or "nothing said").splitlines()
+            raise CannotRun(f"`{' '.join(map(str, command[:3]))} ...` exits {done.returncode}: {said[-1]}")
+        cpu_s, peak_kb = map(float, usage.read_text().split())
+    return Usage(cpu_s, peak_kb / 1024**2)
+
+
+def rendered_images(scene: Path) -> list[Path]:
+    """The six views of the same date."""
+    return [scene / f"img_{view}.tif" for view in RENDERED_VIEWS]
+
+
+def calanques(at: Workplace) -> list[Figure]:
+    """Pleiades triplet, against the surface of another program."""
+    scene = at.scene("pleiades_triplet_calanques")
+    reference = scene / "reference" / "s2p_dsm_0.5m_utm31n.tif"
+    images = sorted(scene.glob("img_0*.tif"))
+    for _ in ("compile the kernels", "measure"):
+        used = run([ZLOCUS, "dsm", *images, "-o", at.out, "--like", reference, "--overwrite"])
+    dsm = at.out / "dsm.tif"
+    plain = evaluate(dsm, reference, margin_m=0)
+    aligned = evaluate(dsm, reference, align=True)
+    return [
+        Figure("NMAD, aligned", aligned.all.nmad, "m", at_most=0.55),
+        Figure("reference's cells filled", plain.all.completeness, at_least=0.99),
+        Figure("median offset, as it is", plain.all.median, "m"),
+        Figure("shift east", aligned.shift.east_m, "m"),
+        Figure("shift north", aligned.shift.north_m, "m"),
+        Figure("CPU, kernels cached", used.cpu_s, "s", at_most=8),
+    ]
+
+
+def city(at: Workplace) -> list[Figure]:
+    """Rendered town, six views, exact truth."""
+    scene = at.scene("rendered-city")
+    run([ZLOCUS, "dsm", *rendered_images(scene), "-o", at.out, "--resolution", 0.5, "--overwrite"])
+    figures = at.judge(at.out / "dsm.tif", scene)
+    return [
+        Figure("within 1 m: all", figures["all"]["within"], at_least=0.955),
+        Figure("within 1 m: ground", figures["ground"]["within"], at_least=0.98),
+        Figure("within 1 m: building", figures["building"]["within"], at_least=0.82),
+        Figure("within 1 m: tree", figures["tree"]["within"]),
+        Figure("NMAD ground", figures["ground"]["nmad"], "m", at_most=0.12),
+    ]
+
+
+def hills(at: Workplace) -> list[Figure]:
+    """Rendered hills seen by wrongly pointed cameras."""
+    scene = at.scene("rendered-hills-biased")
+    images = rendered_images(scene)
+    run([ZLOCUS, "dsm", *images, "-o", at.out, "--resolution", 0.5, "--overwrite"])
+    figures = at.judge(at.out / "dsm.tif", scene, "--align")
+    views = json.loads((at.out / "run.json").read_text())["orientation"]["views"]
+    truth = json.loads((scene / "scene.json").read_text())
+    opened = open_scene(images)
+    # What an RPC projects too far is what the correction must take off again.
+    wrong = np.array([truth["views"][view]["bias_row_col"][::-1] for view in RENDERED_VIEWS])
+    applied = np.array([views[view.name]["shift_px"] for view in opened.views])
+    left = shifts_left(opened, applied + wrong, (truth["zmin"] + truth["zmax"]) / 2)
+    return [
+        Figure("NMAD ground, aligned", figures["ground"]["nmad"], "m", at_most=0.16),
+        Figure("within 1 m: ground", figures["ground"]["within"]),
+        Figure("worst shift, after the fit", float(left.max()), "px", at_most=0.1),
+    ]
+
+
+def shifts_left(scene: Scene, shifts: np.ndarray, z: float) -> np.ndarray:
+    """What of the shifts (i, 2) px a common translation of the ground does not explain. (i,) px."""
+    centre = np.array([[(n - 1) / 2 for n in scene.views[0].image.shape[::-1]]])
+    ground = scene.views[0].sensor.ground_from_image(centre, np.array([z]))
+    step = np.vstack([np.zeros(3), np.eye(3)])
+    seen = [view.sensor.image_from_ground(ground + step) for view in scene.views]
+    px_per_m = np.concatenate([(xy[1:] - xy[0]).T for xy in seen])
+    translation, *_ = np.linalg.lstsq(px_per_m, shifts.ravel(), rcond=None)
+    return np.hypot(*(shifts.ravel() - px_per_m @ translation).reshape(-1, 2).T)
+
+
+def ventoux(at: Workplace) -> list[Figure]:
+    """Pleiades pair with little overlap and a large pointing error: the height range is found from the ties."""
+    scene = at.scene("pleiades_pair_ventoux")
+    images = sorted(scene.glob("img_0*.tif"))
+    run([ZLOCUS, "dsm", *images, "-o", at.out, "--overwrite"], accept=(0, COVERAGE_SHORT))
+    opened = open_scene(images)
+    srtm = read_heights(scene / "reference" / "srtm3_v2_egm96_heights.tif")
+    geoid = read_heights(scene / "reference" / "geoid_egm96_15min.tif")
+    xyz = ground_seen_by_all(opened, srtm, geoid)
+    dsm = read_heights(at.out / "dsm.tif")
+    to_grid = Transformer.from_crs(opened.crs, CRS.from_user_input(dsm.crs), always_xy=True)
+    z = dsm.nearest(np.column_stack(to_grid.transform(xyz[:, 0], xyz[:, 1])))
+    return [
+        Figure("ground seen by both, filled", float(np.isfinite(z).mean()), at_least=0.6),
+        Figure("|median difference to SRTM|", abs(float(np.nanmedian(z - xyz[:, 2]))), "m", at_most=10),
+    ]
+
+
+def ground_seen_by_all(scene: Scene, srtm: HeightRaster, geoid: HeightRaster) -> np.ndarray:
+    """Ground points (n, 3) one metre apart, on a coarse terrain model, that lie inside every image."""
+    rows, cols = scene.views[0].image.shape
+    corners = np.array([[0, 0], [cols, 0], [0, rows], [cols, rows]], float)
+    box = np.vstack([scene.views[0].sensor.ground_from_image(corners, np.full(4, z)) for z in (0.0, 1500.0)])
+    x, y = np.meshgrid(*(np.arange(np.floor(box[:, k].min()), box[:, k].max()) for k in (0, 1)))
+    to_degrees = Transformer.from_crs(scene.crs, "EPSG:4326", always_xy=True)
+    degrees = np.column_stack(to_degrees.transform(x.ravel(), y.ravel()))
+    xyz = np.column_stack([x.ravel(), y.ravel(), srtm.bilinear(degrees) + geoid.bilinear(degrees)])
+    inside = np.isfinite(xyz).all(axis=1)
+    for view in scene.views:
+        xy = view.sensor.image_from_ground(xyz)
+        inside &= np.all((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1), axis=1)
+    return xyz[inside]
+
+
+def kernels(at: Workplace) -> list[Figure]:
+    """Speed of the kernels: what the benchmarks leave in their `extra_info`."""
+    report = at.out / "benchmarks.json"
+    at.out.mkdir(parents=True, exist_ok=True)
+    options = ["--benchmark-enable", "--benchmark-only", f"--benchmark-json={report}"]
+    run([sys.executable, "-m", "pytest", ROOT / "benchmarks", *options], cwd=ROOT)
+    found: dict[str, float] = {}
+    for benchmark in json.loads(report.read_text())["benchmarks"]:
+        found |= benchmark["extra_info"]
+    try:
+        sgm, opencv = found["sgm_cell_steps_per_s"], found["opencv_hh_cell_steps_per_s"]
+        ncc = found["resample_ncc_ns"]
+    except KeyError as missing:
+        raise CannotRun(f"no benchmark gives {missing} in its extra_info") from missing
+    return [
+        Figure("SGM, 8 paths", sgm / 1e6, "M cell-steps/s", at_least=200),
+        Figure("over OpenCV StereoSGBM HH", sgm / opencv, at_least=1.3),
+        Figure("resample + NCC 7 x 7", ncc, "ns", at_most=6),
+    ]
+
+
+def memory(at: Workplace) -> list[Figure]:
+    """Six rendered views of a large area."""
+    scene = at.out / "scene"
+    run([
+        sys.executable, "-m", "zlocus.synthetic", "-o", scene, "--kind", "city", "--size", LARGE_SIDE_CELLS,
+        "--views", len(RENDERED_VIEWS),
+    ])  # fmt: skip
+    with rasterio.open(scene / "truth_dsm.tif") as truth:
+        crs, bounds = truth.crs.to_string(), tuple(truth.bounds)
+    used = run([
+        ZLOCUS, "dsm", *rendered_images(scene), "-o", at.out / "dsm", "--resolution", 0.5, "--crs", crs, "--bounds",
+        *bounds,
+    ])  # fmt: skip
+    return [
+        Figure("peak memory", used.peak_gb, "GB", at_most=3),
+        Figure("CPU", used.cpu_s, "s"),
+    ]
+
+
+def clone(at: Workplace) -> list[Figure]:
+    """Nothing but the repository, Python and make."""
+    folder = at.out / "zlocus"
+    run(["git", "clone", "--quiet", ROOT, folder])
+    figures = []
+    for target in ("demo", "test"):
+        used = run(["make", target, f"PYTHON={sys.base_prefix}/bin/python3"], cwd=folder)
+        figures.append(Figure(f"make {target} passes, CPU", used.cpu_s, "s"))
+    return figures
+
+
+ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
+    "calanques": calanques, "city": city, "hills": hills, "ventoux": ventoux, "kernels": kernels, "memory": memory,
+    "clone": clone,
+}  # fmt: skip
+SLOW = ("memory", "clone")
+
+
+def show(name: str, lines: list[tuple[str, str, str, str]]) -> None:
+    for what, value, bar, verdict in lines:
+        print(f"{name:<10} {what:<28} {value:>20}  {bar:<22} {verdict}".rstrip(), flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
+    parser.add_argument("--slow", action="store_true", help="the slow rows too")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the results here")
+    options = parser.parse_args()
+    if unknown := [name for name in options.rows if name not in ROWS]:
+        parser.error(f"no row {unknown[0]}; there are {', '.join(ROWS)}")
+    chosen = options.rows or [name for name in ROWS if options.slow or name not in SLOW]
+    data = os.environ.get("ZLOCUS_TEST_DATA")
+    failed = 0
+    show("row", [("what", "figure", "bar", "")])
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in chosen:
+            out = (options.keep or Path(scratch)).absolute() / name
+            try:
+                figures = ROWS[name](Workplace(Path(data) if data else None, out))
+            except CannotRun as reason:
+                failed += 1
+                print(f"{name:<10} cannot be run: {reason}", flush=True)
+            except Exception:
+                failed += 1
+                print(f"{name:<10} fails:\n{traceback.format_exc()}", flush=True)
+            else:
+                show(name, [figure.cells() for figure in figures])
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
