@@ -8,6 +8,7 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
+
 from zlocus.sensors.rpc import RpcCoefficients
 
 RPC_NAMES = ("LINE_NUM", "LINE_DEN", "SAMP_NUM", "SAMP_DEN")

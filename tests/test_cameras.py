@@ -7,6 +7,7 @@ from dataclasses import astuple, replace
 import numpy as np
 import pytest
 import rasterio
+
 from rpc_fixtures import dimap_dim, dimap_rpc, rpb, rpc_txt, satellite_rpc, write_image
 from zlocus.errors import InputError
 from zlocus.io.cameras import find_sidecar, read_rpc

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import CRS
 from rasterio.transform import RPCTransformer
+
 from rpc_fixtures import gdal_rpc, satellite_rpc
 from zlocus.io.cameras import read_rpc
 from zlocus.sensors.model import SensorModel

@@ -142,7 +142,7 @@ def _check_vertical(crs: CRS, path: Path, geoid: Path | None) -> None:
         raise InputError(f"The heights of {path} are in {vertical[0].axis_info[0].unit_name}. Convert them to metres.")
     if geoid is None:
         warnings.warn(
-            f"The heights of {path} are {vertical[0].name} by its CRS but are taken as ellipsoidal. Give a geoid.",
+            f"{path} has {vertical[0].name} heights by its CRS, but they are taken as ellipsoidal. Give a geoid.",
             ZlocusWarning,
             stacklevel=3,
         )
@@ -162,7 +162,8 @@ def _resampled(source: rasterio.DatasetReader, geobox: GeoBox) -> NDArray[np.flo
     heights = source.read(1, window=window, masked=True, out_dtype=np.float32).filled(np.nan)
     reproject(
         heights, out, src_transform=source.window_transform(window), src_crs=source.crs, src_nodata=np.nan,
-        dst_transform=geobox.transform, dst_crs=_grid_crs(geobox).to_wkt(), dst_nodata=np.nan, resampling=Resampling.bilinear,
+        dst_transform=geobox.transform, dst_crs=_grid_crs(geobox).to_wkt(), dst_nodata=np.nan,
+        resampling=Resampling.bilinear,
     )  # fmt: skip
     return out
 
