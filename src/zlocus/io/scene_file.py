@@ -63,7 +63,7 @@ class ViewEntry(StrictModel):
 class SceneFile(StrictModel):
     """A `scene.yaml`, schema 1."""
 
-    schema_version: Literal[1] = Field(1, alias="schema")
+    schema_version: Literal[1] = Field(alias="schema")
     frame: Frame | None = None
     area: Area | None = None
     heights: tuple[FiniteFloat, FiniteFloat] | None = None
@@ -120,7 +120,8 @@ def read_scene_file(path: Path) -> SceneFile:
         raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
-    for index, view in enumerate(document.get("views") or []):
+    views = document.get("views")
+    for index, view in enumerate(views if isinstance(views, list) else []):
         if isinstance(view, dict) and "camera" in view:
             view["camera"] = _camera(view["camera"], path, f"views[{index}].camera")
     return validated(SceneFile, document, path)
