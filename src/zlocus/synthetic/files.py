@@ -1,0 +1,131 @@
+"""Rendered scenes on disk: images as GeoTIFF with RPC tags, truth rasters, and `scene.json`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
+from rasterio.rpc import RPC
+from rasterio.transform import from_origin
+
+from zlocus.errors import OutputError
+from zlocus.sensors.rpc import RpcCoefficients
+from zlocus.synthetic.render import Sun, expose, render, sunlit
+from zlocus.synthetic.rpc_fit import RpcFit, fit_rpc
+from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures
+from zlocus.synthetic.terrain import SyntheticGround
+
+NOISE_STREAM = 9
+HEIGHT_MARGIN_M = 20.0
+
+
+@dataclass(frozen=True)
+class RenderedScene:
+    """Where a scene was written. images : by name of the view."""
+
+    folder: Path
+    images: dict[str, Path]
+    truth_dsm: Path
+    truth_class: Path
+
+
+def render_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None] = lambda step: None) -> RenderedScene:
+    """Renders all views of `spec` and writes them, the truth and `scene.json` into a new folder.
+
+    progress : called with a word before each step. The folder appears only when it is complete.
+
+    Raises
+    ------
+    OutputError
+        Where the folder exists already, or cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise OutputError(f"`{folder}` exists already: name a new folder for the rendered scene, or remove it.")
+    part = folder.with_name(folder.name + ".part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        _write_scene(spec, part, progress)
+        part.rename(folder)
+    except OSError as error:
+        raise OutputError(f"The rendered scene cannot be written to `{folder}` ({error}): name another folder.") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    images = {view.name: folder / f"img_{view.name}.tif" for view in spec.views}
+    return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif")
+
+
+def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None]) -> None:
+    progress("terrain")
+    seen_by = exposures(spec)
+    ground = build_ground(spec, seen_by)
+    _write_truth(spec, ground, folder)
+    lit: dict[Sun, NDArray[np.bool_]] = {}
+    described = {}
+    for index, exposure in enumerate(seen_by):
+        view = exposure.view
+        progress(view.name)
+        if view.sun not in lit:
+            lit = {view.sun: sunlit(ground, view.sun)}
+        radiance = render(ground, exposure.camera, exposure.shape, view.sun, spec.samples, lit[view.sun])
+        numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]))
+        fit = fit_exposure(spec, exposure)
+        write_image(folder / f"img_{view.name}.tif", numbers, fit.rpc)
+        described[view.name] = {
+            "along": view.along_deg, "across": view.across_deg, "heading": view.heading_deg,
+            "bias_row_col": [view.bias_row_px, view.bias_col_px], "rpc_fit_max_px": fit.max_error_px,
+        }  # fmt: skip
+    low, high = ground.height_range
+    text = {"crs": f"EPSG:{spec.epsg}", "gsd": spec.gsd_m, "seed": spec.seed, "kind": spec.kind, "camera": spec.camera,
+            "size": spec.size, "zmin": low, "zmax": high, "views": described}  # fmt: skip
+    (folder / "scene.json").write_text(json.dumps(text, indent=1) + "\n")
+
+
+def fit_exposure(spec: SceneSpec, exposure: Exposure) -> RpcFit:
+    """The RPC of an exposure, with the pointing error of its view put in."""
+    low, high = spec.height_range
+    fit = fit_rpc(exposure.camera, exposure.shape, spec.crs, (low - HEIGHT_MARGIN_M, high + HEIGHT_MARGIN_M))
+    view = exposure.view
+    line_off, samp_off = fit.rpc.line_off + view.bias_row_px, fit.rpc.samp_off + view.bias_col_px
+    rpc = replace(fit.rpc, line_off=line_off, samp_off=samp_off)
+    return RpcFit(rpc, fit.max_error_px)
+
+
+def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients) -> None:
+    """A single-band GeoTIFF with RPC tags; (0, 0) is the centre of the first pixel and 0 is nodata. numbers : (r, c)."""
+    tags = RPC(
+        height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
+        line_den_coeff=list(rpc.line_den), line_num_coeff=list(rpc.line_num), line_off=rpc.line_off,
+        line_scale=rpc.line_scale, long_off=rpc.lon_off, long_scale=rpc.lon_scale, samp_den_coeff=list(rpc.samp_den),
+        samp_num_coeff=list(rpc.samp_num), samp_off=rpc.samp_off, samp_scale=rpc.samp_scale,
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(
+            path, "w", driver="GTiff", height=numbers.shape[0], width=numbers.shape[1], count=1, dtype=numbers.dtype,
+            nodata=0, compress="deflate", predictor=2, tiled=True, blockxsize=256, blockysize=256, rpcs=tags,
+        ) as file:  # fmt: skip
+            file.write(numbers, 1)
+
+
+def _write_truth(spec: SceneSpec, ground: SyntheticGround, folder: Path) -> None:
+    """Heights and classes of the area, at the step of the height field."""
+    n = round(spec.size * spec.gsd_m / spec.step_m)
+    cells = ground.cells(spec.west_m, spec.north_m, (n, n))
+    profile = {"driver": "GTiff", "height": n, "width": n, "count": 1, "crs": f"EPSG:{spec.epsg}", "compress": "deflate",
+               "transform": from_origin(spec.west_m, spec.north_m, spec.step_m, spec.step_m)}  # fmt: skip
+    layers: tuple[tuple[str, NDArray[np.generic]], ...] = (
+        ("truth_dsm.tif", ground.heights[cells]), ("truth_class.tif", ground.classes[cells])
+    )  # fmt: skip
+    for name, values in layers:
+        with rasterio.open(folder / name, "w", dtype=values.dtype, **profile) as file:
+            file.write(np.ascontiguousarray(values), 1)

@@ -1,0 +1,205 @@
+"""What people and nature put on bare terrain: roads, buildings with roofs and furniture, trees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.synthetic.terrain import (
+    BUILDING,
+    MATERIAL,
+    OBJECT_STREAM,
+    PATTERN_GRAIN,
+    PATTERN_LEAVES,
+    PATTERN_NATURAL,
+    PATTERN_STRIPES,
+    ROAD,
+    TREE,
+    SyntheticGround,
+    plain_material,
+)
+
+BARE, ASPHALT, PAINT, FIRST_TREE = 0, 1, 2, 3
+TREE_ALBEDOS = (0.20, 0.26, 0.33)
+FIRST_BUILDING = FIRST_TREE + len(TREE_ALBEDOS)
+TRIES_PER_OBJECT = 25
+GAP_M = 2.5
+CLUMP_M = 0.5
+
+
+@dataclass(frozen=True)
+class Objects:
+    """How much stands on the ground. Densities are per hectare; towers are buildings of 25 to 60 m."""
+
+    road_spacing_m: float
+    buildings_per_ha: float
+    towers_per_ha: float
+    trees_per_ha: float
+    max_tree_m: float = 12.0
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where an object stands, in the field. x, y : m east and south of the field's corner; length, width : m."""
+
+    x: float
+    y: float
+    angle: float
+    length: float
+    width: float
+
+    def window(self, ground: SyntheticGround, margin_m: float) -> tuple[slice, slice] | None:
+        """Rows and columns around it, or None where it leaves the field."""
+        reach = 0.5 * np.hypot(self.length, self.width) + margin_m
+        first_row, first_col = (int((c - reach) // ground.step) for c in (self.y, self.x))
+        last_row, last_col = (int((c + reach) // ground.step) + 1 for c in (self.y, self.x))
+        if min(first_row, first_col) < 0 or last_row > ground.heights.shape[0] or last_col > ground.heights.shape[1]:
+            return None
+        return slice(first_row, last_row), slice(first_col, last_col)
+
+    def axes(self, ground: SyntheticGround, window: tuple[slice, slice]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distances (m) of the window's cells from the centre, along the length and along the width."""
+        dy = (np.arange(window[0].start, window[0].stop) + 0.5)[:, None] * ground.step - self.y
+        dx = (np.arange(window[1].start, window[1].stop) + 0.5)[None, :] * ground.step - self.x
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        return c * dx + s * dy, c * dy - s * dx
+
+
+def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> SyntheticGround:
+    """Terrain with roads, then towers, other buildings and trees, none on another."""
+    rng = np.random.default_rng([seed, OBJECT_STREAM])
+    painted = replace(ground, planes=ground.planes.copy(), material=ground.material.copy())
+    materials = [ground.materials[0], plain_material(ROAD, PATTERN_GRAIN, 0.27, 0.03),
+                 plain_material(ROAD, PATTERN_GRAIN, 0.62, 0.02)]  # fmt: skip
+    materials += [plain_material(TREE, PATTERN_LEAVES, albedo, 0.3) for albedo in TREE_ALBEDOS]
+    hectares = ground.heights.size * ground.step**2 / 1e4
+    if objects.road_spacing_m:
+        _draw_roads(painted, objects.road_spacing_m, rng)
+    for per_ha, is_tower in ((objects.towers_per_ha, True), (objects.buildings_per_ha, False)):
+        for _ in range(round(per_ha * hectares)):
+            materials += _place_building(painted, is_tower, len(materials), rng)
+    for _ in range(round(objects.trees_per_ha * hectares)):
+        _place_tree(painted, objects.max_tree_m, rng)
+    return replace(painted, materials=np.array(materials, MATERIAL))
+
+
+def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Generator) -> None:
+    """Slightly bent roads both ways, 6 to 9 m wide, with a broken centre line."""
+    for transposed in (False, True):
+        material = ground.material.T if transposed else ground.material
+        length, breadth = (n * ground.step for n in material.shape)
+        for k in range(round(breadth / spacing_m)):
+            along = (np.arange(material.shape[0]) + 0.5) * ground.step
+            middle = (k + rng.uniform(0.25, 0.75)) * spacing_m + rng.normal(0.0, 0.10) * (along - length / 2)
+            middle += rng.uniform(1.0, 5.0) * np.sin(along / rng.uniform(25.0, 60.0) + rng.uniform(0.0, 6.0))
+            half = rng.uniform(3.0, 4.5)
+            reach = int(half / ground.step) + 2
+            col = np.floor(middle / ground.step).astype(int)[:, None] + np.arange(-reach, reach + 1)[None, :]
+            off = np.abs((col + 0.5) * ground.step - middle[:, None])
+            row = np.broadcast_to(np.arange(len(along))[:, None], col.shape)
+            inside = (col >= 0) & (col < material.shape[1])
+            asphalt = inside & (off < half)
+            material[row[asphalt], col[asphalt]] = ASPHALT
+            dashed = inside & (off < 0.2) & (np.remainder(along, 7.0) < 3.0)[:, None]
+            material[row[dashed], col[dashed]] = PAINT
+
+
+def _place_building(
+    ground: SyntheticGround, is_tower: bool, index: int, rng: np.random.Generator
+) -> list[NDArray[np.void]]:  # fmt: skip
+    """Puts a building where there is room for it. Returns its materials (empty where none was found)."""
+    for _ in range(TRIES_PER_OBJECT):
+        rows, cols = ground.heights.shape
+        length, width = rng.uniform(9.0, 26.0), rng.uniform(8.0, 14.0)
+        if is_tower:
+            length, width = rng.uniform(14.0, 22.0), rng.uniform(13.0, 18.0)
+        footprint = Footprint(
+            rng.uniform(0, cols * ground.step), rng.uniform(0, rows * ground.step), rng.uniform(0, np.pi), length, width
+        )
+        window = footprint.window(ground, GAP_M)
+        if window is None:
+            continue
+        p, q = footprint.axes(ground, window)
+        near = (np.abs(p) < length / 2 + GAP_M) & (np.abs(q) < width / 2 + GAP_M)
+        if (ground.material[window][near] != BARE).any():
+            continue
+        storey_height = rng.uniform(25.0, 58.0) if is_tower else float(rng.choice([3.0, 4.5, 6.0, 9.0, 12.0, 18.0]))
+        return _build(ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, index, rng)
+    return []
+
+
+def _build(
+    ground: SyntheticGround, footprint: Footprint, window: tuple[slice, slice], height: float, is_tower: bool,
+    index: int, rng: np.random.Generator,
+) -> list[NDArray[np.void]]:  # fmt: skip
+    """Roof, furniture and materials of one building."""
+    p, q = footprint.axes(ground, window)
+    inside = (np.abs(p) <= footprint.length / 2) & (np.abs(q) <= footprint.width / 2)
+    heights, slopes = ground.heights[window], ground.slopes[window]
+    base = float(heights[inside].min())
+    eave = float(heights[inside].max()) + height
+    pitch = 0.0 if is_tower or rng.random() < 0.55 else rng.uniform(0.25, 0.85)
+    heights[inside] = eave + pitch * (footprint.width / 2 - np.abs(q[inside]))
+    towards = -pitch * np.sign(q[inside]) * ground.step
+    slopes[inside] = towards[:, None] * (-np.sin(footprint.angle), np.cos(footprint.angle))
+    material = _building_material(footprint, base, rng)
+    ground.material[window][inside] = index
+    if pitch:
+        return [material]
+    furniture = material.copy()
+    furniture["albedo"] = furniture["wall"] = rng.choice([0.10, 0.16, 0.70])
+    furniture["pattern"], furniture["floor"] = PATTERN_GRAIN, 0.0
+    for _ in range(rng.integers(1, 6)):
+        size = rng.uniform(0.8, 2.6, 2)
+        centre = rng.uniform(-0.42, 0.42, 2) * (footprint.length, footprint.width)
+        box = inside & (np.abs(p - centre[0]) < size[0] / 2) & (np.abs(q - centre[1]) < size[1] / 2)
+        heights[box] = eave + rng.uniform(0.6, 2.5)
+        ground.material[window][box] = index + 1
+    return [material, furniture]
+
+
+def _building_material(footprint: Footprint, base: float, rng: np.random.Generator) -> NDArray[np.void]:
+    """Roof and walls: plain, striped or textured tops; rows of windows."""
+    pattern = int(rng.choice([PATTERN_GRAIN, PATTERN_GRAIN, PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_NATURAL]))
+    contrast = {PATTERN_GRAIN: 0.006, PATTERN_STRIPES: rng.uniform(0.05, 0.25), PATTERN_NATURAL: 0.03}[pattern]
+    material = plain_material(BUILDING, pattern, float(rng.choice([0.14, 0.22, 0.30, 0.38, 0.46, 0.62])), contrast)
+    material["period"] = rng.uniform(0.7, 2.4)
+    material["x"], material["y"] = footprint.x, footprint.y
+    material["cos"], material["sin"] = np.cos(footprint.angle), np.sin(footprint.angle)
+    material["half_length"], material["half_width"] = footprint.length / 2, footprint.width / 2
+    material["base"], material["wall"] = base, rng.uniform(0.2, 0.55)
+    material["floor"], material["window"] = rng.uniform(2.7, 3.4), rng.uniform(1.6, 3.2)
+    return material
+
+
+def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Generator) -> None:
+    """A rough crown: half an ellipsoid over a trunk's height, broken up into clumps; may touch other trees."""
+    for _ in range(TRIES_PER_OBJECT):
+        rows, cols = ground.heights.shape
+        radius = rng.uniform(1.2, 4.2)
+        height = min(max_tree_m, radius * rng.uniform(1.8, 3.2))
+        footprint = Footprint(
+            rng.uniform(0, cols * ground.step), rng.uniform(0, rows * ground.step), 0.0, 2 * radius, 2 * radius
+        )
+        window = footprint.window(ground, 0.0)
+        if window is None:
+            continue
+        p, q = footprint.axes(ground, window)
+        squared = (p * p + q * q) / radius**2
+        lobes = 1.0 + 0.16 * np.sin(5.0 * np.arctan2(q, p) + rng.uniform(0.0, 6.0))
+        crown = squared < lobes**2
+        if not np.isin(ground.material[window][crown], (BARE, *range(FIRST_TREE, FIRST_BUILDING))).all():
+            continue
+        trunk = 0.35 * height
+        top = trunk + (height - trunk) * np.sqrt(np.maximum(1.0 - squared, 0.02))
+        clump = max(1, round(CLUMP_M / ground.step))
+        rough = np.kron(rng.uniform(0.70, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
+        rough = top * rough[: top.shape[0], : top.shape[1]]
+        foot = float(ground.heights[window][top.shape[0] // 2, top.shape[1] // 2])
+        crown &= foot + rough > ground.heights[window] + 0.3
+        ground.heights[window][crown] = (foot + rough)[crown]
+        ground.slopes[window][crown] = 0.0
+        ground.material[window][crown] = FIRST_TREE + rng.integers(len(TREE_ALBEDOS))
+        return

@@ -1,0 +1,193 @@
+"""Images of a `SyntheticGround` through any sensor model: rays, light, optics, noise, quantisation.
+
+Rays are straight between two heights that enclose the ground, as all of the cameras here have them; for a sensor with
+bent rays (an RPC) the chord is followed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from zlocus.errors import GeometryError
+from zlocus.sensors.model import FloatArray, SensorModel
+from zlocus.synthetic.raycast import MISS, cast_rays, render_rows, sunlit_cells
+from zlocus.synthetic.terrain import SyntheticGround
+
+SPACINGS_PX = (64, 32, 16, 8, 4, 2)
+TABLE_TOLERANCE_PX = 1e-3
+HEIGHT_MARGIN_M = 1.0
+ROWS_PER_BAND = 64
+Field = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Sun:
+    """Where the sun stands: azimuth clockwise from north, elevation above the horizon, degrees."""
+
+    azimuth_deg: float
+    elevation_deg: float
+
+
+@dataclass(frozen=True)
+class Optics:
+    """From radiance to numbers: DN = noisy(haze + gain x blurred radiance), quantised.
+
+    blur_px : sigma of the point spread function. noise : relative to the signal above the haze; noise_floor : DN;
+    both are added in quadrature. n_clouds : soft bright discs.
+    """
+
+    gain: float = 1100.0
+    haze: float = 140.0
+    blur_px: float = 0.55
+    noise: float = 0.011
+    noise_floor: float = 3.5
+    n_clouds: int = 0
+    dtype: str = "uint16"
+
+
+def render(
+    ground: SyntheticGround,
+    sensor: SensorModel,
+    shape: tuple[int, int],
+    sun: Sun,
+    samples: int = 2,
+    lit: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
+    """Radiance (r, c) float32 of an image of `shape`: the mean of samples x samples rays per pixel; 0 where one of them
+    does not meet the ground. The result does not depend on the number of threads.
+
+    lit : (r, c) bool of the field, `sunlit(ground, sun)` where it is known already.
+    """
+    lower, upper = _enclosing(ground)
+    spacing, table = ray_table(ground, sensor, shape, (lower, upper))
+    look = (ground.material, ground.materials, ground.textures, sunlit(ground, sun) if lit is None else lit)
+    sampling = (float(spacing), upper, lower, samples)
+    out = np.empty(shape, np.float32)
+    field, light = field_of(ground), _light(ground, sun)
+    _in_bands(lambda first, band: render_rows(first, table, sampling, field, look, light, band), out)
+    return out
+
+
+def sunlit(ground: SyntheticGround, sun: Sun) -> NDArray[np.bool_]:
+    """Whether the sun reaches the middle of each cell: (r, c) bool."""
+    out = np.empty(ground.heights.shape, np.bool_)
+    field, light = field_of(ground), _light(ground, sun)
+    _in_bands(lambda first, band: sunlit_cells(first, field, light, band), out)
+    return out
+
+
+def _in_bands(fill: Callable[[int, NDArray[np.generic]], None], out: NDArray[np.generic]) -> None:
+    """Calls fill(first_row, rows) for bands of rows of `out`, in threads (the kernels release the GIL)."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        firsts = range(0, len(out), ROWS_PER_BAND)
+        list(pool.map(lambda first: fill(first, out[first : first + ROWS_PER_BAND]), firsts))
+
+
+def field_of(ground: SyntheticGround) -> Field:
+    """The arrays that the kernels of `raycast` call the field."""
+    return ground.planes, ground.block_tops
+
+
+def _steepest(ground: SyntheticGround) -> float:
+    """How far a plane of the field can rise above the centre of its cell, m."""
+    return float(max(np.abs(ground.slopes[..., k]).max() for k in (0, 1)))
+
+
+def _enclosing(ground: SyntheticGround) -> tuple[float, float]:
+    """Heights (m) below and above all of the field."""
+    low, high = ground.height_range
+    slack = _steepest(ground) + HEIGHT_MARGIN_M
+    return low - slack, high + slack
+
+
+def _light(ground: SyntheticGround, sun: Sun) -> tuple[float, ...]:
+    """What the kernels of `raycast` call the light."""
+    azimuth, elevation = np.deg2rad(sun.azimuth_deg), np.deg2rad(sun.elevation_deg)
+    to_sun = (np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation))
+    return (*map(float, to_sun), float(ground.step), float(ground.texel_m), _enclosing(ground)[1])
+
+
+def _field_from_image(ground: SyntheticGround, sensor: SensorModel, xy: FloatArray, z: float) -> FloatArray:
+    """Field coordinates (n, 2) in cells of image positions (n, 2) at height z."""
+    xyz = sensor.ground_from_image(xy, np.full(len(xy), z))
+    return np.column_stack([(xyz[:, 0] - ground.x0) / ground.step, (ground.y0 - xyz[:, 1]) / ground.step])
+
+
+def ray_table(
+    ground: SyntheticGround, sensor: SensorModel, shape: tuple[int, int], z_range: tuple[float, float]
+) -> tuple[int, FloatArray]:
+    """Rays on a coarse lattice of the image, between which they are interpolated bilinearly.
+
+    Returns the spacing (px) and (a, b, 4) float64: field coordinates at the upper and at the lower height, for image
+    positions (-1 + b * spacing, -1 + a * spacing). The spacing is the widest at which the middles of the lattice's
+    cells are right to TABLE_TOLERANCE_PX.
+
+    Raises
+    ------
+    GeometryError
+        Where the sensor cannot map its own image, or bends too fast to be tabulated.
+    """
+    for spacing in SPACINGS_PX:
+        rows, cols = (-1.0 + spacing * np.arange((n + 1) // spacing + 2) for n in shape)
+        table, middle = (
+            np.hstack([_field_from_image(ground, sensor, xy, z) for z in (z_range[1], z_range[0])])
+            for xy in (_lattice(rows, cols), _lattice(rows[:-1] + spacing / 2, cols[:-1] + spacing / 2))
+        )
+        table = table.reshape(len(rows), len(cols), 4)
+        if not np.isfinite(table).all():
+            raise GeometryError(f"The sensor does not map all of its {shape[0]} x {shape[1]} image to the ground.")
+        mean = (table[:-1, :-1] + table[:-1, 1:] + table[1:, :-1] + table[1:, 1:]) / 4
+        pixel_cells = np.abs(np.diff(table, axis=1)).max() / spacing
+        if np.abs(mean.reshape(-1, 4) - middle).max() < TABLE_TOLERANCE_PX * pixel_cells:
+            return spacing, table
+    raise GeometryError("The sensor's rays change too fast from pixel to pixel to be rendered: make its motion smoother.")
+
+
+def _lattice(rows: FloatArray, cols: FloatArray) -> FloatArray:
+    """Image positions (n, 2) of a lattice, row by row."""
+    col, row = np.meshgrid(cols, rows)
+    return np.column_stack([col.ravel(), row.ravel()])
+
+
+def seen_from(ground: SyntheticGround, sensor: SensorModel, xy: FloatArray) -> FloatArray:
+    """What image positions (n, 2) px see of the ground: (n, 3) easting, northing, height in m; NaN where nothing."""
+    lower, upper = _enclosing(ground)
+    start, end = (_field_from_image(ground, sensor, xy, z) for z in (upper, lower))
+    n = len(xy)
+    rays = np.column_stack([start, np.full(n, upper), end - start, np.full(n, lower - upper)])
+    kinds, places = cast_rays(rays, field_of(ground))
+    places[kinds == MISS] = np.nan
+    return np.column_stack(
+        [ground.x0 + ground.step * places[:, 0], ground.y0 - ground.step * places[:, 1], places[:, 2]]
+    )
+
+
+def expose(radiance: NDArray[np.float32], optics: Optics, rng: np.random.Generator) -> NDArray[np.integer]:
+    """Digital numbers (r, c) of `optics.dtype` from radiance; 0 where the radiance is 0, at least 1 elsewhere."""
+    signal = optics.gain * gaussian_filter(radiance, optics.blur_px, mode="nearest")
+    if optics.n_clouds:
+        _add_clouds(signal, optics, rng)
+    sigma = np.sqrt((optics.noise * signal) ** 2 + np.float32(optics.noise_floor) ** 2)
+    signal += sigma * rng.standard_normal(signal.shape, dtype=np.float32) + np.float32(optics.haze)
+    dtype = np.dtype(optics.dtype)
+    numbers = np.clip(np.rint(signal), 1, np.iinfo(dtype).max).astype(dtype)
+    numbers[radiance == 0.0] = 0
+    return numbers
+
+
+def _add_clouds(signal: NDArray[np.float32], optics: Optics, rng: np.random.Generator) -> None:
+    """Soft bright discs, as wide as a twentieth to a tenth of the image."""
+    rows, cols = signal.shape
+    for _ in range(optics.n_clouds):
+        radius = rng.uniform(0.04, 0.09) * min(rows, cols)
+        dy = (np.arange(rows, dtype=np.float32) - rng.uniform(0, rows))[:, None]
+        dx = (np.arange(cols, dtype=np.float32) - rng.uniform(0, cols))[None, :]
+        cover = np.minimum(1.0, 1.4 * np.exp(-0.5 * (dx**2 + dy**2) / radius**2))
+        signal += cover * (np.float32(1.2 * optics.gain) - signal)

@@ -1,0 +1,224 @@
+"""Whole rendered scenes: what to render (`SceneSpec`), and images with RPC, truth and a description on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pyproj import CRS
+
+from zlocus.errors import ConfigError
+from zlocus.options import Checked, option
+from zlocus.sensors.model import FloatArray
+from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
+from zlocus.synthetic.objects import Objects, add_objects
+from zlocus.synthetic.render import Optics, Sun
+from zlocus.synthetic.terrain import SyntheticGround, natural_ground
+
+FLIGHT_HEIGHT_M = 2000.0
+ADVANCE_M = 0.208
+WOBBLE_M, WOBBLE_DEG = 0.5, 0.03
+BORDER_PX = 4
+TALLEST_M = {"city": 66.0, "hills": 13.0}
+LARGE_SIZE = 2000
+
+MORNING, AFTERNOON = Sun(152.0, 46.0), Sun(232.0, 33.0)
+CLEAR = Optics()
+SOFTER = Optics(gain=980.0, haze=150.0, blur_px=0.65, noise=0.012, noise_floor=4.0)
+OTHER_DATE = Optics(gain=760.0, haze=135.0, blur_px=0.7, noise=0.01, noise_floor=9.0)
+HAZY = Optics(gain=900.0, haze=330.0, blur_px=1.3, noise=0.02, noise_floor=22.0, n_clouds=5)
+
+
+@dataclass(frozen=True)
+class ViewSpec:
+    """One image to render.
+
+    along_deg, across_deg : view angles, positive forward and to the right of the nadir, as seen in flight.
+    heading_deg : of the flight, clockwise from north. bias_row_px, bias_col_px : pointing error of the RPC, which
+    projects every point that much too far down and to the right.
+    """
+
+    name: str
+    along_deg: float
+    across_deg: float
+    heading_deg: float = 0.0
+    sun: Sun = MORNING
+    optics: Optics = CLEAR
+    bias_row_px: float = 0.0
+    bias_col_px: float = 0.0
+
+
+SATELLITE_VIEWS = (
+    ViewSpec("n1", 1.0, -4.0, 2.0),
+    ViewSpec("f1", 20.0, -4.0, 2.0),
+    ViewSpec("b1", -20.0, -4.0, 2.0, optics=SOFTER),
+    ViewSpec("n2", 0.0, 12.0, -1.5, optics=SOFTER),
+    ViewSpec("f2", 22.0, 13.0, -1.5, optics=replace(SOFTER, gain=1120.0)),
+    ViewSpec("b2", -22.0, 13.0, -1.5, optics=replace(SOFTER, gain=900.0)),
+    ViewSpec("d1", 8.0, -14.0, 4.0, AFTERNOON, OTHER_DATE),
+    ViewSpec("d2", -10.0, 4.0, 0.0, Sun(165.0, 55.0), HAZY),
+)
+ADS40_VIEWS = (
+    ViewSpec("n1", 2.0, -6.0, 1.0),
+    ViewSpec("f1", 26.0, -6.0, 1.0),
+    ViewSpec("b1", -14.0, -6.0, 1.0, optics=SOFTER),
+    ViewSpec("n2", 2.0, 12.0, -1.0, optics=SOFTER),
+    ViewSpec("f2", 26.0, 12.0, -1.0, optics=SOFTER),
+    ViewSpec("b2", -14.0, 12.0, -1.0),
+)
+
+
+@dataclass(frozen=True)
+class SceneSpec(Checked):
+    """A scene to render: the same specification gives the same bytes."""
+
+    kind: str = option("city", "What stands on the ground.", choices=("city", "hills"))
+    seed: int = option(1, "Seed of terrain, objects, texture and noise.", low=0)
+    size: int = option(520, "Side of the area with truth, in cells of `gsd_m`.", low=32, high=20000)
+    gsd_m: float = option(0.5, "Ground pixel.", low=0.05, high=5.0, unit="m")
+    camera: str = option("satellite", "Pushbroom at 600 km, or airborne three-line scanner.", choices=("satellite", "ads40"))
+    truth_step_m: float | None = option(None, "Cell of the height field and the truth; unset: half of `gsd_m`.", low=0.02, unit="m")
+    samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
+    base_m: float = option(430.0, "Lowest terrain, ellipsoidal.", low=-400.0, high=8000.0, unit="m")
+    relief_m: float = option(24.0, "Terrain from lowest to highest, without its hill.", low=0.1, high=1000.0, unit="m")
+    hill_m: float = option(0.0, "Height of a round hill in the north-east of the area.", low=0.0, high=100.0, unit="m")
+    objects: Objects = field(default=Objects(110.0, 2.2, 0.6, 9.0))
+    views: tuple[ViewSpec, ...] = SATELLITE_VIEWS
+    west_m: float = option(462000.0, "Western border of the area, easting.", unit="m")
+    north_m: float = option(5247000.0, "Northern border of the area, northing.", unit="m")
+    epsg: int = option(32632, "Projected CRS of the truth; heights are ellipsoidal.", low=1024, high=32767)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        cells = self.size * self.gsd_m / self.step_m
+        if abs(cells - round(cells)) > 1e-6:
+            raise ConfigError(
+                f"SceneSpec.truth_step_m = {self.step_m} m does not divide the side of {self.size * self.gsd_m} m: "
+                "choose half or all of gsd_m."
+            )
+        names = [view.name for view in self.views]
+        if not names or len(set(names)) < len(names):
+            raise ConfigError(f"SceneSpec.views must have different names and be at least one, not {names}.")
+
+    @property
+    def step_m(self) -> float:
+        """Cell of the height field and the truth, m."""
+        return self.gsd_m / 2 if self.truth_step_m is None else self.truth_step_m
+
+    @property
+    def crs(self) -> CRS:
+        """Frame of the ground."""
+        return CRS.from_epsg(self.epsg)
+
+    @property
+    def terrain_range(self) -> tuple[float, float]:
+        """No terrain is lower or higher, m."""
+        return self.base_m, self.base_m + self.relief_m + self.hill_m
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        """Nothing is lower or higher, m."""
+        low, high = self.terrain_range
+        return low - 1.0, high + TALLEST_M[self.kind]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A view with its exact camera and the rows and columns of its image."""
+
+    view: ViewSpec
+    camera: SatelliteCamera | LineScanner
+    shape: tuple[int, int]
+
+
+def city_spec(seed: int, **changes: object) -> SceneSpec:
+    """A town like the built-in benchmark's: gentle relief, roads, houses, towers up to 60 m, trees; eight views."""
+    return replace(SceneSpec(kind="city", seed=seed), **changes)  # type: ignore[arg-type]
+
+
+def hills_spec(seed: int, **changes: object) -> SceneSpec:
+    """Steep hills with trees and few roads; eight views."""
+    hills = SceneSpec(kind="hills", seed=seed, base_m=350.0, relief_m=160.0, objects=Objects(170.0, 0.0, 0.0, 30.0))
+    return replace(hills, **changes)  # type: ignore[arg-type]
+
+
+def demo_spec(seed: int = 4) -> SceneSpec:
+    """The demo: a block of six ADS40 images in two strips over towers, houses, trees and a hill, 120 m square."""
+    return SceneSpec(
+        kind="city", seed=seed, size=600, gsd_m=0.2, camera="ads40", relief_m=6.0, hill_m=9.0,
+        objects=Objects(70.0, 5.0, 0.8, 14.0), views=ADS40_VIEWS,
+    )  # fmt: skip
+
+
+def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
+    """The scene with a pointing error drawn for each view, uniform within `max_px` in row and column."""
+    rng = np.random.default_rng([spec.seed, 77])
+    errors = rng.uniform(-max_px, max_px, (len(spec.views), 2))
+    views = (
+        replace(view, bias_row_px=float(row), bias_col_px=float(col))
+        for view, (row, col) in zip(spec.views, errors, strict=True)
+    )
+    return replace(spec, views=tuple(views))
+
+
+def exposures(spec: SceneSpec) -> tuple[Exposure, ...]:
+    """Exact cameras whose images hold all terrain of the area."""
+    side = spec.size * spec.gsd_m
+    low, high = spec.terrain_range
+    middle = (spec.west_m + side / 2, spec.north_m - side / 2, (low + high) / 2)
+    corners = np.array(
+        [(spec.west_m + e * side, spec.north_m - s * side, z) for e in (0, 1) for s in (0, 1) for z in (low, high)]
+    )
+    result = []
+    for view in spec.views:
+        camera = _camera(spec, view, middle)
+        xy = camera.image_from_ground(corners)
+        first = np.floor(xy.min(axis=0)) - BORDER_PX
+        cols, rows = np.ceil(xy.max(axis=0)) + BORDER_PX + 1 - first
+        placed = replace(camera, centre=(float(-first[0]), float(-first[1])))
+        result.append(Exposure(view, placed, (int(rows), int(cols))))
+    return tuple(result)
+
+
+def _camera(
+    spec: SceneSpec, view: ViewSpec, middle: tuple[float, float, float]
+) -> SatelliteCamera | LineScanner:  # fmt: skip
+    """A camera that sees the middle of the area under the view's angles, with its image's origin yet to be placed."""
+    if spec.camera == "satellite":
+        return SatelliteCamera(middle, (0.0, 0.0), spec.gsd_m, view.along_deg, view.across_deg, view.heading_deg)
+    heading = np.deg2rad(view.heading_deg)
+    aside = FLIGHT_HEIGHT_M * np.tan(np.deg2rad(view.across_deg))
+    position = (
+        middle[0] - aside * float(np.cos(heading)), middle[1] + aside * float(np.sin(heading)), middle[2] + FLIGHT_HEIGHT_M
+    )  # fmt: skip
+    return LineScanner(
+        position, (0.0, 0.0), view.heading_deg, view.along_deg, ADVANCE_M, wobble_m=WOBBLE_M, wobble_deg=WOBBLE_DEG
+    )
+
+
+def build_ground(spec: SceneSpec, seen_by: tuple[Exposure, ...]) -> SyntheticGround:
+    """The ground of a scene: the area, and as much around it as any of the images can see."""
+    seen = np.concatenate([_footprint(spec, exposure) for exposure in seen_by])
+    step = spec.step_m
+    reach = np.ceil(np.array([
+        spec.west_m - seen[:, 0].min(), seen[:, 1].max() - spec.north_m,
+        seen[:, 0].max() - spec.west_m, spec.north_m - seen[:, 1].min(),
+    ]) / step).astype(int) + 4  # fmt: skip
+    side = spec.size * spec.gsd_m
+    origin = (spec.west_m - int(reach[0]) * step, spec.north_m + int(reach[1]) * step)
+    is_city = spec.kind == "city"
+    bare = natural_ground(
+        spec.seed, origin, step, (int(reach[1] + reach[3]), int(reach[0] + reach[2])),
+        base_m=spec.base_m, relief_m=spec.relief_m, longest_m=180.0, roughness=2.4 if is_city else 2.5,
+        texel_m=spec.gsd_m / 2,
+        hill=(spec.west_m + 0.7 * side, spec.north_m - 0.3 * side, side / 7, spec.hill_m) if spec.hill_m else None,
+    )  # fmt: skip
+    return add_objects(bare, spec.objects, spec.seed)
+
+
+def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:
+    """Ground points (n, 3) around all that an image can see, a few pixels beyond its border."""
+    rows, cols = exposure.shape
+    along, across = np.linspace(-3.0, rows + 2.0, 9), np.linspace(-3.0, cols + 2.0, 9)
+    xy = np.array([(c, r) for r in along for c in across])
+    return np.concatenate([exposure.camera.ground_from_image(xy, np.full(len(xy), z)) for z in spec.height_range])
