@@ -93,6 +93,14 @@ def test_either_side_of_an_edge_is_right(tmp_path):
     assert evaluate(write(tmp_path / "d.tif", dsm), reference, margin_m=0).all.rmse == pytest.approx(5 / math.sqrt(40))
 
 
+def test_without_an_edge_the_mean_of_the_block_is_right(tmp_path):
+    truth = np.full((80, 80), 10.0, np.float32)
+    truth[:, ::2] += 0.4
+    reference = write(tmp_path / "t.tif", truth, from_origin(WEST, NORTH, 0.25, 0.25))
+    dsm = write(tmp_path / "d.tif", np.full((40, 40), 10.4, np.float32))
+    assert evaluate(dsm, reference, margin_m=0).all.median == pytest.approx(0.2, abs=1e-5)
+
+
 def test_classes_are_judged_apart(tmp_path, hills):
     truth = hills(*grid(80))
     classes = np.repeat(np.arange(4, dtype=np.uint8), 20)[:, None] * np.ones((1, 80), np.uint8)
@@ -130,6 +138,7 @@ def test_align_finds_a_planted_shift_and_reports_it(tmp_path, hills):
     found = (aligned.shift.east_m, aligned.shift.north_m, aligned.shift.up_m)
     np.testing.assert_allclose(found, (east, north, up), atol=SHIFT_TOLERANCE_M)
     assert aligned.all.nmad < 0.02
+    assert abs(aligned.all.median) < 0.01
     assert f"{aligned.shift.up_m:+.3f} m up" in evaluation_table(aligned)
 
 

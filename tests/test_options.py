@@ -69,6 +69,7 @@ class Sample(Checked):
     size: float = option(1.0, "A size.", low=0.5, high=2.0, unit="m")
     kind: str = option("a", "A kind.", choices=("a", "b"))
     count: int | None = option(None, "A count.", low=1)
+    weight: float = option(1.0, "A weight.", low=0.0)
 
 
 @pytest.mark.parametrize("values", [{"size": 0.5}, {"size": 2.0}, {"kind": "b"}, {"count": 1}, {"count": None}])
@@ -83,6 +84,7 @@ def test_limits_are_inclusive(values):
         ({"size": 2.1}, r"Sample\.size = 2\.1"),
         ({"size": float("nan")}, r"Sample\.size = nan"),
         ({"kind": "c"}, r"Sample\.kind = 'c' is not one of a, b\."),
+        ({"weight": float("nan")}, r"Sample\.weight = nan"),
         ({"count": 0}, r"Sample\.count = 0 is outside its range 1 to inf"),
     ],
 )
