@@ -162,6 +162,7 @@ def with_view(**changes):
         ("schema: [1", "cannot be read as YAML"),
         ("just text", "is not a scene file"),
         ({"schema": 1}, "the key views is missing"),
+        ({"views": []}, "the key schema is missing"),
     ],
 )
 def test_what_a_scene_file_must_not_hold(tmp_path, pair, content, message: str):
@@ -180,7 +181,7 @@ def test_area_needs_a_frame(tmp_path, pair):
 
 def test_written_file_reads_back_equal(tmp_path):
     views = tuple(ViewEntry(name=n, image=f"{n}.tif", camera=RpcCamera(shift=(0.1, -1 / 3))) for n in ("å", "b"))
-    scene_file = SceneFile(frame={"crs": "EPSG:32631"}, heights=(1.0, 2.5), views=views)
+    scene_file = SceneFile(schema=1, frame={"crs": "EPSG:32631"}, heights=(1.0, 2.5), views=views)
     path = tmp_path / "scene.yaml"
     write_scene_file(path, scene_file)
     assert read_scene_file(path) == scene_file

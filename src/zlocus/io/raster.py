@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -109,7 +109,8 @@ class RasterSink:
 
     def _remove(self) -> None:
         for path in (self._part, self._cog):
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # where it could not be made
+                path.unlink()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
