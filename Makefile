@@ -17,7 +17,7 @@ $(STAMP): pyproject.toml
 	touch $@
 
 demo: $(STAMP)
-	$(BIN)/zlocus demo --overwrite
+	$(BIN)/zlocus demo
 
 test: lint
 	$(BIN)/python -m pytest -n 2
