@@ -83,9 +83,16 @@ def test_colour_becomes_luminance_and_alpha_a_mask(tmp_path):
 def test_colour_pixel_is_nodata_when_all_bands_are(tmp_path):
     rgb = RNG.integers(1, 255, (3, 9, 9)).astype(np.uint16)
     rgb[:, 2, 2] = 0
-    rgb[0, 5, 5] = 0
+    rgb[0, 5, 5] = rgb[2, 6, 6] = 0
     window = whole(open_image(write_image(tmp_path / "a.tif", rgb, photometric="RGB", nodata=0)))
     assert np.argwhere(~window.valid).tolist() == [[2, 2]]
+
+
+def test_infinities_of_either_sign_in_colours(tmp_path):
+    rgb = np.ones((3, 9, 9), np.float32)
+    rgb[:, 1, 1] = np.inf, -np.inf, np.nan
+    window = whole(open_image(write_image(tmp_path / "a.tif", rgb, photometric="RGB")))
+    assert np.argwhere(~window.valid).tolist() == [[1, 1]]
 
 
 def test_bands_are_found_by_their_colour_not_their_number(tmp_path):
@@ -110,6 +117,16 @@ def test_truncated_at_any_length(tmp_path, profile):
         cut.write_bytes(data[:length])
         with pytest.raises(InputError, match=r"cut\.tif"):
             open_image(cut)
+
+
+def test_truncated_mask(tmp_path):
+    path = write_image(tmp_path / "a.tif", GREY)
+    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "r+") as file:
+        file.write_mask(RNG.random(GREY.shape) > 0.5)
+    data = path.read_bytes()
+    path.write_bytes(data[:-20])
+    with pytest.raises(InputError, match=r"a\.tif"):
+        open_image(path)
 
 
 def test_truncation_is_found_without_decoding_the_lost_block(tmp_path):
@@ -153,6 +170,8 @@ def test_content_of_an_image_that_can_be_matched(tmp_path):
     one_pixel = np.full((1200, 40), 7, np.uint16)
     one_pixel[1100, 20] = 8
     check_content(open_image(write_image(tmp_path / "a.tif", one_pixel)))
+    two_plains = np.repeat(np.array([7, 8], np.uint8), 512)[:, np.newaxis] * np.ones((1, 40), np.uint8)
+    check_content(open_image(write_image(tmp_path / "b.tif", two_plains)))
 
 
 def test_nothing_to_match(tmp_path):

@@ -88,6 +88,7 @@ def test_one_lost_point_does_not_harm_its_neighbours(model: RpcModel):
     xy = np.array([[100.0, 200.0], [np.nan, 0.0], [1e9, -1e9], [100.0, 200.0]])
     xyz = model.ground_from_image(xy, np.full(4, 300.0))
     assert np.isnan(xyz[1]).all()
+    assert np.isnan(model.ground_from_image(xy[:1], np.array([np.nan]))).all()
     np.testing.assert_array_equal(xyz[0], xyz[3])
     np.testing.assert_allclose(model.image_from_ground(xyz[:1]), xy[:1], atol=ROUND_TRIP_PX)
     assert model.ground_from_image(np.empty((0, 2)), np.empty(0)).shape == (0, 3)
@@ -100,6 +101,16 @@ def test_beyond_a_pole_is_nan():
     xy = model.image_from_geographic(lon, np.full(2, rpc.lat_off), np.full(2, rpc.height_off))
     assert np.isfinite(xy[0]).all()
     assert np.isnan(xy[1]).all()
+
+
+def test_a_target_near_a_pole_is_reached_in_short_steps():
+    rpc = satellite_rpc()
+    linear = (0.0, 1.0) + (0.0,) * 18
+    model = RpcModel(replace(rpc, samp_num=linear, samp_den=(1.0, 0.5) + (0.0,) * 18), UTM31)
+    height = np.array([rpc.height_off])
+    lon = np.array([rpc.lon_off - 1.5 * rpc.lon_scale])
+    xy = model.image_from_geographic(lon, np.array([rpc.lat_off]), height)
+    np.testing.assert_allclose(model.geographic_from_image(xy, height)[0], lon, atol=1e-11)
 
 
 def test_longitudes_across_the_date_line_are_neighbours(model: RpcModel):

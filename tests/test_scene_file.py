@@ -59,6 +59,14 @@ def test_utm_zone_of_south_and_date_line(tmp_path, lon: float, lat: float, epsg:
     assert open_scene(paths).crs == CRS.from_epsg(epsg)
 
 
+def test_utm_zone_of_images_on_both_sides_of_the_date_line(tmp_path):
+    paths = []
+    for name, lon in (("a", 179.9), ("b", -179.98)):
+        rpc = type(RPC)(**(vars_of(RPC.moved(-20000, -20000)) | {"lon_off": lon}))
+        paths.append(write_image(tmp_path / f"{name}.tif", PIXELS, rpc))
+    assert open_scene(paths).crs == open_scene(paths[::-1]).crs == CRS.from_epsg(32660)
+
+
 def vars_of(rpc):
     return {name: getattr(rpc, name) for name in rpc.__dataclass_fields__}
 

@@ -133,7 +133,7 @@ class RpcModel:
         height = (z - rpc.height_off) / rpc.height_scale
         lon, lat = np.zeros(len(xy)), np.zeros(len(xy))
         done = np.zeros(len(xy), bool)
-        active = np.flatnonzero(np.isfinite(target).all(axis=1) & np.isfinite(height))
+        active = np.arange(len(xy))
         for _ in range(MAX_ITERATIONS):
             residual = target[active] - self._ratios(lon[active], lat[active], height[active])
             reached = (np.abs(residual * scale) < TOLERANCE_PX).all(axis=1)
