@@ -51,7 +51,7 @@ def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOp
             continue
         row, col = max(core[0] - HALO_PX, 0), max(core[1] - HALO_PX, 0)
         window = image.read(row, col, min(core[2] + HALO_PX, rows) - row, min(core[3] + HALO_PX, cols) - col)
-        limit = int(np.ceil(per_mpx * (core[2] - core[0]) * (core[3] - core[1]) / 1e6))
+        limit = int(np.ceil(per_mpx * window.valid.size / 1e6))
         xy, descriptor = detect_window(window, limit, halved)
         xy = xy + np.array([col, row])
         inside = (xy >= np.array([core[1], core[0]]) - 0.5) & (xy < np.array([core[3], core[2]]) - 0.5)

@@ -11,6 +11,7 @@ from zlocus.orientation.locus import OnLocus
 from zlocus.sensors.model import FloatArray
 
 N_HYPOTHESES = 400
+REFINEMENTS = 10
 SEED = 20240229
 # Singular values of a shift's design below this share of the largest carry no information about the pointing.
 WEAK_DIRECTION = 0.1
@@ -46,7 +47,7 @@ def find_shift(found: OnLocus, max_pointing_px: float, inlier_px: float) -> Pair
     hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_pointing_px]
     squares = (across[:, None] - normal @ hypotheses.T) ** 2
     best = hypotheses[np.argmin(np.minimum(squares, inlier_px**2).sum(axis=0))]
-    for _ in range(3):
+    for _ in range(REFINEMENTS):
         near = np.abs(across - normal @ best) <= inlier_px
         best = minimum_norm_shifts(normal[near][None], across[near][None])[0]
     inliers[usable[np.abs(across - normal @ best) <= inlier_px]] = True
