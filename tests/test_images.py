@@ -170,7 +170,7 @@ def test_content_of_an_image_that_can_be_matched(tmp_path):
     one_pixel = np.full((1200, 40), 7, np.uint16)
     one_pixel[1100, 20] = 8
     check_content(open_image(write_image(tmp_path / "a.tif", one_pixel)))
-    two_plains = np.repeat(np.array([7, 8], np.uint8), 512)[:, np.newaxis] * np.ones((1, 40), np.uint8)
+    two_plains = np.repeat(np.array([7, 8], np.uint8), 1024)[:, np.newaxis] * np.ones((1, 40), np.uint8)
     check_content(open_image(write_image(tmp_path / "b.tif", two_plains)))
 
 

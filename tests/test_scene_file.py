@@ -97,6 +97,7 @@ def test_names_of_equal_stems_tell_the_folder(tmp_path):
 def test_inputs_that_are_no_scene(tmp_path, pair):
     (tmp_path / "link.tif").symlink_to(pair[0])
     (tmp_path / "no_camera").mkdir()
+    plain = write_image(tmp_path / "d.tif", PIXELS * 0, RPC)
     bare = write_image(tmp_path / "no_camera" / "c.tif", PIXELS)
     for inputs, message in (
         ([], "none was given"),
@@ -105,6 +106,7 @@ def test_inputs_that_are_no_scene(tmp_path, pair):
         ([pair[0], tmp_path / "link.tif"], r"link\.tif is given twice"),
         ([pair[0], tmp_path / "none.tif"], r"There is no image .*none\.tif"),
         ([pair[0], bare], r"c\.tif has no camera"),
+        ([pair[0], plain], r"d\.tif has the value 0 everywhere"),
         ([write(tmp_path, document()), pair[0]], r"scene\.yaml is a scene file and stands alone"),
         ([tmp_path / "none.yaml"], "There is no scene file"),
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from zlocus.scene import ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
 LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}
-CHECK_ROWS = 512
+CHECK_SIZE = 1024
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def open_image(path: Path) -> RasterImage:
 def check_content(image: RasterImage) -> None:
     """Refuse an image with nothing to match: all nodata, or one value everywhere.
 
-    Read by strips until two different valid values are met, so that an ordinary image costs one strip.
+    Read by windows until two different valid values are met, so that an ordinary image costs one window.
 
     Raises
     ------
@@ -117,8 +118,8 @@ def check_content(image: RasterImage) -> None:
     """
     rows, cols = image.shape
     first: float | None = None
-    for row in range(0, rows, CHECK_ROWS):
-        window = image.read(row, 0, min(CHECK_ROWS, rows - row), cols)
+    for row, col in product(range(0, rows, CHECK_SIZE), range(0, cols, CHECK_SIZE)):
+        window = image.read(row, col, min(CHECK_SIZE, rows - row), min(CHECK_SIZE, cols - col))
         values = window.pixels[window.valid]
         if not values.size:
             continue

@@ -25,7 +25,7 @@ from pyproj.exceptions import CRSError
 from zlocus.errors import ConfigError, InputError, OutputError
 from zlocus.io.camera_kinds import KINDS, Camera, CameraSource, RpcCamera
 from zlocus.io.crs import checked_crs, utm_zone
-from zlocus.io.images import RasterImage, open_image
+from zlocus.io.images import RasterImage, check_content, open_image
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import StrictModel, validated
 from zlocus.scene import Scene, View
@@ -91,7 +91,8 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
     Raises
     ------
     InputError
-        For a file that is missing, damaged or given twice, an image without a camera, fewer than two images.
+        For a file that is missing, damaged or given twice, an image that is empty, constant or without a camera, fewer
+        than two images.
     ConfigError
         For a CRS that is not projected in metres.
     """
@@ -176,6 +177,8 @@ def _build(
     if len(entries) < 2:
         given = f"only {entries[0][1]} was given" if entries else "none was given"
         raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
+    for image in images:
+        check_content(image)
     sources = [camera.read(folder, path) for _, path, camera in entries]
     crs = _default_crs(images, sources) if crs is None else crs
     views = tuple(
