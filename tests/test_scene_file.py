@@ -197,8 +197,9 @@ def test_written_file_reads_back_equal(tmp_path):
     assert read_scene_file(path) == scene_file
     assert os.listdir(tmp_path) == ["scene.yaml"]
     assert yaml.safe_load(path.read_text())["views"][0]["camera"] == {"kind": "rpc", "shift": [0.1, -1 / 3]}
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_scene_file(tmp_path / "no" / "scene.yaml", scene_file)
+    for unwritable in (tmp_path / "no" / "scene.yaml", path / "scene.yaml"):
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_scene_file(unwritable, scene_file)
 
 
 def test_footprint_and_ground_sample_distance(pair):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -142,7 +143,8 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
         temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # where it could not be made
+            temporary.unlink()
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 
 
