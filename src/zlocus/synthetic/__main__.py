@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from zlocus.errors import ZlocusError
 def main(arguments: list[str] | None = None) -> int:
     """Renders what the command line asks for; returns the exit status."""
     from zlocus.synthetic.files import render_scene
-    from zlocus.synthetic.scenes import LARGE_SIZE, city_spec, demo_spec, hills_spec, with_pointing_errors
+    from zlocus.synthetic.scenes import LARGE_SIZE, SceneSpec, city_spec, demo_spec, hills_spec, with_pointing_errors
 
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
@@ -24,8 +25,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--pointing", type=float, default=0.0, metavar="PX", help="largest pointing error of the RPCs")
     given = parser.parse_args(arguments)
     try:
-        make = {"city": city_spec, "hills": hills_spec, "demo": demo_spec}[given.kind]
-        spec = make(given.seed)
+        make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "demo": demo_spec}
+        spec = make[given.kind](given.seed)
         if given.size:
             coarse = spec.gsd_m if given.size > LARGE_SIZE else None
             spec = replace(spec, size=given.size, truth_step_m=coarse)

@@ -82,7 +82,8 @@ class LineScanner:
 
     position : easting, northing and height (m) of the projection centre at row `centre[1]`.
     centre : (column, row) px; the column lies in the flight's vertical plane.
-    wobble_m, wobble_deg : amplitudes of the position (each axis) and of roll, pitch and yaw; wobble_rows : their period.
+    wobble_m, wobble_deg : amplitudes of the position (each axis) and of roll, pitch and yaw; wobble_rows : their
+    period.
     """
 
     position: tuple[float, float, float]
@@ -114,7 +115,7 @@ class LineScanner:
         turn[:, 0] = np.stack([cy * cr - sy * sp * sr, -sy * cp, cy * sr + sy * sp * cr], axis=-1)
         turn[:, 1] = np.stack([sy * cr + cy * sp * sr, cy * cp, sy * sr - cy * sp * cr], axis=-1)
         turn[:, 2] = np.stack([-cp * sr, sp, cp * cr], axis=-1)
-        return centre, rest @ turn
+        return centre, np.asarray(rest @ turn)
 
     def _focal_plane(self, xyz: FloatArray, row: FloatArray) -> FloatArray:
         """Where ground points (n, 3) fall in the focal plane at the instants of rows (n,): right, forward (n, 2) m."""
@@ -148,7 +149,7 @@ class LineScanner:
         centre, frame_from_camera = self._pose(xy[:, 1])
         towards = np.einsum("nij,nj->ni", frame_from_camera, ray)
         reach = (z - centre[:, 2]) / towards[:, 2]
-        ground = centre + reach[:, None] * towards
+        ground: FloatArray = centre + reach[:, None] * towards
         ground[:, 2] = z
         return ground
 

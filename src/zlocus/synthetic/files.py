@@ -6,7 +6,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +57,7 @@ def render_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None] 
         _write_scene(spec, part, progress)
         part.rename(folder)
     except OSError as error:
-        raise OutputError(f"The rendered scene cannot be written to `{folder}` ({error}): name another folder.") from error
+        raise OutputError(f"The rendered scene cannot be written to `{folder}` ({error}): name another.") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
     images = {view.name: folder / f"img_{view.name}.tif" for view in spec.views}
@@ -95,13 +95,11 @@ def fit_exposure(spec: SceneSpec, exposure: Exposure) -> RpcFit:
     low, high = spec.height_range
     fit = fit_rpc(exposure.camera, exposure.shape, spec.crs, (low - HEIGHT_MARGIN_M, high + HEIGHT_MARGIN_M))
     view = exposure.view
-    line_off, samp_off = fit.rpc.line_off + view.bias_row_px, fit.rpc.samp_off + view.bias_col_px
-    rpc = replace(fit.rpc, line_off=line_off, samp_off=samp_off)
-    return RpcFit(rpc, fit.max_error_px)
+    return RpcFit(fit.rpc.moved(column=view.bias_col_px, row=view.bias_row_px), fit.max_error_px)
 
 
 def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients) -> None:
-    """A single-band GeoTIFF with RPC tags; (0, 0) is the centre of the first pixel and 0 is nodata. numbers : (r, c)."""
+    """A single-band GeoTIFF with RPC tags: (0, 0) is the centre of the first pixel, 0 is nodata. numbers : (r, c)."""
     tags = RPC(
         height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
         line_den_coeff=list(rpc.line_den), line_num_coeff=list(rpc.line_num), line_off=rpc.line_off,
@@ -121,11 +119,18 @@ def _write_truth(spec: SceneSpec, ground: SyntheticGround, folder: Path) -> None
     """Heights and classes of the area, at the step of the height field."""
     n = round(spec.size * spec.gsd_m / spec.step_m)
     cells = ground.cells(spec.west_m, spec.north_m, (n, n))
-    profile = {"driver": "GTiff", "height": n, "width": n, "count": 1, "crs": f"EPSG:{spec.epsg}", "compress": "deflate",
-               "transform": from_origin(spec.west_m, spec.north_m, spec.step_m, spec.step_m)}  # fmt: skip
+    transform = from_origin(spec.west_m, spec.north_m, spec.step_m, spec.step_m)
+    profile = {
+        "driver": "GTiff",
+        "height": n,
+        "width": n,
+        "count": 1,
+        "crs": f"EPSG:{spec.epsg}",
+        "transform": transform,
+    }
     layers: tuple[tuple[str, NDArray[np.generic]], ...] = (
         ("truth_dsm.tif", ground.heights[cells]), ("truth_class.tif", ground.classes[cells])
     )  # fmt: skip
     for name, values in layers:
-        with rasterio.open(folder / name, "w", dtype=values.dtype, **profile) as file:
+        with rasterio.open(folder / name, "w", dtype=values.dtype, compress="deflate", **profile) as file:
             file.write(np.ascontiguousarray(values), 1)

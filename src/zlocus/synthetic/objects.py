@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.sensors.model import FloatArray
 from zlocus.synthetic.terrain import (
     BUILDING,
     MATERIAL,
@@ -26,17 +27,22 @@ TREE_ALBEDOS = (0.20, 0.26, 0.33)
 FIRST_BUILDING = FIRST_TREE + len(TREE_ALBEDOS)
 TRIES_PER_OBJECT = 25
 GAP_M = 2.5
-CLUMP_M = 0.5
+CLUMP_M = 0.3
 
 
 @dataclass(frozen=True)
 class Objects:
-    """How much stands on the ground. Densities are per hectare; towers are buildings of 25 to 60 m."""
+    """How much stands on the ground. Densities are per hectare; towers are buildings of 25 to 60 m.
+
+    plain_roofs : share of roofs without pattern, whose texture is hardly above the noise; the rest is striped or like
+    gravel, half and half.
+    """
 
     road_spacing_m: float
     buildings_per_ha: float
     towers_per_ha: float
     trees_per_ha: float
+    plain_roofs: float = 0.6
     max_tree_m: float = 12.0
 
 
@@ -59,7 +65,7 @@ class Footprint:
             return None
         return slice(first_row, last_row), slice(first_col, last_col)
 
-    def axes(self, ground: SyntheticGround, window: tuple[slice, slice]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def axes(self, ground: SyntheticGround, window: tuple[slice, slice]) -> tuple[FloatArray, FloatArray]:
         """Distances (m) of the window's cells from the centre, along the length and along the width."""
         dy = (np.arange(window[0].start, window[0].stop) + 0.5)[:, None] * ground.step - self.y
         dx = (np.arange(window[1].start, window[1].stop) + 0.5)[None, :] * ground.step - self.x
@@ -79,7 +85,7 @@ def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> Synthet
         _draw_roads(painted, objects.road_spacing_m, rng)
     for per_ha, is_tower in ((objects.towers_per_ha, True), (objects.buildings_per_ha, False)):
         for _ in range(round(per_ha * hectares)):
-            materials += _place_building(painted, is_tower, len(materials), rng)
+            materials += _place_building(painted, is_tower, objects.plain_roofs, len(materials), rng)
     for _ in range(round(objects.trees_per_ha * hectares)):
         _place_tree(painted, objects.max_tree_m, rng)
     return replace(painted, materials=np.array(materials, MATERIAL))
@@ -107,7 +113,7 @@ def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Genera
 
 
 def _place_building(
-    ground: SyntheticGround, is_tower: bool, index: int, rng: np.random.Generator
+    ground: SyntheticGround, is_tower: bool, plain_roofs: float, index: int, rng: np.random.Generator
 ) -> list[NDArray[np.void]]:  # fmt: skip
     """Puts a building where there is room for it. Returns its materials (empty where none was found)."""
     for _ in range(TRIES_PER_OBJECT):
@@ -126,13 +132,15 @@ def _place_building(
         if (ground.material[window][near] != BARE).any():
             continue
         storey_height = rng.uniform(25.0, 58.0) if is_tower else float(rng.choice([3.0, 4.5, 6.0, 9.0, 12.0, 18.0]))
-        return _build(ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, index, rng)
+        return _build(
+            ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, plain_roofs, index, rng
+        )
     return []
 
 
 def _build(
     ground: SyntheticGround, footprint: Footprint, window: tuple[slice, slice], height: float, is_tower: bool,
-    index: int, rng: np.random.Generator,
+    plain_roofs: float, index: int, rng: np.random.Generator,
 ) -> list[NDArray[np.void]]:  # fmt: skip
     """Roof, furniture and materials of one building."""
     p, q = footprint.axes(ground, window)
@@ -144,7 +152,7 @@ def _build(
     heights[inside] = eave + pitch * (footprint.width / 2 - np.abs(q[inside]))
     towards = -pitch * np.sign(q[inside]) * ground.step
     slopes[inside] = towards[:, None] * (-np.sin(footprint.angle), np.cos(footprint.angle))
-    material = _building_material(footprint, base, rng)
+    material = _building_material(footprint, base, plain_roofs, rng)
     ground.material[window][inside] = index
     if pitch:
         return [material]
@@ -160,9 +168,12 @@ def _build(
     return [material, furniture]
 
 
-def _building_material(footprint: Footprint, base: float, rng: np.random.Generator) -> NDArray[np.void]:
+def _building_material(
+    footprint: Footprint, base: float, plain_roofs: float, rng: np.random.Generator
+) -> NDArray[np.void]:
     """Roof and walls: plain, striped or textured tops; rows of windows."""
-    pattern = int(rng.choice([PATTERN_GRAIN, PATTERN_GRAIN, PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_NATURAL]))
+    patterned = (1.0 - plain_roofs) / 2
+    pattern = int(rng.choice([PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_NATURAL], p=[plain_roofs, patterned, patterned]))
     contrast = {PATTERN_GRAIN: 0.006, PATTERN_STRIPES: rng.uniform(0.05, 0.25), PATTERN_NATURAL: 0.03}[pattern]
     material = plain_material(BUILDING, pattern, float(rng.choice([0.14, 0.22, 0.30, 0.38, 0.46, 0.62])), contrast)
     material["period"] = rng.uniform(0.7, 2.4)
@@ -195,7 +206,7 @@ def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Gener
         trunk = 0.35 * height
         top = trunk + (height - trunk) * np.sqrt(np.maximum(1.0 - squared, 0.02))
         clump = max(1, round(CLUMP_M / ground.step))
-        rough = np.kron(rng.uniform(0.70, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
+        rough = np.kron(rng.uniform(0.62, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
         rough = top * rough[: top.shape[0], : top.shape[1]]
         foot = float(ground.heights[window][top.shape[0] // 2, top.shape[1] // 2])
         crown &= foot + rough > ground.heights[window] + 0.3

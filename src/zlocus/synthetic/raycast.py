@@ -1,15 +1,17 @@
 """Kernels that follow rays through a height field of small planes (see `terrain`) and say what they see.
 
 Field coordinates: u (columns) and v (rows) in cells from the upper left corner of cell [0, 0], z in metres.
-`field` is the tuple (planes, block_tops) of a `SyntheticGround`; `look` is (material, materials, textures, lit), with lit
-from `sunlit_cells`. Both are read-only.
+`field` is the tuple (planes, block_tops) of a `SyntheticGround`; `look` is (material, materials, textures, lit), with
+lit from `sunlit_cells`. Both are read-only.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.kernels._jit import kernel
+from zlocus.sensors.model import FloatArray
 from zlocus.synthetic.terrain import (
     BLOCK,
     BUILDING,
@@ -20,6 +22,8 @@ from zlocus.synthetic.terrain import (
 )
 from zlocus.synthetic.textures import FRACTAL, GRASS, GRAVEL
 
+Field = tuple[NDArray[np.float32], NDArray[np.float32]]
+Look = tuple[NDArray[np.uint16], NDArray[np.void], NDArray[np.float32], NDArray[np.bool_]]
 MISS, TOP, WALL_U, WALL_V = 0, 1, 2, 3
 SKY = 0.27
 NEVER = 1e-30
@@ -189,10 +193,7 @@ def radiance(hit, ray, field, look, light):
             cosine = (sun_z - sun_u * by_col - sun_v * by_row) / np.sqrt(1.0 + by_col**2 + by_row**2)
     if cosine <= 0.0:
         return SKY * albedo
-    if is_side:
-        is_lit = not is_shaded(u, v, z, before_i, before_j, field, light)
-    else:
-        is_lit = look[3][i, j]
+    is_lit = not is_shaded(u, v, z, before_i, before_j, field, light) if is_side else look[3][i, j]
     return albedo * (SKY + cosine) if is_lit else albedo * SKY
 
 
@@ -210,9 +211,9 @@ def is_shaded(u, v, z, i, j, field, light):
 
 # i8, field, (6 x f8), (r,c) b1 -> none
 @kernel
-def sunlit_cells(first_row, field, light, out):
-    """Fills `out` (r, c) bool, the field's rows from `first_row` on: whether nothing stands between the middle of a cell
-    and the sun."""
+def sunlit_cells(first_row: int, field: Field, light: tuple[float, ...], out: NDArray[np.bool_]) -> None:
+    """Fills `out` (r, c) bool, the field's rows from `first_row` on: whether nothing stands between the middle of a
+    cell and the sun."""
     planes = field[0]
     for i in range(out.shape[0]):
         row = first_row + i
@@ -222,8 +223,11 @@ def sunlit_cells(first_row, field, light, out):
 
 # (n,6) f8, field -> (n,) i8, (n,3) f8
 @kernel
-def cast_rays(rays, field):
-    """What rays meet (MISS, TOP, WALL_U, WALL_V) and where: (u, v, z). rays : see `march`; all start above the field."""
+def cast_rays(rays: FloatArray, field: Field) -> tuple[NDArray[np.int64], FloatArray]:
+    """What rays meet (MISS, TOP, WALL_U, WALL_V) and where: (u, v, z).
+
+    rays : see `march`; all start above the field.
+    """
     kinds = np.zeros(len(rays), np.int64)
     places = np.full((len(rays), 3), np.nan)
     for n in range(len(rays)):
@@ -237,9 +241,17 @@ def cast_rays(rays, field):
 
 # i8, (a,b,4) f8, (f8, f8, f8, i8), field, look, (6 x f8), (r,c) f4 -> none
 @kernel
-def render_rows(first_row, table, sampling, field, look, light, out):
-    """Fills `out` (r, c) float32, the image's rows from `first_row` on, with the mean radiance of samples x samples rays
-    per pixel; 0 where one of them leaves the field.
+def render_rows(
+    first_row: int,
+    table: FloatArray,
+    sampling: tuple[float, float, float, int],
+    field: Field,
+    look: Look,
+    light: tuple[float, ...],
+    out: NDArray[np.float32],
+) -> None:
+    """Fills `out` (r, c) float32, the image's rows from `first_row` on, with the mean radiance of samples x samples
+    rays per pixel; 0 where one of them leaves the field.
 
     table : (u, v) at the upper and at the lower height, at image positions (-1 + b * spacing, -1 + a * spacing).
     sampling : (spacing px, upper m, lower m, samples).

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,13 @@ from scipy.ndimage import gaussian_filter
 
 from zlocus.errors import GeometryError
 from zlocus.sensors.model import FloatArray, SensorModel
-from zlocus.synthetic.raycast import MISS, cast_rays, render_rows, sunlit_cells
+from zlocus.synthetic.raycast import MISS, Field, Look, cast_rays, render_rows, sunlit_cells
 from zlocus.synthetic.terrain import SyntheticGround
 
 SPACINGS_PX = (64, 32, 16, 8, 4, 2)
 TABLE_TOLERANCE_PX = 1e-3
 HEIGHT_MARGIN_M = 1.0
 ROWS_PER_BAND = 64
-Field = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def render(
     """
     lower, upper = _enclosing(ground)
     spacing, table = ray_table(ground, sensor, shape, (lower, upper))
-    look = (ground.material, ground.materials, ground.textures, sunlit(ground, sun) if lit is None else lit)
+    look: Look = (ground.material, ground.materials, ground.textures, sunlit(ground, sun) if lit is None else lit)
     sampling = (float(spacing), upper, lower, samples)
     out = np.empty(shape, np.float32)
     field, light = field_of(ground), _light(ground, sun)
@@ -83,7 +83,7 @@ def sunlit(ground: SyntheticGround, sun: Sun) -> NDArray[np.bool_]:
     return out
 
 
-def _in_bands(fill: Callable[[int, NDArray[np.generic]], None], out: NDArray[np.generic]) -> None:
+def _in_bands(fill: Callable[[int, Any], None], out: NDArray[Any]) -> None:
     """Calls fill(first_row, rows) for bands of rows of `out`, in threads (the kernels release the GIL)."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         firsts = range(0, len(out), ROWS_PER_BAND)
@@ -135,7 +135,7 @@ def ray_table(
         Where the sensor cannot map its own image, or bends too fast to be tabulated.
     """
     for spacing in SPACINGS_PX:
-        rows, cols = (-1.0 + spacing * np.arange((n + 1) // spacing + 2) for n in shape)
+        rows, cols = (-1.0 + spacing * np.arange((n + 1) // spacing + 2, dtype=np.float64) for n in shape)
         table, middle = (
             np.hstack([_field_from_image(ground, sensor, xy, z) for z in (z_range[1], z_range[0])])
             for xy in (_lattice(rows, cols), _lattice(rows[:-1] + spacing / 2, cols[:-1] + spacing / 2))
@@ -147,7 +147,7 @@ def ray_table(
         pixel_cells = np.abs(np.diff(table, axis=1)).max() / spacing
         if np.abs(mean.reshape(-1, 4) - middle).max() < TABLE_TOLERANCE_PX * pixel_cells:
             return spacing, table
-    raise GeometryError("The sensor's rays change too fast from pixel to pixel to be rendered: make its motion smoother.")
+    raise GeometryError("The sensor's rays change too fast from pixel to pixel to be rendered: smooth its motion.")
 
 
 def _lattice(rows: FloatArray, cols: FloatArray) -> FloatArray:
@@ -179,14 +179,14 @@ def expose(radiance: NDArray[np.float32], optics: Optics, rng: np.random.Generat
     dtype = np.dtype(optics.dtype)
     numbers = np.clip(np.rint(signal), 1, np.iinfo(dtype).max).astype(dtype)
     numbers[radiance == 0.0] = 0
-    return numbers
+    return np.asarray(numbers)
 
 
 def _add_clouds(signal: NDArray[np.float32], optics: Optics, rng: np.random.Generator) -> None:
-    """Soft bright discs, as wide as a twentieth to a tenth of the image."""
+    """Soft bright discs, as wide as a fortieth to a sixteenth of the image."""
     rows, cols = signal.shape
     for _ in range(optics.n_clouds):
-        radius = rng.uniform(0.04, 0.09) * min(rows, cols)
+        radius = rng.uniform(0.025, 0.06) * min(rows, cols)
         dy = (np.arange(rows, dtype=np.float32) - rng.uniform(0, rows))[:, None]
         dx = (np.arange(cols, dtype=np.float32) - rng.uniform(0, cols))[None, :]
         cover = np.minimum(1.0, 1.4 * np.exp(-0.5 * (dx**2 + dy**2) / radius**2))

@@ -22,7 +22,8 @@ RIDGE = 1e-9
 class RpcFit:
     """Coefficients and how well they stand for the camera.
 
-    max_error_px : largest distance from the exact camera, over points between those of the fit.
+    max_error_px : largest distance from the exact camera, over points between those of the fit; infinite where the RPC
+    fails.
     """
 
     rpc: RpcCoefficients
@@ -45,7 +46,7 @@ def fit_rpc(sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tupl
         raise GeometryError(f"An RPC needs a range of heights, not {z_range[0]} to {z_range[1]} m: give low < high.")
     xy, lon_lat_h = _correspondences(sensor, shape, crs, z_range, GRID_POINTS, GRID_HEIGHTS)
     if not np.isfinite(lon_lat_h).all():
-        raise GeometryError(f"The sensor does not map all of its {shape[0]} x {shape[1]} image to the ground: no RPC fits.")
+        raise GeometryError(f"The sensor does not map all of its {shape[0]} x {shape[1]} image: no RPC fits it.")
     low, high = lon_lat_h.min(axis=0), lon_lat_h.max(axis=0)
     offset, scale = (low + high) / 2, (high - low) / 2
     image_offset = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
@@ -62,13 +63,14 @@ def fit_rpc(sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tupl
     )  # fmt: skip
     xy, lon_lat_h = _correspondences(sensor, shape, crs, z_range, 2 * GRID_POINTS, GRID_HEIGHTS + 1)
     fitted = RpcModel(rpc, crs).image_from_geographic(*lon_lat_h.T)
-    return RpcFit(rpc, float(np.hypot(*(fitted - xy).T).max()))
+    error = np.hypot(*(fitted - xy).T)
+    return RpcFit(rpc, float(np.where(np.isnan(error), np.inf, error).max()))
 
 
 def _correspondences(
     sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tuple[float, float], n_points: int, n_heights: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Image positions (n, 2) px over the whole image and what they see at each height: longitude, latitude, h (n, 3)."""
+    """Image positions (n, 2) px over the whole image, and longitude, latitude, height (n, 3) that they see."""
     cols = np.linspace(-0.5, shape[1] - 0.5, n_points)
     rows = np.linspace(-0.5, shape[0] - 0.5, n_points)
     z, row, col = (a.ravel() for a in np.meshgrid(np.linspace(*z_range, n_heights), rows, cols, indexing="ij"))

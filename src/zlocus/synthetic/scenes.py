@@ -76,13 +76,13 @@ class SceneSpec(Checked):
     seed: int = option(1, "Seed of terrain, objects, texture and noise.", low=0)
     size: int = option(520, "Side of the area with truth, in cells of `gsd_m`.", low=32, high=20000)
     gsd_m: float = option(0.5, "Ground pixel.", low=0.05, high=5.0, unit="m")
-    camera: str = option("satellite", "Pushbroom at 600 km, or airborne three-line scanner.", choices=("satellite", "ads40"))
-    truth_step_m: float | None = option(None, "Cell of the height field and the truth; unset: half of `gsd_m`.", low=0.02, unit="m")
+    camera: str = option("satellite", "At 600 km, or an airborne three-line scanner.", choices=("satellite", "ads40"))
+    truth_step_m: float | None = option(None, "Cell of heights and truth; unset: half of `gsd_m`.", low=0.02, unit="m")
     samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
     base_m: float = option(430.0, "Lowest terrain, ellipsoidal.", low=-400.0, high=8000.0, unit="m")
     relief_m: float = option(24.0, "Terrain from lowest to highest, without its hill.", low=0.1, high=1000.0, unit="m")
     hill_m: float = option(0.0, "Height of a round hill in the north-east of the area.", low=0.0, high=100.0, unit="m")
-    objects: Objects = field(default=Objects(110.0, 2.2, 0.6, 9.0))
+    objects: Objects = field(default=Objects(110.0, 2.2, 0.6, 14.0))
     views: tuple[ViewSpec, ...] = SATELLITE_VIEWS
     west_m: float = option(462000.0, "Western border of the area, easting.", unit="m")
     north_m: float = option(5247000.0, "Northern border of the area, northing.", unit="m")
@@ -146,7 +146,7 @@ def demo_spec(seed: int = 4) -> SceneSpec:
     """The demo: a block of six ADS40 images in two strips over towers, houses, trees and a hill, 120 m square."""
     return SceneSpec(
         kind="city", seed=seed, size=600, gsd_m=0.2, camera="ads40", relief_m=6.0, hill_m=9.0,
-        objects=Objects(70.0, 5.0, 0.8, 14.0), views=ADS40_VIEWS,
+        objects=Objects(70.0, 5.0, 0.8, 14.0, plain_roofs=0.25), views=ADS40_VIEWS,
     )  # fmt: skip
 
 
@@ -188,9 +188,8 @@ def _camera(
         return SatelliteCamera(middle, (0.0, 0.0), spec.gsd_m, view.along_deg, view.across_deg, view.heading_deg)
     heading = np.deg2rad(view.heading_deg)
     aside = FLIGHT_HEIGHT_M * np.tan(np.deg2rad(view.across_deg))
-    position = (
-        middle[0] - aside * float(np.cos(heading)), middle[1] + aside * float(np.sin(heading)), middle[2] + FLIGHT_HEIGHT_M
-    )  # fmt: skip
+    east, north = aside * float(np.cos(heading)), -aside * float(np.sin(heading))
+    position = (middle[0] - east, middle[1] - north, middle[2] + FLIGHT_HEIGHT_M)
     return LineScanner(
         position, (0.0, 0.0), view.heading_deg, view.along_deg, ADVANCE_M, wobble_m=WOBBLE_M, wobble_deg=WOBBLE_DEG
     )

@@ -171,7 +171,8 @@ def analytic_ground(
 ) -> SyntheticGround:
     """The height field of `analytic_height`, with natural texture; `centre` (easting, northing, m) is the middle of it.
 
-    Cells hold the exact height of their centre; their slopes are central differences over one cell (zero on the step).
+    Cells hold the exact height of their centre; their slopes are central differences over one cell (zero on the step,
+    whose wall is on its place where the number of columns is even).
     """
     x = (np.arange(shape[1]) + 0.5 - shape[1] / 2) * step
     y = (shape[0] / 2 - 0.5 - np.arange(shape[0])) * step

@@ -10,6 +10,7 @@ TEXTURE_SIZE = 1024
 GRAVEL, GRASS, FRACTAL = 0, 1, 2
 STONES = (128, 72)
 STROKE_DIRECTIONS = 7
+STROKE_DENSITY = 0.004
 STROKE_LENGTH, STROKE_WIDTH = 9.0, 0.9
 
 
@@ -71,7 +72,8 @@ def _strokes(rng: np.random.Generator, size: int) -> NDArray[np.float32]:
     for angle in (np.arange(STROKE_DIRECTIONS) + rng.uniform()) * np.pi / STROKE_DIRECTIONS:
         along = rows * np.sin(angle) + cols * np.cos(angle)
         across = rows * np.cos(angle) - cols * np.sin(angle)
-        impulses = (rng.random((size, size), dtype=np.float32) < 0.004) * rng.standard_normal((size, size), dtype=np.float32)
+        impulses = rng.standard_normal((size, size), dtype=np.float32)
+        impulses *= rng.random((size, size), dtype=np.float32) < STROKE_DENSITY
         blur = np.exp(-2.0 * np.pi**2 * ((along * STROKE_LENGTH) ** 2 + (across * STROKE_WIDTH) ** 2))
         total += fft.rfft2(impulses) * blur.astype(np.float32)
     return np.asarray(fft.irfft2(total, s=(size, size)), np.float32)
