@@ -1,0 +1,67 @@
+"""The semi-global constraint on a cost volume, and the heights it prefers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.kernels.sgm import sweep, winners
+from zlocus.matching.lattice import HeightLattice
+from zlocus.options import SemiGlobalOptions
+
+# From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
+BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
+
+
+@dataclass(frozen=True)
+class SemiGlobalHeights:
+    """Height indices after aggregation, all (r, c).
+
+    best, second : int32, least sum and least other local minimum (= best where there is none); margin : uint16, by
+    how much the sum at `second` is larger; vertex : float32, parabola through the sums around `best`.
+    """
+
+    best: NDArray[np.int32]
+    second: NDArray[np.int32]
+    margin: NDArray[np.uint16]
+    vertex: NDArray[np.float32]
+
+
+def penalties(ortho: NDArray[np.float32] | None, shape: tuple[int, int], options: SemiGlobalOptions) -> NDArray[np.uint16]:
+    """P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
+
+    P2 shrinks with the grey difference g of the two cells in the ortho-image, p2 / (1 + g / (edge_contrast median g)),
+    but not below p2_edge (Hirschmueller 2008, section 2.3, with the scene's own contrast as the unit).
+    """
+    steps = np.full((4, *shape), options.p2, np.uint16)
+    if ortho is None:
+        return steps
+    padded = np.pad(ortho, 1, mode="edge")
+    rows, cols = shape
+    unit = options.edge_contrast * max(float(np.median(np.abs(np.diff(ortho, axis=1)))), 1e-6)
+    for path, (dr, dc) in enumerate(BEHIND):
+        away = np.abs(ortho - padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols])
+        eased = options.p2 / (1.0 + away / unit)
+        steps[path] = np.maximum(eased, min(options.p2_edge, options.p2)).astype(np.uint16)
+    return steps
+
+
+def aggregate(
+    cost: NDArray[np.uint8], lattice: HeightLattice, p2: NDArray[np.uint16], options: SemiGlobalOptions
+) -> SemiGlobalHeights:
+    """Sum of the path costs over 8 paths, and its minima. cost : (v,) uint8, laid out as `HeightLattice.address` says."""
+    total = np.zeros(lattice.size, np.uint16)
+    p1 = np.uint16(options.p1)
+    for sign in (1, -1):
+        sweep(cost, lattice.ranges, lattice.address, lattice.block, p2, p1, sign, total)
+    return pick(total, lattice)
+
+
+def pick(total: NDArray[np.uint16], lattice: HeightLattice) -> SemiGlobalHeights:
+    """Heights of the least sums of a volume laid out as `HeightLattice.address` says."""
+    best, second = np.empty(lattice.shape, np.int32), np.empty(lattice.shape, np.int32)
+    margin, vertex = np.empty(lattice.shape, np.uint16), np.empty(lattice.shape, np.float32)
+    winners(total, lattice.ranges, lattice.address, lattice.block, best, second, margin, vertex)
+    return SemiGlobalHeights(best, second, margin, vertex)

@@ -1,0 +1,140 @@
+"""What a tile sees of every view: pixels of one level, where they are valid, and how its cells project into them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from zlocus.scene import View
+from zlocus.sensors.model import SensorModel
+from zlocus.sensors.table import projection_table
+
+FloatImage = NDArray[np.float32]
+MARGIN_PX = 4
+
+
+@dataclass(frozen=True)
+class ViewPixels:
+    """A window of one view at every level.
+
+    origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
+    does not depend on the window. pixels, valid : per level, (r, c) float32 and bool; level l has half the pixels of
+    level l - 1 each way.
+    """
+
+    sensor: SensorModel
+    origin: tuple[int, int]
+    pixels: tuple[FloatImage, ...]
+    valid: tuple[NDArray[np.bool_], ...]
+
+
+@dataclass(frozen=True)
+class TileViews:
+    """All views of a tile at one level, as the kernels take them.
+
+    pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels no window may touch; layout : (i, 3)
+    int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, 4) float64, see `ProjectionTable`, in pixels of the
+    window; heights : (2,) float64, the table's t at height index 0 and per index.
+    """
+
+    pixels: FloatImage
+    blocked: NDArray[np.bool_]
+    has_blocked: NDArray[np.bool_]
+    layout: NDArray[np.int64]
+    nodes: NDArray[np.float64]
+    heights: NDArray[np.float64]
+
+
+def pixel_window(
+    view: View, corners: NDArray[np.float64], z_range: tuple[float, float], step: int
+) -> tuple[int, int, int, int] | None:
+    """Window (row, col, rows, cols) of an image that sees a patch of ground; None where it sees none of it.
+
+    corners : (n, 2) m, outline of the patch; z_range : m; step : the origin is a multiple of it.
+    """
+    xyz = np.concatenate([np.column_stack([corners, np.full(len(corners), z)]) for z in z_range])
+    xy = view.sensor.image_from_ground(xyz)
+    xy = xy[np.isfinite(xy).all(axis=1)]
+    if not len(xy):
+        return None
+    rows, cols = view.image.shape
+    margin = MARGIN_PX * step
+    col0, row0 = np.floor(xy.min(axis=0)).astype(int) - margin
+    col1, row1 = np.ceil(xy.max(axis=0)).astype(int) + margin + 1
+    row0, col0 = max(row0 // step * step, 0), max(col0 // step * step, 0)
+    row1, col1 = min(row1, rows), min(col1, cols)
+    if row1 - row0 < 2 * step or col1 - col0 < 2 * step:
+        return None
+    return row0, col0, row1 - row0, col1 - col0
+
+
+def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, contrast: float) -> ViewPixels:
+    """Read a window and build its pyramid by means of 2 x 2 valid pixels.
+
+    contrast : the image's standard deviation, which becomes 1 (the same for every window of an image).
+    """
+    row, col, rows, cols = window
+    read = view.image.read(row, col, rows, cols)
+    pixels, valid = [read.pixels * np.float32(1.0 / contrast)], [read.valid]
+    for _ in range(levels - 1):
+        fine, kept = pixels[-1], valid[-1]
+        fine, kept = fine[: len(fine) // 2 * 2, : fine.shape[1] // 2 * 2], kept[: len(kept) // 2 * 2, : kept.shape[1] // 2 * 2]
+        quarters = [(i, j) for i in (0, 1) for j in (0, 1)]
+        if kept.all():
+            mean = sum(fine[i::2, j::2] for i, j in quarters) * np.float32(0.25)
+            count = np.full(mean.shape, 4)
+        else:
+            count = sum(kept[i::2, j::2].astype(np.int64) for i, j in quarters)
+            total = sum(np.where(kept[i::2, j::2], fine[i::2, j::2], np.float32(0.0)) for i, j in quarters)
+            mean = (total / np.maximum(count, 1)).astype(np.float32)
+        pixels.append(np.ascontiguousarray(mean, dtype=np.float32))
+        valid.append(count >= 3)
+    return ViewPixels(view.sensor, (row, col), tuple(pixels), tuple(valid))
+
+
+def tile_views(
+    views: Sequence[ViewPixels],
+    level: int,
+    transform: Affine,
+    shape: tuple[int, int],
+    block: int,
+    lattice: tuple[float, float],
+    z_range: tuple[float, float],
+    half: int,
+) -> TileViews:
+    """Gather one level of all views for a grid of cells.
+
+    transform, shape : of the grid at this level; lattice : height of index 0 and step (m); z_range : m, heights that
+    will be asked for; half : half width of the largest window, by which blocked pixels grow.
+    """
+    # OpenCV's import is paid once, by the orientation; here it only grows masks.
+    import cv2
+
+    layout, nodes, blocked, offset = [], [], [], 0
+    scale = 2.0**level
+    for view in views:
+        shape_px = view.pixels[level].shape
+        layout.append((offset, *shape_px))
+        offset += view.pixels[level].size
+        table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px=0.01 * scale)
+        scaled = table.nodes / scale
+        scaled[..., 0, 0] += 0.5 / scale - 0.5 - view.origin[1] / scale
+        scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0] / scale
+        nodes.append(scaled)
+        unusable = ~view.valid[level]
+        if unusable.any():
+            side = 2 * (half + 2) + 1
+            unusable = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+        blocked.append(unusable)
+    return TileViews(
+        pixels=np.concatenate([view.pixels[level].ravel() for view in views]),
+        blocked=np.concatenate([mask.ravel() for mask in blocked]),
+        has_blocked=np.array([bool(mask.any()) for mask in blocked]),
+        layout=np.array(layout, np.int64),
+        nodes=np.ascontiguousarray(np.stack(nodes)),
+        heights=np.array([(lattice[0] - table.z_mid) / table.z_half, lattice[1] / table.z_half]),
+    )

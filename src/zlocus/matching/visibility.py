@@ -1,0 +1,59 @@
+"""Between which heights each view sees each cell: inside the image, on valid pixels, not hidden by the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from zlocus.kernels.reach import tile_reach
+from zlocus.kernels.visibility import lowest_visible
+from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.views import TileViews
+
+IntVolume = NDArray[np.int32]
+BORDER_PX = 3.0
+
+
+def coverage(views: TileViews, lattice: HeightLattice) -> IntVolume:
+    """(2, i, r, c) int32: lowest and highest height index at which each image covers each cell.
+
+    A view takes part over the longest run of heights whose windows lie inside the image and on valid pixels; at other
+    heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
+    parallax of the range.)
+    """
+    seen = np.empty((2, len(views.layout), *lattice.shape), np.int32)
+    tile_reach(
+        views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
+        BORDER_PX, seen[0], seen[1],
+    )  # fmt: skip
+    return seen
+
+
+def hide(seen: IntVolume, views: TileViews, surface: NDArray[np.float32], block: int, margin_steps: float) -> None:
+    """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
+
+    surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it.
+    """
+    lowest = np.empty(surface.shape, np.float32)
+    for i in range(len(views.layout)):
+        by_col, by_row = cells_per_step(views, i, block)
+        lowest_visible(surface, by_col, by_row, lowest)
+        bound = np.floor(np.maximum(lowest - margin_steps, 0.0)).astype(np.int32)
+        np.maximum(seen[0, i], bound, out=seen[0, i])
+
+
+def cells_per_step(views: TileViews, i: int, block: int) -> tuple[float, float]:
+    """How many cells (columns, rows) the ground point seen by a fixed pixel moves per height step, at the tile's centre."""
+    nodes = views.nodes[i]
+    b, d = (nodes.shape[0] - 1) // 2, (nodes.shape[1] - 1) // 2
+    here, right, below = nodes[b, d], nodes[b, d + 1], nodes[b + 1, d]
+    by_cell = np.column_stack([right[:, 0] - here[:, 0], below[:, 0] - here[:, 0]]) / block
+    by_step = here[:, 1] * views.heights[1]
+    col, row = -np.linalg.solve(by_cell, by_step)
+    return float(col), float(row)
+
+
+def metres_per_cell(transform: Affine) -> float:
+    """Side of a cell."""
+    return float(np.hypot(transform.a, transform.d))

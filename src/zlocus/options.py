@@ -1,0 +1,176 @@
+"""Everything that can be tuned: one frozen class per stage, nested in `RunConfig`.
+
+Each field carries its unit and one sentence in `metadata`; `zlocus config` writes them as a commented file, and
+`__post_init__` refuses values out of range with field, value and allowed range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from zlocus.errors import ConfigError
+
+
+def option(default: Any, doc: str, *, low: float | None = None, high: float | None = None,
+           choices: tuple[str, ...] | None = None, unit: str = "") -> Any:  # fmt: skip
+    """A dataclass field with its sentence, unit and allowed range (inclusive)."""
+    meta = {"doc": doc, "low": low, "high": high, "choices": choices, "unit": unit}
+    return field(default=default, metadata=meta)
+
+
+def group(factory: Callable[[], Any], doc: str) -> Any:
+    """A nested stage."""
+    return field(default_factory=factory, metadata={"doc": doc})
+
+
+class Checked:
+    """Range checks from the fields' metadata."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            value, meta = getattr(self, f.name), f.metadata
+            if value is None or "doc" not in meta:
+                continue
+            low, high, choices = meta.get("low"), meta.get("high"), meta.get("choices")
+            where = f"{type(self).__name__}.{f.name}"
+            if choices is not None and value not in choices:
+                raise ConfigError(f"{where} = {value!r} is not one of {', '.join(choices)}.")
+            if (low is not None and not value >= low) or (high is not None and not value <= high):
+                allowed = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
+                raise ConfigError(
+                    f"{where} = {value!r} is outside its range {allowed} {meta.get('unit', '')}".rstrip() + "."
+                )
+
+
+@dataclass(frozen=True)
+class OrientationOptions(Checked):
+    """Tie points and the correction of each image's pointing (method section 7)."""
+
+    model: str = option("shift", "Correction per image: a shift, or none.", choices=("shift", "none"))
+    features_per_mpx: int = option(
+        5000, "SIFT features kept per megapixel, the strongest of each part.", low=100, high=100000
+    )
+    features_per_image: int = option(30000, "SIFT features kept per image, at most.", low=100, high=10000000)
+    full_detail_mpx: float = option(
+        0.6, "Images above this size are halved for SIFT, which costs no accuracy.", low=0.0, high=1e6, unit="Mpx"
+    )
+    match_ratio: float = option(
+        0.8, "Descriptor distance of a match over that of its best rival, at most.", low=0.1, high=1.0
+    )
+    max_pointing_px: float = option(30.0, "Largest pointing error looked for.", low=1.0, high=1000.0, unit="px")
+    inlier_px: float = option(
+        1.0, "Distance from the locus at which a tie still counts as right.", low=0.1, high=10.0, unit="px"
+    )
+    min_ties: int = option(12, "Fewest ties of a pair that are used.", low=4, high=10000)
+    prior_px: float = option(
+        20.0, "Sigma of the weak prior on every shift, which fixes the datum.", low=0.1, high=1000.0, unit="px"
+    )
+    range_margin: float = option(
+        0.2, "Height range found from ties: added at both ends, as a share of the ties' span.", low=0.0, high=10.0
+    )
+    range_up_m: float = option(
+        60.0,
+        "Height range found from ties: added above, for towers and trees without ties.",
+        low=0.0,
+        high=2000.0,
+        unit="m",
+    )
+    range_down_m: float = option(
+        20.0,
+        "Height range found from ties: added below, for pits and streets without ties.",
+        low=0.0,
+        high=2000.0,
+        unit="m",
+    )
+
+
+@dataclass(frozen=True)
+class PyramidOptions(Checked):
+    """Levels, tiles and the range of heights that each block of cells searches (method sections 1, 6 and 9)."""
+
+    max_shift_px: float = option(
+        0.5, "Shift per height step in the most sensitive image, at most.", low=0.05, high=2.0, unit="px"
+    )
+    coarsest_steps: int = option(
+        64, "Levels are added until the whole height range has at most this many steps at the coarsest.",
+        low=16, high=4096,
+    )  # fmt: skip
+    max_levels: int = option(6, "Levels of the pyramid, at most.", low=1, high=12)
+    block: int = option(32, "Cells along the side of a block, which shares one range of heights.", low=8, high=128)
+    tile: int = option(1024, "Cells along the side of a tile's core.", low=64, high=8192)
+    halo: int = option(32, "Cells around a tile's core at every level, matched for its sake.", low=8, high=512)
+    margin_steps: int = option(
+        6, "Steps added at both ends of what a coarser level found.", low=1, high=1000, unit="steps"
+    )
+    reach: int = option(2, "Coarse cells around a block whose heights it searches too.", low=0, high=64, unit="cells")
+
+
+@dataclass(frozen=True)
+class MeasureOptions(Checked):
+    """How views are compared (method sections 1 and 5)."""
+
+    small_window: int = option(3, "Side of the smaller correlation window.", choices=(3, 5, 7, 9, 11), unit="cells")
+    large_window: int = option(
+        5, "Side of the larger correlation window, whose NCC is averaged with the smaller's.",
+        choices=(3, 5, 7, 9, 11), unit="cells",
+    )  # fmt: skip
+    noise: float = option(
+        0.0, "Standard deviation added to every window, as a share of the image's own: damps plain windows.",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    hidden_margin_steps: float = option(
+        2.0, "A view counts as hidden this far below what hides it.", low=0.0, high=1000.0, unit="steps"
+    )
+
+
+@dataclass(frozen=True)
+class SemiGlobalOptions(Checked):
+    """Penalties of the semi-global constraint, in cost units: 64 is the cost of NCC 0 (method section 5)."""
+
+    p1: int = option(20, "Penalty of a neighbour one step away.", low=0, high=1000)
+    p2: int = option(240, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
+    p2_edge: int = option(60, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
+    edge_contrast: float = option(
+        2.0, "Grey difference that halves the penalty of a jump, in median differences of the scene.", low=0.01, high=1e3
+    )
+
+
+@dataclass(frozen=True)
+class RefineOptions(Checked):
+    """The last pass: sub-step heights from windows that follow the surface (method section 6)."""
+
+    window: int = option(7, "Side of the correlation window.", choices=(3, 5, 7, 9, 11, 13), unit="cells")
+    rounds: int = option(3, "Times the surface is smoothed and measured again.", low=0, high=10)
+    jump_steps: float = option(
+        3.0, "Height difference that smoothing does not bridge.", low=0.5, high=100.0, unit="steps"
+    )
+    reach_steps: float = option(
+        1.5, "A refined height stays this close to the semi-global one, else that is kept.", low=0.1, high=10.0,
+        unit="steps",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CheckOptions(Checked):
+    """When a cell stays empty, or is marked as doubtful."""
+
+    least_ncc: float = option(0.0, "A cell is left empty below this mean NCC.", low=-1.0, high=1.0)
+    doubtful_ncc: float = option(0.3, "A cell is marked as weak below this mean NCC.", low=-1.0, high=1.0)
+    rival_cost: int = option(
+        64, "A cell is marked as ambiguous when another height costs less than this more over the eight paths.",
+        low=0, high=10000,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunConfig(Checked):
+    """A whole run."""
+
+    orientation: OrientationOptions = group(OrientationOptions, "Tie points and pointing corrections.")
+    pyramid: PyramidOptions = group(PyramidOptions, "Levels, tiles and ranges of heights.")
+    measure: MeasureOptions = group(MeasureOptions, "How views are compared.")
+    semiglobal: SemiGlobalOptions = group(SemiGlobalOptions, "Semi-global constraint.")
+    refine: RefineOptions = group(RefineOptions, "Sub-step refinement.")
+    checks: CheckOptions = group(CheckOptions, "Empty and doubtful cells.")

@@ -1,0 +1,34 @@
+"""Why a cell has, lacks or deserves less trust in its height."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Quality(IntFlag):
+    """Bits of `quality.tif`. The first six empty a cell, the others only warn."""
+
+    OUTSIDE = 1  # not asked for: outside the area, or inside a mask
+    UNSEEN = 2  # fewer than two images cover the cell
+    HIDDEN = 4  # fewer than two images see the surface there, the others are behind it
+    RANGE_END = 8  # best match at an end of the height range: the true height may lie beyond it
+    NO_MATCH = 16  # images do not agree at any height
+    FAILED = 32  # its tile could not be processed
+    WEAK = 256  # images agree poorly
+    AMBIGUOUS = 512  # another height fits nearly as well
+    JUMP = 1024  # next to a jump in height
+    UNREFINED = 2048  # height to a fraction of a step only: sub-step refinement did not converge
+    FILLED = 4096  # no match: interpolated from its neighbours
+
+
+EMPTY = (
+    Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
+)
+
+
+def is_empty(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Whether a cell has no height, from its reasons. quality : (r, c) uint16."""
+    return ((quality & EMPTY) != 0) & ((quality & Quality.FILLED) == 0)
