@@ -141,6 +141,14 @@ def test_a_shift_beyond_the_limit_is_not_found():
     assert not find_ties(scene, replace(OPTIONS, max_pointing_px=10.0)).pairs
 
 
+def test_ties_survive_heights_that_a_pointing_error_moves_away():
+    """15 px along the loci are 25 m of height, beyond the 20 m that were asked for."""
+    scene = hill_scene([(0.0, 0.0), (15.0, 0.0)], looks=((0.0, 0.0), (0.3, 0.0)), turn_deg=(0.0, 0.0))
+    ties = find_ties(scene, OPTIONS, (100.0, 120.0))
+    assert len(ties.z) > 100
+    assert not ((ties.z > 95.0) & (ties.z < 121.0)).any()
+
+
 def test_images_of_different_ground_are_not_compared():
     scene = hill_scene([(0.0, 0.0), (0.0, 0.0)])
     far = replace(scene.views[1], sensor=ShiftedModel(scene.views[1].sensor, 9000.0, 0.0))
@@ -155,6 +163,7 @@ def test_the_heights_looked_at_come_from_the_hint_or_the_models():
     scene = hill_scene([(0.0, 0.0), (0.0, 0.0)], size=64)
     assert widest_range(scene.views) == (0.0, 300.0)
     assert find_ties(scene, OPTIONS, (90.0, 130.0)).z_range == (90.0, 130.0)
+    assert find_ties(replace(scene, heights=(80.0, 140.0)), OPTIONS).z_range == (80.0, 140.0)
     anywhere = tuple(replace(v, sensor=AffineSensor(0.0, 0.0, bounds=None)) for v in scene.views)
     with pytest.raises(GeometryError, match="--heights"):
         find_ties(replace(scene, views=anywhere), OPTIONS)

@@ -59,7 +59,7 @@ def adjust(
         seen, xyz = consistent(seen, points, options.inlier_px), points.xyz
     seen, xyz = renumbered(seen, xyz)
     points = triangulate(sensors, moved(seen, shift), xyz)
-    before = triangulate(sensors, seen, points.xyz)
+    before = triangulate(sensors, seen, points.xyz, by_ground=points.by_ground)
     return Adjustment(shift, n_seen, seen, points, before.residual)
 
 
@@ -129,7 +129,7 @@ def seen_directions(normal: FloatArray, weight_of_view: FloatArray) -> FloatArra
     unseen = vectors[:, values < SEEN_INFORMATION / n_views**2]
     hidden = np.where(linked[:, None], unseen * inverse[:, None], unseen)
     left, _, _ = np.linalg.svd(hidden, full_matrices=True)
-    return np.asarray(left[:, hidden.shape[1] :])
+    return np.where(linked[:, None], left[:, hidden.shape[1] :], 0.0)
 
 
 def moved(seen: Observations, shift: FloatArray) -> Observations:

@@ -142,7 +142,7 @@ def orient(
 ) -> Orientation:
     """Tie points, then one shift per image, solved with the heights of the ties.
 
-    z_range_hint: heights in m that hold the ground, where they are known.
+    z_range_hint: heights in m that hold the ground, where they are known; else the scene's.
     """
     ties = find_ties(scene, options, z_range_hint, progress)
     sensors = [view.sensor for view in scene.views]

@@ -45,7 +45,9 @@ def find_shift(found: OnLocus, max_pointing_px: float, inlier_px: float) -> Pair
     two = rng.integers(0, len(usable), (N_HYPOTHESES // 2, 2))
     hypotheses = np.concatenate([normal[one] * across[one, None], minimum_norm_shifts(normal[two], across[two])])
     hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_pointing_px]
-    squares = (across[:, None] - normal @ hypotheses.T) ** 2
+    # plain sums, not a matrix product: for inner dimension 2 the linear algebra library only wakes its threads
+    expected = normal[:, :1] * hypotheses[:, 0] + normal[:, 1:] * hypotheses[:, 1]
+    squares = (across[:, None] - expected) ** 2
     best = hypotheses[np.argmin(np.minimum(squares, inlier_px**2).sum(axis=0))]
     for _ in range(REFINEMENTS):
         near = np.abs(across - normal @ best) <= inlier_px

@@ -67,10 +67,10 @@ def find_ties(
 ) -> Ties:
     """Tie points between all images that overlap.
 
-    Heights are looked for within `z_range_hint` (m) where given, else wherever the sensor models are made for. A pair
-    with fewer than `min_ties` agreeing matches is dropped.
+    Heights are looked for within `z_range_hint` (m) where given, else within the scene's heights, else wherever the
+    sensor models are made for. A pair with fewer than `min_ties` agreeing matches is dropped.
     """
-    z_range = widest_range(scene.views) if z_range_hint is None else z_range_hint
+    z_range = z_range_hint or scene.heights or widest_range(scene.views)
     report = progress or (lambda _stage, _share: None)
     wanted = shared_parts(scene.views, z_range, options.max_pointing_px)
     features = []
@@ -149,7 +149,7 @@ def match_pair(
     pointing = find_shift(found, max_px, options.inlier_px)
     if pointing.inliers.sum() < options.min_ties:
         return empty
-    likely = likely_range(found.z[pointing.inliers], z_range)
+    likely = likely_range(found.z[pointing.inliers])
     loci = trace(*sensors, xy_a, likely).moved(pointing.shift_px)
     first, second = match_near_loci(loci, features[a], features[b], 2.0 * options.inlier_px, options.match_ratio)
     found = locate(*sensors, xy_a[first], xy_b[second], likely)
@@ -159,10 +159,13 @@ def match_pair(
     return PairMatches(pair, first[keep], second[keep], found.z[keep], n_candidates, pointing.shift_px)
 
 
-def likely_range(z: FloatArray, z_range: tuple[float, float]) -> tuple[float, float]:
-    """Heights (m) worth a second look: those of nearly all matches z (n,), widened by their span, within `z_range`."""
+def likely_range(z: FloatArray) -> tuple[float, float]:
+    """Heights (m) worth a second look: those of nearly all matches z (n,), widened by their span.
+
+    Not cut to the heights asked for: a pointing error along the loci raises or lowers all of them.
+    """
     low, high = np.percentile(z, (5.0, 95.0))
-    return max(z_range[0], low - (high - low) - 1.0), min(z_range[1], high + (high - low) + 1.0)
+    return low - (high - low) - 1.0, high + (high - low) + 1.0
 
 
 def match_near_loci(
@@ -186,8 +189,7 @@ def match_near_loci(
         if not len(near):
             continue
         allowed = near_segments(low[block], high[block], in_b.xy[near], max_px)
-        distance = descriptor_distances(in_a.descriptors[block], in_b.descriptors[near])
-        distance[~allowed] = np.inf
+        distance = descriptor_distances(in_a.descriptors[block], in_b.descriptors[near], allowed)
         best, sure = best_and_sure(distance, in_b.xy[near], ratio)
         best_of_a[block] = near[best]
         sure_of_a[block] = sure
@@ -216,11 +218,10 @@ def near_segments(low: FloatArray, high: FloatArray, xy: FloatArray, max_px: flo
     chord = high - low
     length = np.hypot(*chord.T)
     unit = (chord / np.maximum(length, 1e-9)[:, None]).astype(np.float32)
-    start = np.einsum("nj,nj->n", low, unit)[:, None]
-    offset = (low[:, 0] * unit[:, 1] - low[:, 1] * unit[:, 0])[:, None]
-    xy = xy.astype(np.float32)
-    along = unit @ xy.T - start.astype(np.float32)
-    across = np.column_stack([unit[:, 1], -unit[:, 0]]) @ xy.T - offset.astype(np.float32)
+    x = (xy[:, 0] - low[:, :1]).astype(np.float32)
+    y = (xy[:, 1] - low[:, 1:]).astype(np.float32)
+    along = x * unit[:, :1] + y * unit[:, 1:]
+    across = x * unit[:, 1:] - y * unit[:, :1]
     return np.asarray((np.abs(across) <= max_px) & (along >= -max_px) & (along <= length[:, None] + max_px))
 
 
@@ -240,9 +241,18 @@ def best_and_sure(
     return best, nearest < ratio * np.minimum(rival, UNRELATED_DISTANCE)
 
 
-def descriptor_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Euclidean distances (n, k) of unit vectors a (n, 128) and b (k, 128)."""
-    return np.asarray(np.sqrt(np.maximum(2.0 - 2.0 * (a @ b.T), 0.0)))
+def descriptor_distances(
+    a: NDArray[np.float32], b: NDArray[np.float32], allowed: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Euclidean distances (n, k) of unit vectors a (n, 128) and b (k, 128); inf where not allowed (n, k).
+
+    Only the allowed ones, a few in a hundred, are computed: cheaper than a whole matrix product, and it wakes no
+    threads of the linear algebra library.
+    """
+    distance = np.full(allowed.shape, np.inf, np.float32)
+    row, col = np.nonzero(allowed)
+    distance[row, col] = np.sqrt(np.maximum(2.0 - 2.0 * np.einsum("nk,nk->n", a[row], b[col]), 0.0))
+    return distance
 
 
 def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_range: tuple[float, float]) -> Ties:

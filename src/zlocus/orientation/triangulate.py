@@ -64,11 +64,12 @@ def triangulate(
     """
     weight = np.ones(len(seen)) if weight is None else weight
     by_ground = ground_jacobian(sensors, seen, xyz) if by_ground is None else by_ground
+    inverse = point_covariance(by_ground, weight, seen.point, len(xyz))
     step_px = 0.0
     for _ in range(MAX_ITERATIONS):
         if step_px > RELINEARISE_PX:
             by_ground = ground_jacobian(sensors, seen, xyz)
-        inverse = point_covariance(by_ground, weight, seen.point, len(xyz))
+            inverse = point_covariance(by_ground, weight, seen.point, len(xyz))
         residual = seen.xy - project_points(sensors, seen, xyz)
         pull = summed(np.einsum("mji,mj,m->mi", by_ground, residual, weight), seen.point, len(xyz))
         step = np.einsum("nij,nj->ni", inverse, pull)
@@ -90,13 +91,9 @@ def project_points(sensors: Sequence[SensorModel], seen: Observations, xyz: Floa
 
 
 def ground_jacobian(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:
-    """Central differences (m, 2, 3) of image position by ground position, px per m."""
-    columns = []
-    for axis in range(3):
-        offset = np.zeros(3)
-        offset[axis] = DIFFERENCE_M
-        ahead, behind = (project_points(sensors, seen, xyz + sign * offset) for sign in (1.0, -1.0))
-        columns.append((ahead - behind) / (2.0 * DIFFERENCE_M))
+    """Derivatives (m, 2, 3) of image position by ground position, px per m, as differences over a metre."""
+    here = project_points(sensors, seen, xyz)
+    columns = [(project_points(sensors, seen, xyz + step) - here) / DIFFERENCE_M for step in np.eye(3) * DIFFERENCE_M]
     return np.stack(columns, axis=2)
 
 
