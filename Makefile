@@ -2,18 +2,20 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
+MINIMUM := .venv/minimum
+PIP_OPTIONS := --quiet --disable-pip-version-check --only-binary=:all:
 TEST_DATA := $(wildcard ../shared/data)
 ifneq ($(TEST_DATA),)
 export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
 endif
 
-.PHONY: demo test lint bench acceptance acceptance-all clean
+.PHONY: demo test test-minimum lint bench acceptance acceptance-all clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "zlocus needs Python 3.11 or newer: make PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary=:all: --editable '.[dev]'
+	$(BIN)/python -m pip install $(PIP_OPTIONS) --editable '.[dev]'
 	touch $@
 
 demo: $(STAMP)
@@ -21,6 +23,14 @@ demo: $(STAMP)
 
 test: lint
 	$(BIN)/python -m pytest -n 2
+
+# The oldest versions that pyproject.toml allows, in an environment of their own.
+test-minimum: $(STAMP)
+	$(PYTHON) -m venv $(MINIMUM)
+	$(BIN)/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	    print(*(d.split(",")[0].replace(">=", "==") for d in project["dependencies"]), sep="\n")' > $(MINIMUM)/versions.txt
+	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[dev]'
+	$(MINIMUM)/bin/python -m pytest -n 2
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -40,7 +40,7 @@ def test_every_option_says_what_it_is(f, value, kind):
     elif kind is float:
         assert type(value) is float
     is_number = kind in (int, float)
-    has_range = f.metadata["low"] is not None or f.metadata["high"] is not None
+    has_range = any(f.metadata[limit] is not None for limit in ("low", "high", "choices"))
     assert has_range or not is_number, "a number without any limit"
     for suffix, unit in (("_px", "px"), ("_m", "m"), ("_gb", "GB"), ("_deg", "degrees")):
         assert not f.name.endswith(suffix) or f.metadata["unit"] == unit
@@ -68,6 +68,7 @@ class Sample(Checked):
 
     size: float = option(1.0, "A size.", low=0.5, high=2.0, unit="m")
     kind: str = option("a", "A kind.", choices=("a", "b"))
+    window: int = option(5, "A window.", choices=(5, 7))
     count: int | None = option(None, "A count.", low=1)
     weight: float = option(1.0, "A weight.", low=0.0)
 
@@ -84,6 +85,7 @@ def test_limits_are_inclusive(values):
         ({"size": 2.1}, r"Sample\.size = 2\.1"),
         ({"size": float("nan")}, r"Sample\.size = nan"),
         ({"kind": "c"}, r"Sample\.kind = 'c' is not one of a, b\."),
+        ({"window": 6}, r"Sample\.window = 6 is not one of 5, 7\."),
         ({"weight": float("nan")}, r"Sample\.weight = nan"),
         ({"count": 0}, r"Sample\.count = 0 is outside its range 1 to inf"),
     ],

@@ -135,12 +135,15 @@ def _comment(text: str) -> list[str]:
 def _allowed(meta: Mapping[str, Any]) -> str:
     """Range and unit of an option in brackets; empty where it has neither."""
     low, high, unit, choices = meta.get("low"), meta.get("high"), meta.get("unit", ""), meta.get("choices")
+    limits = ""
     if choices is not None:
-        return f"[{' | '.join(choices)}]"
-    if low is None and high is None:
-        return f"[{unit}]" if unit else ""
-    limits = f"{low} to {high}" if None not in (low, high) else f"at least {low}" if high is None else f"at most {high}"
-    return f"[{limits} {unit}".rstrip() + "]"
+        limits = " | ".join(map(str, choices))
+    elif None not in (low, high):
+        limits = f"{low} to {high}"
+    elif low is not None or high is not None:
+        limits = f"at least {low}" if high is None else f"at most {high}"
+    text = f"{limits} {unit}".strip()
+    return f"[{text}]" if text else ""
 
 
 def _toml(value: Any) -> str:
