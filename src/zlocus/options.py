@@ -14,7 +14,7 @@ from zlocus.errors import ConfigError
 
 
 def option(default: Any, doc: str, *, low: float | None = None, high: float | None = None,
-           choices: tuple[str, ...] | None = None, unit: str = "") -> Any:  # fmt: skip
+           choices: tuple[Any, ...] | None = None, unit: str = "") -> Any:  # fmt: skip
     """A dataclass field with its sentence, unit and allowed range (inclusive)."""
     meta = {"doc": doc, "low": low, "high": high, "choices": choices, "unit": unit}
     return field(default=default, metadata=meta)
@@ -36,7 +36,7 @@ class Checked:
             low, high, choices = meta.get("low"), meta.get("high"), meta.get("choices")
             where = f"{type(self).__name__}.{f.name}"
             if choices is not None and value not in choices:
-                raise ConfigError(f"{where} = {value!r} is not one of {', '.join(choices)}.")
+                raise ConfigError(f"{where} = {value!r} is not one of {', '.join(map(str, choices))}.")
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 allowed = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
                 raise ConfigError(
