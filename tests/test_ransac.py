@@ -48,6 +48,17 @@ def test_without_wrong_matches_the_shift_is_exact(offset):
     assert find_shift(found, 30.0, 1.0).shift_px == pytest.approx([0.0, offset], abs=1e-9)
 
 
+@pytest.mark.parametrize("n", [100, 1000, 5000])
+def test_matches_of_unrelated_images_are_not_taken_for_a_shift(n):
+    """Best of all shifts, some matches always agree: chance is told from truth by how many lie elsewhere."""
+    normal = np.tile([0.6, 0.8], (n, 1))
+    for seed in range(10):
+        unrelated, _ = matches((0.0, 0.0), 1.0, normal, seed=seed)
+        assert not find_shift(unrelated, 30.0, 1.0).is_certain(12)
+        related, _ = matches((3.0, 4.0), 0.6, normal, seed=seed)
+        assert find_shift(related, 30.0, 1.0).is_certain(12)
+
+
 def test_the_same_matches_give_the_same_answer():
     found, _ = matches((3.0, 1.0), 0.7, np.tile([1.0, 0.0], (N, 1)), noise_px=0.3)
     one, two = find_shift(found, 30.0, 1.0), find_shift(found, 30.0, 1.0)

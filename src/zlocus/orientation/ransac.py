@@ -22,29 +22,36 @@ class PairShift:
     """The pointing of image b against image a.
 
     shift_px : (2,) column and row by which b's points lie off their loci (minimum norm: the part along the loci, which
-    cannot be told from a height, is left out); inliers : (n,) bool.
+    cannot be told from a height, is left out); inliers : (n,) bool; by_chance: how many wrong matches are expected
+    among them, from how many lie elsewhere.
     """
 
     shift_px: FloatArray
     inliers: NDArray[np.bool_]
+    by_chance: float
+
+    def is_certain(self, min_ties: int) -> bool:
+        """Whether enough matches agree, beyond twice what chance alone puts there."""
+        return bool(self.inliers.sum() >= min_ties + 2.0 * self.by_chance)
 
 
-def find_shift(found: OnLocus, max_pointing_px: float, inlier_px: float) -> PairShift:
+def find_shift(found: OnLocus, max_px: float, inlier_px: float) -> PairShift:
     """The shift that puts most matches on their loci, by RANSAC (MSAC score), and the matches it puts there.
 
-    Half of the hypotheses come from one match (right where all loci are parallel), half from two (where they are not).
-    Deterministic: fixed seed. Survives 80 % of wrong matches: a hypothesis from one match is right one time in five.
+    Matches were looked for within `max_px` of where the loci were expected. Half of the hypotheses come from one match
+    (right where all loci are parallel), half from two (where they are not). Deterministic: fixed seed. Survives 80 % of
+    wrong matches: a hypothesis from one match is right one time in five.
     """
-    usable = np.flatnonzero(np.isfinite(found.across_px) & (np.abs(found.across_px) <= max_pointing_px))
+    usable = np.flatnonzero(np.isfinite(found.across_px) & (np.abs(found.across_px) <= max_px))
     inliers = np.zeros(len(found.across_px), bool)
     if len(usable) < 2:
-        return PairShift(np.zeros(2), inliers)
+        return PairShift(np.zeros(2), inliers, 0.0)
     normal, across = found.normal[usable], found.across_px[usable]
     rng = np.random.default_rng(SEED)
     one = rng.integers(0, len(usable), N_HYPOTHESES // 2)
     two = rng.integers(0, len(usable), (N_HYPOTHESES // 2, 2))
     hypotheses = np.concatenate([normal[one] * across[one, None], minimum_norm_shifts(normal[two], across[two])])
-    hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_pointing_px]
+    hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_px]
     # plain sums, not a matrix product: for inner dimension 2 the linear algebra library only wakes its threads
     expected = normal[:, :1] * hypotheses[:, 0] + normal[:, 1:] * hypotheses[:, 1]
     squares = (across[:, None] - expected) ** 2
@@ -53,7 +60,8 @@ def find_shift(found: OnLocus, max_pointing_px: float, inlier_px: float) -> Pair
         near = np.abs(across - normal @ best) <= inlier_px
         best = minimum_norm_shifts(normal[near][None], across[near][None])[0]
     inliers[usable[np.abs(across - normal @ best) <= inlier_px]] = True
-    return PairShift(best, inliers)
+    outside = len(usable) - int(inliers.sum())
+    return PairShift(best, inliers, outside * inlier_px / max(max_px - inlier_px, inlier_px))
 
 
 def minimum_norm_shifts(normal: FloatArray, across: FloatArray) -> FloatArray:

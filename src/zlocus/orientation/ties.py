@@ -81,7 +81,7 @@ def find_ties(
     candidates = list(combinations(range(len(scene.views)), 2))
     for done, (a, b) in enumerate(candidates):
         matches = match_pair(scene.views, features, (a, b), z_range, options)
-        if len(matches) >= options.min_ties:
+        if len(matches):
             pairs.append(matches)
         report("matches", (done + 1) / len(candidates))
     return join_tracks(features, tuple(pairs), z_range)
@@ -147,16 +147,18 @@ def match_pair(
     first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
     found = locate(*sensors, xy_a[sample[first]], xy_b[second], z_range)
     pointing = find_shift(found, max_px, options.inlier_px)
-    if pointing.inliers.sum() < options.min_ties:
+    if not pointing.is_certain(options.min_ties):
         return empty
-    likely = likely_range(found.z[pointing.inliers])
+    likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * options.inlier_px
     loci = trace(*sensors, xy_a, likely).moved(pointing.shift_px)
-    first, second = match_near_loci(loci, features[a], features[b], 2.0 * options.inlier_px, options.match_ratio)
-    found = locate(*sensors, xy_a[first], xy_b[second], likely)
-    n_candidates = len(first)
-    pointing = find_shift(found, max_px, options.inlier_px)
-    keep = pointing.inliers
-    return PairMatches(pair, first[keep], second[keep], found.z[keep], n_candidates, pointing.shift_px)
+    first, second = match_near_loci(loci, features[a], features[b], near_px, options.match_ratio)
+    moved_b = xy_b[second] - pointing.shift_px
+    rest = find_shift(locate(*sensors, xy_a[first], moved_b, likely), near_px, options.inlier_px)
+    if not rest.is_certain(options.min_ties):
+        return empty
+    keep = rest.inliers
+    found = locate(*sensors, xy_a[first[keep]], xy_b[second[keep]], likely)
+    return PairMatches(pair, first[keep], second[keep], found.z, len(first), pointing.shift_px + rest.shift_px)
 
 
 def likely_range(z: FloatArray) -> tuple[float, float]:
