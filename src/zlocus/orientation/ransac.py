@@ -51,7 +51,7 @@ def find_shift(found: OnLocus, max_px: float, inlier_px: float) -> PairShift:
     one = rng.integers(0, len(usable), N_HYPOTHESES // 2)
     two = rng.integers(0, len(usable), (N_HYPOTHESES // 2, 2))
     hypotheses = np.concatenate([normal[one] * across[one, None], minimum_norm_shifts(normal[two], across[two])])
-    hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_px]
+    hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_px * (1.0 + 1e-9)]
     # plain sums, not a matrix product: for inner dimension 2 the linear algebra library only wakes its threads
     expected = normal[:, :1] * hypotheses[:, 0] + normal[:, 1:] * hypotheses[:, 1]
     squares = (across[:, None] - expected) ** 2
