@@ -28,5 +28,5 @@ class SensorModel(Protocol):
         ...
 
     def height_bounds(self) -> tuple[float, float] | None:
-        """Lowest and highest ellipsoidal height in m for which the model was made; None where it holds at any height."""
+        """Lowest and highest ellipsoidal height (m) the model was made for; None where it holds at any height."""
         ...
