@@ -79,7 +79,7 @@ def test_pixels_see_the_truth(folder: Path, spec: SceneSpec, ground: SyntheticGr
     exposure = exposures(spec)[1]
     xy = np.random.default_rng(3).uniform(20, 90, (4000, 2))
     seen = seen_from(ground, exposure.camera, xy)
-    within = exposure.camera.ground_from_image(xy, seen[:, 2] - 0.01)
+    within = exposure.camera.ground_from_image(xy, seen[:, 2] - 0.001)
     row = np.floor((spec.north_m - within[:, 1]) / 0.25).astype(int)
     col = np.floor((within[:, 0] - spec.west_m) / 0.25).astype(int)
     inside = (row >= 0) & (row < CELLS) & (col >= 0) & (col < CELLS)
