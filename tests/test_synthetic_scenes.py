@@ -204,8 +204,10 @@ def test_the_demo_is_the_block_of_the_paper() -> None:
         assert np.linalg.norm(ground[1] - ground[0]) == pytest.approx(0.21, abs=0.02)
         assert np.linalg.norm(ground[2] - ground[0]) == pytest.approx(0.21, abs=0.01)
         high = exposure.camera.ground_from_image(xy, middle[0, 2] + 100.0)[0] - ground[0]
-        expected = 100.0 * np.hypot(*np.tan(np.deg2rad([exposure.view.along_deg, exposure.view.across_deg])))
-        assert np.hypot(*high[:2]) == pytest.approx(expected, abs=0.5)
+        heading = np.deg2rad(exposure.view.heading_deg)
+        forward, right = np.array([(np.sin(heading), np.cos(heading)), (np.cos(heading), -np.sin(heading))])
+        ahead, aside = np.tan(np.deg2rad([exposure.view.along_deg, exposure.view.across_deg]))
+        np.testing.assert_allclose(high[:2], -100.0 * (ahead * forward + aside * right), atol=0.5)
 
 
 def test_pointing_errors_are_drawn_within_their_range() -> None:

@@ -14,7 +14,6 @@ from zlocus.sensors.rpc import GEOGRAPHIC, RpcCoefficients, RpcModel, rpc_terms
 
 GRID_POINTS = 11
 GRID_HEIGHTS = 5
-REWEIGHTINGS = 3
 RIDGE = 1e-9
 
 
@@ -31,11 +30,12 @@ class RpcFit:
 
 
 def fit_rpc(sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tuple[float, float]) -> RpcFit:
-    """The RPC that stands for `sensor` over an image of `shape` (rows, columns) and a range of ellipsoidal heights (m).
+    """The RPC that stands for `sensor` over an image of `shape` (rows, columns) and a range of heights in m.
 
-    Each axis is solved alone, linear in its 39 coefficients, reweighted by its own denominator; the ridge keeps the
-    terms that the points cannot tell apart near zero. Source: Tao & Hu (2001), "A comprehensive study of the rational
-    function model for photogrammetric processing", eqs. (6) to (13).
+    Each axis is solved alone, linear in its 39 coefficients. The denominators of near-parallel and airborne rays stay
+    near 1, so weighting by them changes nothing and is left out. The ridge keeps the terms that the points cannot tell
+    apart near zero. Source: Tao & Hu (2001), "A comprehensive study of the rational function model for photogrammetric
+    processing", the direct least-squares solution.
 
     Raises
     ------
@@ -85,10 +85,5 @@ def _fit_ratio(terms: FloatArray, target: FloatArray) -> tuple[tuple[float, ...]
     """Numerator and denominator (20 each, the denominator's first is 1) with numerator / denominator = target (n,)."""
     design = np.hstack([terms, -target[:, None] * terms[:, 1:]])
     ridge = RIDGE * np.sqrt(len(terms)) * np.eye(design.shape[1])
-    denominator = np.ones(len(terms))
-    solution = np.zeros(design.shape[1])
-    for _ in range(REWEIGHTINGS):
-        weighted = np.vstack([design / denominator[:, None], ridge])
-        solution = lstsq(weighted, np.append(target / denominator, np.zeros(len(ridge))), lapack_driver="gelsy")[0]
-        denominator = 1.0 + terms[:, 1:] @ solution[20:]
+    solution = lstsq(np.vstack([design, ridge]), np.append(target, np.zeros(len(ridge))), lapack_driver="gelsy")[0]
     return tuple(map(float, solution[:20])), (1.0, *map(float, solution[20:]))
