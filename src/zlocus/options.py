@@ -104,6 +104,8 @@ class PyramidOptions(Checked):
     margin_steps: int = option(
         6, "Steps added at both ends of what a coarser level found.", low=1, high=1000, unit="steps"
     )
+    dem_up_m: float = option(100.0, "Searched above a DEM given as --dem.", low=0.0, high=1e4, unit="m")
+    dem_down_m: float = option(50.0, "Searched below a DEM given as --dem.", low=0.0, high=1e4, unit="m")
     reach: int = option(2, "Coarse cells around a block whose heights it searches too.", low=0, high=64, unit="cells")
 
 
@@ -133,7 +135,10 @@ class SemiGlobalOptions(Checked):
     p2: int = option(240, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
     p2_edge: int = option(60, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
     edge_contrast: float = option(
-        2.0, "Grey difference that halves the penalty of a jump, in median differences of the scene.", low=0.01, high=1e3
+        2.0,
+        "Grey difference that halves the penalty of a jump, in median differences of the scene.",
+        low=0.01,
+        high=1e3,
     )
 
 

@@ -33,6 +33,11 @@ class ImageSource(Protocol):
         """Rows and columns."""
         ...
 
+    @property
+    def dtype(self) -> str:
+        """Data type of the file's pixels, as NumPy names it."""
+        ...
+
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """The window that starts at (row, col); it lies inside the image."""
         ...

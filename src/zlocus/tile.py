@@ -5,81 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from affine import Affine
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter, spline_filter
 
 from zlocus.kernels.refine import tile_ortho
+from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
 from zlocus.matching.ranges import ranges_nearby, whole_range
 from zlocus.matching.refine import refine, smoothed
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties
-from zlocus.matching.views import ViewPixels, TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
+from zlocus.matching.setup import MatchScene
+from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import coverage, hide
 from zlocus.options import RunConfig
-from zlocus.scene import View
 from zlocus.surface.checks import judge
 from zlocus.surface.reasons import is_empty
 from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
-
-
-@dataclass(frozen=True)
-class CellWindow:
-    """Rows and columns of the scene's lattice of cells at one level; row and column may be negative."""
-
-    row: int
-    col: int
-    rows: int
-    cols: int
-
-    def at_level(self, level: int, halo: int) -> CellWindow:
-        """The same ground at a coarser level, with a halo of that level's cells."""
-        size = 2**level
-        row, col = self.row // size - halo, self.col // size - halo
-        row1, col1 = -(-(self.row + self.rows) // size) + halo, -(-(self.col + self.cols) // size) + halo
-        return CellWindow(row, col, row1 - row, col1 - col)
-
-    def within(self, other: CellWindow) -> CellWindow:
-        """The part inside another window of the same level (may be empty)."""
-        row, col = max(self.row, other.row), max(self.col, other.col)
-        row1 = min(self.row + self.rows, other.row + other.rows)
-        col1 = min(self.col + self.cols, other.col + other.cols)
-        return CellWindow(row, col, max(row1 - row, 0), max(col1 - col, 0))
-
-    def slices_in(self, other: CellWindow) -> tuple[slice, slice]:
-        """Where this window lies in an array of another one of the same level."""
-        row, col = self.row - other.row, self.col - other.col
-        return slice(row, row + self.rows), slice(col, col + self.cols)
-
-
-@dataclass(frozen=True)
-class MatchScene:
-    """All that is settled before tiling, the same for every tile.
-
-    views : oriented, the leading (most nadir) one first; anchor : ground position of cell (0, 0)'s corner; cell_m :
-    side of a finest cell; origin_m, step_m, n_steps : lattice of heights at the finest level; levels : of the pyramid;
-    seen : cells (finest level) that two views may cover; contrast : standard deviation of each image; ties : (n, 3)
-    ground points that widen the ranges of their blocks.
-    """
-
-    views: tuple[View, ...]
-    anchor: tuple[float, float]
-    cell_m: float
-    origin_m: float
-    step_m: float
-    n_steps: int
-    levels: int
-    seen: CellWindow
-    contrast: tuple[float, ...]
-    ties: NDArray[np.float64]
-
-    def transform(self, window: CellWindow, level: int) -> Affine:
-        """Cell corners to ground of a window of a level."""
-        side = self.cell_m * 2**level
-        return Affine(side, 0.0, self.anchor[0] + window.col * side, 0.0, -side, self.anchor[1] - window.row * side)
 
 
 @dataclass(frozen=True)
@@ -93,18 +37,43 @@ class LevelResult:
     heights: SemiGlobalHeights
 
 
-def match_tile(scene: MatchScene, core: CellWindow, config: RunConfig) -> Surface:
-    """The surface of a tile's core (finest cells), computed with a halo at every level."""
-    coarsest = scene.levels - 1
+@dataclass(frozen=True)
+class TileResult:
+    """surface : of the tile's core; evaluations : NCC evaluated (cell x step x image, all levels); all_images : the
+    same if every image that covers a cell had been used."""
+
+    surface: Surface
+    evaluations: int = 0
+    all_images: int = 0
+
+
+def match_tile(
+    scene: MatchScene, core: CellWindow, config: RunConfig, method: str = "mvll-sgm", use_visibility: bool = True
+) -> TileResult:
+    """The surface of a tile's core (finest cells), computed with a halo at every level.
+
+    method : mvll-sgm, or mvll without the semi-global constraint; use_visibility : whether views count as hidden where
+    the coarser level's surface stands in their way.
+    """
+    if not (core.rows and core.cols):
+        return TileResult(Surface.nothing(core))
     pixels = _read(scene, core, config)
     if len(pixels) < 2:
-        return _nothing(core)
+        return TileResult(Surface.nothing(core))
     result: LevelResult | None = None
-    for level in range(coarsest, -1, -1):
+    evaluations = 0
+    for level in range(scene.levels - 1, -1, -1):
         window = _level_window(scene, core, level, config)
-        result = _match_level(scene, pixels, window, level, result, config)
+        result = _match_level(scene, pixels, window, level, result, config, method, use_visibility)
+        evaluations += _evaluations(result)
     assert result is not None
-    return _finish(scene, pixels, core, result, config)
+    return TileResult(_finish(scene, pixels, core, result, config), evaluations, evaluations)
+
+
+def _evaluations(result: LevelResult) -> int:
+    """Cells x steps x images that were compared."""
+    _, count = result.lattice.cell_ranges()
+    return int(((result.seen[1] >= 0).sum(axis=0) * count).sum())
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:
@@ -134,6 +103,8 @@ def _match_level(
     level: int,
     coarser: LevelResult | None,
     config: RunConfig,
+    method: str,
+    use_visibility: bool,
 ) -> LevelResult:
     """One level: ranges, visibility, costs, semi-global constraint."""
     shape = (window.rows, window.cols)
@@ -144,18 +115,22 @@ def _match_level(
     half = config.measure.large_window // 2
     views = tile_views(pixels, level, scene.transform(window, level), shape, block, (scene.origin_m, step), z, half)
     above = None if coarser is None else _finer(coarser, window, level)
-    if above is None:
+    if above is None and scene.prior is None:
         lattice = whole_range(scene.origin_m, step, n_steps, shape, block)
     else:
-        low, high = _candidates(scene, coarser, window, level)
+        low, high = _from_prior(scene, window, step) if coarser is None else _candidates(scene, coarser, window, level)
         lattice = ranges_nearby(low, high, scene.origin_m, step, shape, n_steps, config.pyramid)
     seen = coverage(views, lattice)
     ortho = None
     if above is not None:
-        hide(seen, views, minimum_filter(above, 3), block, config.measure.hidden_margin_steps)
+        if use_visibility:
+            hide(seen, views, minimum_filter(above, 3), block, config.measure.hidden_margin_steps)
         ortho = _ortho(views, smoothed(above, config.refine.jump_steps), block)
     cost = cost_volume(views, lattice, seen, config.measure)
-    heights = aggregate(cost, lattice, penalties(ortho, shape, config.semiglobal), config.semiglobal)
+    if method == "mvll":
+        heights = pick(cost.astype(np.uint16), lattice)
+    else:
+        heights = aggregate(cost, lattice, penalties(ortho, shape, config.semiglobal), config.semiglobal)
     return LevelResult(window, views, lattice, seen, heights)
 
 
@@ -199,6 +174,16 @@ def _candidates(
     return low, high
 
 
+def _from_prior(
+    scene: MatchScene, window: CellWindow, step_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Lowest and highest height index of the coarsest level, from a DEM; NaN where it has no heights."""
+    assert scene.prior is not None
+    part = scene.prior[(slice(None), *window.slices_in(scene.seen.at_level(scene.levels - 1, 0)))]
+    low, high = (part - np.float32(scene.origin_m)) / np.float32(step_m)
+    return low, high
+
+
 def _finish(
     scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, result: LevelResult, config: RunConfig
 ) -> Surface:
@@ -225,26 +210,4 @@ def _finish(
     ortho = _ortho(result.views, refined.height, block) * np.float32(scene.contrast[0])
     ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
-    return _place(core, result.window, Surface(height, quality, used, ortho))
-
-
-def _nothing(core: CellWindow) -> Surface:
-    """A tile that no two views cover."""
-    from zlocus.surface.reasons import Quality
-
-    shape = (core.rows, core.cols)
-    empty = np.full(shape, np.nan, np.float32)
-    return Surface(empty, np.full(shape, Quality.UNSEEN, np.uint16), np.zeros(shape, np.uint8), empty)
-
-
-def _place(core: CellWindow, window: CellWindow, surface: Surface) -> Surface:
-    """The core of a tile, from what was computed with halos and inside the ground seen."""
-    out = _nothing(core)
-    shared = core.within(window)
-    here, there = shared.slices_in(core), shared.slices_in(window)
-    result = {}
-    for name in ("height", "quality", "views", "ortho"):
-        array = getattr(out, name).copy()
-        array[here] = getattr(surface, name)[there]
-        result[name] = array
-    return Surface(**result)
+    return Surface(height, quality, used, ortho).part(core, result.window)

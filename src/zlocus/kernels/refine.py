@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from zlocus.kernels._jit import kernel
-from zlocus.kernels.agreement import CHUNK, squared_sum, window_moments
+from zlocus.kernels.agreement import pair_sum, window_moments
 from zlocus.kernels.volume import HIDDEN, flat_visibility, plane_grid
 
 
@@ -59,17 +59,18 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
     """Mean NCC over all pairs of the views that see the surface, at `surface` + `offsets`; windows follow the surface.
 
     surface : (r + 2 half, c + 2 half) float32 height indices, border included; offsets : (j,) float32, in steps;
-    seen : (2, i, r, c) int32, see `block_costs`; out : (j, r, c) float32, written; 0 where fewer than two views see the cell.
+    seen : (2, i, r, c) int32, see `block_costs`; out : (j, r, c) float32, written; 0 where
+    fewer than two views see the cell.
     """
     rows, cols = out.shape[1], out.shape[2]
     n_views = layout.shape[0]
     width = cols + 2 * half
     size = (rows + 2 * half) * width
-    planes = np.zeros(((n_views + 2) // 3 * 3, size), np.float32)
+    planes = np.zeros((n_views, size), np.float32)
     mean, scale = np.zeros_like(planes), np.zeros_like(planes)
     flat = np.empty((2, n_views, size), np.int32)
     pairs, agreed = np.empty(size, np.float32), np.empty(size, np.float32)
-    scratch, chunk = np.empty((2, size), np.float32), np.empty((2, CHUNK), np.float32)
+    scratch = np.empty((2, size), np.float32)
     grids, level = np.empty((3, 8)), np.empty(surface.shape, np.float32)
     at_surface = np.zeros((2, n_views, rows, cols), np.int32)
     for i in range(n_views):
@@ -91,17 +92,14 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
                 plane_grid(nodes, i, t, block, half, grids[m])
             resample_surface(pixels, layout[i], grids, level, planes[i].reshape(surface.shape))
             planes[i] -= planes[i, half * width + half]
-            window_moments(planes[i], half, width, n, floor, scratch, mean[i], scale[i])
+            window_moments(planes[i], 0, half, width, n, floor, scratch[0], mean[i], scale[i])
             for p in range(n):
                 scale[i, p] *= np.float32(flat[0, i, p] < HIDDEN)
-        squared_sum(planes, mean, scale, half, width, n, chunk, agreed)
+        pair_sum(planes, 0, mean, scale, half, width, n, scratch, agreed)
         for r in range(rows):
             for c in range(cols):
                 p = r * width + c
-                alone = np.float32(0.0)
-                for i in range(n_views):
-                    alone += np.float32(flat[0, i, p] < HIDDEN)
-                out[j, r, c] = (agreed[p] - alone) * pairs[p]
+                out[j, r, c] = agreed[p] * pairs[p]
 
 
 # as block_profile, over every block of a tile; surface : (r + 2 half, c + 2 half)
@@ -123,7 +121,7 @@ def tile_profile(pixels, layout, nodes, heights, surface, offsets, block, half, 
 # (p,) f4, (i,3) i8, (i,b,d,2,4) f8, (2,) f8, (r,c) f4, i8, i8, (r,c) f4 -> None
 @kernel
 def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
-    """Image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c) float32, written."""
+    """Image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c), written."""
     n_rows, n_cols = surface.shape
     low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
     middle, reach = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)

@@ -188,6 +188,9 @@ def winners(total, ranges, address, block, best, second, margin, vertex):
             margin[r, c] = np.uint16(65535) if other_at == where else np.uint16(other - low)
             vertex[r, c] = first[c] + where
             if 0 < where < sums.shape[0] - 1:
-                left, right = np.float32(sums[where - 1]) - np.float32(low), np.float32(sums[where + 1]) - np.float32(low)
+                left, right = (
+                    np.float32(sums[where - 1]) - np.float32(low),
+                    np.float32(sums[where + 1]) - np.float32(low),
+                )
                 if left + right > 0:
                     vertex[r, c] += np.float32(0.5) * (left - right) / (left + right)

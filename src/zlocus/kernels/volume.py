@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from zlocus.kernels._jit import kernel
-from zlocus.kernels.agreement import CHUNK, squared_sum, window_moments
+from zlocus.kernels.agreement import pair_sum, window_moments
 from zlocus.kernels.resample import resample_plane
 
 COST_SCALE = np.float32(64.0)
@@ -41,7 +41,7 @@ def plane_grid(nodes, view, t, block, half, grid):
 # (2,i,r,c) i4, i8, (2,i,p) i4, (p,) f4 -> i8
 @kernel
 def flat_visibility(seen, half, flat, pairs):
-    """`seen` of a block on the flat layout (never beyond it), and 1 / (n (n - 1)) with n the views that see the cell."""
+    """`seen` of a block on the flat layout (never beyond it); 1 / (n (n - 1)), n the views that see the cell."""
     n_views, rows, cols = seen.shape[1], seen.shape[2], seen.shape[3]
     width = cols + 2 * half
     flat[0] = HIDDEN
@@ -72,15 +72,14 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
     where chance agreement is larger.
     """
     n_views, rows, cols = seen.shape[1], seen.shape[2], seen.shape[3]
-    n_padded = (n_views + 2) // 3 * 3
     half = windows.max()
     width = cols + 2 * half
     size = (rows + 2 * half) * width
-    planes = np.zeros((n_padded, size), np.float32)
-    mean, scale = np.zeros((n_padded, size), np.float32), np.zeros((n_padded, size), np.float32)
+    planes = np.zeros((n_views, size), np.float32)
+    mean, scale = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
     flat = np.empty((2, n_views, size), np.int32)
     pairs, total, agreed = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    scratch, chunk = np.empty((2, size), np.float32), np.empty((2, CHUNK), np.float32)
+    scratch = np.empty((2, size), np.float32)
     index, fraction, grid = np.empty(width, np.uint32), np.empty((2, width), np.float32), np.empty(8)
     n = flat_visibility(seen, half, flat, pairs)
     first, count = span[0], span[1]
@@ -104,12 +103,11 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
             for i in range(n_views):
                 if not takes_part[i]:
                     continue
-                window_moments(planes[i, trim:], windows[w], width, n, floor, scratch, mean[i], scale[i])
+                window_moments(planes[i], trim, windows[w], width, n, floor, scratch[0], mean[i], scale[i])
                 for j in range(n):
                     visible = np.float32(flat[0, i, j] <= height and height <= flat[1, i, j])
                     scale[i, j] *= visible
-                    total[j] -= visible * share
-            squared_sum(planes[:, trim:], mean, scale, windows[w], width, n, chunk, agreed)
+            pair_sum(planes, trim, mean, scale, windows[w], width, n, scratch, agreed)
             for j in range(n):
                 total[j] += share * agreed[j]
         for j in range(n):

@@ -47,7 +47,9 @@ class HeightLattice:
         base = np.concatenate([[0], np.cumsum(length * heights)])[:-1]
         start = np.cumsum(by_block, axis=1) - by_block
         wide = (n_b, n_d)
-        return np.stack([np.broadcast_to(base[:, None], wide), np.broadcast_to(length[:, None], wide), start]).astype(np.int64)
+        return np.stack([np.broadcast_to(base[:, None], wide), np.broadcast_to(length[:, None], wide), start]).astype(
+            np.int64
+        )
 
     @cached_property
     def size(self) -> int:

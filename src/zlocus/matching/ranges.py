@@ -6,18 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from zlocus.kernels.agreement import CHUNK
 from zlocus.matching.lattice import HeightLattice
 from zlocus.options import PyramidOptions
 
 LANES = 16
 
-assert CHUNK % LANES == 0
 
-
-def whole_range(
-    origin_m: float, step_m: float, n_steps: int, shape: tuple[int, int], block: int
-) -> HeightLattice:
+def whole_range(origin_m: float, step_m: float, n_steps: int, shape: tuple[int, int], block: int) -> HeightLattice:
     """Every block searches indices 0 to n_steps - 1 (rounded up to whole vector lanes)."""
     n_b, n_d = -(-shape[0] // block), -(-shape[1] // block)
     count = -(-n_steps // LANES) * LANES

@@ -31,7 +31,7 @@ def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
     """Median, then means that do not reach across jumps."""
     import cv2
 
-    out = cv2.medianBlur(np.ascontiguousarray(surface), 5)
+    out = np.asarray(cv2.medianBlur(np.ascontiguousarray(surface), 5), np.float32)
     for _ in range(SMOOTH_PASSES):
         smooth = np.empty_like(out)
         smooth_surface(out, SMOOTH_RADIUS, np.float32(SMOOTH_SPREAD), np.float32(jump_steps), smooth)

@@ -29,7 +29,9 @@ class SemiGlobalHeights:
     vertex: NDArray[np.float32]
 
 
-def penalties(ortho: NDArray[np.float32] | None, shape: tuple[int, int], options: SemiGlobalOptions) -> NDArray[np.uint16]:
+def penalties(
+    ortho: NDArray[np.float32] | None, shape: tuple[int, int], options: SemiGlobalOptions
+) -> NDArray[np.uint16]:
     """P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
 
     P2 shrinks with the grey difference g of the two cells in the ortho-image, p2 / (1 + g / (edge_contrast median g)),
@@ -51,7 +53,7 @@ def penalties(ortho: NDArray[np.float32] | None, shape: tuple[int, int], options
 def aggregate(
     cost: NDArray[np.uint8], lattice: HeightLattice, p2: NDArray[np.uint16], options: SemiGlobalOptions
 ) -> SemiGlobalHeights:
-    """Sum of the path costs over 8 paths, and its minima. cost : (v,) uint8, laid out as `HeightLattice.address` says."""
+    """Sum of the path costs over 8 paths, and its minima. cost : (v,) uint8, see `HeightLattice.address`."""
     total = np.zeros(lattice.size, np.uint16)
     p1 = np.uint16(options.p1)
     for sign in (1, -1):

@@ -81,19 +81,23 @@ def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, cont
     read = view.image.read(row, col, rows, cols)
     pixels, valid = [read.pixels * np.float32(1.0 / contrast)], [read.valid]
     for _ in range(levels - 1):
-        fine, kept = pixels[-1], valid[-1]
-        fine, kept = fine[: len(fine) // 2 * 2, : fine.shape[1] // 2 * 2], kept[: len(kept) // 2 * 2, : kept.shape[1] // 2 * 2]
-        quarters = [(i, j) for i in (0, 1) for j in (0, 1)]
-        if kept.all():
-            mean = sum(fine[i::2, j::2] for i, j in quarters) * np.float32(0.25)
-            count = np.full(mean.shape, 4)
-        else:
-            count = sum(kept[i::2, j::2].astype(np.int64) for i, j in quarters)
-            total = sum(np.where(kept[i::2, j::2], fine[i::2, j::2], np.float32(0.0)) for i, j in quarters)
-            mean = (total / np.maximum(count, 1)).astype(np.float32)
-        pixels.append(np.ascontiguousarray(mean, dtype=np.float32))
-        valid.append(count >= 3)
+        coarse, kept = halved(pixels[-1], valid[-1])
+        pixels.append(coarse)
+        valid.append(kept)
     return ViewPixels(view.sensor, (row, col), tuple(pixels), tuple(valid))
+
+
+def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, NDArray[np.bool_]]:
+    """Means over 2 x 2 valid pixels; valid where three of the four are. A last odd row or column is dropped."""
+    rows, cols = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
+    blocks = pixels[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
+    if valid.all():
+        mean = (blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]) * np.float32(0.25)
+        return np.ascontiguousarray(mean, np.float32), np.ones(mean.shape, bool)
+    kept = valid[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
+    count = kept.sum(axis=(1, 3))
+    total = np.where(kept, blocks, np.float32(0.0)).sum(axis=(1, 3))
+    return (total / np.maximum(count, 1)).astype(np.float32), np.asarray(count >= 3)
 
 
 def tile_views(

@@ -44,7 +44,7 @@ def hide(seen: IntVolume, views: TileViews, surface: NDArray[np.float32], block:
 
 
 def cells_per_step(views: TileViews, i: int, block: int) -> tuple[float, float]:
-    """How many cells (columns, rows) the ground point seen by a fixed pixel moves per height step, at the tile's centre."""
+    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, at the tile's centre."""
     nodes = views.nodes[i]
     b, d = (nodes.shape[0] - 1) // 2, (nodes.shape[1] - 1) // 2
     here, right, below = nodes[b, d], nodes[b, d + 1], nodes[b + 1, d]

@@ -56,8 +56,8 @@ def projection_table(
     error = table_error(table, sensor, transform, block)
     if not error <= tolerance_px:
         raise GeometryError(
-            f"A projection table of {block} cells is {error:.3g} px from the exact sensor model (allowed {tolerance_px} px) "
-            f"between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or a narrower range of heights."
+            f"A projection table of {block} cells is {error:.3g} px from the exact model (allowed {tolerance_px} px) "
+            f"between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer heights."
         )
     return table
 
@@ -65,7 +65,7 @@ def projection_table(
 def table_error(table: ProjectionTable, sensor: SensorModel, transform: Affine, block: int) -> float:
     """Largest distance (px) of the table from the exact model at block centres, at both ends and between the nodes."""
     n_b, n_d = table.nodes.shape[0] - 1, table.nodes.shape[1] - 1
-    rows, cols = (np.arange(n_b) + 0.5) * block, (np.arange(n_d) + 0.5) * block
+    rows, cols = (np.arange(n_b) + 0.5) * float(block), (np.arange(n_d) + 0.5) * float(block)
     centre = 0.25 * (table.nodes[:-1, :-1] + table.nodes[1:, :-1] + table.nodes[:-1, 1:] + table.nodes[1:, 1:])
     worst = 0.0
     for t in (-1.0, -0.7, 0.0, 0.7, 1.0):

@@ -24,11 +24,9 @@ class Quality(IntFlag):
     FILLED = 4096  # no match: interpolated from its neighbours
 
 
-EMPTY = (
-    Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
-)
+EMPTY = Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
 
 
 def is_empty(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:
     """Whether a cell has no height, from its reasons. quality : (r, c) uint16."""
-    return ((quality & EMPTY) != 0) & ((quality & Quality.FILLED) == 0)
+    return np.asarray(((quality & EMPTY) != 0) & ((quality & Quality.FILLED) == 0))

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from zlocus.matching.cells import CellWindow
+from zlocus.surface.reasons import Quality
 
 
 @dataclass(frozen=True)
@@ -20,3 +24,34 @@ class Surface:
     quality: NDArray[np.uint16]
     views: NDArray[np.uint8]
     ortho: NDArray[np.float32]
+
+    def part(self, window: CellWindow, whole: CellWindow) -> Surface:
+        """The cells of `window`, from a surface that covers `whole`; cells beyond it are UNSEEN."""
+        out = Surface.nothing(window)
+        shared = window.within(whole)
+        to, since = shared.slices_in(window), shared.slices_in(whole)
+        for mine, theirs in zip(out.arrays, self.arrays, strict=True):
+            mine[to] = theirs[since]
+        return out
+
+    def without(self, outside: NDArray[np.bool_]) -> Surface:
+        """The surface with some cells emptied because they were not asked for. outside : (r, c) bool."""
+        quality = np.where(outside, np.uint16(Quality.OUTSIDE), self.quality)
+        height, ortho = (np.where(outside, np.float32(np.nan), v) for v in (self.height, self.ortho))
+        return Surface(height, quality, np.where(outside, np.uint8(0), self.views), ortho)
+
+    @property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """All four arrays."""
+        return self.height, self.quality, self.views, self.ortho
+
+    @classmethod
+    def nothing(cls, window: CellWindow) -> Surface:
+        """Cells that no two views cover."""
+        shape = (window.rows, window.cols)
+        return cls(
+            np.full(shape, np.nan, np.float32),
+            np.full(shape, Quality.UNSEEN, np.uint16),
+            np.zeros(shape, np.uint8),
+            np.full(shape, np.nan, np.float32),
+        )

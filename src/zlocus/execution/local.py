@@ -1,0 +1,36 @@
+"""Runs a function over tiles in threads of this process; kernels release the interpreter lock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from itertools import islice
+from typing import TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[tuple[Task, Result]]:
+    """Results as they come, at most `workers` tasks at a time and no result waiting while tasks pile up.
+
+    An exception in a task, or an interrupt, ends the run: tasks not begun are dropped.
+    """
+    remaining = iter(tasks)
+    if workers == 1:
+        for task in remaining:
+            yield task, function(task)
+        return
+    pool = ThreadPoolExecutor(workers)
+    running: dict[Future[Result], Task] = {}
+    try:
+        running.update({pool.submit(function, task): task for task in islice(remaining, workers)})
+        while running:
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                task = running.pop(future)
+                result = future.result()
+                running.update({pool.submit(function, following): following for following in islice(remaining, 1)})
+                yield task, result
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,199 @@
+"""What is settled for the whole scene before any tile: grid, heights, levels, the leading view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from zlocus.errors import ConfigError, GeometryError
+from zlocus.matching.cells import CellWindow
+from zlocus.options import PyramidOptions
+from zlocus.scene import Scene, View, footprint, ground_sample_distance
+
+SAMPLE_ROWS = 64
+FINEST_CELL = 0.1
+ON_GRID = 1e-6
+FEWEST_LEVELS = 3
+
+
+@dataclass(frozen=True)
+class MatchScene:
+    """All that is settled before tiling, the same for every tile.
+
+    views : oriented, the leading one (most nadir, or asked for) first; anchor : ground position of cell (0, 0)'s
+    corner; cell_m : side of a finest cell; origin_m, step_m, n_steps : lattice of heights at the finest level; levels :
+    of the pyramid; seen : finest cells that two views may cover; contrast : standard deviation of each image; ties :
+    (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m, lowest and highest height
+    to search on the cells of `seen` at the coarsest level (from a DEM), or None.
+    """
+
+    views: tuple[View, ...]
+    anchor: tuple[float, float]
+    cell_m: float
+    origin_m: float
+    step_m: float
+    n_steps: int
+    levels: int
+    seen: CellWindow
+    contrast: tuple[float, ...]
+    ties: NDArray[np.float64] = field(repr=False)
+    prior: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    def transform(self, window: CellWindow, level: int) -> Affine:
+        """Cell corners to ground of a window of a level."""
+        side = self.cell_m * 2**level
+        return Affine(side, 0.0, self.anchor[0] + window.col * side, 0.0, -side, self.anchor[1] - window.row * side)
+
+
+def nadir_offset(view: View, z: float) -> NDArray[np.float64]:
+    """(dE, dN) that the ground point seen by the image's centre pixel moves per metre of height."""
+    rows, cols = view.image.shape
+    xy = np.array([[(cols - 1) / 2, (rows - 1) / 2]] * 2)
+    low, high = view.sensor.ground_from_image(xy, np.array([z - 5.0, z + 5.0]))
+    return np.asarray((high - low)[:2] / 10.0)
+
+
+def leading_first(scene: Scene, z: float, reference: str | None) -> tuple[View, ...]:
+    """The views, the one asked for or the most nadir first, the others by growing angle.
+
+    Raises
+    ------
+    ConfigError
+        `reference` is not the name of a view.
+    """
+    names = [view.name for view in scene.views]
+    if reference is not None and reference not in names:
+        raise ConfigError(f"--reference {reference} is not a view of this scene. Choose one of {', '.join(names)}.")
+    slant = [float(np.hypot(*nadir_offset(view, z))) for view in scene.views]
+    order = sorted(range(len(names)), key=lambda i: (names[i] != reference, slant[i], names[i]))
+    return tuple(scene.views[i] for i in order)
+
+
+def median_ground_pixel(scene: Scene, z: float) -> float:
+    """Median over the views of the ground pixel, m."""
+    return float(np.median([ground_sample_distance(view, z) for view in scene.views]))
+
+
+def check_resolution(resolution: float, scene: Scene, z: float) -> None:
+    """Refuse cells much finer than the images."""
+    pixel = min(ground_sample_distance(view, z) for view in scene.views)
+    if resolution < FINEST_CELL * pixel:
+        raise ConfigError(
+            f"--resolution {resolution:g} m is finer than a tenth of the finest image's pixel ({pixel:.3g} m on the "
+            f"ground). Ask for {pixel:.2g} m or a few times that."
+        )
+
+
+def shared_ground(scene: Scene, z_range: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Bounds (xmin, ymin, xmax, ymax) of the ground that two views may see between two heights.
+
+    Raises
+    ------
+    GeometryError
+        When no two footprints overlap.
+    """
+    from shapely import MultiPoint
+
+    hulls = []
+    for view in scene.views:
+        points = np.concatenate([footprint(view, z) for z in z_range])
+        hulls.append(MultiPoint(points).convex_hull)
+    shared = [a.intersection(b) for a, b in combinations(hulls, 2)]
+    bounds = np.array([part.bounds for part in shared if part.area > 0])
+    if not len(bounds):
+        raise GeometryError(
+            f"No two images see the same ground at heights of {z_range[0]:.0f} to {z_range[1]:.0f} m. Check the RPCs, "
+            "or give other heights with --heights."
+        )
+    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: float) -> float:
+    """Step (m) that shifts the most sensitive image by `max_shift_px` against the leading one.
+
+    Equivalent disparity (method section 1): |v_i - v_0| dz / g, with g the larger of the image's ground pixel and the
+    cell, since nothing finer is compared.
+
+    Raises
+    ------
+    GeometryError
+        When all views look along the same line, so that heights cannot be seen.
+    """
+    lead = nadir_offset(views[0], z)
+    rates = []
+    for view in views[1:]:
+        pixel = max(ground_sample_distance(view, z), cell_m)
+        rates.append(float(np.hypot(*(nadir_offset(view, z) - lead))) / pixel)
+    if not max(rates) > 1e-4:
+        raise GeometryError(
+            f"All images look along the same line (base-to-height below {max(rates) * cell_m:.1e}), so they show no "
+            "heights. Add an image from another direction."
+        )
+    return max_shift_px / max(rates)
+
+
+def levels_for(n_steps: int, options: PyramidOptions) -> int:
+    """Levels of the pyramid: until the whole range is short at the coarsest, and never fewer than the visibility and
+    the penalties need."""
+    levels = 1
+    while levels < options.max_levels and (
+        levels < FEWEST_LEVELS or n_steps / 2 ** (levels - 1) > options.coarsest_steps
+    ):
+        levels += 1
+    return levels
+
+
+def image_contrast(view: View) -> float:
+    """Standard deviation of an image, from rows spread over it: the same whatever part is matched."""
+    rows, cols = view.image.shape
+    values = []
+    for row in np.unique(np.linspace(0, rows - 1, SAMPLE_ROWS).astype(int)):
+        read = view.image.read(int(row), 0, 1, cols)
+        values.append(read.pixels[read.valid])
+    deviation = float(np.concatenate(values).std())
+    return deviation if deviation > 0 else 1.0
+
+
+def seen_window(
+    bounds: tuple[float, float, float, float], anchor: tuple[float, float], cell_m: float, levels: int
+) -> CellWindow:
+    """Finest cells that cover bounds, whole coarsest cells."""
+    unit = 2 ** (levels - 1)
+    side = cell_m * unit
+    col0, col1 = np.floor((bounds[0] - anchor[0]) / side), np.ceil((bounds[2] - anchor[0]) / side)
+    row0, row1 = np.floor((anchor[1] - bounds[3]) / side), np.ceil((anchor[1] - bounds[1]) / side)
+    return CellWindow(int(row0) * unit, int(col0) * unit, int(row1 - row0) * unit, int(col1 - col0) * unit)
+
+
+def settle(
+    scene: Scene,
+    cell_m: float,
+    anchor: tuple[float, float],
+    z_range: tuple[float, float],
+    ties: NDArray[np.float64],
+    reference: str | None,
+    options: PyramidOptions,
+) -> MatchScene:
+    """Lattice of heights, levels and extent of a scene. z_range : m; ties : (n, 3) m; see `MatchScene`."""
+    z = (z_range[0] + z_range[1]) / 2
+    views = leading_first(scene, z, reference)
+    step = height_step(views, z, cell_m, options.max_shift_px)
+    n_steps = max(int(np.ceil((z_range[1] - z_range[0]) / step)), 4)
+    levels = levels_for(n_steps, options)
+    return MatchScene(
+        views=views,
+        anchor=anchor,
+        cell_m=cell_m,
+        origin_m=z_range[0],
+        step_m=step,
+        n_steps=n_steps,
+        levels=levels,
+        seen=seen_window(shared_ground(scene, z_range), anchor, cell_m, levels),
+        contrast=tuple(image_contrast(view) for view in views),
+        ties=ties,
+    )

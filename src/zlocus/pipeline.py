@@ -1,0 +1,350 @@
+"""The order of a run: scene, orientation, heights, grid, tiles, products. The only file that knows it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from zlocus.errors import ConfigError, CoverageError, GeometryError, OutputError
+from zlocus.evaluation.evaluate import Evaluation
+from zlocus.evaluation.evaluate import evaluate as compare
+from zlocus.execution.local import run_all
+from zlocus.execution.plan import Tile, plan_tiles, tile_memory_bytes
+from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
+from zlocus.io.config import config_as_dict
+from zlocus.io.crs import checked_crs
+from zlocus.io.reference import cells_inside, read_dem, read_geobox, read_polygons
+from zlocus.io.scene_file import open_scene
+from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
+from zlocus.options import RunConfig
+from zlocus.orientation.orient import Orientation, height_range, orient
+from zlocus.products.rasters import SurfaceRasters
+from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.progress import Progress
+from zlocus.request import DsmRequest
+from zlocus.scene import Scene, check_overlap
+from zlocus.surface.reasons import Quality
+from zlocus.surface.surface import Surface
+from zlocus.tile import TileResult, match_tile
+
+HEIGHT_SAMPLES = 5
+SUFFICIENT_COVERAGE = 0.5
+UNBOUNDED_M = (-500.0, 9000.0)
+
+
+@dataclass(frozen=True)
+class DsmResult:
+    """out : folder of the products; coverage : share of the cells seen by two images or more that have a height."""
+
+    out: Path
+    coverage: float
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """out : folder of the products; evaluation : against the rendered truth."""
+
+    out: Path
+    evaluation: Evaluation
+
+
+@dataclass
+class Tally:
+    """Counts over all tiles, cells inside the area asked for."""
+
+    n_seen: int = 0
+    n_matched: int = 0
+    evaluations: int = 0
+    all_images: int = 0
+
+    def add(self, surface: Surface, result: TileResult) -> None:
+        """Count a tile."""
+        outside = np.uint16(Quality.OUTSIDE | Quality.UNSEEN)
+        self.n_seen += int(((surface.quality & outside) == 0).sum())
+        self.n_matched += int(np.isfinite(surface.height).sum())
+        self.evaluations += result.evaluations
+        self.all_images += result.all_images
+
+    @property
+    def coverage(self) -> float:
+        """Share of the cells seen by two images or more that have a height."""
+        return self.n_matched / self.n_seen if self.n_seen else 0.0
+
+
+def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
+    """Make a surface and write all products to `request.out`.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError, OutputError
+        Before the first tile, for what cannot be used.
+    CoverageError
+        At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
+    """
+    watch = Stopwatch()
+    with watch.stage("open"), progress.stage("Opening images"):
+        like = None if request.like is None else read_geobox(request.like)
+        scene = open_scene(request.inputs, _asked_crs(request, like))
+        check_overlap(scene, _possible_heights(scene, request))
+        polygons = _area_polygons(request, scene.crs)
+    with watch.stage("orient"):
+        heights = request.heights or scene.heights
+        orientation = _oriented(scene, config, heights, progress)
+        progress.note(_what_was_applied(orientation))
+    with watch.stage("settle"):
+        oriented = orientation.apply(scene)
+        z_range = heights or _searched_heights(request, oriented, orientation, config)
+        grid = _grid(request, like, oriented, z_range)
+        settled = settle(
+            oriented, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid
+        )
+        settled = _with_dem(request, settled, scene.crs, config)
+        tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
+        workers = _workers(request, settled, config)
+        _check_area(grid, settled)
+    tally = Tally()
+    out = _created(request.out)
+    with watch.stage("match"), SurfaceRasters(out, grid.geobox, settled.views[0].image.dtype) as rasters:
+        _match(request, config, settled, grid, tiles, workers, polygons, rasters, tally, progress)
+    with watch.stage("record"):
+        record = inputs_record(_files(request, scene))
+    write_record(
+        out / "run.json",
+        {
+            "config": {"request": _request_record(request), "options": config_as_dict(config)},
+            "versions": versions_record(),
+            "inputs": record,
+            "stages": watch.stages,
+            "orientation": orientation.as_dict(),
+            "grid": {
+                "crs": scene.crs.to_string(), "transform": list(grid.geobox.transform)[:6],
+                "shape": list(grid.geobox.shape),
+            },
+            "heights": {
+                "range_m": [round(v, 3) for v in z_range], "step_m": settled.step_m, "levels": settled.levels,
+                "leading_view": settled.views[0].name,
+            },
+            "evaluations": {"done": tally.evaluations, "all_images": tally.all_images},
+            "coverage": round(tally.coverage, 6),
+        },
+    )  # fmt: skip
+    if tally.coverage < SUFFICIENT_COVERAGE and not request.partial:
+        raise CoverageError(
+            f"Only {100 * tally.coverage:.1f} % of the cells seen by two images or more have a height in "
+            f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "
+            "with --partial."
+        )
+    return DsmResult(out, tally.coverage)
+
+
+def run_demo(out: Path, progress: Progress) -> DemoResult:
+    """Render the built-in scene (six views in two strips), match it, and compare the surface with its truth."""
+    from zlocus.synthetic.files import render_scene
+    from zlocus.synthetic.scenes import demo_spec
+
+    spec = demo_spec()
+    folder = _created(out) / "scene"
+    if folder.exists():
+        shutil.rmtree(folder)
+    with progress.stage("Rendering the scene", len(spec.views)) as stage:
+        rendered = render_scene(spec, folder, lambda step: stage.advance())
+    request = DsmRequest(
+        inputs=tuple(rendered.images.values()), out=out, crs=f"EPSG:{spec.epsg}", resolution=spec.gsd_m, overwrite=True
+    )
+    result = run_dsm(request, RunConfig(), progress)
+    evaluation = compare(result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, align=True)
+    return DemoResult(result.out, evaluation)
+
+
+def _match(
+    request: DsmRequest,
+    config: RunConfig,
+    settled: MatchScene,
+    grid: Grid,
+    tiles: list[Tile],
+    workers: int,
+    polygons: tuple[NDArray[Any] | None, NDArray[Any] | None],
+    rasters: SurfaceRasters,
+    tally: Tally,
+    progress: Progress,
+) -> None:
+    """Match every tile and write what was asked for of it."""
+
+    def work(tile: Tile) -> TileResult:
+        return match_tile(settled, tile.core, config, request.method, request.views == "auto")
+
+    with progress.stage("Matching", len(tiles)) as stage:
+        for tile, result in run_all(work, tiles, workers):
+            row, col = tile.kept.row - grid.window.row, tile.kept.col - grid.window.col
+            geobox = grid.geobox[row : row + tile.kept.rows, col : col + tile.kept.cols]
+            surface = _inside(result.surface.part(tile.kept, tile.core), geobox, polygons)
+            tally.add(surface, result)
+            rasters.write(row, col, surface)
+            stage.advance()
+
+
+def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | None, NDArray[Any] | None]) -> Surface:
+    """The surface with cells outside the area, or inside the mask, emptied."""
+    area, mask = polygons
+    outside = np.zeros(surface.height.shape, bool)
+    if area is not None:
+        outside |= ~cells_inside(area, geobox)
+    if mask is not None:
+        outside |= cells_inside(mask, geobox)
+    return surface.without(outside) if outside.any() else surface
+
+
+def _asked_crs(request: DsmRequest, like: GeoBox | None) -> CRS | None:
+    if like is not None:
+        return CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
+    if request.crs is None:
+        return None
+    try:
+        return checked_crs(CRS.from_user_input(request.crs))
+    except CRSError as error:
+        raise ConfigError(
+            f"--crs {request.crs} is not a known CRS. Give a projected one, such as EPSG:32632."
+        ) from error
+
+
+def _oriented(scene: Scene, config: RunConfig, heights: tuple[float, float] | None, progress: Progress) -> Orientation:
+    """Tie points and corrections, with progress."""
+    with progress.stage("Tie points", 1.0) as stage:
+        done = 0.0
+
+        def report(_: str, share: float) -> None:
+            nonlocal done
+            stage.advance(share - done)
+            done = share
+
+        return orient(scene, config.orientation, heights, report)
+
+
+def _possible_heights(scene: Scene, request: DsmRequest) -> list[float]:
+    """Heights at which the scene may have ground, for a first look at overlaps."""
+    given = request.heights or scene.heights
+    if given is not None:
+        return [float(z) for z in np.linspace(*given, HEIGHT_SAMPLES)]
+    bounds = [b for view in scene.views if (b := view.sensor.height_bounds()) is not None]
+    low = max((b[0] for b in bounds), default=UNBOUNDED_M[0])
+    high = min((b[1] for b in bounds), default=UNBOUNDED_M[1])
+    return [float(z) for z in np.linspace(low, max(high, low), HEIGHT_SAMPLES)]
+
+
+def _searched_heights(
+    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig
+) -> tuple[float, float]:
+    """Height range of the search: from the DEM, else from the ties."""
+    if request.dem is None:
+        return height_range(orientation, config.orientation)
+    z = _possible_heights(scene, request)
+    bounds = shared_ground(scene, (z[0], z[-1]))
+    cell = median_ground_pixel(scene, sum(z) / len(z)) * 16
+    heights = read_dem(request.dem, grid_from_bounds(bounds, cell, scene.crs).geobox)
+    if not np.isfinite(heights).any():
+        raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
+    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
+    return low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
+
+
+def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
+    """Limits from the DEM for the coarsest level."""
+    if request.dem is None:
+        return settled
+    level = settled.levels - 1
+    window = settled.seen.at_level(level, 0)
+    dem = read_dem(request.dem, GeoBox((window.rows, window.cols), settled.transform(window, level), crs))
+    limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
+    return replace(settled, prior=limits)
+
+
+def _grid(request: DsmRequest, like: GeoBox | None, scene: Scene, z_range: tuple[float, float]) -> Grid:
+    """The grid asked for: another raster's, or the area at a resolution, both with defaults."""
+    z = (z_range[0] + z_range[1]) / 2
+    if like is not None:
+        grid = grid_from_geobox(like, str(request.like))
+        check_resolution(grid.cell_m, scene, z)
+        return grid
+    cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
+    check_resolution(cell, scene, z)
+    bounds = request.bounds or scene.bounds or shared_ground(scene, z_range)
+    return grid_from_bounds(bounds, cell, scene.crs)
+
+
+def _check_area(grid: Grid, settled: MatchScene) -> None:
+    """Refuse an area that no two images see."""
+    shared = grid.window.within(settled.seen)
+    if shared.rows and shared.cols:
+        return
+    west, north = settled.transform(settled.seen, 0) * (0, 0)
+    east, south = settled.transform(settled.seen, 0) * (settled.seen.cols, settled.seen.rows)
+    asked = grid.geobox.extent.boundingbox
+    raise GeometryError(
+        f"The area asked for (E {asked.left:.0f} to {asked.right:.0f} m, N {asked.bottom:.0f} to {asked.top:.0f} m) "
+        f"lies outside the ground that two images see (E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m). "
+        "Check --bounds, --like and the CRS."
+    )
+
+
+def _area_polygons(request: DsmRequest, crs: CRS) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+    """Polygons of --area and --mask."""
+    area = None if request.area is None else read_polygons(request.area, crs)
+    mask = None if request.mask is None else read_polygons(request.mask, crs)
+    return area, mask
+
+
+def _workers(request: DsmRequest, settled: MatchScene, config: RunConfig) -> int:
+    """Tiles at a time: as asked, as memory allows."""
+    if request.memory_gb is None:
+        return request.workers
+    need = tile_memory_bytes(settled, config.pyramid)
+    fit = int(request.memory_gb * 1e9 / need)
+    if fit < 1:
+        raise ConfigError(
+            f"--memory {request.memory_gb:g} GB is too little for one tile, which needs about {need / 1e9:.1f} GB. "
+            "Allow more, or set a smaller pyramid.tile in --config."
+        )
+    return min(request.workers, fit)
+
+
+def _what_was_applied(orientation: Orientation) -> str:
+    """The corrections, in a sentence."""
+    moved = [
+        f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in orientation.views if v.shift_px != (0.0, 0.0)
+    ]
+    if not moved:
+        return "Pointing: no correction applied."
+    return f"Pointing corrected from {len(orientation.xyz)} tie points, px (column, row): {', '.join(moved)}."
+
+
+def _created(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be made: {error.strerror}. Choose another folder with -o.") from error
+    return folder
+
+
+def _files(request: DsmRequest, scene: Scene) -> list[Path]:
+    """Every file whose content the result depends on."""
+    extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
+    listed = list(request.inputs) + [view.path for view in scene.views] + extra
+    return list(dict.fromkeys(listed))
+
+
+def _request_record(request: DsmRequest) -> dict[str, Any]:
+    """The request as JSON can hold it."""
+    record: dict[str, Callable[..., Any] | Any] = {}
+    for name, value in vars(request).items():
+        record[name] = str(value) if isinstance(value, Path) else value
+    record["inputs"] = [str(path) for path in request.inputs]
+    return record

@@ -1,0 +1,58 @@
+"""The rasters of a run, written tile by tile."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import DTypeLike
+from odc.geo.geobox import GeoBox
+
+from zlocus.io.raster import RasterSink
+from zlocus.surface.surface import Surface
+
+
+class SurfaceRasters:
+    """dsm.tif, quality.tif, views.tif and ortho.tif of one grid, complete when the context ends, else not there."""
+
+    def __init__(self, folder: Path, geobox: GeoBox, ortho_dtype: DTypeLike) -> None:
+        self._stack = ExitStack()
+        self._ortho_dtype = np.dtype(ortho_dtype)
+
+        def sink(name: str, dtype: DTypeLike, description: str, **options: object) -> RasterSink:
+            raster = RasterSink(folder / name, geobox, dtype, descriptions=(description,), **options)  # type: ignore[arg-type]
+            return self._stack.enter_context(raster)
+
+        with ExitStack() as undo:
+            undo.push(self._stack)
+            self._dsm = sink("dsm.tif", "float32", "height above the ellipsoid", nodata=float("nan"), units="m")
+            self._quality = sink("quality.tif", "uint16", "quality bit flags")
+            self._views = sink("views.tif", "uint8", "images used", nodata=0)
+            self._ortho = sink("ortho.tif", self._ortho_dtype, "grey value", has_mask=True)
+            undo.pop_all()
+
+    def write(self, row: int, col: int, surface: Surface) -> None:
+        """Put a block of cells with its first cell at (row, col) of the grid."""
+        self._dsm.write(row, col, surface.height)
+        self._quality.write(row, col, surface.quality)
+        self._views.write(row, col, surface.views)
+        valid = np.isfinite(surface.ortho)
+        self._ortho.write(row, col, as_source(np.where(valid, surface.ortho, 0), self._ortho_dtype), valid)
+
+    def __enter__(self) -> SurfaceRasters:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+
+def as_source(values: np.ndarray[tuple[int, ...], np.dtype[np.float32]], dtype: np.dtype[np.generic]) -> np.ndarray:  # type: ignore[type-arg]
+    """Grey values in the data type of the images, rounded and kept in range."""
+    if dtype.kind == "f":
+        return values.astype(dtype)
+    info = np.iinfo(dtype.name)
+    return np.clip(np.rint(values), info.min, info.max).astype(dtype)

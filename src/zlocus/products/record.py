@@ -1,0 +1,79 @@
+"""run.json: what was asked, with which inputs and versions, what was done and how long it took."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from zlocus.errors import OutputError
+
+SCHEMA = 1
+CHUNK_BYTES = 1 << 20
+LIBRARIES = ("zlocus", "numpy", "numba", "scipy", "rasterio", "pyproj", "odc-geo", "opencv-python-headless")
+
+
+@dataclass
+class Stopwatch:
+    """Wall time, CPU time and peak memory of each stage of a run."""
+
+    stages: list[dict[str, Any]] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a block."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.stages.append(
+            {
+                "name": name,
+                "wall_s": round(time.perf_counter() - wall, 3),
+                "cpu_s": round(time.process_time() - cpu, 3),
+                "peak_mb": round(peak_memory_mb(), 1),
+            }
+        )
+
+
+def peak_memory_mb() -> float:
+    """Most memory this process has held so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def inputs_record(paths: Iterable[Path]) -> list[dict[str, str]]:
+    """Path and SHA-256 of every input file."""
+    records = []
+    for path in paths:
+        digest = hashlib.sha256()
+        with path.open("rb") as file:
+            while chunk := file.read(CHUNK_BYTES):
+                digest.update(chunk)
+        records.append({"path": str(path), "sha256": digest.hexdigest()})
+    return records
+
+
+def versions_record() -> dict[str, str]:
+    """Versions of Python and of the libraries a height may depend on."""
+    return {"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}}
+
+
+def write_record(path: Path, record: dict[str, Any]) -> None:
+    """Write JSON whole or not at all."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(json.dumps({"schema": SCHEMA, **record}, indent=2) + "\n", encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(
+            f"{path} cannot be written: {error.strerror}. Check the folder and the space left."
+        ) from error
