@@ -15,6 +15,9 @@ import numpy as np
 from zlocus.kernels._jit import kernel
 
 TINY = np.float32(1e-9)
+# A window is even when its variance is this share of its mean square: below it, float32 sums leave nothing but rounding
+# (up to 8e-7 of it for exactly equal values).
+EVEN = np.float32(2e-6)
 
 
 # (p,) f4, (p,) f4, i8, i8, (p,) f4, (p,) f4 -> None
@@ -83,7 +86,7 @@ def window_moments(plane, start, half, width, n, floor, scratch, mean, scale):
 
     plane : (p,) float32, centred near zero so that float32 sums are exact enough; start : place of the first window's
     first cell (not 0 where a larger window set the border); floor : variance added, grey values squared; scale =
-    1 / sqrt(sum (x - mean)^2 + m floor) with m = (2 half + 1)^2.
+    1 / sqrt(sum (x - mean)^2 + m floor) with m = (2 half + 1)^2, and 0 where the window is even: it agrees with nothing.
     """
     m = np.float32((2 * half + 1) ** 2)
     inverse = np.float32(1.0) / m
@@ -94,9 +97,11 @@ def window_moments(plane, start, half, width, n, floor, scratch, mean, scale):
     column_sums(scratch, half, width, n, scale)
     for j in range(n):
         value = mean[j] * inverse
-        square = max(scale[j] - mean[j] * value, np.float32(0.0))
+        square = scale[j] - mean[j] * value
+        is_even = square <= EVEN * scale[j]
         mean[j] = value
-        scale[j] = np.float32(1.0) / np.sqrt(square + m * floor + TINY)
+        norm = np.float32(1.0) / np.sqrt(max(square, np.float32(0.0)) + m * floor + TINY)
+        scale[j] = np.float32(0.0) if is_even else norm
 
 
 # (i,p) f4, i8, (i,p) f4, (i,p) f4, i8, i8, i8, (2,p) f4, (p,) f4 -> None
