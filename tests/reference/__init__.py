@@ -1,0 +1,1 @@
+"""Slow twins: each kernel again, written as its definition reads, in float64 and without tricks."""
