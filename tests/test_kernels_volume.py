@@ -89,7 +89,7 @@ def test_grid_of_a_block_is_its_projection():
     plane_grid(scene.nodes[:, 1:3, 2:4], 1, 0.4, scene.block, half, grid)
     for r, c in ((0, 0), (0, 20), (21, 0), (17, 9)):
         xy = grid[:2] + c * grid[2:4] + r * grid[4:6] + r * c * grid[6:]
-        exact = position(scene.nodes[1, 1:3, 2:4], 0.4, r - half, c - half, scene.block)
+        exact = position(scene.nodes[1, 1:3, 2:4], np.float64(0.4), r - half, c - half, scene.block)
         np.testing.assert_allclose(xy, exact, rtol=0, atol=1e-9)
 
 

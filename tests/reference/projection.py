@@ -7,25 +7,22 @@ from scipy.ndimage import map_coordinates
 
 
 def position(node, t, row, col, block):
-    """(x, y) px of a cell (row, col) of a block at height t. node : (2, 2, 2, 4) corner row, corner column, axis, cubic.
+    """(x, y) px of the cell (row, col) of a block at height t: bilinear between four corners, cubic in height.
 
-    Bilinear between the four corners, cubic in height.
+    node : (2, 2, 2, 4) corner row, corner column, axis, coefficients. t, row, col : numbers, or arrays of one shape.
     """
-    powers = np.array([1.0, t, t**2, t**3])
-    a, b = row / block, col / block
-    corners = node @ powers
-    top = (1 - b) * corners[0, 0] + b * corners[0, 1]
-    low = (1 - b) * corners[1, 0] + b * corners[1, 1]
+    powers = np.stack([np.ones_like(t), t, t**2, t**3], axis=-1)
+    a, b = np.asarray(row / block)[..., None], np.asarray(col / block)[..., None]
+    corners = [[powers @ node[i, j].T for j in (0, 1)] for i in (0, 1)]
+    top = (1 - b) * corners[0][0] + b * corners[0][1]
+    low = (1 - b) * corners[1][0] + b * corners[1][1]
     return (1 - a) * top + a * low
 
 
 def positions(node, t, shape, block, border=0):
-    """(r, c, 2) px of the first `shape` cells of a block and of a border around them. t : height, a number or (r, c)."""
-    t = np.broadcast_to(t, (shape[0] + 2 * border, shape[1] + 2 * border))
-    out = np.empty((*t.shape, 2))
-    for r, c in np.ndindex(t.shape):
-        out[r, c] = position(node, t[r, c], r - border, c - border, block)
-    return out
+    """(r, c, 2) px of the first `shape` cells of a block and a border around them. t : height, a number or (r, c)."""
+    row, col = np.indices((shape[0] + 2 * border, shape[1] + 2 * border)) - float(border)
+    return position(node, np.broadcast_to(np.asarray(t, float), row.shape), row, col, block)
 
 
 def bilinear(image, xy):
@@ -36,5 +33,7 @@ def bilinear(image, xy):
 
 
 def cubic(image, xy):
-    """Values of the cubic B-spline through an image (r, c) at positions (..., 2), from plain pixels."""
-    return map_coordinates(image.astype(float), [xy[..., 1], xy[..., 0]], order=3, mode="mirror")
+    """Values of the cubic B-spline through an image (r, c) at positions (..., 2), clamped to its inner pixels."""
+    x = np.clip(xy[..., 0], 1.0, image.shape[1] - 3.01)
+    y = np.clip(xy[..., 1], 1.0, image.shape[0] - 3.01)
+    return map_coordinates(image.astype(float), [y, x], order=3, mode="mirror")

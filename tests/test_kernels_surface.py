@@ -1,0 +1,210 @@
+"""Visibility, reach, smoothing, profiles along a surface and the ortho-image against their slow twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, spline_filter
+
+from kernel_scene import HIDDEN, even_lattice, kernel_scene
+from reference import agreement, surfaces
+from reference.projection import bilinear, cubic, positions
+from zlocus.kernels.reach import block_reach, surely_inside, tile_reach
+from zlocus.kernels.refine import block_profile, resample_surface, tile_ortho, tile_profile
+from zlocus.kernels.smooth import smooth_surface
+from zlocus.kernels.visibility import lowest_visible
+from zlocus.kernels.volume import plane_grid
+
+# Float32 images with a spread of 1.4 grey values.
+GREY = 1e-4
+# Three grids stand for the cubic in height.
+NCC = 1e-3
+STEPS = 1e-4
+
+
+def rough_surface(shape, seed=0, high=25.0):
+    rng = np.random.default_rng(seed)
+    return (rng.integers(0, 2, shape) * high * rng.random(shape)).astype(np.float32)
+
+
+def visible_from(surface, by_col, by_row):
+    out = np.empty(surface.shape, np.float32)
+    lowest_visible(surface, by_col, by_row, out)
+    return out
+
+
+@pytest.mark.parametrize("direction", [(0.5, 0.0), (-0.5, 0.0), (0.0, 2.0), (0.0, -0.25), (1.0, 1.0), (-1.0, 1.0)])
+def test_lowest_visible_along_rows_columns_and_diagonals(direction):
+    surface = rough_surface((37, 53))
+    expected = surfaces.marched(surface.astype(float), *direction)
+    found = visible_from(surface, *direction)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-3)
+
+
+@pytest.mark.parametrize("direction", [(0.5, 0.2), (-0.3, 1.0), (0.7, -0.69), (-1.5, -0.1)])
+def test_lowest_visible_in_any_direction(direction):
+    """A hill 60 high. Between two rays their bounds are interpolated again at every cell, which lowers a top a little."""
+    row, col = np.indices((57, 73))
+    hill = (60 * np.exp(-((row - 28) ** 2 + (col - 36) ** 2) / 100)).astype(np.float32)
+    found, expected = visible_from(hill, *direction), surfaces.marched(hill.astype(float), *direction)
+    hidden = expected > hill
+    assert hidden.sum() > 50
+    assert np.abs(found - expected)[hidden].max() < 3.5
+
+
+def test_a_nadir_view_sees_everything():
+    assert (visible_from(rough_surface((9, 12)), 0.0, 0.0) == np.float32(-1e30)).all()
+
+
+def test_a_tower_hides_what_its_shadow_covers():
+    """20 high, view gains 2 per cell: hidden behind it 18, 16, ... down to 0 after ten cells."""
+    surface = np.zeros((5, 30), np.float32)
+    surface[:, 20] = 20.0
+    found = visible_from(surface, 0.5, 0.0)[2]
+    np.testing.assert_allclose(found[10:20], np.arange(0.0, 20.0, 2.0))
+    assert (found[:9] < 0).all()
+
+
+def reached(scene, lattice, blocked=None):
+    blocked = np.zeros(len(scene.pixels), bool) if blocked is None else blocked
+    has = np.array([blocked[o : o + r * c].any() for o, r, c in scene.layout])
+    seen = np.empty((2, scene.n_views, *scene.shape), np.int32)
+    tile_reach(
+        blocked, has, scene.layout, scene.nodes, scene.heights, lattice.ranges, scene.block, 3.0, seen[0], seen[1]
+    )
+    return seen
+
+
+@pytest.mark.parametrize(("n_views", "shape", "block"), [(3, (37, 70), 16), (2, (45, 90), 32), (2, (5, 7), 8)])
+@pytest.mark.parametrize("with_holes", [False, True])
+def test_reach(n_views, shape, block, with_holes):
+    scene, lattice = kernel_scene(n_views, shape, block), even_lattice(32, shape, block, first=3)
+    blocked = np.zeros(len(scene.pixels), bool)
+    if with_holes:
+        for offset, rows, cols in scene.layout[:2]:
+            blocked[offset : offset + rows * cols].reshape(rows, cols)[20:26, 15:33] = True
+    seen = reached(scene, lattice, blocked)
+    ends = 0
+    for b, d, rows, cols in scene.blocks():
+        for i in range(n_views):
+            node, cells = scene.nodes[i, b : b + 2, d : d + 2], (rows.stop - rows.start, cols.stop - cols.start)
+            good = np.stack([covers(scene, i, node, cells, k, blocked) for k in range(3, 35)], axis=-1)
+            for r, c in np.ndindex(cells):
+                run = surfaces.longest_run(good[r, c])
+                expected = (HIDDEN, -1) if run is None else (run[0] + 3, run[1] + 3)
+                assert tuple(seen[:, i, rows.start + r, cols.start + c]) == expected
+                ends += run is not None and run != (0, 31)
+    assert ends > 0 or shape == (5, 7)
+
+
+def covers(scene, i, node, cells, k, blocked):
+    """Whether the cells of a block fall on a usable pixel at height index k, three from the border."""
+    x, y = np.moveaxis(positions(node, scene.heights[0] + k * scene.heights[1], cells, scene.block), -1, 0)
+    offset, rows, cols = scene.layout[i]
+    inside = (x >= 3) & (x <= cols - 4) & (y >= 3) & (y <= rows - 4)
+    hole = blocked[offset : offset + rows * cols].reshape(rows, cols)
+    at = (np.clip((y + 0.5).astype(int), 0, rows - 1), np.clip((x + 0.5).astype(int), 0, cols - 1))
+    return inside & ~hole[at]
+
+
+def test_reach_of_one_block_and_its_shortcut():
+    scene = kernel_scene(2, (8, 8), 8)
+    assert surely_inside(scene.nodes, 0, -0.5, 0.5, 8, 3.0, scene.layout[0])
+    assert not surely_inside(scene.nodes, 0, -9.0, 0.5, 8, 3.0, scene.layout[0])
+    lowest, highest = np.empty((2, 2, 8, 8), np.int32)
+    block_reach(
+        np.zeros(len(scene.pixels), bool), np.zeros(2, bool), scene.layout, scene.nodes, scene.heights,
+        np.array([0, 16]), 8, 3.0, lowest, highest,
+    )  # fmt: skip
+    assert (lowest == 0).all()
+    assert (highest == 15).all()
+
+
+@pytest.mark.parametrize(("radius", "spread", "jump"), [(3, 2.0, 3.0), (1, 1.0, 50.0)])
+def test_smoothing(radius, spread, jump):
+    surface = rough_surface((23, 31), high=6.0) + 100
+    out = np.empty_like(surface)
+    smooth_surface(surface, radius, np.float32(spread), np.float32(jump), out)
+    np.testing.assert_allclose(out, surfaces.smoothed(surface.astype(float), radius, spread, jump), rtol=0, atol=STEPS)
+
+
+def test_smoothing_keeps_planes_and_jumps():
+    row, col = np.indices((20, 30))
+    surface = (0.2 * row + 0.1 * col + 10.0 * (col >= 15)).astype(np.float32)
+    out = np.empty_like(surface)
+    smooth_surface(surface, 3, np.float32(2.0), np.float32(3.0), out)
+    np.testing.assert_allclose(out[3:-3, 3:12], surface[3:-3, 3:12], rtol=0, atol=STEPS)
+    assert np.abs(out - surface)[3:-3].max() < 0.5
+
+
+def coefficients(scene):
+    """Cubic B-spline coefficients of all images, one after the other."""
+    return np.concatenate([spline_filter(i, 3, output=np.float32, mode="mirror").ravel() for i in scene.images])
+
+
+def test_cubic_values_on_a_surface():
+    """Positions quadratic in the level are given by three grids; values are those of the interpolating B-spline."""
+    scene = kernel_scene(2, (15, 16), 16)
+    grids, level = np.empty((3, 8)), np.random.default_rng(0).uniform(-1, 1, (15, 16)).astype(np.float32)
+    node = scene.nodes[1].copy()
+    node[..., 3] = 0.0
+    for m in range(3):
+        plane_grid(node[None], 0, 0.3 * (m - 1), 16, 0, grids[m])
+    out = np.empty((15, 16), np.float32)
+    resample_surface(coefficients(scene), scene.layout[1], grids, level, out)
+    expected = cubic(scene.images[1], positions(node, 0.3 * level.astype(float), (15, 16), 16))
+    np.testing.assert_allclose(out, expected, rtol=0, atol=GREY)
+
+
+@pytest.mark.parametrize(("n_views", "half"), [(2, 2), (4, 3)])
+def test_profiles(n_views, half):
+    scene = kernel_scene(n_views, (20, 26), 16)
+    shape = (20 + 2 * half, 26 + 2 * half)
+    surface = (15 + 4 * gaussian_filter(np.random.default_rng(1).normal(size=shape), 3)).astype(np.float32)
+    offsets = np.array([-1.5, 0.0, 0.7], np.float32)
+    seen = scene.all_seen()
+    seen[0, 1, 3:9], seen[1, 0, :, :5] = HIDDEN, 3
+    out = np.empty((3, *scene.shape), np.float32)
+    tile_profile(
+        coefficients(scene), scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, half, seen,
+        np.float32(0.0), out,
+    )  # fmt: skip
+    for b, d, rows, cols in scene.blocks():
+        around = surface[rows.start : rows.stop + 2 * half, cols.start : cols.stop + 2 * half].astype(float)
+        nodes = scene.nodes[:, b : b + 2, d : d + 2]
+        for j, offset in enumerate(offsets):
+            expected = agreement.profile(
+                scene.images, nodes, scene.heights, around, offset, scene.block, half, seen[:, :, rows, cols]
+            )
+            np.testing.assert_allclose(out[j, rows, cols], expected, rtol=0, atol=NCC)
+    if n_views == 2:
+        assert (out[:, 3:9] == 0).all()
+
+
+def test_profile_of_one_block():
+    scene = kernel_scene(3, (9, 11), 16)
+    surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 9, 11), np.float32)
+    block_profile(
+        coefficients(scene), scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16, 2,
+        scene.all_seen(), np.float32(0.0), out,
+    )  # fmt: skip
+    expected = agreement.profile(
+        scene.images, scene.nodes, scene.heights, surface.astype(float), 0.0, 16, 2, scene.all_seen()
+    )
+    np.testing.assert_allclose(out[0], expected, rtol=0, atol=1e-3)
+
+
+def test_ortho_image():
+    scene = kernel_scene(3)
+    surface = (15 + 6 * gaussian_filter(np.random.default_rng(1).normal(size=scene.shape), 3)).astype(np.float32)
+    out = np.empty(scene.shape, np.float32)
+    for view in range(3):
+        nodes = scene.nodes.copy()
+        nodes[..., 3] = 0.0  # three grids stand for a quadratic exactly
+        tile_ortho(scene.pixels, scene.layout, nodes, scene.heights, surface, view, scene.block, out)
+        for b, d, rows, cols in scene.blocks():
+            t = scene.heights[0] + surface[rows, cols].astype(float) * scene.heights[1]
+            xy = positions(nodes[view, b : b + 2, d : d + 2], t, t.shape, scene.block)
+            inside = (xy > 0).all(axis=-1) & (xy < np.array(scene.images[view].shape[::-1]) - 1.1).all(axis=-1)
+            expected = bilinear(scene.images[view], xy)
+            np.testing.assert_allclose(out[rows, cols][inside], expected[inside], rtol=0, atol=GREY)
