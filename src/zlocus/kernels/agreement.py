@@ -20,7 +20,7 @@ TINY = np.float32(1e-9)
 EVEN = np.float32(2e-6)
 
 
-# (p,) f4, (p,) f4, i8, i8, (p,) f4, (p,) f4 -> None
+# (p,) f4, (p,) f4, i8, i8, (p,) f4 -> None
 @kernel
 def product_rows(a, b, half, n, out):
     """Horizontal sums over 2 half + 1 products a b, at the first n places."""
@@ -86,7 +86,7 @@ def window_moments(plane, start, half, width, n, floor, scratch, mean, scale):
 
     plane : (p,) float32, centred near zero so that float32 sums are exact enough; start : place of the first window's
     first cell (not 0 where a larger window set the border); floor : variance added, grey values squared; scale =
-    1 / sqrt(sum (x - mean)^2 + m floor) with m = (2 half + 1)^2, and 0 where the window is even: it agrees with nothing.
+    1 / sqrt(sum (x - mean)^2 + m floor) with m = (2 half + 1)^2, and 0 where the window is even (it agrees with none).
     """
     m = np.float32((2 * half + 1) ** 2)
     inverse = np.float32(1.0) / m
