@@ -102,7 +102,7 @@ class PyramidOptions(Checked):
     tile: int = option(1024, "Cells along the side of a tile's core.", low=64, high=8192)
     halo: int = option(32, "Cells around a tile's core at every level, matched for its sake.", low=8, high=512)
     margin_steps: int = option(
-        6, "Steps added at both ends of what a coarser level found.", low=1, high=1000, unit="steps"
+        3, "Steps added at both ends of what a coarser level found.", low=1, high=1000, unit="steps"
     )
     dem_up_m: float = option(100.0, "Searched above a DEM given as --dem.", low=0.0, high=1e4, unit="m")
     dem_down_m: float = option(50.0, "Searched below a DEM given as --dem.", low=0.0, high=1e4, unit="m")
@@ -146,8 +146,8 @@ class SemiGlobalOptions(Checked):
 class RefineOptions(Checked):
     """The last pass: sub-step heights from windows that follow the surface (method section 6)."""
 
-    window: int = option(7, "Side of the correlation window.", choices=(3, 5, 7, 9, 11, 13), unit="cells")
-    rounds: int = option(3, "Times the surface is smoothed and measured again.", low=0, high=10)
+    window: int = option(9, "Side of the correlation window.", choices=(3, 5, 7, 9, 11, 13), unit="cells")
+    rounds: int = option(2, "Times the surface is smoothed and measured again.", low=0, high=10)
     jump_steps: float = option(
         3.0, "Height difference that smoothing does not bridge.", low=0.5, high=100.0, unit="steps"
     )

@@ -14,7 +14,7 @@ from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
 FIRST_REACH, LATER_REACH = 1.5, 0.75
-SMOOTH_RADIUS, SMOOTH_SPREAD, SMOOTH_PASSES = 3, 2.0, 3
+SPACINGS = (1, 2, 4)
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
     import cv2
 
     out = np.asarray(cv2.medianBlur(np.ascontiguousarray(surface), 5), np.float32)
-    for _ in range(SMOOTH_PASSES):
+    for spacing in SPACINGS:
         smooth = np.empty_like(out)
-        smooth_surface(out, SMOOTH_RADIUS, np.float32(SMOOTH_SPREAD), np.float32(jump_steps), smooth)
+        smooth_surface(out, spacing, np.float32(jump_steps), smooth)
         out = smooth
     return out
 
