@@ -177,11 +177,12 @@ def _candidates(
 def _from_prior(
     scene: MatchScene, window: CellWindow, step_m: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest height index of the coarsest level, from a DEM; NaN where it has no heights."""
+    """Lowest and highest height index of the coarsest level, from a DEM; the whole range where it has no heights."""
     assert scene.prior is not None
     part = scene.prior[(slice(None), *window.slices_in(scene.seen.at_level(scene.levels - 1, 0)))]
     low, high = (part - np.float32(scene.origin_m)) / np.float32(step_m)
-    return low, high
+    last = np.float32(scene.n_steps * scene.step_m / step_m)
+    return np.nan_to_num(low, nan=0.0), np.nan_to_num(high, nan=last)
 
 
 def _finish(

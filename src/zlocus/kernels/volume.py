@@ -85,8 +85,13 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
     first, count = span[0], span[1]
     share = np.float32(1.0 / windows.shape[0])
     takes_part = np.empty(n_views, np.bool_)
+    n_taking = 0
     for i in range(n_views):
         takes_part[i] = flat[1, i].max() >= first and flat[0, i].min() < first + count
+        n_taking += takes_part[i]
+    if n_taking < 2:
+        out[:] = np.uint8(COST_SCALE)
+        return
     for k in range(count):
         height = np.int32(first + k)
         for i in range(n_views):

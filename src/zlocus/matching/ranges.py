@@ -33,7 +33,7 @@ def ranges_nearby(
     """The span of the heights found in and around each block, with a margin.
 
     low, high : (r, c) float32, lowest and highest candidate of every cell, in height indices of this level; NaN where
-    there is none. A block with no candidate at all searches everything.
+    there is none. A block with no candidate at all, which no two views saw at the coarser level, searches the least.
     """
     block = options.block
     n_b, n_d = -(-shape[0] // block), -(-shape[1] // block)
@@ -43,7 +43,7 @@ def ranges_nearby(
     known = np.isfinite(lowest) & np.isfinite(highest)
     last = -(-n_steps // LANES) * LANES - 1
     first = np.where(known, np.floor(np.where(known, lowest, 0)) - options.margin_steps, 0)
-    end = np.where(known, np.ceil(np.where(known, highest, 0)) + options.margin_steps, last)
+    end = np.where(known, np.ceil(np.where(known, highest, 0)) + options.margin_steps, 0)
     first, end = np.clip(first, 0, last), np.clip(end, 0, last)
     count = np.minimum(-(-(end - first + 1) // LANES) * LANES, last + 1).astype(np.int64)
     first = np.minimum(first, last + 1 - count).astype(np.int64)
