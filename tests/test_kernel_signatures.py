@@ -1,4 +1,4 @@
-"""The signature comment above each kernel: as many arguments as the function takes, with the types it is called with."""
+"""The signature comment above each kernel: as many arguments as the function takes, of the types it is called with."""
 
 from __future__ import annotations
 
@@ -63,8 +63,10 @@ def calls():
     volume, total = np.ones(lattice.size, np.uint8), np.ones(lattice.size, u2)
     reach, surface = np.empty((2, 2, 8, 8), np.int32), np.full((8, 8), 5, f4)
     blocked, free = np.zeros(len(scene.pixels), bool), np.zeros(2, bool)
-    span, halves, four = np.array([0, 16], i8), np.array([1], i8), np.array([2, 30, 60, 90], i8)
-    row, p2 = np.zeros((4, 8), i8), np.ones((4, 8, 8), u2)
+    span, halves = np.array([0, 16], i8), np.array([1], i8)
+    p2, paths, least = np.ones((4, 8, 8), u2), np.ones(2000, u2), np.ones((4, 10), u2)
+    spots, planes = np.arange(2, 402, 50).reshape(2, 4), 2 + 160 * np.arange(12).reshape(3, 4)
+    segments = np.tile(np.array([[0, 0, 0], [-1, 16, -1], [0, 0, 8], [2, 2, 2]], i8), (2, 1, 1))
     picks = np.empty((2, 8, 8), np.int32)
     views = (scene.pixels, scene.layout, scene.nodes, scene.heights)
     return {
@@ -80,10 +82,21 @@ def calls():
         "flat_visibility": (seen, half, np.empty((2, 2, size), np.int32), plane()),
         "block_costs": (*views, span, halves, seen, 8, f4(0), volume.reshape(8, 128).copy()),
         "path_cost": tuple(u2(v) for v in (5, 6, 7, 1, 9, 5, 3)),
-        "four_paths": (volume, total.copy(), 0, 16, np.ones(300, u2), four, four + 100, np.ones(4, u2), np.ones(4, u2),
-                       u2(1)),
-        "one_path": (volume, total.copy(), 0, 16, np.ones(300, u2), 2, 16, 0, 100, u2(1), u2(9), u2(1)),
-        "row_layout": (lattice.ranges, lattice.address, 8, 0, 8, *row),
+        "run_cells": (
+            volume, total.copy(), 0, np.array([16, 1], i8), paths, spots, least, least.copy(), least, 0, u2(1),
+        ),
+        "shifted": (paths, 2, 16, 1, 100, 16),
+        "row_segments": (lattice.ranges, 0, 8, 8, 1, segments[0].copy()),
+        "row_edges": (p2, 0, -1, np.empty((4, 8), u2)),
+        "alike": (segments[0], 1, segments[1], 1),
+        "find_neighbours": (paths, planes, segments, 0, 0, 1, 0, spots.copy()),
+        "sweep_segment": (
+            volume, total.copy(), 0, paths, planes, segments, 0, 0, 1, np.ones((2, 4, 10), u2), least, u2(1),
+        ),
+        "reverse_cells": (volume, 0, 16, 8, volume.copy()),
+        "add_reversed": (total, 0, 16, 8, total.copy()),
+        "least_sum": (total[:16],),
+        "other_minimum": (total[:16], 5),
         "sweep": (volume, lattice.ranges, lattice.address, 8, p2, u2(1), 1, total.copy()),
         "winners": (total, lattice.ranges, lattice.address, 8, *picks, np.empty((8, 8), u2), surface.copy()),
         "lowest_visible": (surface, 0.5, 0.2, surface.copy()),
@@ -93,7 +106,9 @@ def calls():
             blocked, free, scene.layout, scene.nodes, scene.heights, span, 8, 3.0, reach[0].copy(), reach[1].copy(),
         ),
         "resample_surface": (scene.pixels, scene.layout[0], grids, surface * f4(0.1), surface.copy()),
-        "block_profile": (*views, np.full((10, 10), 5, f4), np.zeros(1, f4), 8, 1, seen, f4(0), np.empty((1, 8, 8), f4)),
+        "block_profile": (
+            *views, np.full((10, 10), 5, f4), np.zeros(1, f4), 8, 1, seen, f4(0), np.empty((1, 8, 8), f4),
+        ),
         "tile_ortho": (*views, surface, 0, 8, surface.copy()),
     }  # fmt: skip
 
