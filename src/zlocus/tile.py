@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter, spline_filter
 
 from zlocus.kernels.refine import tile_ortho
+from zlocus.kernels.spline import spline_coefficients
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
@@ -124,7 +125,7 @@ def _match_level(
     ortho = None
     if above is not None:
         if use_visibility:
-            hide(seen, views, minimum_filter(above, 3), block, config.measure.hidden_margin_steps)
+            hide(seen, views, cv2.erode(above, np.ones((3, 3), np.uint8)), block, config.measure.hidden_margin_steps)
         ortho = _ortho(views, smoothed(above, config.refine.jump_steps), block)
     cost = cost_volume(views, lattice, seen, config.measure)
     if method == "mvll":
@@ -134,10 +135,22 @@ def _match_level(
     return LevelResult(window, views, lattice, seen, heights)
 
 
-def _ortho(views: TileViews, surface: NDArray[np.float32], block: int) -> NDArray[np.float32]:
-    """The leading view on a surface of height indices."""
+def _ortho(views: TileViews, surface: NDArray[np.float32], block: int, view: int = 0) -> NDArray[np.float32]:
+    """One view, by default the leading one, on a surface of height indices."""
     out = np.empty(surface.shape, np.float32)
-    tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, 0, block, out)
+    tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, view, block, out)
+    return out
+
+
+def _true_ortho(
+    pixels: list[ViewPixels], result: LevelResult, surface: NDArray[np.float32], block: int
+) -> NDArray[np.float32]:
+    """Grey values of the first view that sees each cell of a surface; NaN where none does."""
+    out = np.full(surface.shape, np.nan, np.float32)
+    for i, view in enumerate(pixels):
+        shown = np.isnan(out) & (result.seen[0, i] <= surface) & (surface <= result.seen[1, i])
+        if shown.any():
+            out[shown] = _ortho(result.views, surface, block, i)[shown] * np.float32(view.contrast)
     return out
 
 
@@ -182,7 +195,7 @@ def _from_prior(
     part = scene.prior[(slice(None), *window.slices_in(scene.seen.at_level(scene.levels - 1, 0)))]
     low, high = (part - np.float32(scene.origin_m)) / np.float32(step_m)
     last = np.float32(scene.n_steps * scene.step_m / step_m)
-    return np.nan_to_num(low, nan=0.0), np.nan_to_num(high, nan=last)
+    return np.where(np.isnan(low), np.float32(0.0), low), np.where(np.isnan(high), last, high)
 
 
 def _finish(
@@ -191,9 +204,7 @@ def _finish(
     """Refine the finest level, judge it, and cut the core out."""
     block = config.pyramid.block
     coefficients = TileViews(
-        pixels=np.concatenate(
-            [spline_filter(view.pixels[0], 3, output=np.float32, mode="mirror").ravel() for view in pixels]
-        ),
+        pixels=np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels]),
         blocked=result.views.blocked,
         has_blocked=result.views.has_blocked,
         layout=result.views.layout,
@@ -208,7 +219,7 @@ def _finish(
     quality = judge(result.heights, refined, covering, seeing, last, config.checks)
     height = result.lattice.metres(refined.height)
     height[is_empty(quality)] = np.nan
-    ortho = _ortho(result.views, refined.height, block) * np.float32(scene.contrast[0])
+    ortho = _true_ortho(pixels, result, refined.height, block)
     ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
     return Surface(height, quality, used, ortho).part(core, result.window)

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import rasterio
 import shapely
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from pyogrio.errors import DataLayerError, DataSourceError
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 from rasterio.enums import Resampling
@@ -76,6 +74,10 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     InputError
         For a file that is no vector file, has several layers, no CRS, or anything but polygons.
     """
+    # pyogrio brings pandas, a third of a second that only runs with polygons need.
+    import pyogrio.raw
+    from pyogrio.errors import DataLayerError, DataSourceError
+
     path = existing_file(path, "vector file")
     try:
         layers = pyogrio.list_layers(path)[:, 0]

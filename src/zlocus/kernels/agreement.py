@@ -110,7 +110,7 @@ def pair_sum(planes, start, mean, scale, half, width, n, work, out):
     """Sum of NCC over all pairs of views, each counted twice, at the first n places.
 
     planes, mean, scale : (i, p), a view takes part where its scale is not zero; start : see `window_moments`;
-    work : (2, p), scratch; out : (p,), written. Plain formula: 2 sum_{a<b} scale_a scale_b (sum x_a x_b - m mean_a mean_b).
+    work : (2, p), scratch; out : (p,). Plain formula: 2 sum_{a<b} scale_a scale_b (sum x_a x_b - m mean_a mean_b).
     """
     m = np.float32((2 * half + 1) ** 2)
     out[:n] = 0.0

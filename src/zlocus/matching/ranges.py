@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from zlocus.matching.lattice import HeightLattice
 from zlocus.options import PyramidOptions
@@ -37,9 +37,9 @@ def ranges_nearby(
     """
     block = options.block
     n_b, n_d = -(-shape[0] // block), -(-shape[1] // block)
-    grow = 2 * options.reach * 2 + 1
-    lowest = _by_block(minimum_filter(np.where(np.isnan(low), np.inf, low), grow), block, np.minimum)
-    highest = _by_block(maximum_filter(np.where(np.isnan(high), -np.inf, high), grow), block, np.maximum)
+    grow = np.ones((4 * options.reach + 1,) * 2, np.uint8)
+    lowest = _by_block(cv2.erode(np.where(np.isnan(low), np.float32(np.inf), low), grow), block, np.minimum)
+    highest = _by_block(cv2.dilate(np.where(np.isnan(high), np.float32(-np.inf), high), grow), block, np.maximum)
     known = np.isfinite(lowest) & np.isfinite(highest)
     last = -(-n_steps // LANES) * LANES - 1
     first = np.where(known, np.floor(np.where(known, lowest, 0)) - options.margin_steps, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,8 +30,6 @@ class RefinedHeights:
 
 def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
     """Median, then means that do not reach across jumps."""
-    import cv2
-
     out = np.asarray(cv2.medianBlur(np.ascontiguousarray(surface), 5), np.float32)
     for spacing in SPACINGS:
         smooth = np.empty_like(out)

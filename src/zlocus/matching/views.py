@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
@@ -22,12 +23,13 @@ class ViewPixels:
     """A window of one view at every level.
 
     origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
-    does not depend on the window. pixels, valid : per level, (r, c) float32 and bool; level l has half the pixels of
+    does not depend on the window. contrast : grey values of the image that are 1 here. pixels, valid : per level, (r, c) float32 and bool; level l has half the pixels of
     level l - 1 each way.
     """
 
     sensor: SensorModel
     origin: tuple[int, int]
+    contrast: float
     pixels: tuple[FloatImage, ...]
     valid: tuple[NDArray[np.bool_], ...]
 
@@ -115,9 +117,6 @@ def tile_views(
     transform, shape : of the grid at this level; lattice : height of index 0 and step (m); z_range : m, heights that
     will be asked for; half : half width of the largest window, by which blocked pixels grow.
     """
-    # OpenCV's import is paid once, by the orientation; here it only grows masks.
-    import cv2
-
     layout, nodes, blocked, offset = [], [], [], 0
     scale = 2.0**level
     for view in views:

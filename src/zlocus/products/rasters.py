@@ -5,9 +5,10 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 from odc.geo.geobox import GeoBox
 
 from zlocus.io.raster import RasterSink
@@ -21,8 +22,8 @@ class SurfaceRasters:
         self._stack = ExitStack()
         self._ortho_dtype = np.dtype(ortho_dtype)
 
-        def sink(name: str, dtype: DTypeLike, description: str, **options: object) -> RasterSink:
-            raster = RasterSink(folder / name, geobox, dtype, descriptions=(description,), **options)  # type: ignore[arg-type]
+        def sink(name: str, dtype: DTypeLike, description: str, **options: Any) -> RasterSink:
+            raster = RasterSink(folder / name, geobox, dtype, descriptions=(description,), **options)
             return self._stack.enter_context(raster)
 
         with ExitStack() as undo:
@@ -50,7 +51,7 @@ class SurfaceRasters:
         self._stack.__exit__(kind, error, trace)
 
 
-def as_source(values: np.ndarray[tuple[int, ...], np.dtype[np.float32]], dtype: np.dtype[np.generic]) -> np.ndarray:  # type: ignore[type-arg]
+def as_source(values: NDArray[np.float32], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Grey values in the data type of the images, rounded and kept in range."""
     if dtype.kind == "f":
         return values.astype(dtype)

@@ -46,8 +46,8 @@ def projection_table(
         Where the sensor cannot map a corner, or the table is further than `tolerance_px` from the exact model at the
         centres of the blocks (then a smaller block is needed).
     """
-    rows = np.arange(-(-shape[0] // block) + 1) * float(block)
-    cols = np.arange(-(-shape[1] // block) + 1) * float(block)
+    rows = block * np.arange(-(-shape[0] // block) + 1, dtype=np.float64)
+    cols = block * np.arange(-(-shape[1] // block) + 1, dtype=np.float64)
     z_mid, z_half = (z_range[0] + z_range[1]) / 2, max((z_range[1] - z_range[0]) / 2, 0.5)
     t = np.cos((np.arange(DEGREE + 1) + 0.5) * np.pi / (DEGREE + 1))
     fit = np.linalg.inv(np.vander(t, increasing=True))
@@ -65,7 +65,8 @@ def projection_table(
 def table_error(table: ProjectionTable, sensor: SensorModel, transform: Affine, block: int) -> float:
     """Largest distance (px) of the table from the exact model at block centres, at both ends and between the nodes."""
     n_b, n_d = table.nodes.shape[0] - 1, table.nodes.shape[1] - 1
-    rows, cols = (np.arange(n_b) + 0.5) * float(block), (np.arange(n_d) + 0.5) * float(block)
+    rows = block * (np.arange(n_b, dtype=np.float64) + 0.5)
+    cols = block * (np.arange(n_d, dtype=np.float64) + 0.5)
     centre = 0.25 * (table.nodes[:-1, :-1] + table.nodes[1:, :-1] + table.nodes[:-1, 1:] + table.nodes[1:, 1:])
     worst = 0.0
     for t in (-1.0, -0.7, 0.0, 0.7, 1.0):

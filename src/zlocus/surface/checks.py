@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from zlocus.matching.refine import RefinedHeights
 from zlocus.matching.semiglobal import SemiGlobalHeights
@@ -12,6 +12,7 @@ from zlocus.options import CheckOptions
 from zlocus.surface.reasons import Quality
 
 JUMP_STEPS = 3.0
+AROUND = np.ones((3, 3), np.uint8)
 
 
 def judge(
@@ -39,6 +40,6 @@ def judge(
     mark(seen & (refined.ncc < options.least_ncc), Quality.NO_MATCH)
     mark(seen & (refined.ncc < options.doubtful_ncc), Quality.WEAK)
     mark(heights.margin < options.rival_cost, Quality.AMBIGUOUS)
-    mark(maximum_filter(refined.height, 3) - minimum_filter(refined.height, 3) > JUMP_STEPS, Quality.JUMP)
+    mark(cv2.dilate(refined.height, AROUND) - cv2.erode(refined.height, AROUND) > JUMP_STEPS, Quality.JUMP)
     mark(~refined.is_refined, Quality.UNREFINED)
     return quality
