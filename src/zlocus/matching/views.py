@@ -23,8 +23,8 @@ class ViewPixels:
     """A window of one view at every level.
 
     origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
-    does not depend on the window. contrast : grey values of the image that are 1 here. pixels, valid : per level, (r, c) float32 and bool; level l has half the pixels of
-    level l - 1 each way.
+    does not depend on the window. contrast : grey values of the image that are 1 here. pixels, valid : per level,
+    (r, c) float32 and bool; level l has half the pixels of level l - 1 each way.
     """
 
     sensor: SensorModel
@@ -86,7 +86,7 @@ def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, cont
         coarse, kept = halved(pixels[-1], valid[-1])
         pixels.append(coarse)
         valid.append(kept)
-    return ViewPixels(view.sensor, (row, col), tuple(pixels), tuple(valid))
+    return ViewPixels(view.sensor, (row, col), contrast, tuple(pixels), tuple(valid))
 
 
 def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, NDArray[np.bool_]]:
