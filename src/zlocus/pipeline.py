@@ -111,6 +111,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
         workers = _workers(request, settled, config)
         _check_area(grid, settled)
+        _check_polygons(request, grid, settled, polygons[0])
     tally = Tally()
     out = _created(request.out)
     with watch.stage("match"), SurfaceRasters(out, grid.geobox, settled.views[0].image.dtype) as rasters:
@@ -293,6 +294,18 @@ def _check_area(grid: Grid, settled: MatchScene) -> None:
         f"lies outside the ground that two images see (E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m). "
         "Check --bounds, --like and the CRS."
     )
+
+
+def _check_polygons(request: DsmRequest, grid: Grid, settled: MatchScene, area: NDArray[Any] | None) -> None:
+    """Refuse polygons of an area that hold no cell to be matched."""
+    if area is None:
+        return
+    shared = grid.window.within(settled.seen)
+    row, col = shared.row - grid.window.row, shared.col - grid.window.col
+    if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
+        raise GeometryError(
+            f"No cell of the ground that two images see lies inside the area of {request.area}. Check its place and CRS."
+        )
 
 
 def _area_polygons(request: DsmRequest, crs: CRS) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
