@@ -105,6 +105,12 @@ def calls():
         "block_reach": (
             blocked, free, scene.layout, scene.nodes, scene.heights, span, 8, 3.0, reach[0].copy(), reach[1].copy(),
         ),
+        "row_positions": (grids, 0, 3, 9.0, np.empty(6, f4)),
+        "spline_weights": (surface[0], np.ones(6, f4), f4(0), f4(9), np.empty(8, np.int32), np.empty((4, 8), f4)),
+        "spline_gather": (
+            scene.pixels, np.int32(0), np.int32(16), np.zeros((2, 8), np.int32), np.ones((4, 8), f4),
+            np.ones((4, 8), f4), surface[0].copy(),
+        ),
         "resample_surface": (scene.pixels, scene.layout[0], grids, surface * f4(0.1), surface.copy()),
         "block_profile": (
             *views, np.full((10, 10), 5, f4), np.zeros(1, f4), 8, 1, seen, f4(0), np.empty((1, 8, 8), f4),

@@ -35,6 +35,11 @@ def product_rows(a, b, half, n, out):
         for j in range(n):
             first = a[j] * b[j] + a[j + 1] * b[j + 1] + a[j + 2] * b[j + 2] + a[j + 3] * b[j + 3]
             out[j] = first + a[j + 4] * b[j + 4] + a[j + 5] * b[j + 5] + a[j + 6] * b[j + 6]
+    elif half == 4:
+        for j in range(n):
+            first = a[j] * b[j] + a[j + 1] * b[j + 1] + a[j + 2] * b[j + 2] + a[j + 3] * b[j + 3]
+            first += a[j + 4] * b[j + 4] + a[j + 5] * b[j + 5] + a[j + 6] * b[j + 6]
+            out[j] = first + a[j + 7] * b[j + 7] + a[j + 8] * b[j + 8]
     else:
         for j in range(n):
             out[j] = a[j] * b[j]
@@ -57,6 +62,10 @@ def row_sums(a, half, n, out):
     elif half == 3:
         for j in range(n):
             out[j] = a[j] + a[j + 1] + a[j + 2] + a[j + 3] + a[j + 4] + a[j + 5] + a[j + 6]
+    elif half == 4:
+        for j in range(n):
+            first = a[j] + a[j + 1] + a[j + 2] + a[j + 3] + a[j + 4]
+            out[j] = first + a[j + 5] + a[j + 6] + a[j + 7] + a[j + 8]
     else:
         for j in range(n):
             out[j] = a[j]

@@ -9,48 +9,92 @@ from zlocus.kernels.agreement import pair_sum, window_moments
 from zlocus.kernels.volume import HIDDEN, flat_visibility, plane_grid
 
 
+# (3,8) f8, i8, i8, f8, (6,) f4 -> None
+@kernel
+def row_positions(grids, axis, row, origin, out):
+    """x (axis 0) or y of a row of cells, px from `origin`: coefficients of 1, u, u^2 at column 0, then per column.
+
+    grids : (3, 8), positions at u = -1, 0 and 1, see `plane_grid`.
+    """
+    for part in range(2):
+        k = axis + 2 * part
+        low = grids[0, k] + row * grids[0, k + 4]
+        mid = grids[1, k] + row * grids[1, k + 4]
+        high = grids[2, k] + row * grids[2, k + 4]
+        out[3 * part] = mid - (origin if part == 0 else 0.0)
+        out[3 * part + 1] = 0.5 * (high - low)
+        out[3 * part + 2] = 0.5 * (high + low) - mid
+
+
+# (c,) f4, (6,) f4, f4, f4, (c,) i4, (4,c) f4 -> None
+@kernel
+def spline_weights(level, line, low, high, whole, weights):
+    """Whole pixel and the four cubic B-spline weights around every cell of a row, along one axis.
+
+    level : (c,) float32, u; line : (6,), see `row_positions`; low, high : bounds of the position, px from its origin.
+    """
+    one, half, sixth = np.float32(1.0), np.float32(0.5), np.float32(1.0 / 6.0)
+    two_thirds = np.float32(2.0 / 3.0)
+    for c in range(level.shape[0]):
+        u, t = level[c], np.float32(c)
+        x = (line[0] + t * line[3]) + u * ((line[1] + t * line[4]) + u * (line[2] + t * line[5]))
+        x = min(max(x, low), high)
+        pixel = np.floor(x)
+        whole[c] = np.int32(pixel)
+        f = x - pixel
+        g = one - f
+        weights[0, c] = g * g * g * sixth
+        weights[1, c] = two_thirds - f * f * (one - half * f)
+        weights[2, c] = two_thirds - g * g * (one - half * g)
+        weights[3, c] = f * f * f * sixth
+
+
+# (p,) f4, i4, i4, (2,c) i4, (4,c) f4, (4,c) f4, (c,) f4 -> None
+@kernel
+def spline_gather(image, origin, n_cols, whole, across, down, out):
+    """Weighted sums of 4 x 4 pixels for every cell of a row.
+
+    origin : index in `image` of the first of the sixteen where `whole`, (2, c) columns and rows, is zero.
+    """
+    stride, one, two, three = np.uint32(n_cols), np.uint32(1), np.uint32(2), np.uint32(3)
+    for c in range(out.shape[0]):
+        p = np.uint32(np.int32(whole[1, c] * n_cols) + whole[0, c] + origin)
+        q = np.uint32(p + stride)
+        r = np.uint32(q + stride)
+        s = np.uint32(r + stride)
+        w0, w1, w2, w3 = across[0, c], across[1, c], across[2, c], across[3, c]
+        top = (w0 * image[p] + w1 * image[p + one]) + (w2 * image[p + two] + w3 * image[p + three])
+        high = (w0 * image[q] + w1 * image[q + one]) + (w2 * image[q + two] + w3 * image[q + three])
+        low = (w0 * image[r] + w1 * image[r + one]) + (w2 * image[r + two] + w3 * image[r + three])
+        end = (w0 * image[s] + w1 * image[s + one]) + (w2 * image[s + two] + w3 * image[s + three])
+        out[c] = (down[0, c] * top + down[1, c] * high) + (down[2, c] * low + down[3, c] * end)
+
+
 # (p,) f4, (3,) i8, (3,8) f8, (r,c) f4, (r,c) f4 -> None
 @kernel
 def resample_surface(pixels, layout, grids, level, out):
     """Cubic B-spline image values on a grid of cells, each at a height of its own.
 
     pixels : (p,) float32 B-spline coefficients; grids : (3, 8) positions at levels -1, 0 and 1 (see `plane_grid`);
-    level : (r, c) float32 in [-1, 1]: positions are quadratic in it; out : (r, c).
+    level : (r, c) float32 in [-1, 1]: positions are quadratic in it; out : (r, c). Positions are float32 from a
+    whole-pixel origin near the grid; the passes of a row that find them vectorise.
     """
     base, n_rows, n_cols = layout[0], layout[1], layout[2]
     image = pixels[base : base + n_rows * n_cols]
-    stride = np.uint32(n_cols)
-    one = np.uint32(1)
-    sixth = np.float32(1.0 / 6.0)
+    width = out.shape[1]
+    x0 = min(max(int(grids[1, 0]), 1), n_cols - 4)
+    y0 = min(max(int(grids[1, 1]), 1), n_rows - 4)
+    x_low, x_high = np.float32(1 - x0), np.float32(n_cols - 3.01 - x0)
+    y_low, y_high = np.float32(1 - y0), np.float32(n_rows - 3.01 - y0)
+    origin = np.int32((y0 - 1) * n_cols + x0 - 1)
+    line, whole = np.empty(6, np.float32), np.empty((2, width), np.int32)
+    across, down = np.empty((4, width), np.float32), np.empty((4, width), np.float32)
     for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            u = np.float64(level[r, c])
-            w0, w1, w2 = 0.5 * u * (u - 1.0), 1.0 - u * u, 0.5 * u * (u + 1.0)
-            x = y = 0.0
-            for j in range(3):
-                w = w0 if j == 0 else (w1 if j == 1 else w2)
-                x += w * (grids[j, 0] + r * grids[j, 4] + c * (grids[j, 2] + r * grids[j, 6]))
-                y += w * (grids[j, 1] + r * grids[j, 5] + c * (grids[j, 3] + r * grids[j, 7]))
-            x = min(max(x, 1.0), n_cols - 3.01)
-            y = min(max(y, 1.0), n_rows - 3.01)
-            col, row = int(x), int(y)
-            fx, fy = np.float32(x - col), np.float32(y - row)
-            gx, gy = np.float32(1.0) - fx, np.float32(1.0) - fy
-            ax, dx = gx * gx * gx * sixth, fx * fx * fx * sixth
-            bx = np.float32(2.0 / 3.0) - fx * fx * (np.float32(1.0) - np.float32(0.5) * fx)
-            cx = np.float32(1.0) - ax - bx - dx
-            ay, dy = gy * gy * gy * sixth, fy * fy * fy * sixth
-            by = np.float32(2.0 / 3.0) - fy * fy * (np.float32(1.0) - np.float32(0.5) * fy)
-            cy = np.float32(1.0) - ay - by - dy
-            p = np.uint32((row - 1) * n_cols + col - 1)
-            total = np.float32(0.0)
-            for j in range(4):
-                w_row = ay if j == 0 else (by if j == 1 else (cy if j == 2 else dy))
-                q = np.uint32(p + np.uint32(j) * stride)
-                total += w_row * (
-                    ax * image[q] + bx * image[q + one] + cx * image[q + np.uint32(2)] + dx * image[q + np.uint32(3)]
-                )
-            out[r, c] = total
+        row_positions(grids, 0, r, float(x0), line)
+        spline_weights(level[r], line, x_low, x_high, whole[0], across)
+        row_positions(grids, 1, r, float(y0), line)
+        spline_weights(level[r], line, y_low, y_high, whole[1], down)
+        spline_gather(image, origin, np.int32(n_cols), whole, across, down, out[r])
 
 
 # (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (2,i,r,c) i4, f4, (j,r,c) f4 -> None
