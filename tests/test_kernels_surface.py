@@ -43,7 +43,7 @@ def test_lowest_visible_along_rows_columns_and_diagonals(direction):
 
 @pytest.mark.parametrize("direction", [(0.5, 0.2), (-0.3, 1.0), (0.7, -0.69), (-1.5, -0.1)])
 def test_lowest_visible_in_any_direction(direction):
-    """A hill 60 high. Between two rays their bounds are interpolated again at every cell, which lowers a top a little."""
+    """A hill 60 high. Between two rays their bounds are interpolated again at every cell: tops lose a little."""
     row, col = np.indices((57, 73))
     hill = (60 * np.exp(-((row - 28) ** 2 + (col - 36) ** 2) / 100)).astype(np.float32)
     found, expected = visible_from(hill, *direction), surfaces.marched(hill.astype(float), *direction)
