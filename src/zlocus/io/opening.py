@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import rasterio
+from rasterio._err import CPLE_BaseError
 from rasterio.enums import Interleaving
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
@@ -49,7 +50,7 @@ def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetRea
             with _quiet, warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
                 dataset = rasterio.open(path)
-        except (RasterioError, OSError) as error:
+        except (RasterioError, CPLE_BaseError, OSError) as error:
             raise InputError(
                 f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
                 "GeoTIFF (or another format of GDAL)."
@@ -57,7 +58,7 @@ def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetRea
         with dataset:
             try:
                 yield dataset
-            except RasterioError as error:
+            except (RasterioError, CPLE_BaseError) as error:
                 raise InputError(
                     f"{path} cannot be read: {reason(error)}. It is damaged or truncated; copy it again from its "
                     "source."
