@@ -1,4 +1,4 @@
-"""Bad input through the real command line: exit status 2, one sentence that names the fault, and nothing left behind."""
+"""Bad input through the real command line: exit status 2, one sentence that names the fault, nothing left behind."""
 
 from __future__ import annotations
 

@@ -365,7 +365,7 @@ def test_two_images(images, tmp_path):
 
 
 def test_memory_limits_the_tiles_at_a_time(images, tmp_path):
-    with pytest.raises(ConfigError, match="--memory 0.001 GB is too little"):
+    with pytest.raises(ConfigError, match=r"--memory 0\.001 GB is too little"):
         run(images("sine"), tmp_path / "out", memory_gb=0.001)
     assert not (tmp_path / "out").exists()
     assert run(images("sine"), tmp_path / "out", workers=2, memory_gb=0.5, bounds=PART).coverage > 0.99
