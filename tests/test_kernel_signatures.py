@@ -67,7 +67,7 @@ def calls():
     p2, paths, least = np.ones((4, 8, 8), u2), np.ones(2000, u2), np.ones((4, 10), u2)
     spots, planes = np.arange(2, 402, 50).reshape(2, 4), 2 + 160 * np.arange(12).reshape(3, 4)
     segments = np.tile(np.array([[0, 0, 0], [-1, 16, -1], [0, 0, 8], [2, 2, 2]], i8), (2, 1, 1))
-    picks = np.empty((2, 8, 8), np.int32)
+    picks = np.zeros((2, 8, 8), np.int32)
     views = (scene.pixels, scene.layout, scene.nodes, scene.heights)
     return {
         "product_rows": (plane(), plane(), half, n, plane()),
@@ -102,6 +102,9 @@ def calls():
         "lowest_visible": (surface, 0.5, 0.2, surface.copy()),
         "smooth_surface": (surface, 1, f4(1), f4(3), surface.copy()),
         "surely_inside": (scene.nodes, 0, 0.0, 0.5, 8, 3.0, scene.layout[0]),
+        "plane_cover": (grid, np.array([8, 8]), 3.0, scene.layout[0], blocked, True),
+        "lengthen": (picks[0], 2, 9, picks[0].copy(), reach[0, 0].copy(), reach[1, 0].copy()),
+        "step_cells": (grid, 3.0, scene.layout[0], blocked, True, picks[0].copy()),
         "block_reach": (
             blocked, free, scene.layout, scene.nodes, scene.heights, span, 8, 3.0, reach[0].copy(), reach[1].copy(),
         ),

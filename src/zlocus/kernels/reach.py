@@ -7,6 +7,9 @@ import numpy as np
 from zlocus.kernels._jit import kernel
 from zlocus.kernels.volume import HIDDEN, plane_grid
 
+# Positions this close to a bound (px) are judged cell by cell.
+ROUNDING = 1e-6
+
 
 # (i,2,2,2,4) f8, i8, f8, f8, i8, f8, (3,) i8 -> b1
 @kernel
@@ -24,6 +27,81 @@ def surely_inside(nodes, view, t_low, t_high, block, margin, layout):
     return True
 
 
+# (8,) f8, (2,) i8, f8, (3,) i8, (p,) b1, b1 -> i8
+@kernel
+def plane_cover(grid, shape, margin, layout, blocked, has_blocked):
+    """Of a block's cells at one height, an image covers: 1 all, -1 none, 0 some or unknown.
+
+    grid : see `plane_grid`; shape : rows and columns of cells. Positions are bilinear, so their extremes are at the
+    corners; blocked pixels are looked for in the rectangle around them.
+    """
+    x_low, y_low = np.inf, np.inf
+    x_high, y_high = -np.inf, -np.inf
+    for corner in range(4):
+        r, c = (corner // 2) * (shape[0] - 1), (corner % 2) * (shape[1] - 1)
+        x = grid[0] + r * grid[4] + c * (grid[2] + r * grid[6])
+        y = grid[1] + r * grid[5] + c * (grid[3] + r * grid[7])
+        x_low, x_high = min(x_low, x), max(x_high, x)
+        y_low, y_high = min(y_low, y), max(y_high, y)
+    x_last, y_last = layout[2] - 1 - margin, layout[1] - 1 - margin
+    if x_high < margin - ROUNDING or y_high < margin - ROUNDING:
+        return -1
+    if x_low > x_last + ROUNDING or y_low > y_last + ROUNDING:
+        return -1
+    low = margin + ROUNDING
+    if not (x_low >= low and y_low >= low and x_high <= x_last - ROUNDING and y_high <= y_last - ROUNDING):
+        return 0
+    if not has_blocked:
+        return 1
+    left, width = int(x_low), min(int(x_high) + 2, layout[2]) - int(x_low)
+    top, height = int(y_low), min(int(y_high) + 2, layout[1]) - int(y_low)
+    n_blocked = 0
+    for row in range(top, top + height):
+        start = layout[0] + row * layout[2] + left
+        in_row = np.uint16(0)
+        for is_blocked in blocked[start : start + width]:
+            in_row = np.uint16(in_row + np.uint16(is_blocked))
+        n_blocked += in_row
+    return 1 if n_blocked == 0 else (-1 if n_blocked == width * height else 0)
+
+
+# (r,c) i4, i8, i8, (r,c) i4, (r,c) i4, (r,c) i4 -> None
+@kernel
+def lengthen(run, steps, last, longest, lowest, highest):
+    """Lengthen the run of every cell by `steps` heights up to index `last`, and keep the longest."""
+    step, end = np.int32(steps), np.int32(last)
+    for r in range(run.shape[0]):
+        now, most, low, high = run[r], longest[r], lowest[r], highest[r]
+        for c in range(now.shape[0]):
+            length = np.int32(now[c] + step)
+            is_longer = length > most[c]
+            now[c] = length
+            most[c] = length if is_longer else most[c]
+            high[c] = end if is_longer else high[c]
+            low[c] = np.int32(np.int32(end - length) + np.int32(1)) if is_longer else low[c]
+
+
+# (8,) f8, f8, (3,) i8, (p,) b1, b1, (r,c) i4 -> None
+@kernel
+def step_cells(grid, margin, layout, blocked, has_blocked, run):
+    """One height, cell by cell: a run grows where the image covers the cell and ends where it does not."""
+    base, n_cols = layout[0], layout[2]
+    x_last, y_last = layout[2] - 1 - margin, layout[1] - 1 - margin
+    for r in range(run.shape[0]):
+        x0, y0 = grid[0] + r * grid[4], grid[1] + r * grid[5]
+        dx, dy = grid[2] + r * grid[6], grid[3] + r * grid[7]
+        row = run[r]
+        for c in range(row.shape[0]):
+            x, y = x0 + c * dx, y0 + c * dy
+            inside = (margin <= x) & (x <= x_last) & (margin <= y) & (y <= y_last)
+            row[c] = np.int32(row[c] + np.int32(1)) if inside else np.int32(0)
+        if has_blocked:
+            for c in range(row.shape[0]):
+                if row[c] > 0:
+                    p = base + int(y0 + c * dy + 0.5) * n_cols + int(x0 + c * dx + 0.5)
+                    row[c] = 0 if blocked[p] else row[c]
+
+
 # (p,) b1, (i,) b1, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, i8, f8, (i,r,c) i4, (i,r,c) i4 -> None
 @kernel
 def block_reach(blocked, has_blocked, layout, nodes, heights, span, block, margin, lowest, highest):
@@ -34,33 +112,37 @@ def block_reach(blocked, has_blocked, layout, nodes, heights, span, block, margi
     no such height.
     """
     grid = np.empty(8)
-    first, count = span[0], span[1]
-    rows, cols = lowest.shape[1], lowest.shape[2]
-    t_low, t_high = heights[0] + first * heights[1], heights[0] + (first + count - 1) * heights[1]
+    first, end = span[0], span[0] + span[1]
+    shape = np.array([lowest.shape[1], lowest.shape[2]])
+    run = np.empty((shape[0], shape[1]), np.int32)
+    longest = np.empty_like(run)
+    t_low, t_high = heights[0] + first * heights[1], heights[0] + (end - 1) * heights[1]
     for i in range(layout.shape[0]):
         if not has_blocked[i] and surely_inside(nodes, i, t_low, t_high, block, margin, layout[i]):
             lowest[i] = first
-            highest[i] = first + count - 1
+            highest[i] = end - 1
             continue
         lowest[i] = HIDDEN
         highest[i] = -1
-        run = np.zeros((rows, cols), np.int32)
-        longest = np.zeros((rows, cols), np.int32)
-        base, n_rows, n_cols = layout[i, 0], layout[i, 1], layout[i, 2]
-        for k in range(first, first + count):
+        run[:] = 0
+        longest[:] = 0
+        covered = 0
+        for k in range(first, end):
             plane_grid(nodes, i, heights[0] + k * heights[1], block, 0, grid)
-            for r in range(rows):
-                for c in range(cols):
-                    x = grid[0] + r * grid[4] + c * (grid[2] + r * grid[6])
-                    y = grid[1] + r * grid[5] + c * (grid[3] + r * grid[7])
-                    inside = margin <= x <= n_cols - 1 - margin and margin <= y <= n_rows - 1 - margin
-                    if inside and blocked[base + int(y + 0.5) * n_cols + int(x + 0.5)]:
-                        inside = False
-                    run[r, c] = run[r, c] + 1 if inside else 0
-                    if run[r, c] > longest[r, c]:
-                        longest[r, c] = run[r, c]
-                        highest[i, r, c] = k
-                        lowest[i, r, c] = k - run[r, c] + 1
+            cover = plane_cover(grid, shape, margin, layout[i], blocked, has_blocked[i])
+            if cover > 0:
+                covered += 1
+                continue
+            if covered:
+                lengthen(run, covered, k - 1, longest, lowest[i], highest[i])
+                covered = 0
+            if cover < 0:
+                run[:] = 0
+            else:
+                step_cells(grid, margin, layout[i], blocked, has_blocked[i], run)
+                lengthen(run, 0, k, longest, lowest[i], highest[i])
+        if covered:
+            lengthen(run, covered, end - 1, longest, lowest[i], highest[i])
 
 
 # as block_reach, over every block of a tile; ranges : (2,b,d) i8
