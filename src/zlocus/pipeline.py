@@ -304,7 +304,7 @@ def _check_polygons(request: DsmRequest, grid: Grid, settled: MatchScene, area: 
     row, col = shared.row - grid.window.row, shared.col - grid.window.col
     if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
         raise GeometryError(
-            f"No cell of the ground that two images see lies inside the area of {request.area}. Check its place and CRS."
+            f"No cell of the ground that two images see lies inside {request.area}. Check the polygons and their CRS."
         )
 
 
