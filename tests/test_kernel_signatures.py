@@ -38,6 +38,7 @@ KERNELS = all_kernels()
 
 def letters(kind):
     """A Numba type as the comments write it: `(,) f4` for each dimension a place."""
+    kind = types.unliteral(kind)
     if isinstance(kind, types.Array):
         return f"{kind.ndim}d {LETTERS[str(kind.dtype)]}"
     return LETTERS[str(kind)]

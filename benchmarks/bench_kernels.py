@@ -1,0 +1,199 @@
+"""Speed of the kernels on one core, on made-up views of about the size of a small tile.
+
+Compiled before they are timed. `extra_info` has the figure of each in its own unit (ns per cell, step and image, or
+cell-steps a second), the machine and the threads; SGM runs beside OpenCV's StereoSGBM of the same pixels x disparities.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from zlocus.kernels.refine import tile_profile
+from zlocus.kernels.resample import resample_plane
+from zlocus.kernels.sgm import sweep, winners
+from zlocus.kernels.visibility import lowest_visible
+from zlocus.kernels.volume import tile_costs
+from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.refine import smoothed
+
+SIDE, BLOCK, ROUNDS = 320, 32, 5
+SGM_SIDE = 576
+NEVER, ALWAYS = 0, 10_000
+
+
+def processor() -> str:
+    """Name of the processor as the system gives it."""
+    listed = Path("/proc/cpuinfo")
+    lines = listed.read_text().splitlines() if listed.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def timed(benchmark, call, n: int, unit: str) -> float:
+    """CPU seconds of the best of a few calls, after one that compiles; ns and units a second go to `extra_info`."""
+    call()
+    seconds = []
+
+    def once():
+        start = time.thread_time()
+        call()
+        seconds.append(time.thread_time() - start)
+
+    benchmark.pedantic(once, rounds=ROUNDS)
+    best = min(seconds)
+    benchmark.extra_info.update(
+        {f"ns per {unit}": best / n * 1e9, f"{unit} per s": n / best, "threads": 1, "machine": processor()}
+    )
+    return best
+
+
+def views(n_views: int, side: int = SIDE):
+    """Pixels, layout, nodes and heights of views about as wide as the grid, 64 heights of half a pixel between two."""
+    rng = np.random.default_rng(7)
+    px = side + 96
+    corners = np.mgrid[: side // BLOCK + 1, : side // BLOCK + 1] * BLOCK
+    nodes = np.zeros((n_views, *corners.shape[1:], 2, 4))
+    for i in range(n_views):
+        nodes[i, ..., 0, 0] = 48 + 0.99 * corners[1] + 0.02 * (i - 1) * corners[0]
+        nodes[i, ..., 1, 0] = 48 + 1.01 * corners[0] - 0.01 * i * corners[1]
+        nodes[i, ..., 0, 1] = 16.0 * (i % 3 - 1)
+        nodes[i, ..., 1, 1] = 3.0 * i
+    pixels = rng.normal(size=n_views * px * px).astype(np.float32)
+    layout = np.array([(i * px * px, px, px) for i in range(n_views)], np.int64)
+    return pixels, layout, nodes, np.array([-1.0, 2.0 / 64.0])
+
+
+def all_seen(n_views: int, side: int = SIDE):
+    """Every view sees every cell at every height."""
+    seen = np.full((2, n_views, side, side), NEVER, np.int32)
+    seen[1] = ALWAYS
+    return seen
+
+
+def lattice(side: int, count: int | None) -> HeightLattice:
+    """One range for all blocks, or, as on real scenes, ranges of 16 to 64 heights that differ from block to block."""
+    rng = np.random.default_rng(3)
+    blocks = (side // BLOCK, side // BLOCK)
+    first = np.zeros(blocks, np.int64) if count else rng.integers(0, 41, blocks)
+    counts = np.full(blocks, count, np.int64) if count else 16 * rng.integers(1, 5, blocks)
+    return HeightLattice(0.0, 1.0, (side, side), BLOCK, first.astype(np.int64), counts.astype(np.int64))
+
+
+def rolling() -> np.ndarray:
+    """A smooth surface of height indices."""
+    r, c = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    return (32 + 8 * np.sin(r / 30) * np.cos(c / 40)).astype(np.float32)
+
+
+def test_resample(benchmark):
+    pixels, layout, _, _ = views(1)
+    side = BLOCK + 6
+    grid = np.array([60.3, 60.7, 0.99, 0.01, -0.02, 1.01, 0.0, 0.0])
+    index, fraction = np.empty(side, np.uint32), np.empty((2, side), np.float32)
+    out = np.empty((side, side), np.float32)
+
+    def call():
+        for _ in range(500):
+            resample_plane(pixels, layout[0], grid, index, fraction, out)
+
+    timed(benchmark, call, 500 * side * side, "sample")
+
+
+@pytest.mark.parametrize(
+    ("n_views", "windows"),
+    [(2, [3]), (3, [1, 2]), (6, [1, 2])],
+    ids=["2-views-7x7", "3-views-3x3-5x5", "6-views-3x3-5x5"],
+)
+def test_costs(benchmark, n_views, windows):
+    heights = lattice(SIDE, 32)
+    volume = np.empty(heights.size, np.uint8)
+    seen, half = all_seen(n_views), np.array(windows, np.int64)
+    scene = views(n_views)
+
+    def call():
+        tile_costs(*scene, heights.ranges, heights.address, half, seen, BLOCK, np.float32(0), volume)
+
+    n = heights.size * n_views
+    seconds = timed(benchmark, call, n, "cell, step and image")
+    if windows == [3]:
+        benchmark.extra_info["resample_ncc_ns"] = seconds / n * 1e9
+
+
+@pytest.mark.parametrize("count", [16, 32, 64, 128, None], ids=["16", "32", "64", "128", "ragged"])
+def test_sgm(benchmark, count):
+    side = SGM_SIDE // 2 if count == 128 else SGM_SIDE
+    heights = lattice(side, count)
+    rng = np.random.default_rng(5)
+    cost = rng.integers(0, 129, heights.size).astype(np.uint8)
+    p2 = rng.integers(60, 240, (4, side, side)).astype(np.uint16)
+    total = np.zeros(heights.size, np.uint16)
+
+    def call():
+        for sign in (1, -1):
+            sweep(cost, heights.ranges, heights.address, BLOCK, p2, np.uint16(20), sign, total)
+
+    seconds = timed(benchmark, call, heights.size, "cell-step")
+    if count == 64:
+        benchmark.extra_info["sgm_cell_steps_per_s"] = heights.size / seconds
+        benchmark.extra_info["opencv_hh_cell_steps_per_s"] = opencv_speed(side, count)
+
+
+def opencv_speed(side: int, n_disparities: int) -> float:
+    """Pixels x disparities a second of StereoSGBM over 8 paths, its cost included, on a pair with `side`^2 matches."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    right = np.random.default_rng(2).integers(0, 256, (side, side + n_disparities)).astype(np.uint8)
+    right = cv2.GaussianBlur(right, (5, 5), 0)
+    left = np.roll(right, n_disparities // 3, axis=1)
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=0, numDisparities=n_disparities, blockSize=3, P1=20, P2=240, mode=cv2.STEREO_SGBM_MODE_HH
+    )
+    seconds = []
+    for _ in range(ROUNDS):
+        start = time.thread_time()
+        matcher.compute(left, right)
+        seconds.append(time.thread_time() - start)
+    cv2.setNumThreads(threads)
+    return side * side * n_disparities / min(seconds)
+
+
+@pytest.mark.parametrize("count", [32, None], ids=["32", "ragged"])
+def test_winners(benchmark, count):
+    heights = lattice(SGM_SIDE, count)
+    total = np.random.default_rng(5).integers(100, 2000, heights.size).astype(np.uint16)
+    shape = heights.shape
+    best, second = np.empty(shape, np.int32), np.empty(shape, np.int32)
+    margin, vertex = np.empty(shape, np.uint16), np.empty(shape, np.float32)
+
+    def call():
+        winners(total, heights.ranges, heights.address, BLOCK, best, second, margin, vertex)
+
+    timed(benchmark, call, heights.size, "cell-step")
+
+
+def test_profile(benchmark):
+    half, offsets = 4, np.linspace(-0.75, 0.75, 5).astype(np.float32)
+    surface, seen, scene = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
+    out = np.empty((len(offsets), SIDE, SIDE), np.float32)
+
+    def call():
+        tile_profile(*scene, surface, offsets, BLOCK, half, seen, np.float32(0), out)
+
+    timed(benchmark, call, out.size * 3, "cell, offset and image")
+
+
+def test_smooth(benchmark):
+    surface = rolling()
+    timed(benchmark, lambda: smoothed(surface, 2.0), surface.size, "cell")
+
+
+def test_visibility(benchmark):
+    surface = rolling()
+    out = np.empty_like(surface)
+    timed(benchmark, lambda: lowest_visible(surface, 0.4, 0.2, out), surface.size, "cell")
