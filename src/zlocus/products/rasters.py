@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from odc.geo.geobox import GeoBox
 
+from zlocus.errors import OutputError
 from zlocus.io.raster import RasterSink
 from zlocus.surface.surface import Surface
 
@@ -21,8 +22,10 @@ class SurfaceRasters:
     def __init__(self, folder: Path, geobox: GeoBox, ortho_dtype: DTypeLike) -> None:
         self._stack = ExitStack()
         self._ortho_dtype = np.dtype(ortho_dtype)
+        self._paths: list[Path] = []
 
         def sink(name: str, dtype: DTypeLike, description: str, **options: Any) -> RasterSink:
+            self._paths.append(folder / name)
             raster = RasterSink(folder / name, geobox, dtype, descriptions=(description,), **options)
             return self._stack.enter_context(raster)
 
@@ -48,7 +51,14 @@ class SurfaceRasters:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.__exit__(kind, error, trace)
+        try:
+            self._stack.__exit__(kind, error, trace)
+        except OutputError:
+            # Some were complete already: a set of products that do not belong together helps nobody.
+            for path in self._paths:
+                with suppress(OSError):
+                    path.unlink()
+            raise
 
 
 def as_source(values: NDArray[np.float32], dtype: np.dtype[Any]) -> NDArray[Any]:
