@@ -41,10 +41,16 @@ def grid_from_geobox(geobox: GeoBox, name: str) -> Grid:
             f"The grid of {name} is not north up with square cells. Use --resolution and --bounds instead."
         )
     side = float(t.a)
-    anchor = (float(t.c - np.floor(t.c / side) * side), float(t.f - np.floor(t.f / side) * side))
+    anchor = (_phase(float(t.c), side), _phase(float(t.f), side))
     rows, cols = geobox.shape
     window = CellWindow(round((anchor[1] - t.f) / side), round((t.c - anchor[0]) / side), rows, cols)
     return Grid(geobox, anchor, window)
+
+
+def _phase(edge: float, side: float) -> float:
+    """How far an edge lies above a multiple of the cell size, m; exactly 0 where it is on one but for rounding."""
+    cells = edge / side
+    return 0.0 if abs(cells - round(cells)) < SQUARE else float(edge - np.floor(cells) * side)
 
 
 def grid_from_bounds(bounds: tuple[float, float, float, float], cell_m: float, crs: CRS) -> Grid:
