@@ -149,13 +149,15 @@ def levels_for(n_steps: int, options: PyramidOptions) -> int:
 
 
 def image_contrast(view: View) -> float:
-    """Standard deviation of an image, from rows spread over it: the same whatever part is matched."""
+    """Standard deviation of an image, from rows spread over it: the same whatever part is matched. 1 where they hold
+    nothing that differs."""
     rows, cols = view.image.shape
     values = []
     for row in np.unique(np.linspace(0, rows - 1, SAMPLE_ROWS).astype(int)):
         read = view.image.read(int(row), 0, 1, cols)
         values.append(read.pixels[read.valid])
-    deviation = float(np.concatenate(values).std())
+    grey = np.concatenate(values)
+    deviation = float(grey.std()) if grey.size else 0.0
     return deviation if deviation > 0 else 1.0
 
 
