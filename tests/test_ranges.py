@@ -1,0 +1,113 @@
+"""The range belongs to the cell: towers stay in it, open ground is cheap."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from zlocus.matching.cells import CellWindow
+from zlocus.matching.ranges import LANES, ranges_nearby, whole_range
+from zlocus.options import PyramidOptions
+from zlocus.tile import RIVALS_KEPT, _candidates
+
+OPTIONS = PyramidOptions(block=16, margin_steps=6, reach=2)
+N_STEPS = 250
+
+
+def nearby(low, high=None):
+    low = np.asarray(low, np.float32)
+    return ranges_nearby(low, low if high is None else high, 10.0, 0.5, low.shape, N_STEPS, OPTIONS)
+
+
+def holds(lattice, block, low, high):
+    first, count = lattice.first[block], lattice.count[block]
+    return first <= low and high <= first + count - 1
+
+
+def test_the_whole_range():
+    lattice = whole_range(10.0, 0.5, 50, (37, 70), 16)
+    assert lattice.first.shape == (3, 5)
+    assert (lattice.first == 0).all()
+    assert (lattice.count == 64).all()
+
+
+def test_flat_ground_has_a_short_range_around_it():
+    lattice = nearby(np.full((37, 70), 100.3))
+    assert (lattice.count == LANES).all()
+    assert holds(lattice, (0, 0), 95, 106)
+
+
+def test_a_tower_widens_its_block_and_those_within_reach():
+    low = np.full((48, 80), 100.0, np.float32)
+    high = low.copy()
+    high[20:26, 14:19] = 210.0  # in the second and, by its neighbourhood, in the first and second column of blocks
+    lattice = nearby(low, high)
+    for block in ((1, 0), (1, 1)):
+        assert holds(lattice, block, 94, 216)
+    # Four fine cells further on, across the border of blocks, the tower still counts.
+    assert holds(lattice, (0, 1), 94, 106)
+    assert not holds(lattice, (1, 3), 94, 216)
+    beside = low.copy()
+    beside[20, 12] = 210.0
+    assert holds(nearby(low, beside), (1, 1), 94, 216)
+    beside[20, 12], beside[20, 11] = 100.0, 210.0
+    assert not holds(nearby(low, beside), (1, 1), 94, 216)
+
+
+def test_ranges_end_where_the_scene_does():
+    lattice = nearby(np.full((20, 20), 1.0), np.full((20, 20), 400.0, np.float32))
+    assert (lattice.first == 0).all()
+    assert (lattice.first + lattice.count == 256).all()
+    top = nearby(np.full((20, 20), 249.0))
+    assert (top.first + top.count <= 256).all()
+    assert holds(top, (0, 0), 243, 249)
+
+
+def test_a_block_that_nobody_saw_searches_the_least():
+    """Also at the border of the tile and beside blocks with candidates."""
+    low = np.full((80, 80), np.nan, np.float32)
+    low[:16, :16] = 120.0
+    lattice = nearby(low)
+    assert holds(lattice, (0, 0), 114, 126)
+    assert (lattice.count[3:, 3:] == LANES).all()
+    assert (lattice.count > 0).all()
+    assert (lattice.first >= 0).all()
+
+
+def coarse_result(best, second, margin, window):
+    heights = SimpleNamespace(best=best, second=second, margin=margin)
+    seen = np.zeros((2, 3, *best.shape), np.int32)
+    seen[1] = 100
+    return SimpleNamespace(window=window, heights=heights, seen=seen)
+
+
+def candidates(second_at, margin_at, ties=()):
+    """Candidates on 40 x 40 cells above 24 x 24 coarse ones, whose best index is 20; cell (10, 12) has a rival."""
+    coarse = CellWindow(-2, -2, 24, 24)
+    best = np.full((24, 24), 20, np.int32)
+    second, margin = best.copy(), np.full((24, 24), 65535, np.uint16)
+    second[10, 12], margin[10, 12] = second_at, margin_at
+    scene = SimpleNamespace(
+        ties=np.array(ties, float).reshape(-1, 3), cell_m=0.5, anchor=(1000.0, 2000.0), origin_m=10.0, step_m=0.25
+    )
+    return _candidates(scene, coarse_result(best, second, margin, coarse), CellWindow(0, 0, 40, 40), 1)
+
+
+def test_a_near_rival_is_a_candidate():
+    low, high = candidates(55, RIVALS_KEPT - 1)
+    np.testing.assert_array_equal(high[16:18, 20:22], 110)
+    assert (high == 110).sum() == 4
+    assert (low == 40).all()
+
+
+def test_a_far_rival_is_none():
+    assert (candidates(55, RIVALS_KEPT)[1] == 40).all()
+
+
+def test_tie_points_are_candidates():
+    """Cells of 1 m at this level: a tie at (1005.3, 1992.1) lies in row 7, column 5; steps of 0.5 m."""
+    low, high = candidates(20, 65535, [(1005.3, 1992.1, 72.0), (900.0, 900.0, 500.0)])
+    assert high[7, 5] == 124
+    assert (high == 40).sum() == high.size - 1
+    assert (low == 40).all()

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+
+import numpy as np
+import pytest
+
+from zlocus.errors import OutputError
+from zlocus.products.record import Stopwatch, inputs_record, peak_memory_mb, versions_record, write_record
+
+
+def test_stages_are_timed():
+    watch = Stopwatch()
+    with watch.stage("sleep"):
+        time.sleep(0.05)
+    with watch.stage("work"):
+        end = time.process_time() + 0.05
+        while time.process_time() < end:
+            pass
+    asleep, busy = watch.stages
+    assert [asleep["name"], busy["name"]] == ["sleep", "work"]
+    assert asleep["wall_s"] >= 0.05 > asleep["cpu_s"]
+    assert busy["cpu_s"] >= 0.05
+
+
+def test_peak_memory_grows_by_what_is_held():
+    before = peak_memory_mb()
+    held = np.ones(60_000_000, np.uint8)
+    assert peak_memory_mb() >= before
+    assert peak_memory_mb() > held.nbytes / 1e6
+
+
+def test_inputs_are_known_by_their_content(tmp_path):
+    path = tmp_path / "a.tif"
+    path.write_bytes(b"x" * 3_000_000)
+    assert inputs_record([path]) == [{"path": str(path), "sha256": hashlib.sha256(b"x" * 3_000_000).hexdigest()}]
+
+
+def test_versions_name_what_heights_depend_on():
+    versions = versions_record()
+    assert {"python", "zlocus", "numpy", "numba", "rasterio", "pyproj"} <= set(versions)
+    assert versions["numpy"] == np.__version__
+
+
+def test_a_record_is_whole_or_not_there(tmp_path):
+    write_record(tmp_path / "run.json", {"coverage": 0.5})
+    assert json.loads((tmp_path / "run.json").read_text()) == {"schema": 1, "coverage": 0.5}
+    assert [p.name for p in tmp_path.iterdir()] == ["run.json"]
+    (tmp_path / "taken.json").mkdir()
+    with pytest.raises(OutputError, match=r"taken\.json cannot be written"):
+        write_record(tmp_path / "taken.json", {})
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.json", "taken.json"]

@@ -1,0 +1,94 @@
+"""Sub-step heights: the parabola, and a planted fraction of a step on a rendered plane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from affine import Affine
+from scipy.ndimage import spline_filter
+
+from rendered_scenes import CENTRE, FIELD, GSD_M, LOOKS, SIZE_PX, camera
+from zlocus.matching.refine import parabola_peak, refine, smoothed
+from zlocus.matching.views import ViewPixels, tile_views
+from zlocus.options import RefineOptions
+from zlocus.synthetic.render import Sun, render
+from zlocus.synthetic.terrain import analytic_ground
+
+# Steps of 0.4 m are half a pixel; noise-free images.
+STEP_M, STEPS = 0.4, 0.02
+
+
+def test_the_parabola_through_three_samples():
+    offsets = np.linspace(-1.5, 1.5, 7, dtype=np.float32)
+    peaks = np.array([[-0.9, 0.0, 0.26, 0.74]], np.float32)
+    profile = 0.8 - 0.3 * (offsets[:, None, None] - peaks) ** 2
+    at, value, inside = parabola_peak(profile, offsets)
+    np.testing.assert_allclose(at, peaks, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(value, 0.8, rtol=0, atol=1e-6)
+    assert inside.all()
+
+
+def test_a_maximum_at_an_end_is_not_believed():
+    offsets = np.linspace(-1, 1, 5, dtype=np.float32)
+    profile = np.stack([offsets, -offsets, 0 * offsets], axis=1)[:, None, :].astype(np.float32)
+    at, _, inside = parabola_peak(profile, offsets)
+    assert not inside.any()
+    assert np.isfinite(at).all()
+    assert np.abs(at).max() <= 1.0
+
+
+def test_smoothing_removes_single_cells_and_keeps_jumps():
+    surface = np.full((20, 30), 10.0, np.float32)
+    surface[:, 15:] = 40.0
+    surface[5, 5] = 90.0
+    out = smoothed(surface, 3.0)
+    np.testing.assert_allclose(out[:, :15], 10.0, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(out[:, 15:], 40.0, rtol=0, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def plane():
+    """The views of a plane at 50 m, as splines."""
+    ground, shape = analytic_ground("plane", CENTRE, GSD_M / 2, FIELD, seed=5), (SIZE_PX, SIZE_PX)
+    images = []
+    for name in LOOKS:
+        pixels = render(ground, camera(name), shape, Sun(150.0, 50.0), samples=3)
+        pixels = pixels / pixels.std()
+        images.append((camera(name), spline_filter(pixels, 3, output=np.float32, mode="mirror")))
+    return images
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.13, 0.37, 0.5, 0.81])
+def test_a_planted_fraction_of_a_step(plane, fraction):
+    """The lattice starts 20 + fraction steps below the plane: refinement finds it from 20.5."""
+    shape, block = (48, 50), 16
+    origin = 50.0 - (20 + fraction) * STEP_M
+    transform = Affine(GSD_M, 0, CENTRE[0] - 12.5, 0, -GSD_M, CENTRE[1] + 12.0)
+    windows = [ViewPixels(sensor, (0, 0), 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane]
+    z = (origin, origin + 50 * STEP_M)
+    views = tile_views(windows, 0, transform, shape, block, (origin, STEP_M), z, 2)
+    seen = np.zeros((2, len(LOOKS), *shape), np.int32)
+    seen[1] = 50
+    coarse = np.full(shape, 20.5, np.float32)
+    found = refine(views, coarse, seen, block, RefineOptions(rounds=3))
+    inner = (slice(4, -4), slice(4, -4))
+    assert found.is_refined[inner].mean() > 0.99
+    assert abs(np.median(found.height[inner]) - 20 - fraction) < STEPS
+    assert np.median(found.ncc) > 0.95
+
+
+def test_what_is_too_far_keeps_the_coarse_height(plane):
+    shape, origin = (32, 32), 50.0 - 20 * STEP_M
+    transform = Affine(GSD_M, 0, CENTRE[0] - 8, 0, -GSD_M, CENTRE[1] + 8)
+    windows = [ViewPixels(sensor, (0, 0), 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane]
+    views = tile_views(windows, 0, transform, shape, 16, (origin, STEP_M), (40.0, 70.0), 2)
+    seen = np.zeros((2, len(LOOKS), *shape), np.int32)
+    seen[1] = 50
+    coarse = np.full(shape, 32.0, np.float32)
+    found = refine(views, coarse, seen, 16, RefineOptions(rounds=1, reach_steps=0.1))
+    kept = found.height[~found.is_refined]
+    assert kept.size > 100
+    assert (kept == 32.0).all()
+    none = refine(views, coarse, seen, 16, RefineOptions(rounds=0))
+    assert (none.height == 32.0).all()
+    assert not none.is_refined.any()

@@ -1,0 +1,59 @@
+"""Penalties from the ortho-image, and the two forms of picking heights."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from kernel_scene import even_lattice
+from zlocus.matching.semiglobal import BEHIND, aggregate, penalties, pick
+from zlocus.options import SemiGlobalOptions
+
+OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0)
+
+
+def test_without_an_ortho_image_penalties_are_even():
+    p2 = penalties(None, (5, 7), OPTIONS)
+    assert p2.dtype == np.uint16
+    assert p2.shape == (4, 5, 7)
+    assert (p2 == 240).all()
+
+
+def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
+    ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
+    p2 = penalties(ortho, (12, 15), OPTIONS)
+    unit = 2.0 * np.median(np.abs(np.diff(ortho, axis=1)))
+    for path, (dr, dc) in enumerate(BEHIND):
+        for r in range(1, 11):
+            for c in range(1, 14):
+                plain = 240 / (1 + abs(ortho[r, c] - ortho[r + dr, c + dc]) / unit)
+                assert abs(p2[path, r, c] - max(plain, 60)) <= 1
+    assert p2.min() < 100
+    assert p2.max() > 150
+
+
+def test_a_strong_edge_is_cheap_to_cross_only_where_it_is():
+    ortho = np.zeros((8, 12), np.float32) + np.random.default_rng(1).normal(0, 0.01, (8, 12)).astype(np.float32)
+    ortho[:, 6:] += 5
+    p2 = penalties(ortho, (8, 12), OPTIONS)
+    assert (p2[0, :, 6] == 60).all()
+    assert (p2[2, 1:, 6] > 60).all()
+
+
+def test_a_penalty_of_edges_above_p2_does_not_raise_it():
+    ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
+    assert penalties(ortho, (6, 6), SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
+
+
+def test_aggregation_joins_what_picking_alone_does_not():
+    lattice = even_lattice(16, (20, 24), 16)
+    rng = np.random.default_rng(3)
+    cost = rng.integers(30, 90, (20, 24, 16)).astype(np.uint8)
+    cost[..., 7] -= 25
+    p2 = penalties(None, lattice.shape, OPTIONS)
+    joined = aggregate(cost.ravel(), lattice, p2, OPTIONS)
+    alone = pick(cost.ravel().astype(np.uint16), lattice)
+    assert (np.abs(joined.best - 7) <= 1).mean() > 0.97
+    assert (np.abs(alone.best - 7) <= 1).mean() < 0.9
+    assert joined.vertex.dtype == np.float32
+    assert np.abs(joined.vertex - joined.best).max() <= 0.5

@@ -1,0 +1,97 @@
+"""Which view sees which height of a cell, through real projection tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from affine import Affine
+
+from rendered_scenes import CENTRE
+from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.views import ViewPixels, tile_views
+from zlocus.matching.visibility import BORDER_PX, cells_per_step, coverage, hide
+from zlocus.synthetic.cameras import SatelliteCamera
+
+CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (30, 50)
+ORIGIN_M, N_STEPS = 40.0, 64
+
+
+def sensor(along=0.0, across=0.0):
+    return SatelliteCamera((*CENTRE, 50.0), (60.0, 50.0), 0.5, along, across)
+
+
+def tile(sensors, valid=None):
+    """A tile around the scene's centre and its lattice of heights."""
+    transform = Affine(CELL_M, 0, CENTRE[0] - 12.5, 0, -CELL_M, CENTRE[1] + 7.5)
+    pixels = (np.zeros((101, 121), np.float32),)
+    mask = (np.ones((101, 121), bool) if valid is None else valid,)
+    windows = [ViewPixels(s, (0, 0), 1.0, pixels, mask) for s in sensors]
+    blocks = (-(-SHAPE[0] // BLOCK), -(-SHAPE[1] // BLOCK))
+    lattice = HeightLattice(
+        ORIGIN_M, STEP_M, SHAPE, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
+    )
+    z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
+    return tile_views(windows, 0, transform, SHAPE, BLOCK, (ORIGIN_M, STEP_M), z, 2), lattice, transform
+
+
+def test_all_is_covered_well_inside_the_image():
+    views, lattice, _ = tile([sensor(), sensor(10, 5)])
+    seen = coverage(views, lattice)
+    assert (seen[0] == 0).all()
+    assert (seen[1] == N_STEPS - 1).all()
+
+
+def test_heights_at_which_a_cell_leaves_the_image():
+    """A view 60 degrees off nadir: high ground falls off the image's edge."""
+    camera = sensor(along=60.0)
+    views, lattice, transform = tile([sensor(), camera])
+    seen = coverage(views, lattice)
+    for r, c in ((0, 0), (15, 30), (29, 49)):
+        x, y = transform * (c + 0.5, r + 0.5)
+        z = ORIGIN_M + STEP_M * np.arange(N_STEPS)
+        xy = camera.image_from_ground(np.column_stack([np.full(N_STEPS, x), np.full(N_STEPS, y), z]))
+        inside = ((xy >= BORDER_PX) & (xy <= np.array([120, 100]) - BORDER_PX)).all(axis=1)
+        assert 0 < inside.sum() < N_STEPS
+        first, last = np.flatnonzero(inside)[[0, -1]]
+        assert abs(seen[0, 1, r, c] - first) <= 1
+        assert abs(seen[1, 1, r, c] - last) <= 1
+
+
+def test_windows_do_not_touch_nodata():
+    valid = np.ones((101, 121), bool)
+    valid[50, 60] = False
+    views, lattice, transform = tile([sensor(), sensor(5)], valid)
+    lost = coverage(views, lattice)[1, 0] < 0
+    col, row = ~transform * CENTRE
+    r, c = np.nonzero(lost)
+    assert 64 <= lost.sum() <= 81
+    assert np.abs(r + 0.5 - row).max() <= 4.6
+    assert np.abs(c + 0.5 - col).max() <= 4.6
+
+
+@pytest.mark.parametrize(("along", "across"), [(20.0, 0.0), (0.0, -15.0), (-10.0, 12.0)])
+def test_how_far_a_fixed_pixel_moves_per_step(along, across):
+    camera = sensor(along, across)
+    views, _, _ = tile([camera])
+    low, high = camera.ground_from_image(np.array([[60.0, 50.0]] * 2), np.array([50.0, 51.0]))
+    east, north = (high - low)[:2] * STEP_M / CELL_M
+    np.testing.assert_allclose(cells_per_step(views, 0, BLOCK), (east, -north), rtol=0, atol=1e-3)
+
+
+def test_a_tower_hides_the_ground_behind_it():
+    """10 m high; a view that leans 45 degrees from the east does not see 10 m of ground to the west of it."""
+    views, lattice, _ = tile([sensor(), sensor(across=-45.0)])
+    seen = coverage(views, lattice)
+    surface = np.full(SHAPE, 10.0, np.float32)
+    surface[:, 35:40] = 30.0
+    hide(seen, views, surface, BLOCK, 0.0)
+    sees_ground = seen[0] <= 10
+    assert sees_ground[0].all()
+    hidden = np.flatnonzero(~sees_ground[1, 15])
+    # 20 steps of 0.5 m, a metre of shadow a metre of height; the cells of the tower itself count as hidden at its foot.
+    assert hidden.min() in (15, 16)
+    assert (np.diff(hidden) == 1).all()
+    assert hidden.max() in (38, 39)
+    shown = coverage(views, lattice)
+    hide(shown, views, surface, BLOCK, 100.0)
+    assert (shown[0] == 0).all()
