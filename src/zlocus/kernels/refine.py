@@ -36,7 +36,7 @@ def spline_weights(level, line, low, high, whole, weights):
     one, half, sixth = np.float32(1.0), np.float32(0.5), np.float32(1.0 / 6.0)
     two_thirds = np.float32(2.0 / 3.0)
     for c in range(level.shape[0]):
-        u, t = level[c], np.float32(c)
+        u, t = level[c], np.float32(np.int32(c))
         x = (line[0] + t * line[3]) + u * ((line[1] + t * line[4]) + u * (line[2] + t * line[5]))
         x = min(max(x, low), high)
         pixel = np.floor(x)
@@ -97,13 +97,13 @@ def resample_surface(pixels, layout, grids, level, out):
         spline_gather(image, origin, np.int32(n_cols), whole, across, down, out[r])
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (2,i,r,c) i4, f4, (j,r,c) f4 -> None
+# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (3,i,r,c) i4, f4, (j,r,c) f4 -> None
 @kernel
 def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
     """Mean NCC over all pairs of the views that see the surface, at `surface` + `offsets`; windows follow the surface.
 
     surface : (r + 2 half, c + 2 half) float32 height indices, border included; offsets : (j,) float32, in steps;
-    seen : (2, i, r, c) int32, see `block_costs`; out : (j, r, c) float32, written; 0 where
+    seen : (3, i, r, c) int32, see `block_costs`; out : (j, r, c) float32, written; 0 where
     fewer than two views see the cell.
     """
     rows, cols = out.shape[1], out.shape[2]
@@ -112,16 +112,16 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
     size = (rows + 2 * half) * width
     planes = np.zeros((n_views, size), np.float32)
     mean, scale = np.zeros_like(planes), np.zeros_like(planes)
-    flat = np.empty((2, n_views, size), np.int32)
+    flat = np.empty((3, n_views, size), np.int32)
     pairs, agreed = np.empty(size, np.float32), np.empty(size, np.float32)
     scratch = np.empty((2, size), np.float32)
     grids, level = np.empty((3, 8)), np.empty(surface.shape, np.float32)
-    at_surface = np.zeros((2, n_views, rows, cols), np.int32)
+    at_surface = np.zeros((3, n_views, rows, cols), np.int32)
     for i in range(n_views):
         for r in range(rows):
             for c in range(cols):
                 z = surface[r + half, c + half]
-                if not (seen[0, i, r, c] <= z <= seen[1, i, r, c]):
+                if not (max(seen[0, i, r, c], seen[2, i, r, c]) <= z <= seen[1, i, r, c]):
                     at_surface[0, i, r, c] = HIDDEN
     n = flat_visibility(at_surface, half, flat, pairs)
     centre = np.float64(0.5) * (surface.min() + offsets.min() + surface.max() + offsets.max())

@@ -16,7 +16,8 @@ def resample_plane(pixels, layout, grid, index, fraction, out):
     in `pixels`; grid : (8,) float64, px: (x, y) at the first cell, step per column, step per row, mixed step per row
     and column; index : (c,) uint32 and fraction : (2, c) float32, scratch; out : (r, c) float32, written.
     Positions outside the image are clamped to its border (the caller masks them). Two passes per row, positions and
-    gathers, so that the first vectorises; positions are float32 from a whole-pixel origin near the grid.
+    gathers, so that the first vectorises (int32 becomes float32 in vector lanes, int64 does not); positions are float32
+    from a whole-pixel origin near the grid.
     """
     base, n_rows, n_cols = layout[0], layout[1], layout[2]
     origin_x = min(max(int(grid[0]), 0), n_cols - 2)
@@ -33,8 +34,8 @@ def resample_plane(pixels, layout, grid, index, fraction, out):
         dx = np.float32(grid[2] + r * grid[6])
         dy = np.float32(grid[3] + r * grid[7])
         for c in range(out.shape[1]):
-            x = min(max(x0 + np.float32(c) * dx, x_low), x_high)
-            y = min(max(y0 + np.float32(c) * dy, y_low), y_high)
+            x = min(max(x0 + np.float32(np.int32(c)) * dx, x_low), x_high)
+            y = min(max(y0 + np.float32(np.int32(c)) * dy, y_low), y_high)
             col = np.int32(np.floor(x))
             row = np.int32(np.floor(y))
             fraction[0, c] = x - np.float32(col)
