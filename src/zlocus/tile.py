@@ -18,7 +18,7 @@ from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import coverage, hide
+from zlocus.matching.visibility import coverage, hide, sees
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.reasons import is_empty
@@ -148,7 +148,7 @@ def _true_ortho(
     """Grey values of the first view that sees each cell of a surface; NaN where none does."""
     out = np.full(surface.shape, np.nan, np.float32)
     for i, view in enumerate(pixels):
-        shown = np.isnan(out) & (result.seen[0, i] <= surface) & (surface <= result.seen[1, i])
+        shown = np.isnan(out) & sees(result.seen[:, i], surface)
         if shown.any():
             out[shown] = _ortho(result.views, surface, block, i)[shown] * np.float32(view.contrast)
     return out
@@ -214,7 +214,7 @@ def _finish(
     refined = refine(coefficients, result.heights.vertex, result.seen, block, config.refine)
     at = refined.height[None]
     covering = (result.seen[1] >= 0).sum(axis=0)
-    seeing = ((result.seen[0] <= at) & (at <= result.seen[1])).sum(axis=0)
+    seeing = sees(result.seen, at).sum(axis=0)
     last = scene.n_steps - 1
     quality = judge(result.heights, refined, covering, seeing, last, config.checks)
     height = result.lattice.metres(refined.height)

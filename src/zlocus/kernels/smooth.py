@@ -1,4 +1,4 @@
-"""Smoothing of a surface that keeps its jumps."""
+"""Smoothing of a surface that keeps its jumps and its slopes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,44 @@ from zlocus.kernels._jit import kernel
 TAPS = (1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0)
 
 
-# (c,) f4, (c,) f4, f4, f4, (c,) f4, (c,) f4 -> None
+# f4, f4 -> f4
 @kernel
-def add_tap(centre, other, near, inverse, total, weight):
-    """Add one neighbour of every cell of a row: weight near (1 - (dz / jump)^2)^2, none beyond the jump."""
+def smaller_slope(before, after):
+    """The smaller of two slopes of one sign, else 0 (minmod): a jump on one side only is no slope."""
+    if before * after <= 0.0:
+        return np.float32(0.0)
+    return before if abs(before) < abs(after) else after
+
+
+# (r,c) f4, i8, (r,c) f4, (r,c) f4 -> None
+@kernel
+def slopes(surface, reach, by_row, by_col):
+    """Slope per cell along rows and columns, over `reach` cells to both sides; 0 at the border and beside jumps."""
+    n_rows, n_cols = surface.shape
+    by_row[:] = 0.0
+    by_col[:] = 0.0
+    inverse = np.float32(1.0 / reach)
+    for r in range(n_rows):
+        for c in range(n_cols):
+            here = surface[r, c]
+            if reach <= r < n_rows - reach:
+                before, after = here - surface[r - reach, c], surface[r + reach, c] - here
+                by_row[r, c] = smaller_slope(before, after) * inverse
+            if reach <= c < n_cols - reach:
+                before, after = here - surface[r, c - reach], surface[r, c + reach] - here
+                by_col[r, c] = smaller_slope(before, after) * inverse
+
+
+# (c,) f4, (c,) f4, (c,) f4, (c,) f4, (3,) f4, f4, (c,) f4, (c,) f4 -> None
+@kernel
+def add_tap(centre, other, by_row, by_col, tap, inverse, total, weight):
+    """Add one neighbour of every cell of a row, less the slope to it: weight (1 - (dz / jump)^2)^2, none beyond it.
+
+    tap : weight of the tap and its distance in rows and in columns.
+    """
+    near, rows, cols = tap[0], tap[1], tap[2]
     for c in range(centre.shape[0]):
-        step = other[c] - centre[c]
+        step = other[c] - centre[c] - rows * by_row[c] - cols * by_col[c]
         away = step * inverse
         kept = max(np.float32(1.0) - away * away, np.float32(0.0))
         w = near * kept * kept
@@ -23,19 +55,19 @@ def add_tap(centre, other, near, inverse, total, weight):
         weight[c] += w
 
 
-# (r,c) f4, i8, f4, (r,c) f4 -> None
+# (r,c) f4, (r,c) f4, (r,c) f4, i8, f4, (r,c) f4 -> None
 @kernel
-def smooth_surface(surface, spacing, jump, out):
-    """Weighted mean over 5 x 5 cells `spacing` apart; cells further than `jump` in height have no weight.
+def smooth_surface(surface, by_row, by_col, spacing, jump, out):
+    """Weighted mean over 5 x 5 cells `spacing` apart, around each cell's own plane; nothing reaches across a jump.
 
-    surface : (r, c) float32, any unit of height; jump : the same unit; out : (r, c), written. Passes with growing
-    spacings make a wide smoothing of few taps. Source: Tomasi and Manduchi (1998), with Tukey's weight in height and
-    the taps of Starck et al. (2007).
+    surface : (r, c) float32, any unit of height; by_row, by_col : (r, c), its slopes per cell; jump : distance from
+    the plane beyond which a cell has no weight; out : (r, c), written. Passes with growing spacings make a wide
+    smoothing of few taps. Source: Tomasi and Manduchi (1998), with Tukey's weight in height and the taps of Starck et
+    al. (2007).
     """
     n_rows, n_cols = surface.shape
-    taps = np.array(TAPS, np.float32)
     inverse = np.float32(1.0) / jump
-    total, weight = np.empty(n_cols, np.float32), np.empty(n_cols, np.float32)
+    total, weight, tap = np.empty(n_cols, np.float32), np.empty(n_cols, np.float32), np.empty(3, np.float32)
     for r in range(n_rows):
         total[:] = 0.0
         weight[:] = 0.0
@@ -46,10 +78,11 @@ def smooth_surface(surface, spacing, jump, out):
             for j in range(5):
                 shift = (j - 2) * spacing
                 c0, c1 = max(-shift, 0), min(n_cols - shift, n_cols)
+                tap[0], tap[1], tap[2] = TAPS[i] * TAPS[j], (i - 2) * spacing, shift
                 if c1 > c0:
                     add_tap(
-                        surface[r, c0:c1], surface[row, c0 + shift : c1 + shift], taps[i] * taps[j], inverse,
-                        total[c0:c1], weight[c0:c1],
+                        surface[r, c0:c1], surface[row, c0 + shift : c1 + shift], by_row[r, c0:c1], by_col[r, c0:c1],
+                        tap, inverse, total[c0:c1], weight[c0:c1],
                     )  # fmt: skip
         for c in range(n_cols):
             out[r, c] = surface[r, c] + total[c] / weight[c]

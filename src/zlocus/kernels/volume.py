@@ -9,6 +9,7 @@ from zlocus.kernels.agreement import pair_sum, window_moments
 from zlocus.kernels.resample import resample_plane
 
 COST_SCALE = np.float32(64.0)
+UNSEEN_COST = np.float32(40.0)
 HIDDEN = np.int32(2**30)
 
 
@@ -38,7 +39,7 @@ def plane_grid(nodes, view, t, block, half, grid):
         grid[6 + axis] = mixed
 
 
-# (2,i,r,c) i4, i8, (2,i,p) i4, (p,) f4 -> i8
+# (3,i,r,c) i4, i8, (3,i,p) i4, (p,) f4 -> i8
 @kernel
 def flat_visibility(seen, half, flat, pairs):
     """`seen` of a block on the flat layout (never beyond it); 1 / (n (n - 1)), n the views that see the cell."""
@@ -46,13 +47,14 @@ def flat_visibility(seen, half, flat, pairs):
     width = cols + 2 * half
     flat[0] = HIDDEN
     flat[1] = -1
+    flat[2] = HIDDEN
     pairs[:] = 0.0
     for r in range(rows):
         for c in range(cols):
             usable = np.float32(0.0)
             for i in range(n_views):
-                flat[0, i, r * width + c] = seen[0, i, r, c]
-                flat[1, i, r * width + c] = seen[1, i, r, c]
+                for bound in range(3):
+                    flat[bound, i, r * width + c] = seen[bound, i, r, c]
                 if seen[0, i, r, c] <= seen[1, i, r, c]:
                     usable += np.float32(1.0)
             if usable > 1.0:
@@ -60,16 +62,18 @@ def flat_visibility(seen, half, flat, pairs):
     return rows * width - 2 * half
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, (w,) i8, (2,i,r,c) i4, i8, f4, (r,d) u1 -> None
+# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, f4, (r,d) u1 -> None
 @kernel
 def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floor, out):
     """Costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), rounded.
 
     pixels, layout : see `resample_plane`; nodes : see `plane_grid`; heights : t of height index 0, t per index;
-    span : first height index and count; windows : half widths of the windows; seen : (2, i, r, c) int32, lowest and
-    highest height index at which a view sees a cell (HIDDEN, -1 where it never does); out : (r, c * count) uint8.
+    span : first height index and count; windows : half widths of the windows; seen : (3, i, r, c) int32, lowest and
+    highest height index at which an image covers a cell (HIDDEN, -1 where it never does), and the lowest at which
+    nothing hides it; out : (r, c * count) uint8.
     A pair with a hidden view counts as uncorrelated (NCC 0): dropping it would favour heights that few views see,
-    where chance agreement is larger.
+    where chance agreement is larger. Heights that fewer than two images cover cost UNSEEN_COST, less than chance
+    agreement and more than a match: so a cell whose true height is outside the images is not matched elsewhere.
     """
     n_views, rows, cols = seen.shape[1], seen.shape[2], seen.shape[3]
     half = windows.max()
@@ -77,9 +81,9 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
     size = (rows + 2 * half) * width
     planes = np.zeros((n_views, size), np.float32)
     mean, scale = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
-    flat = np.empty((2, n_views, size), np.int32)
+    flat = np.empty((3, n_views, size), np.int32)
     pairs, total, agreed = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    scratch = np.empty((2, size), np.float32)
+    scratch, n_covering = np.empty((2, size), np.float32), np.empty(size, np.float32)
     index, fraction, grid = np.empty(width, np.uint32), np.empty((2, width), np.float32), np.empty(8)
     n = flat_visibility(seen, half, flat, pairs)
     first, count = span[0], span[1]
@@ -90,7 +94,7 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
         takes_part[i] = flat[1, i].max() >= first and flat[0, i].min() < first + count
         n_taking += takes_part[i]
     if n_taking < 2:
-        out[:] = np.uint8(COST_SCALE)
+        out[:] = np.uint8(UNSEEN_COST)
         return
     for k in range(count):
         height = np.int32(first + k)
@@ -103,6 +107,7 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
             for j in range(size):
                 planes[i, j] -= centre
         total[:n] = 0.0
+        n_covering[:n] = 0.0
         for w in range(windows.shape[0]):
             trim = (half - windows[w]) * (width + 1)
             for i in range(n_views):
@@ -110,13 +115,16 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
                     continue
                 window_moments(planes[i], trim, windows[w], width, n, floor, scratch[0], mean[i], scale[i])
                 for j in range(n):
-                    visible = np.float32(flat[0, i, j] <= height and height <= flat[1, i, j])
-                    scale[i, j] *= visible
+                    covered = np.float32(flat[0, i, j] <= height and height <= flat[1, i, j])
+                    scale[i, j] *= covered * np.float32(flat[2, i, j] <= height)
+                    n_covering[j] += covered
             pair_sum(planes, trim, mean, scale, windows[w], width, n, scratch, agreed)
             for j in range(n):
                 total[j] += share * agreed[j]
         for j in range(n):
-            total[j] = COST_SCALE - COST_SCALE * total[j] * pairs[j] + np.float32(0.5)
+            cost = COST_SCALE - COST_SCALE * total[j] * pairs[j]
+            is_seen = n_covering[j] > np.float32(1.5 * windows.shape[0])
+            total[j] = (cost if is_seen else UNSEEN_COST) + np.float32(0.5)
         for r in range(rows):
             for c in range(cols):
                 out[r, c * count + k] = np.uint8(min(max(total[r * width + c], np.float32(0.0)), np.float32(255.0)))

@@ -10,6 +10,7 @@ from zlocus.matching.lattice import HeightLattice
 from zlocus.options import PyramidOptions
 
 LANES = 16
+UNKNOWN = np.float32(1e9)
 
 
 def whole_range(origin_m: float, step_m: float, n_steps: int, shape: tuple[int, int], block: int) -> HeightLattice:
@@ -36,18 +37,16 @@ def ranges_nearby(
     there is none. A block with no candidate at all, which no two views saw at the coarser level, searches the least.
     """
     block = options.block
-    n_b, n_d = -(-shape[0] // block), -(-shape[1] // block)
     grow = np.ones((4 * options.reach + 1,) * 2, np.uint8)
-    lowest = _by_block(cv2.erode(np.where(np.isnan(low), np.float32(np.inf), low), grow), block, np.minimum)
-    highest = _by_block(cv2.dilate(np.where(np.isnan(high), np.float32(-np.inf), high), grow), block, np.maximum)
-    known = np.isfinite(lowest) & np.isfinite(highest)
+    lowest = _by_block(cv2.erode(np.where(np.isnan(low), UNKNOWN, low), grow), block, np.minimum)
+    highest = _by_block(cv2.dilate(np.where(np.isnan(high), -UNKNOWN, high), grow), block, np.maximum)
+    known = lowest <= highest
     last = -(-n_steps // LANES) * LANES - 1
     first = np.where(known, np.floor(np.where(known, lowest, 0)) - options.margin_steps, 0)
     end = np.where(known, np.ceil(np.where(known, highest, 0)) + options.margin_steps, 0)
     first, end = np.clip(first, 0, last), np.clip(end, 0, last)
     count = np.minimum(-(-(end - first + 1) // LANES) * LANES, last + 1).astype(np.int64)
     first = np.minimum(first, last + 1 - count).astype(np.int64)
-    assert first.shape == (n_b, n_d)
     return HeightLattice(origin_m, step_m, shape, block, first, count)
 
 

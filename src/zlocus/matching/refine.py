@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_profile
-from zlocus.kernels.smooth import smooth_surface
+from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.views import TileViews
 from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
 FIRST_REACH, LATER_REACH = 1.5, 0.75
 SPACINGS = (1, 2, 4)
+SLOPE_REACH = 4
 
 
 @dataclass(frozen=True)
@@ -29,11 +30,13 @@ class RefinedHeights:
 
 
 def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
-    """Median, then means that do not reach across jumps."""
+    """Median, then means along the slope that do not reach across jumps."""
     out = np.asarray(cv2.medianBlur(np.ascontiguousarray(surface), 5), np.float32)
+    by_row, by_col = np.empty_like(out), np.empty_like(out)
     for spacing in SPACINGS:
+        slopes(out, SLOPE_REACH, by_row, by_col)
         smooth = np.empty_like(out)
-        smooth_surface(out, spacing, np.float32(jump_steps), smooth)
+        smooth_surface(out, by_row, by_col, spacing, np.float32(jump_steps), smooth)
         out = smooth
     return out
 

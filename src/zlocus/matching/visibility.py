@@ -16,13 +16,13 @@ BORDER_PX = 3.0
 
 
 def coverage(views: TileViews, lattice: HeightLattice) -> IntVolume:
-    """(2, i, r, c) int32: lowest and highest height index at which each image covers each cell.
+    """(3, i, r, c) int32: lowest and highest height index at which each image covers each cell, and 0 (nothing hidden).
 
     A view takes part over the longest run of heights whose windows lie inside the image and on valid pixels; at other
     heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
     parallax of the range.)
     """
-    seen = np.empty((2, len(views.layout), *lattice.shape), np.int32)
+    seen = np.zeros((3, len(views.layout), *lattice.shape), np.int32)
     tile_reach(
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
         BORDER_PX, seen[0], seen[1],
@@ -40,7 +40,12 @@ def hide(seen: IntVolume, views: TileViews, surface: NDArray[np.float32], block:
         by_col, by_row = cells_per_step(views, i, block)
         lowest_visible(surface, by_col, by_row, lowest)
         bound = np.floor(np.maximum(lowest - margin_steps, 0.0)).astype(np.int32)
-        np.maximum(seen[0, i], bound, out=seen[0, i])
+        seen[2, i] = bound
+
+
+def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which views see the cells at the given height indices. seen : (3, ..., r, c); height : (..., r, c)."""
+    return np.asarray((seen[0] <= height) & (height <= seen[1]) & (seen[2] <= height))
 
 
 def cells_per_step(views: TileViews, i: int, block: int) -> tuple[float, float]:
