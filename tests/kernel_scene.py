@@ -38,8 +38,8 @@ class KernelScene:
                 yield b, d, rows, slice(c0, min(c0 + self.block, self.shape[1]))
 
     def all_seen(self):
-        """(2, i, r, c) int32: every view sees every height."""
-        seen = np.zeros((2, self.n_views, *self.shape), np.int32)
+        """(3, i, r, c) int32: every view covers and sees every height."""
+        seen = np.zeros((3, self.n_views, *self.shape), np.int32)
         seen[1] = 1000
         return seen
 

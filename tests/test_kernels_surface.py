@@ -11,7 +11,7 @@ from reference import agreement, surfaces
 from reference.projection import bilinear, cubic, positions
 from zlocus.kernels.reach import block_reach, surely_inside, tile_reach
 from zlocus.kernels.refine import block_profile, resample_surface, tile_ortho, tile_profile
-from zlocus.kernels.smooth import smooth_surface
+from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.kernels.visibility import lowest_visible
 from zlocus.kernels.volume import plane_grid
 
@@ -120,21 +120,36 @@ def test_reach_of_one_block_and_its_shortcut():
     assert (highest == 15).all()
 
 
-@pytest.mark.parametrize(("radius", "spread", "jump"), [(3, 2.0, 3.0), (1, 1.0, 50.0)])
-def test_smoothing(radius, spread, jump):
+def slopes_of(surface, reach=2):
+    by_row, by_col = np.empty_like(surface), np.empty_like(surface)
+    slopes(surface, reach, by_row, by_col)
+    return by_row, by_col
+
+
+@pytest.mark.parametrize(("spacing", "jump"), [(1, 3.0), (2, 4.0), (8, 50.0)])
+def test_smoothing(spacing, jump):
     surface = rough_surface((23, 31), high=6.0) + 100
+    by_row, by_col = slopes_of(surface)
     out = np.empty_like(surface)
-    smooth_surface(surface, radius, np.float32(spread), np.float32(jump), out)
-    np.testing.assert_allclose(out, surfaces.smoothed(surface.astype(float), radius, spread, jump), rtol=0, atol=STEPS)
+    smooth_surface(surface, by_row, by_col, spacing, np.float32(jump), out)
+    expected = surfaces.smoothed(*(v.astype(float) for v in (surface, by_row, by_col)), spacing, jump)
+    np.testing.assert_allclose(out, expected, rtol=0, atol=STEPS)
+
+
+@pytest.mark.parametrize("reach", [1, 2])
+def test_slopes(reach):
+    surface = rough_surface((17, 22), high=6.0)
+    for axis, found in enumerate(slopes_of(surface, reach)):
+        np.testing.assert_allclose(found, surfaces.slope(surface.astype(float), reach, axis), rtol=0, atol=STEPS)
 
 
 def test_smoothing_keeps_planes_and_jumps():
     row, col = np.indices((20, 30))
     surface = (0.2 * row + 0.1 * col + 10.0 * (col >= 15)).astype(np.float32)
     out = np.empty_like(surface)
-    smooth_surface(surface, 3, np.float32(2.0), np.float32(3.0), out)
+    smooth_surface(surface, *slopes_of(surface, 1), 1, np.float32(3.0), out)
     np.testing.assert_allclose(out[3:-3, 3:12], surface[3:-3, 3:12], rtol=0, atol=STEPS)
-    assert np.abs(out - surface)[3:-3].max() < 0.5
+    assert np.abs(out - surface)[3:-3, 3:-3].max() < 0.5
 
 
 def coefficients(scene):

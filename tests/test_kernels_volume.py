@@ -49,13 +49,14 @@ def twin_costs(scene, lattice, seen, halves=HALVES, floor=0.0):
 
 
 def partly_seen(scene, seed=1):
-    """Random lowest and highest heights, some cells seen by no view at all."""
+    """Random heights covered and hidden, some cells covered by no view at all."""
     rng = np.random.default_rng(seed)
     seen = scene.all_seen()
     seen[0] = rng.integers(0, 14, seen[0].shape)
     seen[1] = seen[0] + rng.integers(2, 40, seen[1].shape)
     nothing = rng.random(seen[0].shape) < 0.3
     seen[0][nothing], seen[1][nothing] = HIDDEN, -1
+    seen[2] = rng.integers(0, 20, seen[2].shape)
     return seen
 
 
@@ -177,7 +178,7 @@ def test_costs_with_hidden_views(halves, floor):
     assert np.abs(found[searched] - expected[searched]).max() < COST
     alone = ((seen[0] <= seen[1]).sum(axis=0) < 2)[..., None] & searched
     assert alone.any()
-    assert (found[alone] == 64).all()
+    assert (found[alone] == twin.UNSEEN_COST).all()
 
 
 def test_costs_of_one_block():
@@ -188,7 +189,7 @@ def test_costs_of_one_block():
         scene.pixels, scene.layout, scene.nodes, scene.heights, np.array([5, count]), HALVES, seen, scene.block,
         np.float32(0.0), out,
     )  # fmt: skip
-    flat = np.empty((2, 3, (10 + 2 * half) * (12 + 2 * half)), np.int32)
+    flat = np.empty((3, 3, (10 + 2 * half) * (12 + 2 * half)), np.int32)
     pairs = np.empty(flat.shape[2], np.float32)
     assert flat_visibility(seen, half, flat, pairs) == 10 * 16 - 4
     for k in range(count):

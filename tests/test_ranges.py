@@ -77,7 +77,7 @@ def test_a_block_that_nobody_saw_searches_the_least():
 
 def coarse_result(best, second, margin, window):
     heights = SimpleNamespace(best=best, second=second, margin=margin)
-    seen = np.zeros((2, 3, *best.shape), np.int32)
+    seen = np.zeros((3, 3, *best.shape), np.int32)
     seen[1] = 100
     return SimpleNamespace(window=window, heights=heights, seen=seen)
 

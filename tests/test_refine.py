@@ -67,7 +67,7 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
     windows = [ViewPixels(sensor, (0, 0), 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane]
     z = (origin, origin + 50 * STEP_M)
     views = tile_views(windows, 0, transform, shape, block, (origin, STEP_M), z, 2)
-    seen = np.zeros((2, len(LOOKS), *shape), np.int32)
+    seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 20.5, np.float32)
     found = refine(views, coarse, seen, block, RefineOptions(rounds=3))
@@ -82,7 +82,7 @@ def test_what_is_too_far_keeps_the_coarse_height(plane):
     transform = Affine(GSD_M, 0, CENTRE[0] - 8, 0, -GSD_M, CENTRE[1] + 8)
     windows = [ViewPixels(sensor, (0, 0), 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane]
     views = tile_views(windows, 0, transform, shape, 16, (origin, STEP_M), (40.0, 70.0), 2)
-    seen = np.zeros((2, len(LOOKS), *shape), np.int32)
+    seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 32.0, np.float32)
     found = refine(views, coarse, seen, 16, RefineOptions(rounds=1, reach_steps=0.1))

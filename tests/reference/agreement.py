@@ -9,6 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from reference.projection import bilinear, cubic, positions
 
+UNSEEN_COST = 40.0
+
 
 def windows(plane, half):
     """(r, c, m): the values of every window that lies inside a plane."""
@@ -43,20 +45,24 @@ def mean_ncc(planes, visible, half, floor=0.0):
 
 
 def cell_costs(images, nodes, heights, index, block, halves, seen, floor):
-    """64 (1 - mean NCC) of every cell of a block at one height index, (r, c) float, before rounding."""
+    """64 (1 - mean NCC) of every cell of a block at one height index, (r, c) float, before rounding.
+
+    Where fewer than two images cover that height, a fixed cost: see `block_costs`.
+    """
     half = max(halves)
     shape = seen.shape[2:]
     t = heights[0] + index * heights[1]
     planes = [
         bilinear(image, positions(node, t, shape, block, half)) for image, node in zip(images, nodes, strict=True)
     ]
-    visible = np.stack([(seen[0] <= index) & (index <= seen[1]), seen[0] <= seen[1]])
+    covered = (seen[0] <= index) & (index <= seen[1])
+    visible = np.stack([covered & (seen[2] <= index), seen[0] <= seen[1]])
     by_window = []
     for small in halves:
         trim = half - small
         inner = [plane[trim : plane.shape[0] - trim, trim : plane.shape[1] - trim] for plane in planes]
         by_window.append(mean_ncc(inner, visible, small, floor))
-    return 64.0 - 64.0 * np.mean(by_window, axis=0)
+    return np.where(covered.sum(axis=0) > 1, 64.0 - 64.0 * np.mean(by_window, axis=0), UNSEEN_COST)
 
 
 def profile(images, nodes, heights, surface, offset, block, half, seen, floor=0.0):
@@ -65,5 +71,5 @@ def profile(images, nodes, heights, surface, offset, block, half, seen, floor=0.
     t = heights[0] + (surface + offset) * heights[1]
     planes = [cubic(image, positions(node, t, shape, block, half)) for image, node in zip(images, nodes, strict=True)]
     centre = surface[half : half + shape[0], half : half + shape[1]]
-    visible = (seen[0] <= centre) & (centre <= seen[1])
+    visible = (seen[0] <= centre) & (centre <= seen[1]) & (seen[2] <= centre)
     return mean_ncc(planes, np.stack([visible, visible]), half, floor)

@@ -45,16 +45,28 @@ def longest_run(is_good):
     return best
 
 
-def smoothed(surface, radius, spread, jump):
-    """Weighted mean over a square of cells, Gauss in distance and Tukey in height."""
-    out = np.empty(surface.shape)
-    rows, cols = surface.shape
+def slope(surface, reach, axis):
+    """The smaller of the slopes before and after each cell where they have one sign, else 0; 0 at the border."""
+    out = np.zeros(surface.shape)
+    for at in np.ndindex(surface.shape):
+        if reach <= at[axis] < surface.shape[axis] - reach:
+            step = np.array([reach if k == axis else 0 for k in (0, 1)])
+            before, after = surface[at] - surface[tuple(at - step)], surface[tuple(at + step)] - surface[at]
+            if before * after > 0:
+                out[at] = (before if abs(before) < abs(after) else after) / reach
+    return out
+
+
+def smoothed(surface, by_row, by_col, spacing, jump):
+    """Binomial mean over 5 x 5 cells around each cell's own plane, with Tukey's weight in the distance from it."""
+    out, taps = np.empty(surface.shape), np.array([1, 4, 6, 4, 1]) / 16
     for r, c in np.ndindex(surface.shape):
         total = weight = 0.0
-        for i in range(max(r - radius, 0), min(r + radius + 1, rows)):
-            for j in range(max(c - radius, 0), min(c + radius + 1, cols)):
-                away = (surface[i, j] - surface[r, c]) / jump
-                w = max(1 - away**2, 0.0) ** 2 * np.exp(-((i - r) ** 2 + (j - c) ** 2) / (2 * spread**2))
-                total, weight = total + w * surface[i, j], weight + w
-        out[r, c] = total / weight
+        for i, j in np.ndindex(5, 5):
+            dr, dc = (i - 2) * spacing, (j - 2) * spacing
+            if 0 <= r + dr < surface.shape[0] and 0 <= c + dc < surface.shape[1]:
+                away = surface[r + dr, c + dc] - surface[r, c] - dr * by_row[r, c] - dc * by_col[r, c]
+                w = taps[i] * taps[j] * max(1 - (away / jump) ** 2, 0.0) ** 2
+                total, weight = total + w * away, weight + w
+        out[r, c] = surface[r, c] + total / weight
     return out
