@@ -24,7 +24,7 @@ from zlocus.matching.refine import smoothed
 
 SIDE, BLOCK, ROUNDS = 320, 32, 5
 SGM_SIDE = 576
-NEVER, ALWAYS = 0, 10_000
+HIGHEST = 10_000
 
 
 def processor() -> str:
@@ -71,8 +71,8 @@ def views(n_views: int, side: int = SIDE):
 
 def all_seen(n_views: int, side: int = SIDE):
     """Every view sees every cell at every height."""
-    seen = np.full((2, n_views, side, side), NEVER, np.int32)
-    seen[1] = ALWAYS
+    seen = np.zeros((3, n_views, side, side), np.int32)
+    seen[1] = HIGHEST
     return seen
 
 
