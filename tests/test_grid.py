@@ -33,11 +33,10 @@ def test_bounds_are_widened_to_whole_cells():
     check_lattice(grid)
 
 
-@pytest.mark.parametrize("cell", [0.1, 0.3, 0.7, 2.0])
-def test_bounds_on_cell_edges_stay(cell):
+@given(st.integers(1_500_000, 1_600_000), st.integers(17_000_000, 18_000_000), st.sampled_from([0.1, 0.3, 0.7, 2.0]))
+def test_bounds_on_cell_edges_stay(col, row, cell):
     """Also where the size of a cell is no binary fraction."""
-    bounds = (1_540_000 * cell, 17_490_000 * cell, 1_540_040 * cell, 17_490_025 * cell)
-    grid = grid_from_bounds(bounds, cell, UTM)
+    grid = grid_from_bounds((col * cell, row * cell, (col + 40) * cell, (row + 25) * cell), cell, UTM)
     assert tuple(grid.geobox.shape) == (25, 40)
     check_lattice(grid)
 
