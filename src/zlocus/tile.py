@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_ortho
 from zlocus.kernels.spline import spline_coefficients
+from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ranges import ranges_nearby, whole_range
+from zlocus.matching.ranges import ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import coverage, hide, sees
+from zlocus.matching.visibility import above_base, coverage, covers, hide, sees
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.reasons import is_empty
@@ -29,7 +30,10 @@ RIVALS_KEPT = 128
 
 @dataclass(frozen=True)
 class LevelResult:
-    """What one level hands to the next: its window, heights, and how many views cover and see each cell."""
+    """What one level hands to the next: its window, heights, and between which heights views cover and see each cell.
+
+    seen and heights are in height indices of the level's lattice, whatever base surface they were found along.
+    """
 
     window: CellWindow
     views: TileViews
@@ -61,20 +65,29 @@ def match_tile(
     pixels = _read(scene, core, config)
     if len(pixels) < 2:
         return TileResult(Surface.nothing(core))
-    result: LevelResult | None = None
     evaluations = 0
-    for level in range(scene.levels - 1, -1, -1):
-        window = _level_window(scene, core, level, config)
-        result = _match_level(scene, pixels, window, level, result, config, method, use_visibility)
+    coarsest = scene.levels - 1
+    window = _level_window(scene, core, coarsest, config)
+    result = _match_level(
+        scene, pixels, window, coarsest, _coarsest_guide(scene, window, None), config, method, use_visibility
+    )
+    evaluations += _evaluations(result)
+    if BaseSurface.along(smoothed(result.heights.vertex, config.refine.jump_steps), config.pyramid.block).is_steep:
+        guide = _coarsest_guide(scene, window, result.heights.vertex)
+        result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility)
         evaluations += _evaluations(result)
-    assert result is not None
+    for level in range(coarsest - 1, -1, -1):
+        window = _level_window(scene, core, level, config)
+        guide = Guide(_finer(result, window), *_candidates(scene, result, window, level))
+        result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility)
+        evaluations += _evaluations(result)
     return TileResult(_finish(scene, pixels, core, result, config), evaluations, evaluations)
 
 
 def _evaluations(result: LevelResult) -> int:
     """Cells x steps x images that were compared."""
     _, count = result.lattice.cell_ranges()
-    return int(((result.seen[1] >= 0).sum(axis=0) * count).sum())
+    return int((covers(result.seen).sum(axis=0) * count).sum())
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:
@@ -97,42 +110,67 @@ def _read(scene: MatchScene, core: CellWindow, config: RunConfig) -> list[ViewPi
     return found
 
 
+@dataclass(frozen=True)
+class Guide:
+    """What is known of a level's heights before it is matched, in its own height indices, all (r, c) float32.
+
+    surface : the coarser level's; low, high : lowest and highest index worth a look, NaN where nothing is known.
+    """
+
+    surface: NDArray[np.float32] | None
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+
+
+def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.float32] | None) -> Guide:
+    """The whole range, or what a DEM leaves of it."""
+    n_steps = -(-scene.n_steps // 2 ** (scene.levels - 1))
+    low = np.zeros((window.rows, window.cols), np.float32)
+    high = np.full((window.rows, window.cols), n_steps - 1, np.float32)
+    if scene.prior is not None:
+        part = scene.prior[(slice(None), *window.slices_in(scene.seen.at_level(scene.levels - 1, 0)))]
+        step = np.float32(scene.step_m * 2 ** (scene.levels - 1))
+        from_dem = (part - np.float32(scene.origin_m)) / step
+        low, high = (
+            np.where(np.isnan(from_dem[0]), low, from_dem[0]),
+            np.where(np.isnan(from_dem[1]), high, from_dem[1]),
+        )
+    return Guide(surface, low, high)
+
+
 def _match_level(
     scene: MatchScene,
     pixels: list[ViewPixels],
     window: CellWindow,
     level: int,
-    coarser: LevelResult | None,
+    guide: Guide,
     config: RunConfig,
     method: str,
     use_visibility: bool,
 ) -> LevelResult:
-    """One level: ranges, visibility, costs, semi-global constraint."""
-    shape = (window.rows, window.cols)
+    """One level: base surface, ranges, visibility, costs, semi-global constraint."""
+    shape, block = (window.rows, window.cols), config.pyramid.block
     step = scene.step_m * 2**level
     n_steps = -(-scene.n_steps // 2**level)
-    block = config.pyramid.block
     z = (scene.origin_m - 2 * step, scene.origin_m + (n_steps + 18) * step)
     half = config.measure.large_window // 2
     views = tile_views(pixels, level, scene.transform(window, level), shape, block, (scene.origin_m, step), z, half)
-    above = None if coarser is None else _finer(coarser, window, level)
-    if above is None and scene.prior is None:
-        lattice = whole_range(scene.origin_m, step, n_steps, shape, block)
-    else:
-        low, high = _from_prior(scene, window, step) if coarser is None else _candidates(scene, coarser, window, level)
-        lattice = ranges_nearby(low, high, scene.origin_m, step, shape, n_steps, config.pyramid)
-    seen = coverage(views, lattice)
-    ortho = None
-    if above is not None:
-        if use_visibility:
-            hide(seen, views, cv2.erode(above, np.ones((3, 3), np.uint8)), block, config.measure.hidden_margin_steps)
-        ortho = _ortho(views, smoothed(above, config.refine.jump_steps), block)
-    cost = cost_volume(views, lattice, seen, config.measure)
+    smooth = None if guide.surface is None else smoothed(guide.surface, config.refine.jump_steps)
+    base = BaseSurface.level(shape, block) if smooth is None else BaseSurface.along(smooth, block)
+    low, high = guide.low - base.cells, guide.high - base.cells
+    lattice = ranges_nearby(low, high, scene.origin_m, step, shape, config.pyramid)
+    along_base = base.shear(views)
+    seen = coverage(along_base, lattice)
+    if guide.surface is not None and use_visibility:
+        obstacle = cv2.erode(guide.surface, np.ones((3, 3), np.uint8))
+        hide(seen, views, obstacle, base.cells, block, config.measure.hidden_margin_steps)
+    ortho = None if smooth is None else _ortho(views, smooth, block)
+    cost = cost_volume(along_base, lattice, seen, config.measure)
     if method == "mvll":
         heights = pick(cost.astype(np.uint16), lattice)
     else:
         heights = aggregate(cost, lattice, penalties(ortho, shape, config.semiglobal), config.semiglobal)
-    return LevelResult(window, views, lattice, seen, heights)
+    return LevelResult(window, views, lattice, above_base(seen, base.cells), heights.above(base.cells))
 
 
 def _ortho(views: TileViews, surface: NDArray[np.float32], block: int, view: int = 0) -> NDArray[np.float32]:
@@ -154,7 +192,7 @@ def _true_ortho(
     return out
 
 
-def _finer(coarser: LevelResult, window: CellWindow, level: int) -> NDArray[np.float32]:
+def _finer(coarser: LevelResult, window: CellWindow) -> NDArray[np.float32]:
     """Height indices of the coarser level on the cells, and in the steps, of the finer."""
     return 2 * _doubled(coarser.heights.vertex, coarser.window, window)
 
@@ -171,7 +209,7 @@ def _candidates(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Lowest and highest height index worth a look in every cell: best, near rivals and tie points."""
     heights = coarser.heights
-    known = (coarser.seen[0] <= coarser.seen[1]).sum(axis=0) >= 2
+    known = covers(coarser.seen).sum(axis=0) >= 2
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
     low = np.where(known, np.minimum(heights.best, rival), np.nan).astype(np.float32)
     high = np.where(known, np.maximum(heights.best, rival), np.nan).astype(np.float32)
@@ -185,17 +223,6 @@ def _candidates(
         np.fmin.at(low, (row[inside], col[inside]), index)
         np.fmax.at(high, (row[inside], col[inside]), index)
     return low, high
-
-
-def _from_prior(
-    scene: MatchScene, window: CellWindow, step_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest height index of the coarsest level, from a DEM; the whole range where it has no heights."""
-    assert scene.prior is not None
-    part = scene.prior[(slice(None), *window.slices_in(scene.seen.at_level(scene.levels - 1, 0)))]
-    low, high = (part - np.float32(scene.origin_m)) / np.float32(step_m)
-    last = np.float32(scene.n_steps * scene.step_m / step_m)
-    return np.where(np.isnan(low), np.float32(0.0), low), np.where(np.isnan(high), last, high)
 
 
 def _finish(
@@ -213,7 +240,7 @@ def _finish(
     )
     refined = refine(coefficients, result.heights.vertex, result.seen, block, config.refine)
     at = refined.height[None]
-    covering = (result.seen[1] >= 0).sum(axis=0)
+    covering = covers(result.seen).sum(axis=0)
     seeing = sees(result.seen, at).sum(axis=0)
     last = scene.n_steps - 1
     quality = judge(result.heights, refined, covering, seeing, last, config.checks)

@@ -1,4 +1,4 @@
-"""Which heights each block of cells searches: all at the coarsest level, then what the coarser level found nearby."""
+"""Which heights each block of cells searches: what is worth a look in and around it."""
 
 from __future__ import annotations
 
@@ -13,22 +13,12 @@ LANES = 16
 UNKNOWN = np.float32(1e9)
 
 
-def whole_range(origin_m: float, step_m: float, n_steps: int, shape: tuple[int, int], block: int) -> HeightLattice:
-    """Every block searches indices 0 to n_steps - 1 (rounded up to whole vector lanes)."""
-    n_b, n_d = -(-shape[0] // block), -(-shape[1] // block)
-    count = -(-n_steps // LANES) * LANES
-    return HeightLattice(
-        origin_m, step_m, shape, block, np.zeros((n_b, n_d), np.int64), np.full((n_b, n_d), count, np.int64)
-    )
-
-
 def ranges_nearby(
     low: NDArray[np.float32],
     high: NDArray[np.float32],
     origin_m: float,
     step_m: float,
     shape: tuple[int, int],
-    n_steps: int,
     options: PyramidOptions,
 ) -> HeightLattice:
     """The span of the heights found in and around each block, with a margin.
@@ -41,13 +31,10 @@ def ranges_nearby(
     lowest = _by_block(cv2.erode(np.where(np.isnan(low), UNKNOWN, low), grow), block, np.minimum)
     highest = _by_block(cv2.dilate(np.where(np.isnan(high), -UNKNOWN, high), grow), block, np.maximum)
     known = lowest <= highest
-    last = -(-n_steps // LANES) * LANES - 1
-    first = np.where(known, np.floor(np.where(known, lowest, 0)) - options.margin_steps, 0)
-    end = np.where(known, np.ceil(np.where(known, highest, 0)) + options.margin_steps, 0)
-    first, end = np.clip(first, 0, last), np.clip(end, 0, last)
-    count = np.minimum(-(-(end - first + 1) // LANES) * LANES, last + 1).astype(np.int64)
-    first = np.minimum(first, last + 1 - count).astype(np.int64)
-    return HeightLattice(origin_m, step_m, shape, block, first, count)
+    first = np.where(known, np.floor(lowest) - options.margin_steps, 0)
+    end = np.where(known, np.ceil(highest) + options.margin_steps, 0)
+    count = -(-(end - first + 1).astype(np.int64) // LANES) * LANES
+    return HeightLattice(origin_m, step_m, shape, block, first.astype(np.int64), count)
 
 
 def _by_block(values: NDArray[np.float32], block: int, reduce: np.ufunc) -> NDArray[np.float32]:

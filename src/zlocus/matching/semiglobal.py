@@ -28,6 +28,11 @@ class SemiGlobalHeights:
     margin: NDArray[np.uint16]
     vertex: NDArray[np.float32]
 
+    def above(self, base: NDArray[np.float32]) -> SemiGlobalHeights:
+        """The same heights counted from the lattice's origin, from indices counted from a base surface (r, c)."""
+        best, second = (np.rint(v + base).astype(np.int32) for v in (self.best, self.second))
+        return SemiGlobalHeights(best, second, self.margin, self.vertex + base)
+
 
 def penalties(
     ortho: NDArray[np.float32] | None, shape: tuple[int, int], options: SemiGlobalOptions

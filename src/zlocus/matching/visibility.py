@@ -8,21 +8,24 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.reach import tile_reach
 from zlocus.kernels.visibility import lowest_visible
+from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews
 
 IntVolume = NDArray[np.int32]
 BORDER_PX = 3.0
+NOTHING_HIDDEN = -(2**29)
 
 
 def coverage(views: TileViews, lattice: HeightLattice) -> IntVolume:
-    """(3, i, r, c) int32: lowest and highest height index at which each image covers each cell, and 0 (nothing hidden).
+    """(3, i, r, c) int32: lowest and highest height index at which each image covers each cell, and from where on
+    nothing hides it (everywhere, for now).
 
     A view takes part over the longest run of heights whose windows lie inside the image and on valid pixels; at other
     heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
     parallax of the range.)
     """
-    seen = np.zeros((3, len(views.layout), *lattice.shape), np.int32)
+    seen = np.full((3, len(views.layout), *lattice.shape), NOTHING_HIDDEN, np.int32)
     tile_reach(
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
         BORDER_PX, seen[0], seen[1],
@@ -30,22 +33,43 @@ def coverage(views: TileViews, lattice: HeightLattice) -> IntVolume:
     return seen
 
 
-def hide(seen: IntVolume, views: TileViews, surface: NDArray[np.float32], block: int, margin_steps: float) -> None:
+def hide(
+    seen: IntVolume,
+    views: TileViews,
+    surface: NDArray[np.float32],
+    base: NDArray[np.float32],
+    block: int,
+    margin_steps: float,
+) -> None:
     """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
 
-    surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it.
+    surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it; base : (r, c) float32,
+    the base surface that the indices of `seen` are counted from.
     """
     lowest = np.empty(surface.shape, np.float32)
     for i in range(len(views.layout)):
         by_col, by_row = cells_per_step(views, i, block)
         lowest_visible(surface, by_col, by_row, lowest)
-        bound = np.floor(np.maximum(lowest - margin_steps, 0.0)).astype(np.int32)
-        seen[2, i] = bound
+        bound = np.maximum(lowest - margin_steps - base, NOTHING_HIDDEN)
+        seen[2, i] = np.floor(bound).astype(np.int32)
 
 
 def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which views see the cells at the given height indices. seen : (3, ..., r, c); height : (..., r, c)."""
     return np.asarray((seen[0] <= height) & (height <= seen[1]) & (seen[2] <= height))
+
+
+def covers(seen: IntVolume) -> NDArray[np.bool_]:
+    """Which views cover the cells at any height. seen : (3, ..., r, c)."""
+    return np.asarray(seen[0] <= seen[1])
+
+
+def above_base(seen: IntVolume, base: NDArray[np.float32]) -> IntVolume:
+    """`seen` counted from the lattice's origin, to half a step, from `seen` counted from a base surface (r, c)."""
+    moved = seen + np.rint(base).astype(np.int32)
+    never = ~covers(seen)
+    moved[0][never], moved[1][never] = HIDDEN, NOTHING_HIDDEN
+    return np.asarray(moved, np.int32)
 
 
 def cells_per_step(views: TileViews, i: int, block: int) -> tuple[float, float]:
