@@ -30,8 +30,8 @@ def cache_folder(sources: Path) -> Path:
         return Path(os.path.expanduser("~")) / ".cache" / "zlocus" / digest
 
 
-if not config.CACHE_DIR:
-    config.CACHE_DIR = str(cache_folder(Path(__file__).parent))
+if not config.CACHE_DIR:  # type: ignore[attr-defined]
+    config.CACHE_DIR = str(cache_folder(Path(__file__).parent))  # type: ignore[attr-defined]
 
 
 def kernel(function: F) -> F:

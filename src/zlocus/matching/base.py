@@ -24,7 +24,7 @@ BINOMIAL = ((1, 1, 1, 1), (0, 1, 2, 3), (0, 0, 1, 3), (0, 0, 0, 1))
 
 @dataclass(frozen=True)
 class BaseSurface:
-    """nodes : (b + 1, d + 1) float64, height indices at the corners of blocks; cells : (r, c) float32, of every cell."""
+    """nodes : (b + 1, d + 1) float64, height indices at corners of blocks; cells : (r, c) float32, of every cell."""
 
     nodes: NDArray[np.float64]
     cells: NDArray[np.float32]
