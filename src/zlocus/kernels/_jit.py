@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +26,7 @@ def cache_folder(sources: Path) -> Path:
         with tempfile.TemporaryFile(dir=beside):
             return beside / digest
     except OSError:
-        return Path(os.path.expanduser("~")) / ".cache" / "zlocus" / digest
+        return Path.home() / ".cache" / "zlocus" / digest
 
 
 if not config.CACHE_DIR:  # type: ignore[attr-defined]

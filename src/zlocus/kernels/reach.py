@@ -55,13 +55,13 @@ def plane_cover(grid, shape, margin, layout, blocked, has_blocked):
         return 1
     left, width = int(x_low), min(int(x_high) + 2, layout[2]) - int(x_low)
     top, height = int(y_low), min(int(y_high) + 2, layout[1]) - int(y_low)
-    n_blocked = 0
+    n_blocked = np.int64(0)
     for row in range(top, top + height):
         start = layout[0] + row * layout[2] + left
         in_row = np.uint16(0)
         for is_blocked in blocked[start : start + width]:
             in_row = np.uint16(in_row + np.uint16(is_blocked))
-        n_blocked += in_row
+        n_blocked += np.int64(in_row)
     return 1 if n_blocked == 0 else (-1 if n_blocked == width * height else 0)
 
 
