@@ -7,17 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.ranges import LANES, ranges_nearby, whole_range
+from zlocus.matching.ranges import LANES, ranges_nearby
 from zlocus.options import PyramidOptions
 from zlocus.tile import RIVALS_KEPT, _candidates
 
 OPTIONS = PyramidOptions(block=16, margin_steps=6, reach=2)
-N_STEPS = 250
 
 
 def nearby(low, high=None):
     low = np.asarray(low, np.float32)
-    return ranges_nearby(low, low if high is None else high, 10.0, 0.5, low.shape, N_STEPS, OPTIONS)
+    return ranges_nearby(low, low if high is None else high, 10.0, 0.5, low.shape, OPTIONS)
 
 
 def holds(lattice, block, low, high):
@@ -26,10 +25,11 @@ def holds(lattice, block, low, high):
 
 
 def test_the_whole_range():
-    lattice = whole_range(10.0, 0.5, 50, (37, 70), 16)
+    lattice = nearby(np.zeros((37, 70)), np.full((37, 70), 49, np.float32))
     assert lattice.first.shape == (3, 5)
-    assert (lattice.first == 0).all()
+    assert (lattice.first == -6).all()
     assert (lattice.count == 64).all()
+    assert (lattice.origin_m, lattice.step_m) == (10.0, 0.5)
 
 
 def test_flat_ground_has_a_short_range_around_it():
@@ -55,13 +55,11 @@ def test_a_tower_widens_its_block_and_those_within_reach():
     assert not holds(nearby(low, beside), (1, 1), 94, 216)
 
 
-def test_ranges_end_where_the_scene_does():
-    lattice = nearby(np.full((20, 20), 1.0), np.full((20, 20), 400.0, np.float32))
-    assert (lattice.first == 0).all()
-    assert (lattice.first + lattice.count == 256).all()
-    top = nearby(np.full((20, 20), 249.0))
-    assert (top.first + top.count <= 256).all()
-    assert holds(top, (0, 0), 243, 249)
+def test_heights_below_the_base_surface_have_negative_indices():
+    lattice = nearby(np.full((20, 20), -40.5), np.full((20, 20), -31.0, np.float32))
+    assert (lattice.first == -47).all()
+    assert holds(lattice, (0, 0), -47, -25)
+    assert (lattice.count == 32).all()
 
 
 def test_a_block_that_nobody_saw_searches_the_least():
@@ -72,7 +70,7 @@ def test_a_block_that_nobody_saw_searches_the_least():
     assert holds(lattice, (0, 0), 114, 126)
     assert (lattice.count[3:, 3:] == LANES).all()
     assert (lattice.count > 0).all()
-    assert (lattice.first >= 0).all()
+    assert (lattice.first[3:, 3:] == 0).all()
 
 
 def coarse_result(best, second, margin, window):

@@ -44,6 +44,13 @@ def test_versions_name_what_heights_depend_on():
     assert versions["numpy"] == np.__version__
 
 
+def test_numbers_that_are_not_finite_become_null(tmp_path):
+    write_record(tmp_path / "run.json", {"pairs": [{"px": float("nan")}, (np.float64("inf"), 1.5)], "n": 3})
+    assert json.loads((tmp_path / "run.json").read_text()) == {
+        "schema": 1, "pairs": [{"px": None}, [None, 1.5]], "n": 3,
+    }  # fmt: skip
+
+
 def test_a_record_is_whole_or_not_there(tmp_path):
     write_record(tmp_path / "run.json", {"coverage": 0.5})
     assert json.loads((tmp_path / "run.json").read_text()) == {"schema": 1, "coverage": 0.5}

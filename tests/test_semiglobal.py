@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from kernel_scene import even_lattice
-from zlocus.matching.semiglobal import BEHIND, aggregate, penalties, pick
+from zlocus.matching.semiglobal import BEHIND, SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.options import SemiGlobalOptions
 
 OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0)
@@ -57,3 +57,17 @@ def test_aggregation_joins_what_picking_alone_does_not():
     assert (np.abs(alone.best - 7) <= 1).mean() < 0.9
     assert joined.vertex.dtype == np.float32
     assert np.abs(joined.vertex - joined.best).max() <= 0.5
+
+
+def test_heights_above_a_base_surface():
+    """Indices along the base become indices of the lattice: whole ones to half a step, the vertex exactly."""
+    base = np.linspace(-7.3, 12.9, 12, dtype=np.float32).reshape(3, 4)
+    best, second = np.arange(12, dtype=np.int32).reshape(3, 4), np.full((3, 4), -3, np.int32)
+    margin, vertex = np.arange(12, dtype=np.uint16).reshape(3, 4), (best + 0.25).astype(np.float32)
+    moved = SemiGlobalHeights(best, second, margin, vertex).above(base)
+    np.testing.assert_array_equal(moved.margin, margin)
+    np.testing.assert_allclose(moved.vertex, vertex + base, rtol=0, atol=1e-6)
+    assert moved.vertex.dtype == np.float32
+    for found, plain in ((moved.best, best), (moved.second, second)):
+        assert found.dtype == np.int32
+        assert np.abs(found - plain - base).max() <= 0.5

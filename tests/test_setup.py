@@ -85,9 +85,9 @@ def test_levels(n_steps, levels):
 def test_ground_pixel_and_resolution():
     views = scene(view("a", gsd=0.5), view("b", gsd=0.7), view("c", gsd=2.0))
     assert median_ground_pixel(views, 50.0) == pytest.approx(0.7, rel=1e-3)
-    check_resolution(0.06, views, 50.0)
+    check_resolution(0.06, views, 50.0, "--resolution")
     with pytest.raises(ConfigError, match=r"--resolution 0\.04 m is finer"):
-        check_resolution(0.04, views, 50.0)
+        check_resolution(0.04, views, 50.0, "--resolution")
 
 
 def test_shared_ground_is_what_two_views_see():

@@ -7,13 +7,24 @@ import pytest
 from affine import Affine
 
 from rendered_scenes import CENTRE
+from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import ViewPixels, tile_views
-from zlocus.matching.visibility import BORDER_PX, cells_per_step, coverage, hide, sees
+from zlocus.matching.visibility import (
+    BORDER_PX,
+    NOTHING_HIDDEN,
+    above_base,
+    cells_per_step,
+    coverage,
+    covers,
+    hide,
+    sees,
+)
 from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (30, 50)
 ORIGIN_M, N_STEPS = 40.0, 64
+LEVEL = np.zeros(SHAPE, np.float32)
 
 
 def sensor(along=0.0, across=0.0):
@@ -84,7 +95,7 @@ def test_a_tower_hides_the_ground_behind_it():
     seen = coverage(views, lattice)
     surface = np.full(SHAPE, 10.0, np.float32)
     surface[:, 35:40] = 30.0
-    hide(seen, views, surface, BLOCK, 0.0)
+    hide(seen, views, surface, LEVEL, BLOCK, 0.0)
     assert (seen[0] == 0).all()
     sees_ground = sees(seen, np.full((2, *SHAPE), 10.0))
     assert sees_ground[0].all()
@@ -94,5 +105,45 @@ def test_a_tower_hides_the_ground_behind_it():
     assert (np.diff(hidden) == 1).all()
     assert hidden.max() in (38, 39)
     shown = coverage(views, lattice)
-    hide(shown, views, surface, BLOCK, 100.0)
-    assert (shown[2] == 0).all()
+    hide(shown, views, surface, LEVEL, BLOCK, 100.0)
+    assert (shown[2] < 0).all()
+
+
+def test_what_is_hidden_is_counted_from_the_base():
+    """The same tower seen along a base surface that rises to the east: the bound sinks by as much."""
+    views, lattice, _ = tile([sensor(), sensor(across=-45.0)])
+    surface = np.full(SHAPE, 10.0, np.float32)
+    surface[:, 35:40] = 30.0
+    base = np.broadcast_to(np.arange(SHAPE[1], dtype=np.float32) * 2, SHAPE)
+    level, sloped = coverage(views, lattice), coverage(views, lattice)
+    hide(level, views, surface, LEVEL, BLOCK, 0.0)
+    hide(sloped, views, surface, base, BLOCK, 0.0)
+    hidden = level[2, 1] > NOTHING_HIDDEN
+    assert hidden.sum() > 400
+    np.testing.assert_array_equal((level[2, 1] - base)[hidden], sloped[2, 1][hidden])
+    # On a level base at height 10, what was hidden at the ground stays so at index 0.
+    at_ground = coverage(views, lattice)
+    hide(at_ground, views, surface, LEVEL + 10, BLOCK, 0.0)
+    np.testing.assert_array_equal(
+        sees(at_ground, np.zeros((2, *SHAPE)))[1], sees(level, np.full((2, *SHAPE), 10.0))[1]
+    )  # fmt: skip
+
+
+def test_above_the_base_and_back():
+    """Bounds move with the base, to half a step; a cell that a view never covers stays so."""
+    seen = np.zeros((3, 2, 4, 5), np.int32)
+    seen[1], seen[2] = 20, 7
+    seen[0, 1, 2, 3], seen[1, 1, 2, 3] = HIDDEN, -1
+    base = np.linspace(-30, 30, 20, dtype=np.float32).reshape(4, 5)
+    moved = above_base(seen, base)
+    assert moved.dtype == np.int32
+    known = covers(seen)
+    assert known.sum() == 39
+    np.testing.assert_array_equal(covers(moved), known)
+    for bound, plain in enumerate((0, 20, 7)):
+        assert (np.abs(moved[bound] - plain - base) <= 0.5)[known].all()
+    never = moved[:, 1, 2, 3]
+    assert never[0] == HIDDEN
+    assert never[1] == NOTHING_HIDDEN
+    for height in (-1000.0, -1.0, 0.0, 1000.0):
+        assert not sees(moved, np.full((2, 4, 5), height))[1, 2, 3]

@@ -39,5 +39,9 @@ class CoverageError(ZlocusError):
     exit_status = 3
 
 
+class TileError(ZlocusError):
+    """A tile that failed for no reason the input explains."""
+
+
 class ZlocusWarning(UserWarning):
     """Something the user should know, that does not stop the run."""

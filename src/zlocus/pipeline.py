@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, CoverageError, GeometryError, OutputError
+from zlocus.errors import ConfigError, CoverageError, GeometryError, OutputError, TileError, ZlocusError
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.local import run_all
@@ -113,8 +114,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         _check_area(grid, settled)
         _check_polygons(request, grid, settled, polygons[0])
     tally = Tally()
-    out = _created(request.out)
-    with watch.stage("match"), SurfaceRasters(out, grid.geobox, settled.views[0].image.dtype) as rasters:
+    out, dtype = request.out, settled.views[0].image.dtype
+    with watch.stage("match"), _made(out), SurfaceRasters(out, grid.geobox, dtype) as rasters:
         _match(request, config, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     with watch.stage("record"):
         record = inputs_record(_files(request, scene))
@@ -126,24 +127,14 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
             "inputs": record,
             "stages": watch.stages,
             "orientation": orientation.as_dict(),
-            "grid": {
-                "crs": scene.crs.to_string(), "transform": list(grid.geobox.transform)[:6],
-                "shape": list(grid.geobox.shape),
-            },
-            "heights": {
-                "range_m": [round(v, 3) for v in z_range], "step_m": settled.step_m, "levels": settled.levels,
-                "leading_view": settled.views[0].name,
-            },
+            "grid": _grid_record(grid, scene.crs),
+            "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
             "evaluations": {"done": tally.evaluations, "all_images": tally.all_images},
             "coverage": round(tally.coverage, 6),
         },
-    )  # fmt: skip
-    if tally.coverage < SUFFICIENT_COVERAGE and not request.partial:
-        raise CoverageError(
-            f"Only {100 * tally.coverage:.1f} % of the cells seen by two images or more have a height in "
-            f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "
-            "with --partial."
-        )
+    )
+    if not request.partial:
+        _check_coverage(tally, out)
     return DsmResult(out, tally.coverage)
 
 
@@ -153,9 +144,10 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     from zlocus.synthetic.scenes import demo_spec
 
     spec = demo_spec()
-    folder = _created(out) / "scene"
+    folder = out / "scene"
     if folder.exists():
         shutil.rmtree(folder)
+    _make(folder)
     with progress.stage("Rendering the scene", len(spec.views)) as stage:
         rendered = render_scene(spec, folder, lambda step: stage.advance())
     request = DsmRequest(
@@ -181,7 +173,12 @@ def _match(
     """Match every tile and write what was asked for of it."""
 
     def work(tile: Tile) -> TileResult:
-        return match_tile(settled, tile.core, config, request.method, request.views == "auto")
+        try:
+            return match_tile(settled, tile.core, config, request.method, request.views == "auto")
+        except ZlocusError:
+            raise
+        except Exception as error:
+            raise TileError(_what_failed(settled, tile, error)) from error
 
     with progress.stage("Matching", len(tiles)) as stage:
         for tile, result in run_all(work, tiles, workers):
@@ -273,10 +270,10 @@ def _grid(request: DsmRequest, like: GeoBox | None, scene: Scene, z_range: tuple
     z = (z_range[0] + z_range[1]) / 2
     if like is not None:
         grid = grid_from_geobox(like, str(request.like))
-        check_resolution(grid.cell_m, scene, z)
+        check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
         return grid
     cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
-    check_resolution(cell, scene, z)
+    check_resolution(cell, scene, z, "--resolution")
     bounds = request.bounds or scene.bounds or shared_ground(scene, z_range)
     return grid_from_bounds(bounds, cell, scene.crs)
 
@@ -339,18 +336,66 @@ def _what_was_applied(orientation: Orientation) -> str:
     return f"Pointing corrected from {len(orientation.xyz)} tie points, px (column, row): {', '.join(moved)}."
 
 
-def _created(folder: Path) -> Path:
+def _what_failed(settled: MatchScene, tile: Tile, error: Exception) -> str:
+    """The tile and its fault, in a sentence."""
+    transform = settled.transform(tile.core, 0)
+    (west, north), (east, south) = transform * (0, 0), transform * (tile.core.cols, tile.core.rows)
+    what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
+    where = f"The tile E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
+    if isinstance(error, MemoryError):
+        return f"{where} does not fit into memory. Use fewer --workers, or set a smaller pyramid.tile in --config."
+    return (
+        f"{where} failed with {what}. This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the "
+        "trace, and report it."
+    )
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """A folder that is there; after a failure, what was made of it and its parents is removed again while empty."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    _make(folder)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):  # where something lies in it
+            for path in new:
+                path.rmdir()
+        raise
+
+
+def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder} cannot be made: {error.strerror}. Choose another folder with -o.") from error
-    return folder
+
+
+def _check_coverage(tally: Tally, out: Path) -> None:
+    """Refuse to call a run a success that found few heights."""
+    if tally.coverage < SUFFICIENT_COVERAGE:
+        raise CoverageError(
+            f"Only {100 * tally.coverage:.1f} % of the cells seen by two images or more have a height in "
+            f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "
+            "with --partial."
+        )
+
+
+def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
+    """The products' grid as JSON can hold it."""
+    geobox = grid.geobox
+    return {"crs": crs.to_string(), "transform": list(geobox.transform)[:6], "shape": list(geobox.shape)}
+
+
+def _lattice_record(settled: MatchScene) -> dict[str, Any]:
+    """The heights' lattice as JSON can hold it."""
+    return {"step_m": settled.step_m, "levels": settled.levels, "leading_view": settled.views[0].name}
 
 
 def _files(request: DsmRequest, scene: Scene) -> list[Path]:
     """Every file whose content the result depends on."""
     extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
-    listed = list(request.inputs) + [view.path for view in scene.views] + extra
+    listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
     return list(dict.fromkeys(listed))
 
 

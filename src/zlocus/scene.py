@@ -45,12 +45,13 @@ class ImageSource(Protocol):
 
 @dataclass(frozen=True)
 class View:
-    """One image with its sensor model in the scene's frame."""
+    """One image with its sensor model in the scene's frame. camera_files : what the model was read from, besides it."""
 
     name: str
     path: Path
     image: ImageSource
     sensor: SensorModel
+    camera_files: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

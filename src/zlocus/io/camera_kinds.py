@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import FiniteFloat
 from pyproj import CRS
 
-from zlocus.io.cameras import read_rpc
+from zlocus.io.cameras import find_sidecar, read_rpc
 from zlocus.io.strict import StrictModel
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import SensorModel
@@ -20,6 +20,11 @@ from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 
 class CameraSource(Protocol):
     """A camera that has been read, before the scene's CRS is known."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What it was read from, besides the image."""
+        ...
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
         """Longitude and latitude (degrees) of the image's centre; None for a camera that knows only its own frame."""
@@ -40,10 +45,11 @@ class Camera(StrictModel, ABC):
 
 @dataclass(frozen=True)
 class RpcSource:
-    """An RPC and the shift (column, row) px laid over it."""
+    """An RPC, the shift (column, row) px laid over it, and the files it stands in where that is not the image."""
 
     rpc: RpcCoefficients
     shift: tuple[float, float] | None = None
+    files: tuple[Path, ...] = ()
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
         """See `CameraSource`; at the RPC's height offset."""
@@ -68,7 +74,8 @@ class RpcCamera(Camera):
 
     def read(self, folder: Path, image: Path) -> RpcSource:
         """See `Camera`."""
-        return RpcSource(read_rpc(image, None if self.file is None else folder / self.file), self.shift)
+        file = find_sidecar(image) if self.file is None else folder / self.file
+        return RpcSource(read_rpc(image, file), self.shift, () if file is None else (file,))
 
 
 KINDS: dict[str, type[Camera]] = {"rpc": RpcCamera}

@@ -184,7 +184,7 @@ def _build(
     sources = [camera.read(folder, path) for _, path, camera in entries]
     crs = _default_crs(images, sources) if crs is None else crs
     views = tuple(
-        View(name, path, image, source.sensor(crs))
+        View(name, path, image, source.sensor(crs), source.files)
         for (name, path, _), image, source in zip(entries, images, sources, strict=True)
     )
     return Scene(views, crs, bounds, heights)

@@ -62,6 +62,17 @@ def flat_visibility(seen, half, flat, pairs):
     return rows * width - 2 * half
 
 
+# (3,i,p) i4, (2,) i8 -> (i,) b1
+@kernel
+def taking_part(flat, span):
+    """Which views cover any cell of a block at any height of its range. flat : see `flat_visibility`."""
+    first, end = span[0], span[0] + span[1]
+    takes = np.empty(flat.shape[1], np.bool_)
+    for i in range(flat.shape[1]):
+        takes[i] = flat[1, i].max() >= first and flat[0, i].min() < end
+    return takes
+
+
 # (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, f4, (r,d) u1 -> None
 @kernel
 def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floor, out):
@@ -88,12 +99,8 @@ def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floo
     n = flat_visibility(seen, half, flat, pairs)
     first, count = span[0], span[1]
     share = np.float32(1.0 / windows.shape[0])
-    takes_part = np.empty(n_views, np.bool_)
-    n_taking = 0
-    for i in range(n_views):
-        takes_part[i] = flat[1, i].max() >= first and flat[0, i].min() < first + count
-        n_taking += takes_part[i]
-    if n_taking < 2:
+    takes_part = taking_part(flat, span)
+    if takes_part.sum() < 2:
         out[:] = np.uint8(UNSEEN_COST)
         return
     for k in range(count):

@@ -78,12 +78,12 @@ def median_ground_pixel(scene: Scene, z: float) -> float:
     return float(np.median([ground_sample_distance(view, z) for view in scene.views]))
 
 
-def check_resolution(resolution: float, scene: Scene, z: float) -> None:
-    """Refuse cells much finer than the images."""
+def check_resolution(resolution: float, scene: Scene, z: float, given: str) -> None:
+    """Refuse cells much finer than the images. given : what asked for the resolution, for the message."""
     pixel = min(ground_sample_distance(view, z) for view in scene.views)
     if resolution < FINEST_CELL * pixel:
         raise ConfigError(
-            f"--resolution {resolution:g} m is finer than a tenth of the finest image's pixel ({pixel:.3g} m on the "
+            f"{given} {resolution:g} m is finer than a tenth of the finest image's pixel ({pixel:.3g} m on the "
             f"ground). Ask for {pixel:.2g} m or a few times that."
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import resource
 import sys
@@ -67,13 +68,24 @@ def versions_record() -> dict[str, str]:
 
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
-    """Write JSON whole or not at all."""
+    """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(json.dumps({"schema": SCHEMA, **record}, indent=2) + "\n", encoding="utf-8")
+        part.write_text(
+            json.dumps(_finite({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n", encoding="utf-8"
+        )
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
         raise OutputError(
             f"{path} cannot be written: {error.strerror}. Check the folder and the space left."
         ) from error
+
+
+def _finite(value: Any) -> Any:
+    """The same value with None for every number in it that is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

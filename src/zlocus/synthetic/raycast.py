@@ -31,6 +31,20 @@ OFF_SURFACE_M = 0.02
 OFF_WALL_CELLS = 1.5
 
 
+# (6 x f8), f8, i8, i8, i8 -> (i8, i8, i8, i8)
+@kernel
+def leave_block(ray, t, block_i, block_j, across):
+    """The cell that a ray enters where it leaves a block at t, across u or v (WALL_U, WALL_V), and the one before."""
+    u, v, _, du, dv, _ = ray
+    if across == WALL_U:
+        before_i = min(max(int(np.floor(v + dv * t)), block_i * BLOCK), block_i * BLOCK + BLOCK - 1)
+        before_j = block_j * BLOCK + (BLOCK - 1 if du > 0.0 else 0)
+        return before_i, before_j + (1 if du > 0.0 else -1), before_i, before_j
+    before_j = min(max(int(np.floor(u + du * t)), block_j * BLOCK), block_j * BLOCK + BLOCK - 1)
+    before_i = block_i * BLOCK + (BLOCK - 1 if dv > 0.0 else 0)
+    return before_i + (1 if dv > 0.0 else -1), before_j, before_i, before_j
+
+
 # (6 x f8), i8, i8, field -> (i8, f8, i8, i8, i8, i8)
 @kernel
 def march(ray, i, j, field):
@@ -61,16 +75,8 @@ def march(ray, i, j, field):
                 return MISS, 1.0, i, j, i, j
             t = block_end
             is_first = False
-            if block_u <= block_v:
-                before_i = min(max(int(np.floor(v + dv * t)), block_i * BLOCK), block_i * BLOCK + BLOCK - 1)
-                before_j = block_j * BLOCK + ahead_j * (BLOCK - 1)
-                i, j = before_i, before_j + step_j
-                entered = WALL_U
-            else:
-                before_j = min(max(int(np.floor(u + du * t)), block_j * BLOCK), block_j * BLOCK + BLOCK - 1)
-                before_i = block_i * BLOCK + ahead_i * (BLOCK - 1)
-                i, j = before_i + step_i, before_j
-                entered = WALL_V
+            entered = WALL_U if block_u <= block_v else WALL_V
+            i, j, before_i, before_j = leave_block(ray, t, block_i, block_j, entered)
             continue
         while i // BLOCK == block_i and j // BLOCK == block_j and i < rows and j < cols:
             cell_u = (j + ahead_j - u) * per_u
