@@ -28,6 +28,7 @@ from zlocus.io.scene_file import open_scene
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import Orientation, height_range, orient
+from zlocus.products.picture import picture_beside_truth
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
@@ -147,7 +148,7 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     folder = out / "scene"
     if folder.exists():
         shutil.rmtree(folder)
-    _make(folder)
+    _make(out)
     with progress.stage("Rendering the scene", len(spec.views)) as stage:
         rendered = render_scene(spec, folder, lambda step: stage.advance())
     request = DsmRequest(
@@ -155,6 +156,7 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     )
     result = run_dsm(request, RunConfig(), progress)
     evaluation = compare(result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, align=True)
+    picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")
     return DemoResult(result.out, evaluation)
 
 

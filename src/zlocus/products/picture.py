@@ -1,0 +1,94 @@
+"""A picture of a surface beside its truth: shaded relief coloured by height, and the error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+from rasterio.vrt import WarpedVRT
+
+from zlocus.errors import OutputError
+
+FloatImage = NDArray[np.float32]
+GAP = 12
+CAPTION = 34
+EMPTY_GREY = 255
+SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 45.0
+ERROR_SCALE_M = 1.0
+INK = (40, 40, 40)
+
+
+def picture_beside_truth(dsm: Path, truth: Path, path: Path, side: int = 480) -> None:
+    """Writes a PNG: the surface, the truth and the error, `side` pixels high each, on the cells of the truth.
+
+    Both surfaces are shaded from the north-west and share one range of colours (2nd to 98th percentile of the truth);
+    the error is red where the surface is too high, blue where it is too low, full at 1 m. Cells without a height are
+    white.
+    """
+    true, cell_m = _read(truth, None, side)
+    found, _ = _read(dsm, truth, side)
+    low, high = np.nanpercentile(true, (2.0, 98.0))
+    panels = [
+        _captioned(relief(found, cell_m, (low, high)), "surface"),
+        _captioned(relief(true, cell_m, (low, high)), f"truth, {low:.0f} to {high:.0f} m"),
+        _captioned(error_map(found - true), f"error, blue -{ERROR_SCALE_M:g} m to red +{ERROR_SCALE_M:g} m"),
+    ]
+    gap = np.full((panels[0].shape[0], GAP, 3), 255, np.uint8)
+    done, png = cv2.imencode(".png", np.hstack([panels[0], gap, panels[1], gap, panels[2]]))
+    try:
+        path.write_bytes(png.tobytes() if done else b"")
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written: {error.strerror}. Check the folder and the space left."
+        ) from error
+
+
+def relief(height: FloatImage, cell_m: float, span: tuple[float, float]) -> NDArray[np.uint8]:
+    """Heights (r, c) as colours, shaded by the sun from the north-west: (r, c, 3) uint8 in OpenCV's order."""
+    south, east = np.gradient(height, cell_m)
+    azimuth, elevation = np.deg2rad(SUN_AZIMUTH_DEG), np.deg2rad(SUN_ELEVATION_DEG)
+    to_sun = np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
+    light = (to_sun[2] - east * to_sun[0] + south * to_sun[1]) / np.sqrt(1.0 + east**2 + south**2)
+    # The square root leaves most colours to the ground, which towers would otherwise make one dark plain.
+    share = np.sqrt(np.clip((height - span[0]) / max(span[1] - span[0], 1e-6), 0.0, 1.0))
+    colours = cv2.applyColorMap(np.nan_to_num(255.0 * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    shaded = colours * (0.35 + 0.75 * np.clip(np.nan_to_num(light), 0.0, 1.0))[..., None]
+    return _empty_white(np.clip(shaded, 0, 255), np.isfinite(height))
+
+
+def error_map(error: FloatImage) -> NDArray[np.uint8]:
+    """Errors (r, c), m, as red (too high), white and blue (too low): (r, c, 3) uint8 in OpenCV's order."""
+    share = np.clip(np.nan_to_num(error) / ERROR_SCALE_M, -1.0, 1.0)
+    blue, green, red = 1.0 - np.maximum(share, 0.0), 1.0 - np.abs(share), 1.0 + np.minimum(share, 0.0)
+    # A light grey at no error keeps cells without a height, which are white, apart.
+    return _empty_white(225.0 * np.stack([blue, green, red], axis=-1), np.isfinite(error))
+
+
+def _empty_white(colours: NDArray[np.floating], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return np.where(known[..., None], colours, EMPTY_GREY).astype(np.uint8)
+
+
+def _captioned(panel: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    strip = np.full((CAPTION, panel.shape[1], 3), 255, np.uint8)
+    cv2.putText(strip, text, (2, CAPTION - 11), cv2.FONT_HERSHEY_SIMPLEX, 0.55, INK, 1, cv2.LINE_AA)
+    return np.vstack([strip, panel])
+
+
+def _read(path: Path, like: Path | None, side: int) -> tuple[FloatImage, float]:
+    """Heights of a raster (r, c) with NaN where there is none, `side` rows high, and the cell size, m.
+
+    like : raster whose extent is read; None reads the raster's own.
+    """
+    with rasterio.open(like or path) as frame:
+        shape = side, max(round(side * frame.width / frame.height), 1)
+        transform = frame.transform * frame.transform.scale(frame.width / shape[1], frame.height / shape[0])
+        crs = frame.crs
+    with rasterio.open(path) as file, WarpedVRT(
+        file, crs=crs, transform=transform, height=shape[0], width=shape[1], nodata=float("nan"),
+        resampling=Resampling.average,
+    ) as view:  # fmt: skip
+        return view.read(1).astype(np.float32), float(transform.a)
