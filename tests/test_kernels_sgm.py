@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -115,3 +117,16 @@ def test_a_minimum_at_an_end_is_a_winner_without_a_fraction():
     # A level stretch counts as a minimum of its own.
     assert (margin == 90).all()
     assert (np.abs(second - best) >= 3).all()
+
+
+def test_whatever_index_heights_start_at():
+    """Heights below the base surface have negative indices: the same sums, the same heights 20 lower."""
+    lattice = ragged_lattice((37, 70), 16, seed=5)
+    lower = replace(lattice, first=lattice.first - 20)
+    cost, p2 = random_cost(lattice), random_p2((37, 70))
+    total = aggregated(cost, lattice, 20, p2)
+    np.testing.assert_array_equal(aggregated(cost, lower, 20, p2), total)
+    plain, moved = picked(total, lattice), picked(total, lower)
+    assert (moved[0] < 0).any()
+    for k, (shift, rounding) in enumerate(((20, 0), (20, 0), (0, 0), (20, VERTEX))):
+        np.testing.assert_allclose(moved[k] + shift, plain[k], rtol=0, atol=rounding)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, spline_filter
@@ -11,7 +13,7 @@ from reference import agreement, surfaces
 from reference.projection import bilinear, cubic, positions
 from zlocus.kernels.reach import block_reach, surely_inside, tile_reach
 from zlocus.kernels.refine import block_profile, resample_surface, tile_ortho, tile_profile
-from zlocus.kernels.smooth import slopes, smooth_surface
+from zlocus.kernels.smooth import add_tap, slopes, smaller_slope, smooth_surface
 from zlocus.kernels.visibility import lowest_visible
 from zlocus.kernels.volume import plane_grid
 
@@ -97,6 +99,21 @@ def test_reach(n_views, shape, block, with_holes):
     assert ends > 0 or shape == (5, 7)
 
 
+def test_reach_whatever_index_heights_start_at():
+    """Heights below the base surface have negative indices: the same heights, numbered from 20 lower."""
+    scene = kernel_scene()
+    blocked = np.zeros(len(scene.pixels), bool)
+    blocked[: 61 * 97].reshape(61, 97)[15:40, 30:60] = True
+    plain = reached(scene, even_lattice(32, first=3), blocked)
+    moved = replace(scene, heights=scene.heights + np.array([20 * scene.heights[1], 0.0]))
+    lower = reached(moved, even_lattice(32, first=-17), blocked)
+    never = plain[0] == HIDDEN
+    assert 0 < never.sum() < never.size / 2
+    np.testing.assert_array_equal(lower[0] == HIDDEN, never)
+    np.testing.assert_array_equal(lower[:, ~never], plain[:, ~never] - 20)
+    assert (lower[0] > lower[1])[never].all()
+
+
 def covers(scene, i, node, cells, k, blocked):
     """Whether the cells of a block fall on a usable pixel at height index k, three from the border."""
     x, y = np.moveaxis(positions(node, scene.heights[0] + k * scene.heights[1], cells, scene.block), -1, 0)
@@ -134,6 +151,26 @@ def test_smoothing(spacing, jump):
     smooth_surface(surface, by_row, by_col, spacing, np.float32(jump), out)
     expected = surfaces.smoothed(*(v.astype(float) for v in (surface, by_row, by_col)), spacing, jump)
     np.testing.assert_allclose(out, expected, rtol=0, atol=STEPS)
+
+
+def test_the_smaller_slope():
+    for before, after, expected in (
+        (1, 2, 1), (2, 1, 1), (-3, -2, -2), (-2, -3, -2), (1, -1, 0), (-1, 1, 0), (0, 5, 0), (5, 0, 0),
+    ):  # fmt: skip
+        assert smaller_slope(np.float32(before), np.float32(after)) == expected
+
+
+def test_one_neighbour_of_a_row():
+    """A neighbour two rows down and one column left, 0.3 of the weight; beyond the jump of 4 it counts for nothing."""
+    rng = np.random.default_rng(2)
+    centre, other, by_row, by_col = rng.normal(0, 2, (4, 40)).astype(np.float32)
+    total, weight = np.ones(40, np.float32), np.full(40, 0.5, np.float32)
+    add_tap(centre, other, by_row, by_col, np.array([0.3, 2, -1], np.float32), np.float32(0.25), total, weight)
+    away = other - centre - 2 * by_row + by_col
+    expected = np.where(np.abs(away) < 4, 0.3 * (1 - (away / 4) ** 2) ** 2, 0)
+    assert 0 < (expected == 0).sum() < 40
+    np.testing.assert_allclose(weight, 0.5 + expected, rtol=0, atol=STEPS)
+    np.testing.assert_allclose(total, 1 + expected * away, rtol=0, atol=STEPS)
 
 
 @pytest.mark.parametrize("reach", [1, 2])

@@ -15,7 +15,7 @@ from reference.projection import bilinear, position, positions
 from reference.semiglobal import dense
 from zlocus.kernels.agreement import column_sums, pair_sum, product_rows, row_sums, window_moments
 from zlocus.kernels.resample import resample_plane
-from zlocus.kernels.volume import block_costs, flat_visibility, plane_grid, tile_costs
+from zlocus.kernels.volume import block_costs, flat_visibility, plane_grid, taking_part, tile_costs
 
 # Bilinear values of images with a spread of 1.4 grey values: positions are float32 within some 60 px of their origin.
 GREY = 1e-4
@@ -212,3 +212,28 @@ def test_gain_offset_and_order_of_images_do_not_matter():
     assert np.abs(changed.astype(int) - plain).max() <= 1
     assert (changed != plain).mean() < 0.01
     assert plain.min() < 40
+
+
+def test_views_that_take_part():
+    """Of heights 5 to 20: covering up to 4, from 21 on, all, one, and none at all."""
+    flat = np.zeros((3, 5, 6), np.int32)
+    flat[0], flat[1] = HIDDEN, -1
+    for i, (low, high) in enumerate(((0, 4), (21, 30), (0, 30), (20, 20))):
+        flat[0, i, 3], flat[1, i, 3] = low, high
+    np.testing.assert_array_equal(taking_part(flat, np.array([5, 16])), [False, False, True, True, False])
+    assert not taking_part(flat, np.array([-40, 16])).any()
+    np.testing.assert_array_equal(taking_part(flat, np.array([-15, 16])), [True, False, True, False, False])
+
+
+def test_costs_whatever_index_heights_start_at():
+    """Heights below the base surface have negative indices: the same heights, numbered from 20 lower."""
+    scene, lattice = kernel_scene(), ragged_lattice()
+    seen = partly_seen(scene)
+    expected = costs(scene, lattice, seen)
+    moved = replace(scene, heights=scene.heights + np.array([20 * scene.heights[1], 0.0]))
+    covered = seen[0] < HIDDEN
+    lower = np.where(covered, seen - 20, seen).astype(np.int32)
+    found = costs(moved, replace(lattice, first=lattice.first - 20), lower)
+    # The table's t of a height is rounded differently.
+    assert np.abs(found.astype(int) - expected).max() <= 1
+    assert (found != expected).mean() < 1e-3

@@ -85,7 +85,8 @@ def integrated(
 ) -> NDArray[np.float64]:
     """Heights of the corners of blocks whose differences come closest to the slopes of the blocks. (b + 1, d + 1).
 
-    Least squares over both edges of every block and direction; a weak weight on the blocks' heights fixes the rest.
+    Least squares over both edges of every block and direction; a weak weight on the blocks' heights, which are the
+    means of their corners, fixes the rest.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.linalg import spsolve
@@ -108,10 +109,11 @@ def integrated(
         np.add.at(right, m, -rise)
     for corner in corners:
         p = corner.ravel()
-        rows.append(p)
-        cols.append(p)
-        values.append(np.full(p.size, ANCHOR))
-        np.add.at(right, p, ANCHOR * heights.ravel())
+        np.add.at(right, p, ANCHOR / 4 * heights.ravel())
+        for other in corners:
+            rows.append(p)
+            cols.append(other.ravel())
+            values.append(np.full(p.size, ANCHOR / 16))
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
     matrix = coo_array(entries, shape=(number.size, number.size)).tocsc()
     return np.asarray(spsolve(matrix, right)).reshape(number.shape)
