@@ -25,3 +25,18 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.fail(f"ZLOCUS_TEST_DATA is {folder}, which is not a folder")
     return path
+
+
+@pytest.fixture(scope="session")
+def images(tmp_path_factory):
+    """Images of an analytic ground, rendered once: `images(kind)`."""
+    from rendered_scenes import rendered
+
+    made = {}
+
+    def of(kind):
+        if kind not in made:
+            made[kind] = rendered(tmp_path_factory.mktemp(kind), kind)
+        return made[kind]
+
+    return of

@@ -30,6 +30,10 @@ FIELD = (640, 640)
 LOOKS = {"nadir": (1.0, -3.0), "fore": (18.0, 2.0), "aft": (-17.0, 4.0)}
 QUIET = Optics(noise=0.003, noise_floor=1.0)
 SMALL_TILES = RunConfig(pyramid=PyramidOptions(tile=64))
+# A part of the area that all images see.
+PART = (CENTRE[0] - 12.0, CENTRE[1] - 10.0, CENTRE[0] + 14.0, CENTRE[1] + 9.0)
+# An error that counts as a wrong match.
+BLUNDER_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -99,3 +103,13 @@ def well_seen(source: rasterio.DatasetReader, truth: np.ndarray, margin_px: floa
         xy = camera(name).image_from_ground(xyz)
         inside &= ((xy > margin_px) & (xy < last)).all(axis=1)
     return inside.reshape(truth.shape)
+
+
+def errors_of(out, kind):
+    """Height errors where all images see the surface, m; NaN where there is no height."""
+    height, source = read(out / "dsm.tif")
+    truth = truth_at(kind, source)
+    error = height - truth
+    seen = well_seen(source, truth)
+    assert seen.sum() > 50
+    return error, seen
