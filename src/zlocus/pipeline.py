@@ -40,6 +40,7 @@ from zlocus.tile import TileResult, match_tile
 
 HEIGHT_SAMPLES = 5
 SUFFICIENT_COVERAGE = 0.5
+DEMO_WORKERS = 2
 UNBOUNDED_M = (-500.0, 9000.0)
 
 
@@ -152,8 +153,9 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     with progress.stage("Rendering the scene", len(spec.views)) as stage:
         rendered = render_scene(spec, folder, lambda step: stage.advance())
     request = DsmRequest(
-        inputs=tuple(rendered.images.values()), out=out, crs=f"EPSG:{spec.epsg}", resolution=spec.gsd_m, overwrite=True
-    )
+        inputs=tuple(rendered.images.values()), out=out, crs=f"EPSG:{spec.epsg}", resolution=spec.gsd_m, overwrite=True,
+        workers=DEMO_WORKERS,
+    )  # fmt: skip
     result = run_dsm(request, RunConfig(), progress)
     evaluation = compare(result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, align=True)
     picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")

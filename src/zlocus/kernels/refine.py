@@ -127,7 +127,9 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
     centre = np.float64(0.5) * (surface.min() + offsets.min() + surface.max() + offsets.max())
     reach = max(np.float64(0.5) * (surface.max() + offsets.max() - surface.min() - offsets.min()), 0.01)
     for j in range(offsets.shape[0]):
-        level[:] = (surface + offsets[j] - np.float32(centre)) / np.float32(reach)
+        for r in range(surface.shape[0]):
+            for c in range(width):
+                level[r, c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(reach)
         for i in range(n_views):
             if flat[0, i].min() == HIDDEN:
                 continue

@@ -120,7 +120,10 @@ def row_edges(p2, row, sign, edge):
     """P2 of the steps into each cell of a row, by position; the up sweep takes the steps of `p2` the other way."""
     rows, cols = p2.shape[1], p2.shape[2]
     if sign > 0:
-        edge[:] = p2[:, row]
+        # Plain loops: Numba takes five seconds to compile the shape check of an array assigned to a slice.
+        for path in range(4):
+            for c in range(cols):
+                edge[path, c] = p2[path, row, c]
         return
     behind = min(row + 1, rows - 1)
     for i in range(cols):
