@@ -1,0 +1,61 @@
+"""What the documents say of the code."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import typer.main
+import yaml
+
+from zlocus.cli import app
+from zlocus.io.scene_file import SceneFile
+from zlocus.surface import reasons
+from zlocus.surface.reasons import EMPTY, Quality
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
+
+
+def fate(flag: Quality) -> str:
+    if flag in EMPTY:
+        return "none"
+    return "filled" if flag is Quality.FILLED else "kept"
+
+
+def test_the_table_of_quality_flags_is_that_of_the_code():
+    source = Path(reasons.__file__).read_text(encoding="utf-8")
+    said = dict(re.findall(r"^    ([A-Z_]+) = \d+  # (.+)$", source, re.MULTILINE))
+    expected = [(str(int(flag)), flag.name, said[flag.name], fate(flag)) for flag in Quality]
+    page = (ROOT / "docs" / "quality.md").read_text(encoding="utf-8")
+    rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in page.splitlines()]
+    assert [row for row in rows if row[0].isdigit()] == expected
+
+
+def test_the_scene_file_of_the_documents_is_valid():
+    page = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    scene = SceneFile.model_validate(yaml.safe_load(example))
+    assert [view.name for view in scene.views] == ["nadir", "forward"]
+
+
+def test_the_readme_lists_every_option_of_dsm():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    command = typer.main.get_command(app).commands["dsm"]
+    options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
+    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z]+)", readme, re.MULTILINE))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_lead_to_files(page):
+    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_paths_named_in_the_method_exist():
+    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    named = re.findall(r"\(`([a-z_/]+(?:\.py|/))`\)", text)
+    assert len(named) == 8
+    for path in named:
+        assert (ROOT / "src" / "zlocus" / path).exists(), path
