@@ -146,10 +146,16 @@ class SemiGlobalOptions(Checked):
 class RefineOptions(Checked):
     """The last pass: sub-step heights from windows that follow the surface (method section 6)."""
 
-    window: int = option(9, "Side of the correlation window.", choices=(3, 5, 7, 9, 11, 13), unit="cells")
+    window: int | None = option(
+        None,
+        "Side of the correlation window; unset: 9 where a height step is higher than two cells (narrow bases, noise "
+        "rules), else 7 (relief within the window rules).",
+        choices=(3, 5, 7, 9, 11, 13),
+        unit="cells",
+    )
     rounds: int = option(2, "Times the surface is smoothed and measured again.", low=0, high=10)
     jump_steps: float = option(
-        3.0, "Height difference that smoothing does not bridge.", low=0.5, high=100.0, unit="steps"
+        2.0, "Height difference that smoothing does not bridge.", low=0.5, high=100.0, unit="steps"
     )
     reach_steps: float = option(
         1.5, "A refined height stays this close to the semi-global one, else that is kept.", low=0.1, high=10.0,

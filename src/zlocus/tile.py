@@ -238,7 +238,9 @@ def _finish(
         nodes=result.views.nodes,
         heights=result.views.heights,
     )
-    refined = refine(coefficients, result.heights.vertex, result.seen, block, config.refine)
+    refined = refine(
+        coefficients, result.heights.vertex, result.seen, block, scene.step_m / scene.cell_m, config.refine
+    )
     at = refined.height[None]
     covering = covers(result.seen).sum(axis=0)
     seeing = sees(result.seen, at).sum(axis=0)

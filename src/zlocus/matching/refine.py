@@ -16,7 +16,8 @@ from zlocus.options import RefineOptions
 FloatGrid = NDArray[np.float32]
 FIRST_REACH, LATER_REACH = 1.5, 0.75
 SPACINGS = (1, 2, 4)
-SLOPE_REACH = 4
+SLOPE_REACH = 8
+NARROW_BASE, WIDE_WINDOW, NARROW_WINDOW = 2.0, 9, 7
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ def refine(
     coarse: FloatGrid,
     seen: NDArray[np.int32],
     block: int,
+    step_cells: float,
     options: RefineOptions,
 ) -> RefinedHeights:
     """Refine height indices `coarse` (r, c) float32.
@@ -53,9 +55,9 @@ def refine(
     coefficients : the views with cubic B-spline coefficients for pixels. Each round smooths the surface, measures the
     mean NCC at a few fractions of a step around it and puts a parabola through the best three. Windows that follow a
     noisy surface would see a different place in each image, hence the smoothing; a refined height further than
-    `reach_steps` from the semi-global one is not believed.
+    `reach_steps` from the semi-global one is not believed. step_cells : height of a step over the side of a cell.
     """
-    half = options.window // 2
+    half = (options.window or default_window(step_cells)) // 2
     height, is_refined = coarse.astype(np.float32), np.zeros(coarse.shape, bool)
     best = np.zeros(coarse.shape, np.float32)
     for number in range(options.rounds):
@@ -72,6 +74,15 @@ def refine(
         is_refined = inside & (np.abs(found - coarse) < options.reach_steps)
         height = np.where(is_refined, found, height)
     return RefinedHeights(height, best, is_refined)
+
+
+def default_window(step_cells: float) -> int:
+    """Side of the window where none is asked for.
+
+    With a narrow base a step is many cells high and relief within a window a small part of it: noise rules and a large
+    window averages it. With a wide base relief rules, and a large window smooths it away.
+    """
+    return WIDE_WINDOW if step_cells > NARROW_BASE else NARROW_WINDOW
 
 
 def parabola_peak(profile: NDArray[np.float32], offsets: FloatGrid) -> tuple[FloatGrid, FloatGrid, NDArray[np.bool_]]:
