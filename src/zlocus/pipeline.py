@@ -20,6 +20,7 @@ from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.local import run_all
 from zlocus.execution.plan import Tile, plan_tiles, tile_memory_bytes
+from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.io.config import config_as_dict
 from zlocus.io.crs import checked_crs
@@ -150,7 +151,7 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     if folder.exists():
         shutil.rmtree(folder)
     _make(out)
-    with progress.stage("Rendering the scene", len(spec.views)) as stage:
+    with progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
         rendered = render_scene(spec, folder, lambda step: stage.advance())
     request = DsmRequest(
         inputs=tuple(rendered.images.values()), out=out, crs=f"EPSG:{spec.epsg}", resolution=spec.gsd_m, overwrite=True,

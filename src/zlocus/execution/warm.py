@@ -1,0 +1,108 @@
+"""Compiles the kernels ahead, in processes of their own, while something else runs: the cache on disk serves all.
+
+`python -m zlocus.execution.warm GROUP` runs one group of kernels on a scene of a few cells.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from zlocus.matching.cells import CellWindow
+from zlocus.matching.setup import MatchScene
+from zlocus.options import RunConfig
+from zlocus.scene import ImageWindow, View
+from zlocus.sensors.model import FloatArray
+
+GROUPS = ("match", "refine")
+SIDE = 96
+
+
+@contextmanager
+def kernels_compiling() -> Iterator[None]:
+    """Kernels compile while the block runs; at its end they are ready."""
+    commands = [[sys.executable, "-m", "zlocus.execution.warm", group] for group in GROUPS]
+    running = [subprocess.Popen(c, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
+    try:
+        yield
+        for process in running:
+            process.wait()
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+@dataclass(frozen=True)
+class SlantedCamera:
+    """Parallel rays: column = E + by_height z, row = -N."""
+
+    by_height: float
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return np.column_stack([xyz[:, 0] + self.by_height * xyz[:, 2], -xyz[:, 1]])
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return np.column_stack([xy[:, 0] - self.by_height * z, -xy[:, 1], np.broadcast_to(z, len(xy))])
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`."""
+        return None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """An image of noise."""
+
+    seed: int
+    shape: tuple[int, int] = (SIDE, SIDE)
+    dtype: str = "float32"
+
+    def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+        """See `ImageSource`."""
+        pixels = np.random.default_rng(self.seed).normal(size=self.shape).astype(np.float32)
+        part = np.ascontiguousarray(pixels[row : row + rows, col : col + cols])
+        return ImageWindow(part, np.ones(part.shape, bool))
+
+
+def tiny_scene() -> MatchScene:
+    """Two images of noise over 96 x 96 cells."""
+    views = tuple(View(f"v{i}", Path(f"v{i}"), Noise(i), SlantedCamera(0.5 * i)) for i in range(2))
+    return MatchScene(
+        views=views, anchor=(0.0, 0.0), cell_m=1.0, origin_m=0.0, step_m=1.0, n_steps=16, levels=2,
+        seen=CellWindow(0, 0, SIDE, SIDE), contrast=(1.0, 1.0), ties=np.zeros((0, 3)),
+    )  # fmt: skip
+
+
+def warm(group: str) -> None:
+    """Run a group of kernels once: `match` is everything up to the finest level's heights, `refine` what follows."""
+    from zlocus import tile
+    from zlocus.kernels.spline import spline_coefficients
+    from zlocus.matching.refine import refine
+    from zlocus.matching.views import read_pixels, tile_views
+
+    scene, config = tiny_scene(), RunConfig()
+    if group == "match":
+        without = replace(config, refine=replace(config.refine, rounds=0))
+        tile.match_tile(scene, scene.seen, without)
+        return
+    pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, 1.0) for view in scene.views]
+    shape, block = (SIDE, SIDE), config.pyramid.block
+    views = tile_views(pixels, 0, scene.transform(scene.seen, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
+    for view in pixels:
+        spline_coefficients(view.pixels[0])
+    seen = np.zeros((3, 2, *shape), np.int32)
+    seen[1] = 16
+    refine(views, np.full(shape, 8.0, np.float32), seen, block, 1.0, config.refine)
+
+
+if __name__ == "__main__":
+    warm(sys.argv[1])
