@@ -98,6 +98,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     with watch.stage("open"), progress.stage("Opening images"):
         like = None if request.like is None else read_geobox(request.like)
         scene = open_scene(request.inputs, _asked_crs(request, like))
+        # By name, so that the order of the inputs changes nothing.
+        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
         check_overlap(scene, _possible_heights(scene, request))
         polygons = _area_polygons(request, scene.crs)
     with watch.stage("orient"):
@@ -179,7 +181,7 @@ def _match(
 
     def work(tile: Tile) -> TileResult:
         try:
-            return match_tile(settled, tile.core, config, request.method, request.views == "auto")
+            return match_tile(settled, tile.core, config, request.method, request.views == "auto", request.fill)
         except ZlocusError:
             raise
         except Exception as error:

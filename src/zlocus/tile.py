@@ -22,6 +22,7 @@ from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixe
 from zlocus.matching.visibility import above_base, coverage, covers, hide, sees
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
+from zlocus.surface.fill import filled
 from zlocus.surface.reasons import is_empty
 from zlocus.surface.surface import Surface
 
@@ -53,12 +54,17 @@ class TileResult:
 
 
 def match_tile(
-    scene: MatchScene, core: CellWindow, config: RunConfig, method: str = "mvll-sgm", use_visibility: bool = True
+    scene: MatchScene,
+    core: CellWindow,
+    config: RunConfig,
+    method: str = "mvll-sgm",
+    use_visibility: bool = True,
+    fill: str = "none",
 ) -> TileResult:
     """The surface of a tile's core (finest cells), computed with a halo at every level.
 
     method : mvll-sgm, or mvll without the semi-global constraint; use_visibility : whether views count as hidden where
-    the coarser level's surface stands in their way.
+    the coarser level's surface stands in their way; fill : none, or interpolate gaps that images cover.
     """
     if not (core.rows and core.cols):
         return TileResult(Surface.nothing(core))
@@ -81,7 +87,10 @@ def match_tile(
         guide = Guide(_finer(result, window), *_candidates(scene, result, window, level))
         result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility)
         evaluations += _evaluations(result)
-    return TileResult(_finish(scene, pixels, core, result, config), evaluations, evaluations)
+    surface = _finish(scene, pixels, result, config)
+    if fill == "interpolate":
+        surface = filled(surface, config.pyramid.halo // 2)
+    return TileResult(surface.part(core, result.window), evaluations, evaluations)
 
 
 def _evaluations(result: LevelResult) -> int:
@@ -225,10 +234,8 @@ def _candidates(
     return low, high
 
 
-def _finish(
-    scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, result: LevelResult, config: RunConfig
-) -> Surface:
-    """Refine the finest level, judge it, and cut the core out."""
+def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:
+    """Refine the finest level and judge it, halo included."""
     block = config.pyramid.block
     coefficients = TileViews(
         pixels=np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels]),
@@ -251,4 +258,4 @@ def _finish(
     ortho = _true_ortho(pixels, result, refined.height, block)
     ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
-    return Surface(height, quality, used, ortho).part(core, result.window)
+    return Surface(height, quality, used, ortho)

@@ -1,0 +1,23 @@
+"""Heights for gaps, for those who want none: interpolated, and marked as such."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zlocus.kernels.fill import interpolate_gaps
+from zlocus.surface.reasons import Quality
+from zlocus.surface.surface import Surface
+
+
+def filled(surface: Surface, reach: int) -> Surface:
+    """The surface with gaps interpolated from the nearest heights in eight directions, at most `reach` cells away.
+
+    Cells that no two images cover, or that were not asked for, stay empty. Filled cells carry `Quality.FILLED` beside
+    the reason why they were empty, and use 0 images.
+    """
+    beyond = (surface.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
+    height = np.empty_like(surface.height)
+    interpolate_gaps(surface.height, beyond, reach, height)
+    gained = np.isnan(surface.height) & np.isfinite(height)
+    quality = np.where(gained, surface.quality | np.uint16(Quality.FILLED), surface.quality)
+    return Surface(height, quality, surface.views, surface.ortho)
