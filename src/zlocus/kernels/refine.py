@@ -124,6 +124,9 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
                 if not (max(seen[0, i, r, c], seen[2, i, r, c]) <= z <= seen[1, i, r, c]):
                     at_surface[0, i, r, c] = HIDDEN
     n = flat_visibility(at_surface, half, flat, pairs)
+    if pairs.max() == 0.0:
+        out[:] = 0.0
+        return
     centre = np.float64(0.5) * (surface.min() + offsets.min() + surface.max() + offsets.max())
     reach = max(np.float64(0.5) * (surface.max() + offsets.max() - surface.min() - offsets.min()), 0.01)
     for j in range(offsets.shape[0]):

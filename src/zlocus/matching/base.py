@@ -71,13 +71,13 @@ def block_heights(surface: NDArray[np.float32], block: int) -> NDArray[np.float6
 
 
 def block_medians(values: NDArray[np.float32], block: int) -> NDArray[np.float64]:
-    """Median of every block of (r, c) values; blocks at the border may be smaller."""
+    """Median of every block of (r, c) values; cut blocks at the border are filled up by mirroring."""
     rows, cols = values.shape
     n_b, n_d = -(-rows // block), -(-cols // block)
-    padded = np.full((n_b * block, n_d * block), np.nan, np.float32)
-    padded[:rows, :cols] = values
+    beyond = ((0, n_b * block - rows), (0, n_d * block - cols))
+    padded = np.pad(values, beyond, mode="symmetric" if min(rows, cols) >= block else "edge")
     pieces = padded.reshape(n_b, block, n_d, block).transpose(0, 2, 1, 3).reshape(n_b, n_d, -1)
-    return np.asarray(np.nanmedian(pieces, axis=2), np.float64)
+    return np.asarray(np.median(pieces, axis=2), np.float64)
 
 
 def integrated(

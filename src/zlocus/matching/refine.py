@@ -14,7 +14,7 @@ from zlocus.matching.views import TileViews
 from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
-FIRST_REACH, LATER_REACH = 1.5, 0.75
+FIRST_REACH, LATER_REACH, SAMPLES = 1.5, 0.75, 5
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
 NARROW_BASE, WIDE_WINDOW, NARROW_WINDOW = 2.0, 9, 7
@@ -63,7 +63,7 @@ def refine(
     for number in range(options.rounds):
         surface = smoothed(height, options.jump_steps)
         reach = FIRST_REACH if number == 0 else LATER_REACH
-        offsets = np.linspace(-reach, reach, 7 if number == 0 else 5, dtype=np.float32)
+        offsets = np.linspace(-reach, reach, SAMPLES, dtype=np.float32)
         profile = np.empty((len(offsets), *coarse.shape), np.float32)
         tile_profile(
             coefficients.pixels, coefficients.layout, coefficients.nodes, coefficients.heights,

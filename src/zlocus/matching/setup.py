@@ -14,7 +14,7 @@ from zlocus.matching.cells import CellWindow
 from zlocus.options import PyramidOptions
 from zlocus.scene import Scene, View, footprint, ground_sample_distance
 
-SAMPLE_ROWS = 24
+SAMPLE_ROWS = 12
 FINEST_CELL = 0.1
 ON_GRID = 1e-6
 FEWEST_LEVELS = 3
