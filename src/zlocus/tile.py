@@ -27,6 +27,7 @@ from zlocus.surface.reasons import is_empty
 from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
+SEEN_MARGIN = 4
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,11 @@ def match_tile(
         guide = _coarsest_guide(scene, window, result.heights.vertex)
         result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility)
         evaluations += _evaluations(result)
+    worth = _worth_matching(result)
     for level in range(coarsest - 1, -1, -1):
-        window = _level_window(scene, core, level, config)
+        window = _level_window(scene, core, level, config).within(worth.finer(coarsest - level))
+        if not (window.rows and window.cols):
+            return TileResult(Surface.nothing(core), evaluations, evaluations)
         guide = Guide(_finer(result, window), *_candidates(scene, result, window, level))
         result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility)
         evaluations += _evaluations(result)
@@ -91,6 +95,18 @@ def match_tile(
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
     return TileResult(surface.part(core, result.window), evaluations, evaluations)
+
+
+def _worth_matching(coarsest: LevelResult) -> CellWindow:
+    """The cells, with a margin, whose ground two views see as far as the coarsest level can tell."""
+    seeing = sees(coarsest.seen, coarsest.heights.vertex[None]).sum(axis=0) >= 2
+    rows, cols = np.flatnonzero(seeing.any(axis=1)), np.flatnonzero(seeing.any(axis=0))
+    window = coarsest.window
+    if not len(rows):
+        return CellWindow(window.row, window.col, 0, 0)
+    row, col = window.row + int(rows[0]) - SEEN_MARGIN, window.col + int(cols[0]) - SEEN_MARGIN
+    size = (int(rows[-1] - rows[0]) + 1 + 2 * SEEN_MARGIN, int(cols[-1] - cols[0]) + 1 + 2 * SEEN_MARGIN)
+    return CellWindow(row, col, *size)
 
 
 def _evaluations(result: LevelResult) -> int:

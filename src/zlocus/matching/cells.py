@@ -21,6 +21,11 @@ class CellWindow:
         row1, col1 = -(-(self.row + self.rows) // size) + halo, -(-(self.col + self.cols) // size) + halo
         return CellWindow(row, col, row1 - row, col1 - col)
 
+    def finer(self, levels: int) -> CellWindow:
+        """The same ground so many levels finer."""
+        size = 2**levels
+        return CellWindow(self.row * size, self.col * size, self.rows * size, self.cols * size)
+
     def within(self, other: CellWindow) -> CellWindow:
         """The part inside another window of the same level (may be empty)."""
         row, col = max(self.row, other.row), max(self.col, other.col)
