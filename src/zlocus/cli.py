@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
+# Threads that wait for the small matrices of a run burn more than they save; set before NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from zlocus import __version__
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.progress import progress_for
