@@ -94,7 +94,7 @@ class PyramidOptions(Checked):
         0.5, "Shift per height step in the most sensitive image, at most.", low=0.05, high=2.0, unit="px"
     )
     coarsest_steps: int = option(
-        64, "Levels are added until the whole height range has at most this many steps at the coarsest.",
+        128, "Levels are added until the whole height range has at most this many steps at the coarsest.",
         low=16, high=4096,
     )  # fmt: skip
     max_levels: int = option(6, "Levels of the pyramid, at most.", low=1, high=12)
