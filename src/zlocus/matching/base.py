@@ -71,13 +71,18 @@ def block_heights(surface: NDArray[np.float32], block: int) -> NDArray[np.float6
 
 
 def block_medians(values: NDArray[np.float32], block: int) -> NDArray[np.float64]:
-    """Median of every block of (r, c) values; cut blocks at the border are filled up by mirroring."""
+    """Median of every block of (r, c) values; blocks at the border may be smaller."""
     rows, cols = values.shape
     n_b, n_d = -(-rows // block), -(-cols // block)
-    beyond = ((0, n_b * block - rows), (0, n_d * block - cols))
-    padded = np.pad(values, beyond, mode="symmetric" if min(rows, cols) >= block else "edge")
-    pieces = padded.reshape(n_b, block, n_d, block).transpose(0, 2, 1, 3).reshape(n_b, n_d, -1)
-    return np.asarray(np.median(pieces, axis=2), np.float64)
+    whole_b, whole_d = rows // block, cols // block
+    out = np.empty((n_b, n_d))
+    whole = values[: whole_b * block, : whole_d * block].reshape(whole_b, block, whole_d, block)
+    out[:whole_b, :whole_d] = np.median(whole.transpose(0, 2, 1, 3).reshape(whole_b, whole_d, block * block), axis=2)
+    for b in range(n_b):
+        for d in range(n_d):
+            if b >= whole_b or d >= whole_d:
+                out[b, d] = np.median(values[b * block : (b + 1) * block, d * block : (d + 1) * block])
+    return out
 
 
 def integrated(
