@@ -1,0 +1,155 @@
+"""Progressive matching: the mean correlation is built image by image, and images stop when its peak is distinct.
+
+The plain form over cells and heights. Images are asked for only where they are needed: nothing is evaluated and then
+thrown away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.matching.curve import GOOD, curve_labels
+from zlocus.options import SelectionOptions
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+# (n,) cells and (n,) images, one each -> (n, h) correlation, NaN where the image does not see that height.
+Measure = Callable[[IntArray, IntArray], NDArray[np.floating]]
+
+
+@dataclass(frozen=True)
+class ProgressiveMean:
+    """Mean correlation over the images added so far.
+
+    mean : (n, h) float64, 0 where no image was valid; count : (n, h) int64, images valid at each height.
+    """
+
+    mean: FloatArray
+    count: IntArray
+
+    @classmethod
+    def empty(cls, n_cells: int, n_heights: int) -> ProgressiveMean:
+        """Before the first image."""
+        return cls(np.zeros((n_cells, n_heights)), np.zeros((n_cells, n_heights), np.int64))
+
+    def add(self, cells: IntArray, ncc: NDArray[np.floating]) -> None:
+        """Add one image to some cells, in place. cells : (m,), each once; ncc : (m, h), NaN where not valid.
+
+        SNCC_m = ((m - 1) SNCC_{m-1} + NCC_m) / m, where m counts the images valid at that cell and height.
+        Source: Ji et al. 2014, equation (3); the paper takes every image as valid everywhere.
+        """
+        valid = ~np.isnan(ncc)
+        m = self.count[cells] + valid
+        before = self.mean[cells]
+        self.mean[cells] = np.where(valid, ((m - 1) * before + ncc) / np.maximum(m, 1), before)
+        self.count[cells] = m
+
+    def sncc(self, cells: IntArray) -> FloatArray:
+        """(m, h) float64, the match curves of some cells, NaN where no image was valid."""
+        return np.where(self.count[cells] > 0, self.mean[cells], np.nan)
+
+
+@dataclass(frozen=True)
+class ProgressiveMatch:
+    """Match curves of the images that were needed.
+
+    sncc : (n, h) float64, NaN where no image was valid; n_images : (n,) int64, images that were used; label : (n,)
+    int8, of the final curve; is_stopped : (n,) bool, whether the curve was good after some image (cells outside the
+    sample are not judged: False); n_added : (b,) int64, images that each block went through; evaluations : cell x
+    height x image that were evaluated; evaluations_all : those of all images.
+    """
+
+    sncc: FloatArray
+    n_images: IntArray
+    label: NDArray[np.int8]
+    is_stopped: NDArray[np.bool_]
+    n_added: IntArray
+    evaluations: int
+    evaluations_all: int
+
+    @property
+    def saved(self) -> float:
+        """Share of the evaluations of all images that was not needed; 0 where there was nothing to evaluate."""
+        return 1.0 - self.evaluations / self.evaluations_all if self.evaluations_all else 0.0
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """What may be matched with what, in which order.
+
+    order : (b, j) int64, search images of each block, best first, each once; block : (n,) int64, the block of each
+    cell; seen : (n, i) bool, whether the image enters the cell (over its whole range; heights hidden in it are NaN in
+    the measure); step_px : (i,) float64, equivalent disparity of one step of height in each image; sample : (n,) bool,
+    the cells that decide when a block stops.
+    """
+
+    order: IntArray
+    block: IntArray
+    seen: NDArray[np.bool_]
+    step_px: FloatArray
+    sample: NDArray[np.bool_]
+
+    @classmethod
+    def by_cell(cls, order: IntArray, seen: NDArray[np.bool_], step_px: FloatArray) -> SearchPlan:
+        """Every cell is a block of its own: the rule of the paper. order : (n, j)."""
+        n = len(order)
+        return cls(order, np.arange(n), seen, step_px, np.ones(n, bool))
+
+
+def match_progressively(
+    measure: Measure, n_heights: int, plan: SearchPlan, options: SelectionOptions
+) -> ProgressiveMatch:
+    """Add images in order until the match curves are good.
+
+    A block adds images until `stopped_share` of its sampled cells has stopped: their curve was good after one of the
+    images, or no image is left that sees them. A cell that has stopped takes part as long as its block goes on. A
+    block without a sampled cell adds all images. Rivals of a mean count by the equivalent disparity of the most
+    sensitive image in it.
+    Source: Ji et al. 2014, section 3.3, step 3; blocks are ours.
+    """
+    n_cells, n_ranks = len(plan.block), plan.order.shape[1]
+    everyone = np.arange(n_cells)
+    enters = np.take_along_axis(plan.seen, plan.order[plan.block], axis=1)
+    images_left = enters.sum(axis=1)
+    mean, widest_px = ProgressiveMean.empty(n_cells, n_heights), np.zeros(n_cells)
+    n_images, n_added = np.zeros(n_cells, np.int64), np.zeros(len(plan.order), np.int64)
+    is_stopped = np.zeros(n_cells, bool)
+    n_evaluated = 0
+    goes_on = _goes_on(images_left == 0, plan, options)
+    for rank in range(n_ranks):
+        n_added += goes_on
+        cells = np.flatnonzero(goes_on[plan.block] & enters[:, rank])
+        images = plan.order[plan.block[cells], rank]
+        ncc = measure(cells, images)
+        mean.add(cells, ncc)
+        n_evaluated += len(cells)
+        n_images[cells] += ~np.isnan(ncc).all(axis=1)
+        images_left[cells] -= 1
+        widest_px[cells] = np.maximum(widest_px[cells], plan.step_px[images])
+        judged = cells[plan.sample[cells] & ~is_stopped[cells]]
+        is_stopped[judged] = curve_labels(mean.sncc(judged), widest_px[judged], options) == GOOD
+        goes_on &= _goes_on(is_stopped | (images_left == 0), plan, options)
+        if not goes_on.any():
+            break
+    curves = mean.sncc(everyone)
+    return ProgressiveMatch(
+        sncc=curves,
+        n_images=n_images,
+        label=curve_labels(curves, widest_px, options),
+        is_stopped=is_stopped,
+        n_added=n_added,
+        evaluations=n_evaluated * n_heights,
+        evaluations_all=int(enters.sum()) * n_heights,
+    )
+
+
+def _goes_on(is_done: NDArray[np.bool_], plan: SearchPlan, options: SelectionOptions) -> NDArray[np.bool_]:
+    """Blocks with too few sampled cells that are done, or with no sampled cell, (b,) bool."""
+    n_blocks = len(plan.order)
+    sampled = np.bincount(plan.block[plan.sample], minlength=n_blocks)
+    done = np.bincount(plan.block[plan.sample & is_done], minlength=n_blocks)
+    return np.asarray((sampled == 0) | (done < options.stopped_share * sampled), bool)
