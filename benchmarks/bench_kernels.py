@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from zlocus.kernels.refine import tile_profile
-from zlocus.kernels.resample import resample_plane
+from zlocus.kernels.resample import RUN, resample_plane
 from zlocus.kernels.sgm import sweep, winners
 from zlocus.kernels.visibility import lowest_visible
-from zlocus.kernels.volume import tile_costs
+from zlocus.kernels.volume import flat_cells, tile_costs
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.refine import smoothed
 
@@ -95,29 +95,32 @@ def test_resample(benchmark):
     pixels, layout, _, _ = views(1)
     side = BLOCK + 6
     grid = np.array([60.3, 60.7, 0.99, 0.01, -0.02, 1.01, 0.0, 0.0])
-    index, fraction = np.empty(side, np.uint32), np.empty((2, side), np.float32)
-    out = np.empty((side, side), np.float32)
+    index, fraction, cells = np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32), flat_cells((side, side))
+    relief, out = np.zeros(side * side, np.float32), np.empty(side * side, np.float32)
+    velocity = np.array([0.5, 0.1], np.float32)
 
     def call():
         for _ in range(500):
-            resample_plane(pixels, layout[0], grid, index, fraction, out)
+            resample_plane(pixels, layout[0], grid, cells, relief, velocity, index, fraction, out)
 
     timed(benchmark, call, 500 * side * side, "sample")
 
 
 @pytest.mark.parametrize(
-    ("n_views", "windows"),
-    [(2, [3]), (3, [1, 2]), (6, [1, 2])],
-    ids=["2-views-7x7", "3-views-3x3-5x5", "6-views-3x3-5x5"],
+    ("n_views", "windows", "weight"),
+    [(2, [3], 0.0), (3, [1, 2], 0.0), (3, [1, 2], 1.0), (6, [1, 2], 1.0)],
+    ids=["2-views-7x7", "3-views-3x3-5x5", "3-views-3x3-5x5-greys", "6-views-3x3-5x5-greys"],
 )
-def test_costs(benchmark, n_views, windows):
+def test_costs(benchmark, n_views, windows, weight):
     heights = lattice(SIDE, 32)
     volume = np.empty(heights.size, np.uint8)
     seen, half = all_seen(n_views), np.array(windows, np.int64)
+    border, measure = 2 * max(windows), np.array([0.0, weight, 0.3, 0.5], np.float32)
+    base = np.zeros((SIDE + border, SIDE + border), np.float32), np.zeros((SIDE // BLOCK + 1, SIDE // BLOCK + 1))
     scene = views(n_views)
 
     def call():
-        tile_costs(*scene, heights.ranges, heights.address, half, seen, BLOCK, np.float32(0), volume)
+        tile_costs(*scene, *base, heights.ranges, heights.address, half, seen, BLOCK, measure, volume)
 
     n = heights.size * n_views
     seconds = timed(benchmark, call, n, "cell, step and image")

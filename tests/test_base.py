@@ -7,15 +7,17 @@ import pytest
 
 from kernel_scene import kernel_scene
 from zlocus.kernels.volume import plane_grid
-from zlocus.matching.base import ANCHOR, BaseSurface, bilinear, block_medians, block_slopes, integrated
+from zlocus.matching.base import ANCHOR, PATCH, BaseSurface, integrated, patch_medians
 from zlocus.matching.views import TileViews
 
 BLOCK = 16
 SHAPE = (75, 104)
-# Least squares with a weak pull towards the blocks' heights; rounding of float32 heights.
-STEPS, FLOAT32_STEPS = 1e-6, 1e-3
+# Steps of height: rounding of float64 and of float32 heights.
+STEPS, FLOAT32_STEPS = 1e-9, 1e-3
 # Positions of nodes, px, whose cubics are shifted in float64.
 POSITION_PX = 1e-9
+# Share of the rise of a plane over a patch that the pull towards the heights beside the border costs.
+PULLED = 2e-3
 
 
 def plane(by_row, by_col, shape=SHAPE):
@@ -32,7 +34,7 @@ def test_sheared_views_project_where_the_base_lies():
     """Index k of the base, at a node that lies `up` steps above the lattice's origin, is k + up of the lattice."""
     scene = kernel_scene()
     up = np.random.default_rng(4).uniform(-30, 30, scene.nodes.shape[1:3])
-    base = BaseSurface(up, bilinear(up, scene.shape, scene.block))
+    base = BaseSurface(up, scene.block, scene.shape, scene.block)
     sheared = base.shear(views_of(scene))
     assert sheared.nodes.shape == scene.nodes.shape
     start, step = scene.heights
@@ -56,51 +58,124 @@ def test_a_level_base_changes_nothing():
     views, base = views_of(scene), BaseSurface.level(scene.shape, scene.block)
     assert base.nodes.shape == scene.nodes.shape[1:3]
     np.testing.assert_array_equal(base.shear(views).nodes, views.nodes)
-    assert (base.cells == 0).all()
-    assert base.cells.shape == scene.shape
+    assert base.cells.shape == base.relief().shape == scene.shape
+    assert base.padded(5).shape == (scene.shape[0] + 10, scene.shape[1] + 10)
+    assert (base.padded(5) == 0).all()
+    assert (base.relief() == 0).all()
     assert not base.is_steep
 
 
 def test_the_slopes_of_a_plane_come_back():
     by_row, by_col = np.full((4, 6), 0.7), np.full((4, 6), -1.3)
-    middle = BLOCK * (np.indices((4, 6)) + 0.5)
-    nodes = integrated(by_row, by_col, BLOCK, 0.7 * middle[0] - 1.3 * middle[1] + 5)
-    np.testing.assert_allclose(np.diff(nodes, axis=0), BLOCK * 0.7, rtol=0, atol=STEPS)
-    np.testing.assert_allclose(np.diff(nodes, axis=1), BLOCK * -1.3, rtol=0, atol=STEPS)
-    assert nodes[0, 0] == pytest.approx(5.0, abs=STEPS)
+    middle = PATCH * (np.indices((4, 6)) + 0.5)
+    nodes = integrated(by_row, by_col, PATCH, 0.7 * middle[0] - 1.3 * middle[1] + 5)
+    allowed = PULLED * PATCH * 1.3
+    np.testing.assert_allclose(np.diff(nodes, axis=0), PATCH * 0.7, rtol=0, atol=allowed)
+    np.testing.assert_allclose(np.diff(nodes, axis=1), PATCH * -1.3, rtol=0, atol=allowed)
+    assert nodes.mean() == pytest.approx(5 + 0.7 * 2 * PATCH - 1.3 * 3 * PATCH, abs=STEPS)
 
 
-def test_slopes_that_no_surface_has_are_shared_out():
-    """A block with a slope of its own among level ones: the sum of squares is least, so moving any node raises it."""
+def least_squares(by_row, by_col, patch, heights):
+    """Plain-loop twin of `integrated`: every edge is as steep as the patches beside it, every node as high as those
+    around it."""
+    rows, cols = by_row.shape
+    number = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
+    matrix, right = [], []
+
+    def equation(weight, terms, value):
+        row = np.zeros(number.size)
+        for node, factor in terms:
+            row[number[node]] += factor
+        matrix.append(weight * row)
+        right.append(weight * value)
+
+    def around(values, patches):
+        return np.mean([values[b, d] for b, d in patches if 0 <= b < rows and 0 <= d < cols])
+
+    for b, d in np.ndindex(number.shape):
+        if b < rows:
+            rise = patch * around(by_row, [(b, d - 1), (b, d)])
+            equation(1.0, [((b + 1, d), 1.0), ((b, d), -1.0)], rise)
+        if d < cols:
+            rise = patch * around(by_col, [(b - 1, d), (b, d)])
+            equation(1.0, [((b, d + 1), 1.0), ((b, d), -1.0)], rise)
+        height = around(heights, [(b - 1, d - 1), (b - 1, d), (b, d - 1), (b, d)])
+        equation(np.sqrt(ANCHOR), [((b, d), 1.0)], height)
+    return np.linalg.lstsq(np.array(matrix), np.array(right), rcond=None)[0].reshape(number.shape)
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (5, 2), (1, 7), (1, 1)])
+def test_slopes_that_no_surface_has_are_shared_out(shape):
+    """Slopes and heights at random: the corners are those of the least sum of squares."""
     rng = np.random.default_rng(0)
-    by_row, by_col, heights = rng.normal(size=(3, 4)), rng.normal(size=(3, 4)), rng.normal(size=(3, 4))
-
-    def misfit(nodes):
-        rows, cols = np.diff(nodes, axis=0), np.diff(nodes, axis=1)
-        total = sum(((rows[:, k : k + 4] - BLOCK * by_row) ** 2).sum() for k in (0, 1))
-        total += sum(((cols[k : k + 3] - BLOCK * by_col) ** 2).sum() for k in (0, 1))
-        middle = (nodes[:-1, :-1] + nodes[:-1, 1:] + nodes[1:, :-1] + nodes[1:, 1:]) / 4
-        return total + ANCHOR * ((middle - heights) ** 2).sum()
-
-    nodes = integrated(by_row, by_col, BLOCK, heights)
-    least = misfit(nodes)
-    for at in np.ndindex(nodes.shape):
-        for by in (-0.01, 0.01):
-            moved = nodes.copy()
-            moved[at] += by
-            assert misfit(moved) > least
+    by_row, by_col, heights = rng.normal(size=shape), rng.normal(size=shape), 50 * rng.normal(size=shape)
+    found = integrated(by_row, by_col, PATCH, heights)
+    np.testing.assert_allclose(found, least_squares(by_row, by_col, PATCH, heights), rtol=0, atol=STEPS)
 
 
+@pytest.mark.parametrize("block", [16, 32, 12])
 @pytest.mark.parametrize(("by_row", "by_col"), [(1.5, 0.0), (-0.4, 2.0)])
-def test_along_a_slope(by_row, by_col):
-    """Also where the last blocks are cut off by the tile's border, and at the border, where slopes are unknown."""
+def test_along_a_slope(by_row, by_col, block):
+    """Everywhere, also where the last blocks are cut off by the tile's border and where no slope is known."""
     surface = plane(by_row, by_col)
-    base = BaseSurface.along(surface, BLOCK)
-    rise = BLOCK * max(abs(by_row), abs(by_col))
+    base = BaseSurface.along(surface, block)
+    rise = block * max(abs(by_row), abs(by_col))
     assert base.is_steep == (rise > 8)
-    away = base.cells - surface
-    assert np.ptp(away[BLOCK : 4 * BLOCK, BLOCK : 6 * BLOCK]) < 0.02 * rise
+    for axis, slope in enumerate((by_row, by_col)):
+        np.testing.assert_allclose(np.diff(base.cells, axis=axis), slope, rtol=0, atol=5 * PULLED * rise / block)
+    assert base.cells.shape == SHAPE
     assert base.cells.dtype == np.float32
+
+
+def hillside(wavelength=64.0, height=8.0):
+    """A slope with folds that are too short for blocks of 32 cells, not for patches."""
+    row, col = np.indices((160, 192))
+    folds = height * np.sin(2 * np.pi * (col + 0.5 * row) / wavelength)
+    return (0.8 * row - 0.5 * col + folds).astype(np.float32)
+
+
+def test_patches_follow_a_rough_hillside():
+    """Windows see what slope the base leaves: along the patches it is a third of that along whole blocks."""
+    surface = hillside()
+    base = BaseSurface.along(surface, 32)
+
+    def left_over(cells):
+        by_row, by_col = np.gradient((cells - surface)[16:-16, 16:-16])
+        return np.hypot(by_row, by_col).mean()
+
+    by_patches, by_blocks = left_over(base.cells), left_over(base.cells - base.relief())
+    assert by_blocks > 0.3
+    assert by_patches < 0.4 * by_blocks
+
+
+def test_relief_is_what_lies_above_the_corners_of_blocks():
+    base = BaseSurface.along(hillside()[:150, :187], 32)
+    relief = base.relief()
+    assert base.nodes.shape == (6, 7)
+    assert base.patches.shape == (21, 25)
+    assert (relief[::32, ::32] == 0).all()
+    assert np.abs(relief).max() > 3
+    for r, c in ((5, 9), (33, 64), (31, 100), (149, 186)):
+        b, d, p, q = r // 32, c // 32, r % 32 / 32, c % 32 / 32
+        top = (1 - q) * base.nodes[b, d] + q * base.nodes[b, d + 1]
+        low = (1 - q) * base.nodes[b + 1, d] + q * base.nodes[b + 1, d + 1]
+        blocks = (1 - p) * top + p * low
+        assert relief[r, c] == pytest.approx(base.cells[r, c] - blocks, abs=FLOAT32_STEPS)
+
+
+def test_a_block_that_patches_do_not_divide_is_one_patch():
+    base = BaseSurface.along(hillside(), 12)
+    assert base.patch == base.block == 12
+    np.testing.assert_array_equal(base.nodes, base.patches)
+    assert (base.relief() == 0).all()
+    assert np.ptp(base.cells) > 50
+
+
+def test_a_tile_too_small_to_know_slopes_is_level():
+    surface = np.random.default_rng(1).normal(0, 30, (8, 5)).astype(np.float32)
+    base = BaseSurface.along(surface, BLOCK)
+    assert base.cells.shape == (8, 5)
+    assert np.ptp(base.cells) < FLOAT32_STEPS
 
 
 def test_a_building_on_level_ground_leaves_the_base_nearly_level():
@@ -109,6 +184,7 @@ def test_a_building_on_level_ground_leaves_the_base_nearly_level():
     surface[50:53, 5:100] = 70.0
     base = BaseSurface.along(surface, BLOCK)
     assert max(np.abs(np.diff(base.nodes, axis=axis)).max() for axis in (0, 1)) < 0.5
+    assert np.abs(base.relief()).max() < 0.5
     assert not base.is_steep
 
 
@@ -120,30 +196,31 @@ def test_a_jump_in_a_slope_adds_nothing_to_it():
     np.testing.assert_allclose(np.diff(nodes[1:4], axis=1)[:, 1:5], BLOCK, rtol=0, atol=0.1 * BLOCK)
 
 
-@pytest.mark.parametrize(("shape", "block"), [((37, 70), 16), ((16, 32), 16), ((5, 3), 8), ((1, 9), 4)])
-def test_bilinear_values(shape, block):
-    nodes = np.random.default_rng(2).normal(0, 50, (-(-shape[0] // block) + 1, -(-shape[1] // block) + 1))
-    found = bilinear(nodes, shape, block)
+@pytest.mark.parametrize("half", [0, 1, 5])
+@pytest.mark.parametrize(("shape", "patch"), [((37, 70), 16), ((16, 32), 16), ((5, 3), 8), ((1, 9), 4)])
+def test_values_of_cells_and_of_their_border(shape, patch, half):
+    """Bilinear between the corners of patches, and on from the outermost ones."""
+    n_b, n_d = (-(-n // patch) for n in shape)
+    corners = np.random.default_rng(2).normal(0, 50, (n_b + 1, n_d + 1))
+    base = BaseSurface(corners, patch, shape, patch)
+    found = base.padded(half)
     assert found.dtype == np.float32
-    for r, c in np.ndindex(shape):
-        b, d, p, q = r // block, c // block, r % block / block, c % block / block
-        top = (1 - q) * nodes[b, d] + q * nodes[b, d + 1]
-        low = (1 - q) * nodes[b + 1, d] + q * nodes[b + 1, d + 1]
+    assert found.shape == (shape[0] + 2 * half, shape[1] + 2 * half)
+    np.testing.assert_array_equal(found[half : half + shape[0], half : half + shape[1]], base.cells)
+    for r, c in np.ndindex(found.shape):
+        row, col = r - half, c - half
+        b, d = min(max(row // patch, 0), n_b - 1), min(max(col // patch, 0), n_d - 1)
+        p, q = row / patch - b, col / patch - d
+        top = (1 - q) * corners[b, d] + q * corners[b, d + 1]
+        low = (1 - q) * corners[b + 1, d] + q * corners[b + 1, d + 1]
         assert found[r, c] == pytest.approx((1 - p) * top + p * low, abs=FLOAT32_STEPS)
 
 
-def test_medians_of_blocks():
-    """Of the cells there are, in blocks that the border cuts."""
+def test_medians_of_patches():
+    """Of the cells there are, in patches that the border cuts."""
     values = np.random.default_rng(3).normal(size=(37, 21)).astype(np.float32)
-    found = block_medians(values, BLOCK)
-    assert found.shape == (3, 2)
-    for b, d in np.ndindex(3, 2):
-        part = values[b * BLOCK : (b + 1) * BLOCK, d * BLOCK : (d + 1) * BLOCK]
-        assert found[b, d] == pytest.approx(np.median(part), abs=STEPS)
-
-
-def test_slopes_of_blocks():
-    by_row, by_col = block_slopes(plane(0.25, -0.75), BLOCK)
-    assert by_row.shape == by_col.shape == (5, 7)
-    np.testing.assert_allclose(by_row[1:-1], 0.25, rtol=0, atol=FLOAT32_STEPS)
-    np.testing.assert_allclose(by_col[:, 1:-1], -0.75, rtol=0, atol=FLOAT32_STEPS)
+    found = patch_medians(values, PATCH)
+    assert found.shape == (5, 3)
+    for b, d in np.ndindex(5, 3):
+        part = values[b * PATCH : (b + 1) * PATCH, d * PATCH : (d + 1) * PATCH]
+        assert found[b, d] == pytest.approx(np.median(part), abs=1e-6)

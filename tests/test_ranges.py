@@ -5,11 +5,12 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.ranges import LANES, ranges_nearby
 from zlocus.options import PyramidOptions
-from zlocus.tile import RIVALS_KEPT, _candidates
+from zlocus.tile import RIVALS_KEPT, _candidates, _without_spikes
 
 OPTIONS = PyramidOptions(block=16, margin_steps=6, reach=2)
 
@@ -80,12 +81,12 @@ def coarse_result(best, second, margin, window):
     return SimpleNamespace(window=window, heights=heights, seen=seen)
 
 
-def candidates(second_at, margin_at, ties=()):
-    """Candidates on 40 x 40 cells above 24 x 24 coarse ones, whose best index is 20; cell (10, 12) has a rival."""
+def candidates(second_at, margin_at, ties=(), side=3):
+    """Candidates on 40 x 40 cells above 24 x 24 coarse ones, whose best index is 20; `side` x `side` have a rival."""
     coarse = CellWindow(-2, -2, 24, 24)
     best = np.full((24, 24), 20, np.int32)
     second, margin = best.copy(), np.full((24, 24), 65535, np.uint16)
-    second[10, 12], margin[10, 12] = second_at, margin_at
+    second[10 : 10 + side, 12 : 12 + side], margin[10 : 10 + side, 12 : 12 + side] = second_at, margin_at
     scene = SimpleNamespace(
         ties=np.array(ties, float).reshape(-1, 3), cell_m=0.5, anchor=(1000.0, 2000.0), origin_m=10.0, step_m=0.25
     )
@@ -94,9 +95,35 @@ def candidates(second_at, margin_at, ties=()):
 
 def test_a_near_rival_is_a_candidate():
     low, high = candidates(55, RIVALS_KEPT - 1)
-    np.testing.assert_array_equal(high[16:18, 20:22], 110)
-    assert (high == 110).sum() == 4
+    np.testing.assert_array_equal(high[16:22, 20:26], 110)
+    assert (high == 110).sum() == 36
     assert (low == 40).all()
+    low, high = candidates(5, RIVALS_KEPT - 1)
+    assert (low == 10).sum() == 36
+    assert (high == 40).all()
+
+
+@pytest.mark.parametrize("second_at", [55, 5])
+def test_a_rival_of_few_cells_is_none(second_at):
+    """It would widen the range of a whole block."""
+    low, high = candidates(second_at, 0, side=2)
+    assert (low == 40).all()
+    assert (high == 40).all()
+
+
+def test_spikes_beside_cells_that_nobody_saw():
+    """Unknown cells stay unknown, and neither hold up a spike nor wear away what lies beside them."""
+    known = np.ones((12, 12), bool)
+    known[:, 6:] = False
+    low, high = np.full((12, 12), 40, np.float32), np.full((12, 12), 40, np.float32)
+    high[2:5, 3:6], high[8, 5] = 90, 90
+    found_low, found_high = _without_spikes(low, high, known)
+    assert np.isnan(found_high[~known]).all()
+    assert np.isnan(found_low[~known]).all()
+    expected = np.full((12, 6), 40.0)
+    expected[2:5, 3:6] = 90
+    np.testing.assert_array_equal(found_high[:, :6], expected)
+    assert (found_low[:, :6] == 40).all()
 
 
 def test_a_far_rival_is_none():

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy.ndimage import gaussian_filter
 
 from kernel_scene import even_lattice
 from zlocus.matching.semiglobal import BEHIND, SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.options import SemiGlobalOptions
 
-OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0)
+OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, level_easing=0.5)
 
 
 def test_without_an_ortho_image_penalties_are_even():
-    p2 = penalties(None, (5, 7), OPTIONS)
+    p2 = penalties(None, (5, 7), 0, OPTIONS)
     assert p2.dtype == np.uint16
     assert p2.shape == (4, 5, 7)
     assert (p2 == 240).all()
@@ -21,7 +24,7 @@ def test_without_an_ortho_image_penalties_are_even():
 
 def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
     ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
-    p2 = penalties(ortho, (12, 15), OPTIONS)
+    p2 = penalties(ortho, (12, 15), 0, OPTIONS)
     unit = 2.0 * np.median(np.abs(np.diff(ortho, axis=1)))
     for path, (dr, dc) in enumerate(BEHIND):
         for r in range(1, 11):
@@ -35,14 +38,33 @@ def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
 def test_a_strong_edge_is_cheap_to_cross_only_where_it_is():
     ortho = np.zeros((8, 12), np.float32) + np.random.default_rng(1).normal(0, 0.01, (8, 12)).astype(np.float32)
     ortho[:, 6:] += 5
-    p2 = penalties(ortho, (8, 12), OPTIONS)
+    p2 = penalties(ortho, (8, 12), 0, OPTIONS)
     assert (p2[0, :, 6] == 60).all()
     assert (p2[2, 1:, 6] > 60).all()
 
 
 def test_a_penalty_of_edges_above_p2_does_not_raise_it():
     ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
-    assert penalties(ortho, (6, 6), SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
+    assert penalties(ortho, (6, 6), 0, SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_penalties_ease_from_level_to_level(level):
+    """Those of even ground and those of edges alike."""
+    ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
+    ortho[:, 6:] += 5
+    even, finest = penalties(None, (12, 15), level, OPTIONS), penalties(ortho, (12, 15), 0, OPTIONS)
+    assert (even == 240 // 2**level).all()
+    eased = penalties(ortho, (12, 15), level, OPTIONS)
+    assert (finest == 60).any()
+    assert (eased[finest == 60] == 60 // 2**level).all()
+    assert np.abs(eased - finest / 2**level).max() <= 1
+
+
+def test_penalties_without_easing_are_the_same_at_every_level():
+    ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
+    kept = replace(OPTIONS, level_easing=1.0)
+    np.testing.assert_array_equal(penalties(ortho, (6, 6), 3, kept), penalties(ortho, (6, 6), 0, kept))
 
 
 def test_aggregation_joins_what_picking_alone_does_not():
@@ -50,7 +72,7 @@ def test_aggregation_joins_what_picking_alone_does_not():
     rng = np.random.default_rng(3)
     cost = rng.integers(30, 90, (20, 24, 16)).astype(np.uint8)
     cost[..., 7] -= 25
-    p2 = penalties(None, lattice.shape, OPTIONS)
+    p2 = penalties(None, lattice.shape, 0, OPTIONS)
     joined = aggregate(cost.ravel(), lattice, p2, OPTIONS)
     alone = pick(cost.ravel().astype(np.uint16), lattice)
     assert (np.abs(joined.best - 7) <= 1).mean() > 0.97

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ from orientation_scenes import image_of
 from rendered_scenes import CENTRE, UTM
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.radiometry import grey_scales
 from zlocus.matching.setup import (
     check_resolution,
     height_step,
-    image_contrast,
     leading_first,
     levels_for,
     median_ground_pixel,
@@ -110,27 +109,15 @@ def test_the_seen_window_is_whole_coarsest_cells():
     assert north - window.rows * 0.5 <= -7.0
 
 
-def test_contrast_is_the_standard_deviation_of_valid_pixels():
-    assert image_contrast(view("v")) == pytest.approx(GREY.std(), rel=0.05)
-    flat = view("flat", pixels=np.full((40, 50), 7.0))
-    assert image_contrast(flat) == 1.0
-
-
-def test_contrast_of_an_image_whose_sampled_rows_are_nodata():
-    """Valid rows may all fall between the 64 that are read."""
-    valid = np.zeros((1000, 20), bool)
-    valid[3:9] = True
-    blind = replace(view("v"), image=image_of(np.random.default_rng(0).normal(size=(1000, 20)), valid))
-    assert image_contrast(blind) == 1.0
-
-
 def test_a_settled_scene():
     views = scene(view("n", 2), view("f", 20))
-    settled = settle(views, 0.5, (0.0, 0.0), (30.0, 90.0), np.empty((0, 3)), None, PyramidOptions())
+    ties = np.random.default_rng(1).uniform(-20, 20, (60, 3)) + np.array([*CENTRE, 60.0])
+    settled = settle(views, 0.5, (0.0, 0.0), (30.0, 90.0), ties, None, PyramidOptions())
     assert settled.views[0].name == "n"
     assert settled.n_steps == np.ceil(60 / settled.step_m)
     assert settled.origin_m == 30.0
-    assert len(settled.contrast) == 2
+    assert settled.grey == grey_scales(settled.views, ties)
+    assert settled.grey != grey_scales(settled.views, ties[:0])
     transform = settled.transform(CellWindow(-4, 6, 3, 3), 2)
     assert transform * (0, 0) == (12.0, 8.0)
     assert transform.a == 2.0

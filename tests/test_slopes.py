@@ -21,7 +21,7 @@ EAST, NORTH = 0.8, 0.6
 LOOKS = ((1.0, -4.0), (20.0, -4.0), (-20.0, -4.0), (0.0, 12.0), (22.0, 13.0), (-22.0, 13.0))
 NOISY = Optics(noise=0.02, noise_floor=22.0)
 HEIGHTS, SEEN_M = (0.0, 100.0), 24.0
-NMAD_M, BIAS_M, WITHIN_M, WITHIN = 0.15, 0.05, 0.5, 0.97
+NMAD_M, BIAS_M, WITHIN_M, WITHIN = 0.12, 0.05, 0.5, 0.99
 
 
 @pytest.fixture(scope="module")

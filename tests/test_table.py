@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from affine import Affine
 
+from orientation_scenes import image_of
 from rendered_scenes import CENTRE, camera
 from zlocus.errors import GeometryError
 from zlocus.io.scene_file import open_scene
-from zlocus.matching.views import ViewPixels, halved, tile_views
+from zlocus.matching.views import ViewPixels, halved, read_pixels, tile_views
+from zlocus.scene import View
 from zlocus.sensors.table import TOLERANCE_PX, projection_table
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 
 HEIGHTS = (20.0, 140.0)
+# Rounding of float32 grey values, in contrasts of the image.
+FLOAT32_CONTRASTS = 1e-5
 
 
 def steep():
@@ -88,7 +94,7 @@ def test_pixels_of_a_level(level):
     transform = grid(0.5 * 2**level, shape)
     origin = (8, 20)
     pixels = tuple(np.zeros((96 // 2**k, 112 // 2**k), np.float32) for k in range(3))
-    window = ViewPixels(sensor, origin, 1.0, pixels, tuple(np.ones(p.shape, bool) for p in pixels))
+    window = ViewPixels(sensor, origin, 0.0, 1.0, pixels, tuple(np.ones(p.shape, bool) for p in pixels))
     lattice = (30.0, 1.5)
     views = tile_views([window], level, transform, shape, block, lattice, HEIGHTS, 2)
     for row, col, k in ((0, 0, 0), (16, 32, 7), (32, 48, 30)):
@@ -97,6 +103,19 @@ def test_pixels_of_a_level(level):
         ground = np.array([[*(transform * (col + 0.5, row + 0.5)), lattice[0] + k * lattice[1]]])
         exact = (sensor.image_from_ground(ground)[0] + 0.5) / 2**level - 0.5 - np.array(origin[::-1]) / 2**level
         np.testing.assert_allclose((x, y), exact, rtol=0, atol=TOLERANCE_PX)
+
+
+def test_pixels_of_a_window_are_on_the_scale_of_all_views():
+    """The view's own zero and one, at every level, wherever the window starts."""
+    pixels = 500.0 + 40.0 * np.random.default_rng(0).normal(size=(40, 60))
+    view = View("v", Path("v.tif"), image_of(pixels), camera("fore"))
+    read = read_pixels(view, (4, 8, 24, 32), 3, 480.0, 25.0)
+    assert (read.origin, read.mean, read.contrast) == ((4, 8), 480.0, 25.0)
+    plain = (pixels[4:28, 8:40] - 480.0) / 25.0
+    for level, found in enumerate(read.pixels):
+        side = 2**level
+        means = plain.reshape(24 // side, side, 32 // side, side).mean(axis=(1, 3))
+        np.testing.assert_allclose(found, means, rtol=0, atol=FLOAT32_CONTRASTS)
 
 
 def test_halved_pixels_lie_between_four():

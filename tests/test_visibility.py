@@ -8,6 +8,7 @@ from affine import Affine
 
 from rendered_scenes import CENTRE
 from zlocus.kernels.volume import HIDDEN
+from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import ViewPixels, tile_views
 from zlocus.matching.visibility import (
@@ -24,7 +25,7 @@ from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (30, 50)
 ORIGIN_M, N_STEPS = 40.0, 64
-LEVEL = np.zeros(SHAPE, np.float32)
+LEVEL, LEVEL_BASE = np.zeros(SHAPE, np.float32), BaseSurface.level(SHAPE, BLOCK)
 
 
 def sensor(along=0.0, across=0.0):
@@ -36,7 +37,7 @@ def tile(sensors, valid=None):
     transform = Affine(CELL_M, 0, CENTRE[0] - 12.5, 0, -CELL_M, CENTRE[1] + 7.5)
     pixels = (np.zeros((101, 121), np.float32),)
     mask = (np.ones((101, 121), bool) if valid is None else valid,)
-    windows = [ViewPixels(s, (0, 0), 1.0, pixels, mask) for s in sensors]
+    windows = [ViewPixels(s, (0, 0), 0.0, 1.0, pixels, mask) for s in sensors]
     blocks = (-(-SHAPE[0] // BLOCK), -(-SHAPE[1] // BLOCK))
     lattice = HeightLattice(
         ORIGIN_M, STEP_M, SHAPE, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
@@ -47,7 +48,7 @@ def tile(sensors, valid=None):
 
 def test_all_is_covered_well_inside_the_image():
     views, lattice, _ = tile([sensor(), sensor(10, 5)])
-    seen = coverage(views, lattice)
+    seen = coverage(views, LEVEL_BASE, lattice)
     assert (seen[0] == 0).all()
     assert (seen[1] == N_STEPS - 1).all()
 
@@ -56,7 +57,7 @@ def test_heights_at_which_a_cell_leaves_the_image():
     """A view 60 degrees off nadir: high ground falls off the image's edge."""
     camera = sensor(along=60.0)
     views, lattice, transform = tile([sensor(), camera])
-    seen = coverage(views, lattice)
+    seen = coverage(views, LEVEL_BASE, lattice)
     for r, c in ((0, 0), (15, 30), (29, 49)):
         x, y = transform * (c + 0.5, r + 0.5)
         z = ORIGIN_M + STEP_M * np.arange(N_STEPS)
@@ -68,11 +69,65 @@ def test_heights_at_which_a_cell_leaves_the_image():
         assert abs(seen[1, 1, r, c] - last) <= 1
 
 
+def rough_base(up):
+    """Level at the corners of blocks, so that nodes stay, and up to `up` steps from there between them, anywhere."""
+    blocks = [-(-n // BLOCK) for n in SHAPE]
+    corners = np.random.default_rng(6).uniform(-up, up, [4 * n + 1 for n in blocks])
+    corners[::4, ::4] = 0.0
+    return BaseSurface(corners, BLOCK // 4, SHAPE, BLOCK)
+
+
+def test_a_bound_that_the_image_cuts_is_counted_from_the_relief():
+    """A view 60 degrees off nadir covers a cell to the same height in metres, whatever the base under it."""
+    base = rough_base(9.0)
+    relief = base.relief()
+    views, lattice, _ = tile([sensor(), sensor(along=60.0)])
+    level, rough = coverage(views, LEVEL_BASE, lattice), coverage(views, base, lattice)
+    assert (level[0, 1] > 0).any()
+    assert (level[1, 1] < N_STEPS - 1).any()
+    for r, c in np.ndindex(SHAPE):
+        low, high = level[:2, 1, r, c]
+        covered = [k for k in range(-20, N_STEPS + 20) if low <= k + relief[r, c] <= high]
+        if low > 0:
+            assert rough[0, 1, r, c] == covered[0]
+        if high < N_STEPS - 1:
+            assert rough[1, 1, r, c] == covered[-1]
+
+
+def test_a_bound_that_the_image_does_not_cut_stays():
+    views, lattice, _ = tile([sensor(), sensor(across=60.0)])
+    level, rough = coverage(views, LEVEL_BASE, lattice), coverage(views, rough_base(9.0), lattice)
+    np.testing.assert_array_equal(rough[:, 0], level[:, 0])
+    for bound, end in ((0, 0), (1, N_STEPS - 1)):
+        uncut = level[bound, 1] == end
+        assert uncut.any()
+        assert (rough[bound, 1][uncut] == end).all()
+
+
+def test_a_short_run_that_the_relief_moves_away_from_itself_is_kept():
+    """Where an image covers fewer heights than the relief is deep, both bounds still move alike."""
+    valid = np.zeros((101, 121), bool)
+    valid[:, 56:67] = True
+    base = rough_base(20.0)
+    views, lattice, _ = tile([sensor(across=40.0)], valid)
+    level, rough = coverage(views, LEVEL_BASE, lattice), coverage(views, base, lattice)
+    cut = (level[0, 0] > 0) & (level[1, 0] < N_STEPS - 1) & covers(level)[0]
+    run = (level[1] - level[0])[0]
+    short = cut & (np.abs(base.relief()) > run + 1)
+    assert short.sum() > 50
+    for r, c in np.argwhere(short):
+        whole = np.ceil(level[0, 0, r, c] - base.relief()[r, c]), np.floor(level[1, 0, r, c] - base.relief()[r, c])
+        assert tuple(rough[:2, 0, r, c]) == whole
+    never = ~covers(level)[0]
+    assert never.sum() > 50
+    np.testing.assert_array_equal(rough[:, 0, never], level[:, 0, never])
+
+
 def test_windows_do_not_touch_nodata():
     valid = np.ones((101, 121), bool)
     valid[50, 60] = False
     views, lattice, transform = tile([sensor(), sensor(5)], valid)
-    lost = coverage(views, lattice)[1, 0] < 0
+    lost = coverage(views, LEVEL_BASE, lattice)[1, 0] < 0
     col, row = ~transform * CENTRE
     r, c = np.nonzero(lost)
     assert 64 <= lost.sum() <= 81
@@ -92,7 +147,7 @@ def test_how_far_a_fixed_pixel_moves_per_step(along, across):
 def test_a_tower_hides_the_ground_behind_it():
     """10 m high; a view that leans 45 degrees from the east does not see 10 m of ground to the west of it."""
     views, lattice, _ = tile([sensor(), sensor(across=-45.0)])
-    seen = coverage(views, lattice)
+    seen = coverage(views, LEVEL_BASE, lattice)
     surface = np.full(SHAPE, 10.0, np.float32)
     surface[:, 35:40] = 30.0
     hide(seen, views, surface, LEVEL, BLOCK, 0.0)
@@ -104,7 +159,7 @@ def test_a_tower_hides_the_ground_behind_it():
     assert hidden.min() in (15, 16)
     assert (np.diff(hidden) == 1).all()
     assert hidden.max() in (38, 39)
-    shown = coverage(views, lattice)
+    shown = coverage(views, LEVEL_BASE, lattice)
     hide(shown, views, surface, LEVEL, BLOCK, 100.0)
     assert (shown[2] < 0).all()
 
@@ -115,14 +170,14 @@ def test_what_is_hidden_is_counted_from_the_base():
     surface = np.full(SHAPE, 10.0, np.float32)
     surface[:, 35:40] = 30.0
     base = np.broadcast_to(np.arange(SHAPE[1], dtype=np.float32) * 2, SHAPE)
-    level, sloped = coverage(views, lattice), coverage(views, lattice)
+    level, sloped = coverage(views, LEVEL_BASE, lattice), coverage(views, LEVEL_BASE, lattice)
     hide(level, views, surface, LEVEL, BLOCK, 0.0)
     hide(sloped, views, surface, base, BLOCK, 0.0)
     hidden = level[2, 1] > NOTHING_HIDDEN
     assert hidden.sum() > 400
     np.testing.assert_array_equal((level[2, 1] - base)[hidden], sloped[2, 1][hidden])
     # On a level base at height 10, what was hidden at the ground stays so at index 0.
-    at_ground = coverage(views, lattice)
+    at_ground = coverage(views, LEVEL_BASE, lattice)
     hide(at_ground, views, surface, LEVEL + 10, BLOCK, 0.0)
     np.testing.assert_array_equal(
         sees(at_ground, np.zeros((2, *SHAPE)))[1], sees(level, np.full((2, *SHAPE), 10.0))[1]

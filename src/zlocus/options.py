@@ -122,6 +122,18 @@ class MeasureOptions(Checked):
         0.0, "Standard deviation added to every window, as a share of the image's own: damps plain windows.",
         low=0.0, high=1.0,
     )  # fmt: skip
+    grey_weight: float = option(
+        1.0, "Weight of grey differences between views beside the correlation, which is blind on plain roofs.",
+        low=0.0, high=1.5,
+    )  # fmt: skip
+    grey_reach: float = option(
+        0.3, "Grey difference from which on two views are strangers, as a share of the image's deviation.",
+        low=0.01, high=10.0,
+    )  # fmt: skip
+    hidden_excused: float = option(
+        0.5, "Share of the pairs with a hidden view that is left out; the others count as uncorrelated.",
+        low=0.0, high=1.0,
+    )  # fmt: skip
     hidden_margin_steps: float = option(
         2.0, "A view counts as hidden this far below what hides it.", low=0.0, high=1000.0, unit="steps"
     )
@@ -134,6 +146,10 @@ class SemiGlobalOptions(Checked):
     p1: int = option(20, "Penalty of a neighbour one step away.", low=0, high=1000)
     p2: int = option(240, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
     p2_edge: int = option(60, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
+    level_easing: float = option(
+        0.85, "Penalties of jumps are eased by this at every coarser level, where a roof has fewer cells.",
+        low=0.1, high=1.0,
+    )  # fmt: skip
     edge_contrast: float = option(
         2.0,
         "Grey difference that halves the penalty of a jump, in median differences of the scene.",
@@ -164,10 +180,82 @@ class RefineOptions(Checked):
 
 
 @dataclass(frozen=True)
+class SelectionOptions(Checked):
+    """Which search images a cell is matched with, in which order, and when they are enough (method sections 2 to 4)."""
+
+    rho1_high: float = option(0.90, "Good above this largest correlation and `ratio_high`.", low=0.0, high=1.0)
+    ratio_high: float = option(1.2, "Good above this ratio of peaks and `rho1_high`.", low=1.0, high=100.0)
+    rho1_middle: float = option(0.80, "Good above this largest correlation and `ratio_middle`.", low=0.0, high=1.0)
+    ratio_middle: float = option(1.4, "Good above this ratio of peaks and `rho1_middle`.", low=1.0, high=100.0)
+    rho1_low: float = option(
+        0.65, "Good above this largest correlation and `ratio_low`, fair above it at any ratio.", low=0.0, high=1.0
+    )
+    ratio_low: float = option(1.6, "Good above this ratio of peaks and `rho1_low`.", low=1.0, high=100.0)
+    rho1_fair: float = option(0.50, "Fair above this largest correlation and `ratio_fair`.", low=0.0, high=1.0)
+    ratio_fair: float = option(1.4, "Fair above this ratio of peaks and `rho1_fair`.", low=1.0, high=100.0)
+    rival_px: float = option(
+        2.0, "Equivalent disparity from the peak at which another maximum is a rival.", low=0.0, high=100.0, unit="px"
+    )
+    negative_rival: str = option(
+        "absolute", "Ratio to a rival of no positive correlation: of absolute values, or infinite.",
+        choices=("absolute", "infinite"),
+    )  # fmt: skip
+    least_seen: float = option(
+        0.5, "A curve seen over a smaller share of its heights is never good.", low=0.0, high=1.0
+    )
+    neighbours: str = option(
+        "radius", "Feature points that order the images of a cell: those within the radius, or the corners of the TIN "
+        "triangle around it.", choices=("radius", "tin"),
+    )  # fmt: skip
+    radius_px: float = option(
+        100.0, "Distance within which feature points order the images of a cell.", low=1.0, high=1e5, unit="px"
+    )
+    nearest: int = option(5, "Feature points taken where none is within the radius.", low=1, high=1000)
+    widest: float = option(
+        5.0, "Those are looked for within so many radii; beyond, the order of the whole scene holds.",
+        low=1.0, high=1000.0,
+    )  # fmt: skip
+    accumulate: str = option(
+        "sum", "What orders images: the sum of their labels, or the count of those that are good.",
+        choices=("sum", "count"),
+    )  # fmt: skip
+    stopped_share: float = option(
+        0.95, "A block adds images until this share of its cells has stopped.", low=0.0, high=1.0
+    )
+    candidates: int = option(12, "Search images considered for a block, at most.", low=1, high=254)
+    least_overlap: float = option(
+        0.2, "Images that see a smaller share of a block are considered last.", low=0.0, high=1.0
+    )
+    least_angle_deg: float = option(
+        5.0, "Images at a smaller angle to the reference are considered last.", low=0.0, high=90.0, unit="degrees"
+    )
+    best_angle_deg: float = option(
+        20.0, "Images at about this angle to the reference are considered first.", low=0.1, high=90.0, unit="degrees"
+    )
+    most_angle_deg: float = option(
+        45.0, "Images at a larger angle to the reference are considered last.", low=1.0, high=180.0, unit="degrees"
+    )
+    half_days: float = option(
+        60.0, "Days between two images that halve the worth of matching them.", low=0.01, high=1e6, unit="days"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.least_angle_deg <= self.best_angle_deg <= self.most_angle_deg:
+            raise ConfigError(
+                f"SelectionOptions.best_angle_deg = {self.best_angle_deg!r} is outside least_angle_deg to "
+                f"most_angle_deg = {self.least_angle_deg!r} to {self.most_angle_deg!r} degrees."
+            )
+
+
+@dataclass(frozen=True)
 class CheckOptions(Checked):
     """When a cell stays empty, or is marked as doubtful."""
 
-    least_ncc: float = option(0.0, "A cell is left empty below this mean NCC.", low=-1.0, high=1.0)
+    least_ncc: float = option(
+        -0.2, "A cell is left empty below this mean NCC: less than plain roofs give, where noise decides.",
+        low=-1.0, high=1.0,
+    )  # fmt: skip
     doubtful_ncc: float = option(0.3, "A cell is marked as weak below this mean NCC.", low=-1.0, high=1.0)
     rival_cost: int = option(
         64, "A cell is marked as ambiguous when another height costs less than this more over the eight paths.",

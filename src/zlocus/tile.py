@@ -14,7 +14,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ranges import ranges_nearby
+from zlocus.matching.ranges import UNKNOWN, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.matching.setup import MatchScene
@@ -28,6 +28,9 @@ from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
+# What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's.
+OBSTACLE = np.ones((5, 5), np.uint8)
+SPIKE = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -128,10 +131,10 @@ def _read(scene: MatchScene, core: CellWindow, config: RunConfig) -> list[ViewPi
     across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
     corners = np.array([transform * (c, r) for c in across for r in down])
     found = []
-    for view, contrast in zip(scene.views, scene.contrast, strict=True):
+    for view, grey in zip(scene.views, scene.grey, strict=True):
         part = pixel_window(view, corners, z, 2**coarsest)
         if part is not None:
-            found.append(read_pixels(view, part, scene.levels, contrast))
+            found.append(read_pixels(view, part, scene.levels, *grey))
     return found
 
 
@@ -185,16 +188,16 @@ def _match_level(
     low, high = guide.low - base.cells, guide.high - base.cells
     lattice = ranges_nearby(low, high, scene.origin_m, step, shape, config.pyramid)
     along_base = base.shear(views)
-    seen = coverage(along_base, lattice)
+    seen = coverage(along_base, base, lattice)
     if guide.surface is not None and use_visibility:
-        obstacle = cv2.erode(guide.surface, np.ones((3, 3), np.uint8))
+        obstacle = cv2.erode(guide.surface, OBSTACLE)
         hide(seen, views, obstacle, base.cells, block, config.measure.hidden_margin_steps)
     ortho = None if smooth is None else _ortho(views, smooth, block)
-    cost = cost_volume(along_base, lattice, seen, config.measure)
+    cost = cost_volume(along_base, base, lattice, seen, config.measure)
     if method == "mvll":
         heights = pick(cost.astype(np.uint16), lattice)
     else:
-        heights = aggregate(cost, lattice, penalties(ortho, shape, config.semiglobal), config.semiglobal)
+        heights = aggregate(cost, lattice, penalties(ortho, shape, level, config.semiglobal), config.semiglobal)
     return LevelResult(window, views, lattice, above_base(seen, base.cells), heights.above(base.cells))
 
 
@@ -213,7 +216,8 @@ def _true_ortho(
     for i, view in enumerate(pixels):
         shown = np.isnan(out) & sees(result.seen[:, i], surface)
         if shown.any():
-            out[shown] = _ortho(result.views, surface, block, i)[shown] * np.float32(view.contrast)
+            grey = _ortho(result.views, surface, block, i)[shown]
+            out[shown] = grey * np.float32(view.contrast) + np.float32(view.mean)
     return out
 
 
@@ -236,8 +240,9 @@ def _candidates(
     heights = coarser.heights
     known = covers(coarser.seen).sum(axis=0) >= 2
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
-    low = np.where(known, np.minimum(heights.best, rival), np.nan).astype(np.float32)
-    high = np.where(known, np.maximum(heights.best, rival), np.nan).astype(np.float32)
+    low = np.minimum(heights.best, rival).astype(np.float32)
+    high = np.maximum(heights.best, rival).astype(np.float32)
+    low, high = _without_spikes(low, high, known)
     low, high = (2 * _doubled(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):
         side = scene.cell_m * 2**level
@@ -248,6 +253,23 @@ def _candidates(
         np.fmin.at(low, (row[inside], col[inside]), index)
         np.fmax.at(high, (row[inside], col[inside]), index)
     return low, high
+
+
+def _without_spikes(
+    low: NDArray[np.float32], high: NDArray[np.float32], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Lowest and highest candidates that 3 x 3 cells share (a closing and an opening), NaN where not `known`.
+
+    A false height of a cell or two would widen the range of a whole block; a tower has more cells, and tie points are
+    added later.
+    """
+    far = UNKNOWN
+    top = cv2.erode(np.where(known, high, far), SPIKE)
+    top = cv2.dilate(np.where(known, top, -far), SPIKE)
+    floor = cv2.dilate(np.where(known, low, -far), SPIKE)
+    floor = cv2.erode(np.where(known, floor, far), SPIKE)
+    nothing = np.float32(np.nan)
+    return np.where(known, np.minimum(floor, top), nothing), np.where(known, np.maximum(floor, top), nothing)
 
 
 def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:

@@ -1,4 +1,4 @@
-"""Twins of the NCC kernels: windows cut out of planes, their plain correlation, its mean over all pairs of views."""
+"""Twins of the measure: windows cut out of planes, their plain correlation, grey differences, means over all pairs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from reference.projection import bilinear, cubic, positions
+from reference.projection import along_base, bilinear, cubic, positions
 
 UNSEEN_COST = 40.0
 
@@ -29,31 +29,57 @@ def ncc(a, b, floor=0.0):
     return np.where(constant, 0.0, (a * b).sum(axis=-1) / np.where(constant, 1.0, norm))
 
 
-def mean_ncc(planes, visible, half, floor=0.0):
-    """Mean over all pairs of the views that are usable, (r, c); a pair of which one is hidden counts as 0.
+def over_pairs(total, visible, excused):
+    """Mean over all pairs of usable views of a sum over the visible pairs, (r, c).
 
-    planes : one (r + 2 half, c + 2 half) each; visible : (2, i, r, c) whether a view sees the cell at this height, and
-    whether it does at any height (then its pairs count).
+    visible : (2, i, r, c) whether a view sees the cell at this height, and whether it does at any height (then its
+    pairs count); excused : share of the hidden pairs that is as good as the visible ones, the others are 0.
     """
-    here, anywhere = visible
+    here, anywhere = (v.sum(axis=0) for v in visible)
+    every = np.where(anywhere > 1, total / np.maximum(anywhere * (anywhere - 1) / 2, 1), 0.0)
+    shown = np.where(here > 1, total / np.maximum(here * (here - 1) / 2, 1), 0.0)
+    return (1 - excused) * every + excused * shown
+
+
+def mean_ncc(planes, visible, half, floor=0.0, excused=0.0):
+    """Mean over all pairs of the views that are usable, (r, c), see `over_pairs`.
+
+    planes : one (r + 2 half, c + 2 half) each.
+    """
+    here = visible[0]
     total = np.zeros(here.shape[1:])
     for a, b in combinations(range(len(planes)), 2):
         agreement = ncc(windows(planes[a], half), windows(planes[b], half), floor)
         total += np.where(here[a] & here[b], agreement, 0.0)
-    n = anywhere.sum(axis=0)
-    return np.where(n > 1, total / np.maximum(n * (n - 1) / 2, 1), 0.0)
+    return over_pairs(total, visible, excused)
 
 
-def cell_costs(images, nodes, heights, index, block, halves, seen, floor):
-    """64 (1 - mean NCC) of every cell of a block at one height index, (r, c) float, before rounding.
+def mean_closeness(greys, visible, reach, excused=0.0):
+    """Mean over all pairs of usable views of max(0, 1 - grey difference / reach), (r, c), see `over_pairs`.
 
-    Where fewer than two images cover that height, a fixed cost: see `block_costs`.
+    greys : one (r, c) each.
+    """
+    here = visible[0]
+    total = np.zeros(here.shape[1:])
+    for a, b in combinations(range(len(greys)), 2):
+        close = np.maximum(0.0, 1.0 - np.abs(np.subtract(greys[a], greys[b], dtype=float)) / reach)
+        total += np.where(here[a] & here[b], close, 0.0)
+    return over_pairs(total, visible, excused)
+
+
+def cell_costs(images, nodes, heights, index, block, halves, seen, measure, relief):
+    """64 (1 - mean NCC + weight (1 - mean closeness)) of a block's cells at one height, (r, c), before rounding.
+
+    Where fewer than two images cover that height, a fixed cost: see `block_costs`. measure : floor, weight, reach,
+    excused; relief : (r + 2 half, c + 2 half) steps.
     """
     half = max(halves)
+    floor, weight, reach, excused = measure
     shape = seen.shape[2:]
     t = heights[0] + index * heights[1]
     planes = [
-        bilinear(image, positions(node, t, shape, block, half)) for image, node in zip(images, nodes, strict=True)
+        bilinear(image, along_base(node, t, relief, heights[1], shape, block, half))
+        for image, node in zip(images, nodes, strict=True)
     ]
     covered = (seen[0] <= index) & (index <= seen[1])
     visible = np.stack([covered & (seen[2] <= index), seen[0] <= seen[1]])
@@ -61,8 +87,10 @@ def cell_costs(images, nodes, heights, index, block, halves, seen, floor):
     for small in halves:
         trim = half - small
         inner = [plane[trim : plane.shape[0] - trim, trim : plane.shape[1] - trim] for plane in planes]
-        by_window.append(mean_ncc(inner, visible, small, floor))
-    return np.where(covered.sum(axis=0) > 1, 64.0 - 64.0 * np.mean(by_window, axis=0), UNSEEN_COST)
+        by_window.append(mean_ncc(inner, visible, small, floor, excused))
+    greys = [plane[half:-half, half:-half] for plane in planes]
+    apart = 1.0 - np.mean(by_window, axis=0) + weight * (1.0 - mean_closeness(greys, visible, reach, excused))
+    return np.where(covered.sum(axis=0) > 1, 64.0 * apart, UNSEEN_COST * (1.0 + weight))
 
 
 def profile(images, nodes, heights, surface, offset, block, half, seen, floor=0.0):

@@ -25,6 +25,30 @@ def positions(node, t, shape, block, border=0):
     return position(node, np.broadcast_to(np.asarray(t, float), row.shape), row, col, block)
 
 
+def derivative(node):
+    """Corners (2, 2, 2, 4) whose positions are the px per t of `node`'s."""
+    return np.concatenate([node[..., 1:] * [1.0, 2.0, 3.0], np.zeros_like(node[..., :1])], axis=-1)
+
+
+def along_base(node, t, relief, per_index, shape, block, border=0):
+    """(r, c, 2) px of the cells of a block, `relief` steps above t, moving as fast as the block's middle does at t.
+
+    relief : (r + 2 border, c + 2 border) steps; per_index : t per step. `positions` of the cells' own heights, but for
+    the change of speed within a block and over the relief.
+    """
+    speed = position(derivative(node), np.float64(t), block / 2, block / 2, block) * per_index
+    return positions(node, t, shape, block, border) + relief[..., None] * speed
+
+
+def base_relief(base, corners, rows, cols, block, border):
+    """Base surface less the bilinear surface through a block's four corners. base : of a tile and its border."""
+    part = base[rows.start : rows.stop + 2 * border, cols.start : cols.stop + 2 * border]
+    a, b = (np.indices(part.shape) - border) / block
+    top = (1 - b) * corners[0, 0] + b * corners[0, 1]
+    low = (1 - b) * corners[1, 0] + b * corners[1, 1]
+    return part - (1 - a) * top - a * low
+
+
 def bilinear(image, xy):
     """Values of an image (r, c) at positions (..., 2), clamped to just inside its last pixel."""
     x = np.clip(xy[..., 0], 0, image.shape[1] - 1.01)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from zlocus.kernels._jit import kernel
-from zlocus.kernels.agreement import pair_sum, window_moments
+from zlocus.kernels.agreement import SLACK, add_pairs, window_moments
 from zlocus.kernels.volume import HIDDEN, flat_visibility, plane_grid
 
 
@@ -109,12 +109,12 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
     rows, cols = out.shape[1], out.shape[2]
     n_views = layout.shape[0]
     width = cols + 2 * half
-    size = (rows + 2 * half) * width
-    planes = np.zeros((n_views, size), np.float32)
-    mean, scale = np.zeros_like(planes), np.zeros_like(planes)
-    flat = np.empty((3, n_views, size), np.int32)
+    n, size = rows * width, surface.size + SLACK
+    planes, windows = np.zeros((n_views, size), np.float32), np.full(1, half)
+    mean, scale = np.zeros((n_views, 1, size), np.float32), np.zeros((n_views, 1, size), np.float32)
+    flat = np.empty((n_views, 3, size), np.int32)
     pairs, agreed = np.empty(size, np.float32), np.empty(size, np.float32)
-    scratch = np.empty((2, size), np.float32)
+    work = np.empty((4, size), np.float32)
     grids, level = np.empty((3, 8)), np.empty(surface.shape, np.float32)
     at_surface = np.zeros((3, n_views, rows, cols), np.int32)
     for i in range(n_views):
@@ -123,7 +123,7 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
                 z = surface[r + half, c + half]
                 if not (max(seen[0, i, r, c], seen[2, i, r, c]) <= z <= seen[1, i, r, c]):
                     at_surface[0, i, r, c] = HIDDEN
-    n = flat_visibility(at_surface, half, flat, pairs)
+    flat_visibility(at_surface, half, flat, pairs)
     if pairs.max() == 0.0:
         out[:] = 0.0
         return
@@ -134,17 +134,18 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
             for c in range(width):
                 level[r, c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(reach)
         for i in range(n_views):
-            if flat[0, i].min() == HIDDEN:
+            if flat[i, 0].min() == HIDDEN:
                 continue
             for m in range(3):
                 t = heights[0] + (centre + (m - 1) * reach) * heights[1]
                 plane_grid(nodes, i, t, block, half, grids[m])
-            resample_surface(pixels, layout[i], grids, level, planes[i].reshape(surface.shape))
+            resample_surface(pixels, layout[i], grids, level, planes[i, : surface.size].reshape(surface.shape))
             planes[i] -= planes[i, half * width + half]
-            window_moments(planes[i], 0, half, width, n, floor, scratch[0], mean[i], scale[i])
+            window_moments(planes[i], windows, width, n, floor, work, mean[i], scale[i])
             for p in range(n):
-                scale[i, p] *= np.float32(flat[0, i, p] < HIDDEN)
-        pair_sum(planes, 0, mean, scale, half, width, n, scratch, agreed)
+                scale[i, 0, p] *= np.float32(flat[i, 0, p] < HIDDEN)
+        agreed[:] = 0.0
+        add_pairs(planes, windows, mean, scale, width, n, work, agreed)
         for r in range(rows):
             for c in range(cols):
                 p = r * width + c

@@ -6,44 +6,66 @@ import numpy as np
 
 from zlocus.kernels._jit import kernel
 
+# Cells at a time: their positions and their pixels stay in the first level of the cache.
+RUN = 512
 
-# (p,) f4, (3,) i8, (8,) f8, (c,) u4, (2,c) f4, (r,c) f4 -> None
+
+# (3,) i8, (8,) f8, (2,p) f4, (p,) f4, (2,) f4, i8, i8, (n,) u4, (2,n) f4 -> None
 @kernel
-def resample_plane(pixels, layout, grid, index, fraction, out):
-    """Bilinear image values at positions that are bilinear in row and column of the ground grid.
+def pixel_positions(layout, grid, cells, relief, velocity, first, end, index, fraction):
+    """Index of the upper left of the four pixels around each of a run of cells, and how far it is from there (x, y).
 
-    pixels : (p,) float32, all images one after the other; layout : (3,) int64, offset, rows and columns of this image
-    in `pixels`; grid : (8,) float64, px: (x, y) at the first cell, step per column, step per row, mixed step per row
-    and column; index : (c,) uint32 and fraction : (2, c) float32, scratch; out : (r, c) float32, written.
-    Positions outside the image are clamped to its border (the caller masks them). Two passes per row, positions and
-    gathers, so that the first vectorises (int32 becomes float32 in vector lanes, int64 does not); positions are float32
-    from a whole-pixel origin near the grid.
+    See `resample_plane`; float32 positions are from a whole-pixel origin near the grid. Vectorises (int32 becomes
+    float32 in vector lanes, int64 does not).
     """
-    base, n_rows, n_cols = layout[0], layout[1], layout[2]
+    n_rows, n_cols = layout[1], layout[2]
     origin_x = min(max(int(grid[0]), 0), n_cols - 2)
     origin_y = min(max(int(grid[1]), 0), n_rows - 2)
     x_low, x_high = np.float32(-origin_x), np.float32(n_cols - 1.01 - origin_x)
     y_low, y_high = np.float32(-origin_y), np.float32(n_rows - 1.01 - origin_y)
-    stride = np.int32(n_cols)
-    right, below, diagonal = np.uint32(1), np.uint32(n_cols), np.uint32(n_cols + 1)
-    origin = np.int32(origin_y * n_cols + origin_x)
-    image = pixels[base : base + n_rows * n_cols]
-    for r in range(out.shape[0]):
-        x0 = np.float32(grid[0] + r * grid[4] - origin_x)
-        y0 = np.float32(grid[1] + r * grid[5] - origin_y)
-        dx = np.float32(grid[2] + r * grid[6])
-        dy = np.float32(grid[3] + r * grid[7])
-        for c in range(out.shape[1]):
-            x = min(max(x0 + np.float32(np.int32(c)) * dx, x_low), x_high)
-            y = min(max(y0 + np.float32(np.int32(c)) * dy, y_low), y_high)
-            col = np.int32(np.floor(x))
-            row = np.int32(np.floor(y))
-            fraction[0, c] = x - np.float32(col)
-            fraction[1, c] = y - np.float32(row)
-            index[c] = np.uint32(np.int32(row * stride) + col + origin)
-        for c in range(out.shape[1]):
-            p = index[c]
-            fx = fraction[0, c]
-            top = image[p] + fx * (image[p + right] - image[p])
-            low = image[p + below] + fx * (image[p + diagonal] - image[p + below])
-            out[r, c] = top + fraction[1, c] * (low - top)
+    stride, origin = np.int32(n_cols), np.int32(origin_y * n_cols + origin_x)
+    x0, y0 = np.float32(grid[0] - origin_x), np.float32(grid[1] - origin_y)
+    x_col, y_col, x_row, y_row = np.float32(grid[2]), np.float32(grid[3]), np.float32(grid[4]), np.float32(grid[5])
+    x_mixed, y_mixed = np.float32(grid[6]), np.float32(grid[7])
+    vx, vy = velocity[0], velocity[1]
+    rows, cols, steps, fx, fy = cells[0][first:end], cells[1][first:end], relief[first:end], fraction[0], fraction[1]
+    for j in range(end - first):
+        r, c, z = rows[j], cols[j], steps[j]
+        x = min(max(x0 + c * (x_col + r * x_mixed) + r * x_row + z * vx, x_low), x_high)
+        y = min(max(y0 + c * (y_col + r * y_mixed) + r * y_row + z * vy, y_low), y_high)
+        left, top = np.floor(x), np.floor(y)
+        fx[j] = x - left
+        fy[j] = y - top
+        index[j] = np.uint32(np.int32(np.int32(top) * stride) + np.int32(left) + origin)
+
+
+# (p,) f4, (3,) i8, (n,) u4, (2,n) f4, (n,) f4 -> None
+@kernel
+def gather(pixels, layout, index, fraction, out):
+    """Bilinear values between the four pixels from each index on."""
+    image = pixels[layout[0] : layout[0] + layout[1] * layout[2]]
+    right, below, diagonal = np.uint64(1), np.uint64(layout[2]), np.uint64(layout[2] + 1)
+    fx, fy = fraction[0], fraction[1]
+    for j in range(out.shape[0]):
+        p = np.uint64(index[j])
+        top = image[p] + fx[j] * (image[p + right] - image[p])
+        low = image[p + below] + fx[j] * (image[p + diagonal] - image[p + below])
+        out[j] = top + fy[j] * (low - top)
+
+
+# (p,) f4, (3,) i8, (8,) f8, (2,c) f4, (c,) f4, (2,) f4, (n,) u4, (2,n) f4, (c,) f4 -> None
+@kernel
+def resample_plane(pixels, layout, grid, cells, relief, velocity, index, fraction, out):
+    """Bilinear image values at positions that are bilinear in row and column of the ground grid, moved by its relief.
+
+    pixels : (p,) float32, all images one after the other; layout : (3,) int64, offset, rows and columns of this image
+    in `pixels`; grid : (8,) float64, px: (x, y) at the first cell, step per column, step per row, mixed step per row
+    and column; cells : (2, c) float32, rows and columns from the first cell; relief : (c,) float32 steps above those
+    positions' heights; velocity : (2,) float32, px per step (x, y); index : (RUN,) uint32 and fraction : (2, RUN)
+    float32, scratch; out : (c,) float32 or longer, written.
+    Positions outside the image are clamped to its border (the caller masks them).
+    """
+    for first in range(0, relief.shape[0], RUN):
+        end = min(first + RUN, relief.shape[0])
+        pixel_positions(layout, grid, cells, relief, velocity, first, end, index, fraction)
+        gather(pixels, layout, index, fraction, out[first:end])

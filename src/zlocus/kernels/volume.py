@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from zlocus.kernels._jit import kernel
-from zlocus.kernels.agreement import pair_sum, window_moments
-from zlocus.kernels.resample import resample_plane
+from zlocus.kernels.agreement import SLACK, add_closeness, add_pairs, window_moments
+from zlocus.kernels.resample import RUN, resample_plane
 
 COST_SCALE = np.float32(64.0)
 UNSEEN_COST = np.float32(40.0)
 HIDDEN = np.int32(2**30)
+# Grey value of a view where it shows nothing, times its number: as far from any grey as from another view's.
+NOWHERE = np.float32(1e6)
 
 
 # (i,2,2,2,4) f8, i8, f8, i8, i8, (8,) f8 -> None
@@ -39,123 +41,249 @@ def plane_grid(nodes, view, t, block, half, grid):
         grid[6 + axis] = mixed
 
 
-# (3,i,r,c) i4, i8, (3,i,p) i4, (p,) f4 -> i8
+# (3,i,r,c) i4, i8, (i,3,p) i4, (p,) f4 -> None
 @kernel
 def flat_visibility(seen, half, flat, pairs):
-    """`seen` of a block on the flat layout (never beyond it); 1 / (n (n - 1)), n the views that see the cell."""
+    """`seen` of a block on the flat layout (never beyond it); 2 / (n (n - 1)), n the views that see the cell."""
     n_views, rows, cols = seen.shape[1], seen.shape[2], seen.shape[3]
     width = cols + 2 * half
-    flat[0] = HIDDEN
-    flat[1] = -1
-    flat[2] = HIDDEN
+    flat[:, 0] = HIDDEN
+    flat[:, 1] = -1
+    flat[:, 2] = HIDDEN
     pairs[:] = 0.0
-    for r in range(rows):
-        for c in range(cols):
-            usable = np.float32(0.0)
-            for i in range(n_views):
-                for bound in range(3):
-                    flat[bound, i, r * width + c] = seen[bound, i, r, c]
-                if seen[0, i, r, c] <= seen[1, i, r, c]:
-                    usable += np.float32(1.0)
-            if usable > 1.0:
-                pairs[r * width + c] = np.float32(1.0) / (usable * (usable - np.float32(1.0)))
-    return rows * width - 2 * half
+    for i in range(n_views):
+        for bound in range(3):
+            for r in range(rows):
+                for c in range(cols):
+                    flat[i, bound, r * width + c] = seen[bound, i, r, c]
+        for j in range(pairs.shape[0]):
+            pairs[j] += np.float32(flat[i, 0, j] <= flat[i, 1, j])
+    for j in range(pairs.shape[0]):
+        usable = pairs[j]
+        ordered = usable * (usable - np.float32(1.0))
+        pairs[j] = np.float32(2.0) / ordered if usable > np.float32(1.5) else np.float32(0.0)
 
 
-# (3,i,p) i4, (2,) i8 -> (i,) b1
+# (3,i,r,c) i4, (i,4) i4 -> None
 @kernel
-def taking_part(flat, span):
-    """Which views cover any cell of a block at any height of its range. flat : see `flat_visibility`."""
-    first, end = span[0], span[0] + span[1]
-    takes = np.empty(flat.shape[1], np.bool_)
-    for i in range(flat.shape[1]):
-        takes[i] = flat[1, i].max() >= first and flat[0, i].min() < end
-    return takes
+def height_ranges(seen, ranges):
+    """Of every view, lowest and highest height index at which it covers any cell of a block, and at which it covers and
+    sees every cell. seen : see `block_costs`; ranges : (i, 4), written."""
+    for i in range(seen.shape[1]):
+        low, high, from_, to = HIDDEN, np.int32(-HIDDEN), np.int32(-HIDDEN), HIDDEN
+        for r in range(seen.shape[2]):
+            for c in range(seen.shape[3]):
+                low, high = min(low, seen[0, i, r, c]), max(high, seen[1, i, r, c])
+                from_ = max(from_, max(seen[0, i, r, c], seen[2, i, r, c]))
+                to = min(to, seen[1, i, r, c])
+        ranges[i, 0], ranges[i, 1], ranges[i, 2], ranges[i, 3] = low, high, from_, to
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, f4, (r,d) u1 -> None
+# (i,4) i4, (2,) i8 -> (i,) i8
 @kernel
-def block_costs(pixels, layout, nodes, heights, span, windows, seen, block, floor, out):
-    """Costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), rounded.
+def taking_part(ranges, span):
+    """The views that cover any cell of a block at any height of its range. ranges : see `height_ranges`."""
+    takes = np.empty(ranges.shape[0], np.int64)
+    n = 0
+    for i in range(ranges.shape[0]):
+        if ranges[i, 1] >= span[0] and ranges[i, 0] < span[0] + span[1]:
+            takes[n] = i
+            n += 1
+    return takes[:n]
+
+
+# (2,) i8 -> (2,p) f4
+@kernel
+def flat_cells(shape):
+    """Rows and columns of cells on the flat layout."""
+    cells = np.empty((2, shape[0] * shape[1]), np.float32)
+    for j in range(cells.shape[1]):
+        cells[0, j], cells[1, j] = j // shape[1], j % shape[1]
+    return cells
+
+
+# (i,2,2,2,4) f8, i8, f8, f8, (2,) f4 -> None
+@kernel
+def plane_velocity(nodes, view, t, per_index, velocity):
+    """Pixels (x, y) that a cell at the middle of a block moves per height index. per_index : t per index."""
+    for axis in range(2):
+        total = 0.0
+        for corner in range(4):
+            k = nodes[view, corner // 2, corner % 2, axis]
+            total += (3.0 * k[3] * t + 2.0 * k[2]) * t + k[1]
+        velocity[axis] = np.float32(0.25 * total * per_index)
+
+
+# (r,c) f4, (2,2) f8, i8, i8, (r,c) f4 -> None
+@kernel
+def block_relief(surface, corners, block, half, relief):
+    """Base surface of a block and its border, less the bilinear surface through its corners, which its nodes follow."""
+    for r in range(surface.shape[0]):
+        u = (r - half) / block
+        left = corners[0, 0] + u * (corners[1, 0] - corners[0, 0])
+        rise = corners[0, 1] + u * (corners[1, 1] - corners[0, 1]) - left
+        for c in range(surface.shape[1]):
+            relief[r, c] = np.float32(surface[r, c] - left - (c - half) / block * rise)
+
+
+# (3,p) i4, i4, i8, (p,) f4, (2,p) f4 -> None
+@kernel
+def shown_at(bounds, height, n, shown, counts):
+    """Where a view covers and sees the cells at a height (1 or 0); counts the views that cover, and that see, a cell.
+
+    bounds : of one view, see `flat_visibility`.
+    """
+    low, high, visible = bounds[0], bounds[1], bounds[2]
+    for j in range(n):
+        covered = np.float32(low[j] <= height and height <= high[j])
+        shown[j] = covered * np.float32(visible[j] <= height)
+        counts[0, j] += covered
+        counts[1, j] += shown[j]
+
+
+# (p,) f4, i8, (w,p) f4, (p,) f4, f4 -> None
+@kernel
+def hide(shown, n, scale, grey, nowhere):
+    """Take a view out of all pairs where it is not shown."""
+    for w in range(scale.shape[0]):
+        unit = scale[w]
+        for j in range(n):
+            unit[j] *= shown[j]
+    for j in range(n):
+        grey[j] = grey[j] if shown[j] > np.float32(0.0) else nowhere
+
+
+# (p,) f4, (p,) f4, (2,p) f4, (4,) f4, i8, i8, (p,) u1 -> None
+@kernel
+def whole_costs(total, pairs, counts, measure, n_sizes, n, out):
+    """Costs of a block at one height, rounded, from the sums over pairs of views; see `block_costs`.
+
+    counts : (2, p), views that cover and that see each cell.
+    """
+    weight, excused, one = measure[1], measure[3], np.float32(1.0)
+    n_covering, n_seeing = counts[0], counts[1]
+    highest = COST_SCALE * (np.float32(1.0) + weight)
+    unseen = UNSEEN_COST * (np.float32(1.0) + weight)
+    factor = COST_SCALE / np.float32(n_sizes)
+    for j in range(n):
+        m = n_seeing[j]
+        visible = np.float32(2.0) / max(m * (m - one), one)
+        cost = highest - factor * total[j] * (pairs[j] + excused * (visible - pairs[j]))
+        total[j] = (cost if n_covering[j] > np.float32(1.5) else unseen) + np.float32(0.5)
+    for j in range(n):
+        out[j] = np.uint8(np.int32(min(max(total[j], np.float32(0.0)), np.float32(255.0))))
+
+
+# (h,p) u1, i8, (r,d) u1 -> None
+@kernel
+def heights_last(codes, width, out):
+    """Costs, one flat plane a height, as rows of cells with all their heights."""
+    count = codes.shape[0]
+    for r in range(out.shape[0]):
+        for c in range(out.shape[1] // count):
+            for k in range(count):
+                out[r, c * count + k] = codes[k, r * width + c]
+
+
+# (p,) f4, i8, f4, i8, f4, i8, (p,) f4 -> None
+@kernel
+def centred(plane, size, centre, start, by_reach, n, grey):
+    """Take `centre` from a plane's `size` values; grey : those of the cells themselves, from `start` on, times
+    `by_reach`, unless that is 0."""
+    for j in range(size):
+        plane[j] -= centre
+    if by_reach > np.float32(0.0):
+        inner = plane[start:]
+        for j in range(n):
+            grey[j] = inner[j] * by_reach
+
+
+# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, (4,) f4, (r,d) u1 -> None
+@kernel
+def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, block, measure, out):
+    """Costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and as much,
+    weighted, for their grey differences.
 
     pixels, layout : see `resample_plane`; nodes : see `plane_grid`; heights : t of height index 0, t per index;
-    span : first height index and count; windows : half widths of the windows; seen : (3, i, r, c) int32, lowest and
-    highest height index at which an image covers a cell (HIDDEN, -1 where it never does), and the lowest at which
-    nothing hides it; out : (r, c * count) uint8.
-    A pair with a hidden view counts as uncorrelated (NCC 0): dropping it would favour heights that few views see,
-    where chance agreement is larger. Heights that fewer than two images cover cost UNSEEN_COST, less than chance
-    agreement and more than a match: so a cell whose true height is outside the images is not matched elsewhere.
+    relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; span : first height index and count; windows :
+    half widths of the windows, ascending; seen : (3, i, r, c) int32, lowest and highest height index at which an image
+    covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (4,) float32,
+    variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused; out :
+    (r, c * count) uint8.
+    A pair with a hidden view counts as uncorrelated (NCC 0), but for the excused share, which agrees as the visible
+    pairs do: without it the ground beside a wall would rather be roof, which all views see; excusing all would favour
+    heights that few views see, where chance agreement is larger. Heights that fewer than two images cover cost
+    UNSEEN_COST, less than chance agreement and more than a match: so a cell whose true height is outside the images is
+    not matched elsewhere.
     """
-    n_views, rows, cols = seen.shape[1], seen.shape[2], seen.shape[3]
-    half = windows.max()
-    width = cols + 2 * half
-    size = (rows + 2 * half) * width
-    planes = np.zeros((n_views, size), np.float32)
-    mean, scale = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
-    flat = np.empty((3, n_views, size), np.int32)
-    pairs, total, agreed = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    scratch, n_covering = np.empty((2, size), np.float32), np.empty(size, np.float32)
-    index, fraction, grid = np.empty(width, np.uint32), np.empty((2, width), np.float32), np.empty(8)
-    n = flat_visibility(seen, half, flat, pairs)
-    first, count = span[0], span[1]
-    share = np.float32(1.0 / windows.shape[0])
-    takes_part = taking_part(flat, span)
-    if takes_part.sum() < 2:
-        out[:] = np.uint8(UNSEEN_COST)
+    ranges = np.empty((seen.shape[1], 4), np.int32)
+    height_ranges(seen, ranges)
+    takes = taking_part(ranges, span)
+    floor, weight, reach = measure[0], measure[1], measure[2]
+    if takes.shape[0] < 2:
+        out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
         return
-    for k in range(count):
-        height = np.int32(first + k)
-        for i in range(n_views):
-            if not takes_part[i]:
-                continue
-            plane_grid(nodes, i, heights[0] + height * heights[1], block, half, grid)
-            resample_plane(pixels, layout[i], grid, index, fraction, planes[i].reshape((rows + 2 * half, width)))
-            centre = planes[i, half * width + half]
-            for j in range(size):
-                planes[i, j] -= centre
+    n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
+    n, steps, start = seen.shape[2] * width, relief.ravel(), half * (width + 1)
+    size = steps.shape[0] + SLACK
+    planes, greys = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
+    mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
+    flat, codes = np.empty((seen.shape[1], 3, size), np.int32), np.empty((span[1], n), np.uint8)
+    pairs, total = np.empty(size, np.float32), np.empty(size, np.float32)
+    shown, counts = np.empty(size, np.float32), np.empty((2, size), np.float32)
+    work, grid, velocity = np.empty((4, size), np.float32), np.empty(8), np.empty(2, np.float32)
+    index, fraction, cells = np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32), flat_cells(relief.shape)
+    flat_visibility(seen, half, flat, pairs)
+    top, centre = weight * np.float32(n_sizes), np.float32(0.0)
+    for k in range(span[1]):
+        height = np.int32(span[0] + k)
+        t = heights[0] + height * heights[1]
         total[:n] = 0.0
-        n_covering[:n] = 0.0
-        for w in range(windows.shape[0]):
-            trim = (half - windows[w]) * (width + 1)
-            for i in range(n_views):
-                if not takes_part[i]:
-                    continue
-                window_moments(planes[i], trim, windows[w], width, n, floor, scratch[0], mean[i], scale[i])
-                for j in range(n):
-                    covered = np.float32(flat[0, i, j] <= height and height <= flat[1, i, j])
-                    scale[i, j] *= covered * np.float32(flat[2, i, j] <= height)
-                    n_covering[j] += covered
-            pair_sum(planes, trim, mean, scale, windows[w], width, n, scratch, agreed)
-            for j in range(n):
-                total[j] += share * agreed[j]
-        for j in range(n):
-            cost = COST_SCALE - COST_SCALE * total[j] * pairs[j]
-            is_seen = n_covering[j] > np.float32(1.5 * windows.shape[0])
-            total[j] = (cost if is_seen else UNSEEN_COST) + np.float32(0.5)
-        for r in range(rows):
-            for c in range(cols):
-                out[r, c * count + k] = np.uint8(min(max(total[r * width + c], np.float32(0.0)), np.float32(255.0)))
+        shows_all = (ranges[takes, 2] <= height) & (height <= ranges[takes, 3])
+        counts[:, :n] = shows_all.sum()
+        for i in range(n_views):
+            view, plane, grey = takes[i], planes[i], greys[i]
+            plane_grid(nodes, view, t, block, half, grid)
+            plane_velocity(nodes, view, t, heights[1], velocity)
+            resample_plane(pixels, layout[view], grid, cells, steps, velocity, index, fraction, plane)
+            centre = plane[start] if i == 0 else centre
+            centred(plane, steps.shape[0], centre, start, top / reach if weight > 0.0 else np.float32(0.0), n, grey)
+            window_moments(plane, windows, width, n, floor, work, mean[i], scale[i])
+            if not shows_all[i]:
+                shown_at(flat[view], height, n, shown, counts)
+                hide(shown, n, scale[i], grey, NOWHERE * np.float32(i + 1))
+        if weight > 0.0:
+            add_closeness(greys, top, n, total)
+        add_pairs(planes, windows, mean, scale, width, n, work, total)
+        whole_costs(total, pairs, counts, measure, n_sizes, n, codes[k])
+    heights_last(codes, width, out)
 
 
-# as block_costs, with (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
+# as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
 @kernel
-def tile_costs(pixels, layout, nodes, heights, ranges, address, windows, seen, block, floor, volume):
+def tile_costs(
+    pixels, layout, nodes, heights, base, base_nodes, ranges, address, windows, seen, block, measure, volume
+):  # fmt: skip
     """`block_costs` of every block of a tile.
 
-    ranges : (2, b, d) int64, first index and count of each block; address : (3, b, d) int64, see
-    `HeightLattice.address`; volume : (v,) uint8, written.
+    base : (r + 2 half, c + 2 half) float32 base surface, border included, in height indices; base_nodes : (b + 1,
+    d + 1) float64, the base surface at the corners of blocks, which `nodes` follow; ranges : (2, b, d) int64, first
+    index and count of each block; address : (3, b, d) int64, see `HeightLattice.address`; volume : (v,) uint8, written.
     """
     n_rows, n_cols = seen.shape[2], seen.shape[3]
-    span = np.empty(2, np.int64)
+    span, half = np.empty(2, np.int64), windows[-1]
     for br in range(ranges.shape[1]):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
-        base, length = address[0, br, 0], address[1, br, 0]
-        rows = volume[base : base + (r1 - r0) * length].reshape((r1 - r0, length))
+        first, length = address[0, br, 0], address[1, br, 0]
+        rows = volume[first : first + (r1 - r0) * length].reshape((r1 - r0, length))
         for bc in range(ranges.shape[2]):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             span[0], span[1] = ranges[0, br, bc], ranges[1, br, bc]
             start = address[2, br, bc]
+            relief = np.empty((r1 - r0 + 2 * half, c1 - c0 + 2 * half), np.float32)
+            corners = base_nodes[br : br + 2, bc : bc + 2]
+            block_relief(base[r0 : r1 + 2 * half, c0 : c1 + 2 * half], corners, block, half, relief)
             block_costs(
-                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, span, windows, seen[:, :, r0:r1, c0:c1],
-                block, floor, rows[:, start : start + (c1 - c0) * span[1]],
+                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, relief, span, windows,
+                seen[:, :, r0:r1, c0:c1], block, measure, rows[:, start : start + (c1 - c0) * span[1]],
             )  # fmt: skip

@@ -1,21 +1,24 @@
 """The base surface of a level: heights are searched along it, so that a slope is level to windows and penalties.
 
 Level windows see a slope as a step per cell, and the semi-global constraint makes stairs of it. The base surface takes
-the slopes of the coarser level's surface (medians over blocks, which jumps do not touch) and none of its jumps; height
-index k then means k steps above the base. It is continuous and bilinear between the corners of blocks, so neighbours
+the slopes of the coarser level's surface (medians over patches, which jumps do not touch) and none of its jumps; height
+index k then means k steps above the base. It is continuous and bilinear between the corners of patches, so neighbours
 are still compared by height. It follows no building: where slopes are small it is nearly level.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn, idctn
 
 from zlocus.kernels.smooth import slopes
 from zlocus.matching.views import TileViews
 
+PATCH = 8
 SLOPE_REACH = 4
 ANCHOR = 1e-3
 STEEP_STEPS = 8.0
@@ -24,21 +27,59 @@ BINOMIAL = ((1, 1, 1, 1), (0, 1, 2, 3), (0, 0, 1, 3), (0, 0, 0, 1))
 
 @dataclass(frozen=True)
 class BaseSurface:
-    """nodes : (b + 1, d + 1) float64, height indices at corners of blocks; cells : (r, c) float32, of every cell."""
+    """Height indices (fractions too) of a continuous surface over the cells of a tile.
 
-    nodes: NDArray[np.float64]
-    cells: NDArray[np.float32]
+    patches : (p + 1, q + 1) float64, at the corners of patches of `patch` cells; shape : (r, c), cells of the tile;
+    block : cells along the side of a block, a multiple of `patch`.
+    """
+
+    patches: NDArray[np.float64]
+    patch: int
+    shape: tuple[int, int]
+    block: int
 
     @classmethod
     def level(cls, shape: tuple[int, int], block: int) -> BaseSurface:
         """No slope anywhere."""
-        return cls(np.zeros((-(-shape[0] // block) + 1, -(-shape[1] // block) + 1)), np.zeros(shape, np.float32))
+        return cls(np.zeros((-(-shape[0] // block) + 1, -(-shape[1] // block) + 1)), block, shape, block)
 
     @classmethod
     def along(cls, surface: NDArray[np.float32], block: int) -> BaseSurface:
         """With the slopes of a smooth surface, (r, c) float32 height indices."""
-        nodes = integrated(*block_slopes(surface, block), block, block_heights(surface, block))
-        return cls(nodes, bilinear(nodes, surface.shape, block))
+        patch = PATCH if block % PATCH == 0 else block
+        rows, cols = surface.shape
+        whole = ((0, -rows % block), (0, -cols % block))
+        by_row, by_col = known_slopes(surface)
+        down, across, heights = (
+            np.pad(patch_medians(values, patch), [(0, (n + more) // patch - -(-n // patch)) for n, (_, more) in
+                   zip(surface.shape, whole, strict=True)], mode="edge")
+            for values in (by_row, by_col, surface)
+        )  # fmt: skip
+        return cls(integrated(down, across, patch, heights), patch, surface.shape, block)
+
+    @cached_property
+    def nodes(self) -> NDArray[np.float64]:
+        """(b + 1, d + 1) float64, at the corners of blocks."""
+        every = self.block // self.patch
+        return np.ascontiguousarray(self.patches[::every, ::every])
+
+    @cached_property
+    def cells(self) -> NDArray[np.float32]:
+        """(r, c) float32, of every cell."""
+        return self.padded(0)
+
+    def padded(self, half: int) -> NDArray[np.float32]:
+        """(r + 2 half, c + 2 half) float32, of every cell and of a border, over which the outermost patches go on."""
+        r, c = (np.arange(-half, n + half) for n in self.shape)
+        b, d = (np.clip(k // self.patch, 0, n - 2) for k, n in zip((r, c), self.patches.shape, strict=True))
+        fr, fc = (r - b * self.patch) / self.patch, (c - d * self.patch) / self.patch
+        along = self.patches[:, d] * (1 - fc) + self.patches[:, d + 1] * fc
+        return (along[b] * (1 - fr)[:, None] + along[b + 1] * fr[:, None]).astype(np.float32)
+
+    def relief(self) -> NDArray[np.float32]:
+        """(r, c) float32: the cells less the bilinear surface through the corners of their blocks."""
+        blocks = BaseSurface(self.nodes, self.block, self.shape, self.block)
+        return np.asarray(self.cells - blocks.cells)
 
     @property
     def is_steep(self) -> bool:
@@ -58,75 +99,61 @@ class BaseSurface:
         return replace(views, nodes=moved)
 
 
-def block_slopes(surface: NDArray[np.float32], block: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Median slope per cell of every block along rows and columns, each (b, d)."""
-    by_row, by_col = np.empty_like(surface), np.empty_like(surface)
-    slopes(surface, SLOPE_REACH, by_row, by_col)
-    return block_medians(by_row, block), block_medians(by_col, block)
+def known_slopes(surface: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Slopes per cell along rows and columns, each (r, c); at the border, where none are known, those next to it."""
+    by_axis = (np.empty_like(surface), np.empty_like(surface))
+    slopes(surface, SLOPE_REACH, *by_axis)
+    for axis, values in enumerate(by_axis):
+        along, n = values if axis == 0 else values.T, values.shape[axis]
+        if n > 2 * SLOPE_REACH:
+            along[:SLOPE_REACH], along[n - SLOPE_REACH :] = along[SLOPE_REACH], along[n - SLOPE_REACH - 1]
+    return by_axis
 
 
-def block_heights(surface: NDArray[np.float32], block: int) -> NDArray[np.float64]:
-    """Median height of every block, (b, d)."""
-    return block_medians(surface, block)
-
-
-def block_medians(values: NDArray[np.float32], block: int) -> NDArray[np.float64]:
-    """Median of every block of (r, c) values; blocks at the border may be smaller."""
+def patch_medians(values: NDArray[np.float32], patch: int) -> NDArray[np.float64]:
+    """Median of every patch of (r, c) values; patches at the border may be smaller."""
     rows, cols = values.shape
-    n_b, n_d = -(-rows // block), -(-cols // block)
-    whole_b, whole_d = rows // block, cols // block
-    out = np.empty((n_b, n_d))
-    whole = values[: whole_b * block, : whole_d * block].reshape(whole_b, block, whole_d, block)
-    out[:whole_b, :whole_d] = np.median(whole.transpose(0, 2, 1, 3).reshape(whole_b, whole_d, block * block), axis=2)
-    for b in range(n_b):
-        for d in range(n_d):
-            if b >= whole_b or d >= whole_d:
-                out[b, d] = np.median(values[b * block : (b + 1) * block, d * block : (d + 1) * block])
+    out = np.empty((-(-rows // patch), -(-cols // patch)))
+    # The whole patches first, then those that the last row, the last column and the corner cut.
+    for b in _spans(rows, patch):
+        for d in _spans(cols, patch):
+            height, width = min(patch, rows - b.start), min(patch, cols - d.start)
+            part = values[b, d].reshape(-1, height, (d.stop - d.start) // width, width)
+            by_patch = part.transpose(0, 2, 1, 3).reshape(len(part), part.shape[2], height * width)
+            first_b, first_d = b.start // patch, d.start // patch
+            out[first_b : first_b + len(part), first_d : first_d + part.shape[2]] = np.median(by_patch, axis=2)
     return out
 
 
+def _spans(n: int, patch: int) -> list[slice]:
+    """The cells of all whole patches along an axis, and those of the cut one, if any of each."""
+    whole = n // patch * patch
+    return [part for part in (slice(0, whole), slice(whole, n)) if part.stop > part.start]
+
+
 def integrated(
-    by_row: NDArray[np.float64], by_col: NDArray[np.float64], block: int, heights: NDArray[np.float64]
+    by_row: NDArray[np.float64], by_col: NDArray[np.float64], patch: int, heights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Heights of the corners of blocks whose differences come closest to the slopes of the blocks. (b + 1, d + 1).
+    """Heights of the corners of patches whose differences come closest to the slopes of the patches. (p + 1, q + 1).
 
-    Least squares over both edges of every block and direction; a weak weight on the blocks' heights, which are the
-    means of their corners, fixes the rest.
+    Least squares over all edges, each as steep as the patches beside it; a weak pull towards the patches' heights
+    fixes the rest. The normal equations are a screened Poisson equation with free borders, which the cosine transform
+    solves exactly (Simchony et al. 1990, section 3).
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.linalg import spsolve
-
-    n_b, n_d = by_row.shape
-    number = np.arange((n_b + 1) * (n_d + 1)).reshape(n_b + 1, n_d + 1)
-    corners = [number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]]
-    equations = [
-        (corners[2], corners[0], by_row), (corners[3], corners[1], by_row),
-        (corners[1], corners[0], by_col), (corners[3], corners[2], by_col),
-    ]  # fmt: skip
-    rows, cols, values = [], [], []
-    right = np.zeros(number.size)
-    for plus, minus, slope in equations:
-        p, m, rise = plus.ravel(), minus.ravel(), block * slope.ravel()
-        rows += [p, m, p, m]
-        cols += [p, m, m, p]
-        values += [np.ones(p.size), np.ones(p.size), -np.ones(p.size), -np.ones(p.size)]
-        np.add.at(right, p, rise)
-        np.add.at(right, m, -rise)
-    for corner in corners:
-        p = corner.ravel()
-        np.add.at(right, p, ANCHOR / 4 * heights.ravel())
-        for other in corners:
-            rows.append(p)
-            cols.append(other.ravel())
-            values.append(np.full(p.size, ANCHOR / 16))
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
-    matrix = coo_array(entries, shape=(number.size, number.size)).tocsc()
-    return np.asarray(spsolve(matrix, right)).reshape(number.shape)
+    rise_down, rise_across = patch * _beside(by_row, 1), patch * _beside(by_col, 0)
+    around = _beside(_beside(heights, 0), 1)
+    right = ANCHOR * around
+    right[1:] += rise_down
+    right[:-1] -= rise_down
+    right[:, 1:] += rise_across
+    right[:, :-1] -= rise_across
+    p, q = (2.0 - 2.0 * np.cos(np.pi * np.arange(n) / n) for n in right.shape)
+    spectrum = dctn(right, type=2, norm="ortho") / (p[:, None] + q[None, :] + ANCHOR)
+    return np.asarray(idctn(spectrum, type=2, norm="ortho"), np.float64)
 
 
-def bilinear(nodes: NDArray[np.float64], shape: tuple[int, int], block: int) -> NDArray[np.float32]:
-    """Values at every cell between corners `block` cells apart, (r, c) float32."""
-    r, c = np.arange(shape[0]), np.arange(shape[1])
-    b, d, fr, fc = r // block, c // block, (r % block) / block, (c % block) / block
-    along = nodes[:, d] * (1 - fc) + nodes[:, d + 1] * fc
-    return (along[b] * (1 - fr)[:, None] + along[b + 1] * fr[:, None]).astype(np.float32)
+def _beside(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Means of the patches before and after every line between them; at the border, of the one there is."""
+    wide = np.pad(values, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
+    n = wide.shape[axis]
+    return np.asarray((wide.take(range(n - 1), axis) + wide.take(range(1, n), axis)) / 2)

@@ -6,24 +6,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.volume import tile_costs
+from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews
 from zlocus.options import MeasureOptions
 
 
 def cost_volume(
-    views: TileViews, lattice: HeightLattice, seen: NDArray[np.int32], options: MeasureOptions
+    views: TileViews, base: BaseSurface, lattice: HeightLattice, seen: NDArray[np.int32], options: MeasureOptions
 ) -> NDArray[np.uint8]:
-    """64 (1 - NCC) of every cell and height, (v,) uint8, laid out as `HeightLattice.address` says.
+    """64 (1 - NCC) + 64 w d of every cell and height, (v,) uint8, laid out as `HeightLattice.address` says.
 
-    NCC is the mean over all pairs of views and over the window sizes (the paper's SNCC, equation 2, for two views;
-    for more it has no reference image, so that no single view's noise is in every term). seen : (2, i, r, c) int32,
-    see `coverage`.
+    views : whose nodes follow `base`, see `BaseSurface.shear`. NCC is the mean over all pairs of views and over the
+    window sizes (the paper's SNCC, equation 2, for two views; for more it has no reference image, so that no single
+    view's noise is in every term). d is the mean over the same pairs of the two pixels' grey difference, in units of
+    `grey_reach` and at most 1: NCC knows nothing of plain roofs, on which all views show one grey, and blurs edges by
+    the width of its window (as AD-Census does: Mei et al. 2011, equation 3). seen : (3, i, r, c) int32, see `coverage`.
     """
     windows = np.unique([options.small_window // 2, options.large_window // 2])
+    measure = np.array([options.noise**2, options.grey_weight, options.grey_reach, options.hidden_excused], np.float32)
     volume = np.empty(lattice.size, np.uint8)
     tile_costs(
-        views.pixels, views.layout, views.nodes, views.heights, lattice.ranges, lattice.address, windows, seen,
-        lattice.block, np.float32(options.noise**2), volume,
+        views.pixels, views.layout, views.nodes, views.heights, base.padded(int(windows.max())), base.nodes,
+        lattice.ranges, lattice.address, windows, seen, lattice.block, measure, volume,
     )  # fmt: skip
     return volume

@@ -14,7 +14,9 @@ from zlocus.matching.views import TileViews
 from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
-FIRST_REACH, LATER_REACH, SAMPLES = 1.5, 0.75, 5
+# Heights measured around the surface, in steps: wide in the first round, then three beside the peak.
+FIRST_OFFSETS = np.linspace(-1.5, 1.5, 5, dtype=np.float32)
+LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
 NARROW_BASE, WIDE_WINDOW, NARROW_WINDOW = 2.0, 9, 7
@@ -62,8 +64,7 @@ def refine(
     best = np.zeros(coarse.shape, np.float32)
     for number in range(options.rounds):
         surface = smoothed(height, options.jump_steps)
-        reach = FIRST_REACH if number == 0 else LATER_REACH
-        offsets = np.linspace(-reach, reach, SAMPLES, dtype=np.float32)
+        offsets = FIRST_OFFSETS if number == 0 else LATER_OFFSETS
         profile = np.empty((len(offsets), *coarse.shape), np.float32)
         tile_profile(
             coefficients.pixels, coefficients.layout, coefficients.nodes, coefficients.heights,

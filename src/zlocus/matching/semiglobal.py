@@ -35,14 +35,17 @@ class SemiGlobalHeights:
 
 
 def penalties(
-    ortho: NDArray[np.float32] | None, shape: tuple[int, int], options: SemiGlobalOptions
+    ortho: NDArray[np.float32] | None, shape: tuple[int, int], level: int, options: SemiGlobalOptions
 ) -> NDArray[np.uint16]:
     """P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
 
     P2 shrinks with the grey difference g of the two cells in the ortho-image, p2 / (1 + g / (edge_contrast median g)),
-    but not below p2_edge (Hirschmueller 2008, section 2.3, with the scene's own contrast as the unit).
+    but not below p2_edge (Hirschmueller 2008, section 2.3, with the scene's own contrast as the unit). Both are eased
+    at coarser levels: the same roof has half the cells to pay for its jumps, and a roof lost there stays lost.
     """
-    steps = np.full((4, *shape), options.p2, np.uint16)
+    easing = options.level_easing**level
+    p2, p2_edge = options.p2 * easing, min(options.p2_edge, options.p2) * easing
+    steps = np.full((4, *shape), p2, np.uint16)
     if ortho is None:
         return steps
     padded = np.pad(ortho, 1, mode="edge")
@@ -50,8 +53,7 @@ def penalties(
     unit = options.edge_contrast * max(float(np.median(np.abs(np.diff(ortho, axis=1)))), 1e-6)
     for path, (dr, dc) in enumerate(BEHIND):
         away = np.abs(ortho - padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols])
-        eased = options.p2 / (1.0 + away / unit)
-        steps[path] = np.maximum(eased, min(options.p2_edge, options.p2)).astype(np.uint16)
+        steps[path] = np.maximum(p2 / (1.0 + away / unit), p2_edge).astype(np.uint16)
     return steps
 
 

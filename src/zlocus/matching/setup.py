@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.radiometry import grey_scales
 from zlocus.options import PyramidOptions
 from zlocus.scene import Scene, View, footprint, ground_sample_distance
 
-SAMPLE_ROWS = 12
 FINEST_CELL = 0.1
 ON_GRID = 1e-6
 FEWEST_LEVELS = 3
@@ -26,9 +26,9 @@ class MatchScene:
 
     views : oriented, the leading one (most nadir, or asked for) first; anchor : ground position of cell (0, 0)'s
     corner; cell_m : side of a finest cell; origin_m, step_m, n_steps : lattice of heights at the finest level; levels :
-    of the pyramid; seen : finest cells that two views may cover; contrast : standard deviation of each image; ties :
-    (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m, lowest and highest height
-    to search on the cells of `seen` at the coarsest level (from a DEM), or None.
+    of the pyramid; seen : finest cells that two views may cover; grey : grey value that is 0 and grey values that are 1
+    of each image; ties : (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m,
+    lowest and highest height to search on the cells of `seen` at the coarsest level (from a DEM), or None.
     """
 
     views: tuple[View, ...]
@@ -39,7 +39,7 @@ class MatchScene:
     n_steps: int
     levels: int
     seen: CellWindow
-    contrast: tuple[float, ...]
+    grey: tuple[tuple[float, float], ...]
     ties: NDArray[np.float64] = field(repr=False)
     prior: NDArray[np.float32] | None = field(default=None, repr=False)
 
@@ -148,19 +148,6 @@ def levels_for(n_steps: int, options: PyramidOptions) -> int:
     return levels
 
 
-def image_contrast(view: View) -> float:
-    """Standard deviation of an image, from rows spread over it: the same whatever part is matched. 1 where they hold
-    nothing that differs."""
-    rows, cols = view.image.shape
-    values = []
-    for row in np.unique(np.linspace(0, rows - 1, SAMPLE_ROWS).astype(int)):
-        read = view.image.read(int(row), 0, 1, cols)
-        values.append(read.pixels[read.valid])
-    grey = np.concatenate(values)
-    deviation = float(grey.std()) if grey.size else 0.0
-    return deviation if deviation > 0 else 1.0
-
-
 def seen_window(
     bounds: tuple[float, float, float, float], anchor: tuple[float, float], cell_m: float, levels: int
 ) -> CellWindow:
@@ -196,6 +183,6 @@ def settle(
         n_steps=n_steps,
         levels=levels,
         seen=seen_window(shared_ground(scene, z_range), anchor, cell_m, levels),
-        contrast=tuple(image_contrast(view) for view in views),
+        grey=grey_scales(views, ties),
         ties=ties,
     )

@@ -26,12 +26,14 @@ class ViewPixels:
     """A window of one view at every level.
 
     origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
-    does not depend on the window. contrast : grey values of the image that are 1 here. pixels, valid : per level,
+    does not depend on the window. mean, contrast : grey value of the image that is 0, and that are 1 here, so that
+    views taken with other exposures compare. pixels, valid : per level,
     (r, c) float32 and bool; level l has half the pixels of level l - 1 each way.
     """
 
     sensor: SensorModel
     origin: tuple[int, int]
+    mean: float
     contrast: float
     pixels: tuple[FloatImage, ...]
     valid: tuple[NDArray[np.bool_], ...]
@@ -77,19 +79,20 @@ def pixel_window(
     return row0, col0, row1 - row0, col1 - col0
 
 
-def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, contrast: float) -> ViewPixels:
+def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, mean: float, contrast: float) -> ViewPixels:
     """Read a window and build its pyramid by means of 2 x 2 valid pixels.
 
-    contrast : the image's standard deviation, which becomes 1 (the same for every window of an image).
+    mean, contrast : the image's mean and standard deviation, which become 0 and 1 (the same for every window of an
+    image).
     """
     row, col, rows, cols = window
     read = view.image.read(row, col, rows, cols)
-    pixels, valid = [read.pixels * np.float32(1.0 / contrast)], [read.valid]
+    pixels, valid = [(read.pixels - np.float32(mean)) * np.float32(1.0 / contrast)], [read.valid]
     for _ in range(levels - 1):
         coarse, kept = halved(pixels[-1], valid[-1])
         pixels.append(coarse)
         valid.append(kept)
-    return ViewPixels(view.sensor, (row, col), contrast, tuple(pixels), tuple(valid))
+    return ViewPixels(view.sensor, (row, col), mean, contrast, tuple(pixels), tuple(valid))
 
 
 def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, NDArray[np.bool_]]:

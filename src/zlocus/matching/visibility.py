@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from zlocus.kernels.reach import tile_reach
 from zlocus.kernels.visibility import lowest_visible
 from zlocus.kernels.volume import HIDDEN
+from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews
 
@@ -17,19 +18,27 @@ BORDER_PX = 3.0
 NOTHING_HIDDEN = -(2**29)
 
 
-def coverage(views: TileViews, lattice: HeightLattice) -> IntVolume:
+def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> IntVolume:
     """(3, i, r, c) int32: lowest and highest height index at which each image covers each cell, and from where on
     nothing hides it (everywhere, for now).
 
     A view takes part over the longest run of heights whose windows lie inside the image and on valid pixels; at other
     heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
-    parallax of the range.)
+    parallax of the range.) views : whose nodes follow `base`, from which heights are counted.
     """
     seen = np.full((3, len(views.layout), *lattice.shape), NOTHING_HIDDEN, np.int32)
     tile_reach(
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
         BORDER_PX, seen[0], seen[1],
     )  # fmt: skip
+    first, count = lattice.cell_ranges()
+    relief = base.relief()
+    for i in range(len(views.layout)):
+        low, high = seen[0, i], seen[1, i]
+        covered = low <= high
+        from_below, from_above = covered & (low > first), covered & (high < first + count - 1)
+        low[from_below] = np.ceil(low[from_below] - relief[from_below])
+        high[from_above] = np.floor(high[from_above] - relief[from_above])
     return seen
 
 
