@@ -58,10 +58,10 @@ def test_a_level_base_changes_nothing():
     views, base = views_of(scene), BaseSurface.level(scene.shape, scene.block)
     assert base.nodes.shape == scene.nodes.shape[1:3]
     np.testing.assert_array_equal(base.shear(views).nodes, views.nodes)
-    assert base.cells.shape == base.relief().shape == scene.shape
+    assert base.cells.shape == base.relief.shape == scene.shape
     assert base.padded(5).shape == (scene.shape[0] + 10, scene.shape[1] + 10)
     assert (base.padded(5) == 0).all()
-    assert (base.relief() == 0).all()
+    assert (base.relief == 0).all()
     assert not base.is_steep
 
 
@@ -143,14 +143,14 @@ def test_patches_follow_a_rough_hillside():
         by_row, by_col = np.gradient((cells - surface)[16:-16, 16:-16])
         return np.hypot(by_row, by_col).mean()
 
-    by_patches, by_blocks = left_over(base.cells), left_over(base.cells - base.relief())
+    by_patches, by_blocks = left_over(base.cells), left_over(base.cells - base.relief)
     assert by_blocks > 0.3
     assert by_patches < 0.4 * by_blocks
 
 
 def test_relief_is_what_lies_above_the_corners_of_blocks():
     base = BaseSurface.along(hillside()[:150, :187], 32)
-    relief = base.relief()
+    relief = base.relief
     assert base.nodes.shape == (6, 7)
     assert base.patches.shape == (21, 25)
     assert (relief[::32, ::32] == 0).all()
@@ -167,7 +167,7 @@ def test_a_block_that_patches_do_not_divide_is_one_patch():
     base = BaseSurface.along(hillside(), 12)
     assert base.patch == base.block == 12
     np.testing.assert_array_equal(base.nodes, base.patches)
-    assert (base.relief() == 0).all()
+    assert (base.relief == 0).all()
     assert np.ptp(base.cells) > 50
 
 
@@ -184,7 +184,7 @@ def test_a_building_on_level_ground_leaves_the_base_nearly_level():
     surface[50:53, 5:100] = 70.0
     base = BaseSurface.along(surface, BLOCK)
     assert max(np.abs(np.diff(base.nodes, axis=axis)).max() for axis in (0, 1)) < 0.5
-    assert np.abs(base.relief()).max() < 0.5
+    assert np.abs(base.relief).max() < 0.5
     assert not base.is_steep
 
 

@@ -80,7 +80,7 @@ def rough_base(up):
 def test_a_bound_that_the_image_cuts_is_counted_from_the_relief():
     """A view 60 degrees off nadir covers a cell to the same height in metres, whatever the base under it."""
     base = rough_base(9.0)
-    relief = base.relief()
+    relief = base.relief
     views, lattice, _ = tile([sensor(), sensor(along=60.0)])
     level, rough = coverage(views, LEVEL_BASE, lattice), coverage(views, base, lattice)
     assert (level[0, 1] > 0).any()
@@ -113,10 +113,10 @@ def test_a_short_run_that_the_relief_moves_away_from_itself_is_kept():
     level, rough = coverage(views, LEVEL_BASE, lattice), coverage(views, base, lattice)
     cut = (level[0, 0] > 0) & (level[1, 0] < N_STEPS - 1) & covers(level)[0]
     run = (level[1] - level[0])[0]
-    short = cut & (np.abs(base.relief()) > run + 1)
+    short = cut & (np.abs(base.relief) > run + 1)
     assert short.sum() > 50
     for r, c in np.argwhere(short):
-        whole = np.ceil(level[0, 0, r, c] - base.relief()[r, c]), np.floor(level[1, 0, r, c] - base.relief()[r, c])
+        whole = np.ceil(level[0, 0, r, c] - base.relief[r, c]), np.floor(level[1, 0, r, c] - base.relief[r, c])
         assert tuple(rough[:2, 0, r, c]) == whole
     never = ~covers(level)[0]
     assert never.sum() > 50

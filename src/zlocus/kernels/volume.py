@@ -153,22 +153,30 @@ def hide(shown, n, scale, grey, nowhere):
         grey[j] = grey[j] if shown[j] > np.float32(0.0) else nowhere
 
 
-# (p,) f4, (p,) f4, (2,p) f4, (4,) f4, i8, i8, (p,) u1 -> None
+# (p,) f4, (2,p) f4, f4, i8 -> None
 @kernel
-def whole_costs(total, pairs, counts, measure, n_sizes, n, out):
+def excuse(pairs, counts, excused, n):
+    """Pass part of the weight of pairs with a hidden view on to the visible ones. counts : (2, p), views that cover and
+    that see each cell."""
+    n_seeing, one = counts[1], np.float32(1.0)
+    for j in range(n):
+        m = n_seeing[j]
+        visible = np.float32(2.0) / max(m * (m - one), one)
+        pairs[j] += excused * (visible - pairs[j])
+
+
+# (p,) f4, (p,) f4, (p,) f4, f4, i8, i8, (p,) u1 -> None
+@kernel
+def whole_costs(total, pairs, n_covering, weight, n_sizes, n, out):
     """Costs of a block at one height, rounded, from the sums over pairs of views; see `block_costs`.
 
-    counts : (2, p), views that cover and that see each cell.
+    pairs : (p,), weight of a visible pair.
     """
-    weight, excused, one = measure[1], measure[3], np.float32(1.0)
-    n_covering, n_seeing = counts[0], counts[1]
     highest = COST_SCALE * (np.float32(1.0) + weight)
     unseen = UNSEEN_COST * (np.float32(1.0) + weight)
     factor = COST_SCALE / np.float32(n_sizes)
     for j in range(n):
-        m = n_seeing[j]
-        visible = np.float32(2.0) / max(m * (m - one), one)
-        cost = highest - factor * total[j] * (pairs[j] + excused * (visible - pairs[j]))
+        cost = highest - factor * total[j] * pairs[j]
         total[j] = (cost if n_covering[j] > np.float32(1.5) else unseen) + np.float32(0.5)
     for j in range(n):
         out[j] = np.uint8(np.int32(min(max(total[j], np.float32(0.0)), np.float32(255.0))))
@@ -219,7 +227,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     ranges = np.empty((seen.shape[1], 4), np.int32)
     height_ranges(seen, ranges)
     takes = taking_part(ranges, span)
-    floor, weight, reach = measure[0], measure[1], measure[2]
+    floor, weight = measure[0], measure[1]
     if takes.shape[0] < 2:
         out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
         return
@@ -235,10 +243,10 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     index, fraction, cells = np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32), flat_cells(relief.shape)
     flat_visibility(seen, half, flat, pairs)
     top, centre = weight * np.float32(n_sizes), np.float32(0.0)
+    by_reach = top / measure[2]
     for k in range(span[1]):
-        height = np.int32(span[0] + k)
+        height, total[:n] = np.int32(span[0] + k), 0.0
         t = heights[0] + height * heights[1]
-        total[:n] = 0.0
         shows_all = (ranges[takes, 2] <= height) & (height <= ranges[takes, 3])
         counts[:, :n] = shows_all.sum()
         for i in range(n_views):
@@ -247,7 +255,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
             plane_velocity(nodes, view, t, heights[1], velocity)
             resample_plane(pixels, layout[view], grid, cells, steps, velocity, index, fraction, plane)
             centre = plane[start] if i == 0 else centre
-            centred(plane, steps.shape[0], centre, start, top / reach if weight > 0.0 else np.float32(0.0), n, grey)
+            centred(plane, steps.shape[0], centre, start, by_reach, n, grey)
             window_moments(plane, windows, width, n, floor, work, mean[i], scale[i])
             if not shows_all[i]:
                 shown_at(flat[view], height, n, shown, counts)
@@ -255,7 +263,10 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
         if weight > 0.0:
             add_closeness(greys, top, n, total)
         add_pairs(planes, windows, mean, scale, width, n, work, total)
-        whole_costs(total, pairs, counts, measure, n_sizes, n, codes[k])
+        shown[:n] = pairs[:n]
+        if not shows_all.all():
+            excuse(shown, counts, measure[3], n)
+        whole_costs(total, shown, counts[0], weight, n_sizes, n, codes[k])
     heights_last(codes, width, out)
 
 

@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
 
 from zlocus.kernels.smooth import slopes
 from zlocus.matching.views import TileViews
@@ -76,6 +75,7 @@ class BaseSurface:
         along = self.patches[:, d] * (1 - fc) + self.patches[:, d + 1] * fc
         return (along[b] * (1 - fr)[:, None] + along[b + 1] * fr[:, None]).astype(np.float32)
 
+    @cached_property
     def relief(self) -> NDArray[np.float32]:
         """(r, c) float32: the cells less the bilinear surface through the corners of their blocks."""
         blocks = BaseSurface(self.nodes, self.block, self.shape, self.block)
@@ -147,9 +147,18 @@ def integrated(
     right[:-1] -= rise_down
     right[:, 1:] += rise_across
     right[:, :-1] -= rise_across
-    p, q = (2.0 - 2.0 * np.cos(np.pi * np.arange(n) / n) for n in right.shape)
-    spectrum = dctn(right, type=2, norm="ortho") / (p[:, None] + q[None, :] + ANCHOR)
-    return np.asarray(idctn(spectrum, type=2, norm="ortho"), np.float64)
+    (waves_down, p), (waves_across, q) = (cosine_transform(n) for n in right.shape)
+    spectrum = waves_down @ right @ waves_across.T / (p[:, None] + q[None, :] + ANCHOR)
+    return np.asarray(waves_down.T @ spectrum @ waves_across, np.float64)
+
+
+def cosine_transform(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Orthonormal cosine transform (n, n), a wave a row, and what second differences with free ends make of each wave:
+    (n,) factors. (As a matrix: n is a few hundred at most, and importing a library's takes longer than all of them.)"""
+    k = np.arange(n)
+    waves = np.sqrt(2.0 / n) * np.cos(np.pi * k[:, None] * (k + 0.5) / n)
+    waves[0] /= np.sqrt(2.0)
+    return waves, 2.0 - 2.0 * np.cos(np.pi * k / n)
 
 
 def _beside(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:

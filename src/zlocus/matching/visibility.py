@@ -31,14 +31,14 @@ def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> Int
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
         BORDER_PX, seen[0], seen[1],
     )  # fmt: skip
-    first, count = lattice.cell_ranges()
-    relief = base.relief()
-    for i in range(len(views.layout)):
-        low, high = seen[0, i], seen[1, i]
-        covered = low <= high
-        from_below, from_above = covered & (low > first), covered & (high < first + count - 1)
-        low[from_below] = np.ceil(low[from_below] - relief[from_below])
-        high[from_above] = np.floor(high[from_above] - relief[from_above])
+    first, count = (n.astype(np.int32) for n in lattice.cell_ranges())
+    for low, high in zip(seen[0], seen[1], strict=True):
+        from_below, from_above = low > first, high < first + count - 1
+        if not (from_below.any() or from_above.any()):
+            continue
+        covered, relief = low <= high, base.relief
+        np.copyto(low, np.ceil(low - relief), casting="unsafe", where=covered & from_below)
+        np.copyto(high, np.floor(high - relief), casting="unsafe", where=covered & from_above)
     return seen
 
 
