@@ -14,8 +14,8 @@ from zlocus.matching.views import TileViews
 from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
-# Heights measured around the surface, in steps, wider in the first round. Three: a wide search finds wrong peaks.
-FIRST_OFFSETS = np.linspace(-1.0, 1.0, 3, dtype=np.float32)
+# Heights measured around the surface, in steps: wide in the first round, then three beside the peak.
+FIRST_OFFSETS = np.linspace(-1.5, 1.5, 5, dtype=np.float32)
 LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
@@ -72,11 +72,9 @@ def refine(
         )  # fmt: skip
         found, best, inside = parabola_peak(profile, offsets)
         found += surface
-        near = np.abs(found - coarse) < options.reach_steps
-        is_refined = inside & near
-        # A peak at an end may be inside once the windows have moved there.
-        height = np.where(near if number + 1 < options.rounds else is_refined, found, height)
-    return RefinedHeights(np.where(is_refined, height, coarse), best, is_refined)
+        is_refined = inside & (np.abs(found - coarse) < options.reach_steps)
+        height = np.where(is_refined, found, height)
+    return RefinedHeights(height, best, is_refined)
 
 
 def default_window(step_cells: float) -> int:
