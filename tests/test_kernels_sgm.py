@@ -40,7 +40,13 @@ def random_p2(shape, seed=0):
 
 @pytest.mark.parametrize(
     ("shape", "block", "counts"),
-    [((37, 70), 32, (16, 32, 48)), ((33, 21), 16, (16, 32)), ((9, 11), 32, (16,)), ((17, 1), 8, (16, 32))],
+    [
+        ((37, 70), 32, (16, 32, 48)),
+        ((33, 21), 16, (16, 32)),
+        ((9, 11), 32, (16,)),
+        ((17, 1), 8, (16, 32)),
+        ((21, 40), 16, (4, 12, 28)),
+    ],
 )
 @pytest.mark.parametrize("p1", [20, 0])
 def test_path_sums(shape, block, counts, p1):
@@ -95,7 +101,7 @@ def test_penalties_join_a_noisy_plane():
 @pytest.mark.parametrize("levels", [4, 400, 40000])
 def test_winners(levels):
     """Few levels give many ties, of which the lowest height wins."""
-    lattice = ragged_lattice((37, 70), 16, seed=2)
+    lattice = ragged_lattice((37, 70), 16, seed=2, counts=(4, 12, 20, 32))
     total = np.random.default_rng(8).integers(0, levels, lattice.size).astype(np.uint16)
     best, second, margin, vertex = picked(total, lattice)
     sums, (first, count) = dense(total, lattice, np.inf), lattice.cell_ranges()
@@ -121,7 +127,7 @@ def test_a_minimum_at_an_end_is_a_winner_without_a_fraction():
 
 def test_whatever_index_heights_start_at():
     """Heights below the base surface have negative indices: the same sums, the same heights 20 lower."""
-    lattice = ragged_lattice((37, 70), 16, seed=5)
+    lattice = ragged_lattice((37, 70), 16, seed=5, counts=(8, 16, 28))
     lower = replace(lattice, first=lattice.first - 20)
     cost, p2 = random_cost(lattice), random_p2((37, 70))
     total = aggregated(cost, lattice, 20, p2)

@@ -67,13 +67,15 @@ def test_a_tower_hides_what_its_shadow_covers():
     assert (found[:9] < 0).all()
 
 
-def reached(scene, lattice, blocked=None):
+def reached(scene, lattice, blocked=None, relief=None):
+    relief = np.zeros(scene.shape, np.float32) if relief is None else relief
     blocked = np.zeros(len(scene.pixels), bool) if blocked is None else blocked
     has = np.array([blocked[o : o + r * c].any() for o, r, c in scene.layout])
     seen = np.empty((2, scene.n_views, *scene.shape), np.int32)
     tile_reach(
-        blocked, has, scene.layout, scene.nodes, scene.heights, lattice.ranges, scene.block, 3.0, seen[0], seen[1]
-    )
+        blocked, has, scene.layout, scene.nodes, scene.heights, lattice.ranges, scene.block, 3.0, relief,
+        seen[0], seen[1],
+    )  # fmt: skip
     return seen
 
 
@@ -112,6 +114,20 @@ def test_reach_whatever_index_heights_start_at():
     np.testing.assert_array_equal(lower[0] == HIDDEN, never)
     np.testing.assert_array_equal(lower[:, ~never], plain[:, ~never] - 20)
     assert (lower[0] > lower[1])[never].all()
+
+
+def test_ends_of_reach_follow_the_relief():
+    """A run that ends at the image's border ends by as much lower as the surface stands higher there; one that ends
+    with the block's heights stays."""
+    scene, lattice = kernel_scene(), even_lattice(32, first=3)
+    relief = np.random.default_rng(3).uniform(-6.0, 6.0, scene.shape).astype(np.float32)
+    plain, moved = reached(scene, lattice), reached(scene, lattice, relief=relief)
+    never, from_below, from_above = plain[0] > plain[1], plain[0] > 3, plain[1] < 34
+    for some in (from_below & ~never, from_above & ~never, ~from_below & ~from_above):
+        assert some.any()
+    low = np.where(from_below & ~never, np.ceil(plain[0] - relief), plain[0])
+    high = np.where(from_above & ~never, np.floor(plain[1] - relief), plain[1])
+    np.testing.assert_array_equal(moved, [low, high])
 
 
 def covers(scene, i, node, cells, k, blocked):

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zlocus.execution.plan import plan_tiles, tile_memory_bytes
+from zlocus.execution.plan import core_size, plan_tiles, tile_memory_bytes
 from zlocus.matching.cells import CellWindow
 from zlocus.options import PyramidOptions
 
@@ -27,16 +27,30 @@ def test_tiles_hold_each_cell_asked_for_once(asked):
 
 @given(WINDOWS)
 def test_cores_do_not_depend_on_the_area(asked):
-    everything = {(t.kept.row // 64, t.kept.col // 64): t.core for t in plan_tiles(SEEN, SEEN, OPTIONS)}
+    height, width = core_size(SEEN, OPTIONS)
+    everything = {(t.core.row, t.core.col): t.core for t in plan_tiles(SEEN, SEEN, OPTIONS)}
     for tile in plan_tiles(asked, SEEN, OPTIONS):
+        assert tile.kept.rows <= height
+        assert tile.kept.cols <= width
         if tile.core.rows and tile.core.cols:
-            assert tile.core == everything[tile.kept.row // 64, tile.kept.col // 64]
-            assert tile.core.within(SEEN) == tile.core
+            assert tile.core == everything[tile.core.row, tile.core.col]
 
 
-def test_tiles_come_row_by_row():
-    starts = [(t.core.row, t.core.col) for t in plan_tiles(CellWindow(0, 64, 128, 128), SEEN, OPTIONS)]
-    assert starts == [(0, 64), (0, 128), (64, 64), (64, 128)]
+def test_tiles_are_equal_whole_blocks_row_by_row():
+    tiles = plan_tiles(SEEN, SEEN, OPTIONS)
+    assert core_size(SEEN, OPTIONS) == (64, 64)
+    starts = [(-100 + 64 * i, 30 + 64 * j) for i in range(5) for j in range(4)]
+    assert [(t.core.row, t.core.col) for t in tiles] == starts
+
+
+@given(st.integers(1, 20000), st.integers(1, 20000), st.sampled_from([64, 512, 1024]))
+def test_cores_are_about_as_large_as_asked(rows, cols, tile):
+    options = PyramidOptions(tile=tile)
+    seen = CellWindow(7, -3, rows, cols)
+    for side, core in zip((rows, cols), core_size(seen, options), strict=True):
+        assert core <= 1.5 * tile + options.block
+        assert core >= min(side, tile * 2 / 3)
+    assert sum(t.core.rows * t.core.cols for t in plan_tiles(seen, seen, options)) == rows * cols
 
 
 def test_memory_grows_with_tiles_views_and_levels():

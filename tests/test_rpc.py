@@ -13,7 +13,7 @@ from rasterio.transform import RPCTransformer
 from rpc_fixtures import gdal_rpc, satellite_rpc
 from zlocus.io.cameras import read_rpc
 from zlocus.sensors.model import SensorModel
-from zlocus.sensors.rpc import RpcModel, rpc_term_slopes, rpc_terms
+from zlocus.sensors.rpc import RpcModel, rpc_terms
 
 UTM31 = CRS.from_epsg(32631)
 ROUND_TRIP_PX = 1e-6
@@ -28,20 +28,20 @@ def model() -> RpcModel:
 
 
 def test_terms_stand_in_the_order_of_rpc00b():
-    terms = rpc_terms(np.array([2.0]), np.array([3.0]), np.array([5.0]))[0]
+    terms = rpc_terms(np.array([2.0]), np.array([3.0]), np.array([5.0]))[:, 0]
     expected = [1, 2, 3, 5, 6, 10, 15, 4, 9, 25, 30, 8, 18, 50, 12, 27, 75, 20, 45, 125]
     assert terms.tolist() == expected
 
 
-def test_slopes_are_the_derivatives_of_the_terms():
-    lon, lat, height, d = np.array([0.3]), np.array([-0.7]), np.array([0.4]), 1e-6
-    by_lon, by_lat = rpc_term_slopes(lon, lat, height)
-    np.testing.assert_allclose(
-        by_lon, (rpc_terms(lon + d, lat, height) - rpc_terms(lon - d, lat, height)) / (2 * d), atol=1e-9
-    )
-    np.testing.assert_allclose(
-        by_lat, (rpc_terms(lon, lat + d, height) - rpc_terms(lon, lat - d, height)) / (2 * d), atol=1e-9
-    )
+def test_slopes_are_the_derivatives_of_the_polynomials():
+    rng = np.random.default_rng(5)
+    polynomials = ("line_num", "line_den", "samp_num", "samp_den")
+    rpc = replace(satellite_rpc(), **{name: tuple(rng.normal(size=20)) for name in polynomials})
+    (lon, lat, height), d = rng.uniform(-1, 1, (3, 7)), 1e-5
+    found = (rpc.slopes @ rpc_terms(lon, lat, height)[:10]).reshape(2, 4, 7)
+    by_lon = rpc.matrix @ (rpc_terms(lon + d, lat, height) - rpc_terms(lon - d, lat, height)) / (2 * d)
+    by_lat = rpc.matrix @ (rpc_terms(lon, lat + d, height) - rpc_terms(lon, lat - d, height)) / (2 * d)
+    np.testing.assert_allclose(found, [by_lon, by_lat], rtol=0, atol=1e-7)
 
 
 def test_is_a_sensor_model_that_travels_between_processes(model: RpcModel):

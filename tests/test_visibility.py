@@ -190,7 +190,7 @@ def test_above_the_base_and_back():
     seen[1], seen[2] = 20, 7
     seen[0, 1, 2, 3], seen[1, 1, 2, 3] = HIDDEN, -1
     base = np.linspace(-30, 30, 20, dtype=np.float32).reshape(4, 5)
-    moved = above_base(seen, base)
+    moved = above_base(seen.copy(), base)
     assert moved.dtype == np.int32
     known = covers(seen)
     assert known.sum() == 39

@@ -99,7 +99,9 @@ class PyramidOptions(Checked):
     )  # fmt: skip
     max_levels: int = option(6, "Levels of the pyramid, at most.", low=1, high=12)
     block: int = option(32, "Cells along the side of a block, which shares one range of heights.", low=8, high=128)
-    tile: int = option(1024, "Cells along the side of a tile's core.", low=64, high=8192)
+    tile: int = option(
+        1024, "Cells along the side of a tile's core, about: up to half as many more.", low=64, high=8192
+    )
     halo: int = option(32, "Cells around a tile's core at every level, matched for its sake.", low=8, high=512)
     margin_steps: int = option(
         3, "Steps added at both ends of what a coarser level found.", low=1, high=1000, unit="steps"

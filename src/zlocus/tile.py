@@ -14,7 +14,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ranges import UNKNOWN, ranges_nearby
+from zlocus.matching.ranges import UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.matching.setup import MatchScene
@@ -114,8 +114,8 @@ def _worth_matching(coarsest: LevelResult) -> CellWindow:
 
 def _evaluations(result: LevelResult) -> int:
     """Cells x steps x images that were compared."""
-    _, count = result.lattice.cell_ranges()
-    return int((covers(result.seen).sum(axis=0) * count).sum())
+    covering = covers(result.seen).sum(axis=0, dtype=np.int32)
+    return int((by_block(covering, result.lattice.block, np.add) * result.lattice.count).sum())
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:

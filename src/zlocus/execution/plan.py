@@ -23,20 +23,33 @@ class Tile:
 def plan_tiles(asked: CellWindow, seen: CellWindow, options: PyramidOptions) -> list[Tile]:
     """Tiles of the scene's lattice that hold the cells asked for, row by row.
 
-    asked, seen : finest cells. Cores lie on multiples of the tile size, cut to the ground seen (a property of the
-    scene), never to the area asked for: so a cell's height does not depend on the area.
+    asked, seen : finest cells. Cores are equal parts of the ground seen (a property of the scene), whatever the area
+    asked for: so a cell's height does not depend on the area. Cells beyond that ground belong to tiles of the same size
+    without a core.
     """
-    size, tiles = options.tile, []
-    for row in range(asked.row // size * size, asked.row + asked.rows, size):
-        for col in range(asked.col // size * size, asked.col + asked.cols, size):
-            whole = CellWindow(row, col, size, size)
+    height, width = core_size(seen, options)
+    first_row, first_col = asked.row - (asked.row - seen.row) % height, asked.col - (asked.col - seen.col) % width
+    tiles = []
+    for row in range(first_row, asked.row + asked.rows, height):
+        for col in range(first_col, asked.col + asked.cols, width):
+            whole = CellWindow(row, col, height, width)
             tiles.append(Tile(whole.within(seen), whole.within(asked)))
     return tiles
 
 
+def core_size(seen: CellWindow, options: PyramidOptions) -> tuple[int, int]:
+    """Rows and columns of a tile's core: equal parts of the ground seen, whole blocks, about `tile` cells a side."""
+    height, width = (
+        -(-side // (max(round(side / options.tile), 1) * options.block)) * options.block
+        for side in (seen.rows, seen.cols)
+    )
+    return height, width
+
+
 def tile_memory_bytes(scene: MatchScene, options: PyramidOptions) -> int:
     """About what one tile needs at its largest: cost volume, path sums, pixels of all views, planes and results."""
-    side = options.tile + 2 * options.halo * 2 ** (scene.levels - 1)
-    fine = min((options.tile + 2 * options.halo) ** 2, scene.seen.rows * scene.seen.cols)
-    pixels = min(side**2, scene.seen.rows * scene.seen.cols) * len(scene.views) * 16
+    height, width = core_size(scene.seen, options)
+    wide, everything = 2 * options.halo * 2 ** (scene.levels - 1), scene.seen.rows * scene.seen.cols
+    fine = min((height + 2 * options.halo) * (width + 2 * options.halo), everything)
+    pixels = min((height + wide) * (width + wide), everything) * len(scene.views) * 16
     return int(fine * (min(STEPS_PER_CELL, scene.n_steps + 16) * 3 + BYTES_PER_CELL) + pixels)

@@ -145,10 +145,29 @@ def block_reach(blocked, has_blocked, layout, nodes, heights, span, block, margi
             lengthen(run, covered, end - 1, longest, lowest[i], highest[i])
 
 
-# as block_reach, over every block of a tile; ranges : (2,b,d) i8
+# (r,c) f4, (2,) i8, (r,c) i4, (r,c) i4 -> None
 @kernel
-def tile_reach(blocked, has_blocked, layout, nodes, heights, ranges, block, margin, lowest, highest):
-    """`block_reach` of every block of a tile."""
+def ends_on_relief(relief, span, lowest, highest):
+    """Move the ends of one view's runs that lie within a block's heights, where the image ends, by the relief."""
+    first, last = span[0], span[0] + span[1] - 1
+    for r in range(relief.shape[0]):
+        for c in range(relief.shape[1]):
+            low, high = lowest[r, c], highest[r, c]
+            if low > high:
+                continue
+            if low > first:
+                lowest[r, c] = np.int32(np.ceil(np.float32(low) - relief[r, c]))
+            if high < last:
+                highest[r, c] = np.int32(np.floor(np.float32(high) - relief[r, c]))
+
+
+# as block_reach, with (r,c) f4 after its margin, over every block of a tile; ranges : (2,b,d) i8
+@kernel
+def tile_reach(blocked, has_blocked, layout, nodes, heights, ranges, block, margin, relief, lowest, highest):
+    """`block_reach` of every block of a tile, whose heights are counted from a surface with `relief`.
+
+    relief : (r, c) float32, steps by which that surface lies above the one that `nodes` follow within each block.
+    """
     n_rows, n_cols = lowest.shape[1], lowest.shape[2]
     span = np.empty(2, np.int64)
     for br in range(ranges.shape[1]):
@@ -160,3 +179,5 @@ def tile_reach(blocked, has_blocked, layout, nodes, heights, ranges, block, marg
                 blocked, has_blocked, layout, nodes[:, br : br + 2, bc : bc + 2], heights, span, block, margin,
                 lowest[:, r0:r1, c0:c1], highest[:, r0:r1, c0:c1],
             )  # fmt: skip
+            for i in range(layout.shape[0]):
+                ends_on_relief(relief[r0:r1, c0:c1], span, lowest[i, r0:r1, c0:c1], highest[i, r0:r1, c0:c1])

@@ -168,6 +168,26 @@ def tile_profile(pixels, layout, nodes, heights, surface, offsets, block, half, 
             )  # fmt: skip
 
 
+# (p,) f4, i4, i4, i4, (c,) f4, (2,6) f4, (2,2) f4, (c,) f4 -> None
+@kernel
+def ortho_row(image, origin, n_cols, n_cells, level, lines, bounds, out):
+    """Bilinear values of a row of cells. origin : index in `image` that positions count from; level : (c,) float32, u;
+    lines : (2, 6), columns and rows, see `row_positions`; bounds : (2, 2), lowest and highest position of each."""
+    line, across = lines[0], lines[1]
+    for c in range(n_cells):
+        u, t = level[c], np.float32(np.int32(c))
+        x = (line[0] + t * line[3]) + u * ((line[1] + t * line[4]) + u * (line[2] + t * line[5]))
+        y = (across[0] + t * across[3]) + u * ((across[1] + t * across[4]) + u * (across[2] + t * across[5]))
+        x, y = min(max(x, bounds[0, 0]), bounds[0, 1]), min(max(y, bounds[1, 0]), bounds[1, 1])
+        left, top = np.floor(x), np.floor(y)
+        fx, fy = x - left, y - top
+        p = np.uint32(np.int32(np.int32(top) * n_cols) + np.int32(left) + origin)
+        q = np.uint32(p + np.uint32(n_cols))
+        high = image[p] + fx * (image[p + np.uint32(1)] - image[p])
+        low = image[q] + fx * (image[q + np.uint32(1)] - image[q])
+        out[c] = high + fy * (low - high)
+
+
 # (p,) f4, (i,3) i8, (i,b,d,2,4) f8, (2,) f8, (r,c) f4, i8, i8, (r,c) f4 -> None
 @kernel
 def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
@@ -175,23 +195,21 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
     n_rows, n_cols = surface.shape
     low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
     middle, reach = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
-    grids = np.empty((3, 8))
     base, rows, cols = layout[view, 0], layout[view, 1], layout[view, 2]
+    image, grids = pixels[base : base + rows * cols], np.empty((3, 8))
+    lines, bounds, level = np.empty((2, 6), np.float32), np.empty((2, 2), np.float32), np.empty(block, np.float32)
     for br in range((n_rows + block - 1) // block):
         for bc in range((n_cols + block - 1) // block):
             for m in range(3):
                 plane_grid(nodes[:, br : br + 2, bc : bc + 2], view, middle + (m - 1) * reach, block, 0, grids[m])
-            for r in range(min(block, n_rows - br * block)):
-                for c in range(min(block, n_cols - bc * block)):
-                    u = (heights[0] + surface[br * block + r, bc * block + c] * heights[1] - middle) / reach
-                    x = y = 0.0
-                    for j in range(3):
-                        w = 0.5 * u * (u - 1.0) if j == 0 else (1.0 - u * u if j == 1 else 0.5 * u * (u + 1.0))
-                        x += w * (grids[j, 0] + r * grids[j, 4] + c * (grids[j, 2] + r * grids[j, 6]))
-                        y += w * (grids[j, 1] + r * grids[j, 5] + c * (grids[j, 3] + r * grids[j, 7]))
-                    x, y = min(max(x, 0.0), cols - 1.001), min(max(y, 0.0), rows - 1.001)
-                    fx, fy = x - int(x), y - int(y)
-                    p = base + int(y) * cols + int(x)
-                    top = pixels[p] * (1.0 - fx) + pixels[p + 1] * fx
-                    low_row = pixels[p + cols] * (1.0 - fx) + pixels[p + cols + 1] * fx
-                    out[br * block + r, bc * block + c] = top * (1.0 - fy) + low_row * fy
+            x0, y0 = min(max(int(grids[1, 0]), 0), cols - 2), min(max(int(grids[1, 1]), 0), rows - 2)
+            bounds[0, 0], bounds[0, 1] = -x0, cols - 1.01 - x0
+            bounds[1, 0], bounds[1, 1] = -y0, rows - 1.01 - y0
+            c0, c1 = bc * block, min((bc + 1) * block, n_cols)
+            for r in range(br * block, min((br + 1) * block, n_rows)):
+                row_positions(grids, 0, r - br * block, float(x0), lines[0])
+                row_positions(grids, 1, r - br * block, float(y0), lines[1])
+                for c in range(c1 - c0):
+                    level[c] = (heights[0] + surface[r, c0 + c] * heights[1] - middle) / reach
+                origin = np.int32(y0 * cols + x0)
+                ortho_row(image, origin, np.int32(cols), np.int32(c1 - c0), level, lines, bounds, out[r, c0:c1])

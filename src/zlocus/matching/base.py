@@ -72,8 +72,11 @@ class BaseSurface:
         r, c = (np.arange(-half, n + half) for n in self.shape)
         b, d = (np.clip(k // self.patch, 0, n - 2) for k, n in zip((r, c), self.patches.shape, strict=True))
         fr, fc = (r - b * self.patch) / self.patch, (c - d * self.patch) / self.patch
-        along = self.patches[:, d] * (1 - fc) + self.patches[:, d + 1] * fc
-        return (along[b] * (1 - fr)[:, None] + along[b + 1] * fr[:, None]).astype(np.float32)
+        along = (self.patches[:, d] * (1 - fc) + self.patches[:, d + 1] * fc).astype(np.float32)
+        cells = np.diff(along, axis=0)[b]
+        cells *= fr[:, None].astype(np.float32)
+        cells += along[b]
+        return cells
 
     @cached_property
     def relief(self) -> NDArray[np.float32]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,8 @@ from numpy.typing import NDArray
 from zlocus.matching.lattice import HeightLattice
 from zlocus.options import PyramidOptions
 
-LANES = 16
+# Heights of a block come in multiples of this many, for the sake of vector loops.
+LANES = 4
 UNKNOWN = np.float32(1e9)
 
 
@@ -28,8 +31,8 @@ def ranges_nearby(
     """
     block = options.block
     grow = np.ones((4 * options.reach + 1,) * 2, np.uint8)
-    lowest = _by_block(cv2.erode(np.where(np.isnan(low), UNKNOWN, low), grow), block, np.minimum)
-    highest = _by_block(cv2.dilate(np.where(np.isnan(high), -UNKNOWN, high), grow), block, np.maximum)
+    lowest = by_block(cv2.erode(np.where(np.isnan(low), UNKNOWN, low), grow), block, np.minimum)
+    highest = by_block(cv2.dilate(np.where(np.isnan(high), -UNKNOWN, high), grow), block, np.maximum)
     known = lowest <= highest
     first = np.where(known, np.floor(lowest) - options.margin_steps, 0)
     end = np.where(known, np.ceil(highest) + options.margin_steps, 0)
@@ -37,7 +40,7 @@ def ranges_nearby(
     return HeightLattice(origin_m, step_m, shape, block, first.astype(np.int64), count)
 
 
-def _by_block(values: NDArray[np.float32], block: int, reduce: np.ufunc) -> NDArray[np.float32]:
+def by_block(values: NDArray[Any], block: int, reduce: np.ufunc) -> NDArray[Any]:
     """Reduce (r, c) to blocks (b, d)."""
     rows = np.arange(0, values.shape[0], block)
     cols = np.arange(0, values.shape[1], block)

@@ -61,7 +61,7 @@ def aggregate(
     cost: NDArray[np.uint8], lattice: HeightLattice, p2: NDArray[np.uint16], options: SemiGlobalOptions
 ) -> SemiGlobalHeights:
     """Sum of the path costs over 8 paths, and its minima. cost : (v,) uint8, see `HeightLattice.address`."""
-    total = np.zeros(lattice.size, np.uint16)
+    total = np.empty(lattice.size, np.uint16)
     p1 = np.uint16(options.p1)
     for sign in (1, -1):
         sweep(cost, lattice.ranges, lattice.address, lattice.block, p2, p1, sign, total)

@@ -26,19 +26,12 @@ def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> Int
     heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
     parallax of the range.) views : whose nodes follow `base`, from which heights are counted.
     """
-    seen = np.full((3, len(views.layout), *lattice.shape), NOTHING_HIDDEN, np.int32)
+    seen = np.empty((3, len(views.layout), *lattice.shape), np.int32)
+    seen[2] = NOTHING_HIDDEN
     tile_reach(
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
-        BORDER_PX, seen[0], seen[1],
+        BORDER_PX, base.relief, seen[0], seen[1],
     )  # fmt: skip
-    first, count = (n.astype(np.int32) for n in lattice.cell_ranges())
-    for low, high in zip(seen[0], seen[1], strict=True):
-        from_below, from_above = low > first, high < first + count - 1
-        if not (from_below.any() or from_above.any()):
-            continue
-        covered, relief = low <= high, base.relief
-        np.copyto(low, np.ceil(low - relief), casting="unsafe", where=covered & from_below)
-        np.copyto(high, np.floor(high - relief), casting="unsafe", where=covered & from_above)
     return seen
 
 
@@ -59,8 +52,9 @@ def hide(
     for i in range(len(views.layout)):
         by_col, by_row = cells_per_step(views, i, block)
         lowest_visible(surface, by_col, by_row, lowest)
-        bound = np.maximum(lowest - margin_steps - base, NOTHING_HIDDEN)
-        seen[2, i] = np.floor(bound).astype(np.int32)
+        lowest -= base + np.float32(margin_steps)
+        np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
+        seen[2, i] = lowest
 
 
 def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -74,11 +68,11 @@ def covers(seen: IntVolume) -> NDArray[np.bool_]:
 
 
 def above_base(seen: IntVolume, base: NDArray[np.float32]) -> IntVolume:
-    """`seen` counted from the lattice's origin, to half a step, from `seen` counted from a base surface (r, c)."""
-    moved = seen + np.rint(base).astype(np.int32)
+    """`seen`, counted from a base surface (r, c), counted from the lattice's origin, to half a step; changes `seen`."""
     never = ~covers(seen)
-    moved[0][never], moved[1][never] = HIDDEN, NOTHING_HIDDEN
-    return np.asarray(moved, np.int32)
+    seen += np.rint(base).astype(np.int32)
+    seen[0][never], seen[1][never] = HIDDEN, NOTHING_HIDDEN
+    return seen
 
 
 def cells_per_step(views: TileViews, i: int, block: int) -> tuple[float, float]:

@@ -95,24 +95,42 @@ def reduced_normal_equations(
 
     With A the shifts' block, E the shifts-by-points block and C the points' block: A - E C^-1 E^T.
     """
-    from scipy.sparse import bsr_array, coo_array
-
     usable = np.isfinite(points.residual).all(axis=1) & np.isfinite(points.xyz[seen.point, 0])
     weight = np.where(usable, weight, 0.0)
     by_ground = np.where(usable[:, None, None], points.by_ground, 0.0)
     residual = np.where(usable[:, None], points.residual, 0.0)
     n_points = len(points.xyz)
     covariance = np.nan_to_num(point_covariance(by_ground, weight, seen.point, n_points))
-    blocks = bsr_array((covariance, np.arange(n_points), np.arange(n_points + 1)), shape=(3 * n_points, 3 * n_points))
-    rows = np.broadcast_to((2 * seen.view[:, None] + np.arange(2))[:, :, None], by_ground.shape)
-    columns = np.broadcast_to((3 * seen.point[:, None] + np.arange(3))[:, None, :], by_ground.shape)
-    values = by_ground * weight[:, None, None]
-    mixed = coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * n_views, 3 * n_points)).tocsr()
+    mixed = by_ground * weight[:, None, None]
     own = np.repeat(np.bincount(seen.view, weight, n_views), 2)
-    pull = summed(residual * weight[:, None], seen.view, n_views).ravel()
-    pull_of_points = summed(np.einsum("mji,mj->mi", values, residual), seen.point, n_points).ravel()
-    reduced = np.diag(own) - (mixed @ blocks @ mixed.T).toarray()
-    return reduced, pull - mixed @ (blocks @ pull_of_points)
+    pull = summed(residual * weight[:, None], seen.view, n_views)
+    pull_of_points = summed(np.einsum("mji,mj->mi", mixed, residual), seen.point, n_points)
+    solved = np.einsum("nij,nj->ni", covariance, pull_of_points)
+    explained = summed(np.einsum("mji,mi->mj", mixed, solved[seen.point]), seen.view, n_views)
+    return np.diag(own) - between_views(seen, mixed, covariance, n_views), (pull - explained).ravel()
+
+
+def between_views(seen: Observations, mixed: FloatArray, covariance: FloatArray, n_views: int) -> FloatArray:
+    """E C^-1 E^T (2 i, 2 i): what views have to do with each other through the points that they share.
+
+    mixed : (m, 2, 3), the blocks of E; covariance : (n, 3, 3), the blocks of C^-1. Every observation of a point meets
+    every other, so the work grows with the number of points.
+    """
+    order = np.argsort(seen.point, kind="stable")
+    point, view, mixed = seen.point[order], seen.view[order], mixed[order]
+    most = int(np.bincount(point, minlength=1).max())
+    total = np.zeros((2, 2, n_views * n_views))
+    for lag in range(most):
+        one = np.flatnonzero(point[: len(point) - lag] == point[lag:])
+        other = one + lag
+        blocks = np.einsum("kai,kij,kbj->abk", mixed[one], covariance[point[one]], mixed[other], optimize=True)
+        where = view[one] * n_views + view[other]
+        turned = view[other] * n_views + view[one]
+        for a, b in np.ndindex(2, 2):
+            total[a, b] += np.bincount(where, blocks[a, b], n_views * n_views)
+            if lag:
+                total[b, a] += np.bincount(turned, blocks[a, b], n_views * n_views)
+    return total.reshape(2, 2, n_views, n_views).transpose(2, 0, 3, 1).reshape(2 * n_views, 2 * n_views)
 
 
 def seen_directions(normal: FloatArray, weight_of_view: FloatArray) -> FloatArray:

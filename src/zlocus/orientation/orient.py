@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
@@ -23,6 +25,7 @@ SUPPORTERS = 3
 STEEPEST = 1.5
 HEIGHT_SIGMAS = 4.0
 RANGE_PERCENT = (0.5, 99.5)
+KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex), which is not a random one
 
 
 @dataclass(frozen=True)
@@ -229,16 +232,21 @@ def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> np.ndarray[Any, np.dtyp
 
     Two heights agree when a slope of 1.5 between them, and four sigma of both, explain their difference.
     """
-    from scipy.spatial import cKDTree
-
     good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
     trusted = np.zeros(len(xyz), bool)
     if len(good) <= SUPPORTERS:
         return trusted
-    found = cKDTree(xyz[good, :2]).query(xyz[good, :2], k=min(NEIGHBOURS + 1, len(good)))
-    distance, near = np.asarray(found[0]), np.asarray(found[1])
+    distance, near = nearest_points(xyz[good, :2], min(NEIGHBOURS + 1, len(good)))
     sigma = np.hypot(sigma_z_m[good][:, None], sigma_z_m[good][near[:, 1:]])
     difference = np.abs(xyz[good, 2][:, None] - xyz[good, 2][near[:, 1:]])
     agrees = difference <= STEEPEST * distance[:, 1:] + HEIGHT_SIGMAS * sigma
     trusted[good] = agrees.sum(axis=1) >= SUPPORTERS
     return trusted
+
+
+def nearest_points(xy: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int32]]:
+    """Distances (n, k) and numbers (n, k) of the `count` points nearest to each of xy (n, 2), itself among them."""
+    points = (xy - xy.mean(axis=0)).astype(np.float32)
+    index = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})
+    near, squared = index.knnSearch(points, count, params={"checks": -1, "eps": 0.0, "sorted": True})
+    return np.sqrt(squared.astype(float)), near

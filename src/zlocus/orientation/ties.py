@@ -263,16 +263,12 @@ def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_
     A point that would be seen twice by one image is a contradiction and is dropped. Features at one place with several
     orientations count as one.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
     place = np.concatenate([same_place_numbers(f.xy) + start[i] for i, f in enumerate(features)])
     one = np.concatenate([place[start[p.views[0]] + p.first] for p in pairs] or [np.empty(0, np.int64)])
     two = np.concatenate([place[start[p.views[1]] + p.second] for p in pairs] or [np.empty(0, np.int64)])
     heights = np.concatenate([p.z for p in pairs] or [np.empty(0)])
-    links = coo_array((np.ones(len(one), bool), (one, two)), shape=(start[-1], start[-1]))
-    _, track = connected_components(links, directed=False)
+    track = linked(one, two, int(start[-1]))
     node = np.unique(np.concatenate([one, two]))
     view = np.searchsorted(start, node, side="right") - 1
     twice = np.unique(track[node] * len(features) + view, return_counts=True)
@@ -288,6 +284,23 @@ def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_
     z = np.bincount(of_match[kept], heights[kept], n_points) / np.bincount(of_match[kept], minlength=n_points)
     xy = np.concatenate([f.xy for f in features])[node] if len(node) else np.empty((0, 2))
     return Ties(Observations(view, point, xy), z, pairs, z_range)
+
+
+def linked(one: NDArray[np.int64], two: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """For each of `count` things the number of the first one it is linked to, directly or through others.
+
+    one, two : (k,) the ends of the links. Every round gives both ends the smaller number and follows numbers to their
+    end, so that a chain of n links takes about log n rounds.
+    """
+    number = np.arange(count)
+    while True:
+        least = np.minimum(number[one], number[two])
+        if (number[one] == least).all() and (number[two] == least).all():
+            return number
+        np.minimum.at(number, number[one], least)
+        np.minimum.at(number, number[two], least)
+        while (number[number] != number).any():
+            number = number[number]
 
 
 def same_place_numbers(xy: FloatArray) -> NDArray[np.int64]:

@@ -14,6 +14,18 @@ GEOGRAPHIC = CRS.from_epsg(4979)
 MAX_ITERATIONS = 30
 TOLERANCE_PX = 1e-7
 MAX_STEP = 0.5  # of the RPC's box, per Newton iteration
+# The cubic terms (see `rpc_terms`) as products of a quadratic and a linear one.
+CUBICS = (
+    (10, 6, 1), (11, 7, 1), (12, 8, 1), (13, 9, 1), (14, 7, 2), (15, 8, 2), (16, 9, 2), (17, 7, 3), (18, 8, 3),
+    (19, 9, 3),
+)  # fmt: skip
+# Derivatives of the terms by longitude and by latitude: term, factor, and the term that it is a multiple of.
+BY_LON = (
+    (1, 1, 0), (4, 1, 2), (5, 1, 3), (7, 2, 1), (10, 1, 6), (11, 3, 7), (12, 1, 8), (13, 1, 9), (14, 2, 4), (17, 2, 5),
+)  # fmt: skip
+BY_LAT = (
+    (2, 1, 0), (4, 1, 1), (6, 1, 3), (8, 2, 2), (10, 1, 5), (12, 2, 4), (14, 1, 7), (15, 3, 8), (16, 1, 9), (18, 2, 6),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,8 +52,17 @@ class RpcCoefficients:
 
     @cached_property
     def matrix(self) -> FloatArray:
-        """(20, 4) float64: line numerator and denominator, sample numerator and denominator."""
-        return np.column_stack([self.line_num, self.line_den, self.samp_num, self.samp_den])
+        """(4, 20) float64: line numerator and denominator, sample numerator and denominator, by the terms."""
+        return np.array([self.line_num, self.line_den, self.samp_num, self.samp_den])
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """(8, 10) float64: derivatives of the same four by longitude, then by latitude, by the quadratic terms."""
+        slopes = np.zeros((2, 4, 10))
+        for axis, rules in enumerate((BY_LON, BY_LAT)):
+            for term, factor, quadratic in rules:
+                slopes[axis, :, quadratic] = factor * self.matrix[:, term]
+        return slopes.reshape(8, 10)
 
     def moved(self, column: float, row: float) -> RpcCoefficients:
         """The RPC whose image positions are `column` and `row` pixels larger."""
@@ -49,34 +70,18 @@ class RpcCoefficients:
 
 
 def rpc_terms(lon: FloatArray, lat: FloatArray, height: FloatArray) -> FloatArray:
-    """The 20 monomials of RPC00B. Normalised coordinates (n,) -> (n, 20).
+    """The 20 monomials of RPC00B. Normalised coordinates (n,) -> (20, n); the first ten are those of a quadratic.
 
     Source: NIMA STDI-0002 (2000), appendix E, RPC00B: L longitude, P latitude, H height.
     """
-    one = np.ones_like(lon)
-    ll, pp, hh = lon * lon, lat * lat, height * height
-    return np.stack(
-        [
-            one, lon, lat, height, lon * lat, lon * height, lat * height, ll, pp, hh,
-            lat * lon * height, ll * lon, lon * pp, lon * hh, ll * lat, pp * lat, lat * hh, ll * height, pp * height,
-            hh * height,
-        ]
-    ).T  # fmt: skip
-
-
-def rpc_term_slopes(lon: FloatArray, lat: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of `rpc_terms` by longitude and by latitude. Normalised coordinates (n,) -> 2 x (n, 20)."""
-    zero, one = np.zeros_like(lon), np.ones_like(lon)
-    ll, pp, hh, lp = lon * lon, lat * lat, height * height, lon * lat
-    by_lon = [
-        zero, one, zero, zero, lat, height, zero, 2 * lon, zero, zero,
-        lat * height, 3 * ll, pp, hh, 2 * lp, zero, zero, 2 * lon * height, zero, zero,
-    ]  # fmt: skip
-    by_lat = [
-        zero, zero, one, zero, lon, zero, height, zero, 2 * lat, zero,
-        lon * height, zero, 2 * lp, zero, ll, 3 * pp, hh, zero, 2 * lat * height, zero,
-    ]  # fmt: skip
-    return np.stack(by_lon).T, np.stack(by_lat).T
+    terms = np.empty((20, len(lon)))
+    terms[0], terms[1], terms[2], terms[3] = 1.0, lon, lat, height
+    factors = ((lon, lat), (lon, height), (lat, height), (lon, lon), (lat, lat), (height, height))
+    for term, (one, other) in enumerate(factors, 4):
+        np.multiply(one, other, out=terms[term])
+    for term, quadratic, factor in CUBICS:
+        np.multiply(terms[quadratic], terms[factor], out=terms[term])
+    return terms
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,9 @@ class RpcModel:
         NaN beyond a pole of the rational function (far outside the RPC's box), where its value means nothing.
         """
         rpc = self.rpc
-        xy = self._ratios(*self._normalised(lon, lat, height))
+        with np.errstate(all="ignore"):
+            values = rpc.matrix @ rpc_terms(*self._normalised(lon, lat, height))
+        xy = np.ascontiguousarray(self._ratios(values).T)
         xy *= [rpc.samp_scale, rpc.line_scale]
         xy += [rpc.samp_off, rpc.line_off]
         return xy
@@ -128,23 +135,26 @@ class RpcModel:
         crops far from the centre of a large box converge too. NaN where it does not reach `TOLERANCE_PX`.
         """
         rpc = self.rpc
-        scale = np.array([rpc.samp_scale, rpc.line_scale])
-        target = (xy - np.array([rpc.samp_off, rpc.line_off])) / scale
+        scale = np.array([[rpc.samp_scale], [rpc.line_scale]])
+        target = (xy.T - np.array([[rpc.samp_off], [rpc.line_off]])) / scale
         height = (z - rpc.height_off) / rpc.height_scale
         lon, lat = np.zeros(len(xy)), np.zeros(len(xy))
         done = np.zeros(len(xy), bool)
         active = np.arange(len(xy))
         for _ in range(MAX_ITERATIONS):
-            residual = target[active] - self._ratios(lon[active], lat[active], height[active])
-            reached = (np.abs(residual * scale) < TOLERANCE_PX).all(axis=1)
-            lost = ~np.isfinite(residual).all(axis=1)
+            with np.errstate(all="ignore"):
+                terms = rpc_terms(lon[active], lat[active], height[active])
+                values = rpc.matrix @ terms
+            residual = target[:, active] - self._ratios(values)
+            reached = (np.abs(residual * scale) < TOLERANCE_PX).all(axis=0)
+            going = np.isfinite(residual).all(axis=0) & ~reached
             done[active[reached]] = True
-            active, residual = active[~(reached | lost)], residual[~(reached | lost)]
-            if not active.size:
+            if not going.any():
                 break
-            step = self._newton_step(lon[active], lat[active], height[active], residual)
-            lon[active] += step[:, 0]
-            lat[active] += step[:, 1]
+            active = active[going]
+            step_lon, step_lat = self._newton_step(terms[:10, going], values[:, going], residual[:, going])
+            lon[active] += step_lon
+            lat[active] += step_lat
         lon_deg = np.remainder(lon * rpc.lon_scale + rpc.lon_off + 180.0, 360.0) - 180.0
         lat_deg = lat * rpc.lat_scale + rpc.lat_off
         return np.where(done, lon_deg, np.nan), np.where(done, lat_deg, np.nan)
@@ -163,33 +173,33 @@ class RpcModel:
                 (height - rpc.height_off) / rpc.height_scale,
             )
 
-    def _ratios(self, lon: FloatArray, lat: FloatArray, height: FloatArray) -> FloatArray:
-        """Normalised ground (n,) -> normalised (sample, line) (n, 2)."""
+    def _ratios(self, values: FloatArray) -> FloatArray:
+        """The four polynomials (4, n), as `RpcCoefficients.matrix` has them -> normalised (sample, line) (2, n)."""
+        line_num, line_den, samp_num, samp_den = values
         with np.errstate(all="ignore"):
-            line_num, line_den, samp_num, samp_den = (rpc_terms(lon, lat, height) @ self.rpc.matrix).T
-            ratios = np.column_stack([samp_num / samp_den, line_num / line_den])
+            ratios = np.stack([samp_num / samp_den, line_num / line_den])
             # The constant term is the denominator at the centre of the box: another sign means a pole in between.
-            beyond = ~((line_den * self.rpc.line_den[0] > 0) & (samp_den * self.rpc.samp_den[0] > 0))
-        ratios[beyond | ~np.isfinite(ratios).all(axis=1)] = np.nan
+            usable = (line_den * self.rpc.line_den[0] > 0) & (samp_den * self.rpc.samp_den[0] > 0)
+        ratios[:, ~(usable & np.isfinite(ratios).all(axis=0))] = np.nan
         return ratios
 
-    def _newton_step(self, lon: FloatArray, lat: FloatArray, height: FloatArray, residual: FloatArray) -> FloatArray:
-        """Normalised (longitude, latitude) step (n, 2) that removes residual (n, 2), each at most `MAX_STEP`."""
-        matrix = self.rpc.matrix
+    def _newton_step(self, terms: FloatArray, values: FloatArray, residual: FloatArray) -> FloatArray:
+        """Normalised (longitude, latitude) step (2, n) that removes residual (2, n), each at most `MAX_STEP`.
+
+        terms : (10, n), the quadratic ones; values : (4, n), the polynomials there.
+        """
+        line_num, line_den, samp_num, samp_den = values
         with np.errstate(all="ignore"):
-            line_num, line_den, samp_num, samp_den = (rpc_terms(lon, lat, height) @ matrix).T
-            slopes = []
-            for term_slopes in rpc_term_slopes(lon, lat, height):
-                d_line_num, d_line_den, d_samp_num, d_samp_den = (term_slopes @ matrix).T
-                samp = (d_samp_num - samp_num / samp_den * d_samp_den) / samp_den
-                line = (d_line_num - line_num / line_den * d_line_den) / line_den
-                slopes.append((samp, line))
+            sample, line, slopes = samp_num / samp_den, line_num / line_den, []
+            for d_line_num, d_line_den, d_samp_num, d_samp_den in (self.rpc.slopes @ terms).reshape(2, 4, -1):
+                by_sample, by_line = d_samp_num - sample * d_samp_den, d_line_num - line * d_line_den
+                slopes.append((by_sample / samp_den, by_line / line_den))
             (samp_lon, line_lon), (samp_lat, line_lat) = slopes
             determinant = samp_lon * line_lat - line_lon * samp_lat
-            step = np.column_stack(
+            step = np.stack(
                 [
-                    (residual[:, 0] * line_lat - residual[:, 1] * samp_lat) / determinant,
-                    (samp_lon * residual[:, 1] - line_lon * residual[:, 0]) / determinant,
+                    (residual[0] * line_lat - residual[1] * samp_lat) / determinant,
+                    (samp_lon * residual[1] - line_lon * residual[0]) / determinant,
                 ]
             )
         return np.asarray(np.clip(np.nan_to_num(step, nan=np.inf), -MAX_STEP, MAX_STEP))

@@ -51,7 +51,7 @@ def fit_rpc(sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tupl
     offset, scale = (low + high) / 2, (high - low) / 2
     image_offset = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     image_scale = np.array([shape[1] / 2, shape[0] / 2])
-    terms = rpc_terms(*((lon_lat_h - offset) / scale).T)
+    terms = rpc_terms(*((lon_lat_h - offset) / scale).T).T
     target = (xy - image_offset) / image_scale
     samp_num, samp_den = _fit_ratio(terms, target[:, 0])
     line_num, line_den = _fit_ratio(terms, target[:, 1])
