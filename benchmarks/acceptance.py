@@ -24,6 +24,7 @@ import numpy as np
 import rasterio
 from pyproj import CRS, Transformer
 
+from middlebury import CASES, judge
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.io.scene_file import open_scene
@@ -248,6 +249,63 @@ def ground_seen_by_all(scene: Scene, srtm: HeightRaster, geoid: HeightRaster) ->
     return xyz[inside]
 
 
+def selection(at: Workplace) -> list[Figure]:
+    """Eight views of the rendered town, one of another date and one hazy: those that help against all of them."""
+    scene = at.scene("rendered-city")
+    every = sorted(scene.glob("img_*.tif"))
+    figures, shares, cpu = [], {}, {}
+    for name, images, views in (
+        ("all", every, "all"),
+        ("good", rendered_images(scene), "auto"),
+        ("auto", every, "auto"),
+    ):
+        out = at.out / name
+        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--views", views, "--overwrite"])
+        found, record = at.judge(out / "dsm.tif", scene), json.loads((out / "run.json").read_text())
+        shares[name] = {surface: found[surface]["within"] for surface in ("all", "building")}
+        cpu[name] = sum(stage["cpu_s"] for stage in record["stages"])
+    for surface in ("all", "building"):
+        gain, loss = (shares["auto"][surface] - shares[other][surface] for other in ("all", "good"))
+        figures.append(Figure(f"{surface}: over all images", gain, at_least=0.005))
+        figures.append(Figure(f"{surface}: over the six good ones", loss, at_least=-0.005))
+    counted = record["evaluations"]
+    figures.append(Figure("evaluations saved", 1 - counted["done"] / counted["all_images"], at_least=0.4))
+    figures.append(Figure("CPU over that of all images", cpu["auto"] / cpu["all"], at_most=1))
+    return [*figures, no_worse(at, "hills"), no_worse(at, "calanques")]
+
+
+def no_worse(at: Workplace, name: str) -> Figure:
+    """NMAD with the images that help over NMAD with all of them."""
+    nmad = {}
+    for views in ("all", "auto"):
+        out = at.out / f"{name}-{views}"
+        if name == "hills":
+            scene = at.scene("rendered-hills-biased")
+            images = sorted(scene.glob("img_*.tif"))
+            run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--views", views, "--overwrite"])
+            nmad[views] = at.judge(out / "dsm.tif", scene, "--align")["ground"]["nmad"]
+        else:
+            scene = at.scene("pleiades_triplet_calanques")
+            reference = scene / "reference" / "s2p_dsm_0.5m_utm31n.tif"
+            images = sorted(scene.glob("img_0*.tif"))
+            run([ZLOCUS, "dsm", *images, "-o", out, "--like", reference, "--views", views, "--overwrite"])
+            nmad[views] = evaluate(out / "dsm.tif", reference, align=True).all.nmad
+    return Figure(f"{name}: NMAD over that of all images", nmad["auto"] / nmad["all"], at_most=1.02)
+
+
+def middlebury(at: Workplace) -> list[Figure]:
+    """Real rectified photographs through `zlocus cloud`, beside OpenCV's StereoSGBM in its slowest mode."""
+    scenes = at.scene("middlebury_multiview")
+    found = {name: judge(scenes, name, at.out / name.replace(", ", "-").replace(" ", "-")) for name in CASES}
+    share = {name: case.zlocus for name, case in found.items()}
+    bars = {"cones, 2 views": 4.0, "teddy, 2 views": 7.0}
+    figures = [Figure(f"{name}: bad > 1 px", value, "%", at_most=bars.get(name)) for name, value in share.items()]
+    figures += [Figure(f"{name}: over OpenCV's", share[name] / found[name].opencv, at_most=1) for name in bars]
+    for more, fewer in (("cones, 3 views", "cones, 2 views"), ("tsukuba, 5 views", "tsukuba, 2 views")):
+        figures.append(Figure(f"{more} over {fewer}", share[more] / share[fewer], at_most=1))
+    return figures
+
+
 def kernels(at: Workplace) -> list[Figure]:
     """Speed of the kernels: what the benchmarks leave in their `extra_info`."""
     report = at.out / "benchmarks.json"
@@ -301,6 +359,7 @@ def clone(at: Workplace) -> list[Figure]:
 
 ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "calanques": calanques, "city": city, "hills": hills, "unseen": unseen, "ventoux": ventoux, "kernels": kernels,
+    "selection": selection, "middlebury": middlebury,
     "memory": memory, "clone": clone,
 }  # fmt: skip
 SLOW = ("memory", "clone")

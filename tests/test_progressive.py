@@ -213,8 +213,8 @@ def block_volume(n_good, n_cells, n_images=3):
 
 @pytest.mark.parametrize(("n_good", "n_added"), [(20, 1), (19, 1), (18, 3)])
 def test_a_block_stops_when_95_of_100_cells_have(n_good, n_added):
-    volume = block_volume(n_good, 20)
-    found = matched(volume, plan_of([[2, 0, 1]], np.ones((20, 3), bool), block=np.zeros(20, int)))
+    volume, options = block_volume(n_good, 20), SelectionOptions(stopped_share=0.95)
+    found = matched(volume, plan_of([[2, 0, 1]], np.ones((20, 3), bool), block=np.zeros(20, int)), options)
     assert found.n_added.tolist() == [n_added]
     assert found.n_images.tolist() == [n_added] * 20
     assert found.evaluations == n_added * 20 * N_HEIGHTS

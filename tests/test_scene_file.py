@@ -160,7 +160,7 @@ def with_view(**changes):
         (document(views=[1]), r"views\[0\]"),
         (with_view(name=""), r"views\[0\]\.name: String should have at least 1 character"),
         (with_view(name="b"), "'b' is used twice"),
-        (with_view(date=1), r"views\[0\]: unknown key date; allowed here: name, image, camera"),
+        (with_view(day=1), r"views\[0\]: unknown key day; allowed here: name, image, camera, date"),
         (with_view(camera={"kind": "magic"}), r"views\[0\]\.camera\.kind is 'magic'\. Allowed: rpc"),
         (with_view(camera={}), r"views\[0\]\.camera\.kind is None"),
         (with_view(camera="rpc"), r"views\[0\]\.camera"),

@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from zlocus import __version__
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.progress import progress_for
-from zlocus.request import DsmRequest, check_output
+from zlocus.request import CloudRequest, CurvesRequest, DsmRequest, check_output
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
@@ -186,6 +186,93 @@ def dsm(
 
     result = run_dsm(request, run_config, progress_for(sys.stderr))
     print(f"{result.out}: {100 * result.coverage:.1f} % of the cells seen by two images or more have a height.")
+
+
+@app.command()
+@explained
+def cloud(
+    inputs: Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")],
+    reference: Annotated[
+        list[str] | None,
+        typer.Option(help="Name of a view whose pixels get heights; may be repeated. Default: all.", metavar="VIEW"),
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")
+    ] = None,
+    heights: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Range searched, m. Default: found from tie points.", metavar="ZMIN ZMAX"),
+    ] = None,
+    fill: Annotated[
+        str, typer.Option(help="What to do with gaps of the height maps.", metavar="none|interpolate")
+    ] = "none",
+    partial: Annotated[bool, typer.Option("--partial", help="Count a cloud with too few points as a success.")] = False,
+    workers: Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")] = 1,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")] = False,
+    config: Annotated[
+        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Make a coloured point cloud, with a height for every pixel of the images."""
+    request = CloudRequest(
+        inputs=tuple(inputs), out=out, references=tuple(reference or ()), crs=crs, heights=heights, fill=fill,
+        partial=partial, workers=workers, overwrite=overwrite,
+    )  # fmt: skip
+    check_output(out, overwrite)
+    run_config = _run_config(config)
+    from zlocus.cloud import run_cloud
+
+    result = run_cloud(request, run_config, progress_for(sys.stderr))
+    print(
+        f"{result.out}: {result.n_points} points, a height for {100 * result.coverage:.1f} % of the pixels seen by two "
+        "images or more."
+    )
+
+
+@app.command()
+@explained
+def curves(
+    inputs: Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")],
+    at: Annotated[
+        tuple[float, float] | None, typer.Option(help="The point on the ground, in the CRS.", metavar="X Y")
+    ] = None,
+    pixel: Annotated[
+        tuple[str, float, float] | None,
+        typer.Option(help="The point in an image; (0, 0) is the first pixel's centre.", metavar="VIEW ROW COL"),
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for figures and tables.")] = Path("curves"),
+    height: Annotated[
+        float | None, typer.Option(help="Look around this height, m. Default: that of the nearest ties.", metavar="Z")
+    ] = None,
+    resolution: Annotated[
+        float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")
+    ] = None,
+    heights: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Range in which ties are looked for, m. Default: found.", metavar="ZMIN ZMAX"),
+    ] = None,
+    reference: Annotated[
+        str | None, typer.Option(help="Name of the reference view. Default: chosen for the point.", metavar="VIEW")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")] = False,
+    config: Annotated[
+        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Show the match curves of one point: labels, order of the images, and where the match ends."""
+    request = CurvesRequest(
+        inputs=tuple(inputs), out=out, at=at, pixel=pixel, height=height, resolution=resolution, crs=crs,
+        heights=heights, reference=reference, overwrite=overwrite,
+    )  # fmt: skip
+    check_output(out, overwrite)
+    run_config = _run_config(config)
+    from zlocus.point import run_point
+
+    print(run_point(request, run_config, progress_for(sys.stderr)))
 
 
 @app.command()

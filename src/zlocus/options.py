@@ -222,8 +222,23 @@ class SelectionOptions(Checked):
         choices=("sum", "count"),
     )  # fmt: skip
     stopped_share: float = option(
-        0.95, "A block adds images until this share of its cells has stopped.", low=0.0, high=1.0
+        0.75, "A block adds images until this share of its sampled cells has stopped.", low=0.0, high=1.0
     )
+    sigma_steps: float = option(
+        0.12, "A cell stops only where its peak is predicted to this standard deviation; 1000: by its label alone.",
+        low=1e-3, high=1000.0, unit="steps",
+    )  # fmt: skip
+    reach_steps: int = option(
+        40, "Labels are judged over so many heights of the finest level to both sides.", low=4, high=1000, unit="steps"
+    )
+    feature_cells: int = option(
+        24, "One tie point ranks the images in a square of this side.", low=1, high=1000, unit="cells"
+    )
+    least_worth: float = option(
+        0.55, "An image is left out where its accumulated label is below this share of the best one's.",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    least_images: int = option(3, "Search images that are kept whatever their labels say.", low=1, high=254)
     candidates: int = option(12, "Search images considered for a block, at most.", low=1, high=254)
     least_overlap: float = option(
         0.2, "Images that see a smaller share of a block are considered last.", low=0.0, high=1.0
@@ -272,6 +287,7 @@ class RunConfig(Checked):
     orientation: OrientationOptions = group(OrientationOptions, "Tie points and pointing corrections.")
     pyramid: PyramidOptions = group(PyramidOptions, "Levels, tiles and ranges of heights.")
     measure: MeasureOptions = group(MeasureOptions, "How views are compared.")
+    selection: SelectionOptions = group(SelectionOptions, "Which images a block is matched with.")
     semiglobal: SemiGlobalOptions = group(SemiGlobalOptions, "Semi-global constraint.")
     refine: RefineOptions = group(RefineOptions, "Sub-step refinement.")
     checks: CheckOptions = group(CheckOptions, "Empty and doubtful cells.")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
-from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, CoverageError, GeometryError, OutputError, TileError, ZlocusError
+from zlocus.errors import ConfigError, CoverageError, GeometryError, TileError, ZlocusError
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.local import run_all
@@ -23,26 +21,25 @@ from zlocus.execution.plan import Tile, plan_tiles, tile_memory_bytes
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.io.config import config_as_dict
-from zlocus.io.crs import checked_crs
 from zlocus.io.reference import cells_inside, read_dem, read_geobox, read_polygons
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import Orientation, height_range, orient
+from zlocus.orientation.orient import Orientation, height_range
+from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
 from zlocus.products.picture import picture_beside_truth
+from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
-from zlocus.scene import Scene, check_overlap
+from zlocus.scene import Scene, check_overlap, is_local
 from zlocus.surface.reasons import Quality
 from zlocus.surface.surface import Surface
 from zlocus.tile import TileResult, match_tile
 
-HEIGHT_SAMPLES = 5
 SUFFICIENT_COVERAGE = 0.5
 DEMO_WORKERS = 2
-UNBOUNDED_M = (-500.0, 9000.0)
 
 
 @dataclass(frozen=True)
@@ -69,6 +66,7 @@ class Tally:
     n_matched: int = 0
     evaluations: int = 0
     all_images: int = 0
+    ranked: list[RankedPoints] = field(default_factory=list)
 
     def add(self, surface: Surface, result: TileResult) -> None:
         """Count a tile."""
@@ -97,21 +95,18 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     watch = Stopwatch()
     with watch.stage("open"), progress.stage("Opening images"):
         like = None if request.like is None else read_geobox(request.like)
-        scene = open_scene(request.inputs, _asked_crs(request, like))
-        # By name, so that the order of the inputs changes nothing.
-        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
-        check_overlap(scene, _possible_heights(scene, request))
+        scene = _opened(request, like)
         polygons = _area_polygons(request, scene.crs)
     with watch.stage("orient"):
         heights = request.heights or scene.heights
-        orientation = _oriented(scene, config, heights, progress)
-        progress.note(_what_was_applied(orientation))
+        orientation = oriented(scene, config.orientation, heights, progress)
+        progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
-        oriented = orientation.apply(scene)
-        z_range = heights or _searched_heights(request, oriented, orientation, config)
-        grid = _grid(request, like, oriented, z_range)
+        corrected = orientation.apply(scene)
+        z_range = heights or _searched_heights(request, corrected, orientation, config)
+        grid = _grid(request, like, corrected, z_range)
         settled = settle(
-            oriented, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid
+            corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid
         )
         settled = _with_dem(request, settled, scene.crs, config)
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
@@ -120,8 +115,12 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         _check_polygons(request, grid, settled, polygons[0])
     tally = Tally()
     out, dtype = request.out, settled.views[0].image.dtype
-    with watch.stage("match"), _made(out), SurfaceRasters(out, grid.geobox, dtype) as rasters:
+    with watch.stage("match"), made_folder(out), SurfaceRasters(out, grid.geobox, dtype) as rasters:
         _match(request, config, settled, grid, tiles, workers, polygons, rasters, tally, progress)
+    with watch.stage("points"):
+        write_ties(out / "ties.gpkg", orientation, corrected)
+        if tally.ranked:
+            write_ranking(out / "ranking.gpkg", tally.ranked, [view.name for view in settled.views], scene.crs)
     with watch.stage("record"):
         record = inputs_record(_files(request, scene))
     write_record(
@@ -143,6 +142,19 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     return DsmResult(out, tally.coverage)
 
 
+def _opened(request: DsmRequest, like: GeoBox | None) -> Scene:
+    """The scene, its views by name, so that the order of the inputs changes nothing."""
+    crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
+    scene = open_scene(request.inputs, crs)
+    if is_local(scene.crs):
+        raise GeometryError(
+            "The scene's frame is local, and a surface needs a grid on the Earth. Use `zlocus cloud`, or give the "
+            "cameras in a projected CRS."
+        )
+    check_overlap(scene, possible_heights(scene, request.heights or scene.heights))
+    return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+
+
 def run_demo(out: Path, progress: Progress) -> DemoResult:
     """Render the built-in scene (six views in two strips), match it, and compare the surface with its truth."""
     from zlocus.synthetic.files import render_scene
@@ -152,8 +164,7 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     folder = out / "scene"
     if folder.exists():
         shutil.rmtree(folder)
-    _make(out)
-    with progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
+    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
         rendered = render_scene(spec, folder, lambda step: stage.advance())
     request = DsmRequest(
         inputs=tuple(rendered.images.values()), out=out, crs=f"EPSG:{spec.epsg}", resolution=spec.gsd_m, overwrite=True,
@@ -193,6 +204,8 @@ def _match(
             geobox = grid.geobox[row : row + tile.kept.rows, col : col + tile.kept.cols]
             surface = _inside(result.surface.part(tile.kept, tile.core), geobox, polygons)
             tally.add(surface, result)
+            if result.ranking is not None:
+                tally.ranked.append(RankedPoints.of(*result.ranking, settled.ties, tile.core))
             rasters.write(row, col, surface)
             stage.advance()
 
@@ -208,50 +221,13 @@ def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | Non
     return surface.without(outside) if outside.any() else surface
 
 
-def _asked_crs(request: DsmRequest, like: GeoBox | None) -> CRS | None:
-    if like is not None:
-        return CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
-    if request.crs is None:
-        return None
-    try:
-        return checked_crs(CRS.from_user_input(request.crs))
-    except CRSError as error:
-        raise ConfigError(
-            f"--crs {request.crs} is not a known CRS. Give a projected one, such as EPSG:32632."
-        ) from error
-
-
-def _oriented(scene: Scene, config: RunConfig, heights: tuple[float, float] | None, progress: Progress) -> Orientation:
-    """Tie points and corrections, with progress."""
-    with progress.stage("Tie points", 1.0) as stage:
-        done = 0.0
-
-        def report(_: str, share: float) -> None:
-            nonlocal done
-            stage.advance(share - done)
-            done = share
-
-        return orient(scene, config.orientation, heights, report)
-
-
-def _possible_heights(scene: Scene, request: DsmRequest) -> list[float]:
-    """Heights at which the scene may have ground, for a first look at overlaps."""
-    given = request.heights or scene.heights
-    if given is not None:
-        return [float(z) for z in np.linspace(*given, HEIGHT_SAMPLES)]
-    bounds = [b for view in scene.views if (b := view.sensor.height_bounds()) is not None]
-    low = max((b[0] for b in bounds), default=UNBOUNDED_M[0])
-    high = min((b[1] for b in bounds), default=UNBOUNDED_M[1])
-    return [float(z) for z in np.linspace(low, max(high, low), HEIGHT_SAMPLES)]
-
-
 def _searched_heights(
     request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig
 ) -> tuple[float, float]:
     """Height range of the search: from the DEM, else from the ties."""
     if request.dem is None:
         return height_range(orientation, config.orientation)
-    z = _possible_heights(scene, request)
+    z = possible_heights(scene, request.heights or scene.heights)
     bounds = shared_ground(scene, (z[0], z[-1]))
     cell = median_ground_pixel(scene, sum(z) / len(z)) * 16
     heights = read_dem(request.dem, grid_from_bounds(bounds, cell, scene.crs).geobox)
@@ -333,16 +309,6 @@ def _workers(request: DsmRequest, settled: MatchScene, config: RunConfig) -> int
     return min(request.workers, fit)
 
 
-def _what_was_applied(orientation: Orientation) -> str:
-    """The corrections, in a sentence."""
-    moved = [
-        f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in orientation.views if v.shift_px != (0.0, 0.0)
-    ]
-    if not moved:
-        return "Pointing: no correction applied."
-    return f"Pointing corrected from {len(orientation.xyz)} tie points, px (column, row): {', '.join(moved)}."
-
-
 def _what_failed(settled: MatchScene, tile: Tile, error: Exception) -> str:
     """The tile and its fault, in a sentence."""
     transform = settled.transform(tile.core, 0)
@@ -355,27 +321,6 @@ def _what_failed(settled: MatchScene, tile: Tile, error: Exception) -> str:
         f"{where} failed with {what}. This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the "
         "trace, and report it."
     )
-
-
-@contextmanager
-def _made(folder: Path) -> Iterator[None]:
-    """A folder that is there; after a failure, what was made of it and its parents is removed again while empty."""
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    _make(folder)
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):  # where something lies in it
-            for path in new:
-                path.rmdir()
-        raise
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be made: {error.strerror}. Choose another folder with -o.") from error
 
 
 def _check_coverage(tally: Tally, out: Path) -> None:

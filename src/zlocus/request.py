@@ -10,7 +10,7 @@ from pathlib import Path
 from zlocus.errors import ConfigError, InputError, OutputError
 
 SCENE_SUFFIXES = (".yaml", ".yml")
-RUN_FILES = ("run.json", "dsm.tif")
+RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json")
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll")
 VERTICALS = ("ellipsoid",)
@@ -57,42 +57,25 @@ class DsmRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        self._check_inputs()
+        _check_inputs(self.inputs)
         self._check_grid()
-        self._check_heights()
+        _check_heights(self.heights)
+        if self.heights is not None and self.dem is not None:
+            raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
         for name, value, choices in (
             ("views", self.views, VIEWS),
             ("method", self.method, METHODS),
             ("vertical", self.vertical, VERTICALS),
             ("fill", self.fill, FILLS),
         ):
-            if value not in choices:
-                raise ConfigError(f"--{name} {value} is not known; choose from {', '.join(choices)}.")
-        if self.workers < 1:
-            raise ConfigError(f"--workers {self.workers} is too few; give 1 or more.")
+            _check_choice(name, value, choices)
+        _check_workers(self.workers)
         _check_positive("--memory", self.memory_gb, "GB")
 
     @property
     def is_scene_file(self) -> bool:
         """Whether the input is one scene file rather than images."""
         return len(self.inputs) == 1 and _is_scene_file(self.inputs[0])
-
-    def _check_inputs(self) -> None:
-        if self.is_scene_file:
-            return
-        scene_files = [path for path in self.inputs if _is_scene_file(path)]
-        if scene_files:
-            raise InputError(
-                f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs."
-            )
-        if len(self.inputs) < 2:
-            given = f"only {self.inputs[0]} is given" if self.inputs else "none is given"
-            raise InputError(f"A surface needs two images or more, and {given}. Add images, or give one scene.yaml.")
-        seen = set()
-        for path in self.inputs:
-            if path.resolve() in seen:
-                raise InputError(f"{path} is given twice, and an image cannot be matched with itself. Name it once.")
-            seen.add(path.resolve())
 
     def _check_grid(self) -> None:
         _check_positive("--resolution", self.resolution, "m")
@@ -108,14 +91,113 @@ class DsmRequest:
                     f"--bounds {numbers} holds no area. Give XMIN YMIN XMAX YMAX, the smaller values first."
                 )
 
-    def _check_heights(self) -> None:
-        if self.heights is None:
-            return
-        if self.dem is not None:
-            raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
-        zmin, zmax = self.heights
-        if not (math.isfinite(zmin) and math.isfinite(zmax)) or zmin >= zmax:
-            raise ConfigError(f"--heights {zmin:.12g} {zmax:.12g} is an empty range. Give ZMIN ZMAX, the lower first.")
+
+@dataclass(frozen=True)
+class CloudRequest:
+    """A point cloud to be made. `None` means: not given, to be found by the run.
+
+    inputs, crs, heights, partial, workers, overwrite : as in `DsmRequest`. references : names of the views whose pixels
+    get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    references: tuple[str, ...] = ()
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    fill: str = "none"
+    partial: bool = False
+    workers: int = 1
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_heights(self.heights)
+        _check_choice("fill", self.fill, FILLS)
+        _check_workers(self.workers)
+        for name in self.references:
+            if self.references.count(name) > 1:
+                raise ConfigError(f"--reference {name} is given twice. Name each view once.")
+
+
+@dataclass(frozen=True)
+class CurvesRequest:
+    """The match curves of one point, to be shown. `None` means: not given, to be found by the run.
+
+    inputs, resolution, crs, heights, reference, overwrite : as in `DsmRequest`. at : ground point (x, y), m; pixel :
+    view, row and column of an image point; one of both. height : of the point, m, about which curves are sampled.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range, no point, or two.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    at: tuple[float, float] | None = None
+    pixel: tuple[str, float, float] | None = None
+    height: float | None = None
+    resolution: float | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    reference: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_positive("--resolution", self.resolution, "m")
+        _check_heights(self.heights)
+        if (self.at is None) == (self.pixel is None):
+            given = "both are given" if self.at is not None else "none is given"
+            raise ConfigError(f"The point is asked for by --at X Y or by --pixel VIEW ROW COL, and {given}. Give one.")
+        for name, values in (("at", self.at), ("pixel", self.pixel and self.pixel[1:]), ("height", (self.height,))):
+            numbers = [v for v in values or () if v is not None]
+            if not all(map(math.isfinite, numbers)):
+                raise ConfigError(f"--{name} {' '.join(f'{v:g}' for v in numbers)} is no place. Give finite numbers.")
+
+
+def _check_inputs(inputs: tuple[Path, ...]) -> None:
+    if len(inputs) == 1 and _is_scene_file(inputs[0]):
+        return
+    scene_files = [path for path in inputs if _is_scene_file(path)]
+    if scene_files:
+        raise InputError(f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs.")
+    if len(inputs) < 2:
+        given = f"only {inputs[0]} is given" if inputs else "none is given"
+        raise InputError(f"A surface needs two images or more, and {given}. Add images, or give one scene.yaml.")
+    seen = set()
+    for path in inputs:
+        if path.resolve() in seen:
+            raise InputError(f"{path} is given twice, and an image cannot be matched with itself. Name it once.")
+        seen.add(path.resolve())
+
+
+def _check_heights(heights: tuple[float, float] | None) -> None:
+    if heights is None:
+        return
+    zmin, zmax = heights
+    if not (math.isfinite(zmin) and math.isfinite(zmax)) or zmin >= zmax:
+        raise ConfigError(f"--heights {zmin:.12g} {zmax:.12g} is an empty range. Give ZMIN ZMAX, the lower first.")
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ConfigError(f"--{name} {value} is not known; choose from {', '.join(choices)}.")
+
+
+def _check_workers(workers: int) -> None:
+    if workers < 1:
+        raise ConfigError(f"--workers {workers} is too few; give 1 or more.")
 
 
 def _is_scene_file(path: Path) -> bool:

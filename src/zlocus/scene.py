@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date as Date
 from itertools import combinations
 from pathlib import Path
 from typing import Protocol
@@ -45,18 +46,20 @@ class ImageSource(Protocol):
 
 @dataclass(frozen=True)
 class View:
-    """One image with its sensor model in the scene's frame. camera_files : what the model was read from, besides it."""
+    """One image with its sensor model in the scene's frame. camera_files : what the model was read from, besides it;
+    date : of its exposure, where it is known."""
 
     name: str
     path: Path
     image: ImageSource
     sensor: SensorModel
     camera_files: tuple[Path, ...] = ()
+    date: Date | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Views that share a frame: projected easting, northing and ellipsoidal height in metres.
+    """Views that share a frame: projected easting, northing and ellipsoidal height in metres, or local x, y, z (up).
 
     bounds : (xmin, ymin, xmax, ymax) of the area asked for, in `crs`; None is the ground seen by two views or more.
     heights : (zmin, zmax) m, ellipsoidal, searched; None is found from the tie points.
@@ -66,6 +69,11 @@ class Scene:
     crs: CRS
     bounds: tuple[float, float, float, float] | None = None
     heights: tuple[float, float] | None = None
+
+
+def is_local(crs: CRS) -> bool:
+    """Whether a frame is local Cartesian axes at no known place of the Earth."""
+    return bool(crs.is_engineering)
 
 
 def footprint(view: View, z: float, per_side: int = 8) -> FloatArray:

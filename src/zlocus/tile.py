@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -10,16 +11,30 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_ortho
 from zlocus.kernels.spline import spline_coefficients
+from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
 from zlocus.matching.ranges import UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
+from zlocus.matching.selection import (
+    Coarser,
+    Ranking,
+    block_middles,
+    block_of_cells,
+    block_shares,
+    chosen_views,
+    images_needed,
+    order_views,
+    preselected,
+    rank_views,
+    sampled_cells,
+)
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import above_base, coverage, covers, hide, sees
+from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, sees
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
@@ -28,6 +43,9 @@ from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
+COARSEST_SEARCH = 4  # views beside the reference at the coarsest level
+STRIDE = 2  # cells between those that are looked at for the views that cover them
+FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
 # What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's.
 OBSTACLE = np.ones((5, 5), np.uint8)
 SPIKE = np.ones((3, 3), np.uint8)
@@ -38,23 +56,29 @@ class LevelResult:
     """What one level hands to the next: its window, heights, and between which heights views cover and see each cell.
 
     seen and heights are in height indices of the level's lattice, whatever base surface they were found along.
+    evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
     """
 
+    level: int
     window: CellWindow
     views: TileViews
     lattice: HeightLattice
     seen: NDArray[np.int32]
     heights: SemiGlobalHeights
+    evaluations: int
+    all_views: int
 
 
 @dataclass(frozen=True)
 class TileResult:
-    """surface : of the tile's core; evaluations : NCC evaluated (cell x step x image, all levels); all_images : the
-    same if every image that covers a cell had been used."""
+    """surface : of the tile's core; evaluations : NCC evaluated (cell x step x image, all levels, with what it took to
+    choose images; the refinement counts on neither side); all_images : the same if every image that covers a cell had
+    been used; ranking : of the images, and which of the scene's they are, None where there was nothing to choose."""
 
     surface: Surface
     evaluations: int = 0
     all_images: int = 0
+    ranking: tuple[Ranking, list[int]] | None = None
 
 
 def match_tile(
@@ -72,32 +96,33 @@ def match_tile(
     """
     if not (core.rows and core.cols):
         return TileResult(Surface.nothing(core))
-    pixels = _read(scene, core, config)
+    pixels, which = _read(scene, core, config, use_visibility)
     if len(pixels) < 2:
         return TileResult(Surface.nothing(core))
-    evaluations = 0
     coarsest = scene.levels - 1
     window = _level_window(scene, core, coarsest, config)
-    result = _match_level(
-        scene, pixels, window, coarsest, _coarsest_guide(scene, window, None), config, method, use_visibility
-    )
-    evaluations += _evaluations(result)
+    guide = _coarsest_guide(scene, window, None)
+    ranking = _ranking(scene, pixels, core, None, config) if use_visibility else None
+    result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
+    done, every = result.evaluations, result.all_views
     if BaseSurface.along(smoothed(result.heights.vertex, config.refine.jump_steps), config.pyramid.block).is_steep:
         guide = _coarsest_guide(scene, window, result.heights.vertex)
-        result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility)
-        evaluations += _evaluations(result)
+        ranking = _ranking(scene, pixels, core, result, config) if use_visibility else None
+        result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
+        done, every = done + result.evaluations, every + result.all_views
     worth = _worth_matching(result)
     for level in range(coarsest - 1, -1, -1):
         window = _level_window(scene, core, level, config).within(worth.finer(coarsest - level))
         if not (window.rows and window.cols):
-            return TileResult(Surface.nothing(core), evaluations, evaluations)
-        guide = Guide(_finer(result, window), *_candidates(scene, result, window, level))
-        result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility)
-        evaluations += _evaluations(result)
+            return TileResult(Surface.nothing(core), done, every)
+        guide = Guide(_finer(result, window), *_candidates(scene, result, window, level), result)
+        result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
+        done, every = done + result.evaluations, every + result.all_views
     surface = _finish(scene, pixels, result, config)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
-    return TileResult(surface.part(core, result.window), evaluations, evaluations)
+    done += 0 if ranking is None else ranking.evaluations
+    return TileResult(surface.part(core, result.window), done, every, None if ranking is None else (ranking, which))
 
 
 def _worth_matching(coarsest: LevelResult) -> CellWindow:
@@ -112,42 +137,77 @@ def _worth_matching(coarsest: LevelResult) -> CellWindow:
     return CellWindow(row, col, *size)
 
 
-def _evaluations(result: LevelResult) -> int:
-    """Cells x steps x images that were compared."""
-    covering = covers(result.seen).sum(axis=0, dtype=np.int32)
-    return int((by_block(covering, result.lattice.block, np.add) * result.lattice.count).sum())
+def _evaluations(seen: NDArray[np.int32], lattice: HeightLattice) -> int:
+    """Cells x steps x views that are compared."""
+    covering = covers(seen).sum(axis=0, dtype=np.int32)
+    return int((by_block(covering, lattice.block, np.add) * lattice.count).sum())
+
+
+def _ranking(
+    scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, coarsest: LevelResult | None, config: RunConfig
+) -> Ranking | None:
+    """Labels of the views at the tie points in and around the tile; None where there are too few views to choose."""
+    if len(pixels) - 1 <= config.selection.least_images:
+        return None
+    around = math.ceil(config.selection.radius_px)
+    window = core.at_level(0, around).within(scene.seen)
+    block, side = config.pyramid.block, config.measure.large_window
+    reach = config.selection.reach_steps * scene.step_m
+    z = (scene.origin_m - reach, scene.origin_m + scene.n_steps * scene.step_m + reach)
+    transform, shape = scene.transform(window, 0), (window.rows, window.cols)
+    views = tile_views(pixels, 0, transform, shape, block, (scene.origin_m, scene.step_m), z, side // 2)
+    xy = (scene.ties[:, :2] - scene.anchor) * (1.0, -1.0) / scene.cell_m
+    index = (scene.ties[:, 2] - scene.origin_m) / scene.step_m
+    if coarsest is None:
+        return rank_views(views, window, block, xy, index, np.zeros((len(xy), 2)), side, config.selection)
+    surface = smoothed(coarsest.heights.vertex, config.refine.jump_steps)
+    coarse_cell = np.floor(xy[:, ::-1] / 2**coarsest.level).astype(np.int64)
+    at = tuple(np.clip(coarse_cell - (coarsest.window.row, coarsest.window.col), 1, np.subtract(surface.shape, 2)).T)
+    # Steps per cell are the same at every level.
+    slope = np.stack([(surface[at[0] + i, at[1] + j] - surface[at[0] - i, at[1] - j]) / 2 for i, j in ((1, 0), (0, 1))])
+    return rank_views(views, window, block, xy, index, slope.T, side, config.selection)
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:
     return core.at_level(level, config.pyramid.halo).within(scene.seen.at_level(level, 0))
 
 
-def _read(scene: MatchScene, core: CellWindow, config: RunConfig) -> list[ViewPixels]:
-    """Pixels of all views that may see the tile, the leading one first."""
+def _read(scene: MatchScene, core: CellWindow, config: RunConfig, choose: bool) -> tuple[list[ViewPixels], list[int]]:
+    """Pixels of the views that may see the tile, the leading one first, and their numbers in the scene.
+
+    choose : whether those beyond the most promising ones are left out.
+    """
     coarsest = scene.levels - 1
     window = _level_window(scene, core, coarsest, config)
     z = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
     transform = scene.transform(window, coarsest)
     across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
     corners = np.array([transform * (c, r) for c in across for r in down])
+    parts = [pixel_window(view, corners, z, 2**coarsest) for view in scene.views]
+    which = [number for number, part in enumerate(parts) if part is not None]
+    if choose and len(which) > config.selection.candidates + 1:
+        rows = preselected([scene.views[number] for number in which], corners, sum(z) / 2, config.selection)
+        which = [which[row] for row in rows]
     found = []
-    for view, grey in zip(scene.views, scene.grey, strict=True):
-        part = pixel_window(view, corners, z, 2**coarsest)
-        if part is not None:
-            found.append(read_pixels(view, part, scene.levels, *grey))
-    return found
+    for number in which:
+        part = parts[number]
+        assert part is not None
+        found.append(read_pixels(scene.views[number], part, scene.levels, *scene.grey[number]))
+    return found, which
 
 
 @dataclass(frozen=True)
 class Guide:
     """What is known of a level's heights before it is matched, in its own height indices, all (r, c) float32.
 
-    surface : the coarser level's; low, high : lowest and highest index worth a look, NaN where nothing is known.
+    surface : the coarser level's; low, high : lowest and highest index worth a look, NaN where nothing is known;
+    coarser : that level, None at the coarsest.
     """
 
     surface: NDArray[np.float32] | None
     low: NDArray[np.float32]
     high: NDArray[np.float32]
+    coarser: LevelResult | None = None
 
 
 def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.float32] | None) -> Guide:
@@ -175,8 +235,9 @@ def _match_level(
     config: RunConfig,
     method: str,
     use_visibility: bool,
+    ranking: Ranking | None,
 ) -> LevelResult:
-    """One level: base surface, ranges, visibility, costs, semi-global constraint."""
+    """One level: base surface, ranges, visibility, choice of views, costs, semi-global constraint."""
     shape, block = (window.rows, window.cols), config.pyramid.block
     step = scene.step_m * 2**level
     n_steps = -(-scene.n_steps // 2**level)
@@ -192,13 +253,68 @@ def _match_level(
     if guide.surface is not None and use_visibility:
         obstacle = cv2.erode(guide.surface, OBSTACLE)
         hide(seen, views, obstacle, base.cells, block, config.measure.hidden_margin_steps)
+    used, worth, added, all_views = seen, seen, 0, _evaluations(seen, lattice)
+    if ranking is not None:
+        ground = None if guide.surface is None else guide.surface - base.cells
+        used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
+    done = _evaluations(used, lattice) + added
     ortho = None if smooth is None else _ortho(views, smooth, block)
-    cost = cost_volume(along_base, base, lattice, seen, config.measure)
+    cost = cost_volume(along_base, base, lattice, used, config.measure)
     if method == "mvll":
         heights = pick(cost.astype(np.uint16), lattice)
     else:
         heights = aggregate(cost, lattice, penalties(ortho, shape, level, config.semiglobal), config.semiglobal)
-    return LevelResult(window, views, lattice, above_base(seen, base.cells), heights.above(base.cells))
+    worth = above_base(worth, base.cells)
+    return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), done, all_views)
+
+
+def _choose(
+    seen: NDArray[np.int32],
+    ranking: Ranking,
+    lattice: HeightLattice,
+    window: CellWindow,
+    level: int,
+    ground: NDArray[np.float32] | None,
+    coarser: LevelResult | None,
+    config: RunConfig,
+) -> tuple[NDArray[np.int32], NDArray[np.int32], int]:
+    """`seen` of the views that each block needs to be matched, and of all that help; and what it took to find out, cell
+    x step x view.
+
+    A finer block takes as many as the match curves of the coarser level ask for.
+    """
+    options, block = config.selection, lattice.block
+    order = order_views(ranking, block_shares(seen, lattice), block_middles(window, level, lattice), options)
+    every, evaluations = np.full(len(order.reference), order.search.shape[1]), 0
+    needed = np.minimum(every, COARSEST_SEARCH)
+    if coarser is not None:
+        cells, of_block = sampled_cells(lattice)
+        covering = covers(seen[:, :, cells[:, 0], cells[:, 1]]).T
+        offset = np.array([window.row, window.col]), np.array([coarser.window.row, coarser.window.col])
+        last = np.array([coarser.window.rows - 1, coarser.window.cols - 1])
+        below = np.clip((cells + offset[0]) // 2 - offset[1], 0, last)
+        reach = max(options.reach_steps >> coarser.level, FEWEST_STEPS)
+        surface = smoothed(coarser.heights.vertex, config.refine.jump_steps)
+        above = Coarser(coarser.views, coarser.seen, surface, config.measure.large_window, reach, block)
+        match = images_needed(above, below, of_block, covering, order, options)
+        needed = np.where(match.n_added > 0, match.n_added, every)
+        evaluations = match.evaluations + len(cells) * (2 * reach + 1)
+    few = seen[:, :, ::STRIDE, ::STRIDE]
+    covered = covers(few) if ground is None else sees(few, ground[::STRIDE, ::STRIDE])
+    covered = covered.reshape(seen.shape[1], -1)
+    of_cell = block_of_cells(lattice, STRIDE).ravel()
+    used = _only(seen, chosen_views(order, needed, covered, of_cell, options), lattice)
+    return used, _only(seen, chosen_views(order, every, covered, of_cell, options), lattice), evaluations
+
+
+def _only(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLattice) -> NDArray[np.int32]:
+    """`seen` without the views that a block does not take. chosen : (i, b) bool."""
+    by_block = chosen.reshape(len(chosen), *lattice.count.shape)
+    rows, cols = lattice.shape
+    left_out = ~by_block.repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
+    kept = seen.copy()
+    kept[0][left_out], kept[1][left_out] = HIDDEN, NOTHING_HIDDEN
+    return kept
 
 
 def _ortho(views: TileViews, surface: NDArray[np.float32], block: int, view: int = 0) -> NDArray[np.float32]:

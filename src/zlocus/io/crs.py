@@ -6,6 +6,16 @@ from pyproj import CRS
 
 from zlocus.errors import ConfigError
 
+LOCAL = (
+    'ENGCRS["Local Cartesian frame, z up",EDATUM["Local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
+    'LENGTHUNIT["metre",1]]'
+)
+
+
+def local_frame() -> CRS:
+    """Cartesian axes in metres, z up, at no known place of the Earth."""
+    return CRS.from_wkt(LOCAL)
+
 
 def checked_crs(crs: CRS) -> CRS:
     """The horizontal part of a projected CRS in metres.

@@ -1,20 +1,23 @@
 """Scenes from files: a list of images with their own cameras, or one `scene.yaml` (schema 1).
 
 schema: 1
-frame: {crs: "EPSG:32631"}             # optional: else the UTM zone of the scene's centre
+frame: {crs: "EPSG:32631"}             # optional: else the UTM zone of the scene's centre; or {local: true}
 area: {bounds: [xmin, ymin, xmax, ymax]}   # optional, in that CRS
 heights: [zmin, zmax]                  # optional, ellipsoidal metres
 views:
   - name: nadir
     image: img_n1.tif                  # relative to this file
     camera: {kind: rpc, file: other_RPC.TXT, shift: [0.3, -1.2]}   # file and shift are optional
+    date: 2026-05-17                   # optional: near dates are compared first
 """
 
 from __future__ import annotations
 
+import datetime
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,19 +28,26 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, InputError, OutputError
 from zlocus.io.camera_kinds import KINDS, Camera, CameraSource, RpcCamera
-from zlocus.io.crs import checked_crs, utm_zone
+from zlocus.io.crs import checked_crs, local_frame, utm_zone
 from zlocus.io.images import RasterImage, check_content, open_image
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import StrictModel, validated
-from zlocus.scene import Scene, View
+from zlocus.scene import Scene, View, is_local
 
 SCENE_SUFFIXES = (".yaml", ".yml")
 
 
 class Frame(StrictModel):
-    """The CRS all views share."""
+    """What all views share: a CRS, or local Cartesian axes in metres with z up."""
 
-    crs: str
+    crs: str | None = None
+    local: Literal[True] | None = None
+
+    @model_validator(mode="after")
+    def _either(self) -> Frame:
+        if (self.crs is None) == (self.local is None):
+            raise ValueError("give either crs: EPSG:n or local: true")
+        return self
 
 
 class Area(StrictModel):
@@ -54,11 +64,12 @@ class Area(StrictModel):
 
 
 class ViewEntry(StrictModel):
-    """One image and its camera. name : unique."""
+    """One image and its camera. name : unique; date : of the exposure."""
 
     name: str = Field(min_length=1)
     image: str
     camera: SerializeAsAny[Camera]
+    date: datetime.date | None = None
 
 
 class SceneFile(StrictModel):
@@ -80,6 +91,8 @@ class SceneFile(StrictModel):
                 raise ValueError(f"the view name {name!r} is used twice")
         if self.area is not None and self.frame is None:
             raise ValueError("area needs frame: {crs: EPSG:n}, whose coordinates its bounds are")
+        if self.frame is not None and self.frame.local and any(isinstance(v.camera, RpcCamera) for v in self.views):
+            raise ValueError("frame is local, but an RPC knows its place on the Earth: write frame: {crs: EPSG:n}")
         return self
 
 
@@ -151,14 +164,20 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
 def _from_scene_file(path: Path, crs: CRS | None) -> Scene:
     scene_file = read_scene_file(path)
     frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
+    if frame is not None and is_local(frame) and crs is not None:
+        raise ConfigError(f"{path} has a local frame, which --crs cannot place on the Earth. Leave --crs out.")
     if scene_file.area is not None and crs is not None and crs != frame:
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
     views = [(view.name, path.parent / view.image, view.camera) for view in scene_file.views]
     bounds = None if scene_file.area is None else scene_file.area.bounds
-    return _build(views, path.parent, crs or frame, bounds, scene_file.heights)
+    scene = _build(views, path.parent, crs or frame, bounds, scene_file.heights)
+    dated = zip(scene.views, scene_file.views, strict=True)
+    return replace(scene, views=tuple(replace(view, date=entry.date) for view, entry in dated))
 
 
 def _frame_crs(frame: Frame, path: Path) -> CRS:
+    if frame.local:
+        return local_frame()
     try:
         return CRS.from_user_input(frame.crs)
     except CRSError as error:
@@ -173,7 +192,7 @@ def _build(
     heights: tuple[float, float] | None = None,
 ) -> Scene:
     """Open images and cameras, then fix the frame."""
-    crs = None if crs is None else checked_crs(crs)
+    crs = crs if crs is None or is_local(crs) else checked_crs(crs)
     _check_distinct([path for _, path, _ in entries])
     images = [open_image(path) for _, path, _ in entries]
     if len(entries) < 2:

@@ -83,8 +83,9 @@ class SearchPlan:
 
     order : (b, j) int64, search images of each block, best first, each once; block : (n,) int64, the block of each
     cell; seen : (n, i) bool, whether the image enters the cell (over its whole range; heights hidden in it are NaN in
-    the measure); step_px : (i,) float64, equivalent disparity of one step of height in each image; sample : (n,) bool,
-    the cells that decide when a block stops.
+    the measure); step_px : (i,) or (b, i) float64, equivalent disparity of one step of height in each image; sample :
+    (n,) bool, the cells that decide when a block stops; window_cells : cells that a correlation rests on, 0 where a
+    stop asks for the label alone.
     """
 
     order: IntArray
@@ -92,6 +93,7 @@ class SearchPlan:
     seen: NDArray[np.bool_]
     step_px: FloatArray
     sample: NDArray[np.bool_]
+    window_cells: int = 0
 
     @classmethod
     def by_cell(cls, order: IntArray, seen: NDArray[np.bool_], step_px: FloatArray) -> SearchPlan:
@@ -106,10 +108,10 @@ def match_progressively(
     """Add images in order until the match curves are good.
 
     A block adds images until `stopped_share` of its sampled cells has stopped: their curve was good after one of the
-    images, or no image is left that sees them. A cell that has stopped takes part as long as its block goes on. A
-    block without a sampled cell adds all images. Rivals of a mean count by the equivalent disparity of the most
-    sensitive image in it.
-    Source: Ji et al. 2014, section 3.3, step 3; blocks are ours.
+    images, and its peak precise enough (`sigma_steps`, see `predicted_sigma`), or no image is left that sees them. A
+    cell that has stopped takes part as long as its block goes on. A block without a sampled cell adds all images.
+    Rivals of a mean count by the equivalent disparity of the most sensitive image in it.
+    Source: Ji et al. 2014, section 3.3, step 3; blocks and precision are ours.
     """
     n_cells, n_ranks = len(plan.block), plan.order.shape[1]
     everyone = np.arange(n_cells)
@@ -119,6 +121,7 @@ def match_progressively(
     n_images, n_added = np.zeros(n_cells, np.int64), np.zeros(len(plan.order), np.int64)
     is_stopped = np.zeros(n_cells, bool)
     n_evaluated = 0
+    step_px = np.broadcast_to(plan.step_px, (len(plan.order), plan.seen.shape[1]))
     goes_on = _goes_on(images_left == 0, plan, options)
     for rank in range(n_ranks):
         n_added += goes_on
@@ -129,9 +132,9 @@ def match_progressively(
         n_evaluated += len(cells)
         n_images[cells] += ~np.isnan(ncc).all(axis=1)
         images_left[cells] -= 1
-        widest_px[cells] = np.maximum(widest_px[cells], plan.step_px[images])
+        widest_px[cells] = np.maximum(widest_px[cells], step_px[plan.block[cells], images])
         judged = cells[plan.sample[cells] & ~is_stopped[cells]]
-        is_stopped[judged] = curve_labels(mean.sncc(judged), widest_px[judged], options) == GOOD
+        is_stopped[judged] = _is_enough(mean, judged, widest_px[judged], plan, options)
         goes_on &= _goes_on(is_stopped | (images_left == 0), plan, options)
         if not goes_on.any():
             break
@@ -145,6 +148,35 @@ def match_progressively(
         evaluations=n_evaluated * n_heights,
         evaluations_all=int(enters.sum()) * n_heights,
     )
+
+
+def _is_enough(
+    mean: ProgressiveMean, cells: IntArray, step_px: FloatArray, plan: SearchPlan, options: SelectionOptions
+) -> NDArray[np.bool_]:
+    """Whether the curves of some cells are distinct, and precise enough, (m,) bool."""
+    curves = mean.sncc(cells)
+    enough = curve_labels(curves, step_px, options) == GOOD
+    if plan.window_cells:
+        enough &= predicted_sigma(curves, mean.count[cells], plan.window_cells) <= options.sigma_steps
+    return np.asarray(enough)
+
+
+def predicted_sigma(curves: FloatArray, count: IntArray, window_cells: int) -> FloatArray:
+    """Standard deviation of the peak of mean correlations, (n,) in height steps; infinite where it has no two sides.
+
+    curves : (n, h) float64, NaN where not seen; count : (n, h) images in each mean; window_cells : N, of each window.
+    With rho at the peak, c = -d2 rho / dk2 there and m images: sqrt(2 (1 - rho) / (c N m)), from 1 - rho = noise over
+    signal of N pixels, which moves the vertex of a parabola of curvature c. A wide base bends the curve more, and so
+    does texture.
+    """
+    highest = np.where(np.isnan(curves), -np.inf, curves).argmax(axis=1)
+    peak, rows = np.clip(highest, 1, curves.shape[1] - 2), np.arange(len(curves))
+    left, rho, right = (curves[rows, peak + d] for d in (-1, 0, 1))
+    bend = 2 * rho - left - right
+    images = np.maximum(count[rows, peak], 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = np.sqrt(2 * np.maximum(1 - rho, 0) / (bend * window_cells * images))
+    return np.where((bend > 0) & (peak == highest), sigma, np.inf)
 
 
 def _goes_on(is_done: NDArray[np.bool_], plan: SearchPlan, options: SelectionOptions) -> NDArray[np.bool_]:

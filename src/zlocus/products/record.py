@@ -20,7 +20,18 @@ from zlocus.errors import OutputError
 
 SCHEMA = 1
 CHUNK_BYTES = 1 << 20
-LIBRARIES = ("zlocus", "numpy", "numba", "scipy", "rasterio", "pyproj", "odc-geo", "opencv-python-headless")
+LIBRARIES = (
+    "zlocus",
+    "numpy",
+    "numba",
+    "scipy",
+    "rasterio",
+    "pyproj",
+    "odc-geo",
+    "opencv-python-headless",
+    "laspy",
+    "lazrs",
+)
 
 
 @dataclass

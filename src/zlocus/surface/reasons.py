@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Quality(IntFlag):
-    """Bits of `quality.tif`. The first six empty a cell, the others only warn."""
+    """Bits of `quality.tif`. The first seven empty a cell, the others only warn."""
 
     OUTSIDE = 1  # not asked for: outside the area, or inside a mask
     UNSEEN = 2  # fewer than two images cover the cell
@@ -17,6 +17,7 @@ class Quality(IntFlag):
     RANGE_END = 8  # best match at an end of the height range: the true height may lie beyond it
     NO_MATCH = 16  # images do not agree at any height
     FAILED = 32  # its tile could not be processed
+    UNCONFIRMED = 64  # no other image finds the same height when matched back (clouds only)
     WEAK = 256  # images agree poorly
     AMBIGUOUS = 512  # another height fits nearly as well
     JUMP = 1024  # next to a jump in height
@@ -24,7 +25,10 @@ class Quality(IntFlag):
     FILLED = 4096  # no match: interpolated from its neighbours
 
 
-EMPTY = Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
+EMPTY = (
+    Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
+    | Quality.UNCONFIRMED
+)  # fmt: skip
 
 
 def is_empty(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:

@@ -1,0 +1,248 @@
+"""Which views to match a cell with: all of them, some by geometry, or those that tie points and match curves ask for.
+
+    python benchmarks/selection.py [SCENE_FOLDER] [-o OUT] [--only NAME ...]
+
+SCENE_FOLDER holds img_*.tif with RPC, truth_dsm.tif and truth_class.tif; the default is the rendered town, two of whose
+eight views are spoiled: d1 (another date) and d2 (haze, blur, clouds). Each choice is one run of `zlocus dsm`:
+
+- all images: `--views all`, which knows nothing of hidden views either;
+- all images, hidden ones masked: what the choices below are to be compared with;
+- six good images: without those that are spoiled (names that begin with d);
+- k best by geometry: the most nadir view and k - 1 others by `candidate_images` (angles and overlap alone);
+- guided: `--views auto`, ranked at tie points, added until match curves are distinct and precise;
+- guided, rule of the paper: the label alone stops, for 95 % of the cells, and no view is left out for its labels.
+
+Judged against the truth: share of cells within 1 m (empty ones are not), NMAD; NCC evaluations against those of all
+images; CPU of the matching. Then, as the paper does, the final match curves: at about 2000 regularly spaced cells the
+mean NCC over the views that were used there, along the fixed range around the height found; medians of its largest
+value and of the ratio to the second peak. Writes selection.csv and selection.png, prints a table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from pyproj import CRS
+
+from zlocus import cli, tile
+from zlocus.io.config import write_config
+from zlocus.io.scene_file import open_scene
+from zlocus.matching.curve import GOOD, curve_peaks, quality_labels
+from zlocus.matching.order import SearchGeometry, candidate_images
+from zlocus.matching.progressive import ProgressiveMean
+from zlocus.matching.refine import smoothed
+from zlocus.matching.selection import Samples
+from zlocus.matching.setup import leading_first, nadir_offset
+from zlocus.matching.visibility import cells_per_step, covers
+from zlocus.options import RunConfig, SelectionOptions
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+JUDGE = SHARED / "tools" / "evaluate_dsm.py"
+SPOILED = "d"
+CURVES = 2000
+KEEP_ALL = RunConfig(selection=SelectionOptions(least_images=254))
+OF_THE_PAPER = RunConfig(selection=SelectionOptions(sigma_steps=1000.0, stopped_share=0.95, least_worth=0.0))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """images : names of those given; views : --views."""
+
+    images: tuple[str, ...]
+    views: str
+    config: RunConfig
+
+
+def choices(names: list[str], by_geometry: list[str]) -> dict[str, Choice]:
+    """The runs, by the name they are printed under."""
+    good = tuple(name for name in names if not name.startswith(SPOILED))
+    every = tuple(names)
+    best = {f"{k} best by geometry": Choice(tuple(by_geometry[:k]), "auto", KEEP_ALL) for k in (3, 4, 5, 6)}
+    return {
+        "all images": Choice(every, "all", KEEP_ALL),
+        "all images, hidden ones masked": Choice(every, "auto", KEEP_ALL),
+        "six good images": Choice(good, "auto", KEEP_ALL),
+        **best,
+        "guided": Choice(every, "auto", RunConfig()),
+        "guided, rule of the paper": Choice(every, "auto", OF_THE_PAPER),
+    }
+
+
+def ranked_by_geometry(images: dict[str, Path], crs: str, z: float) -> list[str]:
+    """The most nadir view, then the others as `candidate_images` ranks them from angles; all overlap wholly here."""
+    views = leading_first(open_scene(tuple(images.values()), CRS.from_user_input(crs)), z, None)
+    rays = np.array([(*nadir_offset(view, z), 1.0) for view in views])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    angle_deg = np.degrees(np.arccos(np.clip(rays[1:] @ rays[0], -1.0, 1.0)))
+    unknown = np.full(len(angle_deg), np.nan)
+    geometry = SearchGeometry(np.ones(len(angle_deg)), angle_deg, unknown)
+    best = candidate_images(geometry, SelectionOptions(candidates=len(views)))
+    by_path = {path: name for name, path in images.items()}
+    return [by_path[views[i].path] for i in (0, *(best + 1))]
+
+
+@contextmanager
+def watched(tiles: list[tuple[Any, np.ndarray, RunConfig]]) -> Iterator[None]:
+    """Adds what `final_curves` takes of every tile that is matched: finest level, its views used, options."""
+    used: list[np.ndarray] = []
+    costs, finish = tile.cost_volume, tile._finish
+
+    def cost_volume(views: Any, base: Any, lattice: Any, seen: Any, measure: Any) -> Any:
+        used[:] = [seen]
+        return costs(views, base, lattice, seen, measure)
+
+    def finished(scene: Any, pixels: Any, result: Any, config: RunConfig) -> Any:
+        tiles.append((result, used[0], config))
+        return finish(scene, pixels, result, config)
+
+    tile.cost_volume, tile._finish = cost_volume, finished
+    try:
+        yield
+    finally:
+        tile.cost_volume, tile._finish = costs, finish
+
+
+def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int) -> np.ndarray:
+    """(n, 4): rho1, ratio, label and number of views of the mean curves over the views used, at a cell in `spacing`.
+
+    The reference is the first (most nadir) view used at a cell.
+    """
+    half, options, block = config.measure.large_window // 2, config.selection, config.pyramid.block
+    surface = smoothed(result.heights.vertex, config.refine.jump_steps)
+    rows, cols = (np.arange(half + spacing // 2, n - half, spacing) for n in surface.shape)
+    cells = np.stack([v.ravel() for v in np.meshgrid(rows, cols, indexing="ij")], axis=1)
+    takes = covers(used)[:, cells[:, 0], cells[:, 1]].T
+    cells, takes = cells[takes.sum(axis=1) > 1], takes[takes.sum(axis=1) > 1]
+    row, col = cells.T
+    here = surface[row, col]
+    around = [surface[row + i, col + j] - here for i in range(-half, half + 1) for j in range(-half, half + 1)]
+    samples = Samples(cells, here - float(options.reach_steps), 2 * options.reach_steps + 1,
+                      np.ascontiguousarray(np.stack(around, axis=1), np.float32))  # fmt: skip
+    index = samples.first[:, None] + np.arange(samples.n_heights)
+    windows = []
+    for view in range(takes.shape[1]):
+        found = samples.windows(result.views, view, block, slice(None))
+        found[index < result.seen[2, view, row, col][:, None]] = np.nan
+        windows.append(found)
+    reference, everyone = takes.argmax(axis=1), np.arange(len(cells))
+    per_step = np.array([cells_per_step(result.views, i, block) for i in range(takes.shape[1])])
+    mean, widest_px = ProgressiveMean.empty(len(cells), samples.n_heights), np.zeros(len(cells))
+    first = np.stack(windows)[reference, everyone]
+    for view, found in enumerate(windows):
+        which = np.flatnonzero(takes[:, view] & (reference != view))
+        mean.add(which, np.einsum("nhk,nhk->nh", first[which], found[which]))
+        px = np.hypot(*(per_step[reference[which]] - per_step[view]).T)
+        widest_px[which] = np.maximum(widest_px[which], px)
+    peaks = curve_peaks(mean.sncc(everyone), widest_px, options)
+    labels = quality_labels(peaks.rho1, peaks.ratio, peaks.is_open, options)
+    return np.stack([peaks.rho1, peaks.ratio, labels, takes.sum(axis=1)], axis=1)
+
+
+def run(name: str, choice: Choice, folder: Path, out: Path) -> dict[str, Any]:
+    """One choice: the run, its judgement and its curves, by the names of `COLUMNS` (evaluations in millions)."""
+    truth, classes = folder / "truth_dsm.tif", folder / "truth_class.tif"
+    with rasterio.open(truth) as file:
+        bounds, crs, cell = file.bounds, str(file.crs), 2 * file.res[0]
+    spacing = max(int(np.sqrt((bounds.right - bounds.left) * (bounds.top - bounds.bottom) / CURVES) / cell), 1)
+    place = out / name.replace(",", "").replace(" ", "-")
+    shutil.rmtree(place, ignore_errors=True)
+    options = out / f"{place.name}.toml"
+    options.write_text(write_config(choice.config), encoding="utf-8")
+    images = [str(folder / f"img_{image}.tif") for image in choice.images]
+    tiles: list[tuple[Any, np.ndarray, RunConfig]] = []
+    with watched(tiles), redirect_stdout(sys.stderr):
+        cli.app(
+            ["dsm", *images, "-o", str(place), "--crs", crs, "--resolution", str(cell), "--views", choice.views,
+             "--bounds", *map(str, bounds), "--config", str(options)], standalone_mode=False,
+        )  # fmt: skip
+    record = json.loads((place / "run.json").read_text())
+    done, every = record["evaluations"]["done"], record["evaluations"]["all_images"]
+    cpu = next(stage["cpu_s"] for stage in record["stages"] if stage["name"] == "match")
+    judged = judge(place / "dsm.tif", truth, classes)
+    of_curves = np.concatenate([final_curves(*one, spacing) for one in tiles])
+    known = of_curves[np.isfinite(of_curves[:, 0])]
+    within = {f"within_{kind}": judged[kind]["within"] for kind in ("all", "ground", "building", "tree")}
+    return {
+        "choice": name, "images": len(images), **within, "nmad_ground": judged["ground"]["nmad"],
+        "evaluations": done / 1e6, "share": done / every, "cpu_s": cpu, "views_used": float(known[:, 3].mean()),
+        "rho1": float(np.median(known[:, 0])), "ratio": float(np.median(known[:, 1])),
+        "good": float((known[:, 2] == GOOD).mean()),
+    }  # fmt: skip
+
+
+def judge(dsm: Path, truth: Path, classes: Path) -> dict[str, Any]:
+    """Figures per class: of the independent script where it is at hand, else of our own evaluation."""
+    if JUDGE.exists():
+        command = [sys.executable, str(JUDGE), str(dsm), str(truth), "--class", str(classes), "--json"]
+        found = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        return dict(json.loads(found))
+    from zlocus.evaluation.evaluate import evaluate
+
+    return evaluate(dsm, truth, classes=classes).as_dict()
+
+
+COLUMNS = {
+    "choice": "{choice}", "within 1 m": "{within_all:.1%}", "ground": "{within_ground:.1%}",
+    "building": "{within_building:.1%}", "tree": "{within_tree:.1%}", "NMAD, ground, m": "{nmad_ground:.3f}",
+    "evaluations, M": "{evaluations:.0f}", "of all": "{share:.0%}", "CPU, s": "{cpu_s:.1f}",
+    "views a cell": "{views_used:.1f}", "rho1": "{rho1:.3f}", "ratio": "{ratio:.2f}", "label 1": "{good:.0%}",
+}  # fmt: skip
+
+
+def picture(found: list[dict[str, Any]], path: Path) -> None:
+    """Accuracy and the largest correlation against the work."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
+    panels = (("within_all", "cells within 1 m"), ("within_building", "building cells within 1 m"),
+              ("rho1", "median rho1 of the final curves"))  # fmt: skip
+    markers = ("o", "s", "^", "v", "<", ">", "D", "P", "X")
+    for axis, (name, label) in zip(axes, panels, strict=True):
+        for one, marker in zip(found, markers, strict=False):
+            axis.plot(one["evaluations"], one[name], marker, label=one["choice"], markersize=9, alpha=0.7)
+        axis.set(xlabel="NCC evaluations, millions", ylabel=label)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=9)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path, default=SHARED / "data" / "rendered-city")
+    parser.add_argument("-o", "--out", type=Path, default=Path("selection"))
+    parser.add_argument("--only", nargs="*", help="names of the choices to run")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    images = {path.stem.removeprefix("img_"): path for path in sorted(arguments.folder.glob("img_*.tif"))}
+    with rasterio.open(arguments.folder / "truth_dsm.tif") as file:
+        crs, z = str(file.crs), float(np.median(file.read(1)))
+    found = []
+    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS), flush=True)
+    for name, choice in choices(list(images), ranked_by_geometry(images, crs, z)).items():
+        if arguments.only is None or name in arguments.only:
+            found.append(run(name, choice, arguments.folder, arguments.out))
+            print("| " + " | ".join(form.format(**found[-1]) for form in COLUMNS.values()) + " |", flush=True)
+    with (arguments.out / "selection.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, found[0])
+        writer.writeheader()
+        writer.writerows(found)
+    picture(found, arguments.out / "selection.png")
+
+
+if __name__ == "__main__":
+    main()

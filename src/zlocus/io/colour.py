@@ -1,0 +1,29 @@
+"""Colours of image pixels: red, green and blue where a file declares them, else grey."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import ColorInterp
+from rasterio.windows import Window
+
+from zlocus.io.opening import open_raster
+
+CHANNELS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+
+
+def read_colours(path: Path, row: int, rows: int) -> NDArray[np.float32]:
+    """Whole rows of an image, (rows, c, 3) float32, in the file's own numbers.
+
+    Raises
+    ------
+    InputError
+        When the file can no longer be read.
+    """
+    with open_raster(path) as source:
+        index = {meaning: band for band, meaning in zip(source.indexes, source.colorinterp, strict=True)}
+        bands = [index[channel] for channel in CHANNELS] if all(c in index for c in CHANNELS) else [1, 1, 1]
+        values = source.read(bands, window=Window(0, row, source.width, rows), out_dtype=np.float32)
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1))

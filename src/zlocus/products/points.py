@@ -1,0 +1,158 @@
+"""ties.gpkg and ranking.gpkg: what the tie points are, and what they say of the images, as layers of points."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from zlocus.errors import OutputError
+from zlocus.matching.cells import CellWindow
+from zlocus.matching.curve import GOOD
+from zlocus.matching.selection import Ranking
+from zlocus.orientation.orient import Orientation
+from zlocus.orientation.triangulate import project_points
+from zlocus.scene import Scene, is_local
+from zlocus.sensors.model import FloatArray
+
+# In place of a label that there is not; becomes NULL.
+NOT_RANKED = -128
+
+
+def write_ties(path: Path, orientation: Orientation, oriented: Scene) -> None:
+    """Layer `ties`: one 3-D point per tie, in the scene's frame.
+
+    Columns: height_m; sigma_z_m, its standard deviation; n_images; images, their names with commas between;
+    residual_px, the largest distance of an observation from the projected point. Ties whose rays do not meet are left
+    out.
+    oriented : the scene with the orientation applied.
+
+    Raises
+    ------
+    OutputError
+        Where the file cannot be written.
+    """
+    seen, xyz = orientation.seen, orientation.xyz
+    away = np.hypot(*(seen.xy - project_points([view.sensor for view in oriented.views], seen, xyz)).T)
+    residual = np.zeros(len(xyz))
+    np.maximum.at(residual, seen.point, np.nan_to_num(away))
+    n_images = np.bincount(seen.point, minlength=len(xyz)).astype(np.int32)
+    names: list[list[str]] = [[] for _ in xyz]
+    order = np.lexsort((seen.view, seen.point))
+    for point, view in zip(seen.point[order].tolist(), seen.view[order].tolist(), strict=True):
+        names[point].append(oriented.views[view].name)
+    kept = np.isfinite(xyz).all(axis=1)
+    images = np.array([",".join(parts) for parts in names], dtype=object)
+    columns: dict[str, NDArray[np.generic]] = {
+        "height_m": xyz[:, 2], "sigma_z_m": orientation.sigma_z_m, "n_images": n_images, "images": images,
+        "residual_px": residual,
+    }  # fmt: skip
+    write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, oriented.crs)
+
+
+@dataclass(frozen=True)
+class RankedPoints:
+    """Tie points of one tile with the labels of its images.
+
+    xyz : (n, 3) m; labels : (n, k, k) int8, of search image (last axis) against reference; views : (k,) int64, which of
+    the scene's images they are.
+    """
+
+    xyz: FloatArray
+    labels: NDArray[np.int8]
+    views: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, ranking: Ranking, views: Sequence[int], ties: FloatArray, kept: CellWindow) -> RankedPoints:
+        """Those in a window of finest cells, so that no point of two tiles counts twice. ties : (n, 3) m, all."""
+        first, size = np.array([kept.col, kept.row]), np.array([kept.cols, kept.rows])
+        inside = ((ranking.xy >= first) & (ranking.xy < first + size)).all(axis=1)
+        return cls(ties[ranking.tie[inside]], ranking.labels[inside], np.array(views, np.int64))
+
+    def rows(self, n_views: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int16]]:
+        """A row per point and reference: its xyz (m, 3) m, reference (m,), labels (m, n_views), `NOT_RANKED` where the
+        image is the reference or was not compared."""
+        n, k = self.labels.shape[:2]
+        labels = np.full((n, k, n_views), NOT_RANKED, np.int16)
+        labels[:, :, self.views] = self.labels
+        labels[:, np.arange(k), self.views] = NOT_RANKED
+        return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), labels.reshape(n * k, n_views)
+
+
+def write_ranking(path: Path, ranked: Sequence[RankedPoints], names: Sequence[str], crs: CRS) -> None:
+    """Layer `ranking`: one 3-D point per ranked tie point and reference, from south-west to north-east.
+
+    Columns: reference; height_m; n_good, search images labelled 1 there; label_NAME of every image, NULL where it is
+    the reference or was not compared. names : of the scene's images.
+
+    Raises
+    ------
+    OutputError
+        Where the file cannot be written.
+    """
+    parts = [part.rows(len(names)) for part in ranked]
+    nothing = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, len(names)), np.int16))
+    xyz, reference, labels = (np.concatenate(arrays) for arrays in zip(nothing, *parts, strict=True))
+    order = np.lexsort((reference, xyz[:, 1], xyz[:, 0]))
+    xyz, reference, labels = xyz[order], reference[order], labels[order]
+    columns: dict[str, NDArray[np.generic]] = {
+        "reference": np.array(names, dtype=object)[reference],
+        "height_m": xyz[:, 2],
+        "n_good": (labels == GOOD).sum(axis=1).astype(np.int32),
+    }
+    nulls = {}
+    for i, name in enumerate(column_names(names)):
+        columns[name], nulls[name] = labels[:, i].copy(), labels[:, i] == NOT_RANKED
+    write_points(path, "ranking", xyz, columns, crs, nulls)
+
+
+def column_names(names: Sequence[str]) -> list[str]:
+    """Columns of images, all different in a format that takes A and a for one."""
+    found: list[str] = []
+    for name in names:
+        column, k = f"label_{name}", 1
+        while column.casefold() in {old.casefold() for old in found}:
+            k += 1
+            column = f"label_{name}_{k}"
+        found.append(column)
+    return found
+
+
+def write_points(
+    path: Path,
+    layer: str,
+    xyz: FloatArray,
+    columns: dict[str, NDArray[np.generic]],
+    crs: CRS,
+    nulls: dict[str, NDArray[np.bool_]] | None = None,
+) -> None:
+    """A GeoPackage of one layer of 3-D points, whole or not at all. xyz : (n, 3) m; columns, nulls : (n,) each, NULL
+    where NaN or in `nulls`; a local frame has no CRS."""
+    # pyogrio brings pandas, a third of a second.
+    import pyogrio.raw
+    from pyogrio.errors import DataLayerError, DataSourceError
+    from shapely import points, to_wkb
+
+    # GDAL minds another ending.
+    part = path.with_name(f".{path.stem}.{os.getpid()}.part.gpkg")
+    masks = [(nulls or {}).get(name, np.zeros(len(xyz), bool)) for name in columns]
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="'crs' was not provided")
+            pyogrio.raw.write(
+                part, np.asarray(to_wkb(points(xyz), output_dimension=3, flavor="iso"), dtype=object),
+                list(columns.values()), np.array(list(columns), dtype=object), field_mask=masks, layer=layer,
+                driver="GPKG", geometry_type="Point Z", crs=None if is_local(crs) else crs.to_wkt(),
+            )  # fmt: skip
+        os.replace(part, path)
+    except (OSError, DataSourceError, DataLayerError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
+        raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
+    finally:
+        part.unlink(missing_ok=True)
