@@ -238,6 +238,7 @@ class SelectionOptions(Checked):
         0.55, "An image is left out where its accumulated label is below this share of the best one's.",
         low=0.0, high=1.0,
     )  # fmt: skip
+    fewest_views: int = option(7, "Where fewer images see a tile, all are used.", low=3, high=255)
     least_images: int = option(3, "Search images that are kept whatever their labels say.", low=1, high=254)
     candidates: int = option(12, "Search images considered for a block, at most.", low=1, high=254)
     least_overlap: float = option(

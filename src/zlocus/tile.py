@@ -147,7 +147,7 @@ def _ranking(
     scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, coarsest: LevelResult | None, config: RunConfig
 ) -> Ranking | None:
     """Labels of the views at the tie points in and around the tile; None where there are too few views to choose."""
-    if len(pixels) - 1 <= config.selection.least_images:
+    if len(pixels) < config.selection.fewest_views or len(pixels) - 1 <= config.selection.least_images:
         return None
     around = math.ceil(config.selection.radius_px)
     window = core.at_level(0, around).within(scene.seen)
