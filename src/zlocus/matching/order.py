@@ -10,14 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import chain
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from zlocus.matching.curve import GOOD
 from zlocus.options import SelectionOptions
+
+if TYPE_CHECKING:
+    from scipy.spatial import Delaunay, cKDTree
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -108,6 +110,9 @@ def _weights(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray:
 
 def _ordered(near: Neighbours, labels: NDArray[np.int8], scene: IntArray, options: SelectionOptions) -> ImageOrder:
     """Order of the images at cells with these neighbours. scene : (i,) int64, the order of last resort."""
+    # SciPy costs a third of a second, which scenes whose views are all used need not spend.
+    from scipy.sparse import csr_array
+
     n_cells, counts = len(near.start) - 1, np.diff(near.start)
     shape = (n_cells, len(labels))
     position = np.arange(len(near.index)) - np.repeat(near.start[:-1], counts)
@@ -133,6 +138,8 @@ class NeighbourSearch:
 
     def __init__(self, xy: FloatArray, options: SelectionOptions) -> None:
         """xy : (n, 2) float64 px, any number of feature points."""
+        from scipy.spatial import cKDTree
+
         # Map coordinates are large, and triangulation squares them.
         self.centre = xy.mean(axis=0) if len(xy) else np.zeros(2)
         self.xy = xy - self.centre
@@ -172,6 +179,8 @@ class NeighbourSearch:
 
 def triangulated(xy: FloatArray) -> Delaunay | None:
     """Delaunay triangulation of points around the origin, (n, 2); None for fewer than three, or all on one line."""
+    from scipy.spatial import Delaunay, QhullError
+
     if len(xy) < 3:
         return None
     try:
