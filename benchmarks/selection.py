@@ -52,8 +52,16 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 JUDGE = SHARED / "tools" / "evaluate_dsm.py"
 SPOILED = "d"
 CURVES = 2000
-KEEP_ALL = RunConfig(selection=SelectionOptions(least_images=254))
-OF_THE_PAPER = RunConfig(selection=SelectionOptions(sigma_steps=1000.0, stopped_share=0.95, least_worth=0.0))
+KEEP_ALL = RunConfig(selection=SelectionOptions(least_images=254, most_images=254))
+OF_THE_PAPER = RunConfig(
+    selection=SelectionOptions(
+        sigma_steps=1000.0,
+        stopped_share=0.95,
+        least_worth=0.0,
+        order="labels",
+        most_images=254,
+    )
+)
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,7 @@ def test_the_peak_lies_between_samples():
 
 
 def test_an_order_without_any_tie_point():
-    ranking = Ranking(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3, 3), np.int8))
+    ranking = Ranking(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3, 3), np.int8), np.ones((3, 3)))
     order = point_order(ranking, np.array([0.0, 1.0, 0.0]), np.zeros(2), OPTIONS)
     assert (order.reference, order.search.tolist(), order.evidence) == (1, [0, 2], Evidence.SCENE)
     assert order.is_worth.all()
@@ -238,7 +238,7 @@ def test_an_order_without_any_tie_point():
 def test_labels_follow_the_order():
     labels = np.zeros((2, 3, 3), np.int8)
     labels[0, 0], labels[1, 0] = [-1, 0, 1], [-1, -1, 1]
-    ranking = Ranking(np.arange(2), np.array([[9.0, 0.0], [3.0, 0.0]]), labels)
+    ranking = Ranking(np.arange(2), np.array([[9.0, 0.0], [3.0, 0.0]]), labels, np.ones((3, 3)))
     order = point_order(ranking, np.ones(3), np.zeros(2), OPTIONS)
     assert (order.reference, order.search.tolist()) == (0, [2, 1])
     assert order.accumulated.tolist() == [2, -1]

@@ -93,7 +93,8 @@ def test_ranking_has_a_row_per_point_and_reference(tmp_path):
 
 def test_a_tile_keeps_the_points_of_its_own_cells():
     xy = np.array([[9.9, 20.0], [10.0, 20.0], [13.9, 22.9], [12.0, 23.0]])
-    ranking = Ranking(np.array([4, 0, 2, 1]), xy, np.arange(4, dtype=np.int8)[:, None, None] * np.ones((2, 2), np.int8))
+    labels = np.arange(4, dtype=np.int8)[:, None, None] * np.ones((2, 2), np.int8)
+    ranking = Ranking(np.array([4, 0, 2, 1]), xy, labels, np.ones((2, 2)))
     ties = np.arange(15.0).reshape(5, 3)
     found = RankedPoints.of(ranking, [3, 5], ties, CellWindow(20, 10, 3, 4))
     np.testing.assert_array_equal(found.xyz, ties[[0, 2]])

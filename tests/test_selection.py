@@ -38,7 +38,7 @@ SHORT = SelectionOptions(reach_steps=16, feature_cells=8)
 SHAPE, BLOCK, SIDE, BORDER_PX = (40, 48), 16, 7, 20
 # Pixels along columns that a cell moves per step: the first view looks straight down.
 SPEEDS = (0.0, 0.5, -0.5, 0.7)
-LEVEL_STEPS, STEEP = 30.0, (0.0, 0.9)
+LEVEL_STEPS, STEEP, STEPS_PER_CELL = 30.0, (0.0, 0.9), 1.0
 
 
 def textured(slope=(0.0, 0.0), spoiled=(), noise=0.0, speeds=SPEEDS):
@@ -90,7 +90,7 @@ WINDOW = CellWindow(0, 0, *SHAPE)
 
 
 def ranked(views, xy, index, slope=(0.0, 0.0), window=WINDOW, options=SHORT):
-    return rank_views(views, window, BLOCK, xy, index, np.tile(slope, (len(xy), 1)), SIDE, options)
+    return rank_views(views, window, BLOCK, xy, index, np.tile(slope, (len(xy), 1)), SIDE, STEPS_PER_CELL, options)
 
 
 # --- rank_views ---
@@ -118,7 +118,8 @@ def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     rng = np.random.default_rng(2)
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)
-    found = rank_views(views, window, scene.block, xy, rng.uniform(5, 15, 50), np.zeros((50, 2)), SIDE, SHORT)
+    index, flat = rng.uniform(5, 15, 50), np.zeros((50, 2))
+    found = rank_views(views, window, scene.block, xy, index, flat, SIDE, STEPS_PER_CELL, SHORT)
     np.testing.assert_array_equal(found.labels, found.labels.swapaxes(1, 2))
     assert (np.diagonal(found.labels, axis1=1, axis2=2) == POOR).all()
     assert (found.labels == GOOD).mean() < 0.1
@@ -169,11 +170,13 @@ def test_windows_along_a_slope_agree_where_level_ones_do_not():
 # --- order_views ---
 
 
-def ranking_of(xy, labels):
-    """labels : of one symmetric (i, i) for all points, or (n, i, i)."""
+def ranking_of(xy, labels, angle_deg=None):
+    """labels : of one symmetric (i, i) for all points, or (n, i, i); angles are equal unless given."""
     xy = np.asarray(xy, float).reshape(-1, 2)
     labels = np.asarray(labels, np.int8)
-    return Ranking(np.arange(len(xy)), xy, np.broadcast_to(labels, (len(xy), *labels.shape[-2:])).copy())
+    n_views = labels.shape[-1]
+    angle_deg = 10.0 * (1 - np.eye(n_views)) if angle_deg is None else np.asarray(angle_deg, float)
+    return Ranking(np.arange(len(xy)), xy, np.broadcast_to(labels, (len(xy), n_views, n_views)).copy(), angle_deg)
 
 
 def agreeing(n_views, *stranger):
@@ -223,6 +226,22 @@ def test_views_below_a_share_of_the_best_mislead():
         found = order_views(ranking_of(xy, labels), np.ones((4, 1)), AT, options)
         assert found.search.tolist() == [[1, 2, 3]]
         assert found.is_worth.tolist() == [expected], least
+
+
+def test_of_views_that_help_the_one_at_the_best_angle_comes_first():
+    """Angles to the reference 4, 35, 18 and 20 degrees; the last misleads, the third has the lowest label of those that
+    help."""
+    labels = agreeing(5, 4)
+    labels[0, 3] = labels[3, 0] = FAIR
+    labels = np.stack([agreeing(5, 4), labels])
+    angle = np.zeros((5, 5))
+    angle[0], angle[:, 0] = [0, 4, 35, 18, 20], [0, 4, 35, 18, 20]
+    for order, expected in (("angle", [3, 2, 1, 4]), ("labels", [1, 2, 3, 4])):
+        options = SelectionOptions(order=order)
+        found = order_views(ranking_of(NEAR, labels, angle), np.ones((5, 1)), AT, options)
+        assert found.reference.tolist() == [0]
+        assert found.search.tolist() == [expected], order
+        assert found.is_worth.tolist() == [[True, True, True, False]]
 
 
 def test_blocks_have_the_order_of_the_points_around_them():

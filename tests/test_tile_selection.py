@@ -38,7 +38,7 @@ SPEC = SceneSpec(
 )  # fmt: skip
 # Small blocks, so that there are some.
 SMALL_BLOCKS = RunConfig(pyramid=PyramidOptions(block=16), selection=SelectionOptions(fewest_views=3))
-USE_ALL = replace(SMALL_BLOCKS, selection=SelectionOptions(least_images=254))
+USE_ALL = replace(SMALL_BLOCKS, selection=SelectionOptions(least_images=254, most_images=254))
 # Hardly any block has a tie point as near as this.
 LONELY = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, widest=1.0, fewest_views=3))
 WITHIN_M, ROAD, BUILDING = 1.0, 1, 2

@@ -235,11 +235,18 @@ class SelectionOptions(Checked):
         24, "One tie point ranks the images in a square of this side.", low=1, high=1000, unit="cells"
     )
     least_worth: float = option(
-        0.55, "An image is left out where its accumulated label is below this share of the best one's.",
+        0.45, "An image is left out where its accumulated label is below this share of the best one's.",
         low=0.0, high=1.0,
     )  # fmt: skip
+    order: str = option(
+        "angle", "Which of the images that help comes first: that whose angle to the reference is nearest to "
+        "`best_angle_deg`, or that of the highest accumulated label.", choices=("angle", "labels"),
+    )  # fmt: skip
     fewest_views: int = option(7, "Where fewer images see a tile, all are used.", low=3, high=255)
-    least_images: int = option(3, "Search images that are kept whatever their labels say.", low=1, high=254)
+    least_images: int = option(2, "Search images that are kept whatever their labels say.", low=1, high=254)
+    most_images: int = option(
+        4, "Search images a cell is matched with at most; the refinement takes all that help.", low=1, high=254
+    )
     candidates: int = option(12, "Search images considered for a block, at most.", low=1, high=254)
     least_overlap: float = option(
         0.2, "Images that see a smaller share of a block are considered last.", low=0.0, high=1.0

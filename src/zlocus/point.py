@@ -259,8 +259,8 @@ def ranked(settled: MatchScene, views: TileViews, window: CellWindow, config: Ru
     """Labels of all pairs of views at the tie points of a window, on level ground."""
     xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
     index = (settled.ties[:, 2] - settled.origin_m) / settled.step_m
-    side = config.measure.large_window
-    return rank_views(views, window, config.pyramid.block, xy, index, np.zeros((len(xy), 2)), side, config.selection)
+    side, steps_per_cell, flat = config.measure.large_window, settled.cell_m / settled.step_m, np.zeros((len(xy), 2))
+    return rank_views(views, window, config.pyramid.block, xy, index, flat, side, steps_per_cell, config.selection)
 
 
 def loci(views: Sequence[View], report: PointReport) -> list[Locus]:

@@ -43,7 +43,6 @@ from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
-COARSEST_SEARCH = 4  # views beside the reference at the coarsest level
 STRIDE = 2  # cells between those that are looked at for the views that cover them
 FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
 # What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's.
@@ -158,14 +157,16 @@ def _ranking(
     views = tile_views(pixels, 0, transform, shape, block, (scene.origin_m, scene.step_m), z, side // 2)
     xy = (scene.ties[:, :2] - scene.anchor) * (1.0, -1.0) / scene.cell_m
     index = (scene.ties[:, 2] - scene.origin_m) / scene.step_m
+    steps_per_cell = scene.cell_m / scene.step_m
     if coarsest is None:
-        return rank_views(views, window, block, xy, index, np.zeros((len(xy), 2)), side, config.selection)
+        flat = np.zeros((len(xy), 2))
+        return rank_views(views, window, block, xy, index, flat, side, steps_per_cell, config.selection)
     surface = smoothed(coarsest.heights.vertex, config.refine.jump_steps)
     coarse_cell = np.floor(xy[:, ::-1] / 2**coarsest.level).astype(np.int64)
     at = tuple(np.clip(coarse_cell - (coarsest.window.row, coarsest.window.col), 1, np.subtract(surface.shape, 2)).T)
     # Steps per cell are the same at every level.
     slope = np.stack([(surface[at[0] + i, at[1] + j] - surface[at[0] - i, at[1] - j]) / 2 for i, j in ((1, 0), (0, 1))])
-    return rank_views(views, window, block, xy, index, slope.T, side, config.selection)
+    return rank_views(views, window, block, xy, index, slope.T, side, steps_per_cell, config.selection)
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:
@@ -286,7 +287,7 @@ def _choose(
     options, block = config.selection, lattice.block
     order = order_views(ranking, block_shares(seen, lattice), block_middles(window, level, lattice), options)
     every, evaluations = np.full(len(order.reference), order.search.shape[1]), 0
-    needed = np.minimum(every, COARSEST_SEARCH)
+    needed = np.minimum(every, options.most_images)
     if coarser is not None:
         cells, of_block = sampled_cells(lattice)
         covering = covers(seen[:, :, cells[:, 0], cells[:, 1]]).T
@@ -297,7 +298,7 @@ def _choose(
         surface = smoothed(coarser.heights.vertex, config.refine.jump_steps)
         above = Coarser(coarser.views, coarser.seen, surface, config.measure.large_window, reach, block)
         match = images_needed(above, below, of_block, covering, order, options)
-        needed = np.where(match.n_added > 0, match.n_added, every)
+        needed = np.where(match.n_added > 0, np.minimum(match.n_added, options.most_images), every)
         evaluations = match.evaluations + len(cells) * (2 * reach + 1)
     few = seen[:, :, ::STRIDE, ::STRIDE]
     covered = covers(few) if ground is None else sees(few, ground[::STRIDE, ::STRIDE])

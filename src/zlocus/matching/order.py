@@ -211,20 +211,25 @@ class SearchGeometry:
     days: FloatArray
 
 
+def closeness(angle_deg: FloatArray, options: SelectionOptions) -> FloatArray:
+    """How near angles between two rays are to the best one: the smaller over the larger. Any shape, 0 to 1."""
+    best = options.best_angle_deg
+    return np.asarray(np.minimum(angle_deg, best) / np.maximum(angle_deg, best))
+
+
 def candidate_images(geometry: SearchGeometry, options: SelectionOptions) -> IntArray:
     """Search images worth considering for a block, best first, at most `candidates` of them. (j,) int64.
 
-    An image is worth overlap x closeness to the best angle (the smaller over the larger) x 1/2 per `half_days`; an
-    unknown date counts as the farthest known one. Images outside the limits of overlap and angle follow after all
-    others, so that a block without better ones still has candidates; images that see nothing of the block, or look
-    along the same ray as the reference, are none. Of equals the first.
+    An image is worth overlap x `closeness` to the best angle x 1/2 per `half_days`; an unknown date counts as the
+    farthest known one. Images outside the limits of overlap and angle follow after all others, so that a block without
+    better ones still has candidates; images that see nothing of the block, or look along the same ray as the
+    reference, are none. Of equals the first.
     """
     overlap, angle = geometry.overlap, geometry.angle_deg
     known = ~np.isnan(geometry.days)
     farthest = np.abs(geometry.days[known]).max(initial=0.0)
     days = np.where(known, np.abs(geometry.days), farthest)
-    larger, smaller = np.maximum(angle, options.best_angle_deg), np.minimum(angle, options.best_angle_deg)
-    worth = overlap * smaller / larger * 0.5 ** (days / options.half_days)
+    worth = overlap * closeness(angle, options) * 0.5 ** (days / options.half_days)
     is_outside = (
         (overlap < options.least_overlap) | (angle < options.least_angle_deg) | (angle > options.most_angle_deg)
     )

@@ -167,6 +167,7 @@ def point_curves(
     is_stopped = bool(match.is_stopped[0])
     # Views that mislead are better than none.
     at_last = max(int(order.is_worth.sum()), min(options.least_images, n_search))
+    added = int(match.n_added[0]) if is_stopped else at_last
     return PointCurves(
         order=order,
         index=index,
@@ -174,6 +175,6 @@ def point_curves(
         single=JudgedCurves.of(ncc, step_px, options),
         mean=JudgedCurves.of(sncc, np.maximum.accumulate(step_px), options),
         sigma_steps=sigma,
-        n_used=int(match.n_added[0]) if is_stopped else at_last,
-        is_stopped=is_stopped,
+        n_used=min(added, options.most_images),
+        is_stopped=is_stopped and added <= options.most_images,
     )

@@ -18,7 +18,7 @@ from zlocus.kernels.curves import line_windows
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.curve import POOR, curve_labels
 from zlocus.matching.lattice import HeightLattice
-from zlocus.matching.order import FeaturePoints, SearchGeometry, candidate_images, image_order
+from zlocus.matching.order import FeaturePoints, SearchGeometry, candidate_images, closeness, image_order
 from zlocus.matching.progressive import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.setup import nadir_offset
 from zlocus.matching.views import TileViews
@@ -39,13 +39,14 @@ class Ranking:
     """What tie points say of a tile's views.
 
     tie : (n,) int64, numbers of the tie points; xy : (n, 2) float64, columns and rows of the finest level's cells;
-    labels : (n, i, i) int8, of every pair of views (POOR with itself); evaluations : point x height x view that were
-    sampled.
+    labels : (n, i, i) int8, of every pair of views (POOR with itself); angle_deg : (i, i) float64 degrees, between
+    their rays at the tile's centre; evaluations : point x height x view that were sampled.
     """
 
     tie: IntArray
     xy: FloatArray
     labels: NDArray[np.int8]
+    angle_deg: FloatArray
     evaluations: int = 0
 
 
@@ -124,13 +125,14 @@ def _days_between(one: View, other: View) -> float:
 
 def rank_views(
     views: TileViews, window: CellWindow, block: int, xy: FloatArray, index: FloatArray, slope: FloatArray, side: int,
-    options: SelectionOptions,
+    steps_per_cell: float, options: SelectionOptions,
 ) -> Ranking:  # fmt: skip
     """Labels of all pairs of views at tie points.
 
     views : of the finest level's cells `window`; xy : (n, 2) columns and rows of the tie points on that level; index :
     (n,) float64, their height indices; slope : (n, 2) of the ground there, steps a cell down and across; side : cells
-    of the correlation window. Of each square of `feature_cells` cells the northernmost point counts.
+    of the correlation window; steps_per_cell : side of a cell in height steps. Of each square of `feature_cells` cells
+    the northernmost point counts.
     """
     square = np.floor(xy / options.feature_cells).astype(np.int64)
     inside = ((xy >= (window.col, window.row)) & (xy < (window.col + window.cols, window.row + window.rows))).all(
@@ -150,12 +152,13 @@ def rank_views(
     labels = np.full((len(rows), n_views, n_views), POOR, np.int8)
     seen = [samples.windows(views, i, block, slice(None)) for i in range(n_views)]
     per_step = np.array([cells_per_step(views, i, block) for i in range(n_views)])
+    apart = np.hypot(*np.moveaxis(per_step[:, None] - per_step[None], -1, 0))
     for i in range(n_views):
         for j in range(i):
             curves = np.einsum("nhk,nhk->nh", seen[i], seen[j])
-            step_px = float(np.hypot(*(per_step[i] - per_step[j])))
-            labels[:, i, j] = labels[:, j, i] = curve_labels(curves, step_px, options)
-    return Ranking(rows, xy[rows], labels, len(rows) * n_views * samples.n_heights)
+            labels[:, i, j] = labels[:, j, i] = curve_labels(curves, float(apart[i, j]), options)
+    angle_deg = np.degrees(np.arctan(apart * steps_per_cell))
+    return Ranking(rows, xy[rows], labels, angle_deg, len(rows) * n_views * samples.n_heights)
 
 
 def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: SelectionOptions) -> ViewOrder:
@@ -164,7 +167,8 @@ def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
     share : (i, b) float64, of each block that each view covers, the views in the order in which they may be the
     reference; at : (b, 2) float64, the blocks' middles, as `Ranking.xy`. The reference is the first view that shows the
     whole block and has a label above zero with another view around it. A view whose accumulated label is below
-    `least_worth` of the best one's misleads more than it helps.
+    `least_worth` of the best one's misleads more than it helps. Those that help come in the order of their angles, see
+    `closeness`: labels are a matter of tens of points, and neighbouring blocks should not differ by the luck of one.
     """
     n_views, n_blocks = share.shape
     reference = share.argmax(axis=0)
@@ -180,8 +184,12 @@ def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
             value = np.take_along_axis(order.accumulated, order.images, axis=1)
             fits = last_resort | (value[:, 0] > 0) | (len(ranking.xy) == 0)
             rows, images, value = rows[fits], others[order.images[fits]], value[fits]
-            search[rows], is_worth[rows] = images, value >= options.least_worth * np.maximum(value[:, :1], 0)
-            reference[rows], is_open[rows] = view, False
+            helps = value >= options.least_worth * np.maximum(value[:, :1], 0)
+            if options.order == "angle":
+                first = np.where(helps, closeness(ranking.angle_deg[view, images], options), -1.0)
+                by_angle = np.argsort(-first, axis=1, kind="stable")
+                images, helps = np.take_along_axis(images, by_angle, 1), np.take_along_axis(helps, by_angle, 1)
+            search[rows], is_worth[rows], reference[rows], is_open[rows] = images, helps, view, False
     return ViewOrder(reference, search, is_worth)
 
 
