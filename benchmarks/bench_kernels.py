@@ -183,7 +183,7 @@ def test_winners(benchmark, count):
 def test_profile(benchmark):
     half, offsets = 4, np.linspace(-0.75, 0.75, 5).astype(np.float32)
     surface, seen, scene = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
-    out = np.empty((len(offsets), SIDE, SIDE), np.float32)
+    out = np.empty((1, len(offsets), SIDE, SIDE), np.float32)
 
     def call():
         tile_profile(*scene, surface, offsets, BLOCK, half, seen, np.float32(0), out)

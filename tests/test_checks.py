@@ -23,8 +23,9 @@ def judged(**changed):
         arrays[name][AT] = value
     best = arrays["best"].astype(np.int32)
     heights = SemiGlobalHeights(best, best, arrays["margin"].astype(np.uint16), best.astype(np.float32))
+    height, nothing = arrays["height"].astype(np.float32), np.zeros((7, 9), np.float32)
     refined = RefinedHeights(
-        arrays["height"].astype(np.float32), arrays["ncc"].astype(np.float32), arrays["refined"].astype(bool)
+        height, arrays["ncc"].astype(np.float32), arrays["refined"].astype(bool), height, nothing, nothing, 49
     )
     return judge(heights, refined, arrays["covering"], arrays["seeing"], 99, OPTIONS)
 

@@ -19,7 +19,7 @@ def plane_with_gaps() -> tuple[Surface, np.ndarray]:
     height[10:15, 20:25], quality[10:15, 20:25] = np.nan, Quality.NO_MATCH
     height[-4:, -4:], quality[-4:, -4:] = np.nan, Quality.UNSEEN
     views = np.where(np.isnan(height), 0, 3).astype(np.uint8)
-    return Surface(height, quality, views, exact), exact
+    return Surface(height, 0 * height, quality, views, exact), exact
 
 
 def test_a_hole_in_a_plane_is_filled_and_marked():
@@ -31,6 +31,7 @@ def test_a_hole_in_a_plane_is_filled_and_marked():
     assert np.abs(out.height[hole] - exact[hole]).max() < 0.75
     assert (out.quality[hole] == Quality.NO_MATCH | Quality.FILLED).all()
     assert (out.views[hole] == 0).all()
+    assert np.isnan(out.sigma[hole]).all()
 
 
 def test_heights_and_unseen_cells_stay():
@@ -46,7 +47,7 @@ def test_a_gap_beyond_reach_stays_empty():
     height = np.full((5, 60), np.nan, np.float32)
     height[:, 0] = 7.0
     quality = np.where(np.isnan(height), np.uint16(Quality.NO_MATCH), np.uint16(0))
-    out = filled(Surface(height, quality, np.zeros(height.shape, np.uint8), height), REACH)
+    out = filled(Surface(height, height, quality, np.zeros(height.shape, np.uint8), height), REACH)
     np.testing.assert_allclose(out.height[:, 1 : REACH + 1], 7.0)
     assert np.isnan(out.height[:, REACH + 1 :]).all()
     assert (out.quality[:, REACH + 1 :] == Quality.NO_MATCH).all()

@@ -232,11 +232,12 @@ def test_profiles(n_views, half):
     offsets = np.array([-1.5, 0.0, 0.7], np.float32)
     seen = scene.all_seen()
     seen[0, 1, 3:9], seen[1, 0, :, :5] = HIDDEN, 3
-    out = np.empty((3, *scene.shape), np.float32)
+    groups = np.empty((2, 3, *scene.shape), np.float32)
     tile_profile(
         coefficients(scene), scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, half, seen,
-        np.float32(0.0), out,
+        np.float32(0.0), groups,
     )  # fmt: skip
+    out = groups.sum(axis=0)
     for b, d, rows, cols in scene.blocks():
         around = surface[rows.start : rows.stop + 2 * half, cols.start : cols.stop + 2 * half].astype(float)
         nodes = scene.nodes[:, b : b + 2, d : d + 2]
@@ -245,13 +246,19 @@ def test_profiles(n_views, half):
                 scene.images, nodes, scene.heights, around, offset, scene.block, half, seen[:, :, rows, cols]
             )
             np.testing.assert_allclose(out[j, rows, cols], expected, rtol=0, atol=NCC)
+            for group in range(2):
+                expected = agreement.profile(
+                    scene.images, nodes, scene.heights, around, offset, scene.block, half, seen[:, :, rows, cols],
+                    group=(group, 2),
+                )  # fmt: skip
+                np.testing.assert_allclose(groups[group, j, rows, cols], expected, rtol=0, atol=NCC)
     if n_views == 2:
         assert (out[:, 3:9] == 0).all()
 
 
 def test_profile_of_one_block():
     scene = kernel_scene(3, (9, 11), 16)
-    surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 9, 11), np.float32)
+    surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 1, 9, 11), np.float32)
     block_profile(
         coefficients(scene), scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16, 2,
         scene.all_seen(), np.float32(0.0), out,
@@ -259,7 +266,7 @@ def test_profile_of_one_block():
     expected = agreement.profile(
         scene.images, scene.nodes, scene.heights, surface.astype(float), 0.0, 16, 2, scene.all_seen()
     )
-    np.testing.assert_allclose(out[0], expected, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(out[0, 0], expected, rtol=0, atol=1e-3)
 
 
 def test_ortho_image():

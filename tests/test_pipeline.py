@@ -37,7 +37,7 @@ from zlocus.progress import progress_for
 from zlocus.request import DsmRequest
 from zlocus.surface.reasons import Quality, is_empty
 
-PRODUCTS = ("dsm.tif", "quality.tif", "views.tif", "ortho.tif")
+PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
 # Base-to-height about 0.6 and 0.5 m pixels: 0.05 m of height is 0.06 px.
 BIAS_M, SPREAD_M = 0.02, {"plane": 0.05, "tilt": 0.06, "sine": 0.08, "step": 0.08}
 BLUNDERS, RIM_BLUNDERS = 0.005, 0.02
@@ -121,8 +121,8 @@ def test_products(whole, images):
 
     height, dsm = read(whole / "dsm.tif")
     for name, dtype, nodata in (
-        ("dsm.tif", "float32", np.nan), ("quality.tif", "uint16", None), ("views.tif", "uint8", 0),
-        ("ortho.tif", "uint16", None),
+        ("dsm.tif", "float32", np.nan), ("sigma.tif", "float32", np.nan), ("quality.tif", "uint16", None),
+        ("views.tif", "uint8", 0), ("ortho.tif", "uint16", None),
     ):  # fmt: skip
         _, source = read(whole / name)
         assert source.dtypes == (dtype,)
@@ -133,6 +133,9 @@ def test_products(whole, images):
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
     np.testing.assert_array_equal(np.isnan(height), views == 0)
+    sigma = read(whole / "sigma.tif")[0]
+    np.testing.assert_array_equal(np.isnan(height), np.isnan(sigma))
+    assert np.nanmin(sigma) > 0
     assert set(np.unique(views)) <= {0, 2, 3}
     with rasterio.open(whole / "ortho.tif") as ortho:
         np.testing.assert_array_equal(ortho.read_masks(1) > 0, np.isfinite(height))

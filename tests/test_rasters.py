@@ -20,13 +20,17 @@ GRID = GeoBox((30, 40), Affine(0.5, 0, 1000, 0, -0.5, 2000), "EPSG:32632")
 def surface(rows, cols):
     shape = (rows, cols)
     ramp = np.arange(rows * cols, dtype=np.float32).reshape(shape)
-    return Surface(ramp, np.full(shape, 256, np.uint16), np.full(shape, 3, np.uint8), ramp + 5)
+    return Surface(ramp, ramp / 8, np.full(shape, 256, np.uint16), np.full(shape, 3, np.uint8), ramp + 5)
 
 
 def test_blocks_land_in_their_place(tmp_path):
     with SurfaceRasters(tmp_path, GRID, "uint16") as rasters:
         rasters.write(10, 20, surface(8, 12))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dsm.tif", "ortho.tif", "quality.tif", "views.tif"]
+    names = ["dsm.tif", "ortho.tif", "quality.tif", "sigma.tif", "views.tif"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    with rasterio.open(tmp_path / "sigma.tif") as sigma:
+        np.testing.assert_array_equal(sigma.read(1)[10:18, 20:32], surface(8, 12).sigma)
+        assert sigma.units == ("m",)
     with rasterio.open(tmp_path / "dsm.tif") as dsm, rasterio.open(tmp_path / "ortho.tif") as ortho:
         height = dsm.read(1)
         np.testing.assert_array_equal(height[10:18, 20:32], surface(8, 12).height)

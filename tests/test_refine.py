@@ -8,7 +8,7 @@ from affine import Affine
 from scipy.ndimage import spline_filter
 
 from rendered_scenes import CENTRE, FIELD, GSD_M, LOOKS, SIZE_PX, camera
-from zlocus.matching.refine import parabola_peak, refine, smoothed
+from zlocus.matching.refine import FARTHEST_APART, bend_at_centre, parabola_peak, peaks_apart, refine, smoothed
 from zlocus.matching.views import ViewPixels, tile_views
 from zlocus.options import RefineOptions
 from zlocus.synthetic.render import Sun, render
@@ -35,6 +35,20 @@ def test_a_maximum_at_an_end_is_not_believed():
     assert not inside.any()
     assert np.isfinite(at).all()
     assert np.abs(at).max() <= 1.0
+
+
+def test_bend_and_distance_of_two_parabolas():
+    """0.8 - a (x - p)^2: the bend is 2 a per step squared, wherever the peak is."""
+    x, spacing = np.array([-0.5, 0.0, 0.5], np.float32)[:, None, None], np.float32(0.5)
+    peaks = np.array([[[-0.3, 0.0, 0.2]], [[0.1, 0.4, 0.2]]], np.float32)
+    profiles = np.stack([0.8 - 0.3 * (x - peaks[0]) ** 2, 0.7 - 0.5 * (x - peaks[1]) ** 2])
+    np.testing.assert_allclose(bend_at_centre(profiles[0], spacing), 0.6, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(bend_at_centre(-profiles[0], spacing), 0.0)
+    np.testing.assert_allclose(peaks_apart(profiles, spacing), [[0.4, 0.4, 0.0]], rtol=0, atol=1e-5)
+    assert np.isnan(peaks_apart(np.stack([profiles[0], 0 * profiles[0]]), spacing)).all(), "a group of no pair"
+    assert np.isnan(peaks_apart(np.stack([profiles[0], -profiles[0]]), spacing)).all(), "a pit has no peak"
+    nearly_flat = 0.5 + 0.1 * x - 1e-4 * x**2 + np.zeros((1, 1, 3), np.float32)
+    assert (peaks_apart(np.stack([profiles[0], nearly_flat]), spacing) == FARTHEST_APART).all()
 
 
 def test_smoothing_removes_single_cells_and_keeps_jumps():
@@ -77,6 +91,9 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
     assert found.is_refined[inner].mean() > 0.99
     assert abs(np.median(found.height[inner]) - 20 - fraction) < STEPS
     assert np.median(found.ncc) > 0.95
+    assert (found.bend[inner] > 0).all()
+    assert np.median(found.apart[inner]) < 0.1
+    assert found.window_cells == 49
 
 
 def test_what_is_too_far_keeps_the_coarse_height(plane):
@@ -96,3 +113,5 @@ def test_what_is_too_far_keeps_the_coarse_height(plane):
     none = refine(views, coarse, seen, 16, STEP_M / GSD_M, RefineOptions(rounds=0))
     assert (none.height == 32.0).all()
     assert not none.is_refined.any()
+    assert np.isnan(none.apart).all()
+    assert (none.bend == 0).all()

@@ -44,7 +44,7 @@ LONELY = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, widest=
 WITHIN_M, ROAD, BUILDING = 1.0, 1, 2
 # Cells that may be lost, of a few tens of thousands.
 COVERAGE = 0.005
-PRODUCTS = ("dsm.tif", "quality.tif", "views.tif", "ortho.tif")
+PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
 
 
 @dataclass(frozen=True)

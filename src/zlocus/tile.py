@@ -38,6 +38,7 @@ from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, cov
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
+from zlocus.surface.precision import sigma_steps, signs_of_precision
 from zlocus.surface.reasons import is_empty
 from zlocus.surface.surface import Surface
 
@@ -409,8 +410,10 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
     last = scene.n_steps - 1
     quality = judge(result.heights, refined, covering, seeing, last, config.checks)
     height = result.lattice.metres(refined.height)
+    sigma = sigma_steps(signs_of_precision(result.heights, refined, seeing), refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
+    sigma[is_empty(quality)] = np.nan
     ortho = _true_ortho(pixels, result, refined.height, block)
     ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
-    return Surface(height, quality, used, ortho)
+    return Surface(height, sigma, quality, used, ortho)

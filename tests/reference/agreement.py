@@ -41,14 +41,17 @@ def over_pairs(total, visible, excused):
     return (1 - excused) * every + excused * shown
 
 
-def mean_ncc(planes, visible, half, floor=0.0, excused=0.0):
+def mean_ncc(planes, visible, half, floor=0.0, excused=0.0, group=(0, 1)):
     """Mean over all pairs of the views that are usable, (r, c), see `over_pairs`.
 
-    planes : one (r + 2 half, c + 2 half) each.
+    planes : one (r + 2 half, c + 2 half) each; group : number, and how many: the part of the pairs a + b of which is
+    the number modulo how many.
     """
     here = visible[0]
     total = np.zeros(here.shape[1:])
     for a, b in combinations(range(len(planes)), 2):
+        if (a + b) % group[1] != group[0]:
+            continue
         agreement = ncc(windows(planes[a], half), windows(planes[b], half), floor)
         total += np.where(here[a] & here[b], agreement, 0.0)
     return over_pairs(total, visible, excused)
@@ -93,11 +96,14 @@ def cell_costs(images, nodes, heights, index, block, halves, seen, measure, reli
     return np.where(covered.sum(axis=0) > 1, 64.0 * apart, UNSEEN_COST * (1.0 + weight))
 
 
-def profile(images, nodes, heights, surface, offset, block, half, seen, floor=0.0):
-    """Mean NCC, (r, c), in windows of a block that follow a surface (r + 2 half, c + 2 half), plus `offset`."""
+def profile(images, nodes, heights, surface, offset, block, half, seen, floor=0.0, group=(0, 1)):
+    """Mean NCC, (r, c), in windows of a block that follow a surface (r + 2 half, c + 2 half), plus `offset`.
+
+    Or the part of it that a group of pairs has, see `mean_ncc`.
+    """
     shape = seen.shape[2:]
     t = heights[0] + (surface + offset) * heights[1]
     planes = [cubic(image, positions(node, t, shape, block, half)) for image, node in zip(images, nodes, strict=True)]
     centre = surface[half : half + shape[0], half : half + shape[1]]
     visible = (seen[0] <= centre) & (centre <= seen[1]) & (seen[2] <= centre)
-    return mean_ncc(planes, np.stack([visible, visible]), half, floor)
+    return mean_ncc(planes, np.stack([visible, visible]), half, floor, group=group)

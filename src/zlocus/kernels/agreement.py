@@ -115,24 +115,25 @@ def window_moments(plane, windows, width, n, floor, work, mean, scale):
         done = window
 
 
-# (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (2,p) f4, (p,) f4 -> None
+# (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (2,p) f4, (g,p) f4 -> None
 @kernel
 def add_pairs(planes, windows, mean, scale, width, n, work, total):
     """Add the NCC of all pairs of views, for every window, at the first n places.
 
     planes : (i, p); windows, mean, scale : see `window_moments`, a view takes part where its scale is not zero; work :
-    (2, p), scratch; total : (p,). Plain formula: sum_{a<b} scale_a scale_b (sum x_a x_b - mean_a mean_b).
+    (2, p), scratch; total : (g, p), the pair of views a and b adds to row (a + b) % g. Plain formula: sum_{a<b} scale_a
+    scale_b (sum x_a x_b - mean_a mean_b).
     """
-    half, columns, cross = windows[-1], work[0], work[1]
+    half, columns, cross, n_groups = windows[-1], work[0], work[1], total.shape[0]
     for a in range(planes.shape[0]):
         for b in range(a + 1, planes.shape[0]):
-            done = 0
+            done, into = 0, total[(a + b) % n_groups]
             for w in range(windows.shape[0]):
                 column_products(planes[a], planes[b], half, done, windows[w], width, n + SLACK, columns)
                 row_sums(columns[half - windows[w] :], windows[w], n, cross)
                 ma, mb, sa, sb = mean[a, w], mean[b, w], scale[a, w], scale[b, w]
                 for j in range(n):
-                    total[j] += sa[j] * sb[j] * (cross[j] - ma[j] * mb[j])
+                    into[j] += sa[j] * sb[j] * (cross[j] - ma[j] * mb[j])
                 done = windows[w]
 
 

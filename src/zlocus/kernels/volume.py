@@ -237,8 +237,8 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     planes, greys = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
     mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
     flat, codes = np.empty((seen.shape[1], 3, size), np.int32), np.empty((span[1], n), np.uint8)
-    pairs, total = np.empty(size, np.float32), np.empty(size, np.float32)
-    shown, counts = np.empty(size, np.float32), np.empty((2, size), np.float32)
+    pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    counts, totals = np.empty((2, size), np.float32), total.reshape((1, size))
     work, grid, velocity = np.empty((4, size), np.float32), np.empty(8), np.empty(2, np.float32)
     index, fraction, cells = np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32), flat_cells(relief.shape)
     flat_visibility(seen, half, flat, pairs)
@@ -262,7 +262,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
                 hide(shown, n, scale[i], grey, NOWHERE * np.float32(i + 1))
         if weight > 0.0:
             add_closeness(greys, top, n, total)
-        add_pairs(planes, windows, mean, scale, width, n, work, total)
+        add_pairs(planes, windows, mean, scale, width, n, work, totals)
         shown[:n] = pairs[:n]
         if not shows_all.all():
             excuse(shown, counts, measure[3], n)

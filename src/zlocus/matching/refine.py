@@ -20,16 +20,26 @@ LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
 NARROW_BASE, WIDE_WINDOW, NARROW_WINDOW = 2.0, 9, 7
+FARTHEST_APART, LEAST_BEND = np.float32(3.0), np.float32(1e-6)
 
 
 @dataclass(frozen=True)
 class RefinedHeights:
-    """height : (r, c) float32 height indices; ncc : (r, c) float32, the measure there; is_refined : (r, c) bool, False
-    where the semi-global height was kept."""
+    """Sub-step heights and what the measure looks like around them, all (r, c).
+
+    height : float32 height indices; ncc : float32, the measure there; is_refined : bool, False where the semi-global
+    height was kept; smooth : float32 height indices, the surface that the last windows followed; bend : float32,
+    curvature of the measure per step squared, 0 where it has no peak; apart : float32 steps, distance of the peaks of
+    two groups of pairs of views, NaN where a group has none; window_cells : of the correlation window.
+    """
 
     height: FloatGrid
     ncc: FloatGrid
     is_refined: NDArray[np.bool_]
+    smooth: FloatGrid
+    bend: FloatGrid
+    apart: FloatGrid
+    window_cells: int
 
 
 def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
@@ -61,20 +71,27 @@ def refine(
     """
     half = (options.window or default_window(step_cells)) // 2
     height, is_refined = coarse.astype(np.float32), np.zeros(coarse.shape, bool)
-    best = np.zeros(coarse.shape, np.float32)
+    surface, best, bend = height, np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.float32)
+    apart = np.full(coarse.shape, np.nan, np.float32)
     for number in range(options.rounds):
         surface = smoothed(height, options.jump_steps)
         offsets = FIRST_OFFSETS if number == 0 else LATER_OFFSETS
-        profile = np.empty((len(offsets), *coarse.shape), np.float32)
+        groups = 2 if number == options.rounds - 1 else 1
+        profiles = np.empty((groups, len(offsets), *coarse.shape), np.float32)
         tile_profile(
             coefficients.pixels, coefficients.layout, coefficients.nodes, coefficients.heights,
-            np.pad(surface, half, mode="edge"), offsets, block, half, seen, np.float32(0.0), profile,
+            np.pad(surface, half, mode="edge"), offsets, block, half, seen, np.float32(0.0), profiles,
         )  # fmt: skip
+        profile = profiles.sum(axis=0)
         found, best, inside = parabola_peak(profile, offsets)
+        if groups > 1:
+            middle = slice(len(offsets) // 2 - 1, len(offsets) // 2 + 2)
+            spacing = offsets[1] - offsets[0]
+            bend, apart = bend_at_centre(profile[middle], spacing), peaks_apart(profiles[:, middle], spacing)
         found += surface
         is_refined = inside & (np.abs(found - coarse) < options.reach_steps)
         height = np.where(is_refined, found, height)
-    return RefinedHeights(height, best, is_refined)
+    return RefinedHeights(height, best, is_refined, surface, bend, apart, (2 * half + 1) ** 2)
 
 
 def default_window(step_cells: float) -> int:
@@ -96,3 +113,19 @@ def parabola_peak(profile: NDArray[np.float32], offsets: FloatGrid) -> tuple[Flo
     shift = np.clip(np.float32(0.5) * (left - right) / bend, -1, 1)
     value = here - np.float32(0.25) * (left - right) * shift
     return offsets[at[0]] + shift * (offsets[1] - offsets[0]), value, inside
+
+
+def bend_at_centre(profile: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
+    """Curvature per step squared of three samples (3, r, c) at a spacing in steps, 0 where they have no peak. (r, c)"""
+    bend = (2 * profile[1] - profile[0] - profile[2]) / spacing**2
+    return np.asarray(np.maximum(bend, 0), np.float32)
+
+
+def peaks_apart(profiles: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
+    """Distance in steps, at most FARTHEST_APART, of the vertices of two groups' parabolas, through three samples (2, 3,
+    r, c) at a spacing in steps; NaN where a group has no peak. (r, c)"""
+    bend = 2 * profiles[:, 1] - profiles[:, 0] - profiles[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        vertex = np.where(bend > LEAST_BEND, (profiles[:, 2] - profiles[:, 0]) / (2 * bend), np.float32(np.nan))
+    apart = np.abs(vertex[0] - vertex[1]) * spacing
+    return np.asarray(np.minimum(apart, FARTHEST_APART), np.float32)

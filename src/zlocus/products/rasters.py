@@ -17,7 +17,10 @@ from zlocus.surface.surface import Surface
 
 
 class SurfaceRasters:
-    """dsm.tif, quality.tif, views.tif and ortho.tif of one grid, complete when the context ends, else not there."""
+    """The rasters of a `Surface`, on one grid, complete when the context ends, else not there.
+
+    dsm.tif, sigma.tif, quality.tif, views.tif and ortho.tif.
+    """
 
     def __init__(self, folder: Path, geobox: GeoBox, ortho_dtype: DTypeLike) -> None:
         self._stack = ExitStack()
@@ -32,6 +35,7 @@ class SurfaceRasters:
         with ExitStack() as undo:
             undo.push(self._stack)
             self._dsm = sink("dsm.tif", "float32", "height above the ellipsoid", nodata=float("nan"), units="m")
+            self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
             self._quality = sink("quality.tif", "uint16", "quality bit flags")
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
             self._ortho = sink("ortho.tif", self._ortho_dtype, "grey value", has_mask=True)
@@ -40,6 +44,7 @@ class SurfaceRasters:
     def write(self, row: int, col: int, surface: Surface) -> None:
         """Put a block of cells with its first cell at (row, col) of the grid."""
         self._dsm.write(row, col, surface.height)
+        self._sigma.write(row, col, surface.sigma)
         self._quality.write(row, col, surface.quality)
         self._views.write(row, col, surface.views)
         valid = np.isfinite(surface.ortho)

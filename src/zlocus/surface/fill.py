@@ -13,11 +13,11 @@ def filled(surface: Surface, reach: int) -> Surface:
     """The surface with gaps interpolated from the nearest heights in eight directions, at most `reach` cells away.
 
     Cells that no two images cover, or that were not asked for, stay empty. Filled cells carry `Quality.FILLED` beside
-    the reason why they were empty, and use 0 images.
+    the reason why they were empty, use 0 images, and have no sigma.
     """
     beyond = (surface.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
     height = np.empty_like(surface.height)
     interpolate_gaps(surface.height, beyond, reach, height)
     gained = np.isnan(surface.height) & np.isfinite(height)
     quality = np.where(gained, surface.quality | np.uint16(Quality.FILLED), surface.quality)
-    return Surface(height, quality, surface.views, surface.ortho)
+    return Surface(height, surface.sigma, quality, surface.views, surface.ortho)

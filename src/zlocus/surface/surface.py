@@ -14,13 +14,15 @@ from zlocus.surface.reasons import Quality
 
 @dataclass(frozen=True)
 class Surface:
-    """Height, reasons, images used and ortho-image of a block of cells, all (r, c).
+    """Height, its precision, reasons, images used and ortho-image of a block of cells, all (r, c).
 
-    height : float32, ellipsoidal m at the cell's centre, NaN where empty; quality : uint16, see `Quality`; views :
+    height : float32, ellipsoidal m at the cell's centre, NaN where empty; sigma : float32 m, its standard deviation,
+    NaN where empty or interpolated; quality : uint16, see `Quality`; views :
     uint8, images used, 0 where empty; ortho : float32, grey values of the image, NaN where there is none.
     """
 
     height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
     quality: NDArray[np.uint16]
     views: NDArray[np.uint8]
     ortho: NDArray[np.float32]
@@ -37,19 +39,21 @@ class Surface:
     def without(self, outside: NDArray[np.bool_]) -> Surface:
         """The surface with some cells emptied because they were not asked for. outside : (r, c) bool."""
         quality = np.where(outside, np.uint16(Quality.OUTSIDE), self.quality)
-        height, ortho = (np.where(outside, np.float32(np.nan), v) for v in (self.height, self.ortho))
-        return Surface(height, quality, np.where(outside, np.uint8(0), self.views), ortho)
+        nothing = np.float32(np.nan)
+        height, sigma, ortho = (np.where(outside, nothing, v) for v in (self.height, self.sigma, self.ortho))
+        return Surface(height, sigma, quality, np.where(outside, np.uint8(0), self.views), ortho)
 
     @property
     def arrays(self) -> tuple[NDArray[Any], ...]:
-        """All four arrays."""
-        return self.height, self.quality, self.views, self.ortho
+        """All of them, in the order above."""
+        return self.height, self.sigma, self.quality, self.views, self.ortho
 
     @classmethod
     def nothing(cls, window: CellWindow) -> Surface:
         """Cells that no two views cover."""
         shape = (window.rows, window.cols)
         return cls(
+            np.full(shape, np.nan, np.float32),
             np.full(shape, np.nan, np.float32),
             np.full(shape, Quality.UNSEEN, np.uint16),
             np.zeros(shape, np.uint8),

@@ -1,0 +1,305 @@
+"""Calibrates the standard deviations of `sigma.tif`, and judges them.
+
+    python benchmarks/precision.py fit [-o OUT]
+    python benchmarks/precision.py judge [FOLDER ...] [--views 6 3 2] [-o OUT]
+
+`fit` renders the scenes of TRAINING, runs `zlocus dsm` on them with six, three and two views, and writes
+src/zlocus/surface/calibration.py. `judge` runs `zlocus dsm` on folders with img_*.tif, truth_dsm.tif and
+truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and
+trees, the share of true errors within one and two sigma (68 and 95 % of a normal distribution); the share within one
+sigma in each quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the
+largest sigma is dropped. Draws calibration.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import rasterio
+from scipy.optimize import minimize
+
+from zlocus import cli, pipeline, tile
+from zlocus.evaluation.alignment import best_shift
+from zlocus.evaluation.heights import read_heights
+from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
+from zlocus.surface.precision import is_split
+
+CALIBRATION = Path(__file__).resolve().parents[1] / "src" / "zlocus" / "surface" / "calibration.py"
+SIZE, POINTING_PX = 520, 2.0
+# (kind, seed): those that calibrate, and those that judge.
+TRAINING = (("city", 61), ("city", 62), ("city", 31), ("hills", 33))
+JUDGED = (("city", 71), ("city", 72), ("hills", 73))
+VIEWS = {6: ("n1", "f1", "b1", "n2", "f2", "b2"), 3: ("n1", "f1", "b1"), 2: ("n1", "f1")}
+MARGIN_M, LARGE_ERROR_M = 10.0, 1.0
+KNOTS, SMOOTHNESS, LEAST_ERROR_STEPS = 9, 0.02, 1e-3
+# What is asked of one and of two sigma, and what each weighs; of each run at most so many cells, each class so much.
+ASKED = ((0.68, 0.0, 1.0), (0.94, float(np.log(2.0)), 2.0))
+CELLS, CLASS_WEIGHT = 60000, {"ground": 1.0, "building": 0.4, "tree": 0.3}
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Cells of a run with known errors: signs, error_m, kind (index in CLASS_NAMES), (n,) each; step_m of heights."""
+
+    signs: dict[str, np.ndarray]
+    is_refined: np.ndarray
+    error_m: np.ndarray
+    kind: np.ndarray
+    step_m: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Errors and their predicted sigma, m, and kinds, all (n,)."""
+
+    error_m: np.ndarray
+    sigma_m: np.ndarray
+    kind: np.ndarray
+
+
+@contextmanager
+def watched(found: list[tuple[Any, ...]]):
+    """Adds (window, core, signs, is_refined, scene) of every tile that is matched."""
+    predict, finish, match = tile.sigma_steps, tile._finish, pipeline.match_tile
+    last: dict[str, Any] = {}
+
+    def predicted(signs, refined):
+        last.update(signs=signs, is_refined=refined.is_refined)
+        return predict(signs, refined)
+
+    def finished(scene, pixels, result, config):
+        last["window"] = result.window
+        return finish(scene, pixels, result, config)
+
+    def matched(scene, core, *rest):
+        last.clear()
+        result = match(scene, core, *rest)
+        if "window" in last:
+            found.append((last["window"], core, last["signs"], last["is_refined"], scene))
+        return result
+
+    tile.sigma_steps, tile._finish, pipeline.match_tile = predicted, finished, matched
+    try:
+        yield
+    finally:
+        tile.sigma_steps, tile._finish, pipeline.match_tile = predict, finish, match
+
+
+def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]]:
+    """`zlocus dsm` of a scene over the ground with truth, and what was seen of its tiles."""
+    with rasterio.open(folder / "truth_dsm.tif") as file:
+        bounds, crs, cell = file.bounds, file.crs.to_string(), 2 * file.res[0]
+    found: list[tuple[Any, ...]] = []
+    images = [str(folder / f"img_{name}.tif") for name in views]
+    with watched(found), redirect_stdout(sys.stderr):
+        cli.app(["dsm", *images, "-o", str(out), "--crs", crs, "--resolution", str(cell), "--bounds",
+                 *map(str, bounds), "--overwrite"], standalone_mode=False)  # fmt: skip
+    return found
+
+
+def errors_of(folder: Path, dsm: Path) -> tuple[TruthBlocks, np.ndarray, np.ndarray]:
+    """Blocks of truth, where each is looked up in the surface (n, 2), and the errors there (n,) m, NaN where empty.
+
+    A common shift of the ground, which no matcher can see, is removed where the RPCs have pointing errors.
+    """
+    surface, heights = read_heights(dsm), read_heights(folder / "truth_dsm.tif")
+    truth = truth_blocks(heights, MARGIN_M, read_classes(folder / "truth_class.tif", heights))
+    xy = truth.xy
+    if "hills" not in folder.name:
+        return truth, xy, truth.errors(surface.nearest(xy))
+    xy = xy + np.array(best_shift(surface, truth, xy))
+    errors = truth.errors(surface.bilinear(xy))
+    return truth, xy, errors - np.nanmedian(errors)
+
+
+def kinds(truth: TruthBlocks) -> np.ndarray:
+    """Index of the class of every block in CLASS_NAMES."""
+    return np.argmax([truth.members(name) for name in CLASS_NAMES], axis=0)
+
+
+def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
+    """The cells of a run whose errors are known."""
+    tiles = run(folder, views, out)
+    truth, xy, errors = errors_of(folder, out / "dsm.tif")
+    kind = kinds(truth)
+    parts = []
+    for window, core, signs, is_refined, scene in tiles:
+        col = np.floor((xy[:, 0] - scene.anchor[0]) / scene.cell_m).astype(int)
+        row = np.floor((scene.anchor[1] - xy[:, 1]) / scene.cell_m).astype(int)
+        inside = np.isfinite(errors)
+        for at, first, n in ((row, core.row, core.rows), (col, core.col, core.cols),
+                             (row, window.row, window.rows), (col, window.col, window.cols)):  # fmt: skip
+            inside &= (at >= first) & (at < first + n)
+        cell = row[inside] - window.row, col[inside] - window.col
+        parts.append(({k: v[cell] for k, v in signs.items()}, is_refined[cell], errors[inside], kind[inside]))
+    return Sample(
+        {k: np.concatenate([part[0][k] for part in parts]) for k in parts[0][0]},
+        *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)), tiles[0][4].step_m,
+    )  # fmt: skip
+
+
+def hats(values: np.ndarray, first: float, spacing: float) -> np.ndarray:
+    """Hat functions at equally spaced knots, constant beyond both ends, (n, KNOTS)."""
+    x = np.clip((values - first) / spacing, 0, KNOTS - 1)
+    return np.maximum(1 - np.abs(x[:, None] - np.arange(KNOTS)), 0)
+
+
+def fit(samples: list[Sample]) -> dict[str, Any]:
+    """Curves of the additive model: least sum of the quantile losses of log |error| at one and two sigma."""
+    rng = np.random.default_rng(0)
+    chosen, weights = [], []
+    for one in samples:
+        few = rng.choice(len(one.error_m), min(CELLS, len(one.error_m)), replace=False)
+        chosen.append(few)
+        share = np.bincount(one.kind[few], minlength=3) / len(few)
+        factor = np.array(list(CLASS_WEIGHT.values())) / np.maximum(share, 0.01)
+        weights.append(factor[one.kind[few]])
+    rows = list(zip(samples, chosen, strict=True))
+    pooled = {k: np.concatenate([s.signs[k][r] for s, r in rows]) for k in samples[0].signs}
+    refined = np.concatenate([s.is_refined[r] for s, r in rows])
+    target = np.concatenate([np.log(np.abs(s.error_m[r]) / s.step_m + LEAST_ERROR_STEPS) for s, r in rows])
+    weight = np.concatenate(weights)
+    weight /= weight.mean()
+    grid = {k: np.quantile(v, [0.005, 0.995]) for k, v in pooled.items()}
+    grid = {k: (float(a), float(max(b - a, 1e-3) / (KNOTS - 1))) for k, (a, b) in grid.items()}
+    columns = [hats(v, *grid[k]) for k, v in pooled.items()]
+    flags = [np.ones(len(target)), ~refined, ~is_split(pooled)]
+    design = np.column_stack([*columns, *flags]).astype(np.float32)
+    bend = np.zeros((len(grid) * (KNOTS - 2), design.shape[1]))
+    for i in range(len(grid)):
+        for k in range(KNOTS - 2):
+            bend[i * (KNOTS - 2) + k, i * KNOTS + k : i * KNOTS + k + 3] = [1, -2, 1]
+
+    def loss(b: np.ndarray) -> tuple[float, np.ndarray]:
+        predicted = design @ b.astype(np.float32)
+        value, slope = 0.0, np.zeros(len(target))
+        for asked, above, share in ASKED:
+            r = target - predicted - above
+            soft = 0.05
+            value += share * float(np.mean(weight * (asked * r + soft * np.logaddexp(0, -r / soft))))
+            slope += share * (asked - 1 / (1 + np.exp(np.clip(r / soft, -50, 50))))
+        bent = bend @ b
+        gradient = -(design.T @ (weight * slope).astype(np.float32)) / len(target)
+        return value + SMOOTHNESS * bent @ bent + 1e-5 * b @ b, gradient + 2 * SMOOTHNESS * bend.T @ bent + 2e-5 * b
+
+    b = minimize(loss, np.zeros(design.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 800}).x
+    curves = {k: (*grid[k], b[i * KNOTS : (i + 1) * KNOTS]) for i, k in enumerate(grid)}
+    return {"curves": curves, "constant": b[-3], "not_refined": b[-2], "no_split": b[-1]}
+
+
+def write(model: dict[str, Any], path: Path) -> None:
+    """The calibration as a module."""
+    lines = [
+        '"""Curves of the precision model, made by benchmarks/precision.py; not to be edited."""', "",
+        "from __future__ import annotations", "",
+        "# fmt: off",
+        "CONSTANT, NOT_REFINED, NO_SPLIT = {constant:.4f}, {not_refined:.4f}, {no_split:.4f}".format(**model),
+        "# Sign: position of the first knot, spacing of the knots, logarithm of the factor at each.",
+        "CURVES: dict[str, tuple[float, float, tuple[float, ...]]] = {",
+    ]  # fmt: skip
+    for name, (first, spacing, curve) in model["curves"].items():
+        if not np.isfinite([first, spacing, *curve]).all():
+            raise ValueError(f"The curve of {name} is not finite: look at its signs before anything is written.")
+        lines.append(f'    "{name}": ({first:.5g}, {spacing:.5g}, ({", ".join(f"{v:.4f}" for v in curve)})),')
+    path.write_text("\n".join([*lines, "}"]) + "\n", encoding="utf-8")
+
+
+def predicted_sigma(model: dict[str, Any], one: Sample) -> np.ndarray:
+    """Sigma of a sample by a model, m (n,)."""
+    total = np.full(len(one.error_m), model["constant"])
+    for name, (first, spacing, curve) in model["curves"].items():
+        total += hats(one.signs[name], first, spacing) @ curve
+    total += np.where(one.is_refined, 0, model["not_refined"]) + np.where(is_split(one.signs), 0, model["no_split"])
+    return np.exp(total) * one.step_m
+
+
+def judgement(judged: Judged) -> str:
+    """The figures of a run on one line."""
+    size, sigma = np.abs(judged.error_m), judged.sigma_m
+    parts = []
+    for name, rows in (("all", np.ones(len(size), bool)), *((n, judged.kind == i) for i, n in enumerate(CLASS_NAMES))):
+        if rows.sum() > 100:
+            parts.append(f"{name} {(size < sigma)[rows].mean():.3f}/{(size < 2 * sigma)[rows].mean():.3f}")
+    quintile = np.digitize(sigma, np.quantile(sigma, [0.2, 0.4, 0.6, 0.8]))
+    parts.append("quintiles " + " ".join(f"{(size < sigma)[quintile == q].mean():.2f}" for q in range(5)))
+    worst, large = np.argsort(-sigma, kind="stable")[: len(size) // 10], size > LARGE_ERROR_M
+    parts.append(f"worst tenth holds {large[worst].sum() / max(large.sum(), 1):.2f} of {large.mean():.4f} > 1 m")
+    parts.append(f"median {np.median(sigma):.3f} m")
+    return "; ".join(parts)
+
+
+def judge(folder: Path, views: tuple[str, ...], out: Path) -> Judged:
+    """Errors and sigma of a run, from its products."""
+    run(folder, views, out)
+    truth, xy, errors = errors_of(folder, out / "dsm.tif")
+    sigma = read_heights(out / "sigma.tif").nearest(xy)
+    known = np.isfinite(errors) & np.isfinite(sigma)
+    return Judged(errors[known], sigma[known], kinds(truth)[known])
+
+
+def draw(judged: dict[str, Judged], path: Path) -> None:
+    """Share of errors within one and two sigma against sigma, of all runs."""
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+    for name, one in judged.items():
+        edges = np.quantile(one.sigma_m, np.linspace(0, 1, 21))
+        place = np.clip(np.digitize(one.sigma_m, edges[1:-1]), 0, 19)
+        middle = [np.median(one.sigma_m[place == k]) for k in range(20)]
+        for axis, times in zip(axes, (1, 2), strict=True):
+            share = [(np.abs(one.error_m) < times * one.sigma_m)[place == k].mean() for k in range(20)]
+            axis.semilogx(middle, share, marker=".", label=name)
+    for axis, times, asked in zip(axes, (1, 2), (0.683, 0.954), strict=True):
+        axis.axhline(asked, color="0.4", lw=0.8, ls="--")
+        axis.set(xlabel="sigma, m", ylabel=f"errors within {times} sigma", ylim=(0.4, 1.0))
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+
+
+def rendered(kind: str, seed: int, out: Path) -> Path:
+    """A scene, rendered unless it is there."""
+    folder = out / f"{kind}-{seed}"
+    if not folder.exists():
+        pointing = ["--pointing", str(POINTING_PX)] if kind == "hills" else []
+        command = ["--kind", kind, "--seed", str(seed), "--size", str(SIZE), "--views", "6", *pointing]
+        subprocess.run([sys.executable, "-m", "zlocus.synthetic", "-o", str(folder), *command], check=True)
+    return folder
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("action", choices=("fit", "judge"))
+    parser.add_argument("folders", nargs="*", type=Path)
+    parser.add_argument("--views", nargs="+", type=int, choices=tuple(VIEWS), default=tuple(VIEWS))
+    parser.add_argument("-o", "--out", type=Path, default=Path("precision"))
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    scenes = TRAINING if args.action == "fit" else JUDGED
+    folders = args.folders or [rendered(kind, seed, args.out) for kind, seed in scenes]
+    if args.action == "fit":
+        samples = {(f.name, n): sample(f, VIEWS[n], args.out / "run") for f in folders for n in args.views}
+        model = fit(list(samples.values()))
+        write(model, CALIBRATION)
+        for (name, n), one in samples.items():
+            print(f"{name}, {n} views:", judgement(Judged(one.error_m, predicted_sigma(model, one), one.kind)))
+        return
+    judged = {}
+    for folder in folders:
+        for n in args.views:
+            judged[f"{folder.name}, {n} views"] = judge(folder, VIEWS[n], args.out / "run")
+            print(f"{folder.name}, {n} views:", judgement(judged[f"{folder.name}, {n} views"]), flush=True)
+    draw(judged, args.out / "calibration.png")
+
+
+if __name__ == "__main__":
+    main()
