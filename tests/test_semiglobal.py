@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from kernel_scene import even_lattice
-from zlocus.matching.semiglobal import BEHIND, SemiGlobalHeights, aggregate, penalties, pick
+from zlocus.matching.semiglobal import BEHIND, SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.options import SemiGlobalOptions
 
 OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, level_easing=0.5)
@@ -74,11 +74,22 @@ def test_aggregation_joins_what_picking_alone_does_not():
     cost[..., 7] -= 25
     p2 = penalties(None, lattice.shape, 0, OPTIONS)
     joined = aggregate(cost.ravel(), lattice, p2, OPTIONS)
-    alone = pick(cost.ravel().astype(np.uint16), lattice)
+    single = alone(cost.ravel(), lattice)
     assert (np.abs(joined.best - 7) <= 1).mean() > 0.97
-    assert (np.abs(alone.best - 7) <= 1).mean() < 0.9
+    assert (np.abs(single.best - 7) <= 1).mean() < 0.9
     assert joined.vertex.dtype == np.float32
     assert np.abs(joined.vertex - joined.best).max() <= 0.5
+
+
+def test_cells_by_themselves_are_aggregation_without_penalties():
+    """Margins included, on which the ranges of the next level and the flag of ambiguous cells depend."""
+    lattice = even_lattice(16, (20, 24), 16)
+    cost = np.random.default_rng(4).integers(0, 256, lattice.size).astype(np.uint8)
+    free = aggregate(cost, lattice, np.zeros((4, *lattice.shape), np.uint16), replace(OPTIONS, p1=0))
+    single = alone(cost, lattice)
+    for name in ("best", "second", "margin", "vertex"):
+        np.testing.assert_array_equal(getattr(single, name), getattr(free, name))
+    assert 0 < np.median(single.margin) < 65535
 
 
 def test_heights_above_a_base_surface():

@@ -31,7 +31,7 @@ from zlocus.matching.selection import (
     rank_views,
     sampled_cells,
 )
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties, pick
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, sees
@@ -263,7 +263,7 @@ def _match_level(
     ortho = None if smooth is None else _ortho(views, smooth, block)
     cost = cost_volume(along_base, base, lattice, used, config.measure)
     if method == "mvll":
-        heights = pick(cost.astype(np.uint16), lattice)
+        heights = alone(cost, lattice)
     else:
         heights = aggregate(cost, lattice, penalties(ortho, shape, level, config.semiglobal), config.semiglobal)
     worth = above_base(worth, base.cells)

@@ -68,6 +68,14 @@ def aggregate(
     return pick(total, lattice)
 
 
+def alone(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
+    """Heights of the least costs, each cell by itself: what `aggregate` gives without penalties.
+
+    Costs count once per path there, so they do here, and margins mean the same.
+    """
+    return pick(np.multiply(cost, np.uint16(2 * len(BEHIND)), dtype=np.uint16), lattice)
+
+
 def pick(total: NDArray[np.uint16], lattice: HeightLattice) -> SemiGlobalHeights:
     """Heights of the least sums of a volume laid out as `HeightLattice.address` says."""
     best, second = np.empty(lattice.shape, np.int32), np.empty(lattice.shape, np.int32)
