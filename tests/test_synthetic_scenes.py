@@ -16,7 +16,8 @@ from zlocus.sensors.rpc import RpcModel
 from zlocus.synthetic import files
 from zlocus.synthetic.__main__ import main
 from zlocus.synthetic.files import render_scene
-from zlocus.synthetic.objects import PAINT, Objects
+from zlocus.synthetic.objects import BARE, PAINT, Objects
+from zlocus.synthetic.raycast import WEEDS, top_albedo
 from zlocus.synthetic.render import seen_from
 from zlocus.synthetic.scenes import (
     SceneSpec,
@@ -28,7 +29,7 @@ from zlocus.synthetic.scenes import (
     hills_spec,
     with_pointing_errors,
 )
-from zlocus.synthetic.terrain import BUILDING, ROAD, TREE, SyntheticGround, analytic_height
+from zlocus.synthetic.terrain import BUILDING, PATTERN_ROWS, ROAD, TREE, SyntheticGround, analytic_height
 
 RPC_PX = 1e-3
 HEIGHT_M = 1e-3
@@ -178,6 +179,37 @@ def test_roofs_are_planes(ground: SyntheticGround) -> None:
     same &= (ground.slopes[:, :-1] == ground.slopes[:, 1:]).all(axis=2)
     assert same.sum() > 500
     np.testing.assert_allclose(np.diff(ground.heights, axis=1)[same], ground.slopes[:, :-1, 0][same], atol=HEIGHT_M)
+
+
+def test_crops_stand_on_bare_ground_and_move_nothing(ground: SyntheticGround, spec: SceneSpec) -> None:
+    crops = replace(spec, objects=replace(STANDING, crop_side_m=20.0))
+    planted = build_ground(crops, exposures(crops))
+    np.testing.assert_array_equal(planted.planes, ground.planes)
+    np.testing.assert_array_equal(planted.classes, ground.classes)
+    in_rows = (planted.materials["pattern"] == PATTERN_ROWS)[planted.material]
+    assert (ground.material[in_rows] == BARE).all()
+    np.testing.assert_array_equal(planted.material[~in_rows], ground.material[~in_rows])
+    assert 0.7 < in_rows.sum() / (ground.material == BARE).sum() < 0.9
+
+
+def test_rows_repeat_across_and_run_straight_along(spec: SceneSpec) -> None:
+    """Three tenths of a period further only the weeds differ from those a whole period away."""
+    crops = replace(spec, objects=replace(STANDING, crop_side_m=20.0))
+    ground = build_ground(crops, exposures(crops))
+    crop = ground.materials[-1]
+    x, y = np.random.default_rng(2).uniform(50.0, 150.0, (2, 300))
+
+    def albedo(along: float, across: float) -> np.ndarray:
+        at = x + along * crop["cos"] - across * crop["sin"], y + along * crop["sin"] + across * crop["cos"]
+        return np.array([top_albedo(u, v, ground.texel_m, crop, ground.textures) for u, v in zip(*at, strict=True)])
+
+    def differ(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.std(a - b) / (crop["albedo"] * crop["contrast"]))
+
+    here = albedo(0.0, 0.0)
+    assert differ(here, albedo(0.0, crop["period"])) < 2.0 * WEEDS
+    assert differ(here, albedo(7.3, 0.0)) < 2.0 * WEEDS
+    assert differ(here, albedo(0.0, 0.3 * crop["period"])) > 4.0 * WEEDS
 
 
 def test_terrain_slopes_are_those_of_its_heights() -> None:

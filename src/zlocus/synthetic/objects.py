@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from zlocus.sensors.model import FloatArray
 from zlocus.synthetic.terrain import (
     BUILDING,
+    GROUND,
     MATERIAL,
     OBJECT_STREAM,
     PATTERN_GRAIN,
     PATTERN_LEAVES,
     PATTERN_NATURAL,
+    PATTERN_ROWS,
     PATTERN_STRIPES,
     ROAD,
     TREE,
@@ -28,6 +30,7 @@ FIRST_BUILDING = FIRST_TREE + len(TREE_ALBEDOS)
 TRIES_PER_OBJECT = 25
 GAP_M = 2.5
 CLUMP_M = 0.3
+BALK_M = 2.0  # of bare ground between crops
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class Objects:
     """How much stands on the ground. Densities are per hectare; towers are buildings of 25 to 60 m.
 
     plain_roofs : share of roofs without pattern, whose texture is hardly above the noise; the rest is striped or like
-    gravel, half and half.
+    gravel, half and half. crop_side_m : side of the squares of crops, in rows that repeat, on what else is bare; 0:
+    no crops.
     """
 
     road_spacing_m: float
@@ -44,6 +48,7 @@ class Objects:
     trees_per_ha: float
     plain_roofs: float = 0.6
     max_tree_m: float = 12.0
+    crop_side_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class Footprint:
 
 
 def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> SyntheticGround:
-    """Terrain with roads, then towers, other buildings and trees, none on another."""
+    """Terrain with roads, then towers, other buildings and trees, none on another; crops on what is left bare."""
     rng = np.random.default_rng([seed, OBJECT_STREAM])
     painted = replace(ground, planes=ground.planes.copy(), material=ground.material.copy())
     materials = [ground.materials[0], plain_material(ROAD, PATTERN_GRAIN, 0.27, 0.03),
@@ -88,6 +93,8 @@ def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> Synthet
             materials += _place_building(painted, is_tower, objects.plain_roofs, len(materials), rng)
     for _ in range(round(objects.trees_per_ha * hectares)):
         _place_tree(painted, objects.max_tree_m, rng)
+    if objects.crop_side_m:
+        materials += _plant_crops(painted, objects.crop_side_m, len(materials), rng)
     return replace(painted, materials=np.array(materials, MATERIAL))
 
 
@@ -214,3 +221,21 @@ def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Gener
         ground.slopes[window][crown] = 0.0
         ground.material[window][crown] = FIRST_TREE + rng.integers(len(TREE_ALBEDOS))
         return
+
+
+def _plant_crops(
+    ground: SyntheticGround, side_m: float, index: int, rng: np.random.Generator
+) -> list[NDArray[np.void]]:
+    """Squares of straight rows, each of one direction and period, on bare ground. Returns their materials."""
+    side, balk = round(side_m / ground.step), round(BALK_M / ground.step)
+    materials: list[NDArray[np.void]] = []
+    for row in range(0, ground.heights.shape[0], side):
+        for col in range(0, ground.heights.shape[1], side):
+            crop = plain_material(GROUND, PATTERN_ROWS, rng.uniform(0.28, 0.5), rng.uniform(0.15, 0.3))
+            angle = rng.uniform(0.0, np.pi)
+            crop["cos"], crop["sin"], crop["period"] = np.cos(angle), np.sin(angle), rng.uniform(1.6, 4.0)
+            crop["x"], crop["y"] = col * ground.step, row * ground.step
+            part = ground.material[row : row + side - balk, col : col + side - balk]
+            part[part == BARE] = index + len(materials)
+            materials.append(crop)
+    return materials

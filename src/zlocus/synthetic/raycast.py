@@ -17,6 +17,7 @@ from zlocus.synthetic.terrain import (
     BUILDING,
     PATTERN_LEAVES,
     PATTERN_NATURAL,
+    PATTERN_ROWS,
     PATTERN_STRIPES,
     TREE,
 )
@@ -26,6 +27,7 @@ Field = tuple[NDArray[np.float32], NDArray[np.float32]]
 Look = tuple[NDArray[np.uint16], NDArray[np.void], NDArray[np.float32], NDArray[np.bool_]]
 MISS, TOP, WALL_U, WALL_V = 0, 1, 2, 3
 SKY = 0.27
+WEEDS = 0.15  # of natural texture in crops, beside rows of amplitude 1
 NEVER = 1e-30
 OFF_SURFACE_M = 0.02
 OFF_WALL_CELLS = 1.5
@@ -124,9 +126,11 @@ def top_albedo(x, y, texel_m, material, textures):
     """Albedo of the top of a material at field position (x, y) m."""
     a, b = x / texel_m, y / texel_m
     pattern = material.pattern
-    if pattern == PATTERN_STRIPES:
+    if pattern in (PATTERN_STRIPES, PATTERN_ROWS):
         q = material.cos * (y - material.y) - material.sin * (x - material.x)
         value = 1.0 if q / material.period - np.floor(q / material.period) < 0.35 else -0.5
+        if pattern == PATTERN_ROWS:
+            value += WEEDS * _texel(textures[GRASS], a, b)
     elif pattern == PATTERN_NATURAL:
         mixed = 0.5 + 0.9 * _texel(textures[FRACTAL], 0.0131 * a + 0.0071 * b, 0.0131 * b - 0.0071 * a)
         mixed = min(max(mixed, 0.0), 1.0)

@@ -30,10 +30,10 @@ MATERIAL = np.dtype(
         ("pattern", "i4"),  # of the top: one of the PATTERN_ constants
         ("albedo", "f8"),
         ("contrast", "f8"),  # of the pattern, relative to the albedo
-        ("period", "f8"),  # m, of stripes
-        ("x", "f8"),  # m, centre of a building in field coordinates (east, south of the field's corner)
+        ("period", "f8"),  # m, of stripes and rows
+        ("x", "f8"),  # m, centre of a building, corner of a crop, in field coordinates (east and south of the field's)
         ("y", "f8"),
-        ("cos", "f8"),  # direction of a building's first axis
+        ("cos", "f8"),  # direction of a building's first axis, of rows
         ("sin", "f8"),
         ("half_length", "f8"),  # m, along the first axis
         ("half_width", "f8"),
@@ -43,7 +43,7 @@ MATERIAL = np.dtype(
         ("window", "f8"),  # m, distance between windows
     ]
 )
-PATTERN_NATURAL, PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_LEAVES = 0, 1, 2, 3
+PATTERN_NATURAL, PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_LEAVES, PATTERN_ROWS = 0, 1, 2, 3, 4
 
 
 @dataclass(frozen=True)
