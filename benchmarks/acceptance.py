@@ -17,6 +17,7 @@ import tempfile
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import numpy as np
 import rasterio
 from pyproj import CRS, Transformer
 
+import terrain_features
 from middlebury import CASES, judge
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
@@ -306,6 +308,28 @@ def middlebury(at: Workplace) -> list[Figure]:
     return figures
 
 
+def features(at: Workplace) -> list[Figure]:
+    """Three rendered terrain features: what the semi-global constraint and the levels gain."""
+    at.out.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for name in terrain_features.FEATURES:
+        crop = terrain_features.rendered(name, terrain_features.VIEWS, at.out)
+        found = {
+            (method, levels): terrain_features.run(crop, method, levels, at.out)[0]
+            for method, levels in product(terrain_features.METHODS, terrain_features.RESOLUTIONS)
+        }
+        (one_alone, many_alone), (one, many) = (
+            [found[method, levels] for levels in terrain_features.RESOLUTIONS] for method in terrain_features.METHODS
+        )
+        lines.append(Figure(f"{name}: within 1 m", many["within_1"]))
+        for levels, alone, joined in (("one", one_alone, one), ("many", many_alone, many)):
+            gain = joined["within_1"] - alone["within_1"]
+            lines.append(Figure(f"{name}: over MVLL alone, {levels}", gain, at_least=0.0))
+        lines.append(Figure(f"{name}: many over one resolution", many["within_1"] - one["within_1"], at_least=-0.005))
+        lines.append(Figure(f"{name}: evaluations over one's", many["evaluations"] / one["evaluations"], at_most=1.0))
+    return lines
+
+
 def kernels(at: Workplace) -> list[Figure]:
     """Speed of the kernels: what the benchmarks leave in their `extra_info`."""
     report = at.out / "benchmarks.json"
@@ -359,7 +383,7 @@ def clone(at: Workplace) -> list[Figure]:
 
 ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "calanques": calanques, "city": city, "hills": hills, "unseen": unseen, "ventoux": ventoux, "kernels": kernels,
-    "selection": selection, "middlebury": middlebury,
+    "selection": selection, "features": features, "middlebury": middlebury,
     "memory": memory, "clone": clone,
 }  # fmt: skip
 SLOW = ("memory", "clone")

@@ -21,13 +21,8 @@ value and of the ratio to the second peak. Writes selection.csv and selection.pn
 from __future__ import annotations
 
 import argparse
-import csv
-import json
-import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,8 +31,8 @@ import numpy as np
 import rasterio
 from pyproj import CRS
 
-from zlocus import cli, tile
-from zlocus.io.config import write_config
+from judging import SHARED, judged, matched, table_head, table_row, write_table
+from zlocus import tile
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.curve import GOOD, curve_peaks, quality_labels
 from zlocus.matching.order import SearchGeometry, candidate_images
@@ -48,8 +43,6 @@ from zlocus.matching.setup import leading_first, nadir_offset
 from zlocus.matching.visibility import cells_per_step, covers
 from zlocus.options import RunConfig, SelectionOptions
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
-JUDGE = SHARED / "tools" / "evaluate_dsm.py"
 SPOILED = "d"
 CURVES = 2000
 KEEP_ALL = RunConfig(selection=SelectionOptions(least_images=254, most_images=254))
@@ -165,40 +158,23 @@ def run(name: str, choice: Choice, folder: Path, out: Path) -> dict[str, Any]:
         bounds, crs, cell = file.bounds, str(file.crs), 2 * file.res[0]
     spacing = max(int(np.sqrt((bounds.right - bounds.left) * (bounds.top - bounds.bottom) / CURVES) / cell), 1)
     place = out / name.replace(",", "").replace(" ", "-")
-    shutil.rmtree(place, ignore_errors=True)
-    options = out / f"{place.name}.toml"
-    options.write_text(write_config(choice.config), encoding="utf-8")
-    images = [str(folder / f"img_{image}.tif") for image in choice.images]
+    images = [folder / f"img_{image}.tif" for image in choice.images]
     tiles: list[tuple[Any, np.ndarray, RunConfig]] = []
-    with watched(tiles), redirect_stdout(sys.stderr):
-        cli.app(
-            ["dsm", *images, "-o", str(place), "--crs", crs, "--resolution", str(cell), "--views", choice.views,
-             "--bounds", *map(str, bounds), "--config", str(options)], standalone_mode=False,
+    with watched(tiles):
+        work = matched(
+            images, place, choice.config,
+            ["--crs", crs, "--resolution", str(cell), "--views", choice.views, "--bounds", *map(str, bounds)],
         )  # fmt: skip
-    record = json.loads((place / "run.json").read_text())
-    done, every = record["evaluations"]["done"], record["evaluations"]["all_images"]
-    cpu = next(stage["cpu_s"] for stage in record["stages"] if stage["name"] == "match")
-    judged = judge(place / "dsm.tif", truth, classes)
+    figures = judged(place / "dsm.tif", truth, classes)
     of_curves = np.concatenate([final_curves(*one, spacing) for one in tiles])
     known = of_curves[np.isfinite(of_curves[:, 0])]
-    within = {f"within_{kind}": judged[kind]["within"] for kind in ("all", "ground", "building", "tree")}
+    within = {f"within_{kind}": figures[kind]["within"] for kind in ("all", "ground", "building", "tree")}
     return {
-        "choice": name, "images": len(images), **within, "nmad_ground": judged["ground"]["nmad"],
-        "evaluations": done / 1e6, "share": done / every, "cpu_s": cpu, "views_used": float(known[:, 3].mean()),
-        "rho1": float(np.median(known[:, 0])), "ratio": float(np.median(known[:, 1])),
-        "good": float((known[:, 2] == GOOD).mean()),
+        "choice": name, "images": len(images), **within, "nmad_ground": figures["ground"]["nmad"],
+        "evaluations": work.evaluations, "share": work.share, "cpu_s": work.cpu_s,
+        "views_used": float(known[:, 3].mean()), "rho1": float(np.median(known[:, 0])),
+        "ratio": float(np.median(known[:, 1])), "good": float((known[:, 2] == GOOD).mean()),
     }  # fmt: skip
-
-
-def judge(dsm: Path, truth: Path, classes: Path) -> dict[str, Any]:
-    """Figures per class: of the independent script where it is at hand, else of our own evaluation."""
-    if JUDGE.exists():
-        command = [sys.executable, str(JUDGE), str(dsm), str(truth), "--class", str(classes), "--json"]
-        found = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        return dict(json.loads(found))
-    from zlocus.evaluation.evaluate import evaluate
-
-    return evaluate(dsm, truth, classes=classes).as_dict()
 
 
 COLUMNS = {
@@ -240,15 +216,12 @@ def main() -> None:
     with rasterio.open(arguments.folder / "truth_dsm.tif") as file:
         crs, z = str(file.crs), float(np.median(file.read(1)))
     found = []
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS), flush=True)
+    print(table_head(COLUMNS), flush=True)
     for name, choice in choices(list(images), ranked_by_geometry(images, crs, z)).items():
         if arguments.only is None or name in arguments.only:
             found.append(run(name, choice, arguments.folder, arguments.out))
-            print("| " + " | ".join(form.format(**found[-1]) for form in COLUMNS.values()) + " |", flush=True)
-    with (arguments.out / "selection.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, found[0])
-        writer.writeheader()
-        writer.writerows(found)
+            print(table_row(COLUMNS, found[-1]), flush=True)
+    write_table(found, arguments.out / "selection.csv")
     picture(found, arguments.out / "selection.png")
 
 
