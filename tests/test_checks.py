@@ -17,7 +17,16 @@ AT = (3, 4)
 
 def judged(**changed):
     """Reasons of 7 x 9 good cells, of which the one at AT differs."""
-    values = {"best": 50, "margin": 500, "height": 50.2, "ncc": 0.9, "refined": True, "covering": 3, "seeing": 3}
+    values = {
+        "best": 50,
+        "margin": 500,
+        "height": 50.2,
+        "ncc": 0.9,
+        "refined": True,
+        "covering": 3,
+        "seeing": 3,
+        "apart": 0.5,
+    }
     arrays = {name: np.full((7, 9), value) for name, value in values.items()}
     for name, value in changed.items():
         arrays[name][AT] = value
@@ -27,7 +36,8 @@ def judged(**changed):
     refined = RefinedHeights(
         height, arrays["ncc"].astype(np.float32), arrays["refined"].astype(bool), height, nothing, nothing, 49
     )
-    return judge(heights, refined, arrays["covering"], arrays["seeing"], 99, OPTIONS)
+    apart = arrays["apart"].astype(np.float32)
+    return judge(heights, refined, arrays["covering"], arrays["seeing"], apart, 99, OPTIONS)
 
 
 def test_good_cells_have_no_reason():
@@ -44,6 +54,7 @@ def test_good_cells_have_no_reason():
         ({"best": 110}, Quality.RANGE_END),
         ({"ncc": 0.19}, Quality.NO_MATCH | Quality.WEAK),
         ({"ncc": 0.49}, Quality.WEAK),
+        ({"apart": 1.01}, Quality.DISPUTED),
         ({"margin": 63}, Quality.AMBIGUOUS),
         ({"refined": False}, Quality.UNREFINED),
     ],

@@ -282,6 +282,10 @@ class CheckOptions(Checked):
         low=-1.0, high=1.0,
     )  # fmt: skip
     doubtful_ncc: float = option(0.3, "A cell is marked as weak below this mean NCC.", low=-1.0, high=1.0)
+    disputed_steps: float = option(
+        1.0, "A cell is marked as disputed where the heights of two groups of pairs of images are farther apart around "
+        "it.", low=0.0, high=100.0, unit="steps",
+    )  # fmt: skip
     rival_cost: int = option(
         64, "A cell is marked as ambiguous when another height costs less than this more over the eight paths.",
         low=0, high=10000,

@@ -408,9 +408,10 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
     covering = covers(result.seen).sum(axis=0)
     seeing = sees(result.seen, at).sum(axis=0)
     last = scene.n_steps - 1
-    quality = judge(result.heights, refined, covering, seeing, last, config.checks)
+    signs = signs_of_precision(result.heights, refined, seeing)
+    quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)
     height = result.lattice.metres(refined.height)
-    sigma = sigma_steps(signs_of_precision(result.heights, refined, seeing), refined) * np.float32(scene.step_m)
+    sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
     ortho = _true_ortho(pixels, result, refined.height, block)

@@ -20,13 +20,15 @@ def judge(
     refined: RefinedHeights,
     n_covering: NDArray[np.integer],
     n_seeing: NDArray[np.integer],
+    apart: NDArray[np.float32],
     last_index: int,
     options: CheckOptions,
 ) -> NDArray[np.uint16]:
     """Reasons of every cell, (r, c) uint16.
 
-    n_covering : images that cover the cell at any height; n_seeing : images that see the surface there; last_index :
-    highest height index of the scene.
+    n_covering : images that cover the cell at any height; n_seeing : images that see the surface there; apart : (r, c)
+    float32 steps, between the heights of two groups of pairs of images, around the cell (what matching from another
+    reference image checks where there is one); last_index : highest height index of the scene.
     """
     quality = np.zeros(heights.best.shape, np.uint16)
 
@@ -42,4 +44,5 @@ def judge(
     mark(heights.margin < options.rival_cost, Quality.AMBIGUOUS)
     mark(cv2.dilate(refined.height, AROUND) - cv2.erode(refined.height, AROUND) > JUMP_STEPS, Quality.JUMP)
     mark(~refined.is_refined, Quality.UNREFINED)
+    mark(seen & (apart > options.disputed_steps), Quality.DISPUTED)
     return quality

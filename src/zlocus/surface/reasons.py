@@ -23,6 +23,7 @@ class Quality(IntFlag):
     JUMP = 1024  # next to a jump in height
     UNREFINED = 2048  # height to a fraction of a step only: sub-step refinement did not converge
     FILLED = 4096  # no match: interpolated from its neighbours
+    DISPUTED = 8192  # two halves of the pairs of images find different heights around
 
 
 EMPTY = (
