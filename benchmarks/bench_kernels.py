@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.refine import tile_profile
 from zlocus.kernels.resample import RUN, resample_plane
 from zlocus.kernels.sgm import sweep, winners
@@ -145,6 +146,21 @@ def test_sgm(benchmark, count):
     if count == 64:
         benchmark.extra_info["sgm_cell_steps_per_s"] = heights.size / seconds
         benchmark.extra_info["opencv_hh_cell_steps_per_s"] = opencv_speed(side, count)
+
+
+@pytest.mark.parametrize("count", [16, 32, 64, None], ids=["16", "32", "64", "ragged"])
+def test_mgm(benchmark, count):
+    heights = lattice(SGM_SIDE, count)
+    rng = np.random.default_rng(5)
+    cost = rng.integers(0, 129, heights.size).astype(np.uint8)
+    p2 = rng.integers(60, 240, (4, SGM_SIDE, SGM_SIDE)).astype(np.uint16)
+    total = np.zeros(heights.size, np.uint16)
+
+    def call():
+        for turn in range(4):
+            sweep_quarter(cost, heights.ranges, heights.address, BLOCK, p2, np.uint16(20), turn, total)
+
+    timed(benchmark, call, heights.size, "cell-step")
 
 
 def opencv_speed(side: int, n_disparities: int) -> float:

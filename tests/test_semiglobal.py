@@ -67,13 +67,14 @@ def test_penalties_without_easing_are_the_same_at_every_level():
     np.testing.assert_array_equal(penalties(ortho, (6, 6), 3, kept), penalties(ortho, (6, 6), 0, kept))
 
 
-def test_aggregation_joins_what_picking_alone_does_not():
+@pytest.mark.parametrize("predecessors", [1, 2])
+def test_aggregation_joins_what_picking_alone_does_not(predecessors):
     lattice = even_lattice(16, (20, 24), 16)
     rng = np.random.default_rng(3)
     cost = rng.integers(30, 90, (20, 24, 16)).astype(np.uint8)
     cost[..., 7] -= 25
     p2 = penalties(None, lattice.shape, 0, OPTIONS)
-    joined = aggregate(cost.ravel(), lattice, p2, OPTIONS)
+    joined = aggregate(cost.ravel(), lattice, p2, replace(OPTIONS, predecessors=predecessors))
     single = alone(cost.ravel(), lattice)
     assert (np.abs(joined.best - 7) <= 1).mean() > 0.97
     assert (np.abs(single.best - 7) <= 1).mean() < 0.9
@@ -90,6 +91,16 @@ def test_cells_by_themselves_are_aggregation_without_penalties():
     for name in ("best", "second", "margin", "vertex"):
         np.testing.assert_array_equal(getattr(single, name), getattr(free, name))
     assert 0 < np.median(single.margin) < 65535
+
+
+def test_one_and_two_predecessors_give_margins_of_the_same_size():
+    """The chosen kernel is the one that the option names: the sums differ, their size does not."""
+    lattice = even_lattice(16, (20, 24), 16)
+    cost = np.random.default_rng(3).integers(30, 90, lattice.size).astype(np.uint8)
+    p2 = penalties(None, lattice.shape, 0, OPTIONS)
+    one, two = (aggregate(cost, lattice, p2, replace(OPTIONS, predecessors=n)).margin for n in (1, 2))
+    assert (one != two).any()
+    assert np.median(two) == pytest.approx(np.median(one), rel=0.5)
 
 
 def test_heights_above_a_base_surface():

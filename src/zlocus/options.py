@@ -145,15 +145,19 @@ class MeasureOptions(Checked):
 class SemiGlobalOptions(Checked):
     """Penalties of the semi-global constraint, in cost units: 64 is the cost of NCC 0 (method section 5)."""
 
-    p1: int = option(20, "Penalty of a neighbour one step away.", low=0, high=1000)
-    p2: int = option(240, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
-    p2_edge: int = option(60, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
+    predecessors: int = option(
+        2, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower).",
+        choices=(1, 2),
+    )  # fmt: skip
+    p1: int = option(28, "Penalty of a neighbour one step away.", low=0, high=1000)
+    p2: int = option(300, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
+    p2_edge: int = option(30, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
     level_easing: float = option(
         0.85, "Penalties of jumps are eased by this at every coarser level, where a roof has fewer cells.",
         low=0.1, high=1.0,
     )  # fmt: skip
     edge_contrast: float = option(
-        2.0,
+        1.5,
         "Grey difference that halves the penalty of a jump, in median differences of the scene.",
         low=0.01,
         high=1e3,

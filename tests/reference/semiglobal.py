@@ -42,6 +42,36 @@ def path_sums(cost, p1, p2):
     return total
 
 
+def more_global_sums(cost, p1, p2):
+    """Facciolo, de Franchis, Meinhardt (2015), two predecessors, means rounded down, summed over eight directions.
+
+    As `path_sums`; each cell is asked for its two neighbours' path costs, whatever the order.
+    """
+    rows, cols, _ = cost.shape
+    total = np.zeros_like(cost)
+    for along in (*BEHIND, *((-dr, -dc) for dr, dc in BEHIND)):
+        steps = (along, (along[1], -along[0]))
+        done = np.full((rows, cols), False)
+        paths = np.zeros_like(cost)
+        while not done.all():
+            for r, c in np.argwhere(~done):
+                arrivals = []
+                for dr, dc in steps:
+                    q = (r + dr, c + dc)
+                    if not (0 <= q[0] < rows and 0 <= q[1] < cols):
+                        continue
+                    if not done[q]:
+                        break
+                    forward = (dr, dc) in BEHIND
+                    edge = p2[BEHIND.index((dr, dc)), r, c] if forward else p2[BEHIND.index((-dr, -dc)), q[0], q[1]]
+                    arrivals.append(transition(paths[q], p1, edge))
+                else:
+                    paths[r, c] = cost[r, c] + (np.floor(np.mean(arrivals, axis=0)) if arrivals else 0)
+                    done[r, c] = True
+        total += paths
+    return total
+
+
 def transition(behind, p1, p2):
     """Least cost to arrive at each height (h,) from the neighbour's path costs (h,)."""
     least = behind.min()

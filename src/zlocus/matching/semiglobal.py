@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.sgm import sweep, winners
 from zlocus.matching.lattice import HeightLattice
 from zlocus.options import SemiGlobalOptions
@@ -61,6 +62,8 @@ def aggregate(
     cost: NDArray[np.uint8], lattice: HeightLattice, p2: NDArray[np.uint16], options: SemiGlobalOptions
 ) -> SemiGlobalHeights:
     """Sum of the path costs over 8 paths, and its minima. cost : (v,) uint8, see `HeightLattice.address`."""
+    if options.predecessors == 2:
+        return pick(more_global_sums(cost, lattice, p2, options.p1), lattice)
     total = np.empty(lattice.size, np.uint16)
     p1 = np.uint16(options.p1)
     for sign in (1, -1):
@@ -74,6 +77,20 @@ def alone(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
     Costs count once per path there, so they do here, and margins mean the same.
     """
     return pick(np.multiply(cost, np.uint16(2 * len(BEHIND)), dtype=np.uint16), lattice)
+
+
+def more_global_sums(
+    cost: NDArray[np.uint8], lattice: HeightLattice, p2: NDArray[np.uint16], p1: int
+) -> NDArray[np.uint16]:
+    """Sum over 8 directions of path costs with two predecessors, (v,) uint16.
+
+    The second one lies a quarter turn clockwise from the first (Facciolo, de Franchis, Meinhardt 2015). Sums are of
+    the size of those with one predecessor, so that limits on margins mean the same.
+    """
+    total = np.zeros(lattice.size, np.uint16)
+    for turn in range(4):
+        sweep_quarter(cost, lattice.ranges, lattice.address, lattice.block, p2, np.uint16(p1), turn, total)
+    return total
 
 
 def pick(total: NDArray[np.uint16], lattice: HeightLattice) -> SemiGlobalHeights:
