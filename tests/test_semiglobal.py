@@ -74,7 +74,7 @@ def test_aggregation_joins_what_picking_alone_does_not(predecessors):
     cost = rng.integers(30, 90, (20, 24, 16)).astype(np.uint8)
     cost[..., 7] -= 25
     p2 = penalties(None, lattice.shape, 0, OPTIONS)
-    joined = aggregate(cost.ravel(), lattice, p2, replace(OPTIONS, predecessors=predecessors))
+    joined = aggregate(cost.ravel(), lattice, p2, 1.0, replace(OPTIONS, predecessors=predecessors))
     single = alone(cost.ravel(), lattice)
     assert (np.abs(joined.best - 7) <= 1).mean() > 0.97
     assert (np.abs(single.best - 7) <= 1).mean() < 0.9
@@ -86,7 +86,7 @@ def test_cells_by_themselves_are_aggregation_without_penalties():
     """Margins included, on which the ranges of the next level and the flag of ambiguous cells depend."""
     lattice = even_lattice(16, (20, 24), 16)
     cost = np.random.default_rng(4).integers(0, 256, lattice.size).astype(np.uint8)
-    free = aggregate(cost, lattice, np.zeros((4, *lattice.shape), np.uint16), replace(OPTIONS, p1=0))
+    free = aggregate(cost, lattice, np.zeros((4, *lattice.shape), np.uint16), 1.0, replace(OPTIONS, p1=0))
     single = alone(cost, lattice)
     for name in ("best", "second", "margin", "vertex"):
         np.testing.assert_array_equal(getattr(single, name), getattr(free, name))
@@ -98,9 +98,12 @@ def test_one_and_two_predecessors_give_margins_of_the_same_size():
     lattice = even_lattice(16, (20, 24), 16)
     cost = np.random.default_rng(3).integers(30, 90, lattice.size).astype(np.uint8)
     p2 = penalties(None, lattice.shape, 0, OPTIONS)
-    one, two = (aggregate(cost, lattice, p2, replace(OPTIONS, predecessors=n)).margin for n in (1, 2))
+    one, two = (aggregate(cost, lattice, p2, 1.0, replace(OPTIONS, predecessors=n)).margin for n in (1, 2))
     assert (one != two).any()
     assert np.median(two) == pytest.approx(np.median(one), rel=0.5)
+    for step_cells, expected in ((2.0, two), (2.1, one)):
+        unset = aggregate(cost, lattice, p2, step_cells, OPTIONS).margin
+        np.testing.assert_array_equal(unset, expected, err_msg=f"steps of {step_cells} cells")
 
 
 def test_heights_above_a_base_surface():

@@ -145,9 +145,9 @@ class MeasureOptions(Checked):
 class SemiGlobalOptions(Checked):
     """Penalties of the semi-global constraint, in cost units: 64 is the cost of NCC 0 (method section 5)."""
 
-    predecessors: int = option(
-        2, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower).",
-        choices=(1, 2),
+    predecessors: int | None = option(
+        None, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower); unset: 1 where "
+        "a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
     p1: int = option(28, "Penalty of a neighbour one step away.", low=0, high=1000)
     p2: int = option(300, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)

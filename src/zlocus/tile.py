@@ -265,7 +265,8 @@ def _match_level(
     if method == "mvll":
         heights = alone(cost, lattice)
     else:
-        heights = aggregate(cost, lattice, penalties(ortho, shape, level, config.semiglobal), config.semiglobal)
+        p2, step_cells = penalties(ortho, shape, level, config.semiglobal), scene.step_m / scene.cell_m
+        heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal)
     worth = above_base(worth, base.cells)
     return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), done, all_views)
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 IntArray = NDArray[np.int64]
+# Where a height step is more cells high than this, the base is narrow for the size of the cells.
+NARROW_BASE = 2.0
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_profile
 from zlocus.kernels.smooth import slopes, smooth_surface
+from zlocus.matching.lattice import NARROW_BASE
 from zlocus.matching.views import TileViews
 from zlocus.options import RefineOptions
 
@@ -19,7 +20,7 @@ FIRST_OFFSETS = np.linspace(-1.5, 1.5, 5, dtype=np.float32)
 LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
-NARROW_BASE, WIDE_WINDOW, NARROW_WINDOW = 2.0, 9, 7
+WIDE_WINDOW, NARROW_WINDOW = 9, 7
 FARTHEST_APART, LEAST_BEND = np.float32(3.0), np.float32(1e-6)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.sgm import sweep, winners
-from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.lattice import NARROW_BASE, HeightLattice
 from zlocus.options import SemiGlobalOptions
 
 # From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
@@ -59,10 +59,19 @@ def penalties(
 
 
 def aggregate(
-    cost: NDArray[np.uint8], lattice: HeightLattice, p2: NDArray[np.uint16], options: SemiGlobalOptions
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    p2: NDArray[np.uint16],
+    step_cells: float,
+    options: SemiGlobalOptions,
 ) -> SemiGlobalHeights:
-    """Sum of the path costs over 8 paths, and its minima. cost : (v,) uint8, see `HeightLattice.address`."""
-    if options.predecessors == 2:
+    """Sum of the path costs over 8 paths, and its minima.
+
+    cost : (v,) uint8, see `HeightLattice.address`; step_cells : height of a step over the side of a cell. Two
+    predecessors find more roofs; with a narrow base there is little to find (a step is as high as a storey) and they
+    take more time than all the rest of the constraint.
+    """
+    if (options.predecessors or (1 if step_cells > NARROW_BASE else 2)) == 2:
         return pick(more_global_sums(cost, lattice, p2, options.p1), lattice)
     total = np.empty(lattice.size, np.uint16)
     p1 = np.uint16(options.p1)
