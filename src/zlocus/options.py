@@ -146,8 +146,8 @@ class SemiGlobalOptions(Checked):
     """Penalties of the semi-global constraint, in cost units: 64 is the cost of NCC 0 (method section 5)."""
 
     predecessors: int | None = option(
-        None, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower); unset: 1 where "
-        "a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
+        None, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower); unset: 1 "
+        "where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
     p1: int = option(28, "Penalty of a neighbour one step away.", low=0, high=1000)
     p2: int = option(300, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
@@ -249,7 +249,7 @@ class SelectionOptions(Checked):
     fewest_views: int = option(7, "Where fewer images see a tile, all are used.", low=3, high=255)
     least_images: int = option(2, "Search images that are kept whatever their labels say.", low=1, high=254)
     most_images: int = option(
-        4, "Search images a cell is matched with at most; the refinement takes all that help.", low=1, high=254
+        5, "Search images a cell is matched with at most; the refinement takes all that help.", low=1, high=254
     )
     candidates: int = option(12, "Search images considered for a block, at most.", low=1, high=254)
     least_overlap: float = option(
