@@ -31,23 +31,31 @@ TRIES_PER_OBJECT = 25
 GAP_M = 2.5
 CLUMP_M = 0.3
 BALK_M = 2.0  # of bare ground between crops
+CROWN_RADIUS_M = (1.6, 4.8)
+ROUGHEST_CROWN = 0.75
+LEAF_CONTRAST = 0.08
+ROOF_ALBEDOS = (0.20, 0.26, 0.30, 0.38, 0.46, 0.62)
+EAVES_M = (4.5, 6.0, 7.5, 9.0, 10.5, 12.0)
 
 
 @dataclass(frozen=True)
 class Objects:
-    """How much stands on the ground. Densities are per hectare; towers are buildings of 25 to 60 m.
+    """How much stands on the ground. Densities are per hectare.
 
     plain_roofs : share of roofs without pattern, whose texture is hardly above the noise; the rest is striped or like
-    gravel, half and half. crop_side_m : side of the squares of crops, in rows that repeat, on what else is bare; 0:
-    no crops.
+    gravel, half and half. tower_m : lowest and highest tower, up to 2 m more. rough_m : standard deviation of the height
+    of grass and stones, cell by cell, where nothing else stands. crop_side_m : side of the squares of crops, in rows
+    that repeat, on what else is bare; 0: no crops.
     """
 
     road_spacing_m: float
     buildings_per_ha: float
     towers_per_ha: float
     trees_per_ha: float
-    plain_roofs: float = 0.6
-    max_tree_m: float = 12.0
+    plain_roofs: float = 0.5
+    max_tree_m: float = 14.0
+    tower_m: tuple[float, float] = (21.0, 32.0)
+    rough_m: float = 0.0
     crop_side_m: float = 0.0
 
 
@@ -84,17 +92,20 @@ def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> Synthet
     painted = replace(ground, planes=ground.planes.copy(), material=ground.material.copy())
     materials = [ground.materials[0], plain_material(ROAD, PATTERN_GRAIN, 0.27, 0.03),
                  plain_material(ROAD, PATTERN_GRAIN, 0.62, 0.02)]  # fmt: skip
-    materials += [plain_material(TREE, PATTERN_LEAVES, albedo, 0.3) for albedo in TREE_ALBEDOS]
+    materials += [plain_material(TREE, PATTERN_LEAVES, albedo, LEAF_CONTRAST) for albedo in TREE_ALBEDOS]
     hectares = ground.heights.size * ground.step**2 / 1e4
     if objects.road_spacing_m:
         _draw_roads(painted, objects.road_spacing_m, rng)
     for per_ha, is_tower in ((objects.towers_per_ha, True), (objects.buildings_per_ha, False)):
         for _ in range(round(per_ha * hectares)):
-            materials += _place_building(painted, is_tower, objects.plain_roofs, len(materials), rng)
+            materials += _place_building(painted, is_tower, objects, len(materials), rng)
     for _ in range(round(objects.trees_per_ha * hectares)):
         _place_tree(painted, objects.max_tree_m, rng)
     if objects.crop_side_m:
         materials += _plant_crops(painted, objects.crop_side_m, len(materials), rng)
+    if objects.rough_m:
+        bare = painted.material == BARE
+        painted.heights[bare] += objects.rough_m * rng.standard_normal(int(bare.sum()), dtype=np.float32)
     return replace(painted, materials=np.array(materials, MATERIAL))
 
 
@@ -120,12 +131,12 @@ def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Genera
 
 
 def _place_building(
-    ground: SyntheticGround, is_tower: bool, plain_roofs: float, index: int, rng: np.random.Generator
+    ground: SyntheticGround, is_tower: bool, objects: Objects, index: int, rng: np.random.Generator
 ) -> list[NDArray[np.void]]:  # fmt: skip
     """Puts a building where there is room for it. Returns its materials (empty where none was found)."""
     for _ in range(TRIES_PER_OBJECT):
         rows, cols = ground.heights.shape
-        length, width = rng.uniform(9.0, 26.0), rng.uniform(8.0, 14.0)
+        length, width = rng.uniform(12.0, 27.0), rng.uniform(10.0, 17.0)
         if is_tower:
             length, width = rng.uniform(14.0, 22.0), rng.uniform(13.0, 18.0)
         footprint = Footprint(
@@ -138,9 +149,9 @@ def _place_building(
         near = (np.abs(p) < length / 2 + GAP_M) & (np.abs(q) < width / 2 + GAP_M)
         if (ground.material[window][near] != BARE).any():
             continue
-        storey_height = rng.uniform(25.0, 58.0) if is_tower else float(rng.choice([3.0, 4.5, 6.0, 9.0, 12.0, 18.0]))
+        storey_height = rng.uniform(*objects.tower_m) if is_tower else float(rng.choice(EAVES_M))
         return _build(
-            ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, plain_roofs, index, rng
+            ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, objects.plain_roofs, index, rng
         )
     return []
 
@@ -182,7 +193,7 @@ def _building_material(
     patterned = (1.0 - plain_roofs) / 2
     pattern = int(rng.choice([PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_NATURAL], p=[plain_roofs, patterned, patterned]))
     contrast = {PATTERN_GRAIN: 0.006, PATTERN_STRIPES: rng.uniform(0.05, 0.25), PATTERN_NATURAL: 0.03}[pattern]
-    material = plain_material(BUILDING, pattern, float(rng.choice([0.14, 0.22, 0.30, 0.38, 0.46, 0.62])), contrast)
+    material = plain_material(BUILDING, pattern, float(rng.choice(ROOF_ALBEDOS)), contrast)
     material["period"] = rng.uniform(0.7, 2.4)
     material["x"], material["y"] = footprint.x, footprint.y
     material["cos"], material["sin"] = np.cos(footprint.angle), np.sin(footprint.angle)
@@ -196,7 +207,7 @@ def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Gener
     """A rough crown: half an ellipsoid over a trunk's height, broken up into clumps; may touch other trees."""
     for _ in range(TRIES_PER_OBJECT):
         rows, cols = ground.heights.shape
-        radius = rng.uniform(1.2, 4.2)
+        radius = rng.uniform(*CROWN_RADIUS_M)
         height = min(max_tree_m, radius * rng.uniform(1.8, 3.2))
         footprint = Footprint(
             rng.uniform(0, cols * ground.step), rng.uniform(0, rows * ground.step), 0.0, 2 * radius, 2 * radius
@@ -213,7 +224,7 @@ def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Gener
         trunk = 0.35 * height
         top = trunk + (height - trunk) * np.sqrt(np.maximum(1.0 - squared, 0.02))
         clump = max(1, round(CLUMP_M / ground.step))
-        rough = np.kron(rng.uniform(0.62, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
+        rough = np.kron(rng.uniform(ROUGHEST_CROWN, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
         rough = top * rough[: top.shape[0], : top.shape[1]]
         foot = float(ground.heights[window][top.shape[0] // 2, top.shape[1] // 2])
         crown &= foot + rough > ground.heights[window] + 0.3

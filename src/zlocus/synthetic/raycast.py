@@ -28,6 +28,8 @@ Look = tuple[NDArray[np.uint16], NDArray[np.void], NDArray[np.float32], NDArray[
 MISS, TOP, WALL_U, WALL_V = 0, 1, 2, 3
 SKY = 0.27
 WEEDS = 0.15  # of natural texture in crops, beside rows of amplitude 1
+# Of natural ground, finer than a pixel: the rays of another view meet other grains.
+GRAIN = 0.5
 NEVER = 1e-30
 OFF_SURFACE_M = 0.02
 OFF_WALL_CELLS = 1.5
@@ -137,7 +139,8 @@ def top_albedo(x, y, texel_m, material, textures):
         value = mixed * _texel(textures[GRAVEL], a, b) if mixed > 0.0 else 0.0
         if mixed < 1.0:
             value += (1.0 - mixed) * _texel(textures[GRASS], 0.96 * a - 0.28 * b, 0.96 * b + 0.28 * a)
-        value += 0.9 * _texel(textures[FRACTAL], 0.083 * a - 0.031 * b + 71.0, 0.083 * b + 0.031 * a)
+        value += GRAIN * _texel(textures[GRASS], 5.3 * a, 5.3 * b)
+        value += 0.4 * _texel(textures[FRACTAL], 0.083 * a - 0.031 * b + 71.0, 0.083 * b + 0.031 * a)
     elif pattern == PATTERN_LEAVES:
         value = _texel(textures[GRAVEL], 1.7 * a, 1.7 * b)
     else:

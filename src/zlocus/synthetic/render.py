@@ -45,9 +45,9 @@ class Optics:
 
     gain: float = 1100.0
     haze: float = 140.0
-    blur_px: float = 0.55
-    noise: float = 0.011
-    noise_floor: float = 3.5
+    blur_px: float = 0.58
+    noise: float = 0.005
+    noise_floor: float = 4.8
     n_clouds: int = 0
     dtype: str = "uint16"
 

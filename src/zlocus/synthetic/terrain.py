@@ -136,7 +136,7 @@ def natural_ground(
 
 def bare_material() -> NDArray[np.void]:
     """Natural ground: () of dtype MATERIAL."""
-    return plain_material(GROUND, PATTERN_NATURAL, albedo=0.42, contrast=0.16)
+    return plain_material(GROUND, PATTERN_NATURAL, albedo=0.44, contrast=0.17)
 
 
 def plain_material(kind: int, pattern: int, albedo: float, contrast: float) -> NDArray[np.void]:

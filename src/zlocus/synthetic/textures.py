@@ -8,18 +8,18 @@ from scipy import fft
 
 TEXTURE_SIZE = 1024
 GRAVEL, GRASS, FRACTAL = 0, 1, 2
-STONES = (128, 72)
+STONES = (72, 44)
 STROKE_DIRECTIONS = 7
 STROKE_DENSITY = 0.004
-STROKE_LENGTH, STROKE_WIDTH = 9.0, 0.9
+STROKE_LENGTH, STROKE_WIDTH = 11.0, 1.1
 
 
 def natural_textures(rng: np.random.Generator, size: int = TEXTURE_SIZE) -> NDArray[np.float32]:
     """(3, t, t) float32, each of mean 0 and standard deviation 1; periodic. Gravel, grass, fractal."""
     fine, coarse = (_stones(rng, size, max(2, n * size // TEXTURE_SIZE)) for n in STONES)
     fractal = fractal_surface(rng, (size, size), 1.0, longest=size / 8, exponent=1.1)
-    gravel = _unit(fine) + 0.9 * _unit(coarse) + 0.5 * fractal
-    grass = _unit(_strokes(rng, size)) + 0.6 * fractal
+    gravel = _unit(fine) + 0.9 * _unit(coarse) + 0.3 * fractal
+    grass = _unit(_strokes(rng, size)) + 0.3 * fractal
     return np.stack([_unit(gravel), _unit(grass), fractal])
 
 
