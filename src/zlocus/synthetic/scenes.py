@@ -152,7 +152,7 @@ def demo_spec(seed: int = 4) -> SceneSpec:
     return SceneSpec(
         kind="city", seed=seed, size=600, gsd_m=0.2, camera="ads40", relief_m=6.0, hill_m=9.0,
         views=ADS40_VIEWS,
-        objects=Objects(70.0, 5.0, 0.8, 14.0, plain_roofs=0.25, max_tree_m=12.0, tower_m=(25.0, 58.0)),
+        objects=Objects(70.0, 3.6, 0.8, 14.0, plain_roofs=0.25, max_tree_m=12.0, tower_m=(25.0, 58.0)),
     )  # fmt: skip
 
 
