@@ -43,9 +43,9 @@ class Objects:
     """How much stands on the ground. Densities are per hectare.
 
     plain_roofs : share of roofs without pattern, whose texture is hardly above the noise; the rest is striped or like
-    gravel, half and half. tower_m : lowest and highest tower, up to 2 m more. rough_m : standard deviation of the height
-    of grass and stones, cell by cell, where nothing else stands. crop_side_m : side of the squares of crops, in rows
-    that repeat, on what else is bare; 0: no crops.
+    gravel, half and half. tower_m : lowest and highest tower, up to 2 m more. rough_m : standard deviation of the
+    height of grass and stones, cell by cell, where nothing else stands. crop_side_m : side of the squares of crops, in
+    rows that repeat, on what else is bare; 0: no crops.
     """
 
     road_spacing_m: float
