@@ -37,6 +37,14 @@ DEMO_ACCURACY = "accuracy.json"
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# Arguments and options that several commands share.
+Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")]
+Resolution = Annotated[float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")]
+Crs = Annotated[str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")]
+Workers = Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")]
+ConfigFile = Annotated[Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")]
+
 app = typer.Typer(
     name="zlocus",
     help="Digital surface models from images, by multi-view vertical line locus matching.",
@@ -130,14 +138,10 @@ def demo(
 @app.command()
 @explained
 def dsm(
-    inputs: Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")],
+    inputs: Inputs,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")],
-    resolution: Annotated[
-        float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")
-    ] = None,
-    crs: Annotated[
-        str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")
-    ] = None,
+    resolution: Resolution = None,
+    crs: Crs = None,
     bounds: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
@@ -167,12 +171,10 @@ def dsm(
     partial: Annotated[
         bool, typer.Option("--partial", help="Count a surface with too few heights as a success.")
     ] = False,
-    workers: Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")] = 1,
+    workers: Workers = 1,
     memory: Annotated[float | None, typer.Option(help="Most memory to use, GB.", metavar="GB")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")] = False,
-    config: Annotated[
-        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
-    ] = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
 ) -> None:
     """Make a surface from images."""
     request = DsmRequest(
@@ -191,15 +193,13 @@ def dsm(
 @app.command()
 @explained
 def cloud(
-    inputs: Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")],
+    inputs: Inputs,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")],
     reference: Annotated[
         list[str] | None,
         typer.Option(help="Name of a view whose pixels get heights; may be repeated. Default: all.", metavar="VIEW"),
     ] = None,
-    crs: Annotated[
-        str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")
-    ] = None,
+    crs: Crs = None,
     heights: Annotated[
         tuple[float, float] | None,
         typer.Option(help="Range searched, m. Default: found from tie points.", metavar="ZMIN ZMAX"),
@@ -208,11 +208,9 @@ def cloud(
         str, typer.Option(help="What to do with gaps of the height maps.", metavar="none|interpolate")
     ] = "none",
     partial: Annotated[bool, typer.Option("--partial", help="Count a cloud with too few points as a success.")] = False,
-    workers: Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")] = False,
-    config: Annotated[
-        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
-    ] = None,
+    workers: Workers = 1,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
 ) -> None:
     """Make a coloured point cloud, with a height for every pixel of the images."""
     request = CloudRequest(
@@ -233,7 +231,7 @@ def cloud(
 @app.command()
 @explained
 def curves(
-    inputs: Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")],
+    inputs: Inputs,
     at: Annotated[
         tuple[float, float] | None, typer.Option(help="The point on the ground, in the CRS.", metavar="X Y")
     ] = None,
@@ -245,12 +243,8 @@ def curves(
     height: Annotated[
         float | None, typer.Option(help="Look around this height, m. Default: that of the nearest ties.", metavar="Z")
     ] = None,
-    resolution: Annotated[
-        float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")
-    ] = None,
-    crs: Annotated[
-        str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")
-    ] = None,
+    resolution: Resolution = None,
+    crs: Crs = None,
     heights: Annotated[
         tuple[float, float] | None,
         typer.Option(help="Range in which ties are looked for, m. Default: found.", metavar="ZMIN ZMAX"),
@@ -258,10 +252,8 @@ def curves(
     reference: Annotated[
         str | None, typer.Option(help="Name of the reference view. Default: chosen for the point.", metavar="VIEW")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")] = False,
-    config: Annotated[
-        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
-    ] = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
 ) -> None:
     """Show the match curves of one point: labels, order of the images, and where the match ends."""
     request = CurvesRequest(
