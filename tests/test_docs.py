@@ -9,6 +9,7 @@ import pytest
 import typer.main
 
 from zlocus.cli import app
+from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
 from zlocus.surface import reasons
 from zlocus.surface.reasons import EMPTY, Quality
@@ -38,6 +39,21 @@ def test_the_scene_file_of_the_documents_is_valid(tmp_path):
     (tmp_path / "scene.yaml").write_text(example, encoding="utf-8")
     scene = read_scene_file(tmp_path / "scene.yaml")
     assert [view.name for view in scene.views] == ["nadir", "forward"]
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/examples/*.yaml")), ids=lambda p: p.name)
+def test_the_examples_are_valid(path):
+    assert len(read_scene_file(path).views) == 2
+    assert f"examples/{path.name}" in (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+
+
+def test_every_importer_is_documented():
+    page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([a-z]+)` \|", page, re.MULTILINE) == list(IMPORTERS)
+    options = {name for importer in IMPORTERS.values() for name in importer.options} | {"images", "overwrite"}
+    assert all(f"--{name}" in page for name in options)
+    (argument,) = (p for p in typer.main.get_command(app).commands["import"].params if p.name == "kind")
+    assert argument.help == ", ".join(list(IMPORTERS)[:-1]) + f" or {list(IMPORTERS)[-1]}."
 
 
 def test_the_readme_lists_every_option_of_dsm():

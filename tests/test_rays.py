@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from rendered_scenes import UTM, camera
+from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.model import SensorModel
 from zlocus.sensors.rays import DepthRays, HeightRays, PixelModel
@@ -28,7 +31,14 @@ def frame(x: float, kappa: float = 0.0, phi: float = 0.0, z: float = 800.0) -> F
 
 HEIGHTS = (HeightRays(rpc("nadir"), 50.0, 0.5), rpc("fore"))
 DEPTHS = (DepthRays(frame(0.0), 1200.0 * 90.0), frame(90.0, 12.0, 6.0, 700.0))
-both = pytest.mark.parametrize(("rays", "other"), [HEIGHTS, DEPTHS], ids=["heights", "depths"])
+LENS = BrownDistortion(-0.1, 0.02, 4e-4, -2e-4)
+REAL = [replace(model, distortion=LENS, aspect=1.02, skew=0.3) for model in (DEPTHS[0].sensor, DEPTHS[1])]
+AT = [replace(model, centre=tuple(np.add(model.centre, [420_000, 4_790_000, 0]))).on_earth(UTM, UTM) for model in REAL]
+LENSES = (DepthRays(REAL[0], 1200.0 * 90.0), REAL[1])
+EARTH = (DepthRays(AT[0], 1200.0 * 90.0), AT[1])
+both = pytest.mark.parametrize(
+    ("rays", "other"), [HEIGHTS, DEPTHS, LENSES, EARTH], ids=["heights", "depths", "lenses", "earth"]
+)
 
 
 @both

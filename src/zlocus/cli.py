@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from zlocus import __version__
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.progress import progress_for
-from zlocus.request import CloudRequest, CurvesRequest, DsmRequest, check_output
+from zlocus.request import CloudRequest, CurvesRequest, DsmRequest, ImportRequest, check_output
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
@@ -265,6 +265,43 @@ def curves(
     from zlocus.point import run_point
 
     print(run_point(request, run_config, progress_for(sys.stderr)))
+
+
+@app.command("import")
+@explained
+def import_cameras(
+    kind: Annotated[str, typer.Argument(help="colmap, opensfm, metashape, bundler, eo or strecha.", metavar="FORMAT")],
+    source: Annotated[Path, typer.Argument(help="Folder of the cameras, or their file.", metavar="DIR")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Scene file to write.")] = Path("scene.yaml"),
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of the images. Default: in DIR or beside it.", metavar="DIR")
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Map of the result, in metres, or of the coordinates.", metavar="EPSG:N")
+    ] = None,
+    local: Annotated[bool, typer.Option("--local", help="Keep local axes (opensfm: east, north, up).")] = False,
+    up: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Direction that becomes z of a local frame.", metavar="X Y Z"),
+    ] = None,
+    focal: Annotated[float | None, typer.Option(help="Focal length (eo), px.", metavar="PX")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Interior orientation (eo), as scene.yaml has it.", metavar="FILE")
+    ] = None,
+    earth: Annotated[
+        str | None, typer.Option(help="How the map is understood (eo). Default: curved.", metavar="curved|flat")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the scene file.")] = False,
+) -> None:
+    """Make a scene.yaml of the cameras of another program."""
+    request = ImportRequest(
+        kind=kind, source=source, out=out, images=images, crs=crs, local=local, up=up, focal=focal, camera=camera,
+        earth=earth, overwrite=overwrite,
+    )  # fmt: skip
+    from zlocus.io.importers.scene import import_scene
+
+    scene = import_scene(request)
+    print(f"{out}: {len(scene.views)} views.")
 
 
 @app.command()

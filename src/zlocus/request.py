@@ -15,6 +15,7 @@ VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll")
 VERTICALS = ("ellipsoid",)
 FILLS = ("none", "interpolate")
+EARTHS = ("curved", "flat")
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,54 @@ class CurvesRequest:
             numbers = [v for v in values or () if v is not None]
             if not all(map(math.isfinite, numbers)):
                 raise ConfigError(f"--{name} {' '.join(f'{v:g}' for v in numbers)} is no place. Give finite numbers.")
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """Cameras of another program, to become a scene file. `None` means: not given.
+
+    kind : format; source : its folder or file. images : folder of the images. crs : of the result. local : in the local
+    frame of the source, at no place of the Earth. up : direction, in the axes of the source, that becomes z of a local
+    frame. focal : px; camera : file with the interior orientation. earth : how a map is understood.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range, or two that exclude each other.
+    """
+
+    kind: str
+    source: Path
+    out: Path
+    images: Path | None = None
+    crs: str | None = None
+    local: bool = False
+    up: tuple[float, float, float] | None = None
+    focal: float | None = None
+    camera: Path | None = None
+    earth: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if not _is_scene_file(self.out):
+            raise ConfigError(f"-o {self.out} is no name of a scene file. Let it end in {' or '.join(SCENE_SUFFIXES)}.")
+        _check_positive("--focal", self.focal, "px")
+        if self.earth is not None:
+            _check_choice("earth", self.earth, EARTHS)
+        if self.up is not None and not (all(map(math.isfinite, self.up)) and any(self.up)):
+            raise ConfigError(
+                f"--up {' '.join(f'{v:g}' for v in self.up)} is no direction. Give three numbers, not all 0."
+            )
+        for one, other in (("crs", "local"), ("crs", "up"), ("focal", "camera")):
+            if {one, other} <= set(self.given()):
+                raise ConfigError(f"--{one} and --{other} exclude each other. Leave one out.")
+        if self.earth is not None and self.crs is None:
+            raise ConfigError("--earth says how a map is understood, and there is none. Give --crs, or leave it out.")
+
+    def given(self) -> list[str]:
+        """Names of the options that only some formats know, where they are given."""
+        values = {name: getattr(self, name) for name in ("crs", "local", "up", "focal", "camera", "earth")}
+        return [name for name, value in values.items() if value not in (None, False)]
 
 
 def _check_inputs(inputs: tuple[Path, ...]) -> None:

@@ -1,7 +1,7 @@
 """Scenes from files: a list of images with their own cameras, or one `scene.yaml` (schema 1).
 
 schema: 1
-frame: {crs: "EPSG:32631"}             # optional: else the UTM zone of the scene's centre; or {local: true}
+frame: {crs: "EPSG:32631"}             # optional: else the UTM zone; or {local: true, up: [x, y, z]}
 area: {bounds: [xmin, ymin, xmax, ymax]}   # optional, in that CRS
 heights: [zmin, zmax]                  # optional, ellipsoidal metres
 views:
@@ -21,32 +21,46 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import Field, FiniteFloat, SerializeAsAny, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, InputError, OutputError
-from zlocus.io.camera_kinds import KINDS, Camera, CameraSource, RpcCamera
+from zlocus.io.camera_entry import Camera, CameraSource
+from zlocus.io.camera_kinds import KINDS, RpcCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
+from zlocus.io.frame_camera import FrameCamera, Vector
 from zlocus.io.images import RasterImage, check_content, open_image
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import StrictModel, validated
 from zlocus.scene import Scene, View, is_local
+from zlocus.sensors.frame import FrameModel
+from zlocus.sensors.model import FloatArray
 
 SCENE_SUFFIXES = (".yaml", ".yml")
+OPPOSITE = 1e-12
 
 
 class Frame(StrictModel):
-    """What all views share: a CRS, or local Cartesian axes in metres with z up."""
+    """What all views share: a CRS, or local Cartesian axes in metres with z up.
+
+    up : direction, in the axes of the cameras, that becomes z of a local frame, which is turned as little as it takes.
+    """
 
     crs: str | None = None
     local: Literal[True] | None = None
+    up: Vector | None = None
 
     @model_validator(mode="after")
     def _either(self) -> Frame:
         if (self.crs is None) == (self.local is None):
             raise ValueError("give either crs: EPSG:n or local: true")
+        if self.up is not None and not self.local:
+            raise ValueError("up is for local: true; where there is a CRS, up is along the ellipsoid's normal")
+        if self.up is not None and not any(self.up):
+            raise ValueError("up is a direction: one of its three numbers is not 0")
         return self
 
 
@@ -91,8 +105,14 @@ class SceneFile(StrictModel):
                 raise ValueError(f"the view name {name!r} is used twice")
         if self.area is not None and self.frame is None:
             raise ValueError("area needs frame: {crs: EPSG:n}, whose coordinates its bounds are")
-        if self.frame is not None and self.frame.local and any(isinstance(v.camera, RpcCamera) for v in self.views):
-            raise ValueError("frame is local, but an RPC knows its place on the Earth: write frame: {crs: EPSG:n}")
+        frame_cameras = [view.camera for view in self.views if isinstance(view.camera, FrameCamera)]
+        if self.frame is not None and self.frame.local:
+            if any(isinstance(view.camera, RpcCamera) for view in self.views):
+                raise ValueError("frame is local, but an RPC knows its place on the Earth: write frame: {crs: EPSG:n}")
+            if any(camera.crs or camera.earth for camera in frame_cameras):
+                raise ValueError("frame is local, where a camera has no crs and no earth: write frame: {crs: EPSG:n}")
+        if len({camera.earth or "curved" for camera in frame_cameras}) > 1:
+            raise ValueError("some cameras have earth: flat and some not: they do not fit together, choose one for all")
         return self
 
 
@@ -131,7 +151,7 @@ def read_scene_file(path: Path) -> SceneFile:
     path = existing_file(path, "scene file")
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
@@ -168,11 +188,35 @@ def _from_scene_file(path: Path, crs: CRS | None) -> Scene:
         raise ConfigError(f"{path} has a local frame, which --crs cannot place on the Earth. Leave --crs out.")
     if scene_file.area is not None and crs is not None and crs != frame:
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
-    views = [(view.name, path.parent / view.image, view.camera) for view in scene_file.views]
+    named = None if scene_file.frame is None else scene_file.frame.crs
+    views = [(view.name, path.parent / view.image, view.camera.given_in(named)) for view in scene_file.views]
     bounds = None if scene_file.area is None else scene_file.area.bounds
     scene = _build(views, path.parent, crs or frame, bounds, scene_file.heights)
+    if scene_file.frame is not None and scene_file.frame.up is not None:
+        scene = _turned(scene, scene_file.frame.up)
     dated = zip(scene.views, scene_file.views, strict=True)
     return replace(scene, views=tuple(replace(view, date=entry.date) for view, entry in dated))
+
+
+def _turned(scene: Scene, up: tuple[float, float, float]) -> Scene:
+    """The scene in a local frame whose z is `up` of its own."""
+    rotation = turn_to_z(up)
+    views = []
+    for view in scene.views:
+        assert isinstance(view.sensor, FrameModel), "other cameras know their place on the Earth"
+        views.append(replace(view, sensor=view.sensor.turned(rotation)))
+    return replace(scene, views=tuple(views))
+
+
+def turn_to_z(up: tuple[float, float, float]) -> FloatArray:
+    """The smallest rotation, (3, 3), that makes a direction the z axis; half a turn about x for minus z."""
+    x, y, z = np.array(up) / np.max(np.abs(up))
+    x, y, z = np.array([x, y, z]) / np.linalg.norm([x, y, z])
+    if z < -1.0 + OPPOSITE:
+        return np.diag([1.0, -1.0, -1.0])
+    # Rodrigues' formula about the axis up x z, with 1 + cosine = 1 + z.
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
 
 
 def _frame_crs(frame: Frame, path: Path) -> CRS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,10 @@ class StrictModel(BaseModel):
         return value
 
 
+# Of a value that is large, or seems so because it holds itself many times over, a message shows the beginning.
+SHORT = reprlib.Repr()
+SHORT.maxlevel, SHORT.maxstring, SHORT.maxother = 2, 80, 80
+
 Document = TypeVar("Document", bound=StrictModel)
 
 
@@ -47,5 +52,5 @@ def validated(model: type[Document], document: Any, path: Path, where: str = "")
         if first["type"] == "missing":
             raise InputError(f"{path}: the key {key} is missing. Add it.") from error
         message = first["msg"].removeprefix("Value error, ")
-        value = "" if isinstance(first["input"], dict) else f" (there: {first['input']!r})"
+        value = "" if isinstance(first["input"], dict) else f" (there: {SHORT.repr(first['input'])})"
         raise InputError(f"{path}: {key or 'the document'}: {message}{value}.") from error

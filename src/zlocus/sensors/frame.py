@@ -1,11 +1,14 @@
-"""Ideal frame camera: one centre of projection, a flat image, no distortion."""
+"""Frame camera: one centre of projection, a flat image, an ideal lens or a real one, a Cartesian frame or the Earth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pyproj import CRS
 
+from zlocus.sensors.distortion import Distortion
+from zlocus.sensors.geocentric import Geocentric
 from zlocus.sensors.model import FloatArray
 
 Row = tuple[float, float, float]
@@ -13,57 +16,109 @@ Row = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FrameModel:
-    """A pinhole camera as a `SensorModel`.
+    """A frame camera as a `SensorModel`.
 
-    centre : of projection, xyz m; camera_from_ground : rows of the rotation, which are the camera's axes in the scene's
-    frame: along image rows (to the right), down the columns, and forwards along the optical axis; focal : px;
-    principal_point : (column, row) px where the optical axis meets the image.
+    centre : of projection, xyz m; camera_from_ground : rows of the rotation, which are the camera's axes: along image
+    rows (to the right), down the columns, and forwards along the optical axis; focal : px, along rows;
+    principal_point : (column, row) px where the optical axis meets the image. aspect : focal length down the columns
+    over `focal`; skew : px by which columns grow per y (of the plane at depth 1). distortion : None is an ideal lens.
+
+    earth : None where the scene's frame is Cartesian, and has the axes of centre and camera_from_ground; else these are
+    geocentric, and so are rays, while ground points are in the scene's CRS.
     """
 
     centre: Row
     camera_from_ground: tuple[Row, Row, Row]
     focal: float
     principal_point: tuple[float, float]
+    aspect: float = 1.0
+    skew: float = 0.0
+    distortion: Distortion | None = None
+    earth: Geocentric | None = None
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """See `SensorModel`; NaN behind the camera."""
-        return self.image_from_ray(np.asarray(xyz, float) - np.array(self.centre))
+        """See `SensorModel`; NaN behind the camera, and where its distortion folds."""
+        return self.image_from_ray(self._from_centre(xyz))
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`; NaN where the ray does not meet that height in front of the camera."""
         ray = self.ray_from_image(xy)
-        rise = np.broadcast_to(np.asarray(z, float), (len(ray),)) - self.centre[2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = rise / ray[:, 2]
-            xyz = np.array(self.centre) + depth[:, None] * ray
-        xyz[:, 2] = np.broadcast_to(z, (len(ray),))
-        xyz[~((depth > 0) & np.isfinite(depth))] = np.nan
-        return np.asarray(xyz)
+        z = np.broadcast_to(np.asarray(z, float), (len(ray),))
+        if self.earth is None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                depth = (z - self.centre[2]) / ray[:, 2]
+            depth[~((depth > 0) & np.isfinite(depth))] = np.nan
+        else:
+            depth = self.earth.depth_at_height(np.array(self.centre), ray, z)
+        xyz = self._along(ray, depth)
+        xyz[:, 2] = np.where(np.isnan(xyz[:, 2]), np.nan, z)
+        return xyz
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
         return None
 
+    def ground_at_depth(self, xy: FloatArray, depth: FloatArray) -> FloatArray:
+        """Ground points (n, 3) m that pixels (n, 2) see at depths (n,) m along the optical axis."""
+        return self._along(self.ray_from_image(xy), depth)
+
     def ray_from_image(self, xy: FloatArray) -> FloatArray:
-        """From the centre of projection to what pixels (n, 2) see at a depth of 1. -> (n, 3) m."""
-        at = (np.asarray(xy, float) - np.array(self.principal_point)) / self.focal
+        """From the centre of projection to what pixels (n, 2) see at a depth of 1. -> (n, 3) m; NaN where they see
+        nothing."""
+        at = (np.asarray(xy, float) - np.array(self.principal_point)) / [self.focal, self.focal * self.aspect]
+        if self.skew:
+            at[:, 0] -= self.skew / self.focal * at[:, 1]
+        if self.distortion is not None:
+            at = self.distortion.undistorted(at)
         return np.column_stack([at, np.ones(len(at))]) @ self.rotation
 
     def image_from_ray(self, ray: FloatArray) -> FloatArray:
         """Pixels that see directions from the centre of projection. ray : (n, 3), any length -> (n, 2) px."""
         in_camera = np.asarray(ray, float) @ self.rotation.T
         with np.errstate(divide="ignore", invalid="ignore"):
-            xy = self.focal * in_camera[:, :2] / in_camera[:, 2:] + np.array(self.principal_point)
-        xy[~(in_camera[:, 2] > 0)] = np.nan
+            at = in_camera[:, :2] / in_camera[:, 2:]
+        at[~(in_camera[:, 2] > 0)] = np.nan
+        if self.distortion is not None:
+            at = self.distortion.distorted(at)
+        xy = at * [self.focal, self.focal * self.aspect] + np.array(self.principal_point)
+        if self.skew:
+            xy[:, 0] += self.skew * at[:, 1]
         return np.asarray(xy)
 
     def depth(self, xyz: FloatArray) -> FloatArray:
         """Distance (n,) m of ground points (n, 3) along the optical axis; negative behind the camera."""
-        return np.asarray((np.asarray(xyz, float) - np.array(self.centre)) @ self.rotation[2])
+        return np.asarray(self._from_centre(xyz) @ self.rotation[2])
 
     def moved(self, column: float, row: float) -> FrameModel:
         """The camera whose image positions are `column` and `row` pixels larger."""
         return replace(self, principal_point=(self.principal_point[0] + column, self.principal_point[1] + row))
+
+    def turned(self, rotation: FloatArray) -> FrameModel:
+        """The camera in a Cartesian frame that is turned. rotation : (3, 3), new frame from old."""
+        assert self.earth is None, "the Earth is not turned"
+        centre, rows = rotation @ np.array(self.centre), self.rotation @ rotation.T
+        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
+
+    def on_earth(self, given: CRS, crs: CRS) -> FrameModel:
+        """The camera over the curved Earth, for ground points in `crs`.
+
+        Its own centre is a point of the map `given`, and its axes are relative to that map's at the centre: grid east,
+        grid north and up (see `Geocentric.pose`).
+        """
+        earth = Geocentric(crs)
+        centre, axes = earth.pose(given, np.array(self.centre))
+        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(self.rotation @ axes), earth=earth)
+
+    def _from_centre(self, xyz: FloatArray) -> FloatArray:
+        """Rays (n, 3) m to ground points (n, 3)."""
+        xyz = np.asarray(xyz, float)
+        points = xyz if self.earth is None else self.earth.geocentric_from_ground(xyz)
+        return np.asarray(points - np.array(self.centre))
+
+    def _along(self, ray: FloatArray, depth: FloatArray) -> FloatArray:
+        """Ground points (n, 3) at depths (n,) along rays (n, 3)."""
+        points = np.array(self.centre) + np.asarray(depth)[:, None] * ray
+        return points if self.earth is None else self.earth.ground_from_geocentric(points)
 
     @property
     def rotation(self) -> FloatArray:
@@ -83,5 +138,15 @@ def rotation_from_angles(omega: float, phi: float, kappa: float) -> tuple[Row, R
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     about_z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
     rows = np.diag([1.0, -1.0, -1.0]) @ (about_x @ about_y @ about_z).T
-    first, second, third = ((float(x), float(y), float(z)) for x, y, z in rows)
-    return first, second, third
+    return as_rows(rows)
+
+
+def as_row(vector: FloatArray) -> Row:
+    """A vector (3,) as plain numbers."""
+    x, y, z = (float(v) for v in vector)
+    return x, y, z
+
+
+def as_rows(matrix: FloatArray) -> tuple[Row, Row, Row]:
+    """A matrix (3, 3) as plain numbers."""
+    return as_row(matrix[0]), as_row(matrix[1]), as_row(matrix[2])

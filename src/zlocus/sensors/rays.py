@@ -87,7 +87,7 @@ class DepthRays:
         """See `Rays`; NaN at no disparity, which is infinitely far, and below."""
         z = np.broadcast_to(np.asarray(z, float), (len(xy),))
         depth = np.divide(self.scale, z, out=np.full(len(z), np.nan), where=z > 0)
-        return np.asarray(np.array(self.sensor.centre) + depth[:, None] * self.sensor.ray_from_image(xy))
+        return self.sensor.ground_at_depth(xy, depth)
 
     def hypothesis(self, xyz: FloatArray) -> FloatArray:
         """See `Rays`; NaN behind the camera."""
@@ -97,6 +97,7 @@ class DepthRays:
     def to(self, sensor: SensorModel) -> SensorModel:
         """See `Rays`."""
         assert isinstance(sensor, FrameModel), "only frame cameras are matched by depth"
+        assert sensor.earth == self.sensor.earth, "rays of both cameras are in the same axes"
         return DepthModel(self, sensor)
 
 
@@ -104,7 +105,7 @@ class DepthRays:
 class DepthModel:
     """A frame camera over the pixels and disparities of a reference one, as a `SensorModel`.
 
-    At one disparity the two images are related by a homography, which holds beyond infinity too.
+    At one disparity the two images, freed of distortion, are related by a homography, which holds beyond infinity too.
     """
 
     rays: DepthRays

@@ -1,0 +1,137 @@
+"""A table of exterior orientations: name, X, Y, Z, omega, phi, kappa (degrees) per line.
+
+Columns are separated by commas, semicolons, tabs or blanks, in that order or as a heading names them. The interior
+orientation comes with the request. Axes: see `rotation_from_angles`. Pixels: those of the request, counted from the
+centre of the first one.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from zlocus.errors import ConfigError, InputError
+from zlocus.io.frame_camera import Interior
+from zlocus.io.importers.base import AGAIN, Exposure, Imported, found_file, number, read_text, shown, text_lines
+from zlocus.io.strict import validated
+from zlocus.request import ImportRequest
+from zlocus.sensors.frame import rotation_from_angles
+
+FILES = ("eo.csv", "eo.txt", "exterior.csv", "exterior.txt", "camera_pos_ori.txt", "odm_xyz_opk.csv")
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "name": ("name", "image", "filename", "file", "label", "photo", "id"),
+    "x": ("x", "east", "easting", "e"),
+    "y": ("y", "north", "northing", "n"),
+    "z": ("z", "height", "altitude", "h"),
+    "omega": ("omega", "om"),
+    "phi": ("phi", "ph"),
+    "kappa": ("kappa", "ka"),
+}
+LARGEST_ANGLE = 1e4
+LONGEST_INTERIOR = 100_000
+
+
+def read_eo(request: ImportRequest) -> Imported:
+    """The images of the table. See `Exposure`; coordinates are those of `--crs`, or local.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing or damaged.
+    ConfigError
+        Where the interior orientation is not given.
+    """
+    path = found_file(request.source, FILES, "table of exterior orientations")
+    interior = _interior(request)
+    order: dict[str, int] = {name: i for i, name in enumerate(COLUMNS)}
+    exposures: list[Exposure] = []
+    is_first = True
+    for line_number, line in text_lines(path):
+        fields = _fields(line, path, line_number)
+        if not fields or fields[0].startswith("#"):
+            continue
+        heading = _heading(fields) if is_first else None
+        is_first = False
+        if heading is not None:
+            order = _checked_heading(heading, path)
+        else:
+            exposures.append(_exposure(fields, order, interior, path, f"line {line_number}"))
+    return Imported(path, tuple(exposures), request.crs, flat=request.earth == "flat")
+
+
+def _fields(line: str, path: Path, line_number: int) -> list[str]:
+    delimiter = next((mark for mark in ",;\t" if mark in line), " ")
+    quote = "'" if line.lstrip().startswith("'") else '"'
+    try:
+        rows = list(csv.reader([line], delimiter=delimiter, quotechar=quote, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: line {line_number} is no line of a table: {error}. {AGAIN}") from error
+    fields = [field.strip().strip("'") for field in rows[0]] if rows else []
+    return fields if delimiter != " " else [field for field in fields if field]
+
+
+def _heading(fields: Sequence[str]) -> list[str] | None:
+    """The names of columns, where the line holds no numbers."""
+    for field in fields[1:]:
+        try:
+            float(field)
+        except ValueError:
+            continue
+        return None
+    return [field.lower().strip("# ") for field in fields]
+
+
+def _checked_heading(heading: Sequence[str], path: Path) -> dict[str, int]:
+    order = {}
+    for name, spellings in COLUMNS.items():
+        found = [i for i, column in enumerate(heading) if column in spellings]
+        if len(found) != 1:
+            raise InputError(
+                f"{path} has {len(found) or 'no'} columns for {name} in its heading {shown(' '.join(heading))}. Name "
+                f"each of {', '.join(COLUMNS)} once, or leave the heading out."
+            )
+        order[name] = found[0]
+    return order
+
+
+def _exposure(
+    fields: Sequence[str], order: dict[str, int], interior: dict[str, Any], path: Path, where: str
+) -> Exposure:
+    if len(fields) <= max(order.values()):
+        raise InputError(f"{path}: {where} has {len(fields)} columns, not {max(order.values()) + 1}. {AGAIN}")
+    values = {name: number(fields[i], path, f"{name} in {where}") for name, i in order.items() if name != "name"}
+    angles = [values[name] for name in ("omega", "phi", "kappa")]
+    if max(map(abs, angles)) > LARGEST_ANGLE:
+        raise InputError(f"{path}: {where} has an angle of {max(map(abs, angles)):g} degrees. {AGAIN}")
+    centre = np.array([values[name] for name in "xyz"])
+    return Exposure(fields[order["name"]], interior, centre, np.array(rotation_from_angles(*angles)))
+
+
+def _interior(request: ImportRequest) -> dict[str, Any]:
+    """From --camera, a file of what `scene.yaml` has under `camera`, or from --focal alone."""
+    if request.camera is None:
+        if request.focal is None:
+            raise ConfigError(
+                "A table of exterior orientations holds no interior one. Give --focal in pixels, or --camera FILE."
+            )
+        return {"focal": request.focal}
+    text = read_text(Path(request.camera))
+    if len(text) > LONGEST_INTERIOR:
+        raise InputError(
+            f"{request.camera} has {len(text)} letters, too many for an interior orientation. Check --camera."
+        )
+    try:
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{request.camera} cannot be read as YAML: {reason}. Mend it there.") from error
+    given = document if isinstance(document, dict) else {}
+    # The centre of the image stands in where the principal point is not given.
+    filled = {"principal_point": [0.0, 0.0]} | given
+    entry = validated(Interior, filled, Path(request.camera)).model_dump(mode="json", exclude_unset=True)
+    return {key: value for key, value in entry.items() if key in given}

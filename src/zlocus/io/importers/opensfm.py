@@ -1,0 +1,145 @@
+"""OpenSfM's and OpenDroneMap's `reconstruction.json`.
+
+Axes: the camera's are right, down, forwards, as zlocus has them; the world is a tangent frame (east, north, up) at
+`reference_lla`, so poses go through geocentric axes to the map. Pixels: coordinates are normalised by the larger side
+about the centre of the image.
+Source: OpenSfM's documentation, "Geometric models" and "Reporting".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyproj import CRS
+
+from zlocus.errors import InputError
+from zlocus.io.importers.base import (
+    AGAIN,
+    Exposure,
+    Imported,
+    found_file,
+    number,
+    numbers,
+    read_json,
+    rotation_matrix,
+    shown,
+    size,
+)
+from zlocus.io.importers.earth import crs_name, map_poses
+from zlocus.request import ImportRequest
+from zlocus.sensors.geocentric import Geocentric
+from zlocus.sensors.model import FloatArray
+
+FILES = ("reconstruction.json", "opensfm/reconstruction.json", "opensfm_reconstruction.json")
+# Projection, kind of distortion, and its coefficients in zlocus's names.
+LENSES = {
+    "perspective": ("brown", ("k1", "k2")),
+    "radial": ("brown", ("k1", "k2")),
+    "simple_radial": ("brown", ("k1",)),
+    "brown": ("brown", ("k1", "k2", "p1", "p2", "k3")),
+    "fisheye": ("fisheye", ("k1", "k2")),
+    "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
+GEOGRAPHIC = CRS.from_epsg(4326)
+LARGEST = 1e3  # radians, of an axis of rotation
+
+
+def read_opensfm(request: ImportRequest) -> Imported:
+    """The shots of the reconstruction. See `Exposure`; in a map, or with `--local` in the tangent frame.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing or damaged, in several parts, of another projection, or without a place on the Earth.
+    """
+    path = found_file(request.source, FILES, "OpenSfM reconstruction")
+    document = _only_part(read_json(path), path)
+    cameras = {
+        name: _camera(entry, path, f"camera {shown(name)}") for name, entry in _table(document, "cameras", path).items()
+    }
+    exposures = [_exposure(name, entry, cameras, path) for name, entry in _table(document, "shots", path).items()]
+    if request.local:
+        return Imported(path, tuple(exposures))
+    reference = document.get("reference_lla")
+    if not isinstance(reference, dict):
+        raise InputError(f"{path} has no reference_lla, so its place on the Earth is not known. Give --local.")
+    lla = [number(reference.get(k), path, f"reference_lla.{k}") for k in ("longitude", "latitude", "altitude")]
+    if not (abs(lla[0]) <= 360 and abs(lla[1]) <= 90 and abs(lla[2]) < 1e5):
+        raise InputError(f"{path}: reference_lla is no place on the Earth: {', '.join(f'{v:g}' for v in lla)}. {AGAIN}")
+    origin, axes = _tangent(np.array(lla))
+    poses = map_poses(GEOGRAPHIC, request.crs, origin)
+    placed = []
+    for shot in exposures:
+        centre, rotation = poses.pose(origin + shot.centre @ axes, shot.rotation @ axes, path, shot.image)
+        placed.append(Exposure(shot.image, shot.interior, centre, rotation, shot.size))
+    return Imported(path, tuple(placed), crs_name(poses.target))
+
+
+def _tangent(lla: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The tangent frame at longitude, latitude (degrees), height (m): geocentric origin (3,) and axes, rows (3, 3)."""
+    origin = Geocentric(GEOGRAPHIC).geocentric_from_ground(lla[None])[0]
+    (sl, sp), (cl, cp) = np.sin(np.deg2rad(lla[:2])), np.cos(np.deg2rad(lla[:2]))
+    return origin, np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+
+
+def _only_part(document: Any, path: Path) -> dict[str, Any]:
+    parts = document if isinstance(document, list) else [document]
+    if not parts or not all(isinstance(part, dict) for part in parts):
+        raise InputError(f"{path} is not an OpenSfM reconstruction: it must hold cameras and shots. {AGAIN}")
+    if len(parts) > 1:
+        raise InputError(
+            f"{path} holds {len(parts)} parts that are not joined, each with a frame of its own. Keep one of them."
+        )
+    return dict(parts[0])
+
+
+def _table(document: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
+    table = document.get(key)
+    if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
+        raise InputError(f"{path} has no table of {key}. {AGAIN}")
+    return table
+
+
+def _camera(entry: dict[str, Any], path: Path, where: str) -> tuple[dict[str, Any], tuple[int, int]]:
+    projection = entry.get("projection_type", "perspective")
+    if not isinstance(projection, str) or projection not in LENSES:
+        raise InputError(
+            f"{path}: {where} has the projection {shown(projection)}, which is not read. Use one of "
+            f"{', '.join(LENSES)}, or undistort the images in OpenSfM."
+        )
+    pixels = size(entry.get("width"), entry.get("height"), path, where)
+    side = max(pixels)
+    both = entry.get("focal")
+    focal = [number(entry.get(key, both), path, f"{key} of {where}") * side for key in ("focal_x", "focal_y")]
+    point = [
+        number(entry.get(key, 0.0), path, f"{key} of {where}") * side + (n - 1) / 2
+        for key, n in zip(("c_x", "c_y"), pixels, strict=True)
+    ]
+    kind, names = LENSES[projection]
+    lens = {name: number(entry.get(name, 0.0), path, f"{name} of {where}") for name in names}
+    interior = {"focal": focal, "principal_point": point, "distortion": {"kind": kind, **lens}}
+    return interior, pixels
+
+
+def _exposure(
+    name: str, entry: dict[str, Any], cameras: dict[str, tuple[dict[str, Any], tuple[int, int]]], path: Path
+) -> Exposure:
+    where = f"shot {shown(name)}"
+    camera = entry.get("camera")
+    if not isinstance(camera, str) or camera not in cameras:
+        raise InputError(f"{path}: {where} has the camera {shown(camera)}, which the file does not hold. {AGAIN}")
+    axis = numbers(entry.get("rotation"), 3, path, f"rotation of {where}")
+    rotation = rotation_matrix(_from_axis(np.clip(axis, -LARGEST, LARGEST)), path, where)
+    translation = numbers(entry.get("translation"), 3, path, f"translation of {where}")
+    interior, pixels = cameras[camera]
+    return Exposure(name, interior, -rotation.T @ translation, rotation, pixels)
+
+
+def _from_axis(vector: FloatArray) -> FloatArray:
+    """(3, 3) of an axis as long as the angle in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / angle if angle > 0 else vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)

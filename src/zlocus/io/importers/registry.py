@@ -1,0 +1,33 @@
+"""The formats that can be imported. A new one is a module, and a line in `IMPORTERS`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from zlocus.io.importers.base import Imported
+from zlocus.io.importers.bundler import read_bundler
+from zlocus.io.importers.colmap import read_colmap
+from zlocus.io.importers.eo import read_eo
+from zlocus.io.importers.metashape import read_metashape
+from zlocus.io.importers.opensfm import read_opensfm
+from zlocus.io.importers.strecha import read_strecha
+from zlocus.request import ImportRequest
+
+
+@dataclass(frozen=True)
+class Importer:
+    """Reads a format; options : those of `ImportRequest` that say something to it."""
+
+    read: Callable[[ImportRequest], Imported]
+    options: tuple[str, ...]
+
+
+IMPORTERS = {
+    "colmap": Importer(read_colmap, ("crs", "up")),
+    "opensfm": Importer(read_opensfm, ("crs", "local")),
+    "metashape": Importer(read_metashape, ("crs", "up")),
+    "bundler": Importer(read_bundler, ("crs", "up")),
+    "eo": Importer(read_eo, ("crs", "up", "focal", "camera", "earth")),
+    "strecha": Importer(read_strecha, ("up",)),
+}

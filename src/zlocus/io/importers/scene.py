@@ -1,0 +1,139 @@
+"""From cameras of another program to a `scene.yaml`: their images found and measured, their entries checked."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from zlocus.errors import ConfigError, InputError, OutputError
+from zlocus.io.frame_camera import FrameCamera
+from zlocus.io.importers.base import AGAIN, Exposure, Imported, shown
+from zlocus.io.importers.earth import asked_crs, crs_name
+from zlocus.io.importers.registry import IMPORTERS
+from zlocus.io.opening import open_raster
+from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
+from zlocus.io.strict import validated
+from zlocus.request import ImportRequest
+from zlocus.sensors.frame import as_row, as_rows
+
+FOLDERS = ("", "images", "../images", "../../images", "../../../images", "undistorted/images", "../visualize")
+SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg", ".png", ".jp2", ".vrt", ".img")
+FEWEST = 2
+
+
+def import_scene(request: ImportRequest) -> SceneFile:
+    """Read the cameras that the request names and write the scene, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        For cameras or images that are missing, damaged or do not fit together.
+    ConfigError
+        For a format that is not known, or an option that says nothing to it.
+    OutputError
+        Where the scene file exists already, or cannot be written.
+    """
+    if request.kind not in IMPORTERS:
+        raise ConfigError(f"{request.kind} is no format that can be imported. Choose from {', '.join(IMPORTERS)}.")
+    importer = IMPORTERS[request.kind]
+    for name in request.given():
+        if name not in importer.options:
+            raise ConfigError(f"--{name} says nothing to an import of {request.kind}. Leave it out.")
+    if request.out.exists() and not request.overwrite:
+        raise OutputError(f"{request.out} exists already. Choose another name with -o, or add --overwrite.")
+    scene = scene_of(importer.read(request), request)
+    write_scene_file(request.out, scene)
+    return scene
+
+
+def scene_of(imported: Imported, request: ImportRequest) -> SceneFile:
+    """The scene file of cameras, with the paths of their images relative to it."""
+    exposures = imported.exposures
+    if len(exposures) < FEWEST:
+        raise InputError(
+            f"{imported.path} holds {len(exposures)} oriented images, and a surface needs {FEWEST} or more. {AGAIN}"
+        )
+    image, times = Counter(exposure.image for exposure in exposures).most_common(1)[0]
+    if times > 1:
+        raise InputError(f"{imported.path}: the image {shown(image)} is there twice. {AGAIN}")
+    paths = _image_paths(exposures, imported.path, request.images)
+    folder = request.out.absolute().parent.resolve()
+    crs = None if imported.crs is None else crs_name(asked_crs(imported.crs))
+    earth = {"earth": "flat"} if crs is not None and imported.flat else {}
+    views = [
+        ViewEntry(name=name, image=_relative(path, folder), camera=_camera(exposure, path, imported.path, earth))
+        for exposure, path, name in zip(exposures, paths, _names(exposures), strict=True)
+    ]
+    frame: dict[str, Any] = {"local": True} if crs is None else {"crs": crs}
+    if request.up is not None:
+        frame["up"] = request.up
+    return validated(SceneFile, {"schema": 1, "frame": frame, "views": views}, imported.path)
+
+
+def _camera(exposure: Exposure, image: Path, path: Path, earth: dict[str, Any]) -> FrameCamera:
+    """The entry of an exposure, for an image whose size is that of its camera."""
+    with open_raster(image) as source:
+        size = (source.width, source.height)
+    if exposure.size not in (None, size):
+        wide, high = exposure.size or size
+        raise InputError(
+            f"{image} has {size[0]} x {size[1]} pixels, and its camera in {path} {wide} x {high}. Give the folder of "
+            "the images that were oriented with --images."
+        )
+    centre = {"principal_point": [(size[0] - 1) / 2, (size[1] - 1) / 2]}
+    pose = {"centre": as_row(exposure.centre), "rotation": as_rows(exposure.rotation)}
+    entry = {"kind": "frame", **centre, **exposure.interior, **pose, **earth}
+    return validated(FrameCamera, entry, path, f"camera of {shown(exposure.image)}")
+
+
+def _image_paths(exposures: Sequence[Exposure], path: Path, given: Path | None) -> list[Path]:
+    """Where the images lie: in the folder that is given, else in or near that of the cameras."""
+    base = path if path.is_dir() else path.parent
+    folders = [given] if given is not None else [base / name for name in FOLDERS]
+    for folder in folders:
+        if _found(exposures[0].image, folder) is not None:
+            found = {exposure.image: _found(exposure.image, folder) for exposure in exposures}
+            missing = [name for name, image in found.items() if image is None]
+            if missing:
+                raise InputError(
+                    f"{folder} lacks {len(missing)} of {len(exposures)} images of {path}, first {shown(missing[0])}. "
+                    "Add them, or give another folder with --images."
+                )
+            return [image for image in found.values() if image is not None]
+    where = str(given) if given is not None else f"{base} and images beside it"
+    raise InputError(
+        f"The image {shown(exposures[0].image)} of {path} is not in {where}. Give the folder with --images."
+    )
+
+
+def _found(name: str, folder: Path) -> Path | None:
+    """The image of that name, without its folders if need be, or with a suffix of images that the name lacks."""
+    if not name or "\0" in name or len(os.fsencode(name)) > 1000:
+        return None
+    plain = name.replace("\\", "/")
+    try:
+        for candidate in (folder / plain, folder / Path(plain).name):
+            if candidate.is_file():
+                return candidate
+            for suffix in (s for small in SUFFIXES for s in (small, small.upper())):
+                with_suffix = candidate.with_name(candidate.name + suffix)
+                if with_suffix.is_file():
+                    return with_suffix
+    except (OSError, ValueError):
+        return None
+    return None
+
+
+def _names(exposures: Sequence[Exposure]) -> list[str]:
+    """A name per view: that of the image without suffix, in full where two would be equal."""
+    stems = [Path(exposure.image).stem for exposure in exposures]
+    times = Counter(stems)
+    return [e.image if times[stem] > 1 else stem for e, stem in zip(exposures, stems, strict=True)]
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """As the scene file has it: relative to its folder."""
+    return Path(os.path.relpath(path.resolve(), folder)).as_posix()

@@ -1,0 +1,192 @@
+"""Lens distortion: from where an ideal camera sees a direction to where the real one does, and back.
+
+Both sides lie in the plane at depth 1: x to the right and y down, over the depth, without unit. Each kind maps a disc
+about the axis, in which nothing is seen twice; what lies outside is NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from zlocus.sensors.model import FloatArray
+
+WIDEST_DEG = 89.5
+LEAST_SLOPE = 0.01
+N_NODES = 4096
+MAX_ITERATIONS = 50
+CONVERGED = 1e-14
+REACHED = 1e-11
+
+
+class Distortion(Protocol):
+    """A kind of lens distortion. NaN in is NaN out."""
+
+    def distorted(self, at: FloatArray) -> FloatArray:
+        """From ideal to real positions, (n, 2); NaN beyond the disc."""
+        ...
+
+    def undistorted(self, at: FloatArray) -> FloatArray:
+        """From real to ideal positions, (n, 2); NaN where the disc is not seen."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Disc:
+    """A disc that is mapped without folds. inside : (n,) radii or angles; outside : (n,) where they go, increasing."""
+
+    inside: FloatArray
+    outside: FloatArray
+
+    @property
+    def reach(self) -> float:
+        return float(self.inside[-1])
+
+    def inverse(self, outside: FloatArray) -> FloatArray:
+        """A first guess of what goes to `outside`; the rim for what is farther."""
+        return np.asarray(np.interp(outside, self.outside, self.inside))
+
+
+def _disc(inside: FloatArray, outside: FloatArray, least_slope: FloatArray) -> _Disc:
+    """The part from the axis on in which the least slope in any direction stays above `LEAST_SLOPE`."""
+    usable = (least_slope > LEAST_SLOPE) & (np.diff(outside, prepend=-1.0) > 0)
+    n = len(usable) if usable.all() else int(np.argmin(usable))
+    return _Disc(inside[: max(n, 1)], outside[: max(n, 1)])
+
+
+@dataclass(frozen=True)
+class BrownDistortion:
+    """Brown-Conrady distortion with a rational radial part, as OpenCV defines it (its `calib3d`, `projectPoints`).
+
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6) + 2 p1 x y + p2 (r2 + 2 x2), and y' with x and y,
+    p1 and p2 exchanged. The disc ends where the derivative, a symmetric matrix, could stop being positive definite
+    (that of the tangential part is 6 r |p| at most): a map with such a derivative all over a disc is one to one.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    def distorted(self, at: FloatArray) -> FloatArray:
+        """See `Distortion`."""
+        at = np.asarray(at, float)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            r2 = (at**2).sum(axis=1)
+            out = self._mapped(at, r2, self._radial(r2)[0])
+        out[~(r2 <= self._range.reach**2)] = np.nan
+        return out
+
+    def undistorted(self, at: FloatArray) -> FloatArray:
+        """See `Distortion`: Newton from the inverse of the radial part, kept in the disc."""
+        at = np.asarray(at, float)
+        reach = self._range.reach
+        far = np.hypot(at[:, 0], at[:, 1])
+        # Sizes that no camera has would overflow; they are out of reach in any case.
+        at = np.where((far < 1e9)[:, None], at, np.nan)
+        guess = self._range.inverse(far)
+        ideal = at * np.divide(guess, far, out=np.ones_like(far), where=far > 0)[:, None]
+        for _ in range(MAX_ITERATIONS):
+            step = self._newton_step(ideal, at)
+            ideal = ideal + step
+            radius = np.hypot(ideal[:, 0], ideal[:, 1])
+            ideal *= np.minimum(1.0, reach / np.maximum(radius, 1e-300))[:, None]
+            if not (np.abs(step) > CONVERGED * (1.0 + radius[:, None])).any():
+                break
+        r2 = (ideal**2).sum(axis=1)
+        gap = np.abs(self._mapped(ideal, r2, self._radial(r2)[0]) - at)
+        ideal[~(gap <= REACHED * (1.0 + far[:, None])).all(axis=1)] = np.nan
+        return ideal
+
+    @cached_property
+    def _range(self) -> _Disc:
+        radius = np.tan(np.deg2rad(np.linspace(0.0, WIDEST_DEG, N_NODES)))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            factor, slope = self._radial(radius**2)
+            tangential = 6.0 * radius * np.hypot(self.p1, self.p2)
+            least = np.minimum(factor, factor + 2.0 * radius**2 * slope) - tangential
+        return _disc(radius, radius * factor, least)
+
+    def _radial(self, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The radial factor and its derivative by r2, (n,) each."""
+        above = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        above_slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
+        if not (self.k4 or self.k5 or self.k6):
+            return above, above_slope
+        below = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        below_slope = self.k4 + r2 * (2.0 * self.k5 + r2 * 3.0 * self.k6)
+        return above / below, (above_slope * below - above * below_slope) / below**2
+
+    def _mapped(self, at: FloatArray, r2: FloatArray, factor: FloatArray) -> FloatArray:
+        out = at * factor[:, None]
+        if self.p1 or self.p2:
+            x, y = at.T
+            out[:, 0] += 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
+            out[:, 1] += self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
+        return out
+
+    def _newton_step(self, ideal: FloatArray, target: FloatArray) -> FloatArray:
+        """(n, 2) towards the ideal positions that are mapped to `target`."""
+        (x, y), r2 = ideal.T, (ideal**2).sum(axis=1)
+        factor, slope = self._radial(r2)
+        dx, dy = (target - self._mapped(ideal, r2, factor)).T
+        xx = factor + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
+        yy = factor + 2.0 * y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
+        xy = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
+        determinant = xx * yy - xy * xy
+        return np.column_stack([(yy * dx - xy * dy) / determinant, (xx * dy - xy * dx) / determinant])
+
+
+@dataclass(frozen=True)
+class FisheyeDistortion:
+    """Equidistant fisheye, as OpenCV defines it (its `fisheye`): the image's radius is the angle t from the axis times
+    1 + k1 t2 + k2 t4 + k3 t6 + k4 t8."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    def distorted(self, at: FloatArray) -> FloatArray:
+        """See `Distortion`."""
+        at = np.asarray(at, float)
+        radius = np.hypot(at[:, 0], at[:, 1])
+        angle = np.arctan(radius)
+        out = at * np.divide(self._radius(angle)[0], radius, out=np.ones_like(radius), where=radius > 0)[:, None]
+        out[~(angle <= self._range.reach)] = np.nan
+        return out
+
+    def undistorted(self, at: FloatArray) -> FloatArray:
+        """See `Distortion`: Newton along the radius, kept in the disc."""
+        at = np.asarray(at, float)
+        far = np.hypot(at[:, 0], at[:, 1])
+        angle = self._range.inverse(far)
+        for _ in range(MAX_ITERATIONS):
+            radius, slope = self._radius(angle)
+            step = (far - radius) / slope
+            angle = np.clip(angle + step, 0.0, self._range.reach)
+            if not (np.abs(step) > CONVERGED).any():
+                break
+        ideal = at * np.divide(np.tan(angle), far, out=np.ones_like(far), where=far > 0)[:, None]
+        ideal[~(np.abs(self._radius(angle)[0] - far) <= REACHED)] = np.nan
+        return ideal
+
+    @cached_property
+    def _range(self) -> _Disc:
+        angle = np.deg2rad(np.linspace(0.0, WIDEST_DEG, N_NODES))
+        radius, slope = self._radius(angle)
+        return _disc(angle, radius, slope)
+
+    def _radius(self, angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Radius in the image and its derivative by the angle, (n,) each."""
+        t = angle**2
+        radius = angle * (1.0 + t * (self.k1 + t * (self.k2 + t * (self.k3 + t * self.k4))))
+        slope = 1.0 + t * (3.0 * self.k1 + t * (5.0 * self.k2 + t * (7.0 * self.k3 + t * 9.0 * self.k4)))
+        return radius, slope
