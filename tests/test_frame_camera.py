@@ -13,6 +13,7 @@ from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.scene_file import open_scene, read_scene_file, turn_to_z, write_scene_file
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.frame import rotation_from_angles
+from zlocus.sensors.space import FRAME_SPACE, EarthSpace
 
 PIXELS = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60)
 POSE = {"centre": [700_120.0, 4_790_230.0, 1450.0], "angles": [1.0, -2.0, 30.0]}
@@ -78,9 +79,9 @@ def test_what_is_refused(tmp_path, changes, says):
 
 def test_a_map_is_curved_unless_said_otherwise(tmp_path):
     curved, flat = (scene(tmp_path, document(**changes)).views[0].sensor for changes in ({}, {"earth": "flat"}))
-    assert flat.earth is None
+    assert flat.space == FRAME_SPACE
     assert flat.centre == tuple(POSE["centre"])
-    assert curved.earth is not None
+    assert isinstance(curved.space, EarthSpace)
     assert np.linalg.norm(curved.centre) == pytest.approx(6.37e6, rel=1e-2)
     xyz = np.array([[700_000.0, 4_790_300.0, 400.0]])
     gap = np.linalg.norm(curved.image_from_ground(xyz) - flat.image_from_ground(xyz))

@@ -18,6 +18,7 @@ from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.importers.scene import import_scene
 from zlocus.io.scene_file import open_scene
 from zlocus.request import ImportRequest
+from zlocus.sensors.space import FRAME_SPACE, EarthSpace
 
 SAME_PX = 1e-6
 # Of 70 px focal length at 100 m: a micrometre on the ground, which UTM's own figures do not hold to.
@@ -165,8 +166,8 @@ def test_coordinates_of_a_map_may_be_cartesian(tmp_path):
     camera = table.folder / "camera.yaml"
     flat = imported("eo", table, crs="EPSG:32632", camera=camera, earth="flat")
     curved = imported("eo", table, crs="EPSG:32632", camera=camera)
-    assert flat.views[0].sensor.earth is None
-    assert curved.views[0].sensor.earth is not None
+    assert flat.views[0].sensor.space == FRAME_SPACE
+    assert isinstance(curved.views[0].sensor.space, EarthSpace)
 
 
 def test_a_focal_length_alone_has_the_centre_of_the_image(tmp_path):

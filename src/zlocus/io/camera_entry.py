@@ -6,10 +6,13 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Protocol
 
+from pydantic import FiniteFloat
 from pyproj import CRS
 
 from zlocus.io.strict import StrictModel
 from zlocus.sensors.model import SensorModel
+
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class CameraSource(Protocol):

@@ -13,6 +13,7 @@ from pyproj import CRS
 from zlocus.io.camera_entry import Camera
 from zlocus.io.cameras import find_sidecar, read_rpc
 from zlocus.io.frame_camera import FrameCamera
+from zlocus.io.linescan import LineScanCamera
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import SensorModel
 from zlocus.sensors.rpc import RpcCoefficients, RpcModel
@@ -53,4 +54,4 @@ class RpcCamera(Camera):
         return RpcSource(read_rpc(image, file), self.shift, () if file is None else (file,))
 
 
-KINDS: dict[str, type[Camera]] = {"rpc": RpcCamera, "frame": FrameCamera}
+KINDS: dict[str, type[Camera]] = {"rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera}

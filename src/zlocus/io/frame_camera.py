@@ -20,14 +20,14 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, InputError
-from zlocus.io.camera_entry import Camera
+from zlocus.io.camera_entry import Camera, Vector
 from zlocus.io.crs import checked_crs
 from zlocus.io.strict import StrictModel
 from zlocus.scene import is_local
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
-from zlocus.sensors.geocentric import between
 from zlocus.sensors.model import SensorModel
+from zlocus.sensors.space import between
 
 ORTHONORMAL = 1e-4
 # What no camera on or above the Earth exceeds; larger numbers are damage, and would overflow.
@@ -37,7 +37,6 @@ LARGEST_PX = 1e7
 Coordinate = Annotated[FiniteFloat, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 Pixels = Annotated[FiniteFloat, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
 FocalLength = Annotated[FiniteFloat, Field(gt=0, le=LARGEST_PX)]
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 def _pair(value: Any) -> Any:

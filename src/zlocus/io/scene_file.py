@@ -28,10 +28,10 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, InputError, OutputError
-from zlocus.io.camera_entry import Camera, CameraSource
+from zlocus.io.camera_entry import Camera, CameraSource, Vector
 from zlocus.io.camera_kinds import KINDS, RpcCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
-from zlocus.io.frame_camera import FrameCamera, Vector
+from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.images import RasterImage, check_content, open_image
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import StrictModel, validated
@@ -111,6 +111,8 @@ class SceneFile(StrictModel):
                 raise ValueError("frame is local, but an RPC knows its place on the Earth: write frame: {crs: EPSG:n}")
             if any(camera.crs or camera.earth for camera in frame_cameras):
                 raise ValueError("frame is local, where a camera has no crs and no earth: write frame: {crs: EPSG:n}")
+            if self.frame.up is not None and len(frame_cameras) < len(self.views):
+                raise ValueError("up turns frame cameras only: give the others in axes whose z is up")
         if len({camera.earth or "curved" for camera in frame_cameras}) > 1:
             raise ValueError("some cameras have earth: flat and some not: they do not fit together, choose one for all")
         return self

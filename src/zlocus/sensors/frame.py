@@ -8,8 +8,9 @@ import numpy as np
 from pyproj import CRS
 
 from zlocus.sensors.distortion import Distortion
-from zlocus.sensors.geocentric import Geocentric
 from zlocus.sensors.model import FloatArray
+from zlocus.sensors.rotation import from_photogrammetric
+from zlocus.sensors.space import FRAME_SPACE, EarthSpace, Space
 
 Row = tuple[float, float, float]
 
@@ -23,8 +24,7 @@ class FrameModel:
     principal_point : (column, row) px where the optical axis meets the image. aspect : focal length down the columns
     over `focal`; skew : px by which columns grow per y (of the plane at depth 1). distortion : None is an ideal lens.
 
-    earth : None where the scene's frame is Cartesian, and has the axes of centre and camera_from_ground; else these are
-    geocentric, and so are rays, while ground points are in the scene's CRS.
+    space : where rays are straight; centre and camera_from_ground are in its axes, ground points in the scene's frame.
     """
 
     centre: Row
@@ -34,7 +34,7 @@ class FrameModel:
     aspect: float = 1.0
     skew: float = 0.0
     distortion: Distortion | None = None
-    earth: Geocentric | None = None
+    space: Space = FRAME_SPACE
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`; NaN behind the camera, and where its distortion folds."""
@@ -44,15 +44,7 @@ class FrameModel:
         """See `SensorModel`; NaN where the ray does not meet that height in front of the camera."""
         ray = self.ray_from_image(xy)
         z = np.broadcast_to(np.asarray(z, float), (len(ray),))
-        if self.earth is None:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                depth = (z - self.centre[2]) / ray[:, 2]
-            depth[~((depth > 0) & np.isfinite(depth))] = np.nan
-        else:
-            depth = self.earth.depth_at_height(np.array(self.centre), ray, z)
-        xyz = self._along(ray, depth)
-        xyz[:, 2] = np.where(np.isnan(xyz[:, 2]), np.nan, z)
-        return xyz
+        return self.space.meet(np.array(self.centre), ray, z)
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
@@ -95,7 +87,7 @@ class FrameModel:
 
     def turned(self, rotation: FloatArray) -> FrameModel:
         """The camera in a Cartesian frame that is turned. rotation : (3, 3), new frame from old."""
-        assert self.earth is None, "the Earth is not turned"
+        assert self.space == FRAME_SPACE, "the Earth is not turned"
         centre, rows = rotation @ np.array(self.centre), self.rotation @ rotation.T
         return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
 
@@ -103,22 +95,19 @@ class FrameModel:
         """The camera over the curved Earth, for ground points in `crs`.
 
         Its own centre is a point of the map `given`, and its axes are relative to that map's at the centre: grid east,
-        grid north and up (see `Geocentric.pose`).
+        grid north and up (see `EarthSpace.poses`).
         """
-        earth = Geocentric(crs)
+        earth = EarthSpace(crs)
         centre, axes = earth.pose(given, np.array(self.centre))
-        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(self.rotation @ axes), earth=earth)
+        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(self.rotation @ axes), space=earth)
 
     def _from_centre(self, xyz: FloatArray) -> FloatArray:
         """Rays (n, 3) m to ground points (n, 3)."""
-        xyz = np.asarray(xyz, float)
-        points = xyz if self.earth is None else self.earth.geocentric_from_ground(xyz)
-        return np.asarray(points - np.array(self.centre))
+        return np.asarray(self.space.cartesian_from_ground(xyz) - np.array(self.centre))
 
     def _along(self, ray: FloatArray, depth: FloatArray) -> FloatArray:
         """Ground points (n, 3) at depths (n,) along rays (n, 3)."""
-        points = np.array(self.centre) + np.asarray(depth)[:, None] * ray
-        return points if self.earth is None else self.earth.ground_from_geocentric(points)
+        return self.space.ground_from_cartesian(np.array(self.centre) + np.asarray(depth)[:, None] * ray)
 
     @property
     def rotation(self) -> FloatArray:
@@ -133,12 +122,8 @@ def rotation_from_angles(omega: float, phi: float, kappa: float) -> tuple[Row, R
     to the right, y up and z backwards: R = Rx(omega) Ry(phi) Rz(kappa) (Kraus 2007, section 2.1). All zero looks
     straight down with the top of the image to the north.
     """
-    (so, sp, sk), (co, cp, ck) = (f(np.deg2rad([omega, phi, kappa])) for f in (np.sin, np.cos))
-    about_x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
-    rows = np.diag([1.0, -1.0, -1.0]) @ (about_x @ about_y @ about_z).T
-    return as_rows(rows)
+    from_image = from_photogrammetric(*np.deg2rad([[omega], [phi], [kappa]]))[0]
+    return as_rows(np.diag([1.0, -1.0, -1.0]) @ from_image.T)
 
 
 def as_row(vector: FloatArray) -> Row:

@@ -97,7 +97,7 @@ class DepthRays:
     def to(self, sensor: SensorModel) -> SensorModel:
         """See `Rays`."""
         assert isinstance(sensor, FrameModel), "only frame cameras are matched by depth"
-        assert sensor.earth == self.sensor.earth, "rays of both cameras are in the same axes"
+        assert sensor.space == self.sensor.space, "rays of both cameras are in the same axes"
         return DepthModel(self, sensor)
 
 

@@ -14,7 +14,16 @@ from zlocus.errors import ZlocusError
 def main(arguments: list[str] | None = None) -> int:
     """Renders what the command line asks for; returns the exit status."""
     from zlocus.synthetic.files import render_scene
-    from zlocus.synthetic.scenes import LARGE_SIZE, SceneSpec, city_spec, demo_spec, hills_spec, with_pointing_errors
+    from zlocus.synthetic.linescan import TrajectoryNoise
+    from zlocus.synthetic.scenes import (
+        LARGE_SIZE,
+        SceneSpec,
+        city_spec,
+        demo_spec,
+        hills_spec,
+        with_ads40,
+        with_pointing_errors,
+    )
 
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
@@ -23,10 +32,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
     parser.add_argument("--views", type=int, help="render the first N views only")
     parser.add_argument("--pointing", type=float, default=0.0, metavar="PX", help="largest pointing error of the RPCs")
+    parser.add_argument(
+        "--cameras", choices=("rpc", "linescan"), default="rpc",
+        help="RPCs, or an ADS40's focal plane and trajectories under a scene.yaml",
+    )  # fmt: skip
+    parser.add_argument(
+        "--trajectory-noise", type=float, nargs=2, default=(0.0, 0.0), metavar=("M", "DEG"),
+        help="standard deviation of slow errors of the trajectories",
+    )  # fmt: skip
     given = parser.parse_args(arguments)
     try:
         make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "demo": demo_spec}
         spec = make[given.kind](given.seed)
+        linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
+        if linescan is not None:
+            spec = with_ads40(spec)
         if given.size:
             coarse = spec.gsd_m if given.size > LARGE_SIZE else None
             spec = replace(spec, size=given.size, truth_step_m=coarse)
@@ -34,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
             spec = replace(spec, views=spec.views[: given.views])
         if given.pointing:
             spec = with_pointing_errors(spec, given.pointing)
-        render_scene(spec, given.output, progress=lambda step: print(f"rendering {step}", file=sys.stderr))
+        render_scene(spec, given.output, lambda step: print(f"rendering {step}", file=sys.stderr), linescan)
     except ZlocusError as error:
         print(f"Error: {error}", file=sys.stderr)
         return error.exit_status

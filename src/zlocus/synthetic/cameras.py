@@ -97,7 +97,7 @@ class LineScanner:
     wobble_deg: float = 0.0
     wobble_rows: float = 6000.0
 
-    def _pose(self, row: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def poses(self, row: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Projection centres (n, 3) m and rotations frame_from_camera (n, 3, 3) of rows (n,); camera axes are right,
         forward and up at rest."""
         forward, right = _axes(self.heading_deg)
@@ -119,7 +119,7 @@ class LineScanner:
 
     def _focal_plane(self, xyz: FloatArray, row: FloatArray) -> FloatArray:
         """Where ground points (n, 3) fall in the focal plane at the instants of rows (n,): right, forward (n, 2) m."""
-        centre, frame_from_camera = self._pose(row)
+        centre, frame_from_camera = self.poses(row)
         seen = np.einsum("nji,nj->ni", frame_from_camera, xyz - centre)
         return np.asarray(self.focal_m * seen[:, :2] / -seen[:, 2:])
 
@@ -146,7 +146,7 @@ class LineScanner:
         ray = np.column_stack(
             [(xy[:, 0] - self.centre[0]) * self.pixel_m, np.full(len(xy), line), np.full(len(xy), -self.focal_m)]
         )
-        centre, frame_from_camera = self._pose(xy[:, 1])
+        centre, frame_from_camera = self.poses(xy[:, 1])
         towards = np.einsum("nij,nj->ni", frame_from_camera, ray)
         reach = (z - centre[:, 2]) / towards[:, 2]
         ground: FloatArray = centre + reach[:, None] * towards

@@ -1,4 +1,4 @@
-"""Rendered scenes on disk: images as GeoTIFF with RPC tags, truth rasters, and `scene.json`."""
+"""Rendered scenes on disk: images as GeoTIFF with RPC tags or line scanner files, truth rasters, and `scene.json`."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from rasterio.transform import from_origin
 
 from zlocus.errors import OutputError
 from zlocus.sensors.rpc import RpcCoefficients
+from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_scene
 from zlocus.synthetic.render import Sun, expose, render, sunlit
 from zlocus.synthetic.rpc_fit import RpcFit, fit_rpc
 from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures
@@ -29,23 +30,32 @@ HEIGHT_MARGIN_M = 20.0
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """Where a scene was written. images : by name of the view."""
+    """Where a scene was written. images : by name of the view; inputs : what `zlocus dsm` takes."""
 
     folder: Path
     images: dict[str, Path]
     truth_dsm: Path
     truth_class: Path
+    inputs: tuple[Path, ...]
 
 
-def render_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None] = lambda step: None) -> RenderedScene:
+def render_scene(
+    spec: SceneSpec,
+    folder: Path,
+    progress: Callable[[str], None] = lambda step: None,
+    linescan: TrajectoryNoise | None = None,
+) -> RenderedScene:
     """Renders all views of `spec` and writes them, the truth and `scene.json` into a new folder.
 
-    progress : called with a word before each step. The folder appears only when it is complete.
+    progress : called with a word before each step; linescan : cameras are written as line scanners with trajectories of
+    this noise, under a `scene.yaml`, not as RPC. The folder appears only when it is complete.
 
     Raises
     ------
     OutputError
         Where the folder exists already, or cannot be written.
+    ConfigError
+        For line scanners of a scene that has none.
     """
     folder = Path(folder)
     if folder.exists():
@@ -54,19 +64,24 @@ def render_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None] 
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        _write_scene(spec, part, progress)
+        _write_scene(spec, part, progress, linescan)
         part.rename(folder)
     except OSError as error:
         raise OutputError(f"The rendered scene cannot be written to `{folder}` ({error}): name another.") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    images = {view.name: folder / f"img_{view.name}.tif" for view in spec.views}
-    return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif")
+    images = {view.name: folder / image_name(view) for view in spec.views}
+    inputs = tuple(images.values()) if linescan is None else (folder / "scene.yaml",)
+    return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif", inputs)
 
 
-def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None]) -> None:
-    progress("terrain")
+def _write_scene(
+    spec: SceneSpec, folder: Path, progress: Callable[[str], None], linescan: TrajectoryNoise | None
+) -> None:
     seen_by = exposures(spec)
+    if linescan is not None:
+        write_linescan_scene(spec, seen_by, folder, linescan)
+    progress("terrain")
     ground = build_ground(spec, seen_by)
     _write_truth(spec, ground, folder)
     lit: dict[Sun, NDArray[np.bool_]] = {}
@@ -78,11 +93,12 @@ def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None])
             lit = {view.sun: sunlit(ground, view.sun)}
         radiance = render(ground, exposure.camera, exposure.shape, view.sun, spec.samples, lit[view.sun])
         numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]))
-        fit = fit_exposure(spec, exposure)
-        write_image(folder / f"img_{view.name}.tif", numbers, fit.rpc)
+        fit = fit_exposure(spec, exposure) if linescan is None else None
+        write_image(folder / image_name(view), numbers, None if fit is None else fit.rpc)
         described[view.name] = {
             "along": view.along_deg, "across": view.across_deg, "heading": view.heading_deg,
-            "bias_row_col": [view.bias_row_px, view.bias_col_px], "rpc_fit_max_px": fit.max_error_px,
+            "bias_row_col": [view.bias_row_px, view.bias_col_px],
+            "rpc_fit_max_px": None if fit is None else fit.max_error_px,
         }  # fmt: skip
     low, high = ground.height_range
     text = {"crs": f"EPSG:{spec.epsg}", "gsd": spec.gsd_m, "seed": spec.seed, "kind": spec.kind, "camera": spec.camera,
@@ -98,9 +114,12 @@ def fit_exposure(spec: SceneSpec, exposure: Exposure) -> RpcFit:
     return RpcFit(fit.rpc.moved(column=view.bias_col_px, row=view.bias_row_px), fit.max_error_px)
 
 
-def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients) -> None:
-    """A single-band GeoTIFF with RPC tags: (0, 0) is the centre of the first pixel, 0 is nodata. numbers : (r, c)."""
-    tags = RPC(
+def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients | None) -> None:
+    """A single-band GeoTIFF with RPC tags, if any: (0, 0) is the centre of the first pixel, 0 is nodata.
+
+    numbers : (r, c).
+    """
+    tags = None if rpc is None else RPC(
         height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
         line_den_coeff=list(rpc.line_den), line_num_coeff=list(rpc.line_num), line_off=rpc.line_off,
         line_scale=rpc.line_scale, long_off=rpc.lon_off, long_scale=rpc.lon_scale, samp_den_coeff=list(rpc.samp_den),

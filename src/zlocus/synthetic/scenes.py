@@ -156,6 +156,11 @@ def demo_spec(seed: int = 4) -> SceneSpec:
     )  # fmt: skip
 
 
+def with_ads40(spec: SceneSpec) -> SceneSpec:
+    """The scene as the demo's six ADS40 images see it, at their ground pixel."""
+    return replace(spec, camera="ads40", views=ADS40_VIEWS, gsd_m=0.2)
+
+
 def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
     """The scene with a pointing error drawn for each view, uniform within `max_px` in row and column."""
     rng = np.random.default_rng([spec.seed, 77])

@@ -31,6 +31,7 @@ from zlocus.io.importers.base import (
 )
 from zlocus.request import ImportRequest
 from zlocus.sensors.model import FloatArray
+from zlocus.sensors.rotation import from_quaternions
 
 FOLDERS = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
 # Number, name, kind of distortion, and parameters. f, or fx and fy; cx, cy; coefficients.
@@ -93,12 +94,7 @@ def _exposure(path: Path, name: str, pose: FloatArray, camera: int, cameras: dic
     norm = float(np.linalg.norm(pose[:4]))
     if not abs(norm - 1.0) < UNIT:
         raise InputError(f"{path}: {shown(name)} has a quaternion of length {norm:g}, not 1. {AGAIN}")
-    w, x, y, z = pose[:4] / norm
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    rotation = from_quaternions(np.roll(pose[None, :4], -1, axis=1))[0]
     found = cameras[camera]
     return Exposure(name, found.interior, -rotation.T @ pose[4:], rotation, found.size)
 

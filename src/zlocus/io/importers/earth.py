@@ -12,8 +12,8 @@ from pyproj.exceptions import CRSError
 from zlocus.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, utm_zone
 from zlocus.io.importers.base import shown
-from zlocus.sensors.geocentric import Geocentric, between
 from zlocus.sensors.model import FloatArray
+from zlocus.sensors.space import EarthSpace, between
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class MapPoses:
     earth : of the geographic CRS that the axes belong to; target : the map, projected in metres.
     """
 
-    earth: Geocentric
+    earth: EarthSpace
     target: CRS
 
     def pose(self, centre: FloatArray, rotation: FloatArray, path: Path, where: str) -> tuple[FloatArray, FloatArray]:
@@ -34,7 +34,7 @@ class MapPoses:
         InputError
             For a place that the map does not have.
         """
-        lon, lat, height = self.earth.ground_from_geocentric(centre[None])[0]
+        lon, lat, height = self.earth.ground_from_cartesian(centre[None])[0]
         found = np.array([*between(self.earth.crs, self.target).transform(lon, lat), height])
         if not np.isfinite(found).all():
             raise InputError(
@@ -53,9 +53,9 @@ def map_poses(geographic: CRS, crs: str | None, centre: FloatArray) -> MapPoses:
     ConfigError
         For a CRS that is none, or is not projected in metres.
     """
-    earth = Geocentric(geographic.to_2d())
+    earth = EarthSpace(geographic.to_2d())
     if crs is None:
-        lon, lat, _ = earth.ground_from_geocentric(centre[None])[0]
+        lon, lat, _ = earth.ground_from_cartesian(centre[None])[0]
         return MapPoses(earth, utm_zone(float(lon), float(lat)))
     return MapPoses(earth, asked_crs(crs))
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyproj import CRS
 
 from zlocus.errors import InputError
 from zlocus.io.importers.base import (
@@ -29,8 +28,9 @@ from zlocus.io.importers.base import (
 )
 from zlocus.io.importers.earth import crs_name, map_poses
 from zlocus.request import ImportRequest
-from zlocus.sensors.geocentric import Geocentric
 from zlocus.sensors.model import FloatArray
+from zlocus.sensors.rotation import from_vectors
+from zlocus.sensors.space import WGS84, WGS84_EARTH, east_north_up
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json", "opensfm_reconstruction.json")
 # Projection, kind of distortion, and its coefficients in zlocus's names.
@@ -42,7 +42,6 @@ LENSES = {
     "fisheye": ("fisheye", ("k1", "k2")),
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
-GEOGRAPHIC = CRS.from_epsg(4326)
 LARGEST = 1e3  # radians, of an axis of rotation
 
 
@@ -69,7 +68,7 @@ def read_opensfm(request: ImportRequest) -> Imported:
     if not (abs(lla[0]) <= 360 and abs(lla[1]) <= 90 and abs(lla[2]) < 1e5):
         raise InputError(f"{path}: reference_lla is no place on the Earth: {', '.join(f'{v:g}' for v in lla)}. {AGAIN}")
     origin, axes = _tangent(np.array(lla))
-    poses = map_poses(GEOGRAPHIC, request.crs, origin)
+    poses = map_poses(WGS84, request.crs, origin)
     placed = []
     for shot in exposures:
         centre, rotation = poses.pose(origin + shot.centre @ axes, shot.rotation @ axes, path, shot.image)
@@ -79,9 +78,8 @@ def read_opensfm(request: ImportRequest) -> Imported:
 
 def _tangent(lla: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The tangent frame at longitude, latitude (degrees), height (m): geocentric origin (3,) and axes, rows (3, 3)."""
-    origin = Geocentric(GEOGRAPHIC).geocentric_from_ground(lla[None])[0]
-    (sl, sp), (cl, cp) = np.sin(np.deg2rad(lla[:2])), np.cos(np.deg2rad(lla[:2]))
-    return origin, np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+    origin = WGS84_EARTH.cartesian_from_ground(lla[None])[0]
+    return origin, east_north_up(*np.deg2rad(lla[:2, None]))[0].T
 
 
 def _only_part(document: Any, path: Path) -> dict[str, Any]:
@@ -131,15 +129,7 @@ def _exposure(
     if not isinstance(camera, str) or camera not in cameras:
         raise InputError(f"{path}: {where} has the camera {shown(camera)}, which the file does not hold. {AGAIN}")
     axis = numbers(entry.get("rotation"), 3, path, f"rotation of {where}")
-    rotation = rotation_matrix(_from_axis(np.clip(axis, -LARGEST, LARGEST)), path, where)
+    rotation = rotation_matrix(from_vectors(np.clip(axis, -LARGEST, LARGEST)[None])[0], path, where)
     translation = numbers(entry.get("translation"), 3, path, f"translation of {where}")
     interior, pixels = cameras[camera]
     return Exposure(name, interior, -rotation.T @ translation, rotation, pixels)
-
-
-def _from_axis(vector: FloatArray) -> FloatArray:
-    """(3, 3) of an axis as long as the angle in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector / angle if angle > 0 else vector
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)

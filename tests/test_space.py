@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import CRS, Proj, Transformer
 
-from zlocus.sensors.geocentric import Geocentric
+from zlocus.sensors.space import EarthSpace
 
 SAME_M = 2e-8
 # PROJ's own inverse of the polar stereographic projection is no better.
@@ -41,35 +41,35 @@ def spread(at, n=50, m=20_000.0):
 @each
 def test_agrees_with_proj(epsg, at):
     xyz = spread(at)
-    here = Geocentric(CRS.from_epsg(epsg)).geocentric_from_ground(xyz)
+    here = EarthSpace(CRS.from_epsg(epsg)).cartesian_from_ground(xyz)
     np.testing.assert_allclose(here, proj_geocentric(epsg, xyz), rtol=0, atol=SAME_M)
 
 
 @each
 def test_there_and_back(epsg, at):
-    earth, xyz = Geocentric(CRS.from_epsg(epsg)), spread(at)
+    earth, xyz = EarthSpace(CRS.from_epsg(epsg)), spread(at)
     np.testing.assert_allclose(
-        earth.ground_from_geocentric(earth.geocentric_from_ground(xyz)), xyz, rtol=0, atol=THERE_AND_BACK_M
+        earth.ground_from_cartesian(earth.cartesian_from_ground(xyz)), xyz, rtol=0, atol=THERE_AND_BACK_M
     )
 
 
 @each
 def test_axes_of_the_map(epsg, at):
     """Right-handed; up is the normal, and east and north are where the map's coordinates grow, at its own scale."""
-    earth = Geocentric(CRS.from_epsg(epsg))
+    earth = EarthSpace(CRS.from_epsg(epsg))
     centre, axes = earth.pose(earth.crs, np.array(at))
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(np.cross(axes[0], axes[1]), axes[2], atol=1e-14)
-    moved = earth.geocentric_from_ground(np.array(at) + 100.0 * np.vstack([np.eye(3), -np.eye(3)]))
+    moved = earth.cartesian_from_ground(np.array(at) + 100.0 * np.vstack([np.eye(3), -np.eye(3)]))
     towards = (moved[:3] - moved[3:]) / 200.0
     towards /= np.linalg.norm(towards, axis=1)[:, None]
     np.testing.assert_allclose(towards, axes, atol=CONFORMAL_RAD)
-    np.testing.assert_allclose(centre, earth.geocentric_from_ground(np.array([at]))[0])
+    np.testing.assert_allclose(centre, earth.cartesian_from_ground(np.array([at]))[0])
 
 
 def test_grid_north_turns_with_the_convergence():
     crs, at = CRS.from_epsg(32631), np.array([700_000.0, 5_500_000.0, 0.0])
-    earth = Geocentric(crs)
+    earth = EarthSpace(crs)
     _, axes = earth.pose(crs, at)
     lon, lat = Transformer.from_crs(crs, 4326, always_xy=True).transform(*at[:2])
     s, c = np.sin(np.deg2rad([lon, lat])), np.cos(np.deg2rad([lon, lat]))
@@ -82,27 +82,27 @@ def test_a_pose_given_in_another_map():
     utm, lambert = CRS.from_epsg(32631), CRS.from_epsg(2154)
     at = np.array([420_000.0, 5_000_000.0, 800.0])
     x, y = Transformer.from_crs(utm, lambert, always_xy=True).transform(*at[:2])
-    there, axes = Geocentric(lambert).pose(utm, at)
-    here, same = Geocentric(utm).pose(utm, at)
+    there, axes = EarthSpace(lambert).pose(utm, at)
+    here, same = EarthSpace(utm).pose(utm, at)
     np.testing.assert_allclose(there, here, atol=1e-3)  # WGS84 and GRS80 differ by a tenth of a millimetre
     np.testing.assert_allclose(axes, same, atol=1e-9)
-    np.testing.assert_allclose(Geocentric(lambert).ground_from_geocentric(there[None]), [[x, y, 800.0]], atol=1e-6)
+    np.testing.assert_allclose(EarthSpace(lambert).ground_from_cartesian(there[None]), [[x, y, 800.0]], atol=1e-6)
 
 
 @given(st.floats(-75.0, 75.0), st.floats(0.0, 360.0), st.floats(10.0, 9000.0), st.floats(-100.0, 3000.0))
 def test_rays_come_to_their_height(tilt, heading, above, z):
-    earth = Geocentric(CRS.from_epsg(32631))
+    earth = EarthSpace(CRS.from_epsg(32631))
     centre, axes = earth.pose(earth.crs, np.array([420_000.0, 4_790_000.0, z + above]))
     t, h = np.deg2rad([tilt, heading])
     ray = np.array([[np.sin(t) * np.cos(h), np.sin(t) * np.sin(h), -np.cos(t)]]) @ axes
     depth = earth.depth_at_height(centre, ray, np.array([z]))
-    ground = earth.ground_from_geocentric(centre + depth[:, None] * ray)
+    ground = earth.ground_from_cartesian(centre + depth[:, None] * ray)
     assert ground[0, 2] == pytest.approx(z, abs=1e-6)
     assert depth[0] == pytest.approx(above / np.cos(t), rel=0.05)
 
 
 def test_rays_that_miss_the_height():
-    earth = Geocentric(CRS.from_epsg(32631))
+    earth = EarthSpace(CRS.from_epsg(32631))
     centre, (east, _, up) = earth.pose(earth.crs, np.array([420_000.0, 4_790_000.0, 1000.0]))
     ray = np.array([up, -up, east, -up, up, up * np.nan])
     depth = earth.depth_at_height(centre, ray, np.array([500.0, 500.0, 500.0, 1500.0, 1500.0, 500.0]))
@@ -110,6 +110,6 @@ def test_rays_that_miss_the_height():
 
 
 def test_points_no_map_has_are_nothing():
-    earth = Geocentric(CRS.from_epsg(32631))
-    assert np.isnan(earth.geocentric_from_ground(np.array([[1e9, 1e9, 0.0], [np.nan, 0.0, 0.0]]))).all()
-    assert np.isnan(earth.ground_from_geocentric(np.array([[np.nan, 0.0, 0.0]]))).all()
+    earth = EarthSpace(CRS.from_epsg(32631))
+    assert np.isnan(earth.cartesian_from_ground(np.array([[1e9, 1e9, 0.0], [np.nan, 0.0, 0.0]]))).all()
+    assert np.isnan(earth.ground_from_cartesian(np.array([[np.nan, 0.0, 0.0]]))).all()

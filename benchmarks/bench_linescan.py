@@ -1,0 +1,44 @@
+"""Speed of the line scanner's sensor model on one core: points a second, both ways, on a grid of the demo's block."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench_kernels import timed
+from zlocus.sensors.linescan import LineScanModel, LineTimes
+from zlocus.sensors.space import EarthSpace, FrameSpace
+from zlocus.synthetic.linescan import SPEED_M_S, focal_line, sampled
+from zlocus.synthetic.scenes import demo_spec, exposures
+
+SIDE = 700
+
+
+@pytest.fixture(scope="module")
+def scanner():
+    """The forward line of the demo, and a grid of ground points that it sees."""
+    spec = demo_spec()
+    exposure = exposures(spec)[1]
+    interval = -exposure.camera.advance_m / SPEED_M_S
+    lines = LineTimes.regular(0.0, interval, exposure.shape[0])
+    model = LineScanModel(focal_line(exposure.camera), lines, sampled(exposure.camera, exposure.shape[0]), FrameSpace())
+    x, y = np.meshgrid(np.linspace(0.0, 120.0, SIDE), np.linspace(0.0, -120.0, SIDE))
+    xyz = np.column_stack([x.ravel() + spec.west_m, y.ravel() + spec.north_m, np.full(SIDE * SIDE, 440.0)])
+    return spec, model, xyz
+
+
+def test_image_from_ground(benchmark, scanner):
+    _, model, xyz = scanner
+    timed(benchmark, lambda: model.image_from_ground(xyz), len(xyz), "point")
+
+
+def test_ground_from_image(benchmark, scanner):
+    _, model, xyz = scanner
+    xy = model.image_from_ground(xyz)
+    timed(benchmark, lambda: model.ground_from_image(xy, xyz[:, 2]), len(xyz), "point")
+
+
+def test_to_the_earth(benchmark, scanner):
+    """What geocentric rays add to `image_from_ground`: projected coordinates to geocentric ones."""
+    spec, _, xyz = scanner
+    timed(benchmark, lambda: EarthSpace(spec.crs).cartesian_from_ground(xyz), len(xyz), "point")

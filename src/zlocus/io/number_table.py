@@ -1,0 +1,161 @@
+"""Tables of numbers in text: a header of names, then rows; separated by commas, semicolons or blanks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from zlocus.errors import InputError, OutputError
+from zlocus.io.opening import existing_file
+from zlocus.sensors.model import FloatArray
+
+SEPARATORS = (",", ";")
+LONGEST_QUOTE = 40
+
+
+@dataclass(frozen=True, eq=False)
+class NumberTable:
+    """A table that has been read.
+
+    columns : by name, (n,) float64, all finite; labels : (n,) the words of the label column, empty without one;
+    lines : (n,) the line of the file, from 1, on which a row stands.
+    """
+
+    path: Path
+    what: str
+    columns: dict[str, FloatArray]
+    labels: tuple[str, ...]
+    lines: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def stacked(self, names: Sequence[str]) -> FloatArray:
+        """Some columns side by side: (n, k)."""
+        return np.column_stack([self.columns[name] for name in names])
+
+    def refuse(self, row: int, fault: str) -> InputError:
+        """The error of a row, by its line in the file."""
+        return InputError(f"The {self.what} {self.path}, line {self.lines[row]}: {fault}.")
+
+    def check_steps(self, name: str, either: bool = False) -> None:
+        """Refuse a column whose values do not increase all the way; either : or decrease all the way.
+
+        Raises
+        ------
+        InputError
+            Naming the first row that breaks the order.
+        """
+        steps = np.diff(self.columns[name])
+        if either and len(steps) and steps[0] < 0:
+            steps = -steps
+        broken = np.flatnonzero(~(steps > 0))
+        if len(broken):
+            value, before = (float(self.columns[name][broken[0] + i]) for i in (1, 0))
+            rule = "increase, or decrease, from row to row" if either else "increase from row to row"
+            raise self.refuse(
+                int(broken[0]) + 1, f"{name} is {value!r} after {before!r}, but must {rule}; sort the rows"
+            )
+
+
+def read_numbers(path: Path, what: str, allowed: Iterable[str], label: str | None = None) -> NumberTable:
+    """The table in a file. Lines that are empty or start with # are skipped; names are read in any case.
+
+    what : the role of the file, for messages; allowed : names a column may have; label : a column of words.
+
+    Raises
+    ------
+    InputError
+        For a file that is missing, no text, without rows, with an unknown or doubled name, a row of another length, or
+        something that is not a finite number: says on which line.
+    """
+    path = existing_file(path, what)
+    rows = _rows(path, what)
+    if len(rows) < 2:
+        raise InputError(f"The {what} {path} holds no rows: a header of names and rows of numbers are needed.")
+    (_, header), body = rows[0], rows[1:]
+    separator = next((mark for mark in SEPARATORS if mark in header), None)
+    names = [cell.strip().lower() for cell in header.split(separator)]
+    known = [*allowed, *([label] if label else [])]
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"The {what} {path} has the column {_quote(name)} in its header. Allowed: {', '.join(known)}."
+            )
+        if names.count(name) > 1:
+            raise InputError(f"The {what} {path} has the column {name} twice in its header. Remove one.")
+    values, labels = [], []
+    at = names.index(label) if label in names else None
+    for number, line in body:
+        cells = line.split(separator)
+        if len(cells) != len(names):
+            raise InputError(
+                f"The {what} {path}, line {number}: {len(cells)} values, but {len(names)} columns "
+                f"({', '.join(names)}). Mend the line, or copy the file again where it is cut off."
+            )
+        if at is not None:
+            labels.append(cells.pop(at).strip())
+        values.append(_numbers(cells, what, path, number))
+    numeric = [name for name in names if name != label]
+    columns = dict(zip(numeric, np.array(values, float).reshape(len(values), len(numeric)).T, strict=True))
+    return NumberTable(path, what, columns, tuple(labels), tuple(number for number, _ in body))
+
+
+def write_numbers(
+    path: Path, columns: dict[str, FloatArray], comment: str, labels: dict[str, Sequence[str]] | None = None
+) -> None:
+    """Write a table with commas that reads back equal.
+
+    comment : its first line; labels : a column of words by its name, the first of the table.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+    numbers = np.column_stack(list(columns.values())).tolist()
+    words = zip(*labels.values(), strict=True) if labels else [()] * len(numbers)
+    rows = (",".join([*word, *map(repr, row)]) for word, row in zip(words, numbers, strict=True))
+    text = "\n".join([f"# {comment}", ",".join([*(labels or ()), *columns]), *rows]) + "\n"
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
+
+
+def _rows(path: Path, what: str) -> list[tuple[int, str]]:
+    """Lines that count, with their numbers from 1."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"The {what} {path} is not text in UTF-8 (byte {error.start}). Save it as such.") from error
+    except OSError as error:
+        raise InputError(f"The {what} {path} cannot be read: {error.strerror}. Check the path.") from error
+    lines = enumerate(text.split("\n"), 1)
+    return [(number, line.strip()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _numbers(cells: list[str], what: str, path: Path, line: int) -> list[float]:
+    """The finite numbers of a row."""
+    values: list[float] = []
+    for cell in cells:
+        try:
+            value = float(cell)
+        except ValueError:
+            value = math.nan
+        # Python reads 1_000 as a number; no table means it so.
+        if not math.isfinite(value) or "_" in cell:
+            raise InputError(
+                f"The {what} {path}, line {line}: {_quote(cell.strip())} is not a finite number. Mend it there."
+            )
+        values.append(value)
+    return values
+
+
+def _quote(text: str) -> str:
+    """A value for a message, shortened."""
+    return repr(text if len(text) <= LONGEST_QUOTE else text[:LONGEST_QUOTE] + "...")

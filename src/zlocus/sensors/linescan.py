@@ -1,0 +1,362 @@
+"""Line scanner: one line of a focal plane, exposed again and again along a trajectory. Rows are exposures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from zlocus.sensors.model import FloatArray
+from zlocus.sensors.space import Space
+from zlocus.sensors.trajectory import Drift, Trajectory
+
+# Pixels around the image where the model still holds: tiles and blocks reach that far beyond it.
+MARGIN_PX = 4096.0
+# Points handled at once, so that what is computed of them stays in the processor's cache.
+CHUNK = 8192
+MAX_STEPS = 8
+# Newton steps are quadratic, so the one after a step of this size is below 1e-9 rows.
+TOLERANCE_ROWS = 1e-7
+SCAN_KNOTS = 129
+SCAN_STEPS = 60
+# Heights at which the first guess is fitted, as parts of the depth at which pixels are square.
+GUESS_DEPTHS = (0.8, 1.0)
+GUESS_COLUMNS = 5
+# A flight that turns by more than this (cosine of 20 degrees) can see a place with its line's two sides.
+TURNS_COS = 0.94
+
+
+@dataclass(frozen=True, eq=False)
+class FocalLine:
+    """One line of detectors in the focal plane.
+
+    xy_mm : (c, 2) where the centre of each column's detector lies, in the image coordinates of the camera (positive
+    image); straight lines between the columns, and beyond the ends. focal_mm : a column sees along (x, y, -focal_mm).
+    """
+
+    xy_mm: FloatArray
+    focal_mm: float
+
+    def along(self) -> FloatArray:
+        """(2, 2) that turns image coordinates so that the line runs along the first axis."""
+        x, y = self.xy_mm[-1] - self.xy_mm[0]
+        return np.asarray(np.array([[x, y], [-y, x]]) / np.hypot(x, y))
+
+    def goes_on(self) -> bool:
+        """Whether each column lies further along the line than the one before: two columns do not see the same."""
+        is_open = bool((self.xy_mm[0] != self.xy_mm[-1]).any())
+        return is_open and bool((np.diff(self.xy_mm @ self.along()[0]) > 0).all())
+
+
+@dataclass(frozen=True, eq=False)
+class LineTimes:
+    """When the middle of each row was exposed: straight between known rows, and beyond them.
+
+    rows : (k,) increasing, the first and the last row of the image among them; times : (k,) s, all increasing or all
+    decreasing (where row 0 is the last one flown).
+    """
+
+    rows: FloatArray
+    times: FloatArray
+
+    @classmethod
+    def regular(cls, start: float, interval: float, n_rows: int) -> LineTimes:
+        """Rows exposed every `interval` s (negative: backwards), row 0 at `start` s."""
+        last = max(n_rows - 1, 1)
+        return cls(np.array([0.0, last]), np.array([start, start + last * interval]))
+
+    @property
+    def interval(self) -> float:
+        """Mean time from row to row, s."""
+        return float((self.times[-1] - self.times[0]) / (self.rows[-1] - self.rows[0]))
+
+    def time(self, row: FloatArray) -> FloatArray:
+        """Instants (n,) s of rows (n,)."""
+        return _straight(row, self.rows, self.times)
+
+    def row(self, time: FloatArray) -> FloatArray:
+        """Rows (n,) of instants (n,) s."""
+        if self.times[-1] > self.times[0]:
+            return _straight(time, self.times, self.rows)
+        return _straight(time, self.times[::-1], self.rows[::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class LineScanModel:
+    """A line scanner as a `SensorModel`: the raw image (level 0), whose rows are exposures.
+
+    space : where rays are straight. margin_px : how far around the image, in rows and columns, points are mapped; NaN
+    beyond, and where the ground is not in front of the camera.
+    """
+
+    line: FocalLine
+    lines: LineTimes
+    trajectory: Trajectory
+    space: Space
+    margin_px: float = MARGIN_PX
+    _track: _Track = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        assert self.line.goes_on(), "columns lie one after the other"
+        object.__setattr__(self, "_track", _Track.of(self))
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`. The instant is searched at which the point crosses the line."""
+        ground = self.space.cartesian_from_ground(xyz)
+        xy = np.empty((len(ground), 2))
+        for first in range(0, len(ground), CHUNK):
+            part = slice(first, first + CHUNK)
+            xy[part] = self._track.image(np.ascontiguousarray(ground[part].T))
+        return xy
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        xy = np.asarray(xy, float)
+        z = np.broadcast_to(np.asarray(z, float), (len(xy),))
+        xyz = np.empty((len(xy), 3))
+        for first in range(0, len(xy), CHUNK):
+            part = slice(first, first + CHUNK)
+            xyz[part] = self.space.meet(*self._track.rays(xy[part]), z[part])
+        return xyz
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`."""
+        return None
+
+    def corrected(self, drift: Drift) -> LineScanModel:
+        """The model with a drift of its trajectory added."""
+        return replace(self, trajectory=drift.corrected(self.trajectory))
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedModel:
+    """A line scanner's image resampled to a plane (ADS40 level 1), as a `SensorModel`.
+
+    A pixel stands for a point of the plane, that for a place in the raw image, and that for a ray. raw : the raw image
+    in the scene's frame; over_plane : the same in the plane's; height : of the plane, m; plane_from_image : from pixels
+    (column, row), (0, 0) the centre of the first one, to x and y of the plane.
+    """
+
+    raw: LineScanModel
+    over_plane: LineScanModel
+    height: float
+    plane_from_image: Affine
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        on_plane = self.over_plane.ground_from_image(self.raw.image_from_ground(xyz), np.array(self.height))
+        return _mapped(~self.plane_from_image, on_plane)
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        on_plane = _mapped(self.plane_from_image, np.asarray(xy, float))
+        on_plane = np.column_stack([on_plane, np.full(len(on_plane), self.height)])
+        return self.raw.ground_from_image(self.over_plane.image_from_ground(on_plane), z)
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`."""
+        return None
+
+    def corrected(self, drift: Drift) -> RectifiedModel:
+        """The model with a drift of its trajectory added: the pixels stay where the flawed one put them."""
+        return replace(self, raw=self.raw.corrected(drift))
+
+
+def _mapped(transform: Affine, xy: FloatArray) -> FloatArray:
+    """Points (n, 2 or more) through an affine map: (n, 2)."""
+    x, y = xy[:, 0], xy[:, 1]
+    return np.column_stack(
+        [transform.a * x + transform.b * y + transform.c, transform.d * x + transform.e * y + transform.f]
+    )
+
+
+def _straight(at: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+    """Linear interpolation of values at increasing knots, and extrapolation by the end pieces: (n,)."""
+    inside = np.interp(at, knots, values)
+    below, above = np.minimum(at - knots[0], 0.0), np.maximum(at - knots[-1], 0.0)
+    first = (values[1] - values[0]) / (knots[1] - knots[0])
+    last = (values[-1] - values[-2]) / (knots[-1] - knots[-2])
+    return np.asarray(inside + below * first + above * last)
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """What a model computes once: its line turned along the first axis, and where along the flight a point is seen.
+
+    In the line's axes a point lies at u along the line and v across it (mm in the focal plane), at a depth in front.
+    """
+
+    lines: LineTimes
+    trajectory: Trajectory
+    focal: float
+    columns: FloatArray  # (c + 2,), with the margin at both ends
+    u: FloatArray  # (c + 2,) increasing
+    v: FloatArray  # (c + 2,)
+    guess: FloatArray  # (4,) instant of a point, to first order
+    guessed: FloatArray  # (k,) mean guess of points seen at the instants below
+    instants: FloatArray  # (k,) s, increasing, from margin to margin
+    turns: bool
+
+    @classmethod
+    def of(cls, model: LineScanModel) -> _Track:
+        """The track of a model."""
+        turn = np.zeros((3, 3))
+        turn[:2, :2], turn[2, 2] = model.line.along(), -1.0
+        path = model.trajectory
+        trajectory = Trajectory(path.times, path.centres, turn @ path.rotations)
+        n, margin = len(model.line.xy_mm), model.margin_px
+        column = np.array([-0.5 - margin, *range(n), n - 0.5 + margin])
+        u, v = (_straight(column, column[1:-1], axis) for axis in turn[:2, :2] @ model.line.xy_mm.T)
+        ends = model.lines.rows[[0, -1]] + [-0.5 - margin, 0.5 + margin]
+        start, end = np.sort(model.lines.time(ends))
+        instants = np.linspace(start, end, SCAN_KNOTS)
+        forward = trajectory.pose(instants)[3:6]
+        turns = bool((forward.T @ forward).min() < TURNS_COS)
+        nothing = np.zeros(0)
+        track = cls(model.lines, trajectory, model.line.focal_mm, column, u, v, nothing, nothing, instants, turns)
+        return track._with_guess()
+
+    def _with_guess(self) -> _Track:
+        """The linear map from points to instants that fits those seen from margin to margin, and what it leaves."""
+        pose, rate = self.trajectory.moving(self.instants)
+        pitch = np.hypot(*((self.u[-1] - self.u[0], self.v[-1] - self.v[0]))) / (self.columns[-1] - self.columns[0])
+        speed = np.median(np.linalg.norm(rate[9:], axis=0)) * abs(self.lines.interval)
+        depth = speed * self.focal / pitch
+        across = np.linspace(self.u[1], self.u[-2], GUESS_COLUMNS)
+        seen = np.stack([across, np.interp(across, self.u, self.v), np.full(GUESS_COLUMNS, self.focal)])
+        rays = np.einsum("ijk,im->mkj", pose[:9].reshape(3, 3, -1), seen / self.focal)
+        points = np.concatenate([pose[9:].T + part * depth * rays for part in GUESS_DEPTHS]).reshape(-1, 3)
+        middle, when = points.mean(axis=0), np.tile(self.instants, len(points) // len(self.instants))
+        mean = when.mean()
+        slopes = np.linalg.lstsq(points - middle, when - mean, rcond=1e-9)[0]
+        guess = np.append(slopes, mean - middle @ slopes)
+        by_instant = (points @ slopes + guess[3]).reshape(-1, len(self.instants)).mean(axis=0)
+        guessed = np.maximum.accumulate(by_instant)
+        return replace(self, guess=guess, guessed=guessed)
+
+    def rays(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Projection centres and directions, (n, 3) each, of image positions (n, 2); NaN beyond the margin."""
+        pose = self.trajectory.pose(self.lines.time(xy[:, 1]))
+        inside = (xy[:, 0] >= self.columns[0]) & (xy[:, 0] <= self.columns[-1]) & self._in_time(xy[:, 1])
+        u, v = np.interp(xy[:, 0], self.columns, self.u), np.interp(xy[:, 0], self.columns, self.v)
+        a, b, c = pose[:9].reshape(3, 3, -1)
+        # The inverse of a matrix by its rows' products: interpolated, it is not quite a rotation.
+        ray = u * np.cross(b, c, axis=0) + v * np.cross(c, a, axis=0) + self.focal * np.cross(a, b, axis=0)
+        # The line's axes are left-handed, so the products point backwards.
+        ray = np.sign((a * np.cross(b, c, axis=0)).sum(axis=0)) * ray
+        ray[:, ~inside] = np.nan
+        return np.ascontiguousarray(pose[9:].T), np.ascontiguousarray(ray.T)
+
+    def image(self, ground: FloatArray) -> FloatArray:
+        """Image positions (n, 2) of Cartesian points (3, n)."""
+        time = np.interp(self.guess[:3] @ ground + self.guess[3], self.guessed, self.instants)
+        u = np.full(len(time), np.nan)
+        going = np.flatnonzero(np.isfinite(ground).all(axis=0))
+        enough = TOLERANCE_ROWS * abs(self.lines.interval)
+        lost = []
+        for _ in range(MAX_STEPS):
+            at, off, at_rate, rate = self._crossing(ground[:, going], time[going])
+            with np.errstate(all="ignore"):
+                step = -off / rate
+            step = self._bounded(step, time[going])
+            time[going] += step
+            u[going] = at + at_rate * step
+            done = np.abs(step) < enough
+            failed = ~np.isfinite(step)
+            lost.append(going[failed])
+            going = going[~(done | failed)]
+            if not len(going):
+                break
+        lost.append(going)
+        self._recover(ground, time, u, np.concatenate(lost))
+        return self._pixels(time, u)
+
+    def _crossing(self, ground: FloatArray, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Where points (3, n) lie along the line and how far ahead of it (mm) at instants (n,), and how fast both
+        change (mm/s); NaN where a point is not in front of the camera."""
+        pose, rate = self.trajectory.moving(time)
+        x, y, z = ground - pose[9:]
+        # Rotated first: the turn of the camera and its motion add up in its own axes.
+        right, ahead, depth = (pose[i] * x + pose[i + 1] * y + pose[i + 2] * z for i in (0, 3, 6))
+        dx, dy, dz = rate[9:]
+        right_rate, ahead_rate, depth_rate = (
+            rate[i] * x + rate[i + 1] * y + rate[i + 2] * z - pose[i] * dx - pose[i + 1] * dy - pose[i + 2] * dz
+            for i in (0, 3, 6)
+        )
+        with np.errstate(all="ignore"):
+            scale = np.where(depth > 0, self.focal / depth, np.nan)
+            shrink = depth_rate / depth
+            u, v = right * scale, ahead * scale
+            off = v - np.interp(u, self.u, self.v)
+            return u, off, right_rate * scale - u * shrink, ahead_rate * scale - v * shrink
+
+    def _bounded(self, step: FloatArray, time: FloatArray) -> FloatArray:
+        """Steps (n,) s of at most a quarter of the flight, that do not leave it by more than its length."""
+        span = self.instants[-1] - self.instants[0]
+        step = np.clip(step, -span / 4, span / 4)
+        return np.asarray(np.clip(time + step, self.instants[0] - span, self.instants[-1] + span) - time)
+
+    def _recover(self, ground: FloatArray, time: FloatArray, u: FloatArray, lost: NDArray[np.intp]) -> None:
+        """Search the whole flight for points (indices) whose steps did not arrive; fills in time and u, NaN for none.
+
+        Where the flight turns, points found outside the image too: another exposure may see them inside.
+        """
+        u[lost] = np.nan
+        if self.turns:
+            xy = self._pixels(time, u)
+            lost = np.flatnonzero(~(self._outside(xy[:, 0], xy[:, 1]) <= 0) & np.isfinite(ground).all(axis=0))
+        if not len(lost):
+            return
+        points = ground[:, lost]
+        low, high, nearest = np.zeros(len(lost)), np.zeros(len(lost)), np.full(len(lost), np.inf)
+        u_before = off_before = np.full(len(lost), np.nan)
+        for before, instant in zip(self.instants[[0, *range(SCAN_KNOTS - 1)]], self.instants, strict=True):
+            u_here, off_here, _, _ = self._crossing(points, np.full(len(lost), instant))
+            with np.errstate(all="ignore"):
+                part = off_before / (off_before - off_here)
+                xy = self._pixels(before + part * (instant - before), u_before + part * (u_here - u_before))
+                better = (off_before * off_here <= 0) & (self._outside(xy[:, 0], xy[:, 1]) < nearest)
+            low[better], high[better] = before, instant
+            nearest[better] = self._outside(xy[:, 0], xy[:, 1])[better]
+            u_before, off_before = u_here, off_here
+        found = np.isfinite(nearest)
+        time[lost[found]], u[lost[found]] = self._between(points[:, found], low[found], high[found])
+        u[lost[~found]] = np.nan
+
+    def _between(self, points: FloatArray, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The instants (n,) between two at which points (3, n) cross the line, and where (n,) mm: Newton steps inside
+        the bracket, halves of it outside."""
+        rising = self._crossing(points, high)[1] > 0
+        time = (low + high) / 2
+        for _ in range(SCAN_STEPS):
+            _, off, _, rate = self._crossing(points, time)
+            above = (off > 0) == rising
+            low, high = np.where(above, low, time), np.where(above, time, high)
+            with np.errstate(all="ignore"):
+                newton = time - off / rate
+            time = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
+        return time, self._crossing(points, time)[0]
+
+    def _pixels(self, time: FloatArray, u: FloatArray) -> FloatArray:
+        """Columns and rows (n, 2) of instants and places along the line, (n,) each; NaN beyond the margin."""
+        row = self.lines.row(time)
+        xy = np.column_stack([np.interp(u, self.u, self.columns), row])
+        xy[~((u >= self.u[0]) & (u <= self.u[-1]) & self._in_time(row))] = np.nan
+        return xy
+
+    def _outside(self, column: FloatArray, row: FloatArray) -> FloatArray:
+        """How far (n,) px image positions lie outside the image's pixels; 0 inside."""
+        over = [
+            self.columns[1] - column,
+            column - self.columns[-2],
+            self.lines.rows[0] - row,
+            row - self.lines.rows[-1],
+        ]
+        return np.asarray(np.maximum(np.max(over, axis=0) - 0.5, 0.0))
+
+    def _in_time(self, row: FloatArray) -> NDArray[np.bool_]:
+        """Whether rows (n,) lie within the margin."""
+        margin = -self.columns[0]
+        return np.asarray((row >= self.lines.rows[0] - margin) & (row <= self.lines.rows[-1] + margin))
