@@ -13,12 +13,17 @@ from pyproj import CRS, Transformer
 
 from zlocus.io.importers.scene import import_scene
 from zlocus.io.scene_file import open_scene
-from zlocus.request import ImportRequest
+from zlocus.options import RunConfig
+from zlocus.pipeline import run_dsm
+from zlocus.progress import SilentProgress
+from zlocus.request import DsmRequest, ImportRequest
 
 WINDOW = 9
 LO25 = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
 # Rounding of the table: 0.5 mm and 0.0005 degrees in each of three.
 TABLE_M, TABLE_DEG = 1e-3, 1e-3
+# A pixel on the ground.
+TERRAIN_M, LEAST_COVERAGE = 5.8, 0.7
 
 
 def ortho(view, xyz, shape):
@@ -144,6 +149,29 @@ def test_aerial_images_agree_on_the_terrain(shared_data, tmp_path, earth):
         found = agreement(scene.views, xyz + np.array([0.0, 0.0, dz]), shape)
         assert len(found) >= 4
         assert all(low < ncc < high for ncc in found.values())
+
+
+def test_a_surface_of_aerial_images_without_heights(shared_data, tmp_path):
+    """Two images straight down, 5 km up; the terrain model is metres accurate, the pixel 5.8 m."""
+    folder, out = shared_data / "aerial_ngi_dmc", tmp_path / "scene.yaml"
+    camera = tmp_path / "camera.yaml"
+    camera.write_text("focal: 833.3333333333334\n")
+    import_scene(ImportRequest("eo", folder, out, crs=LO25, camera=camera))
+    x, y = -56_400, -3_729_500
+    bounds = (x - 600, y - 900, x + 600, y + 900)
+    request = DsmRequest(inputs=(out,), out=tmp_path / "dsm", bounds=bounds, resolution=12.0)
+    result = run_dsm(request, RunConfig(), SilentProgress())
+    assert result.coverage > LEAST_COVERAGE
+    with rasterio.open(tmp_path / "dsm" / "dsm.tif") as source:
+        found = source.read(1)
+        col, row = np.meshgrid(np.arange(source.width), np.arange(source.height))
+        x, y = source.transform * (col + 0.5, row + 0.5)
+    with rasterio.open(folder / "reference/dem_24m_egm2008.tif") as source:
+        terrain = np.array([v[0] for v in source.sample(np.column_stack([x.ravel(), y.ravel()]))], float)
+    error = found.ravel() - terrain
+    error = error[np.isfinite(error)]
+    assert abs(np.median(error)) < TERRAIN_M
+    assert np.median(np.abs(error - np.median(error))) < TERRAIN_M
 
 
 def test_the_facade_stands_upright(shared_data, tmp_path):

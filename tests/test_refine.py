@@ -86,7 +86,7 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
     seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 20.5, np.float32)
-    found = refine(views, coarse, seen, block, STEP_M / GSD_M, RefineOptions(rounds=3))
+    found = refine(views, coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=3))
     inner = (slice(4, -4), slice(4, -4))
     assert found.is_refined[inner].mean() > 0.99
     assert abs(np.median(found.height[inner]) - 20 - fraction) < STEPS
@@ -106,11 +106,11 @@ def test_what_is_too_far_keeps_the_coarse_height(plane):
     seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 32.0, np.float32)
-    found = refine(views, coarse, seen, 16, STEP_M / GSD_M, RefineOptions(rounds=1, reach_steps=0.1))
+    found = refine(views, coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=1, reach_steps=0.1))
     kept = found.height[~found.is_refined]
     assert kept.size > 100
     assert (kept == 32.0).all()
-    none = refine(views, coarse, seen, 16, STEP_M / GSD_M, RefineOptions(rounds=0))
+    none = refine(views, coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=0))
     assert (none.height == 32.0).all()
     assert not none.is_refined.any()
     assert np.isnan(none.apart).all()

@@ -70,7 +70,7 @@ def textured(slope=(0.0, 0.0), spoiled=(), noise=0.0, speeds=SPEEDS):
     heights = np.array([-LEVEL_STEPS * per_step, per_step])
     return TileViews(
         pixels, np.zeros(len(pixels), bool), np.zeros(len(images), bool), np.array(layout, np.int64), np.stack(nodes),
-        heights,
+        np.ones((len(images), corners[0] - 1, corners[1] - 1), bool), heights, BLOCK,
     )  # fmt: skip
 
 
@@ -90,7 +90,7 @@ WINDOW = CellWindow(0, 0, *SHAPE)
 
 
 def ranked(views, xy, index, slope=(0.0, 0.0), window=WINDOW, options=SHORT):
-    return rank_views(views, window, BLOCK, xy, index, np.tile(slope, (len(xy), 1)), SIDE, STEPS_PER_CELL, options)
+    return rank_views(views, window, xy, index, np.tile(slope, (len(xy), 1)), SIDE, STEPS_PER_CELL, options)
 
 
 # --- rank_views ---
@@ -114,12 +114,13 @@ def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     """Curved projections and images that have nothing in common."""
     scene = kernel_scene()
     views = TileViews(scene.pixels, np.zeros(len(scene.pixels), bool), np.zeros(3, bool), scene.layout, scene.nodes,
-                      scene.heights)  # fmt: skip
+                      np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool), scene.heights,
+                      scene.block)  # fmt: skip
     rng = np.random.default_rng(2)
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)
     index, flat = rng.uniform(5, 15, 50), np.zeros((50, 2))
-    found = rank_views(views, window, scene.block, xy, index, flat, SIDE, STEPS_PER_CELL, SHORT)
+    found = rank_views(views, window, xy, index, flat, SIDE, STEPS_PER_CELL, SHORT)
     np.testing.assert_array_equal(found.labels, found.labels.swapaxes(1, 2))
     assert (np.diagonal(found.labels, axis1=1, axis2=2) == POOR).all()
     assert (found.labels == GOOD).mean() < 0.1
@@ -417,7 +418,7 @@ def needed(views, options, *, worth=(True, True, True), covering=None, hidden=No
     order = ViewOrder(np.zeros(2, np.int64), np.tile(search, (2, 1)), np.tile(worth, (2, 1)))
     covering = np.ones((len(cells), n_views), bool) if covering is None else covering(cells)
     surface = np.full(SHAPE, LEVEL_STEPS, np.float32)
-    coarser = Coarser(views, seen, surface, SIDE, REACH, BLOCK)
+    coarser = Coarser(views, seen, surface, SIDE, REACH)
     return images_needed(coarser, cells, of_block, covering, order, options)
 
 

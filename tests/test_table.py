@@ -12,9 +12,14 @@ from orientation_scenes import image_of
 from rendered_scenes import CENTRE, camera
 from zlocus.errors import GeometryError
 from zlocus.io.scene_file import open_scene
+from zlocus.matching.base import BaseSurface
+from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import ViewPixels, halved, read_pixels, tile_views
+from zlocus.matching.visibility import coverage, covers, hide
 from zlocus.scene import View
-from zlocus.sensors.table import TOLERANCE_PX, projection_table
+from zlocus.sensors.distortion import BrownDistortion
+from zlocus.sensors.frame import FrameModel, rotation_from_angles
+from zlocus.sensors.table import HIGHER_DEGREE, TOLERANCE_PX, projection_table
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 
 HEIGHTS = (20.0, 140.0)
@@ -78,13 +83,87 @@ def test_blocks_too_large_are_refused():
     projection_table(airborne(0.3), grid(0.4, shape), shape, 8, HEIGHTS)
 
 
-def test_a_sensor_that_maps_nothing_is_refused():
+def test_a_sensor_that_maps_nothing_shows_nothing():
     class Blind:
         def image_from_ground(self, xyz):
             return np.full((len(xyz), 2), np.nan)
 
-    with pytest.raises(GeometryError):
-        projection_table(Blind(), grid(0.5, (64, 64)), (64, 64), 32, HEIGHTS)
+    table = projection_table(Blind(), grid(0.5, (64, 64)), (64, 64), 32, HEIGHTS)
+    assert not table.holds.any()
+    assert np.isfinite(table.nodes).all()
+
+
+LENS = BrownDistortion(k1=-0.26, k2=0.1, k3=-0.026)
+
+
+def drone(distortion=LENS, omega=30.0):
+    """105 m above the ground, tilted, with a wide lens whose distortion folds outside of the image."""
+    rotation = rotation_from_angles(omega, 0.0, 0.0)
+    return FrameModel((*CENTRE, 155.0), rotation, 911.0, (683.5, 455.5), distortion=distortion)
+
+
+IMAGE = (0, 0, 912, 1368)
+
+
+def test_what_a_lens_cannot_see_is_not_seen():
+    """Blocks behind the fold, and behind the camera, hold nowhere; the others are as exact as ever."""
+    shape, block, sensor = (600, 600), 8, drone()
+    transform = grid(0.5, shape)
+    rows, cols = np.mgrid[0:601:8, 0:601:8]
+    x, y = transform * (cols + 0.5, rows + 0.5)
+    known = [
+        np.isfinite(sensor.image_from_ground(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)]))).all(axis=1)
+        for z in np.linspace(45.2, 54.8, 5)
+    ]
+    whole = np.all(known, axis=0).reshape(x.shape)
+    assert 0.1 < whole.mean() < 0.9
+    table = projection_table(sensor, transform, shape, block, (45.0, 55.0), 2.0, IMAGE, HIGHER_DEGREE)
+    assert np.isfinite(table.nodes).all()
+    corners = whole[:-1, :-1] & whole[1:, :-1] & whole[:-1, 1:] & whole[1:, 1:]
+    assert not (table.holds & ~corners).any()
+    # Every cell that the image shows is in a block that holds.
+    row, col = np.mgrid[0:600, 0:600]
+    x, y = transform * (col + 0.5, row + 0.5)
+    xy = sensor.image_from_ground(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 50.0)]))
+    shown = ((xy > 0) & (xy < (1367, 911))).all(axis=1).reshape(shape)
+    assert table.holds[row[shown] // block, col[shown] // block].mean() > 0.99
+
+
+def test_coverage_leaves_out_what_does_not_hold():
+    shape, sensor = (600, 600), drone()
+    pixels = np.zeros((912, 1368), np.float32)
+    window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    views = tile_views([window, window], 0, grid(0.15, shape), shape, 32, (45.0, 0.5), (40.0, 60.0), 4, (45.0, 55.0))
+    assert views.block < 32
+    assert not views.holds.all()
+    base = BaseSurface.level(shape, views.block)
+    n = (-(-600 // views.block),) * 2
+    lattice = HeightLattice(45.0, 0.5, shape, views.block, np.zeros(n, np.int64), np.full(n, 20))
+    seen = covers(coverage(views, base, lattice))
+    row, col = np.mgrid[0:600, 0:600]
+    x, y = grid(0.15, shape) * (col + 0.5, row + 0.5)
+    xy = sensor.image_from_ground(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 50.0)]))
+    inside = ((xy > 4) & (xy < (1363, 907))).all(axis=1).reshape(shape)
+    assert not (seen[0] & ~((xy > 0) & (xy < (1367, 911))).all(axis=1).reshape(shape)).mean() > 0.02
+    assert (seen[0] & inside).sum() > 0.97 * inside.sum()
+    unmapped = ~views.holds[0].repeat(views.block, 0).repeat(views.block, 1)[:600, :600]
+    assert not seen[0][unmapped].any()
+    hide(np.zeros((3, 2, *shape), np.int32), views, np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0)
+
+
+def test_perspective_shrinks_blocks_and_raises_the_degree_only_where_needed():
+    """A camera that looks straight down from 2 km keeps its blocks; one that is tilted, and close, does not."""
+    pixels = np.zeros((912, 1368), np.float32)
+
+    def fitted(sensor):
+        window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+        return tile_views([window], 0, grid(0.15, (256, 256)), (256, 256), 32, (45.0, 0.5), (40.0, 60.0), 4)
+
+    far = FrameModel((*CENTRE, 2050.0), rotation_from_angles(0.0, 0.0, 10.0), 13_000.0, (683.5, 455.5))
+    assert (fitted(far).block, fitted(far).nodes.shape[-1]) == (32, 4)
+    near = fitted(drone(None))
+    assert near.block < 32
+    assert near.nodes.shape[-1] == HIGHER_DEGREE + 1
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

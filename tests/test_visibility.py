@@ -141,7 +141,7 @@ def test_how_far_a_fixed_pixel_moves_per_step(along, across):
     views, _, _ = tile([camera])
     low, high = camera.ground_from_image(np.array([[60.0, 50.0]] * 2), np.array([50.0, 51.0]))
     east, north = (high - low)[:2] * STEP_M / CELL_M
-    np.testing.assert_allclose(cells_per_step(views, 0, BLOCK), (east, -north), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(cells_per_step(views, 0), (east, -north), rtol=0, atol=1e-3)
 
 
 def test_a_tower_hides_the_ground_behind_it():
@@ -150,7 +150,7 @@ def test_a_tower_hides_the_ground_behind_it():
     seen = coverage(views, LEVEL_BASE, lattice)
     surface = np.full(SHAPE, 10.0, np.float32)
     surface[:, 35:40] = 30.0
-    hide(seen, views, surface, LEVEL, BLOCK, 0.0)
+    hide(seen, views, surface, LEVEL, 0.0)
     assert (seen[0] == 0).all()
     sees_ground = sees(seen, np.full((2, *SHAPE), 10.0))
     assert sees_ground[0].all()
@@ -160,7 +160,7 @@ def test_a_tower_hides_the_ground_behind_it():
     assert (np.diff(hidden) == 1).all()
     assert hidden.max() in (38, 39)
     shown = coverage(views, LEVEL_BASE, lattice)
-    hide(shown, views, surface, LEVEL, BLOCK, 100.0)
+    hide(shown, views, surface, LEVEL, 100.0)
     assert (shown[2] < 0).all()
 
 
@@ -171,14 +171,14 @@ def test_what_is_hidden_is_counted_from_the_base():
     surface[:, 35:40] = 30.0
     base = np.broadcast_to(np.arange(SHAPE[1], dtype=np.float32) * 2, SHAPE)
     level, sloped = coverage(views, LEVEL_BASE, lattice), coverage(views, LEVEL_BASE, lattice)
-    hide(level, views, surface, LEVEL, BLOCK, 0.0)
-    hide(sloped, views, surface, base, BLOCK, 0.0)
+    hide(level, views, surface, LEVEL, 0.0)
+    hide(sloped, views, surface, base, 0.0)
     hidden = level[2, 1] > NOTHING_HIDDEN
     assert hidden.sum() > 400
     np.testing.assert_array_equal((level[2, 1] - base)[hidden], sloped[2, 1][hidden])
     # On a level base at height 10, what was hidden at the ground stays so at index 0.
     at_ground = coverage(views, LEVEL_BASE, lattice)
-    hide(at_ground, views, surface, LEVEL + 10, BLOCK, 0.0)
+    hide(at_ground, views, surface, LEVEL + 10, 0.0)
     np.testing.assert_array_equal(
         sees(at_ground, np.zeros((2, *SHAPE)))[1], sees(level, np.full((2, *SHAPE), 10.0))[1]
     )  # fmt: skip

@@ -33,8 +33,8 @@ from zlocus.matching.gc3 import (
 )
 from zlocus.matching.setup import FEWEST_LEVELS, MatchScene
 from zlocus.options import OrientationOptions, RunConfig
-from zlocus.orientation.orient import Orientation, height_range, supported
-from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
+from zlocus.orientation.orient import Orientation, supported
+from zlocus.preparing import asked_crs, heights_of_ties, made_folder, oriented, possible_heights, what_was_applied
 from zlocus.products.cloud import PointCloud, file_names, write_map
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
@@ -162,7 +162,8 @@ def orient_scene(
         check_overlap(scene, possible_heights(scene, heights))
         found = oriented(scene, options, heights, progress)
         trusted = supported(found.xyz, found.sigma_z_m)
-        return OrientedScene(found.apply(scene), found, found.xyz, trusted, heights or height_range(found, options))
+        z_range = heights or heights_of_ties(scene, found, options)
+        return OrientedScene(found.apply(scene), found, found.xyz, trusted, z_range)
     space = image_space(scene, scene.views[0].name, (0.0, 0.0))
     given = None if heights is None else hypotheses_of_heights(space, heights)
     found = oriented(Scene(space.views, scene.crs), options, given or widest_disparities(space), progress)

@@ -25,8 +25,16 @@ from zlocus.io.reference import cells_inside, read_dem, read_geobox, read_polygo
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import Orientation, height_range
-from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
+from zlocus.orientation.orient import Orientation
+from zlocus.preparing import (
+    CLEARANCE,
+    asked_crs,
+    heights_of_ties,
+    made_folder,
+    oriented,
+    possible_heights,
+    what_was_applied,
+)
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
@@ -34,6 +42,7 @@ from zlocus.products.record import Stopwatch, inputs_record, versions_record, wr
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
+from zlocus.sensors.model import capped, lowest_station
 from zlocus.surface.reasons import Quality
 from zlocus.surface.surface import Surface
 from zlocus.tile import TileResult, match_tile
@@ -104,6 +113,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     with watch.stage("settle"):
         corrected = orientation.apply(scene)
         z_range = heights or _searched_heights(request, corrected, orientation, config)
+        z_range = capped(z_range, lowest_station(view.sensor for view in corrected.views), CLEARANCE)
         grid = _grid(request, like, corrected, z_range)
         settled = settle(
             corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid
@@ -226,7 +236,7 @@ def _searched_heights(
 ) -> tuple[float, float]:
     """Height range of the search: from the DEM, else from the ties."""
     if request.dem is None:
-        return height_range(orientation, config.orientation)
+        return heights_of_ties(scene, orientation, config.orientation)
     z = possible_heights(scene, request.heights or scene.heights)
     bounds = shared_ground(scene, (z[0], z[-1]))
     cell = median_ground_pixel(scene, sum(z) / len(z)) * 16

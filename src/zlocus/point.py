@@ -18,8 +18,8 @@ from zlocus.matching.selection import Ranking, preselected, rank_views
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle
 from zlocus.matching.views import TileViews, pixel_window, read_pixels, tile_views
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import height_range, supported
-from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
+from zlocus.orientation.orient import supported
+from zlocus.preparing import asked_crs, heights_of_ties, made_folder, oriented, possible_heights, what_was_applied
 from zlocus.products.curves import Locus, PointReport, point_text, write_point
 from zlocus.progress import Progress
 from zlocus.request import CurvesRequest
@@ -62,7 +62,7 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
     orientation = oriented(scene, config.orientation, heights, progress)
     progress.note(what_was_applied(orientation))
     ready = orientation.apply(scene)
-    z_range = heights or height_range(orientation, config.orientation)
+    z_range = heights or heights_of_ties(ready, orientation, config.orientation)
     z = sum(z_range) / 2
     cell_m = request.resolution or float(f"{median_ground_pixel(ready, z):.2g}")
     check_resolution(cell_m, ready, z, "--resolution")
@@ -200,7 +200,7 @@ def curves_at(
 
     Tie points are looked for farther and farther away, as far as the rules of the order reach.
     """
-    options, block, side = config.selection, config.pyramid.block, config.measure.large_window
+    options, side = config.selection, config.measure.large_window
     index = (place.xyz[2] - settled.origin_m) / settled.step_m
     radius, at = options.radius_px, np.array(place.cell[::-1]) + 0.5
     near = () if options.neighbours == "tin" else ((radius, Evidence.NEIGHBOURS),)
@@ -210,7 +210,7 @@ def curves_at(
         if not (window.rows and window.cols):
             check_shown(request, place.xyz, [], settled)
         numbers, views = views_of(settled, window, place, config)
-        windows = cell_windows(views, window, place.cell, index, block, side, options.reach_steps)
+        windows = cell_windows(views, window, place.cell, index, side, options.reach_steps)
         kept = np.flatnonzero(~np.isnan(windows[:, options.reach_steps, 0]))
         check_shown(request, place.xyz, [settled.views[numbers[i]].name for i in kept], settled)
         ranking = ranked(settled, views, window, config)
@@ -218,7 +218,7 @@ def curves_at(
         order = point_order(ranking, references(request, [settled.views[numbers[i]] for i in kept]), at, options)
         if order.evidence <= enough:
             break
-    step_px = steps_px(views, int(kept[order.reference]), kept[order.search], block)
+    step_px = steps_px(views, int(kept[order.reference]), kept[order.search])
     along = index + np.arange(-options.reach_steps, options.reach_steps + 1)
     curves = point_curves(windows[kept], order, step_px, along, options)
     return tuple(settled.views[numbers[i]] for i in kept), curves, settled.origin_m + along * settled.step_m
@@ -260,7 +260,7 @@ def ranked(settled: MatchScene, views: TileViews, window: CellWindow, config: Ru
     xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
     index = (settled.ties[:, 2] - settled.origin_m) / settled.step_m
     side, steps_per_cell, flat = config.measure.large_window, settled.cell_m / settled.step_m, np.zeros((len(xy), 2))
-    return rank_views(views, window, config.pyramid.block, xy, index, flat, side, steps_per_cell, config.selection)
+    return rank_views(views, window, xy, index, flat, side, steps_per_cell, config.selection)
 
 
 def loci(views: Sequence[View], report: PointReport) -> list[Locus]:

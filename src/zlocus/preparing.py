@@ -10,15 +10,21 @@ import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, OutputError
+from zlocus.errors import ConfigError, GeometryError, OutputError
 from zlocus.io.crs import checked_crs
 from zlocus.options import OrientationOptions
-from zlocus.orientation.orient import Orientation, orient
+from zlocus.orientation.orient import Orientation, height_range, orient
 from zlocus.progress import Progress
-from zlocus.scene import Scene
+from zlocus.scene import Scene, View, footprint, is_shared
+from zlocus.sensors.model import capped, lowest_station
 
 HEIGHT_SAMPLES = 5
-UNBOUNDED_M = (-500.0, 9000.0)
+# Ground lies between these on Earth.
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+# Depths below the lowest camera at which footprints are looked at, in equal ratios.
+NEAREST_M, DEPTHS = 2.0, 49
+# Of the depth of the lowest ground below the lowest camera: nothing is searched nearer than that.
+CLEARANCE = 0.25
 
 
 def asked_crs(given: str | None) -> CRS | None:
@@ -38,19 +44,61 @@ def asked_crs(given: str | None) -> CRS | None:
 
 
 def possible_heights(scene: Scene, given: tuple[float, float] | None) -> list[float]:
-    """Heights (m) at which the scene may have ground, for a first look at overlaps. given : those asked for."""
+    """Heights (m) at which the scene may have ground, for a first look at overlaps. given : those asked for.
+
+    Raises
+    ------
+    GeometryError
+        Where neither the request nor the cameras tell.
+    """
     if given is not None:
         return [float(z) for z in np.linspace(*given, HEIGHT_SAMPLES)]
     bounds = [b for view in scene.views if (b := view.sensor.height_bounds()) is not None]
-    low = max((b[0] for b in bounds), default=UNBOUNDED_M[0])
-    high = min((b[1] for b in bounds), default=UNBOUNDED_M[1])
+    if not bounds:
+        return [float(z) for z in np.linspace(*heights_below(scene), HEIGHT_SAMPLES)]
+    low, high = max(b[0] for b in bounds), min(b[1] for b in bounds)
     return [float(z) for z in np.linspace(low, max(high, low), HEIGHT_SAMPLES)]
+
+
+def heights_below(scene: Scene) -> tuple[float, float]:
+    """Between which heights (m) two views see the same ground, of cameras that know where they stood and look down.
+
+    Such a camera sees nothing above itself, and close below it too little for two to share: so the ground ends well
+    below the lowest of them. How deep it lies is not known; the lowest land is.
+
+    Raises
+    ------
+    GeometryError
+        Where a camera does not know its place or sees as high as itself, or no two views see the same ground.
+    """
+    lowest = lowest_station(view.sensor for view in scene.views)
+    ask = "give the range of heights that holds the ground: --heights ZMIN ZMAX, or heights: in the scene file"
+    if lowest is None or any(_sees_as_high_as_itself(view) for view in scene.views):
+        raise GeometryError(f"The cameras do not say at which heights the ground may be; {ask}.")
+    deepest = max(lowest - LOWEST_M, 2 * NEAREST_M)
+    depths = np.geomspace(deepest, NEAREST_M, DEPTHS)
+    shared = [z for depth in depths if is_shared(scene, z := float(lowest - depth))]
+    if not shared:
+        raise GeometryError(
+            f"No two images see the same ground anywhere below the lowest camera, which is {lowest:.0f} m high. "
+            f"Check the positions and angles of the cameras; if they are right, {ask}."
+        )
+    return shared[0], min(shared[-1], HIGHEST_M)
+
+
+def _sees_as_high_as_itself(view: View) -> bool:
+    """Whether some ray at the image's border does not go down."""
+    height = lowest_station([view.sensor])
+    assert height is not None, "callers make sure"
+    return len(footprint(view, height + 1.0)) > 0
 
 
 def oriented(
     scene: Scene, options: OrientationOptions, heights: tuple[float, float] | None, progress: Progress
 ) -> Orientation:
     """Tie points and corrections, with progress."""
+    if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
+        heights = heights_below(scene)
     with progress.stage("Tie points", 1.0) as stage:
         done = 0.0
 
@@ -60,6 +108,12 @@ def oriented(
             done = share
 
         return orient(scene, options, heights, report)
+
+
+def heights_of_ties(scene: Scene, orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
+    """Heights (m) to search, from the ties (see `height_range`), and not close to a camera."""
+    station = lowest_station(view.sensor for view in scene.views)
+    return capped(height_range(orientation, options, station), station, CLEARANCE)
 
 
 def what_was_applied(orientation: Orientation) -> str:

@@ -91,6 +91,16 @@ def footprint(view: View, z: float, per_side: int = 8) -> FloatArray:
     return np.asarray(xyz[np.isfinite(xyz).all(axis=1), :2])
 
 
+def is_shared(scene: Scene, z: float) -> bool:
+    """Whether two views or more see the same ground at a height (m, ellipsoidal)."""
+    from shapely import MultiPoint, STRtree
+
+    hulls = [MultiPoint(footprint(view, z)).convex_hull for view in scene.views]
+    tree = STRtree(hulls)
+    first, second = tree.query(hulls, predicate="intersects")
+    return any(hulls[i].intersection(hulls[j]).area > 0 for i, j in zip(first, second, strict=True) if i < j)
+
+
 def ground_sample_distance(view: View, z: float) -> float:
     """Metres on the ground at height z per pixel at the image's centre: geometric mean of both directions.
 

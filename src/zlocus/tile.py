@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ranges import UNKNOWN, by_block, ranges_nearby
+from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
     Coarser,
@@ -151,23 +151,34 @@ def _ranking(
         return None
     around = math.ceil(config.selection.radius_px)
     window = core.at_level(0, around).within(scene.seen)
-    block, side = config.pyramid.block, config.measure.large_window
+    side = config.measure.large_window
     reach = config.selection.reach_steps * scene.step_m
     z = (scene.origin_m - reach, scene.origin_m + scene.n_steps * scene.step_m + reach)
     transform, shape = scene.transform(window, 0), (window.rows, window.cols)
-    views = tile_views(pixels, 0, transform, shape, block, (scene.origin_m, scene.step_m), z, side // 2)
     xy = (scene.ties[:, :2] - scene.anchor) * (1.0, -1.0) / scene.cell_m
     index = (scene.ties[:, 2] - scene.origin_m) / scene.step_m
+    lattice, needed = (scene.origin_m, scene.step_m), _heights_of_ties(scene, xy, window, reach)
+    views = tile_views(pixels, 0, transform, shape, config.pyramid.block, lattice, z, side // 2, needed)
     steps_per_cell = scene.cell_m / scene.step_m
     if coarsest is None:
         flat = np.zeros((len(xy), 2))
-        return rank_views(views, window, block, xy, index, flat, side, steps_per_cell, config.selection)
+        return rank_views(views, window, xy, index, flat, side, steps_per_cell, config.selection)
     surface = smoothed(coarsest.heights.vertex, config.refine.jump_steps)
     coarse_cell = np.floor(xy[:, ::-1] / 2**coarsest.level).astype(np.int64)
     at = tuple(np.clip(coarse_cell - (coarsest.window.row, coarsest.window.col), 1, np.subtract(surface.shape, 2)).T)
     # Steps per cell are the same at every level.
     slope = np.stack([(surface[at[0] + i, at[1] + j] - surface[at[0] - i, at[1] - j]) / 2 for i, j in ((1, 0), (0, 1))])
-    return rank_views(views, window, block, xy, index, slope.T, side, steps_per_cell, config.selection)
+    return rank_views(views, window, xy, index, slope.T, side, steps_per_cell, config.selection)
+
+
+def _heights_of_ties(
+    scene: MatchScene, xy: NDArray[np.float64], window: CellWindow, reach: float
+) -> tuple[float, float] | None:
+    """Heights (m) of the ties within a window, widened by `reach`; None where there are none. xy : (n, 2) cells."""
+    first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
+    z = scene.ties[((xy >= first) & (xy < last)).all(axis=1), 2]
+    z = z[np.isfinite(z)]
+    return (float(z.min()) - reach, float(z.max()) + reach) if len(z) else None
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:
@@ -240,27 +251,30 @@ def _match_level(
     ranking: Ranking | None,
 ) -> LevelResult:
     """One level: base surface, ranges, visibility, choice of views, costs, semi-global constraint."""
-    shape, block = (window.rows, window.cols), config.pyramid.block
+    shape = (window.rows, window.cols)
     step = scene.step_m * 2**level
     n_steps = -(-scene.n_steps // 2**level)
     z = (scene.origin_m - 2 * step, scene.origin_m + (n_steps + 18) * step)
-    half = config.measure.large_window // 2
-    views = tile_views(pixels, level, scene.transform(window, level), shape, block, (scene.origin_m, step), z, half)
+    views = tile_views(
+        pixels, level, scene.transform(window, level), shape, config.pyramid.block, (scene.origin_m, step), z,
+        config.measure.large_window // 2, _needed_heights(scene, guide, z, level, config),
+    )  # fmt: skip
+    block = views.block
     smooth = None if guide.surface is None else smoothed(guide.surface, config.refine.jump_steps)
     base = BaseSurface.level(shape, block) if smooth is None else BaseSurface.along(smooth, block)
     low, high = guide.low - base.cells, guide.high - base.cells
-    lattice = ranges_nearby(low, high, scene.origin_m, step, shape, config.pyramid)
+    lattice = ranges_nearby(low, high, scene.origin_m, step, shape, config.pyramid, block)
     along_base = base.shear(views)
     seen = coverage(along_base, base, lattice)
     if guide.surface is not None and use_visibility:
         obstacle = cv2.erode(guide.surface, OBSTACLE)
-        hide(seen, views, obstacle, base.cells, block, config.measure.hidden_margin_steps)
+        hide(seen, views, obstacle, base.cells, config.measure.hidden_margin_steps)
     used, worth, added, all_views = seen, seen, 0, _evaluations(seen, lattice)
     if ranking is not None:
         ground = None if guide.surface is None else guide.surface - base.cells
         used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
     done = _evaluations(used, lattice) + added
-    ortho = None if smooth is None else _ortho(views, smooth, block)
+    ortho = None if smooth is None else _ortho(views, smooth)
     cost = cost_volume(along_base, base, lattice, used, config.measure)
     if method == "mvll":
         heights = alone(cost, lattice)
@@ -269,6 +283,19 @@ def _match_level(
         heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal)
     worth = above_base(worth, base.cells)
     return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), done, all_views)
+
+
+def _needed_heights(
+    scene: MatchScene, guide: Guide, z: tuple[float, float], level: int, config: RunConfig
+) -> tuple[float, float]:
+    """The part of the heights z (m) of a level that its candidates, and what is done around them, can reach."""
+    step = scene.step_m * 2**level
+    known = np.isfinite(guide.low) & np.isfinite(guide.high)
+    if not known.any():
+        return z
+    around = config.pyramid.margin_steps + LANES + max(config.selection.reach_steps >> level, FEWEST_STEPS)
+    low, high = float(guide.low[known].min()) - around, float(guide.high[known].max()) + around
+    return max(z[0], scene.origin_m + low * step), min(z[1], scene.origin_m + high * step)
 
 
 def _choose(
@@ -286,7 +313,7 @@ def _choose(
 
     A finer block takes as many as the match curves of the coarser level ask for.
     """
-    options, block = config.selection, lattice.block
+    options = config.selection
     order = order_views(ranking, block_shares(seen, lattice), block_middles(window, level, lattice), options)
     every, evaluations = np.full(len(order.reference), order.search.shape[1]), 0
     needed = np.minimum(every, options.most_images)
@@ -298,7 +325,7 @@ def _choose(
         below = np.clip((cells + offset[0]) // 2 - offset[1], 0, last)
         reach = max(options.reach_steps >> coarser.level, FEWEST_STEPS)
         surface = smoothed(coarser.heights.vertex, config.refine.jump_steps)
-        above = Coarser(coarser.views, coarser.seen, surface, config.measure.large_window, reach, block)
+        above = Coarser(coarser.views, coarser.seen, surface, config.measure.large_window, reach)
         match = images_needed(above, below, of_block, covering, order, options)
         needed = np.where(match.n_added > 0, np.minimum(match.n_added, options.most_images), every)
         evaluations = match.evaluations + len(cells) * (2 * reach + 1)
@@ -320,22 +347,20 @@ def _only(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLat
     return kept
 
 
-def _ortho(views: TileViews, surface: NDArray[np.float32], block: int, view: int = 0) -> NDArray[np.float32]:
+def _ortho(views: TileViews, surface: NDArray[np.float32], view: int = 0) -> NDArray[np.float32]:
     """One view, by default the leading one, on a surface of height indices."""
     out = np.empty(surface.shape, np.float32)
-    tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, view, block, out)
+    tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, view, views.block, out)
     return out
 
 
-def _true_ortho(
-    pixels: list[ViewPixels], result: LevelResult, surface: NDArray[np.float32], block: int
-) -> NDArray[np.float32]:
+def _true_ortho(pixels: list[ViewPixels], result: LevelResult, surface: NDArray[np.float32]) -> NDArray[np.float32]:
     """Grey values of the first view that sees each cell of a surface; NaN where none does."""
     out = np.full(surface.shape, np.nan, np.float32)
     for i, view in enumerate(pixels):
         shown = np.isnan(out) & sees(result.seen[:, i], surface)
         if shown.any():
-            grey = _ortho(result.views, surface, block, i)[shown]
+            grey = _ortho(result.views, surface, i)[shown]
             out[shown] = grey * np.float32(view.contrast) + np.float32(view.mean)
     return out
 
@@ -393,18 +418,9 @@ def _without_spikes(
 
 def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:
     """Refine the finest level and judge it, halo included."""
-    block = config.pyramid.block
-    coefficients = TileViews(
-        pixels=np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels]),
-        blocked=result.views.blocked,
-        has_blocked=result.views.has_blocked,
-        layout=result.views.layout,
-        nodes=result.views.nodes,
-        heights=result.views.heights,
-    )
-    refined = refine(
-        coefficients, result.heights.vertex, result.seen, block, scene.step_m / scene.cell_m, config.refine
-    )
+    splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
+    coefficients = replace(result.views, pixels=splines)
+    refined = refine(coefficients, result.heights.vertex, result.seen, scene.step_m / scene.cell_m, config.refine)
     at = refined.height[None]
     covering = covers(result.seen).sum(axis=0)
     seeing = sees(result.seen, at).sum(axis=0)
@@ -415,7 +431,7 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
     sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
-    ortho = _true_ortho(pixels, result, refined.height, block)
+    ortho = _true_ortho(pixels, result, refined.height)
     ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
     return Surface(height, sigma, quality, used, ortho)

@@ -100,12 +100,10 @@ def warm(group: str) -> None:
     views = tile_views(pixels, 0, scene.transform(scene.seen, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
     for view in pixels:
         spline_coefficients(view.pixels[0])
-    Samples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(
-        views, 0, block, slice(None)
-    )
+    Samples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(views, 0, slice(None))
     seen = np.zeros((3, 2, *shape), np.int32)
     seen[1] = 16
-    refine(views, np.full(shape, 8.0, np.float32), seen, block, 1.0, config.refine)
+    refine(views, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
 
 
 if __name__ == "__main__":

@@ -15,23 +15,27 @@ HIDDEN = np.int32(2**30)
 NOWHERE = np.float32(1e6)
 
 
+# (n,) f8, f8 -> f8
+@kernel
+def polynomial(coefficients, t):
+    """Value of a polynomial at t; coefficients of 1, t, t^2, ..."""
+    value = 0.0
+    for power in range(coefficients.shape[0] - 1, -1, -1):
+        value = value * t + coefficients[power]
+    return value
+
+
 # (i,2,2,2,4) f8, i8, f8, i8, i8, (8,) f8 -> None
 @kernel
 def plane_grid(nodes, view, t, block, half, grid):
     """Positions of one view over a block at one height, border included.
 
-    nodes : (i, 2, 2, 2, 4) float64: view, corner row, corner column, (x, y), cubic in t; t : height in the table's
+    nodes : (i, 2, 2, 2, n) float64: view, corner row, corner column, (x, y), polynomial in t; t : height in the table's
     normalised unit; block : cells between the corners; grid : (8,), see `resample_plane`.
     """
     for axis in range(2):
-        k = nodes[view, 0, 0, axis]
-        origin = ((k[3] * t + k[2]) * t + k[1]) * t + k[0]
-        k = nodes[view, 0, 1, axis]
-        right = ((k[3] * t + k[2]) * t + k[1]) * t + k[0]
-        k = nodes[view, 1, 0, axis]
-        below = ((k[3] * t + k[2]) * t + k[1]) * t + k[0]
-        k = nodes[view, 1, 1, axis]
-        diagonal = ((k[3] * t + k[2]) * t + k[1]) * t + k[0]
+        origin, right = polynomial(nodes[view, 0, 0, axis], t), polynomial(nodes[view, 0, 1, axis], t)
+        below, diagonal = polynomial(nodes[view, 1, 0, axis], t), polynomial(nodes[view, 1, 1, axis], t)
         by_col = (right - origin) / block
         by_row = (below - origin) / block
         mixed = (diagonal - below - right + origin) / (block * block)
@@ -110,7 +114,10 @@ def plane_velocity(nodes, view, t, per_index, velocity):
         total = 0.0
         for corner in range(4):
             k = nodes[view, corner // 2, corner % 2, axis]
-            total += (3.0 * k[3] * t + 2.0 * k[2]) * t + k[1]
+            slope = 0.0
+            for power in range(k.shape[0] - 1, 0, -1):
+                slope = slope * t + power * k[power]
+            total += slope
         velocity[axis] = np.float32(0.25 * total * per_index)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,6 @@ PATCH = 8
 SLOPE_REACH = 4
 ANCHOR = 1e-3
 STEEP_STEPS = 8.0
-BINOMIAL = ((1, 1, 1, 1), (0, 1, 2, 3), (0, 0, 1, 3), (0, 0, 0, 1))
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,14 @@ class BaseSurface:
     def shear(self, views: TileViews) -> TileViews:
         """The views with nodes that project height index k of the base instead of the lattice.
 
-        A cubic in t at a node, taken at t + delta, is another cubic in t: c'_j = sum_i C(i, j) c_i delta^(i - j).
+        A polynomial in t at a node, taken at t + delta, is another in t: c'_j = sum_i C(i, j) c_i delta^(i - j).
         """
         delta = self.nodes * views.heights[1]
         moved = np.zeros_like(views.nodes)
-        for j in range(4):
-            for i in range(j, 4):
-                moved[..., j] += BINOMIAL[j][i] * views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
+        n = moved.shape[-1]
+        for j in range(n):
+            for i in range(j, n):
+                moved[..., j] += comb(i, j) * views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
         return replace(views, nodes=moved)
 
 

@@ -265,7 +265,15 @@ def _fits(scene: MatchScene, block: int) -> bool:
             tolerance_px = 2**level * (COARSER_TABLE_PX if level else FINEST_TABLE_PX)
             for view in scene.views:
                 shape = (window.rows, window.cols)
-                projection_table(view.sensor, scene.transform(window, level), shape, block, z_range, tolerance_px)
+                projection_table(
+                    view.sensor,
+                    scene.transform(window, level),
+                    shape,
+                    block,
+                    z_range,
+                    tolerance_px,
+                    (0, 0, *view.image.shape),
+                )
     except GeometryError:
         return False
     return True

@@ -119,7 +119,7 @@ def point_order(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
 
 
 def cell_windows(
-    views: TileViews, window: CellWindow, cell: tuple[int, int], index: float, block: int, side: int, reach: int
+    views: TileViews, window: CellWindow, cell: tuple[int, int], index: float, side: int, reach: int
 ) -> NDArray[np.float32]:
     """Level windows of every view around a cell, (i, h, k) float32, NaN where a view does not show them.
 
@@ -129,13 +129,13 @@ def cell_windows(
     at = np.array([[cell[0] - window.row, cell[1] - window.col]], np.int64)
     flat = np.zeros((1, side * side), np.float32)
     samples = Samples(at, np.array([index - reach]), 2 * reach + 1, flat)
-    return np.concatenate([samples.windows(views, i, block, slice(None)) for i in range(len(views.layout))])
+    return np.concatenate([samples.windows(views, i, slice(None)) for i in range(len(views.layout))])
 
 
-def steps_px(views: TileViews, reference: int, search: IntArray, block: int) -> FloatArray:
+def steps_px(views: TileViews, reference: int, search: IntArray) -> FloatArray:
     """Equivalent disparity of a height step of search views against the reference, (j,) float64 px."""
-    at_reference = np.array(cells_per_step(views, reference, block))
-    return np.array([np.hypot(*(np.array(cells_per_step(views, int(i), block)) - at_reference)) for i in search])
+    at_reference = np.array(cells_per_step(views, reference))
+    return np.array([np.hypot(*(np.array(cells_per_step(views, int(i))) - at_reference)) for i in search])
 
 
 def point_curves(

@@ -23,13 +23,15 @@ def ranges_nearby(
     step_m: float,
     shape: tuple[int, int],
     options: PyramidOptions,
+    block: int | None = None,
 ) -> HeightLattice:
     """The span of the heights found in and around each block, with a margin.
 
     low, high : (r, c) float32, lowest and highest candidate of every cell, in height indices of this level; NaN where
-    there is none. A block with no candidate at all, which no two views saw at the coarser level, searches the least.
+    there is none; block : cells, None is that of the options. A block with no candidate at all, which no two views saw
+    at the coarser level, searches the least.
     """
-    block = options.block
+    block = block or options.block
     grow = np.ones((4 * options.reach + 1,) * 2, np.uint8)
     lowest = by_block(cv2.erode(np.where(np.isnan(low), UNKNOWN, low), grow), block, np.minimum)
     highest = by_block(cv2.dilate(np.where(np.isnan(high), -UNKNOWN, high), grow), block, np.maximum)

@@ -59,7 +59,6 @@ def refine(
     coefficients: TileViews,
     coarse: FloatGrid,
     seen: NDArray[np.int32],
-    block: int,
     step_cells: float,
     options: RefineOptions,
 ) -> RefinedHeights:
@@ -81,7 +80,7 @@ def refine(
         profiles = np.empty((groups, len(offsets), *coarse.shape), np.float32)
         tile_profile(
             coefficients.pixels, coefficients.layout, coefficients.nodes, coefficients.heights,
-            np.pad(surface, half, mode="edge"), offsets, block, half, seen, np.float32(0.0), profiles,
+            np.pad(surface, half, mode="edge"), offsets, coefficients.block, half, seen, np.float32(0.0), profiles,
         )  # fmt: skip
         profile = profiles.sum(axis=0)
         found, best, inside = parabola_peak(profile, offsets)

@@ -81,14 +81,14 @@ class Samples:
         """Heights and cells of a window."""
         return self.n_heights, self.relief.shape[1]
 
-    def windows(self, views: TileViews, view: int, block: int, rows: IntArray | slice) -> NDArray[np.float32]:
+    def windows(self, views: TileViews, view: int, rows: IntArray | slice) -> NDArray[np.float32]:
         """Normalised windows of one view, (m, h, k) float32, NaN where it does not show them."""
         cells, first, relief = self.cells[rows], self.first[rows], self.relief[rows]
         out = np.empty((len(cells), self.n_heights, self.relief.shape[1]), np.float32)
         half = (round(self.relief.shape[1] ** 0.5) - 1) // 2
         line_windows(
-            views.pixels, views.blocked, views.layout, views.nodes, views.heights, block, view, cells, first, half,
-            relief, out,
+            views.pixels, views.blocked, views.layout, views.nodes, views.heights, views.block, view, cells, first,
+            half, relief, out,
         )  # fmt: skip
         return out
 
@@ -124,7 +124,7 @@ def _days_between(one: View, other: View) -> float:
 
 
 def rank_views(
-    views: TileViews, window: CellWindow, block: int, xy: FloatArray, index: FloatArray, slope: FloatArray, side: int,
+    views: TileViews, window: CellWindow, xy: FloatArray, index: FloatArray, slope: FloatArray, side: int,
     steps_per_cell: float, options: SelectionOptions,
 ) -> Ranking:  # fmt: skip
     """Labels of all pairs of views at tie points.
@@ -150,8 +150,8 @@ def rank_views(
     )  # fmt: skip
     n_views = len(views.layout)
     labels = np.full((len(rows), n_views, n_views), POOR, np.int8)
-    seen = [samples.windows(views, i, block, slice(None)) for i in range(n_views)]
-    per_step = np.array([cells_per_step(views, i, block) for i in range(n_views)])
+    seen = [samples.windows(views, i, slice(None)) for i in range(n_views)]
+    per_step = np.array([cells_per_step(views, i) for i in range(n_views)])
     apart = np.hypot(*np.moveaxis(per_step[:, None] - per_step[None], -1, 0))
     for i in range(n_views):
         for j in range(i):
@@ -232,7 +232,7 @@ class Coarser:
     """A coarser level, on which match curves are looked at.
 
     views, seen : see `TileViews`, `coverage`; surface : (r, c) float32, smooth height indices that windows follow; side
-    : cells of a window; reach : height indices to both sides of the surface; block : cells of a block of its views.
+    : cells of a window; reach : height indices to both sides of the surface.
     """
 
     views: TileViews
@@ -240,7 +240,6 @@ class Coarser:
     surface: NDArray[np.float32]
     side: int
     reach: int
-    block: int
 
     def samples(self, cells: IntArray) -> Samples:
         """The match curves' windows of cells (n, 2), moved off the border."""
@@ -254,7 +253,7 @@ class Coarser:
 
     def windows(self, samples: Samples, view: int, rows: IntArray) -> NDArray[np.float32]:
         """Windows of one view, NaN where it does not show them and at heights where something hides them."""
-        found = samples.windows(self.views, view, self.block, rows)
+        found = samples.windows(self.views, view, rows)
         row, col = samples.cells[rows].T
         index = samples.first[rows, None] + np.arange(samples.n_heights)
         found[index < self.seen[2, view, row, col][:, None]] = np.nan
@@ -289,7 +288,7 @@ def images_needed(
             ncc[rows] = np.einsum("nhk,nhk->nh", of_reference[which[rows]], shown)
         return ncc
 
-    per_step = np.array([cells_per_step(coarser.views, i, coarser.block) for i in range(n_views)] + [(0.0, 0.0)])
+    per_step = np.array([cells_per_step(coarser.views, i) for i in range(n_views)] + [(0.0, 0.0)])
     base = np.hypot(*np.moveaxis(per_step[order.reference][:, None] - per_step[None], -1, 0))
     covering = covering & np.take_along_axis(covering, reference[:, None], axis=1)
     plan = SearchPlan(

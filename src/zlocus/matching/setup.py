@@ -18,6 +18,8 @@ from zlocus.scene import Scene, View, footprint, ground_sample_distance
 FINEST_CELL = 0.1
 ON_GRID = 1e-6
 FEWEST_LEVELS = 3
+SHARED_SAMPLES = 9
+SLANT_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -124,17 +126,55 @@ def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: 
     GeometryError
         When all views look along the same line, so that heights cannot be seen.
     """
-    lead = nadir_offset(views[0], z)
-    rates = []
-    for view in views[1:]:
-        pixel = max(ground_sample_distance(view, z), cell_m)
-        rates.append(float(np.hypot(*(nadir_offset(view, z) - lead))) / pixel)
-    if not max(rates) > 1e-4:
+    if all(view.sensor.height_bounds() is None for view in views):
+        rates = _rates_where_shared(views, z, cell_m)
+    else:
+        lead = nadir_offset(views[0], z)
+        rates = []
+        for view in views[1:]:
+            pixel = max(ground_sample_distance(view, z), cell_m)
+            rates.append(float(np.hypot(*(nadir_offset(view, z) - lead))) / pixel)
+    if not max(rates, default=0.0) > 1e-4:
         raise GeometryError(
-            f"All images look along the same line (base-to-height below {max(rates) * cell_m:.1e}), so they show no "
-            "heights. Add an image from another direction."
+            f"All images look along the same line (base-to-height below {max(rates, default=0.0) * cell_m:.1e}), so "
+            "they show no heights. Add an image from another direction."
         )
     return max_shift_px / max(rates)
+
+
+def _rates_where_shared(views: tuple[View, ...], z: float, cell_m: float) -> list[float]:
+    """Equivalent disparity per metre, px, of all pairs of views, median over the ground they share at a height.
+
+    Satellites look the same way all over an image, cameras close by do not: two that look straight down see a place
+    between them from two sides.
+    """
+    outlines = [footprint(view, z) for view in views]
+    rates = []
+    for i, j in combinations(range(len(views)), 2):
+        if min(len(outlines[i]), len(outlines[j])) < 3:
+            continue
+        low = np.maximum(outlines[i].min(axis=0), outlines[j].min(axis=0))
+        high = np.minimum(outlines[i].max(axis=0), outlines[j].max(axis=0))
+        x, y = np.meshgrid(*(np.linspace(a, b, SHARED_SAMPLES) for a, b in zip(low, high, strict=True)))
+        xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
+        (one, pixel), (other, coarser) = (_slants(views[k], xyz) for k in (i, j))
+        rate = np.hypot(*(one - other).T) / np.maximum(np.maximum(pixel, coarser), cell_m)
+        if (high > low).all() and np.isfinite(rate).any():
+            rates.append(float(np.nanmedian(rate)))
+    return rates
+
+
+def _slants(view: View, xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(dE, dN) (n, 2) per metre of height along the rays to ground points (n, 3), and ground pixels there (n,) m; NaN
+    outside the image."""
+    xy, z = view.sensor.image_from_ground(xyz), xyz[:, 2]
+    rows, cols = view.image.shape
+    xy[~((xy >= -0.5) & (xy < (cols - 0.5, rows - 0.5))).all(axis=1)] = np.nan
+    steps = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
+    right, left, below, above = (view.sensor.ground_from_image(xy + step, z)[:, :2] for step in steps)
+    (ax, ay), (bx, by) = (right - left).T, (below - above).T
+    low, high = (view.sensor.ground_from_image(xy, z + dz)[:, :2] for dz in (-SLANT_M, SLANT_M))
+    return (high - low) / (2 * SLANT_M), np.sqrt(np.abs(ax * by - ay * bx))
 
 
 def levels_for(n_steps: int, options: PyramidOptions) -> int:

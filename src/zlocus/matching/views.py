@@ -10,15 +10,23 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from zlocus.errors import GeometryError
 from zlocus.scene import View
-from zlocus.sensors.model import SensorModel
-from zlocus.sensors.table import projection_table
+from zlocus.sensors.model import SensorModel, capped, lowest_station
+from zlocus.sensors.table import DEGREE, HIGHER_DEGREE, ProjectionTable, projection_table
 
 FloatImage = NDArray[np.float32]
 MARGIN_PX = 4
 # Table against exact model, in pixels of the level. Coarser levels only guide, and a block of theirs spans so much
 # ground that an aircraft's unsteady flight bends it (0.011 px over the 102 m of the demo's).
 FINEST_TABLE_PX, COARSER_TABLE_PX = 0.01, 0.05
+# Where even the smallest blocks are too bent for that: a wide lens close to high things.
+FINEST_BENT_PX, COARSER_BENT_PX = 0.05, 0.25
+# And at last a view may be left out of this share of a tile's blocks.
+MOST_LOST = 0.5
+SMALLEST_BLOCK = 4
+# Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
+CLEARANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,14 +46,21 @@ class ViewPixels:
     pixels: tuple[FloatImage, ...]
     valid: tuple[NDArray[np.bool_], ...]
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns at the finest level."""
+        rows, cols = self.pixels[0].shape
+        return rows, cols
+
 
 @dataclass(frozen=True)
 class TileViews:
     """All views of a tile at one level, as the kernels take them.
 
     pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels no window may touch; layout : (i, 3)
-    int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, 4) float64, see `ProjectionTable`, in pixels of the
-    window; heights : (2,) float64, the table's t at height index 0 and per index.
+    int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, n) float64, see `ProjectionTable`, in pixels of the
+    window; holds : (i, b, d) bool, blocks that a view can show; heights : (2,) float64, the table's t at height index 0
+    and per index; block : cells between the nodes.
     """
 
     pixels: FloatImage
@@ -53,7 +68,9 @@ class TileViews:
     has_blocked: NDArray[np.bool_]
     layout: NDArray[np.int64]
     nodes: NDArray[np.float64]
+    holds: NDArray[np.bool_]
     heights: NDArray[np.float64]
+    block: int
 
 
 def pixel_window(
@@ -65,10 +82,13 @@ def pixel_window(
     """
     xyz = np.concatenate([np.column_stack([corners, np.full(len(corners), z)]) for z in z_range])
     xy = view.sensor.image_from_ground(xyz)
-    xy = xy[np.isfinite(xy).all(axis=1)]
-    if not len(xy):
-        return None
+    known = np.isfinite(xy).all(axis=1)
     rows, cols = view.image.shape
+    if not known.any():
+        return None
+    if not known.all():
+        # What lies between a point that is seen and one that is not may be anywhere in the image.
+        xy = np.concatenate([xy[known], [(0.0, 0.0), (cols - 1.0, rows - 1.0)]])
     margin = MARGIN_PX * step
     col0, row0 = np.floor(xy.min(axis=0)).astype(int) - margin
     col1, row1 = np.ceil(xy.max(axis=0)).astype(int) + margin + 1
@@ -117,20 +137,28 @@ def tile_views(
     lattice: tuple[float, float],
     z_range: tuple[float, float],
     half: int,
+    z_needed: tuple[float, float] | None = None,
 ) -> TileViews:
     """Gather one level of all views for a grid of cells.
 
-    transform, shape : of the grid at this level; lattice : height of index 0 and step (m); z_range : m, heights that
-    will be asked for; half : half width of the largest window, by which blocked pixels grow.
+    transform, shape : of the grid at this level; block : cells between nodes, fewer where projections are too bent for
+    that; lattice : height of index 0 and step (m); z_range : m, heights that may be asked for; half : half width of the
+    largest window, by which blocked pixels grow; z_needed : m, the part of them that will be, where that is known.
+
+    Raises
+    ------
+    GeometryError
+        Where projections are too bent even for the smallest block.
     """
     layout, nodes, blocked, offset = [], [], [], 0
     scale = 2.0**level
-    tolerance_px = scale * (COARSER_TABLE_PX if level else FINEST_TABLE_PX)
-    for view in views:
+    station = lowest_station(view.sensor for view in views)
+    z_ranges = capped(z_range, station, CLEARANCE), capped(z_needed or z_range, station, CLEARANCE)
+    tables, block = _fitting_tables(views, level, transform, shape, block, z_ranges)
+    for view, table in zip(views, tables, strict=True):
         shape_px = view.pixels[level].shape
         layout.append((offset, *shape_px))
         offset += view.pixels[level].size
-        table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px)
         scaled = table.nodes / scale
         scaled[..., 0, 0] += 0.5 / scale - 0.5 - view.origin[1] / scale
         scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0] / scale
@@ -146,5 +174,50 @@ def tile_views(
         has_blocked=np.array([bool(mask.any()) for mask in blocked]),
         layout=np.array(layout, np.int64),
         nodes=np.ascontiguousarray(np.stack(nodes)),
+        holds=np.stack([table.holds for table in tables]),
         heights=np.array([(lattice[0] - table.z_mid) / table.z_half, lattice[1] / table.z_half]),
+        block=block,
     )
+
+
+def _fitting_tables(
+    views: Sequence[ViewPixels],
+    level: int,
+    transform: Affine,
+    shape: tuple[int, int],
+    block: int,
+    z_ranges: tuple[tuple[float, float], tuple[float, float]],
+) -> tuple[list[ProjectionTable], int]:
+    """A table per view that holds to a tolerance, and its block: as asked for, where need be over the second, shorter
+    range of heights only and of a higher degree, where need be halved, and where that is not enough either to the
+    wider tolerance.
+
+    Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones.
+    """
+    near, far = (COARSER_TABLE_PX, COARSER_BENT_PX) if level else (FINEST_TABLE_PX, FINEST_BENT_PX)
+    blocks = [block]
+    while blocks[-1] >= 2 * SMALLEST_BLOCK:
+        blocks.append(blocks[-1] // 2)
+    attempts = [(block, z_ranges[0], near, DEGREE, 0.0)]
+    attempts += [(b, z_ranges[1], px, HIGHER_DEGREE, 0.0) for px in (near, far) for b in blocks]
+    attempts += [(blocks[-1], z_ranges[1], far, HIGHER_DEGREE, MOST_LOST)]
+    for number, (cells, z_range, px, degree, lost) in enumerate(attempts):
+        try:
+            return [
+                projection_table(
+                    view.sensor,
+                    transform,
+                    shape,
+                    cells,
+                    z_range,
+                    px * 2.0**level,
+                    (*view.origin, *view.shape),
+                    degree,
+                    lost,
+                )
+                for view in views
+            ], cells
+        except GeometryError:
+            if number == len(attempts) - 1:
+                raise
+    raise AssertionError("there is one attempt at least")

@@ -32,6 +32,10 @@ def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> Int
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
         BORDER_PX, base.relief, seen[0], seen[1],
     )  # fmt: skip
+    if not views.holds.all():
+        rows, cols = lattice.shape
+        unmapped = (~views.holds).repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
+        seen[0][unmapped], seen[1][unmapped] = HIDDEN, -1
     return seen
 
 
@@ -40,7 +44,6 @@ def hide(
     views: TileViews,
     surface: NDArray[np.float32],
     base: NDArray[np.float32],
-    block: int,
     margin_steps: float,
 ) -> None:
     """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
@@ -50,7 +53,7 @@ def hide(
     """
     lowest = np.empty(surface.shape, np.float32)
     for i in range(len(views.layout)):
-        by_col, by_row = cells_per_step(views, i, block)
+        by_col, by_row = cells_per_step(views, i)
         lowest_visible(surface, by_col, by_row, lowest)
         lowest -= base + np.float32(margin_steps)
         np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
@@ -75,12 +78,18 @@ def above_base(seen: IntVolume, base: NDArray[np.float32]) -> IntVolume:
     return seen
 
 
-def cells_per_step(views: TileViews, i: int, block: int) -> tuple[float, float]:
-    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, at the tile's centre."""
+def cells_per_step(views: TileViews, i: int) -> tuple[float, float]:
+    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, at the tile's centre or
+    as near to it as the view can show; 0 where it shows none of the tile."""
     nodes = views.nodes[i]
     b, d = (nodes.shape[0] - 1) // 2, (nodes.shape[1] - 1) // 2
+    if not views.holds[i, b, d]:
+        shown = np.argwhere(views.holds[i])
+        if not len(shown):
+            return 0.0, 0.0
+        b, d = shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()]
     here, right, below = nodes[b, d], nodes[b, d + 1], nodes[b + 1, d]
-    by_cell = np.column_stack([right[:, 0] - here[:, 0], below[:, 0] - here[:, 0]]) / block
+    by_cell = np.column_stack([right[:, 0] - here[:, 0], below[:, 0] - here[:, 0]]) / views.block
     by_step = here[:, 1] * views.heights[1]
     col, row = -np.linalg.solve(by_cell, by_step)
     return float(col), float(row)

@@ -19,6 +19,7 @@ from zlocus.scene import Scene, View
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import FloatArray
 
+CLOSE_BY = 0.15
 FEWEST_FOR_RANGE = 20
 NEIGHBOURS = 8
 SUPPORTERS = 3
@@ -208,12 +209,16 @@ def median_distance(across_px: FloatArray) -> float:
     return float(np.median(np.abs(known))) if len(known) else np.nan
 
 
-def height_range(orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
+def height_range(
+    orientation: Orientation, options: OrientationOptions, station: float | None = None
+) -> tuple[float, float]:
     """Lowest and highest height (m) to search, from the ties.
 
     The 0.5 to 99.5 percentiles of the ties that their neighbours confirm, widened at both ends by `range_margin` times
     their span (peaks and valleys between ties), then by `range_up_m` above (towers and trees carry few ties) and
-    `range_down_m` below. Too wide costs time at the coarsest level only; too narrow costs the tower.
+    `range_down_m` below, but by no more than `CLOSE_BY` of the depth below `station`, the height of the lowest camera
+    (m), where that is known: a drone flies higher than the things it sees. Too wide costs time at the coarsest level
+    only, and of a drone the tables' accuracy; too narrow costs the tower.
     """
     trusted = supported(orientation.xyz, orientation.sigma_z_m)
     if trusted.sum() < FEWEST_FOR_RANGE:
@@ -224,7 +229,12 @@ def height_range(orientation: Orientation, options: OrientationOptions) -> tuple
         )
     low, high = np.percentile(orientation.xyz[trusted, 2], RANGE_PERCENT)
     margin = options.range_margin * (high - low)
-    return float(low - margin - options.range_down_m), float(high + margin + options.range_up_m)
+    low, high = float(low - margin), float(high + margin)
+    down, up = (
+        more if station is None else min(more, CLOSE_BY * max(station - z, 0.0))
+        for more, z in ((options.range_down_m, low), (options.range_up_m, high))
+    )
+    return low - down, high + up
 
 
 def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from zlocus.orientation.locus import Loci, locate, trace
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.triangulate import Observations
 from zlocus.scene import Scene, View
-from zlocus.sensors.model import FloatArray
+from zlocus.sensors.model import FloatArray, lowest_station
 
 Progress = Callable[[str, float], None]
 
@@ -24,6 +24,8 @@ BLOCK_PX = 128.0
 UNRELATED_DISTANCE = 0.9  # between RootSIFT descriptors of different ground; random pairs measure 0.9 to 1.2
 SAME_PLACE_PX = 2.0
 SAMPLE = 1000  # features of a pair's first search
+# Loci of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
+DEPTH_RATIO = 1.5
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ def find_ties(
     """
     z_range = z_range_hint or scene.heights or widest_range(scene.views)
     report = progress or (lambda _stage, _share: None)
-    wanted = shared_parts(scene.views, z_range, options.max_pointing_px)
+    z_ranges = slabs(scene.views, z_range)
+    wanted = shared_parts(scene.views, z_ranges, options.max_pointing_px)
     features = []
     for i, view in enumerate(scene.views):
         features.append(detect(view.image, wanted[i], options))
@@ -80,11 +83,27 @@ def find_ties(
     pairs = []
     candidates = list(combinations(range(len(scene.views)), 2))
     for done, (a, b) in enumerate(candidates):
-        matches = match_pair(scene.views, features, (a, b), z_range, options)
+        matches = match_pair(scene.views, features, (a, b), z_ranges, options)
         if len(matches):
             pairs.append(matches)
         report("matches", (done + 1) / len(candidates))
+    if len(z_ranges) > 1 and pairs:
+        z_range = likely_range(np.concatenate([pair.z for pair in pairs]))
     return join_tracks(features, tuple(pairs), z_range)
+
+
+def slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tuple[float, float]]:
+    """Ranges (m) that cover the heights, overlapping, in each of which loci run on evenly: all of it but for cameras
+    that stood close by."""
+    station = lowest_station(view.sensor for view in views)
+    if station is None:
+        return [z_range]
+    far, near = (station - z for z in z_range)
+    if not near > 0 or far / near <= DEPTH_RATIO**2:
+        return [z_range]
+    n_slabs = int(np.ceil(np.log(far / near) / np.log(DEPTH_RATIO))) - 1
+    depths = np.geomspace(far, near, n_slabs + 2)
+    return [(station - float(depths[k]), station - float(depths[k + 2])) for k in range(n_slabs)]
 
 
 def widest_range(views: Sequence[View]) -> tuple[float, float]:
@@ -97,7 +116,9 @@ def widest_range(views: Sequence[View]) -> tuple[float, float]:
     return min(low for low, _ in bounds), max(high for _, high in bounds)
 
 
-def shared_parts(views: Sequence[View], z_range: tuple[float, float], margin_px: float) -> list[NDArray[np.bool_]]:
+def shared_parts(
+    views: Sequence[View], z_ranges: Sequence[tuple[float, float]], margin_px: float
+) -> list[NDArray[np.bool_]]:
     """For each view the grid of its parts (see `features.parts`) that some other view may see too."""
     wanted = [np.zeros(part_grid(view.image.shape), bool) for view in views]
     for i, view in enumerate(views):
@@ -106,7 +127,7 @@ def shared_parts(views: Sequence[View], z_range: tuple[float, float], margin_px:
             xy = np.stack(np.meshgrid(col + edge * (col_end - col), row + edge * (row_end - row)), axis=-1).reshape(
                 -1, 2
             )
-            for other in (v for v in views if v is not view):
+            for other, z_range in product((v for v in views if v is not view), z_ranges):
                 loci = trace(view.sensor, other.sensor, xy, z_range)
                 wanted[i][part] |= may_fall_inside(loci, other.image.shape, margin_px)
     return wanted
@@ -126,10 +147,12 @@ def match_pair(
     views: Sequence[View],
     features: Sequence[Features],
     pair: tuple[int, int],
-    z_range: tuple[float, float],
+    z_ranges: Sequence[tuple[float, float]],
     options: OrientationOptions,
 ) -> PairMatches:
     """Matches of two images, guided by the loci, that agree with one pointing shift.
+
+    z_ranges : heights (m) that are looked at one after the other; that with the most matches counts.
 
     Twice: first a sample of the features within `max_pointing_px` of the loci; then, with the shift and the heights
     found, all features within twice `inlier_px`, where fewer rivals let more matches through.
@@ -140,14 +163,17 @@ def match_pair(
     sample = np.arange(0, len(xy_a), max(len(xy_a) // SAMPLE, 1))
     nothing = np.empty(0, np.int64)
     empty = PairMatches(pair, nothing, nothing, np.empty(0), 0, np.zeros(2))
-    loci = trace(*sensors, xy_a[sample], z_range)
-    if not len(xy_b) or not may_fall_inside(loci, views[b].image.shape, options.max_pointing_px):
-        return empty
-    max_px = options.max_pointing_px
-    first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
-    found = locate(*sensors, xy_a[sample[first]], xy_b[second], z_range)
-    pointing = find_shift(found, max_px, options.inlier_px)
-    if not pointing.is_certain(options.min_ties):
+    max_px, pointing, found = options.max_pointing_px, None, None
+    for z_range in z_ranges:
+        loci = trace(*sensors, xy_a[sample], z_range)
+        if not len(xy_b) or not may_fall_inside(loci, views[b].image.shape, max_px):
+            continue
+        first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
+        here = locate(*sensors, xy_a[sample[first]], xy_b[second], z_range)
+        shift = find_shift(here, max_px, options.inlier_px)
+        if pointing is None or shift.inliers.sum() > pointing.inliers.sum():
+            pointing, found = shift, here
+    if pointing is None or found is None or not pointing.is_certain(options.min_ties):
         return empty
     likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * options.inlier_px
     loci = trace(*sensors, xy_a, likely).moved(pointing.shift_px)

@@ -50,6 +50,10 @@ class FrameModel:
         """See `SensorModel`."""
         return None
 
+    def station_height(self) -> float:
+        """See `Stationed`."""
+        return float(self.space.ground_from_cartesian(np.array([self.centre]))[0, 2])
+
     def ground_at_depth(self, xy: FloatArray, depth: FloatArray) -> FloatArray:
         """Ground points (n, 3) m that pixels (n, 2) see at depths (n,) m along the optical axis."""
         return self._along(self.ray_from_image(xy), depth)

@@ -20,6 +20,8 @@ MAX_STEPS = 8
 # Newton steps are quadratic, so the one after a step of this size is below 1e-9 rows.
 TOLERANCE_ROWS = 1e-7
 SCAN_KNOTS = 129
+# Exposures that are asked how high they were.
+STATIONS = 65
 SCAN_STEPS = 60
 # Heights at which the first guess is fitted, as parts of the depth at which pixels are square.
 GUESS_DEPTHS = (0.8, 1.0)
@@ -125,6 +127,11 @@ class LineScanModel:
         """See `SensorModel`."""
         return None
 
+    def station_height(self) -> float:
+        """See `Stationed`."""
+        times = self.lines.time(np.linspace(self.lines.rows[0], self.lines.rows[-1], STATIONS))
+        return float(self.space.ground_from_cartesian(self.trajectory.pose(times)[9:].T)[:, 2].min())
+
     def corrected(self, drift: Drift) -> LineScanModel:
         """The model with a drift of its trajectory added."""
         return replace(self, trajectory=drift.corrected(self.trajectory))
@@ -158,6 +165,10 @@ class RectifiedModel:
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
         return None
+
+    def station_height(self) -> float:
+        """See `Stationed`."""
+        return self.raw.station_height()
 
     def corrected(self, drift: Drift) -> RectifiedModel:
         """The model with a drift of its trajectory added: the pixels stay where the flawed one put them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -30,3 +31,31 @@ class SensorModel(Protocol):
     def height_bounds(self) -> tuple[float, float] | None:
         """Lowest and highest ellipsoidal height (m) the model was made for; None where it holds at any height."""
         ...
+
+
+@runtime_checkable
+class Stationed(Protocol):
+    """A sensor that knows where it stood."""
+
+    def station_height(self) -> float:
+        """Lowest height (m) of its projection centres, as ground points have heights."""
+        ...
+
+
+def lowest_station(sensors: Iterable[SensorModel]) -> float | None:
+    """Height (m) of the lowest projection centre; None where not all sensors know where they stood."""
+    heights = []
+    for sensor in sensors:
+        while hasattr(sensor, "base"):  # a correction laid over it
+            sensor = sensor.base
+        if not isinstance(sensor, Stationed):
+            return None
+        heights.append(sensor.station_height())
+    return min(heights, default=None)
+
+
+def capped(z_range: tuple[float, float], station: float | None, clearance: float) -> tuple[float, float]:
+    """A range of heights (m) without those whose depth below a station is less than a share of the lowest's."""
+    if station is None or z_range[0] >= station:
+        return z_range
+    return z_range[0], min(z_range[1], station - clearance * (station - z_range[0]))
