@@ -47,8 +47,9 @@ COST = 0.51
 # is 0.09 t; half a thousandth more for the curve.
 BENT = 6e-3
 HALVES = np.array([1, 2])
-# Variance added to windows, weight and reach of grey differences, share of hidden pairs that is excused.
-PLAIN, GREYS = (0.0, 0.0, 1.0, 0.0), (0.02, 0.8, 1.5, 0.4)
+# Variance added to windows, weight and reach of grey differences, share of hidden pairs that is excused, weight where
+# two views take part.
+PLAIN, GREYS = (0.0, 0.0, 1.0, 0.0, 0.0), (0.02, 0.8, 1.5, 0.4, 0.3)
 
 
 def bases(scene, half, bumps=1.5, seed=0):
@@ -288,7 +289,7 @@ def test_costs_of_a_tile(n_views, shape, block, measure):
 
 @pytest.mark.parametrize(
     ("halves", "measure"),
-    [([1, 2], PLAIN), ([3], (0.05, 0.0, 1.0, 1.0)), ([2, 4], PLAIN), ([1, 2], GREYS), ([1], GREYS)],
+    [([1, 2], PLAIN), ([3], (0.05, 0.0, 1.0, 1.0, 0.0)), ([2, 4], PLAIN), ([1, 2], GREYS), ([1], GREYS)],
 )
 def test_costs_with_hidden_views(halves, measure):
     scene, lattice = kernel_scene(4, (20, 26), 16), ragged_lattice((20, 26), 16, seed=3)

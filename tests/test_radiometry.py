@@ -20,12 +20,15 @@ from zlocus.matching.radiometry import (
     grey_scales,
     image_grey,
 )
+from zlocus.matching.views import read_pixels
 from zlocus.scene import View
 
 SIZE_PX, GROUND_PX = 160, 400
 # Grey value of an albedo of 0 in each view, and by how much it grows per unit of albedo.
 EXPOSURES = ((200.0, 100.0), (900.0, 40.0), (-50.0, 250.0))
 EAST_PX = (0, 80, -80)
+# What grows by u, by v, and by the square of the distance from the centre, of each view.
+TRENDS = ((1.6, 0.0, 0.0), (0.0, -1.2, 1.0), (-1.4, 0.6, -0.8))
 # Where the field starts that only the second view sees, and how much brighter it is.
 FIELD_PX, BRIGHTER = 90, 6.0
 # Units of albedo, of which the ground's deviation is 1; and a share of a gain.
@@ -59,6 +62,12 @@ def points(n, east_px=(-80.0, 80.0), seed=2):
     return np.column_stack([east * GSD_M, north * GSD_M, np.full(n, BASE_HEIGHT_M)])
 
 
+def moments_of(scales):
+    """Mean and contrast of every view, which has no trend."""
+    assert all(scale.trend is None for scale in scales)
+    return [(scale.mean, scale.contrast) for scale in scales]
+
+
 def albedos_of(scales):
     """What the grey values that become 0 and 1 were on the ground: (i,) albedo and (i,) albedo per unit."""
     zero = [(mean - offset) / gain for (mean, _), (offset, gain) in zip(scales, EXPOSURES, strict=False)]
@@ -73,7 +82,7 @@ def test_views_of_other_ground_agree_where_they_look_at_the_same():
     zero, unit = albedos_of([image_grey(view) for view in views])
     assert np.ptp(zero) > 1
     assert unit.max() > 1.5 * unit.min()
-    zero, unit = albedos_of(grey_scales(views, points(300)))
+    zero, unit = albedos_of(moments_of(grey_scales(views, points(300))))
     assert np.ptp(zero) < ALBEDO
     assert unit.max() < (1 + GAIN) * unit.min()
 
@@ -86,7 +95,7 @@ def test_a_shadow_that_moved_does_not_matter():
     at = points(300)
     col, row = (at[:, :2] * [1, -1] / GSD_M + GROUND_PX / 2).T
     assert 0.1 < ((np.abs(col - 200) < 40) & (np.abs(row - 180) < 20)).mean() < 0.2
-    zero, unit = albedos_of(grey_scales(views, at))
+    zero, unit = albedos_of(moments_of(grey_scales(views, at)))
     assert np.ptp(zero) < ALBEDO
     assert unit.max() < (1 + GAIN) * unit.min()
 
@@ -99,7 +108,7 @@ def test_a_view_that_shares_too_few_points_keeps_its_own_moments(n_seen, keeps):
     at = np.concatenate([points(200, (-80.0, 0.0)), points(n_seen, (0.0, 80.0), seed=3), alone])
     assert np.isfinite(grey_at(views[1], at)).sum() == n_seen + len(alone)
     assert np.isnan(grey_at(views[0], alone)).all()
-    scales, whole = grey_scales(views, at), [image_grey(view) for view in views]
+    scales, whole = moments_of(grey_scales(views, at)), [image_grey(view) for view in views]
     assert (scales[1] == whole[1]) == keeps
     assert scales[0] != whole[0]
     assert scales[2] != whole[2]
@@ -107,27 +116,61 @@ def test_a_view_that_shares_too_few_points_keeps_its_own_moments(n_seen, keeps):
 
 def test_ground_that_no_other_view_sees_says_nothing():
     views = (view_of(albedo(), 1), view_of(albedo(), 2))
-    assert grey_scales(views, points(300)) == tuple(image_grey(view) for view in views)
+    assert moments_of(grey_scales(views, points(300))) == [image_grey(view) for view in views]
 
 
 @pytest.mark.parametrize("n_views", [1, 3])
 def test_without_tie_points_images_keep_their_own_moments(n_views):
     views = tuple(view_of(albedo(), i) for i in range(n_views))
-    assert grey_scales(views, np.empty((0, 3))) == tuple(image_grey(view) for view in views)
+    assert moments_of(grey_scales(views, np.empty((0, 3)))) == [image_grey(view) for view in views]
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0, 20.0])
 def test_contrast_is_kept_over_all_views(noise):
     """The mean of noisy views has less contrast than each, round after round."""
     views = tuple(view_of(albedo(), i, noise) for i in range(3))
-    found, whole = (np.array(s)[:, 1] for s in (grey_scales(views, points(300)), [image_grey(v) for v in views]))
+    found, whole = (
+        np.array(s)[:, 1] for s in (moments_of(grey_scales(views, points(300))), [image_grey(v) for v in views])
+    )
     assert np.abs(found / whole - 1).max() > GAIN
     assert np.log(found / whole).mean() == pytest.approx(0, abs=1e-9)
 
 
 def test_order_of_views_does_not_matter():
     views, at = tuple(view_of(albedo(), i, noise=1.0) for i in range(3)), points(300)
-    np.testing.assert_allclose(grey_scales(views[::-1], at), grey_scales(views, at)[::-1], rtol=1e-9)
+    forth, back = (moments_of(grey_scales(v, at)) for v in (views, views[::-1]))
+    np.testing.assert_allclose(back, forth[::-1], rtol=1e-9)
+
+
+def brightened(view, a, b, c):
+    """A view that is brighter towards one side and its corners: a u + b v + c (u^2 + v^2), in units of albedo."""
+    v, u = np.mgrid[-1 : 1 : SIZE_PX * 1j, -1 : 1 : SIZE_PX * 1j] * (SIZE_PX - 1) / SIZE_PX
+    gain = EXPOSURES[int(view.name[1])][1]
+    return replace(view, image=image_of(view.image.pixels + gain * (a * u + b * v + c * (u * u + v * v))))
+
+
+def test_what_one_side_of_an_image_has_more_is_taken_off():
+    """Views that see the same ground with different sides agree on it, once their trends are taken off."""
+    plain = tuple(view_of(albedo(), i) for i in range(3))
+    views = tuple(brightened(v, *t) for v, t in zip(plain, TRENDS, strict=True))
+    scales, at = grey_scales(views, points(300)), points(200, seed=7)
+    left, before = [], []
+    for view, scale in zip(views, scales, strict=True):
+        assert scale.trend is not None
+        read = read_pixels(view, (0, 0, SIZE_PX, SIZE_PX), 1, scale)
+        np.testing.assert_array_equal(read.trend, scale.trend.window(0, 0, SIZE_PX, SIZE_PX))
+        part = read_pixels(view, (20, 30, 40, 50), 1, scale)
+        np.testing.assert_allclose(part.pixels[0], read.pixels[0][20:60, 30:80], rtol=0, atol=1e-4)
+        for found, pixels in ((left, read.pixels[0]), (before, (view.image.pixels - scale.mean) / scale.contrast)):
+            found.append(grey_at(replace(view, image=image_of(pixels)), at))
+    left, before = (np.nanstd(np.array(found) - np.nanmean(found, axis=0)) for found in (left, before))
+    assert before > 0.2
+    assert left < 0.15 * before
+
+
+def test_noise_is_no_trend():
+    views = tuple(view_of(albedo(), i, noise=1.0) for i in range(3))
+    assert all(scale.trend is None for scale in grey_scales(views, points(300)))
 
 
 @dataclass(frozen=True)

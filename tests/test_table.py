@@ -14,6 +14,7 @@ from zlocus.errors import GeometryError
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.views import ViewPixels, halved, read_pixels, tile_views
 from zlocus.matching.visibility import coverage, covers, hide
 from zlocus.scene import View
@@ -188,7 +189,7 @@ def test_pixels_of_a_window_are_on_the_scale_of_all_views():
     """The view's own zero and one, at every level, wherever the window starts."""
     pixels = 500.0 + 40.0 * np.random.default_rng(0).normal(size=(40, 60))
     view = View("v", Path("v.tif"), image_of(pixels), camera("fore"))
-    read = read_pixels(view, (4, 8, 24, 32), 3, 480.0, 25.0)
+    read = read_pixels(view, (4, 8, 24, 32), 3, GreyScale(480.0, 25.0))
     assert (read.origin, read.mean, read.contrast) == ((4, 8), 480.0, 25.0)
     plain = (pixels[4:28, 8:40] - 480.0) / 25.0
     for level, found in enumerate(read.pixels):

@@ -128,6 +128,10 @@ class MeasureOptions(Checked):
         1.0, "Weight of grey differences between views beside the correlation, which is blind on plain roofs.",
         low=0.0, high=1.5,
     )  # fmt: skip
+    grey_weight_two: float = option(
+        0.3, "The same where only two views see a block: one pair's grey values are alike by chance at many heights.",
+        low=0.0, high=1.5,
+    )  # fmt: skip
     grey_reach: float = option(
         0.3, "Grey difference from which on two views are strangers, as a share of the image's deviation.",
         low=0.01, high=10.0,

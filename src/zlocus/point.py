@@ -249,7 +249,7 @@ def views_of(settled: MatchScene, window: CellWindow, place: Place, config: RunC
         part = pixel_window(settled.views[number], corners, z, 1)
         if part is not None:
             numbers.append(number)
-            found.append(read_pixels(settled.views[number], part, 1, *settled.grey[number]))
+            found.append(read_pixels(settled.views[number], part, 1, settled.grey[number]))
     shape, lattice = (window.rows, window.cols), (settled.origin_m, settled.step_m)
     half = config.measure.large_window // 2
     return numbers, tile_views(found, 0, transform, shape, config.pyramid.block, lattice, z, half)

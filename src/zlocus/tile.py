@@ -205,7 +205,7 @@ def _read(scene: MatchScene, core: CellWindow, config: RunConfig, choose: bool) 
     for number in which:
         part = parts[number]
         assert part is not None
-        found.append(read_pixels(scene.views[number], part, scene.levels, *scene.grey[number]))
+        found.append(read_pixels(scene.views[number], part, scene.levels, scene.grey[number]))
     return found, which
 
 
@@ -362,6 +362,9 @@ def _true_ortho(pixels: list[ViewPixels], result: LevelResult, surface: NDArray[
         if shown.any():
             grey = _ortho(result.views, surface, i)[shown]
             out[shown] = grey * np.float32(view.contrast) + np.float32(view.mean)
+            if view.trend is not None:
+                trend = np.concatenate([p.pixels[0].ravel() if p.trend is None else p.trend.ravel() for p in pixels])
+                out[shown] += _ortho(replace(result.views, pixels=trend), surface, i)[shown]
     return out
 
 

@@ -74,10 +74,11 @@ def cell_costs(images, nodes, heights, index, block, halves, seen, measure, reli
     """64 (1 - mean NCC + weight (1 - mean closeness)) of a block's cells at one height, (r, c), before rounding.
 
     Where fewer than two images cover that height, a fixed cost: see `block_costs`. measure : floor, weight, reach,
-    excused; relief : (r + 2 half, c + 2 half) steps.
+    excused, the weight where only two views cover the block; relief : (r + 2 half, c + 2 half) steps.
     """
     half = max(halves)
-    floor, weight, reach, excused = measure
+    floor, weight, reach, excused, weight_two = measure
+    weight = weight_two if (seen[0] <= seen[1]).any(axis=(1, 2)).sum() == 2 else weight
     shape = seen.shape[2:]
     t = heights[0] + index * heights[1]
     planes = [

@@ -213,7 +213,7 @@ def centred(plane, size, centre, start, by_reach, n, grey):
             grey[j] = inner[j] * by_reach
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, (4,) f4, (r,d) u1 -> None
+# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, (5,) f4, (r,d) u1 -> None
 @kernel
 def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, block, measure, out):
     """Costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and as much,
@@ -222,9 +222,9 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     pixels, layout : see `resample_plane`; nodes : see `plane_grid`; heights : t of height index 0, t per index;
     relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; span : first height index and count; windows :
     half widths of the windows, ascending; seen : (3, i, r, c) int32, lowest and highest height index at which an image
-    covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (4,) float32,
-    variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused; out :
-    (r, c * count) uint8.
+    covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (5,) float32,
+    variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused, the
+    weight where two views take part; out : (r, c * count) uint8.
     A pair with a hidden view counts as uncorrelated (NCC 0), but for the excused share, which agrees as the visible
     pairs do: without it the ground beside a wall would rather be roof, which all views see; excusing all would favour
     heights that few views see, where chance agreement is larger. Heights that fewer than two images cover cost
@@ -238,6 +238,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     if takes.shape[0] < 2:
         out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
         return
+    weight = measure[4] if takes.shape[0] == 2 else weight
     n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
     n, steps, start = seen.shape[2] * width, relief.ravel(), half * (width + 1)
     size = steps.shape[0] + SLACK

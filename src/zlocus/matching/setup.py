@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.radiometry import grey_scales
+from zlocus.matching.radiometry import GreyScale, grey_scales
 from zlocus.options import PyramidOptions
 from zlocus.scene import Scene, View, footprint, ground_sample_distance
 
@@ -28,8 +28,7 @@ class MatchScene:
 
     views : oriented, the leading one (most nadir, or asked for) first; anchor : ground position of cell (0, 0)'s
     corner; cell_m : side of a finest cell; origin_m, step_m, n_steps : lattice of heights at the finest level; levels :
-    of the pyramid; seen : finest cells that two views may cover; grey : grey value that is 0 and grey values that are 1
-    of each image; ties : (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m,
+    of the pyramid; seen : finest cells that two views may cover; grey : grey scale of each image; ties : (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m,
     lowest and highest height to search on the cells of `seen` at the coarsest level (from a DEM), or None.
     """
 
@@ -41,7 +40,7 @@ class MatchScene:
     n_steps: int
     levels: int
     seen: CellWindow
-    grey: tuple[tuple[float, float], ...]
+    grey: tuple[GreyScale, ...]
     ties: NDArray[np.float64] = field(repr=False)
     prior: NDArray[np.float32] | None = field(default=None, repr=False)
 

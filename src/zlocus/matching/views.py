@@ -11,6 +11,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
+from zlocus.matching.radiometry import GreyScale
 from zlocus.scene import View
 from zlocus.sensors.model import SensorModel, capped, lowest_station
 from zlocus.sensors.table import DEGREE, HIGHER_DEGREE, ProjectionTable, projection_table
@@ -36,7 +37,8 @@ class ViewPixels:
     origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
     does not depend on the window. mean, contrast : grey value of the image that is 0, and that are 1 here, so that
     views taken with other exposures compare. pixels, valid : per level,
-    (r, c) float32 and bool; level l has half the pixels of level l - 1 each way.
+    (r, c) float32 and bool; level l has half the pixels of level l - 1 each way. trend : (r, c) float32 grey values
+    taken off at the finest level, None is nothing (see `GreyTrend`).
     """
 
     sensor: SensorModel
@@ -45,6 +47,7 @@ class ViewPixels:
     contrast: float
     pixels: tuple[FloatImage, ...]
     valid: tuple[NDArray[np.bool_], ...]
+    trend: FloatImage | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -99,20 +102,21 @@ def pixel_window(
     return row0, col0, row1 - row0, col1 - col0
 
 
-def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, mean: float, contrast: float) -> ViewPixels:
+def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, scale: GreyScale) -> ViewPixels:
     """Read a window and build its pyramid by means of 2 x 2 valid pixels.
 
-    mean, contrast : the image's mean and standard deviation, which become 0 and 1 (the same for every window of an
-    image).
+    scale : of the whole image, the same for every window of it.
     """
     row, col, rows, cols = window
     read = view.image.read(row, col, rows, cols)
-    pixels, valid = [(read.pixels - np.float32(mean)) * np.float32(1.0 / contrast)], [read.valid]
+    trend = None if scale.trend is None else scale.trend.window(row, col, rows, cols)
+    grey = read.pixels if trend is None else read.pixels - trend
+    pixels, valid = [(grey - np.float32(scale.mean)) * np.float32(1.0 / scale.contrast)], [read.valid]
     for _ in range(levels - 1):
         coarse, kept = halved(pixels[-1], valid[-1])
         pixels.append(coarse)
         valid.append(kept)
-    return ViewPixels(view.sensor, (row, col), mean, contrast, tuple(pixels), tuple(valid))
+    return ViewPixels(view.sensor, (row, col), scale.mean, scale.contrast, tuple(pixels), tuple(valid), trend)
 
 
 def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, NDArray[np.bool_]]:
