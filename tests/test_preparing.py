@@ -12,7 +12,8 @@ from pyproj import CRS
 from orientation_scenes import image_of
 from zlocus.errors import GeometryError
 from zlocus.orientation.ties import slabs
-from zlocus.preparing import LOWEST_M, heights_below, possible_heights
+from zlocus.preparing import LOWEST_M, heights_asked_for, heights_below, possible_heights
+from zlocus.progress import SilentProgress
 from zlocus.scene import Scene, View, is_shared
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
@@ -58,6 +59,29 @@ def test_the_lowest_camera_counts_and_corrections_do_not_hide_it():
     assert capped((0.0, 2000.0), 1300.0, 0.25) == (0.0, 975.0)
     assert capped((0.0, 500.0), 1300.0, 0.25) == (0.0, 500.0)
     assert capped((0.0, 2000.0), None, 0.25) == (0.0, 2000.0)
+
+
+class Notes(SilentProgress):
+    """Keeps what is said."""
+
+    def __init__(self):
+        self.said = []
+
+    def note(self, sentence):
+        self.said.append(sentence)
+
+
+def test_heights_asked_for_are_searched_up_to_the_cameras():
+    """Those well below the lowest camera untouched, in silence; those that reach it up to an eighth of the depth."""
+    views, notes = scene(frame(0.0, 1500.0), frame(600.0, 1300.0)), Notes()
+    assert heights_asked_for(views, (100.0, 1140.0), notes) == (100.0, 1140.0)
+    assert notes.said == []
+    low, high = heights_asked_for(views, (100.0, 1250.0), notes)
+    assert (low, high) == (100.0, pytest.approx(1150.0, abs=1e-6))
+    assert len(notes.said) == 1
+    assert "100 to 1250 m" in notes.said[0]
+    assert "1300.0 m" in notes.said[0]
+    assert "1150.0 m are searched" in notes.said[0]
 
 
 def test_what_cannot_be_told_is_asked_for():

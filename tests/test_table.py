@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.views import ViewPixels, halved, read_pixels, tile_views
-from zlocus.matching.visibility import coverage, covers, hide
+from zlocus.matching.visibility import coverage, covers, hide, left_out
 from zlocus.scene import View
 from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
@@ -150,6 +151,33 @@ def test_coverage_leaves_out_what_does_not_hold():
     unmapped = ~views.holds[0].repeat(views.block, 0).repeat(views.block, 1)[:600, :600]
     assert not seen[0][unmapped].any()
     hide(np.zeros((3, 2, *shape), np.int32), views, np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0)
+
+
+def test_tables_hold_over_heights_that_reach_close_to_the_camera():
+    """From 170 to 55 m below a tilted wide lens, no block that shows the ground is left out."""
+    shape, pixels = (400, 400), np.zeros((912, 1368), np.float32)
+    window = ViewPixels(drone(), (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    views = tile_views([window], 0, grid(0.15, shape), shape, 32, (-15.0, 0.5), (-15.0, 100.0), 4)
+    assert not views.lost.any()
+    assert views.holds.mean() > 0.3
+
+
+def test_blocks_from_which_a_view_is_left_out_are_named():
+    """A camera in the midst of the heights searched cannot be tabulated; what it may show is lost, not unseen."""
+    shape, pixels = (64, 64), np.zeros((912, 1368), np.float32)
+    sensor = replace(drone(), centre=(*CENTRE, 130.0))
+    window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    table = projection_table(sensor, grid(0.5, shape), shape, 8, (15.0, 128.0), 0.01, IMAGE, 3, 1.0)
+    assert table.lost.any()
+    assert not (table.lost & table.holds).any()
+    views = tile_views([window], 0, grid(0.5, shape), shape, 32, (15.0, 0.5), (15.0, 60.0), 4)
+    named = replace(views, lost=np.zeros_like(views.lost))
+    assert not left_out(named, shape).any()
+    named.lost[0, 1, 2] = True
+    side = views.block
+    marked = left_out(named, shape)
+    assert marked[side : 2 * side, 2 * side : 3 * side].all()
+    assert marked.sum() == side**2
 
 
 def test_perspective_shrinks_blocks_and_raises_the_degree_only_where_needed():

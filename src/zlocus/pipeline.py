@@ -27,8 +27,8 @@ from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pi
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import Orientation
 from zlocus.preparing import (
-    CLEARANCE,
     asked_crs,
+    heights_asked_for,
     heights_of_ties,
     made_folder,
     oriented,
@@ -42,7 +42,6 @@ from zlocus.products.record import Stopwatch, inputs_record, versions_record, wr
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
-from zlocus.sensors.model import capped, lowest_station
 from zlocus.surface.reasons import Quality
 from zlocus.surface.surface import Surface
 from zlocus.tile import TileResult, match_tile
@@ -73,6 +72,7 @@ class Tally:
 
     n_seen: int = 0
     n_matched: int = 0
+    n_left_out: int = 0
     evaluations: int = 0
     all_images: int = 0
     ranked: list[RankedPoints] = field(default_factory=list)
@@ -82,6 +82,8 @@ class Tally:
         outside = np.uint16(Quality.OUTSIDE | Quality.UNSEEN)
         self.n_seen += int(((surface.quality & outside) == 0).sum())
         self.n_matched += int(np.isfinite(surface.height).sum())
+        left_out = (surface.quality & np.uint16(Quality.LEFT_OUT)) != 0
+        self.n_left_out += int((left_out & ((surface.quality & np.uint16(Quality.OUTSIDE)) == 0)).sum())
         self.evaluations += result.evaluations
         self.all_images += result.all_images
 
@@ -112,8 +114,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
         corrected = orientation.apply(scene)
-        z_range = heights or _searched_heights(request, corrected, orientation, config)
-        z_range = capped(z_range, lowest_station(view.sensor for view in corrected.views), CLEARANCE)
+        z_range = _searched_heights(request, corrected, orientation, config, progress)
         grid = _grid(request, like, corrected, z_range)
         settled = settle(
             corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid
@@ -145,10 +146,10 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
             "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
             "evaluations": {"done": tally.evaluations, "all_images": tally.all_images},
             "coverage": round(tally.coverage, 6),
+            "left_out_cells": tally.n_left_out,
         },
     )
-    if not request.partial:
-        _check_coverage(tally, out)
+    _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
 
 
@@ -232,9 +233,11 @@ def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | Non
 
 
 def _searched_heights(
-    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig
+    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
 ) -> tuple[float, float]:
-    """Height range of the search: from the DEM, else from the ties."""
+    """Height range of the search: as asked for, else from the DEM, else from the ties."""
+    if heights := request.heights or scene.heights:
+        return heights_asked_for(scene, heights, progress)
     if request.dem is None:
         return heights_of_ties(scene, orientation, config.orientation)
     z = possible_heights(scene, request.heights or scene.heights)
@@ -244,7 +247,8 @@ def _searched_heights(
     if not np.isfinite(heights).any():
         raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
-    return low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
+    low, high = low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
+    return heights_asked_for(scene, (low, high), progress, f"The heights around {request.dem}")
 
 
 def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
@@ -333,9 +337,14 @@ def _what_failed(settled: MatchScene, tile: Tile, error: Exception) -> str:
     )
 
 
-def _check_coverage(tally: Tally, out: Path) -> None:
-    """Refuse to call a run a success that found few heights."""
-    if tally.coverage < SUFFICIENT_COVERAGE:
+def _check_coverage(tally: Tally, out: Path, partial: bool, progress: Progress) -> None:
+    """Say where images were left out, and refuse to call a run a success that found few heights, unless `partial`."""
+    if tally.n_left_out:
+        progress.note(
+            f"In {tally.n_left_out} cells an image that may show them took no part, for it sees them too obliquely "
+            "over the heights searched there (LEFT_OUT in quality.tif). Give --heights closer to those of the ground."
+        )
+    if tally.coverage < SUFFICIENT_COVERAGE and not partial:
         raise CoverageError(
             f"Only {100 * tally.coverage:.1f} % of the cells seen by two images or more have a height in "
             f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "

@@ -25,6 +25,8 @@ LOWEST_M, HIGHEST_M = -500.0, 9000.0
 NEAREST_M, DEPTHS = 2.0, 49
 # Of the depth of the lowest ground below the lowest camera: nothing is searched nearer than that.
 CLEARANCE = 0.25
+# The same where heights are asked for: a little more than what projection tables need.
+LEAST_CLEARANCE = 0.125
 
 
 def asked_crs(given: str | None) -> CRS | None:
@@ -114,6 +116,20 @@ def heights_of_ties(scene: Scene, orientation: Orientation, options: Orientation
     """Heights (m) to search, from the ties (see `height_range`), and not close to a camera."""
     station = lowest_station(view.sensor for view in scene.views)
     return capped(height_range(orientation, options, station), station, CLEARANCE)
+
+
+def heights_asked_for(
+    scene: Scene, asked: tuple[float, float], progress: Progress, given: str = "The heights asked for"
+) -> tuple[float, float]:
+    """Heights (m) to search, as asked for; where they reach the cameras, those below, and a note that says so."""
+    station = lowest_station(view.sensor for view in scene.views)
+    found = capped(asked, station, LEAST_CLEARANCE)
+    if found != asked:
+        progress.note(
+            f"{given}, {asked[0]:g} to {asked[1]:g} m, reach the lowest camera, which is {station:.1f} m high: "
+            f"{found[0]:g} to {found[1]:.1f} m are searched."
+        )
+    return found
 
 
 def what_was_applied(orientation: Orientation) -> str:

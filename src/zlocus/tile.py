@@ -34,12 +34,12 @@ from zlocus.matching.selection import (
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, sees
+from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
 from zlocus.surface.precision import sigma_steps, signs_of_precision
-from zlocus.surface.reasons import is_empty
+from zlocus.surface.reasons import Quality, is_empty
 from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
@@ -430,6 +430,7 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
     last = scene.n_steps - 1
     signs = signs_of_precision(result.heights, refined, seeing)
     quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)
+    quality[left_out(result.views, quality.shape)] |= np.uint16(Quality.LEFT_OUT)
     height = result.lattice.metres(refined.height)
     sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan

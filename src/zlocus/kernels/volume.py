@@ -234,11 +234,10 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     ranges = np.empty((seen.shape[1], 4), np.int32)
     height_ranges(seen, ranges)
     takes = taking_part(ranges, span)
-    floor, weight = measure[0], measure[1]
+    floor, weight = measure[0], measure[4] if takes.shape[0] == 2 else measure[1]
     if takes.shape[0] < 2:
         out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
         return
-    weight = measure[4] if takes.shape[0] == 2 else weight
     n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
     n, steps, start = seen.shape[2] * width, relief.ravel(), half * (width + 1)
     size = steps.shape[0] + SLACK

@@ -44,7 +44,19 @@ class BaseSurface:
 
     @classmethod
     def along(cls, surface: NDArray[np.float32], block: int) -> BaseSurface:
-        """With the slopes of a smooth surface, (r, c) float32 height indices."""
+        """With the slopes of a smooth surface, (r, c) float32 height indices.
+
+        Patches are no smaller in small blocks, whose medians would follow noise: they are divided afterwards.
+        """
+        if block < PATCH and PATCH % block == 0:
+            every = PATCH // block
+            corners = divided(cls.along(surface, PATCH).patches, every)
+            return cls(
+                corners[: -(-surface.shape[0] // block) + 1, : -(-surface.shape[1] // block) + 1],
+                block,
+                surface.shape,
+                block,
+            )
         patch = PATCH if block % PATCH == 0 else block
         rows, cols = surface.shape
         whole = ((0, -rows % block), (0, -cols % block))
@@ -101,6 +113,17 @@ class BaseSurface:
             for i in range(j, n):
                 moved[..., j] += comb(i, j) * views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
         return replace(views, nodes=moved)
+
+
+def divided(corners: NDArray[np.float64], times: int) -> NDArray[np.float64]:
+    """Corners of the same bilinear surface's patches, `times` as many along both axes."""
+    for axis in (0, 1):
+        n = corners.shape[axis]
+        at = np.arange((n - 1) * times + 1) / times
+        low = np.minimum(at.astype(int), n - 2)
+        share = np.expand_dims(at - low, 1 - axis)
+        corners = corners.take(low, axis) * (1 - share) + corners.take(low + 1, axis) * share
+    return np.ascontiguousarray(corners)
 
 
 def known_slopes(surface: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

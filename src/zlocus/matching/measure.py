@@ -21,8 +21,8 @@ def cost_volume(
     window sizes (the paper's SNCC, equation 2, for two views; for more it has no reference image, so that no single
     view's noise is in every term). d is the mean over the same pairs of the two pixels' grey difference, in units of
     `grey_reach` and at most 1: NCC knows nothing of plain roofs, on which all views show one grey, and blurs edges by
-    the width of its window (as AD-Census does: Mei et al. 2011, equation 3). w is `grey_weight`, in blocks that two views take part in
-    `grey_weight_two`. seen : (3, i, r, c) int32, see `coverage`.
+    the width of its window (as AD-Census does: Mei et al. 2011, equation 3). w is `grey_weight`, and `grey_weight_two`
+    in blocks that two views take part in. seen : (3, i, r, c) int32, see `coverage`.
     """
     windows = np.unique([options.small_window // 2, options.large_window // 2])
     greys = options.grey_weight, options.grey_reach, options.hidden_excused, options.grey_weight_two

@@ -20,8 +20,7 @@ PART_PX = 512
 ROUNDS, MEDIAN_ROUNDS, OUTLIER = 20, 3, 3.0
 MAD_TO_SIGMA = 1.4826
 # Of a trend: sigma of the prior on its terms, in contrasts; the share of what differs between views that it must
-# explain. Ground that is the same in all views leaves 0.15 or less to it (satellites, rendered or real); the images of a
-# mapping camera, lit from one side, 0.69.
+# explain. Of satellites, rendered and real ones, it explains 0.15 or less, of images of a mapping camera 0.69.
 TREND_SIGMA, TREND_ROUNDS, LEAST_EXPLAINED = 0.3, 5, 0.25
 # And so large it is at least, in contrasts: smaller ones do not matter.
 LEAST_TREND = 0.04

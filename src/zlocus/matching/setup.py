@@ -27,9 +27,10 @@ class MatchScene:
     """All that is settled before tiling, the same for every tile.
 
     views : oriented, the leading one (most nadir, or asked for) first; anchor : ground position of cell (0, 0)'s
-    corner; cell_m : side of a finest cell; origin_m, step_m, n_steps : lattice of heights at the finest level; levels :
-    of the pyramid; seen : finest cells that two views may cover; grey : grey scale of each image; ties : (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m,
-    lowest and highest height to search on the cells of `seen` at the coarsest level (from a DEM), or None.
+    corner; cell_m : side of a finest cell; origin_m, step_m, n_steps : lattice of heights at the finest level;
+    levels : of the pyramid; seen : finest cells that two views may cover; grey : grey scale of each image; ties :
+    (n, 3) ground points that widen the ranges of their blocks; prior : (2, r, c) float32 m, lowest and highest
+    height to search on the cells of `seen` at the coarsest level (from a DEM), or None.
     """
 
     views: tuple[View, ...]

@@ -14,7 +14,7 @@ from zlocus.errors import GeometryError
 from zlocus.matching.radiometry import GreyScale
 from zlocus.scene import View
 from zlocus.sensors.model import SensorModel, capped, lowest_station
-from zlocus.sensors.table import DEGREE, HIGHER_DEGREE, ProjectionTable, projection_table
+from zlocus.sensors.table import DEGREE, HIGHER_DEGREE, HIGHEST_DEGREE, ProjectionTable, projection_table
 
 FloatImage = NDArray[np.float32]
 MARGIN_PX = 4
@@ -62,7 +62,8 @@ class TileViews:
 
     pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels no window may touch; layout : (i, 3)
     int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, n) float64, see `ProjectionTable`, in pixels of the
-    window; holds : (i, b, d) bool, blocks that a view can show; heights : (2,) float64, the table's t at height index 0
+    window; holds : (i, b, d) bool, blocks that a view can show; lost : (i, b, d) bool, others that it may show, where
+    it takes no part all the same because its table does not hold; heights : (2,) float64, the table's t at height index 0
     and per index; block : cells between the nodes.
     """
 
@@ -72,6 +73,7 @@ class TileViews:
     layout: NDArray[np.int64]
     nodes: NDArray[np.float64]
     holds: NDArray[np.bool_]
+    lost: NDArray[np.bool_]
     heights: NDArray[np.float64]
     block: int
 
@@ -179,6 +181,7 @@ def tile_views(
         layout=np.array(layout, np.int64),
         nodes=np.ascontiguousarray(np.stack(nodes)),
         holds=np.stack([table.holds for table in tables]),
+        lost=np.stack([table.lost for table in tables]),
         heights=np.array([(lattice[0] - table.z_mid) / table.z_half, lattice[1] / table.z_half]),
         block=block,
     )
@@ -194,7 +197,7 @@ def _fitting_tables(
 ) -> tuple[list[ProjectionTable], int]:
     """A table per view that holds to a tolerance, and its block: as asked for, where need be over the second, shorter
     range of heights only and of a higher degree, where need be halved, and where that is not enough either to the
-    wider tolerance.
+    wider tolerance and of the highest degree. A view is left out of blocks (see `TileViews.lost`) only after all that.
 
     Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones.
     """
@@ -204,7 +207,7 @@ def _fitting_tables(
         blocks.append(blocks[-1] // 2)
     attempts = [(block, z_ranges[0], near, DEGREE, 0.0)]
     attempts += [(b, z_ranges[1], px, HIGHER_DEGREE, 0.0) for px in (near, far) for b in blocks]
-    attempts += [(blocks[-1], z_ranges[1], far, HIGHER_DEGREE, MOST_LOST)]
+    attempts += [(blocks[-1], z_ranges[1], far, HIGHEST_DEGREE, lost) for lost in (0.0, MOST_LOST)]
     for number, (cells, z_range, px, degree, lost) in enumerate(attempts):
         try:
             return [

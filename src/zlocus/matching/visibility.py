@@ -33,10 +33,20 @@ def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> Int
         BORDER_PX, base.relief, seen[0], seen[1],
     )  # fmt: skip
     if not views.holds.all():
-        rows, cols = lattice.shape
-        unmapped = (~views.holds).repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
+        unmapped = _cells_of(~views.holds, lattice.block, lattice.shape)
         seen[0][unmapped], seen[1][unmapped] = HIDDEN, -1
     return seen
+
+
+def left_out(views: TileViews, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Cells (r, c) of which a view that may show them was left out: see `TileViews.lost`."""
+    return _cells_of(views.lost.any(axis=0), views.block, shape)
+
+
+def _cells_of(blocks: NDArray[np.bool_], block: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """What holds for blocks (..., b, d), for cells (..., r, c)."""
+    rows, cols = shape
+    return blocks.repeat(block, axis=-2).repeat(block, axis=-1)[..., :rows, :cols]
 
 
 def hide(

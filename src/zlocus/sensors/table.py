@@ -14,7 +14,7 @@ from zlocus.sensors.model import FloatArray, SensorModel
 TOLERANCE_PX = 0.01
 DEGREE = 3
 # For cameras so close that their scale changes a lot from the lowest to the highest ground.
-HIGHER_DEGREE = 7
+HIGHER_DEGREE, HIGHEST_DEGREE = 7, 11
 # Where a corner is put that the sensor cannot map: in no image, and finite, as the kernels need it.
 NOWHERE_PX = -1e9
 CHECKED = (-1.0, -0.7, 0.0, 0.7, 1.0)
@@ -27,13 +27,14 @@ class ProjectionTable:
     nodes : (b + 1, d + 1, 2, n) float64, px: corner row, corner column, (x, y), coefficients of 1, t, t^2, ... with
     t = (z - z_mid) / z_half. The corner (b, d) is the centre of cell (b block, d block); between corners positions are
     bilinear. holds : (b, d) bool, blocks in which that is so; the others are not in the image, or the sensor cannot map
-    all of them: they count as not seen.
+    all of them: they count as not seen. lost : (b, d) bool, those of them that the image may show all the same.
     """
 
     nodes: FloatArray
     z_mid: float
     z_half: float
     holds: NDArray[np.bool_]
+    lost: NDArray[np.bool_]
 
 
 def projection_table(
@@ -69,7 +70,8 @@ def projection_table(
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
-    table = ProjectionTable(nodes, z_mid, z_half, known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:])
+    whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
+    table = ProjectionTable(nodes, z_mid, z_half, whole, np.zeros_like(whole))
     gaps = table_gaps(table, sensor, transform, block)
     bad = table.holds & (gaps > tolerance_px)
     if bad.any() and window is not None:
@@ -80,7 +82,7 @@ def projection_table(
             f"{tolerance_px} px) between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer "
             "heights."
         )
-    return replace(table, holds=table.holds & (gaps <= tolerance_px))
+    return replace(table, holds=table.holds & (gaps <= tolerance_px), lost=bad)
 
 
 def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, block: int) -> FloatArray:
