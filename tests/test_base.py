@@ -28,7 +28,7 @@ def plane(by_row, by_col, shape=SHAPE):
 def views_of(scene):
     none = np.zeros(len(scene.pixels), bool)
     holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
-    return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, holds, scene.heights,
+    return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, holds, ~holds, scene.heights,
                       scene.block)  # fmt: skip
 
 
@@ -53,6 +53,15 @@ def test_sheared_views_project_where_the_base_lies():
                     r, c = i * scene.block, j * scene.block
                     found = grid[:2] + c * grid[2:4] + r * grid[4:6] + r * c * grid[6:8]
                     np.testing.assert_allclose(found, plain[:2], rtol=0, atol=POSITION_PX)
+
+
+@pytest.mark.parametrize("shape", [SHAPE, (64, 72), (5, 9)])
+def test_small_blocks_have_the_base_of_whole_patches(shape):
+    """Medians over a few cells would follow noise."""
+    surface = plane(0.7, -0.4, shape) + np.random.default_rng(2).normal(size=shape).astype(np.float32)
+    small, whole = BaseSurface.along(surface, PATCH // 2), BaseSurface.along(surface, PATCH)
+    assert small.nodes.shape == tuple(-(-n // (PATCH // 2)) + 1 for n in shape)
+    np.testing.assert_allclose(small.cells, whole.cells, rtol=0, atol=FLOAT32_STEPS)
 
 
 def test_a_level_base_changes_nothing():

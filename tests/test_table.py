@@ -169,6 +169,12 @@ def test_blocks_from_which_a_view_is_left_out_are_named():
     window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
     table = projection_table(sensor, grid(0.5, shape), shape, 8, (15.0, 128.0), 0.01, IMAGE, 3, 1.0)
     assert table.lost.any()
+    # Ground 80 m ahead is in the image from 100 m above it, and beyond the fold of the distortion from 3 m.
+    ahead = grid(0.5, shape) * Affine.translation(0.0, -160.0)
+    for z, is_shown in ((55.0, True), (152.0, False)):
+        assert np.isfinite(drone().image_from_ground(np.array([[*(ahead * (32.5, 32.5)), z]]))).all() == is_shown
+    both = projection_table(drone(), ahead, shape, 8, (30.0, 153.0), 2.0, IMAGE, 7, 1.0)
+    assert (both.lost & ~both.holds).mean() > 0.8
     assert not (table.lost & table.holds).any()
     views = tile_views([window], 0, grid(0.5, shape), shape, 32, (15.0, 0.5), (15.0, 60.0), 4)
     named = replace(views, lost=np.zeros_like(views.lost))

@@ -27,7 +27,8 @@ class ProjectionTable:
     nodes : (b + 1, d + 1, 2, n) float64, px: corner row, corner column, (x, y), coefficients of 1, t, t^2, ... with
     t = (z - z_mid) / z_half. The corner (b, d) is the centre of cell (b block, d block); between corners positions are
     bilinear. holds : (b, d) bool, blocks in which that is so; the others are not in the image, or the sensor cannot map
-    all of them: they count as not seen. lost : (b, d) bool, those of them that the image may show all the same.
+    all of them: they count as not seen. lost : (b, d) bool, those of them that the image may show all the same, at some
+    of the heights.
     """
 
     nodes: FloatArray
@@ -67,12 +68,15 @@ def projection_table(
     t = np.cos((np.arange(degree + 1) + 0.5) * np.pi / (degree + 1))
     fit = np.linalg.inv(np.vander(t, increasing=True))
     positions = np.stack([_project(sensor, transform, rows, cols, z_mid + z_half * v) for v in t], axis=-1)
+    shown = np.zeros(positions.shape[:2], bool) if window is None else _inside(positions, window).any(axis=-1)
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
     whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    table = ProjectionTable(nodes, z_mid, z_half, whole, np.zeros_like(whole))
+    shows = shown[:-1, :-1] | shown[1:, :-1] | shown[:-1, 1:] | shown[1:, 1:]
+    table = ProjectionTable(nodes, z_mid, z_half, whole, ~whole & shows)
     gaps = table_gaps(table, sensor, transform, block)
+    unmapped = (~whole | np.isnan(gaps)) & shows
     bad = table.holds & (gaps > tolerance_px)
     if bad.any() and window is not None:
         bad &= _may_show(table, gaps, window)
@@ -82,7 +86,7 @@ def projection_table(
             f"{tolerance_px} px) between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer "
             "heights."
         )
-    return replace(table, holds=table.holds & (gaps <= tolerance_px), lost=bad)
+    return replace(table, holds=table.holds & (gaps <= tolerance_px), lost=bad | unmapped)
 
 
 def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, block: int) -> FloatArray:
@@ -97,6 +101,13 @@ def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, b
         exact = _project(sensor, transform, rows, cols, table.z_mid + t * table.z_half)
         worst = np.maximum(worst, np.linalg.norm(centre @ t ** np.arange(centre.shape[-1]) - exact, axis=-1))
     return worst
+
+
+def _inside(positions: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+    """Which of the positions (b, d, 2, n) lie in a window, (b, d, n)."""
+    row, col, n_rows, n_cols = window
+    x, y = positions[:, :, 0], positions[:, :, 1]
+    return np.asarray((x >= col) & (x <= col + n_cols - 1) & (y >= row) & (y <= row + n_rows - 1))
 
 
 def _may_show(table: ProjectionTable, gaps: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
