@@ -265,6 +265,75 @@ def ground_seen_by_all(scene: Scene, srtm: HeightRaster, geoid: HeightRaster) ->
     return xyz[inside]
 
 
+def dmc(at: Workplace) -> list[Figure]:
+    """Four images of a mapping camera in two strips, with their exterior orientation; no heights are given."""
+    scene = at.scene("aerial_ngi_dmc")
+    at.out.mkdir(parents=True, exist_ok=True)
+    (camera := at.out / "camera.yaml").write_text(f"focal: {120 / 0.144}\n")
+    crs = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", at.out / "scene.yaml"])
+    run([ZLOCUS, "dsm", at.out / "scene.yaml", "-o", at.out / "dsm"], accept=(0, COVERAGE_SHORT))
+    # Columns in front of what a terrain model of 24 m cells says; a blunder is far beyond what it may be wrong by.
+    error = errors_where_two_see(at.out, scene / "reference" / "dem_24m_egm2008.tif")
+    return [
+        *two_view_figures(error, least_filled=0.7, most_nmad_m=8.0, most_median_m=6.0),
+        Figure("found heights > 50 m off", float((np.abs(error[np.isfinite(error)]) > 50.0).mean())),
+    ]
+
+
+def tuniu(at: Workplace) -> list[Figure]:
+    """Four oblique images of a drone, in four directions; no heights are given."""
+    scene = at.scene("drone_tuniu_oblique")
+    at.out.mkdir(parents=True, exist_ok=True)
+    (bundle,) = json.loads((scene / "opensfm_reconstruction.json").read_text())[0]["cameras"].values()
+    side, lens = bundle["width"], {name: bundle[name] for name in ("k1", "k2", "k3", "p1", "p2")}
+    point = [(bundle[f"c_{axis}"] * side + (bundle[size] - 1) / 2) for axis, size in (("x", "width"), ("y", "height"))]
+    (camera := at.out / "camera.yaml").write_text(
+        json.dumps(
+            {"focal": bundle["focal_x"] * side, "principal_point": point, "distortion": {"kind": "brown", **lens}}
+        )
+    )
+    table = ["--crs", "EPSG:32651", "--earth", "flat", "--camera", camera]
+    run([ZLOCUS, "import", "eo", scene, *table, "-o", at.out / "scene.yaml"])
+    run([ZLOCUS, "dsm", at.out / "scene.yaml", "-o", at.out / "dsm"], accept=(0, COVERAGE_SHORT))
+    error = errors_where_two_see(at.out, scene / "reference" / "odm_dsm_0.8m.tif")
+    left_out = json.loads((at.out / "dsm" / "run.json").read_text())["left_out_cells"]
+    return [
+        *two_view_figures(error, least_filled=0.6, most_nmad_m=0.5),
+        Figure("cells an image was left out of", float(left_out)),
+    ]
+
+
+def two_view_figures(
+    error: np.ndarray, least_filled: float, most_nmad_m: float, most_median_m: float | None = None
+) -> list[Figure]:
+    """Of the ground that two images see. error : (n,) m, NaN where there is no height."""
+    found = error[np.isfinite(error)]
+    median = float(np.median(found))
+    return [
+        Figure("ground seen by two, filled", float(np.isfinite(error).mean()), at_least=least_filled),
+        Figure("|median difference|", abs(median), "m", at_most=most_median_m),
+        Figure("NMAD", float(1.4826 * np.median(np.abs(found - median))), "m", at_most=most_nmad_m),
+    ]
+
+
+def errors_where_two_see(folder: Path, reference: Path) -> np.ndarray:
+    """Heights of a surface less those of a reference, at the reference's cells that two images see. (n,) m."""
+    opened, dsm = open_scene([folder / "scene.yaml"]), read_heights(folder / "dsm" / "dsm.tif")
+    with rasterio.open(reference) as source:
+        z, transform = source.read(1, masked=True).astype(float).filled(np.nan), source.transform
+    col, row = np.meshgrid(np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5)
+    x, y = transform * (col, row)
+    xyz = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    n_seeing = np.zeros(len(xyz), int)
+    for view in opened.views:
+        xy = view.sensor.image_from_ground(xyz)
+        n_seeing += ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
+    xyz = xyz[n_seeing >= 2]
+    return np.asarray(dsm.nearest(xyz[:, :2]) - xyz[:, 2])
+
+
 def selection(at: Workplace) -> list[Figure]:
     """Eight views of the rendered town, one of another date and one hazy: those that help against all of them."""
     scene = at.scene("rendered-city")
@@ -397,6 +466,7 @@ def clone(at: Workplace) -> list[Figure]:
 
 ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "calanques": calanques, "city": city, "hills": hills, "new-scenes": new_scenes, "ventoux": ventoux,
+    "dmc": dmc, "tuniu": tuniu,
     "kernels": kernels, "selection": selection, "features": features, "middlebury": middlebury,
     "memory": memory, "clone": clone,
 }  # fmt: skip

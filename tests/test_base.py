@@ -28,8 +28,8 @@ def plane(by_row, by_col, shape=SHAPE):
 def views_of(scene):
     none = np.zeros(len(scene.pixels), bool)
     holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
-    return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, holds, ~holds, scene.heights,
-                      scene.block)  # fmt: skip
+    return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, holds, ~holds,
+                      scene.heights, scene.block)  # fmt: skip
 
 
 def test_sheared_views_project_where_the_base_lies():

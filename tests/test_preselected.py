@@ -13,6 +13,7 @@ from rendered_scenes import CENTRE
 from zlocus.matching.selection import preselected
 from zlocus.options import SelectionOptions
 from zlocus.scene import View
+from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
 
 Z = 50.0
@@ -55,6 +56,16 @@ def test_worse_images_come_last(other):
     good = [view(f"g{i}", 19.0 + i, day=2) for i in range(3)]
     assert "other" not in chosen([view("nadir", day=0), other, *good], 3)
     assert "other" in chosen([view("nadir", day=0), other, *good], 4)
+
+
+def test_directions_are_those_at_the_patch():
+    """All cameras look straight down; the patch is seen from the angle at which they stand aside."""
+    turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    views = []
+    for name, east in (("above", 0.0), ("near", 5.0), ("good", 36.0), ("far", 90.0)):
+        sensor = FrameModel((CENTRE[0] + east, CENTRE[1], Z + 100.0), turn, 50.0, (60.0, 50.0))
+        views.append(View(name, Path(name), Blank(), sensor))
+    assert chosen(views, 1) == ["above", "good"]
 
 
 def test_the_reference_shows_the_whole_ground():

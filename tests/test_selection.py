@@ -68,9 +68,10 @@ def textured(slope=(0.0, 0.0), spoiled=(), noise=0.0, speeds=SPEEDS):
         nodes.append(node)
     pixels = np.concatenate([image.ravel() for image in images])
     heights = np.array([-LEVEL_STEPS * per_step, per_step])
+    holds = np.ones((len(images), corners[0] - 1, corners[1] - 1), bool)
     return TileViews(
         pixels, np.zeros(len(pixels), bool), np.zeros(len(images), bool), np.array(layout, np.int64), np.stack(nodes),
-        np.ones((len(images), corners[0] - 1, corners[1] - 1), bool), heights, BLOCK,
+        holds, ~holds, heights, BLOCK,
     )  # fmt: skip
 
 
@@ -113,9 +114,9 @@ def test_labels_of_views_that_show_the_same_and_of_one_that_does_not():
 def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     """Curved projections and images that have nothing in common."""
     scene = kernel_scene()
+    holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
     views = TileViews(scene.pixels, np.zeros(len(scene.pixels), bool), np.zeros(3, bool), scene.layout, scene.nodes,
-                      np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool), scene.heights,
-                      scene.block)  # fmt: skip
+                      holds, ~holds, scene.heights, scene.block)  # fmt: skip
     rng = np.random.default_rng(2)
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)

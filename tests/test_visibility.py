@@ -19,8 +19,10 @@ from zlocus.matching.visibility import (
     coverage,
     covers,
     hide,
+    parts_of_one_direction,
     sees,
 )
+from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (30, 50)
@@ -202,3 +204,28 @@ def test_above_the_base_and_back():
     assert never[1] == NOTHING_HIDDEN
     for height in (-1000.0, -1.0, 0.0, 1000.0):
         assert not sees(moved, np.full((2, 4, 5), height))[1, 2, 3]
+
+
+def test_a_wide_lens_sees_behind_a_tower_from_its_own_side():
+    """Above the middle of the tile: towers on both sides hide what is outwards of them, and nothing inwards."""
+    shape, block = (64, 256), 16
+    transform = Affine(1.0, 0, CENTRE[0] - 128.0, 0, -1.0, CENTRE[1] + 32.0)
+    turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    camera = FrameModel((*CENTRE, 150.0), turn, 100.0, (200.0, 100.0))
+    pixels = np.zeros((201, 401), np.float32)
+    window = ViewPixels(camera, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    views = tile_views([window], 0, transform, shape, block, (0.0, 1.0), (0.0, 40.0), 2)
+    surface = np.zeros(shape, np.float32)
+    surface[24:40, 40:46] = surface[24:40, 210:216] = 30.0
+    seen = np.zeros((3, 1, *shape), np.int32)
+    hide(seen, views, surface, np.zeros(shape, np.float32), 0.0)
+    hidden = seen[2, 0] > 0
+    # 85 m aside and 120 m above the towers' tops, the shadows of 30 m are a quarter longer than 15 m.
+    assert hidden[28:36, 28:38].mean() > 0.9
+    assert hidden[28:36, 218:228].mean() > 0.9
+    assert not hidden[:, 60:196].any()
+
+
+def test_a_satellite_looks_one_way():
+    views, _, _ = tile([sensor(), sensor(10, 5)])
+    assert all(len(parts_of_one_direction(views, i)) == 1 for i in range(2))

@@ -100,13 +100,21 @@ def preselected(views: Sequence[View], corners: FloatArray, z: float, options: S
     Of a scene of hundreds of images few see the patch, and fewer are worth comparing; see `candidate_images`.
     """
     xyz = np.column_stack([corners, np.full(len(corners), z)])
-    overlap = np.array([_inside(view, xyz).mean() for view in views])
+    inside = [_inside(view, xyz) for view in views]
+    overlap = np.array([seen.mean() for seen in inside])
     reference = int(np.argmax(overlap >= WHOLE)) if (overlap >= WHOLE).any() else int(overlap.argmax())
-    slant = np.array([nadir_offset(view, z) for view in views])
+    slant = np.array([_slant_at(view, xyz[seen], z) for view, seen in zip(views, inside, strict=True)])
     angle = np.degrees(np.arctan(np.hypot(*(slant - slant[reference]).T)))
     days = np.array([_days_between(view, views[reference]) for view in views])
     overlap[reference] = 0.0
     return sorted([reference, *candidate_images(SearchGeometry(overlap, angle, days), options).tolist()])
+
+
+def _slant_at(view: View, xyz: FloatArray, z: float) -> FloatArray:
+    """`nadir_offset` amid the points (n, 3) that a view sees: a wide lens looks another way at every place."""
+    return nadir_offset(
+        view, z, view.sensor.image_from_ground(xyz.mean(axis=0, keepdims=True))[0] if len(xyz) else None
+    )
 
 
 def _inside(view: View, xyz: FloatArray) -> NDArray[np.bool_]:

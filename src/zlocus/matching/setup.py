@@ -51,10 +51,10 @@ class MatchScene:
         return Affine(side, 0.0, self.anchor[0] + window.col * side, 0.0, -side, self.anchor[1] - window.row * side)
 
 
-def nadir_offset(view: View, z: float) -> NDArray[np.float64]:
-    """(dE, dN) that the ground point seen by the image's centre pixel moves per metre of height."""
+def nadir_offset(view: View, z: float, at: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """(dE, dN) that the ground point seen by a pixel, `at` (2,) px or the image's centre, moves per metre of height."""
     rows, cols = view.image.shape
-    xy = np.array([[(cols - 1) / 2, (rows - 1) / 2]] * 2)
+    xy = np.array([[(cols - 1) / 2, (rows - 1) / 2] if at is None else at] * 2)
     low, high = view.sensor.ground_from_image(xy, np.array([z - 5.0, z + 5.0]))
     return np.asarray((high - low)[:2] / 10.0)
 

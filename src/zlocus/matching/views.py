@@ -63,8 +63,8 @@ class TileViews:
     pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels no window may touch; layout : (i, 3)
     int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, n) float64, see `ProjectionTable`, in pixels of the
     window; holds : (i, b, d) bool, blocks that a view can show; lost : (i, b, d) bool, others that it may show, where
-    it takes no part all the same because its table does not hold; heights : (2,) float64, the table's t at height index 0
-    and per index; block : cells between the nodes.
+    it takes no part all the same because its table does not hold; heights : (2,) float64, t of the tables at height
+    index 0 and per index; block : cells between the nodes.
     """
 
     pixels: FloatImage

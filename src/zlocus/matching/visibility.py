@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
@@ -16,6 +19,8 @@ from zlocus.matching.views import TileViews
 IntVolume = NDArray[np.int32]
 BORDER_PX = 3.0
 NOTHING_HIDDEN = -(2**29)
+# Cells per height step by which directions differ within a part of a tile, and parts along a side at most.
+TURN, MOST_PARTS = 0.2, 8
 
 
 def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> IntVolume:
@@ -63,11 +68,11 @@ def hide(
     """
     lowest = np.empty(surface.shape, np.float32)
     for i in range(len(views.layout)):
-        by_col, by_row = cells_per_step(views, i)
-        lowest_visible(surface, by_col, by_row, lowest)
-        lowest -= base + np.float32(margin_steps)
-        np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
-        seen[2, i] = lowest
+        for part in parts_of_one_direction(views, i):
+            lowest_visible(surface, *cells_per_step(views, i, part), lowest)
+            lowest -= base + np.float32(margin_steps)
+            np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
+            seen[2, i][part] = lowest[part]
 
 
 def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -88,11 +93,34 @@ def above_base(seen: IntVolume, base: NDArray[np.float32]) -> IntVolume:
     return seen
 
 
-def cells_per_step(views: TileViews, i: int) -> tuple[float, float]:
-    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, at the tile's centre or
-    as near to it as the view can show; 0 where it shows none of the tile."""
+def parts_of_one_direction(views: TileViews, i: int) -> list[tuple[slice, slice]]:
+    """Parts of a tile, whole blocks each, over which a view looks about the same way: the tile itself from afar."""
+    n = views.holds.shape[1:]
+    by_step = np.array([cells_per_step(views, i, _block_cells(views, b, d)) for b in _ends(n[0]) for d in _ends(n[1])])
+    apart = float(np.abs(np.diff(by_step, axis=0)).max())
+    n_parts = min(max(math.ceil(apart / TURN), 1), MOST_PARTS)
+    edges = [np.unique(np.linspace(0, count, n_parts + 1).astype(int)) * views.block for count in n]
+    rows, cols = ([slice(int(a), int(b)) for a, b in pairwise(edge)] for edge in edges)
+    return [(row, col) for row in rows for col in cols]
+
+
+def _ends(count: int) -> tuple[int, int]:
+    return 0, count - 1
+
+
+def _block_cells(views: TileViews, b: int, d: int) -> tuple[slice, slice]:
+    """Cells of a block."""
+    return slice(b * views.block, (b + 1) * views.block), slice(d * views.block, (d + 1) * views.block)
+
+
+def cells_per_step(views: TileViews, i: int, part: tuple[slice, slice] | None = None) -> tuple[float, float]:
+    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, at the centre of a part
+    of the tile, by default of all, or as near to it as the view can show; 0 where it shows none of the tile."""
     nodes = views.nodes[i]
     b, d = (nodes.shape[0] - 1) // 2, (nodes.shape[1] - 1) // 2
+    if part is not None:
+        b, d = ((span.start + span.stop) // 2 // views.block for span in part)
+        b, d = min(b, nodes.shape[0] - 2), min(d, nodes.shape[1] - 2)
     if not views.holds[i, b, d]:
         shown = np.argwhere(views.holds[i])
         if not len(shown):
