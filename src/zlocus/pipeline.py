@@ -236,8 +236,8 @@ def _searched_heights(
     request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
 ) -> tuple[float, float]:
     """Height range of the search: as asked for, else from the DEM, else from the ties."""
-    if heights := request.heights or scene.heights:
-        return heights_asked_for(scene, heights, progress)
+    if asked := request.heights or scene.heights:
+        return heights_asked_for(scene, asked, progress)
     if request.dem is None:
         return heights_of_ties(scene, orientation, config.orientation)
     z = possible_heights(scene, request.heights or scene.heights)

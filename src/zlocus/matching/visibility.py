@@ -45,7 +45,7 @@ def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> Int
 
 def left_out(views: TileViews, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Cells (r, c) of which a view that may show them was left out: see `TileViews.lost`."""
-    return _cells_of(views.lost.any(axis=0), views.block, shape)
+    return _cells_of(np.asarray(views.lost.any(axis=0)), views.block, shape)
 
 
 def _cells_of(blocks: NDArray[np.bool_], block: int, shape: tuple[int, int]) -> NDArray[np.bool_]:

@@ -68,7 +68,7 @@ def projection_table(
     t = np.cos((np.arange(degree + 1) + 0.5) * np.pi / (degree + 1))
     fit = np.linalg.inv(np.vander(t, increasing=True))
     positions = np.stack([_project(sensor, transform, rows, cols, z_mid + z_half * v) for v in t], axis=-1)
-    shown = np.zeros(positions.shape[:2], bool) if window is None else _inside(positions, window).any(axis=-1)
+    shown = np.zeros(positions.shape[:2], bool) if window is None else _shows_any(positions, window)
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
@@ -103,11 +103,12 @@ def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, b
     return worst
 
 
-def _inside(positions: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Which of the positions (b, d, 2, n) lie in a window, (b, d, n)."""
+def _shows_any(positions: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+    """Whether any of the n positions (b, d, 2, n) lies in a window, (b, d)."""
     row, col, n_rows, n_cols = window
     x, y = positions[:, :, 0], positions[:, :, 1]
-    return np.asarray((x >= col) & (x <= col + n_cols - 1) & (y >= row) & (y <= row + n_rows - 1))
+    inside = (x >= col) & (x <= col + n_cols - 1) & (y >= row) & (y <= row + n_rows - 1)
+    return np.asarray(inside.any(axis=-1))
 
 
 def _may_show(table: ProjectionTable, gaps: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
