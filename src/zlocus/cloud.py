@@ -66,7 +66,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     with watch.stage("settle"):
         settled, options = settle_all(ready, references, options)
     with watch.stage("match"):
-        matched = match_images(settled, options, len(scene.views) > 2, request.workers, progress)
+        matched = match_images(settled, options, True, request.workers, progress)
     with watch.stage("match back"):
         matched = confirmed_images(matched, progress)
     with watch.stage("write"), made_folder(request.out), progress.stage("Writing", len(matched)) as stage:

@@ -108,6 +108,12 @@ class PyramidOptions(Checked):
     )
     dem_up_m: float = option(100.0, "Searched above a DEM given as --dem.", low=0.0, high=1e4, unit="m")
     dem_down_m: float = option(50.0, "Searched below a DEM given as --dem.", low=0.0, high=1e4, unit="m")
+    finest_rounds: int = option(
+        2,
+        "Times the finest level is matched where three views or more see a tile; the later know what hides what.",
+        low=1,
+        high=10,
+    )
     reach: int = option(2, "Coarse cells around a block whose heights it searches too.", low=0, high=64, unit="cells")
 
 

@@ -105,10 +105,11 @@ class Matched:
 
 @dataclass(frozen=True)
 class GridImages:
-    """images : to be put on a grid, in the order in which they give grey values; evaluations, all_images : see
-    `TileResult`."""
+    """images : to be put on a grid, in the order in which they give grey values; matched : all of them; evaluations,
+    all_images : see `TileResult`."""
 
     images: list[PixelHeights]
+    matched: list[PixelHeights]
     evaluations: int
     all_images: int
 
@@ -259,14 +260,12 @@ def match_for_grid(
     heights it takes, in the order in which they give grey values."""
     options = depth_options(config) if is_by_depth(ready.scene) else config
     settled, options = settle_all(ready, [view.name for view in ready.scene.views], options)
-    # With two views none can be spared: what is hidden is left to matching back.
-    use_visibility = use_visibility and len(settled) > 2
     before = match_images(settled, options, use_visibility, workers, progress, area)
     after = confirmed_images(before, progress)
     z = sum(area.z_range) / 2
     images = {one.image.space.reference.name: pixel_heights(one, b, z) for one, b in zip(after, before, strict=True)}
     evaluations = sum(one.evaluations for one in before), sum(one.all_images for one in before)
-    return GridImages([images[name] for name in leading], *evaluations)
+    return GridImages([images[name] for name in leading], list(images.values()), *evaluations)
 
 
 def pixel_heights(one: Matched, before: Matched, z: float) -> PixelHeights:
@@ -287,7 +286,8 @@ def grid_tile(
         return TileResult(Surface.nothing(core))
     window = core.at_level(0, options.halo)
     z_range = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
-    surface = gridded(matched.images, Cells((window.rows, window.cols), scene.transform(window, 0), z_range))
+    cells = Cells((window.rows, window.cols), scene.transform(window, 0), z_range)
+    surface = gridded(matched.images, cells, matched.matched)
     if fill == "interpolate":
         surface = filled(surface, options.halo // 2)
     return TileResult(surface.part(core, window))

@@ -58,18 +58,11 @@ def draw_image(ground, limits, height, pixel):
     int32, -1, both written: highest height at the cell's centre, and flat index of the pixel that is nearest to it.
 
     Triangles of neighbouring pixels are drawn where they show one surface: so no cell between two pixels stays empty,
-    and a height is that at the cell's centre, not that at the place where a point fell. A pixel next to a jump counts
-    for the cell it falls into.
+    and a height is that at the cell's centre, not that at the place where a point fell. A pixel counts for
+    the cell it falls into where no triangle covers that, or only one that lies more than the limit lower.
     """
     n_rows, n_cols = ground.shape[0], ground.shape[1]
-    for r in range(n_rows):
-        for c in range(n_cols):
-            x, y, z = ground[r, c, 0], ground[r, c, 1], np.float32(ground[r, c, 2])
-            if np.isnan(z) or x < 0.0 or y < 0.0 or x >= height.shape[1] or y >= height.shape[0]:
-                continue
-            row, col = int(y), int(x)
-            if not z <= height[row, col]:
-                height[row, col], pixel[row, col] = z, r * n_cols + c
+    jump = np.float32(limits[1])
     for r in range(n_rows - 1):
         for c in range(n_cols - 1):
             a = r * n_cols + c
@@ -85,6 +78,14 @@ def draw_image(ground, limits, height, pixel):
                 draw_triangle(ground, first, second, left, height, pixel)
             if is_connected(ground, first, second, right, limits):
                 draw_triangle(ground, first, second, right, height, pixel)
+    for r in range(n_rows):
+        for c in range(n_cols):
+            x, y, z = ground[r, c, 0], ground[r, c, 1], np.float32(ground[r, c, 2])
+            if np.isnan(z) or x < 0.0 or y < 0.0 or x >= height.shape[1] or y >= height.shape[0]:
+                continue
+            row, col = int(y), int(x)
+            if not z <= height[row, col] + jump:
+                height[row, col], pixel[row, col] = z, r * n_cols + c
 
 
 # (i,r,c) f4, f4, (r,c) f4, (i,r,c) b1 -> None

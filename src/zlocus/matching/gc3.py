@@ -37,6 +37,7 @@ LEAST_DISPARITY_PX = 0.5
 BY_DEPTH: dict[str, dict[str, Any]] = {
     "measure": {"large_window": 3, "hidden_excused": 1.0, "hidden_margin_steps": 24.0},
     "semiglobal": {"predecessors": 1, "p1": 20, "p2": 240, "p2_edge": 100, "edge_contrast": 2.0},
+    "pyramid": {"finest_rounds": 1},
 }
 SMALLEST_BLOCK = 8
 DISPARITY_SAMPLES = 64

@@ -58,13 +58,13 @@ class Cells:
         return np.column_stack([*on_ground(self.transform, col + 0.5, row + 0.5), z])
 
 
-def gridded(images: Sequence[PixelHeights], cells: Cells) -> Surface:
+def gridded(images: Sequence[PixelHeights], cells: Cells, seen_by: Sequence[PixelHeights]) -> Surface:
     """The surface on which most of the images agree in each cell; of equal numbers the higher, for a roof may hide what
     lies lower, never what lies higher.
 
     Where no image has a confirmed height, two that agree on the ground are enough: they confirm each other, though
     others see something farther away there; such cells are marked as DISPUTED. images : in the order in which they give
-    grey values to the ortho-image.
+    grey values to the ortho-image; seen_by : all that were matched, which know why a cell is empty.
     """
     tolerance_m = AGREE_STEPS * min(one.step_m for one in images)
     surface = agreed([drawn(one, one.surface, cells) for one in images], 1, tolerance_m)
@@ -74,7 +74,7 @@ def gridded(images: Sequence[PixelHeights], cells: Cells) -> Surface:
         second = replace(second, quality=second.quality | np.uint16(Quality.DISPUTED))
         for mine, theirs in zip(surface.arrays, second.arrays, strict=True):
             mine[gaps] = theirs[gaps]
-    surface.quality[np.isnan(surface.height)] = why_empty(images, cells, surface.height)
+    surface.quality[np.isnan(surface.height)] = why_empty(seen_by, cells, surface.height)
     return surface
 
 
