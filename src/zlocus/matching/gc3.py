@@ -34,10 +34,11 @@ TIE_PERCENT = (0.5, 99.5)
 DISPARITY_MARGIN_PX = 8.0
 # What is farther is as good as infinitely far.
 LEAST_DISPARITY_PX = 0.5
-BY_DEPTH: dict[str, dict[str, Any]] = {
+# Matching back finds what is hidden: a second round costs heights of ground beside walls.
+IN_IMAGES: dict[str, dict[str, Any]] = {"pyramid": {"finest_rounds": 1}}
+BY_DEPTH: dict[str, dict[str, Any]] = IN_IMAGES | {
     "measure": {"large_window": 3, "hidden_excused": 1.0, "hidden_margin_steps": 24.0},
     "semiglobal": {"predecessors": 1, "p1": 20, "p2": 240, "p2_edge": 100, "edge_contrast": 2.0},
-    "pyramid": {"finest_rounds": 1},
 }
 SMALLEST_BLOCK = 8
 DISPARITY_SAMPLES = 64
@@ -194,8 +195,18 @@ def depth_options(config: RunConfig) -> RunConfig:
     never hidden; and a view counts as hidden only far below what hides it, for the coarser surface blurs outlines by
     some steps, and matching back finds what is hidden exactly.
     """
+    return _with_defaults(config, BY_DEPTH)
+
+
+def image_options(config: RunConfig, by_depth: bool) -> RunConfig:
+    """The options with those for image space where they have their defaults, which are chosen for ground grids."""
+    return depth_options(config) if by_depth else _with_defaults(config, IN_IMAGES)
+
+
+def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> RunConfig:
+    """The options with other values, by stage, where they have their defaults."""
     changed = {}
-    for stage, values in BY_DEPTH.items():
+    for stage, values in defaults.items():
         mine, default = getattr(config, stage), getattr(RunConfig(), stage)
         chosen = {name: value for name, value in values.items() if getattr(mine, name) == getattr(default, name)}
         changed[stage] = replace(mine, **chosen)
