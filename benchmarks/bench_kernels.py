@@ -116,7 +116,7 @@ def test_costs(benchmark, n_views, windows, weight):
     heights = lattice(SIDE, 32)
     volume = np.empty(heights.size, np.uint8)
     seen, half = all_seen(n_views), np.array(windows, np.int64)
-    border, measure = 2 * max(windows), np.array([0.0, weight, 0.3, 0.5], np.float32)
+    border, measure = 2 * max(windows), np.array([0.0, weight, 0.3, 0.5, n_views], np.float32)
     base = np.zeros((SIDE + border, SIDE + border), np.float32), np.zeros((SIDE // BLOCK + 1, SIDE // BLOCK + 1))
     scene = views(n_views)
 

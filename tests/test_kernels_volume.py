@@ -67,11 +67,14 @@ def bases(scene, half, bumps=1.5, seed=0):
 
 
 def costs(scene, lattice, seen, halves=HALVES, measure=PLAIN, bumps=0.0):
+    return costs_along(*bases(scene, max(halves), bumps), scene, lattice, seen, halves, measure, len(scene.layout))
+
+
+def costs_along(base, base_nodes, scene, lattice, seen, halves, measure, few):
     volume = np.zeros(lattice.size, np.uint8)
-    base, base_nodes = bases(scene, max(halves), bumps)
     tile_costs(
         scene.pixels, scene.layout, scene.nodes, scene.heights, base, base_nodes, lattice.ranges, lattice.address,
-        halves, seen, scene.block, np.array(measure, np.float32), volume,
+        halves, seen, scene.block, np.array([*measure, few], np.float32), volume,
     )  # fmt: skip
     return volume
 
@@ -300,6 +303,21 @@ def test_costs_with_hidden_views(halves, measure):
     alone = ((seen[0] <= seen[1]).sum(axis=0) < 2)[..., None] & searched
     assert alone.any()
     assert (found[alone] == round(twin.UNSEEN_COST * (1.0 + measure[1]))).all()
+
+
+def test_many_views_take_the_smallest_window_alone():
+    scene, lattice = kernel_scene(4, (20, 40), 16), ragged_lattice((20, 40), 16)
+    seen, (base, base_nodes) = scene.all_seen(), bases(scene, 2)
+    seen[:2, 0, :, 16:] = np.array([HIDDEN, -1])[:, None, None]  # all four views see the first blocks only
+    found = costs_along(base, base_nodes, scene, lattice, seen, HALVES, GREYS, 3)
+    small = np.ascontiguousarray(base[1:-1, 1:-1])
+    alone = costs_along(small, base_nodes, scene, lattice, seen, HALVES[:1], GREYS, 3)
+    both = costs_along(base, base_nodes, scene, lattice, seen, HALVES, GREYS, 4)
+    found, alone, both = (dense(volume, lattice, np.inf) for volume in (found, alone, both))
+    np.testing.assert_array_equal(found[:, :16], alone[:, :16])
+    np.testing.assert_array_equal(found[:, 16:], both[:, 16:])
+    assert (found[:, :16] != both[:, :16]).any()
+    assert (found[:, 16:] != alone[:, 16:]).any()
 
 
 def test_costs_of_one_block():

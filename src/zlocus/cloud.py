@@ -15,7 +15,7 @@ from zlocus.io.colour import read_colours
 from zlocus.io.config import config_as_dict
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.confirm import ROWS_AT_ONCE
-from zlocus.matching.gc3 import image_options, is_by_depth
+from zlocus.matching.gc3 import depth_options, is_by_depth
 from zlocus.options import RunConfig
 from zlocus.per_image import Matched, chosen_references, confirmed_images, match_images, orient_scene, settle_all
 from zlocus.preparing import asked_crs, made_folder, what_was_applied
@@ -59,7 +59,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         scene = open_scene(request.inputs, asked_crs(request.crs))
         scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
         references = chosen_references(scene, request.references)
-    options = image_options(config, is_by_depth(scene))
+    options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         ready = orient_scene(scene, request.heights or scene.heights, config.orientation, progress)
         progress.note(what_was_applied(ready.orientation))

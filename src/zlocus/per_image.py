@@ -16,10 +16,10 @@ from zlocus.matching.confirm import Confirmation, MatchedImage, confirm
 from zlocus.matching.gc3 import (
     ImageSpace,
     beyond_range,
+    depth_options,
     fitting_block,
     hypotheses_of_heights,
     hypotheses_of_ties,
-    image_options,
     image_space,
     is_by_depth,
     settle_image,
@@ -258,7 +258,7 @@ def match_for_grid(
 ) -> GridImages:
     """All views matched in their own spaces and confirmed by each other, for a surface. leading : names of those whose
     heights it takes, in the order in which they give grey values."""
-    options = image_options(config, is_by_depth(ready.scene))
+    options = depth_options(config) if is_by_depth(ready.scene) else config
     settled, options = settle_all(ready, [view.name for view in ready.scene.views], options)
     before = match_images(settled, options, use_visibility, workers, progress, area)
     after = confirmed_images(before, progress)

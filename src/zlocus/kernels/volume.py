@@ -270,7 +270,18 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     heights_last(codes, width, out)
 
 
-# as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
+# (3,i,r,c) i4, (2,) i8, (w,) i8, i8 -> (w,) i8
+@kernel
+def windows_for(seen, span, windows, few):
+    """The windows of a block: all where at most `few` views take part, else the smallest, for many pairs of views
+    average noise as well, and their windows do not reach beyond a small crown."""
+    ranges = np.empty((seen.shape[1], 4), np.int32)
+    height_ranges(seen, ranges)
+    return windows if taking_part(ranges, span).shape[0] <= few else windows[:1]
+
+
+# as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span, (5,) f4 for its measure
+# and (v,) u1 -> None
 @kernel
 def tile_costs(
     pixels, layout, nodes, heights, base, base_nodes, ranges, address, windows, seen, block, measure, volume
@@ -279,10 +290,11 @@ def tile_costs(
 
     base : (r + 2 half, c + 2 half) float32 base surface, border included, in height indices; base_nodes : (b + 1,
     d + 1) float64, the base surface at the corners of blocks, which `nodes` follow; ranges : (2, b, d) int64, first
-    index and count of each block; address : (3, b, d) int64, see `HeightLattice.address`; volume : (v,) uint8, written.
+    index and count of each block; address : (3, b, d) int64, see `HeightLattice.address`; measure : (5,) float32, the
+    fifth is the most views of a block that takes all windows, see `windows_for`; volume : (v,) uint8, written.
     """
     n_rows, n_cols = seen.shape[2], seen.shape[3]
-    span, half = np.empty(2, np.int64), windows[-1]
+    span, few = np.empty(2, np.int64), np.int64(measure[4])
     for br in range(ranges.shape[1]):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         first, length = address[0, br, 0], address[1, br, 0]
@@ -291,10 +303,13 @@ def tile_costs(
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             span[0], span[1] = ranges[0, br, bc], ranges[1, br, bc]
             start = address[2, br, bc]
+            sizes = windows_for(seen[:, :, r0:r1, c0:c1], span, windows, few)
+            half, beside = sizes[-1], windows[-1] - sizes[-1]
             relief = np.empty((r1 - r0 + 2 * half, c1 - c0 + 2 * half), np.float32)
-            corners = base_nodes[br : br + 2, bc : bc + 2]
-            block_relief(base[r0 : r1 + 2 * half, c0 : c1 + 2 * half], corners, block, half, relief)
+            corners, r, c = base_nodes[br : br + 2, bc : bc + 2], r0 + beside, c0 + beside
+            around = base[r : r + relief.shape[0], c : c + relief.shape[1]]
+            block_relief(around, corners, block, half, relief)
             block_costs(
-                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, relief, span, windows,
+                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, relief, span, sizes,
                 seen[:, :, r0:r1, c0:c1], block, measure, rows[:, start : start + (c1 - c0) * span[1]],
             )  # fmt: skip

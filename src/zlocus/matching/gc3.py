@@ -34,9 +34,7 @@ TIE_PERCENT = (0.5, 99.5)
 DISPARITY_MARGIN_PX = 8.0
 # What is farther is as good as infinitely far.
 LEAST_DISPARITY_PX = 0.5
-# Matching back finds what is hidden: a second round costs heights of ground beside walls.
-IN_IMAGES: dict[str, dict[str, Any]] = {"pyramid": {"finest_rounds": 1}}
-BY_DEPTH: dict[str, dict[str, Any]] = IN_IMAGES | {
+BY_DEPTH: dict[str, dict[str, Any]] = {
     "measure": {"large_window": 3, "hidden_excused": 1.0, "hidden_margin_steps": 24.0},
     "semiglobal": {"predecessors": 1, "p1": 20, "p2": 240, "p2_edge": 100, "edge_contrast": 2.0},
 }
@@ -196,11 +194,6 @@ def depth_options(config: RunConfig) -> RunConfig:
     some steps, and matching back finds what is hidden exactly.
     """
     return _with_defaults(config, BY_DEPTH)
-
-
-def image_options(config: RunConfig, by_depth: bool) -> RunConfig:
-    """The options with those for image space where they have their defaults, which are chosen for ground grids."""
-    return depth_options(config) if by_depth else _with_defaults(config, IN_IMAGES)
 
 
 def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> RunConfig:
