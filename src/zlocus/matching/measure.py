@@ -18,10 +18,11 @@ def cost_volume(
     """64 (1 - NCC) + 64 w d of every cell and height, (v,) uint8, laid out as `HeightLattice.address` says.
 
     views : whose nodes follow `base`, see `BaseSurface.shear`. NCC is the mean over all pairs of views and over the
-    window sizes, of which there is one where more than `few_views` see a block (the paper's SNCC, equation 2, for two views; for more it has no reference image, so that no single
-    view's noise is in every term). d is the mean over the same pairs of the two pixels' grey difference, in units of
-    `grey_reach` and at most 1: NCC knows nothing of plain roofs, on which all views show one grey, and blurs edges by
-    the width of its window (as AD-Census does: Mei et al. 2011, equation 3). seen : (3, i, r, c) int32, see `coverage`.
+    window sizes, of which there is one where more than `few_views` cover a block (the paper's SNCC, equation 2, for two
+    views; for more it has no reference image, so that no single view's noise is in every term). d is the mean over the
+    same pairs of the two pixels' grey difference, in units of `grey_reach` and at most 1: NCC knows nothing of plain
+    roofs, on which all views show one grey, and blurs edges by the width of its window (as AD-Census does: Mei et al.
+    2011, equation 3). seen : (3, i, r, c) int32, see `coverage`.
     """
     windows = np.unique([options.small_window // 2, options.large_window // 2])
     measure = np.array(
