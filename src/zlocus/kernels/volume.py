@@ -280,8 +280,7 @@ def windows_for(seen, span, windows, few):
     return windows if taking_part(ranges, span).shape[0] <= few else windows[:1]
 
 
-# as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span, (5,) f4 for its measure
-# and (v,) u1 -> None
+# as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
 @kernel
 def tile_costs(
     pixels, layout, nodes, heights, base, base_nodes, ranges, address, windows, seen, block, measure, volume
