@@ -172,7 +172,7 @@ def line_edges(p2, line, way, is_first, rows, cols, edge):
     `p2` has the steps from W, NW, N and NE; those from the other side are stored at the cell they come from. A
     neighbour that is missing has the P2 of its partner, two have 0: nothing is added to the costs.
     """
-    n = edge.shape[1]
+    n, flat = edge.shape[1], p2.ravel()
     for path in range(NEIGHBOURS):
         dr, dc = rows[path], cols[path]
         is_behind = dr < 0 or (dr == 0 and dc < 0)
@@ -181,12 +181,14 @@ def line_edges(p2, line, way, is_first, rows, cols, edge):
         low, high = 1 if path in (W, NW) else 0, n - 1 if path == NE else n
         if is_first and path != W:
             low, high = 0, 0
+        at = in_order(0, n, way[SIGN])
+        r, c = (at, line) if way[BY_COLUMN] else (line, at)
+        start = (plane * p2.shape[1] + r + from_r) * p2.shape[2] + c + from_c
+        step = way[SIGN] * (p2.shape[2] if way[BY_COLUMN] else 1)
         for i in range(n):
             edge[path, i] = 0
         for i in range(low, high):
-            at = in_order(i, n, way[SIGN])
-            r, c = (at, line) if way[BY_COLUMN] else (line, at)
-            edge[path, i] = p2[plane, r + from_r, c + from_c]
+            edge[path, i] = flat[np.uint64(start + i * step)]
     edge[W, 0], edge[NW, 0], edge[NE, n - 1] = edge[N, 0], edge[NE, 0], edge[NW, n - 1]
     if is_first:
         for i in range(n):
