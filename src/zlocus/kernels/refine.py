@@ -239,3 +239,23 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
                     level[(r - r0) * width + c] = (index - middle) / reach
             resample_surface(pixels, layout[view], grids, flat_cells((r1 - r0, width)), level[:n], LINEAR, grey[:n])
             out[r0:r1, c0:c1] = grey[:n].reshape((r1 - r0, width))
+
+
+# (j,n) f4, (j,) f4, (n,) f4, (n,) f4, (n,) b1 -> None
+@kernel
+def profile_peaks(profile, offsets, position, value, is_inside):
+    """Position and value of the maximum of equally spaced samples by the parabola through the three around the largest
+    one (at an end, the three at that end), and whether the largest is none at an end. profile : (j, n), a cell a
+    column, j >= 3."""
+    n_samples, spacing = profile.shape[0], offsets[1] - offsets[0]
+    for p in range(profile.shape[1]):
+        best = 0
+        for j in range(1, n_samples):
+            best = j if profile[j, p] > profile[best, p] else best
+        is_inside[p] = 0 < best < n_samples - 1
+        at = min(max(best, 1), n_samples - 2)
+        left, here, right = profile[at - 1, p], profile[at, p], profile[at + 1, p]
+        bend = min(left - np.float32(2.0) * here + right, np.float32(-1e-6))
+        shift = min(max(np.float32(0.5) * (left - right) / bend, np.float32(-1.0)), np.float32(1.0))
+        value[p] = here - np.float32(0.25) * (left - right) * shift
+        position[p] = offsets[at] + shift * spacing

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from zlocus.kernels.mesh import agreed_heights, draw_image
 from zlocus.matching.confirm import MatchedImage, difference
@@ -139,6 +138,9 @@ def why_empty(images: Sequence[PixelHeights], cells: Cells, height: NDArray[np.f
     if empty.all():
         z = np.full(int(empty.sum()), sum(cells.z_range) / 2)
     else:
+        # Imported here: half a second, which runs in object space need not spend.
+        from scipy.ndimage import distance_transform_edt
+
         nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
         z = height[tuple(nearest)][empty].astype(float)
     ground = cells.ground(empty, z)
