@@ -17,7 +17,7 @@ import yaml
 from typer.testing import CliRunner
 
 from rendered_scenes import CENTRE, FIELD, GSD_M, HEIGHTS, LOOKS, QUIET, camera
-from zlocus import cloud
+from zlocus import cloud, per_image
 from zlocus.cli import app
 from zlocus.errors import CoverageError
 from zlocus.io.opening import open_raster
@@ -177,7 +177,7 @@ def test_frame_cameras_without_heights_given(rig, of_rig):
 
 def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypatch):
     patch = (slice(60, 90), slice(60, 90))
-    whole = cloud.matched_image
+    whole = per_image.matched_image
 
     def planted(space, scene, surface):
         matched = whole(space, scene, surface)
@@ -185,7 +185,7 @@ def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypat
             matched.image.height[patch] += 20.0
         return matched
 
-    monkeypatch.setattr(cloud, "matched_image", planted)
+    monkeypatch.setattr(per_image, "matched_image", planted)
     run(images("plane").inputs, tmp_path / "out", crs="EPSG:32632", heights=HEIGHTS)
     height, quality = (read(tmp_path / "out" / f"nadir_{what}.tif") for what in ("height", "quality"))
     assert np.isnan(height[patch]).all()
@@ -195,8 +195,8 @@ def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypat
 
 def test_levels_are_left_out_where_no_block_fits(images, tmp_path, monkeypatch):
     offered = iter([None, 16])
-    monkeypatch.setattr(cloud, "FEWEST_LEVELS", 2)
-    monkeypatch.setattr(cloud, "fitting_block", lambda scenes, block: next(offered))
+    monkeypatch.setattr(per_image, "FEWEST_LEVELS", 2)
+    monkeypatch.setattr(per_image, "fitting_block", lambda scenes, block: next(offered))
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS, "references": ("nadir",)}
     result = run(images("plane").inputs, tmp_path / "out", **asked)
     record = json.loads((result.out / "run.json").read_text())

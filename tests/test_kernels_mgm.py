@@ -6,9 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kernel_scene import even_lattice, ragged_lattice
 from reference.semiglobal import dense, more_global_sums
+from zlocus.kernels.mgm import sweep_quarter
+from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.semiglobal import more_global_sums as aggregated
 from zlocus.matching.semiglobal import pick
 
@@ -42,6 +46,46 @@ def test_sums_over_directions(shape, block, counts, p1):
     cost, p2 = random_cost(lattice), random_p2(shape)
     found = dense(aggregated(cost, lattice, p2, p1), lattice, np.inf)
     np.testing.assert_array_equal(found, twin(cost, lattice, p1, p2))
+
+
+@st.composite
+def lattices(draw):
+    """Blocks of 1 to 80 heights that may lie apart; single rows, columns and blocks among them."""
+    shape = draw(st.tuples(st.integers(1, 11), st.integers(1, 11)))
+    block = draw(st.sampled_from([1, 2, 4, 16]))
+    n = (-(-shape[0] // block), -(-shape[1] // block))
+    count = draw(st.lists(st.integers(1, 80), min_size=n[0] * n[1], max_size=n[0] * n[1]))
+    spread = draw(st.sampled_from([0, 5, 200]))
+    first = draw(st.lists(st.integers(0, spread), min_size=n[0] * n[1], max_size=n[0] * n[1]))
+    return HeightLattice(0.0, 1.0, shape, block, np.reshape(first, n).astype(np.int64), np.reshape(count, n))
+
+
+@settings(deadline=None, max_examples=60)
+@given(lattice=lattices(), p1=st.sampled_from([0, 28, 1000]), seed=st.integers(0, 1000))
+def test_sums_on_any_ranges(lattice, p1, seed):
+    cost, p2 = random_cost(lattice, seed, high=256), random_p2(lattice.shape, seed)
+    found = dense(aggregated(cost, lattice, p2, p1), lattice, np.inf)
+    np.testing.assert_array_equal(found, twin(cost, lattice, p1, p2))
+
+
+def test_what_lies_beyond_the_volume_has_no_effect_and_stays():
+    """Loops run over whole vectors, the last one of the volume not."""
+    lattice = ragged_lattice((9, 11), 4, seed=2, counts=(4, 12, 20))
+    cost, p2 = random_cost(lattice), random_p2(lattice.shape)
+    beyond = np.full(64, 7, np.uint16)
+    sums = []
+    for value in (0, 255):
+        longer = np.concatenate([cost, np.full(64, value, np.uint8)])
+        total = np.concatenate([np.zeros(lattice.size, np.uint16), beyond])
+        for turn in range(4):
+            sweep_quarter(
+                longer[: lattice.size], lattice.ranges, lattice.address, lattice.block, p2, np.uint16(28), turn,
+                total[: lattice.size],
+            )  # fmt: skip
+        np.testing.assert_array_equal(total[lattice.size :], beyond)
+        sums.append(total[: lattice.size])
+    np.testing.assert_array_equal(sums[0], sums[1])
+    np.testing.assert_array_equal(sums[0], aggregated(cost, lattice, p2, 28))
 
 
 def test_ranges_that_do_not_meet():

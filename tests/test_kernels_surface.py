@@ -12,10 +12,11 @@ from kernel_scene import HIDDEN, even_lattice, kernel_scene
 from reference import agreement, surfaces
 from reference.projection import bilinear, cubic, positions
 from zlocus.kernels.reach import block_reach, surely_inside, tile_reach
-from zlocus.kernels.refine import block_profile, resample_surface, tile_ortho, tile_profile
+from zlocus.kernels.refine import CUBIC, LINEAR, block_profile, resample_surface, tile_ortho, tile_profile
+from zlocus.kernels.resample import RUN
 from zlocus.kernels.smooth import add_tap, slopes, smaller_slope, smooth_surface
 from zlocus.kernels.visibility import lowest_visible
-from zlocus.kernels.volume import plane_grid
+from zlocus.kernels.volume import flat_cells, plane_grid
 
 # Float32 images with a spread of 1.4 grey values.
 GREY = 1e-4
@@ -210,18 +211,22 @@ def coefficients(scene):
     return np.concatenate([spline_filter(i, 3, output=np.float32, mode="mirror").ravel() for i in scene.images])
 
 
-def test_cubic_values_on_a_surface():
-    """Positions quadratic in the level are given by three grids; values are those of the interpolating B-spline."""
-    scene = kernel_scene(2, (15, 16), 16)
-    grids, level = np.empty((3, 8)), np.random.default_rng(0).uniform(-1, 1, (15, 16)).astype(np.float32)
+@pytest.mark.parametrize("degree", [LINEAR, CUBIC])
+def test_values_on_a_surface(degree):
+    """Positions quadratic in the level are given by three grids; values are those of the interpolating B-spline, or
+    bilinear. More cells than are taken at a time."""
+    scene, shape = kernel_scene(2, (30, 31), 32), (30, 31)
+    grids, level = np.empty((3, 8)), np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
     node = scene.nodes[1].copy()
     node[..., 3] = 0.0
     for m in range(3):
-        plane_grid(node[None], 0, 0.3 * (m - 1), 16, 0, grids[m])
-    out = np.empty((15, 16), np.float32)
-    resample_surface(coefficients(scene), scene.layout[1], grids, level, out)
-    expected = cubic(scene.images[1], positions(node, 0.3 * level.astype(float), (15, 16), 16))
-    np.testing.assert_allclose(out, expected, rtol=0, atol=GREY)
+        plane_grid(node[None], 0, 0.3 * (m - 1), 32, 0, grids[m])
+    out, pixels = np.empty(level.size, np.float32), scene.pixels if degree == LINEAR else coefficients(scene)
+    assert level.size > RUN
+    resample_surface(pixels, scene.layout[1], grids, flat_cells(shape), level.ravel(), degree, out)
+    value = bilinear if degree == LINEAR else cubic
+    expected = value(scene.images[1], positions(node, 0.3 * level.astype(float), shape, 32))
+    np.testing.assert_allclose(out.reshape(shape), expected, rtol=0, atol=GREY)
 
 
 @pytest.mark.parametrize(("n_views", "half"), [(2, 2), (4, 3)])

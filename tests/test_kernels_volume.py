@@ -68,13 +68,21 @@ def bases(scene, half, bumps=1.5, seed=0):
 
 
 def costs(scene, lattice, seen, halves=HALVES, measure=PLAIN, bumps=0.0):
+    return costs_along(*bases(scene, max(halves), bumps), scene, lattice, seen, halves, measure, len(scene.layout))
+
+
+def costs_along(base, base_nodes, scene, lattice, seen, halves, measure, few):
     volume = np.zeros(lattice.size, np.uint8)
-    base, base_nodes = bases(scene, max(halves), bumps)
     tile_costs(
         scene.pixels, scene.layout, scene.nodes, scene.heights, base, base_nodes, lattice.ranges, lattice.address,
-        halves, seen, scene.block, np.array(measure, np.float32), volume,
+        halves, seen, scene.block, with_few(measure, few), volume,
     )  # fmt: skip
     return volume
+
+
+def with_few(measure, few):
+    """As kernels take it: the fifth is the most views of a block that takes all windows."""
+    return np.array([*measure[:4], few, *measure[4:]], np.float32)
 
 
 def twin_costs(scene, lattice, seen, halves=HALVES, measure=PLAIN, bumps=0.0):
@@ -303,6 +311,21 @@ def test_costs_with_hidden_views(halves, measure):
     assert (found[alone] == round(twin.UNSEEN_COST * (1.0 + measure[1]))).all()
 
 
+def test_many_views_take_the_smallest_window_alone():
+    scene, lattice = kernel_scene(4, (20, 40), 16), ragged_lattice((20, 40), 16)
+    seen, (base, base_nodes) = scene.all_seen(), bases(scene, 2)
+    seen[:2, 0, :, 16:] = np.array([HIDDEN, -1])[:, None, None]  # all four views see the first blocks only
+    found = costs_along(base, base_nodes, scene, lattice, seen, HALVES, GREYS, 3)
+    small = np.ascontiguousarray(base[1:-1, 1:-1])
+    alone = costs_along(small, base_nodes, scene, lattice, seen, HALVES[:1], GREYS, 3)
+    both = costs_along(base, base_nodes, scene, lattice, seen, HALVES, GREYS, 4)
+    found, alone, both = (dense(volume, lattice, np.inf) for volume in (found, alone, both))
+    np.testing.assert_array_equal(found[:, :16], alone[:, :16])
+    np.testing.assert_array_equal(found[:, 16:], both[:, 16:])
+    assert (found[:, :16] != both[:, :16]).any()
+    assert (found[:, 16:] != alone[:, 16:]).any()
+
+
 def test_costs_of_one_block():
     scene, half = kernel_scene(3, (10, 12), 16), 2
     seen, count = partly_seen(scene), 16
@@ -310,7 +333,7 @@ def test_costs_of_one_block():
     out = np.zeros((10, 12 * count), np.uint8)
     block_costs(
         scene.pixels, scene.layout, scene.nodes, scene.heights, relief, np.array([5, count]), HALVES, seen,
-        scene.block, np.array(GREYS, np.float32), out,
+        scene.block, with_few(GREYS, 1), out,
     )  # fmt: skip
     for k in range(count):
         expected = twin.cell_costs(scene.images, scene.nodes, scene.heights, 5 + k, 16, HALVES, seen, GREYS, relief)

@@ -162,10 +162,10 @@ def dsm(
     ] = None,
     dem: Annotated[Path | None, typer.Option(help="Search around the heights of a raster.", metavar="RASTER")] = None,
     reference: Annotated[
-        str | None, typer.Option(help="Name of the view that leads. Default: the most nadir.", metavar="VIEW")
+        str | None, typer.Option(help="Name of the view that leads; of gc3-sgm, that gives heights.", metavar="VIEW")
     ] = None,
     views: Annotated[str, typer.Option(help="Views used for a cell.", metavar="auto|all")] = "auto",
-    method: Annotated[str, typer.Option(help="How heights are decided.", metavar="mvll-sgm|mvll")] = "mvll-sgm",
+    method: Annotated[str, typer.Option(help="How heights are found.", metavar="mvll-sgm|mvll|gc3-sgm")] = "mvll-sgm",
     vertical: Annotated[str, typer.Option(help="Heights are above this.", metavar="ellipsoid")] = "ellipsoid",
     fill: Annotated[str, typer.Option(help="What to do with small gaps.", metavar="none|interpolate")] = "none",
     partial: Annotated[

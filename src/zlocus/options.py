@@ -108,6 +108,12 @@ class PyramidOptions(Checked):
     )
     dem_up_m: float = option(100.0, "Searched above a DEM given as --dem.", low=0.0, high=1e4, unit="m")
     dem_down_m: float = option(50.0, "Searched below a DEM given as --dem.", low=0.0, high=1e4, unit="m")
+    finest_rounds: int = option(
+        1,
+        "Times the finest level is matched where three views or more see a tile; the later know what hides what.",
+        low=1,
+        high=10,
+    )
     reach: int = option(2, "Coarse cells around a block whose heights it searches too.", low=0, high=64, unit="cells")
 
 
@@ -120,6 +126,9 @@ class MeasureOptions(Checked):
         5, "Side of the larger correlation window, whose NCC is averaged with the smaller's.",
         choices=(3, 5, 7, 9, 11), unit="cells",
     )  # fmt: skip
+    few_views: int = option(
+        3, "Blocks that more images see are matched with the smaller window alone.", low=1, high=255
+    )
     noise: float = option(
         0.0, "Standard deviation added to every window, as a share of the image's own: damps plain windows.",
         low=0.0, high=1.0,
@@ -154,14 +163,14 @@ class SemiGlobalOptions(Checked):
         "where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
     p1: int = option(28, "Penalty of a neighbour one step away.", low=0, high=1000)
-    p2: int = option(300, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
+    p2: int = option(400, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
     p2_edge: int = option(30, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
     level_easing: float = option(
         0.85, "Penalties of jumps are eased by this at every coarser level, where a roof has fewer cells.",
         low=0.1, high=1.0,
     )  # fmt: skip
     edge_contrast: float = option(
-        1.5,
+        0.75,
         "Grey difference that halves the penalty of a jump, in median differences of the scene.",
         low=0.01,
         high=1e3,

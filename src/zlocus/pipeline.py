@@ -23,9 +23,11 @@ from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.io.config import config_as_dict
 from zlocus.io.reference import cells_inside, read_dem, read_geobox, read_polygons
 from zlocus.io.scene_file import open_scene
+from zlocus.matching.cells import CellWindow
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import Orientation
+from zlocus.orientation.orient import Orientation, supported
+from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
 from zlocus.preparing import (
     asked_crs,
     heights_asked_for,
@@ -127,7 +129,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     tally = Tally()
     out, dtype = request.out, settled.views[0].image.dtype
     with watch.stage("match"), made_folder(out), SurfaceRasters(out, grid.geobox, dtype) as rasters:
-        _match(request, config, settled, grid, tiles, workers, polygons, rasters, tally, progress)
+        match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
+        _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     with watch.stage("points"):
         write_ties(out / "ties.gpkg", orientation, corrected)
         if tally.ranked:
@@ -187,9 +190,34 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     return DemoResult(result.out, evaluation)
 
 
-def _match(
+def _matcher(
     request: DsmRequest,
     config: RunConfig,
+    settled: MatchScene,
+    scene: Scene,
+    orientation: Orientation,
+    z_range: tuple[float, float],
+    grid: Grid,
+    workers: int,
+    tally: Tally,
+    progress: Progress,
+) -> Callable[[CellWindow], TileResult]:
+    """What makes the surface of a tile's core: matching on the grid, or what was matched in the images."""
+    use_visibility = request.views == "auto"
+    if request.method != "gc3-sgm":
+        return lambda core: match_tile(settled, core, config, request.method, use_visibility, request.fill)
+    xyz = orientation.xyz
+    ready = OrientedScene(scene, orientation, xyz, supported(xyz, orientation.sigma_z_m), z_range)
+    leading = [view.name for view in settled.views if request.reference in (None, view.name)]
+    box, aside = grid.geobox.extent.boundingbox, config.pyramid.halo * grid.cell_m
+    bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
+    matched = match_for_grid(ready, leading, Area(bounds, z_range), config, use_visibility, workers, progress)
+    tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
+    return lambda core: grid_tile(matched, settled, core, config.pyramid, request.fill)
+
+
+def _match(
+    match: Callable[[CellWindow], TileResult],
     settled: MatchScene,
     grid: Grid,
     tiles: list[Tile],
@@ -199,11 +227,11 @@ def _match(
     tally: Tally,
     progress: Progress,
 ) -> None:
-    """Match every tile and write what was asked for of it."""
+    """Make every tile and write what was asked for of it."""
 
     def work(tile: Tile) -> TileResult:
         try:
-            return match_tile(settled, tile.core, config, request.method, request.views == "auto", request.fill)
+            return match(tile.core)
         except ZlocusError:
             raise
         except Exception as error:

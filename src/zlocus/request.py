@@ -12,7 +12,7 @@ from zlocus.errors import ConfigError, InputError, OutputError
 SCENE_SUFFIXES = (".yaml", ".yml")
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json")
 VIEWS = ("auto", "all")
-METHODS = ("mvll-sgm", "mvll")
+METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 VERTICALS = ("ellipsoid",)
 FILLS = ("none", "interpolate")
 EARTHS = ("curved", "flat")
@@ -26,7 +26,8 @@ class DsmRequest:
     resolution : cell size, m. crs : grid's CRS. bounds : (xmin, ymin, xmax, ymax) in the grid's CRS, m.
     like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
     heights : (zmin, zmax), m above the ellipsoid. dem : raster the heights are searched around.
-    reference : name of the view that leads. memory_gb : most memory the tiles may take together, GB.
+    reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
+    memory_gb : most memory the tiles may take together, GB.
     partial : a surface with too few heights counts as a success.
 
     Raises
@@ -63,6 +64,11 @@ class DsmRequest:
         _check_heights(self.heights)
         if self.heights is not None and self.dem is not None:
             raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
+        if self.dem is not None and self.method == "gc3-sgm":
+            raise ConfigError(
+                f"--method gc3-sgm searches one range of heights and cannot follow --dem {self.dem}. Give "
+                "--heights, or use mvll-sgm."
+            )
         for name, value, choices in (
             ("views", self.views, VIEWS),
             ("method", self.method, METHODS),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -46,8 +46,9 @@ RIVALS_KEPT = 128
 SEEN_MARGIN = 4
 STRIDE = 2  # cells between those that are looked at for the views that cover them
 FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
-# What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's.
-OBSTACLE = np.ones((5, 5), np.uint8)
+# What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's; less where
+# they are the level's own.
+OBSTACLE, OWN_OBSTACLE = np.ones((5, 5), np.uint8), np.ones((3, 3), np.uint8)
 SPIKE = np.ones((3, 3), np.uint8)
 
 
@@ -92,13 +93,17 @@ def match_tile(
     """The surface of a tile's core (finest cells), computed with a halo at every level.
 
     method : mvll-sgm, or mvll without the semi-global constraint; use_visibility : whether views count as hidden where
-    the coarser level's surface stands in their way; fill : none, or interpolate gaps that images cover.
+    the coarser level's surface stands in their way, which takes three views or more; fill : none, or interpolate gaps
+    that images cover.
     """
     if not (core.rows and core.cols):
         return TileResult(Surface.nothing(core))
     pixels, which = _read(scene, core, config, use_visibility)
     if len(pixels) < 2:
         return TileResult(Surface.nothing(core))
+    # Of two views none can be spared: where one counts as hidden, by a false height as likely as by a true one, nothing
+    # is left that could tell.
+    use_visibility = use_visibility and len(pixels) > 2
     coarsest = scene.levels - 1
     window = _level_window(scene, core, coarsest, config)
     guide = _coarsest_guide(scene, window, None)
@@ -117,6 +122,10 @@ def match_tile(
             return TileResult(Surface.nothing(core), done, every)
         guide = Guide(_finer(result, window), *_candidates(scene, result, window, level), result)
         result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
+        done, every = done + result.evaluations, every + result.all_views
+    for _ in range(1, config.pyramid.finest_rounds if use_visibility else 1):
+        guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
+        result = _match_level(scene, pixels, window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
     surface = _finish(scene, pixels, result, config)
     if fill == "interpolate":
@@ -213,14 +222,16 @@ def _read(scene: MatchScene, core: CellWindow, config: RunConfig, choose: bool) 
 class Guide:
     """What is known of a level's heights before it is matched, in its own height indices, all (r, c) float32.
 
-    surface : the coarser level's; low, high : lowest and highest index worth a look, NaN where nothing is known;
-    coarser : that level, None at the coarsest.
+    surface : the coarser level's, or an earlier round's; low, high : lowest and highest index worth a look, NaN where
+    nothing is known; coarser : that level, None at the coarsest; obstacle : cells by which what hides others is
+    narrowed.
     """
 
     surface: NDArray[np.float32] | None
     low: NDArray[np.float32]
     high: NDArray[np.float32]
     coarser: LevelResult | None = None
+    obstacle: NDArray[np.uint8] = field(default_factory=lambda: OBSTACLE)
 
 
 def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.float32] | None) -> Guide:
@@ -267,7 +278,7 @@ def _match_level(
     along_base = base.shear(views)
     seen = coverage(along_base, base, lattice)
     if guide.surface is not None and use_visibility:
-        obstacle = cv2.erode(guide.surface, OBSTACLE)
+        obstacle = cv2.erode(guide.surface, guide.obstacle)
         hide(seen, views, obstacle, base.cells, config.measure.hidden_margin_steps)
     used, worth, added, all_views = seen, seen, 0, _evaluations(seen, lattice)
     if ranking is not None:

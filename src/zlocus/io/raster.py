@@ -23,8 +23,9 @@ from zlocus.errors import InputError, OutputError
 from zlocus.io.opening import BLOCK_CACHE_MB, check_complete, open_raster, reason
 
 BLOCK_SIZE = 512
-# Deflate is read everywhere; the level trades little size for much time above 6. One thread: the same bytes each time.
-COG_OPTIONS = {"BLOCKSIZE": BLOCK_SIZE, "COMPRESS": "DEFLATE", "LEVEL": 6, "BIGTIFF": "IF_SAFER", "NUM_THREADS": 1}
+# Deflate is read everywhere. Heights, sigmas and grey values shrink by 1 % more at level 6, in nearly twice the time.
+# One thread: the same bytes each time.
+COG_OPTIONS = {"BLOCKSIZE": BLOCK_SIZE, "COMPRESS": "DEFLATE", "LEVEL": 1, "BIGTIFF": "IF_SAFER", "NUM_THREADS": 1}
 FLOAT_PREDICTOR, INTEGER_PREDICTOR = "FLOATING_POINT", "STANDARD"
 
 

@@ -115,6 +115,32 @@ def window_moments(plane, windows, width, n, floor, work, mean, scale):
         done = window
 
 
+# (p,) f4, i8, i8, (p,) f4, (p,) f4, (p,) f4, (p,) f4, (p,) f4, (p,) f4 -> None
+@kernel
+def add_correlation(columns, window, n, scale_a, scale_b, mean_a, mean_b, work, total):
+    """Add the NCC of a pair of views at the first n places.
+
+    columns : sums of their products down the columns of the windows, from the first of each on; work : (p,), scratch.
+    """
+    x = columns
+    if window == 1:
+        for j in range(n):
+            cross = x[j] + x[j + 1] + x[j + 2]
+            total[j] += scale_a[j] * scale_b[j] * (cross - mean_a[j] * mean_b[j])
+    elif window == 2:
+        for j in range(n):
+            cross = (x[j] + x[j + 1]) + (x[j + 2] + x[j + 3]) + x[j + 4]
+            total[j] += scale_a[j] * scale_b[j] * (cross - mean_a[j] * mean_b[j])
+    elif window == 3:
+        for j in range(n):
+            cross = ((x[j] + x[j + 1]) + (x[j + 2] + x[j + 3])) + ((x[j + 4] + x[j + 5]) + x[j + 6])
+            total[j] += scale_a[j] * scale_b[j] * (cross - mean_a[j] * mean_b[j])
+    else:
+        row_sums(columns, window, n, work)
+        for j in range(n):
+            total[j] += scale_a[j] * scale_b[j] * (work[j] - mean_a[j] * mean_b[j])
+
+
 # (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (2,p) f4, (g,p) f4 -> None
 @kernel
 def add_pairs(planes, windows, mean, scale, width, n, work, total):
@@ -124,17 +150,17 @@ def add_pairs(planes, windows, mean, scale, width, n, work, total):
     (2, p), scratch; total : (g, p), the pair of views a and b adds to row (a + b) % g. Plain formula: sum_{a<b} scale_a
     scale_b (sum x_a x_b - mean_a mean_b).
     """
-    half, columns, cross, n_groups = windows[-1], work[0], work[1], total.shape[0]
+    half, columns, n_groups = windows[-1], work[0], total.shape[0]
     for a in range(planes.shape[0]):
         for b in range(a + 1, planes.shape[0]):
             done, into = 0, total[(a + b) % n_groups]
             for w in range(windows.shape[0]):
-                column_products(planes[a], planes[b], half, done, windows[w], width, n + SLACK, columns)
-                row_sums(columns[half - windows[w] :], windows[w], n, cross)
-                ma, mb, sa, sb = mean[a, w], mean[b, w], scale[a, w], scale[b, w]
-                for j in range(n):
-                    into[j] += sa[j] * sb[j] * (cross[j] - ma[j] * mb[j])
-                done = windows[w]
+                window = windows[w]
+                column_products(planes[a], planes[b], half, done, window, width, n + SLACK, columns)
+                add_correlation(
+                    columns[half - window :], window, n, scale[a, w], scale[b, w], mean[a, w], mean[b, w], work[1], into
+                )
+                done = window
 
 
 # (i,p) f4, f4, i8, (p,) f4 -> None

@@ -1,4 +1,7 @@
-"""The measure close to a surface, with windows that follow it: for heights finer than the lattice."""
+"""The measure close to a surface, with windows that follow it: for heights finer than the lattice.
+
+Blocks are flat (see `agreement.py`), so that the passes over their cells are long loops, which vectorise.
+"""
 
 from __future__ import annotations
 
@@ -6,95 +9,141 @@ import numpy as np
 
 from zlocus.kernels._jit import kernel
 from zlocus.kernels.agreement import SLACK, add_pairs, window_moments
-from zlocus.kernels.volume import HIDDEN, flat_visibility, plane_grid
+from zlocus.kernels.resample import RUN, gather
+from zlocus.kernels.volume import HIDDEN, flat_cells, flat_visibility, plane_grid
+
+LINEAR, CUBIC = 1, 3
 
 
-# (3,8) f8, i8, i8, f8, (6,) f4 -> None
+# (3,8) f8, (3,) i8, i8, (2,14) f4 -> (2,) i8
 @kernel
-def row_positions(grids, axis, row, origin, out):
-    """x (axis 0) or y of a row of cells, px from `origin`: coefficients of 1, u, u^2 at column 0, then per column.
+def surface_path(grids, layout, degree, path):
+    """Where one view sees a block of cells, as polynomials: for x and y, the bilinear coefficients (1, column, row,
+    both) of 1, u and u^2, then lowest and highest position; px from the whole pixel (column, row) that is returned.
 
-    grids : (3, 8), positions at u = -1, 0 and 1, see `plane_grid`.
+    grids : (3, 8), positions at u = -1, 0 and 1, see `plane_grid`; degree : of the interpolation, whose pixels have to
+    lie inside the image; path : (2, 14), written.
     """
-    for part in range(2):
-        k = axis + 2 * part
-        low = grids[0, k] + row * grids[0, k + 4]
-        mid = grids[1, k] + row * grids[1, k + 4]
-        high = grids[2, k] + row * grids[2, k + 4]
-        out[3 * part] = mid - (origin if part == 0 else 0.0)
-        out[3 * part + 1] = 0.5 * (high - low)
-        out[3 * part + 2] = 0.5 * (high + low) - mid
+    before, after = (1, 3.01) if degree == CUBIC else (0, 1.01)
+    origin = np.empty(2, np.int64)
+    for axis in range(2):
+        n = layout[2 - axis]
+        origin[axis] = min(max(int(grids[1, axis]), before), n - int(after) - 1)
+        for part in range(4):
+            k = axis + 2 * part
+            low, middle, high = grids[0, k], grids[1, k], grids[2, k]
+            path[axis, part] = middle - (origin[axis] if part == 0 else 0.0)
+            path[axis, 4 + part] = 0.5 * (high - low)
+            path[axis, 8 + part] = 0.5 * (high + low) - middle
+        path[axis, 12], path[axis, 13] = before - origin[axis], n - after - origin[axis]
+    return origin
 
 
-# (c,) f4, (6,) f4, f4, f4, (c,) i4, (4,c) f4 -> None
+# (14,) f4, (2,p) f4, (p,) f4, i8, i8, (n,) f4 -> None
 @kernel
-def spline_weights(level, line, low, high, whole, weights):
-    """Whole pixel and the four cubic B-spline weights around every cell of a row, along one axis.
+def positions_along(path, cells, level, first, end, out):
+    """Positions of a run of cells on one axis. path : see `surface_path`; cells : (2, p), rows and columns;
+    level : u."""
+    a, b, c, d = path[0], path[1], path[2], path[3]
+    by_a, by_b, by_c, by_d = path[4], path[5], path[6], path[7]
+    bend_a, bend_b, bend_c, bend_d = path[8], path[9], path[10], path[11]
+    low, high = path[12], path[13]
+    rows, cols, levels = cells[0][first:end], cells[1][first:end], level[first:end]
+    for j in range(end - first):
+        row, col, u = rows[j], cols[j], levels[j]
+        at = (a + row * c) + col * (b + row * d)
+        by_level = (by_a + row * by_c) + col * (by_b + row * by_d)
+        bend = (bend_a + row * bend_c) + col * (bend_b + row * bend_d)
+        out[j] = min(max(at + u * (by_level + u * bend), low), high)
 
-    level : (c,) float32, u; line : (6,), see `row_positions`; low, high : bounds of the position, px from its origin.
-    """
+
+# (n,) f4, i8, (n,) f4, (4,n) f4 -> None
+@kernel
+def spline_weights(position, n, whole, weights):
+    """Whole pixel and the four cubic B-spline weights around each of a run of positions."""
     one, half, sixth = np.float32(1.0), np.float32(0.5), np.float32(1.0 / 6.0)
     two_thirds = np.float32(2.0 / 3.0)
-    for c in range(level.shape[0]):
-        u, t = level[c], np.float32(np.int32(c))
-        x = (line[0] + t * line[3]) + u * ((line[1] + t * line[4]) + u * (line[2] + t * line[5]))
-        x = min(max(x, low), high)
-        pixel = np.floor(x)
-        whole[c] = np.int32(pixel)
-        f = x - pixel
+    w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+    for j in range(n):
+        pixel = np.floor(position[j])
+        whole[j] = pixel
+        f = position[j] - pixel
         g = one - f
-        weights[0, c] = g * g * g * sixth
-        weights[1, c] = two_thirds - f * f * (one - half * f)
-        weights[2, c] = two_thirds - g * g * (one - half * g)
-        weights[3, c] = f * f * f * sixth
+        w0[j] = g * g * g * sixth
+        w1[j] = two_thirds - f * f * (one - half * f)
+        w2[j] = two_thirds - g * g * (one - half * g)
+        w3[j] = f * f * f * sixth
 
 
-# (p,) f4, i4, i4, (2,c) i4, (4,c) f4, (4,c) f4, (c,) f4 -> None
+# (2,n) f4, i8, i4, i4, (n,) u4 -> None
 @kernel
-def spline_gather(image, origin, n_cols, whole, across, down, out):
-    """Weighted sums of 4 x 4 pixels for every cell of a row.
+def pixel_indices(whole, n, origin, n_cols, index):
+    """Index in an image, from `origin` on, of whole pixels (columns, rows)."""
+    cols, rows = whole[0], whole[1]
+    for j in range(n):
+        index[j] = np.uint32(np.int32(np.int32(rows[j]) * n_cols) + np.int32(cols[j]) + origin)
 
-    origin : index in `image` of the first of the sixteen where `whole`, (2, c) columns and rows, is zero.
-    """
-    stride, one, two, three = np.uint32(n_cols), np.uint32(1), np.uint32(2), np.uint32(3)
-    for c in range(out.shape[0]):
-        p = np.uint32(np.int32(whole[1, c] * n_cols) + whole[0, c] + origin)
-        q = np.uint32(p + stride)
-        r = np.uint32(q + stride)
-        s = np.uint32(r + stride)
-        w0, w1, w2, w3 = across[0, c], across[1, c], across[2, c], across[3, c]
+
+# (p,) f4, i8, (n,) u4, (4,n) f4, (4,n) f4, i8, (n,) f4 -> None
+@kernel
+def spline_gather(image, n_cols, index, across, down, n, out):
+    """Weighted sums of the 4 x 4 pixels from each index on."""
+    one, two, three, stride = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(n_cols)
+    for j in range(n):
+        p = np.uint64(index[j])
+        q = p + stride
+        r = q + stride
+        s = r + stride
+        w0, w1, w2, w3 = across[0, j], across[1, j], across[2, j], across[3, j]
         top = (w0 * image[p] + w1 * image[p + one]) + (w2 * image[p + two] + w3 * image[p + three])
         high = (w0 * image[q] + w1 * image[q + one]) + (w2 * image[q + two] + w3 * image[q + three])
         low = (w0 * image[r] + w1 * image[r + one]) + (w2 * image[r + two] + w3 * image[r + three])
         end = (w0 * image[s] + w1 * image[s + one]) + (w2 * image[s + two] + w3 * image[s + three])
-        out[c] = (down[0, c] * top + down[1, c] * high) + (down[2, c] * low + down[3, c] * end)
+        out[j] = (down[0, j] * top + down[1, j] * high) + (down[2, j] * low + down[3, j] * end)
 
 
-# (p,) f4, (3,) i8, (3,8) f8, (r,c) f4, (r,c) f4 -> None
+# (2,n) f4, i8, (2,n) f4, (2,n) f4 -> None
 @kernel
-def resample_surface(pixels, layout, grids, level, out):
-    """Cubic B-spline image values on a grid of cells, each at a height of its own.
+def fractions(position, n, whole, fraction):
+    """Whole pixels and what is beyond them, of a run of positions (x, y)."""
+    for axis in range(2):
+        at, pixel, beyond = position[axis], whole[axis], fraction[axis]
+        for j in range(n):
+            pixel[j] = np.floor(at[j])
+            beyond[j] = at[j] - pixel[j]
 
-    pixels : (p,) float32 B-spline coefficients; grids : (3, 8) positions at levels -1, 0 and 1 (see `plane_grid`);
-    level : (r, c) float32 in [-1, 1]: positions are quadratic in it; out : (r, c). Positions are float32 from a
-    whole-pixel origin near the grid; the passes of a row that find them vectorise.
+
+# (p,) f4, (3,) i8, (3,8) f8, (2,p) f4, (p,) f4, i8, (p,) f4 -> None
+@kernel
+def resample_surface(pixels, layout, grids, cells, level, degree, out):
+    """Image values on cells that are each at a height of its own: bilinear, or cubic B-spline from coefficients.
+
+    pixels : (p,) float32, pixels or B-spline coefficients of all images; layout : see `resample_plane`; grids : (3, 8)
+    positions at levels -1, 0 and 1 (see `plane_grid`); cells : (2, p) float32, rows and columns; level : (p,) float32
+    in [-1, 1]: positions are quadratic in it; degree : LINEAR or CUBIC; out : (p,) or longer. Positions are float32
+    from a whole-pixel origin near the grid; those outside the image are moved to its border.
     """
-    base, n_rows, n_cols = layout[0], layout[1], layout[2]
-    image = pixels[base : base + n_rows * n_cols]
-    width = out.shape[1]
-    x0 = min(max(int(grids[1, 0]), 1), n_cols - 4)
-    y0 = min(max(int(grids[1, 1]), 1), n_rows - 4)
-    x_low, x_high = np.float32(1 - x0), np.float32(n_cols - 3.01 - x0)
-    y_low, y_high = np.float32(1 - y0), np.float32(n_rows - 3.01 - y0)
-    origin = np.int32((y0 - 1) * n_cols + x0 - 1)
-    line, whole = np.empty(6, np.float32), np.empty((2, width), np.int32)
-    across, down = np.empty((4, width), np.float32), np.empty((4, width), np.float32)
-    for r in range(out.shape[0]):
-        row_positions(grids, 0, r, float(x0), line)
-        spline_weights(level[r], line, x_low, x_high, whole[0], across)
-        row_positions(grids, 1, r, float(y0), line)
-        spline_weights(level[r], line, y_low, y_high, whole[1], down)
-        spline_gather(image, origin, np.int32(n_cols), whole, across, down, out[r])
+    path, n_cols = np.empty((2, 14), np.float32), layout[2]
+    origin = surface_path(grids, layout, degree, path)
+    before = 1 if degree == CUBIC else 0
+    start = np.int32((origin[1] - before) * n_cols + origin[0] - before)
+    image = pixels[layout[0] : layout[0] + layout[1] * n_cols]
+    position, whole, index = np.empty((2, RUN), np.float32), np.empty((2, RUN), np.float32), np.empty(RUN, np.uint32)
+    across, down = np.empty((4, RUN), np.float32), np.empty((4, RUN), np.float32)
+    for first in range(0, level.shape[0], RUN):
+        end = min(first + RUN, level.shape[0])
+        n = end - first
+        positions_along(path[0], cells, level, first, end, position[0])
+        positions_along(path[1], cells, level, first, end, position[1])
+        if degree == CUBIC:
+            spline_weights(position[0], n, whole[0], across)
+            spline_weights(position[1], n, whole[1], down)
+            pixel_indices(whole, n, start, np.int32(n_cols), index)
+            spline_gather(image, n_cols, index, across, down, n, out[first:end])
+        else:
+            fractions(position, n, whole, across)
+            pixel_indices(whole, n, start, np.int32(n_cols), index)
+            gather(pixels, layout, index, across, out[first:end])
 
 
 # (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (3,i,r,c) i4, f4, (g,j,r,c) f4 -> None
@@ -115,7 +164,7 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
     flat = np.empty((n_views, 3, size), np.int32)
     pairs, agreed = np.empty(size, np.float32), np.empty((out.shape[0], size), np.float32)
     work = np.empty((4, size), np.float32)
-    grids, level = np.empty((3, 8)), np.empty(surface.shape, np.float32)
+    grids, level, cells = np.empty((3, 8)), np.empty(surface.size, np.float32), flat_cells(surface.shape)
     at_surface = np.zeros((3, n_views, rows, cols), np.int32)
     for i in range(n_views):
         for r in range(rows):
@@ -132,14 +181,14 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
     for j in range(offsets.shape[0]):
         for r in range(surface.shape[0]):
             for c in range(width):
-                level[r, c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(reach)
+                level[r * width + c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(reach)
         for i in range(n_views):
             if flat[i, 0].min() == HIDDEN:
                 continue
             for m in range(3):
                 t = heights[0] + (centre + (m - 1) * reach) * heights[1]
                 plane_grid(nodes, i, t, block, half, grids[m])
-            resample_surface(pixels, layout[i], grids, level, planes[i, : surface.size].reshape(surface.shape))
+            resample_surface(pixels, layout[i], grids, cells, level, CUBIC, planes[i])
             planes[i] -= planes[i, half * width + half]
             window_moments(planes[i], windows, width, n, floor, work, mean[i], scale[i])
             for p in range(n):
@@ -169,26 +218,6 @@ def tile_profile(pixels, layout, nodes, heights, surface, offsets, block, half, 
             )  # fmt: skip
 
 
-# (p,) f4, i4, i4, i4, (c,) f4, (2,6) f4, (2,2) f4, (c,) f4 -> None
-@kernel
-def ortho_row(image, origin, n_cols, n_cells, level, lines, bounds, out):
-    """Bilinear values of a row of cells. origin : index in `image` that positions count from; level : (c,) float32, u;
-    lines : (2, 6), columns and rows, see `row_positions`; bounds : (2, 2), lowest and highest position of each."""
-    line, across = lines[0], lines[1]
-    for c in range(n_cells):
-        u, t = level[c], np.float32(np.int32(c))
-        x = (line[0] + t * line[3]) + u * ((line[1] + t * line[4]) + u * (line[2] + t * line[5]))
-        y = (across[0] + t * across[3]) + u * ((across[1] + t * across[4]) + u * (across[2] + t * across[5]))
-        x, y = min(max(x, bounds[0, 0]), bounds[0, 1]), min(max(y, bounds[1, 0]), bounds[1, 1])
-        left, top = np.floor(x), np.floor(y)
-        fx, fy = x - left, y - top
-        p = np.uint32(np.int32(np.int32(top) * n_cols) + np.int32(left) + origin)
-        q = np.uint32(p + np.uint32(n_cols))
-        high = image[p] + fx * (image[p + np.uint32(1)] - image[p])
-        low = image[q] + fx * (image[q + np.uint32(1)] - image[q])
-        out[c] = high + fy * (low - high)
-
-
 # (p,) f4, (i,3) i8, (i,b,d,2,4) f8, (2,) f8, (r,c) f4, i8, i8, (r,c) f4 -> None
 @kernel
 def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
@@ -196,21 +225,37 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
     n_rows, n_cols = surface.shape
     low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
     middle, reach = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
-    base, rows, cols = layout[view, 0], layout[view, 1], layout[view, 2]
-    image, grids = pixels[base : base + rows * cols], np.empty((3, 8))
-    lines, bounds, level = np.empty((2, 6), np.float32), np.empty((2, 2), np.float32), np.empty(block, np.float32)
+    grids, level, grey = np.empty((3, 8)), np.empty(block * block, np.float32), np.empty(block * block, np.float32)
     for br in range((n_rows + block - 1) // block):
+        r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
+            c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             for m in range(3):
                 plane_grid(nodes[:, br : br + 2, bc : bc + 2], view, middle + (m - 1) * reach, block, 0, grids[m])
-            x0, y0 = min(max(int(grids[1, 0]), 0), cols - 2), min(max(int(grids[1, 1]), 0), rows - 2)
-            bounds[0, 0], bounds[0, 1] = -x0, cols - 1.01 - x0
-            bounds[1, 0], bounds[1, 1] = -y0, rows - 1.01 - y0
-            c0, c1 = bc * block, min((bc + 1) * block, n_cols)
-            for r in range(br * block, min((br + 1) * block, n_rows)):
-                row_positions(grids, 0, r - br * block, float(x0), lines[0])
-                row_positions(grids, 1, r - br * block, float(y0), lines[1])
-                for c in range(c1 - c0):
-                    level[c] = (heights[0] + surface[r, c0 + c] * heights[1] - middle) / reach
-                origin = np.int32(y0 * cols + x0)
-                ortho_row(image, origin, np.int32(cols), np.int32(c1 - c0), level, lines, bounds, out[r, c0:c1])
+            width, n = c1 - c0, (r1 - r0) * (c1 - c0)
+            for r in range(r0, r1):
+                for c in range(width):
+                    index = heights[0] + surface[r, c0 + c] * heights[1]
+                    level[(r - r0) * width + c] = (index - middle) / reach
+            resample_surface(pixels, layout[view], grids, flat_cells((r1 - r0, width)), level[:n], LINEAR, grey[:n])
+            out[r0:r1, c0:c1] = grey[:n].reshape((r1 - r0, width))
+
+
+# (j,n) f4, (j,) f4, (n,) f4, (n,) f4, (n,) b1 -> None
+@kernel
+def profile_peaks(profile, offsets, position, value, is_inside):
+    """Position and value of the maximum of equally spaced samples by the parabola through the three around the largest
+    one (at an end, the three at that end), and whether the largest is none at an end. profile : (j, n), a cell a
+    column, j >= 3."""
+    n_samples, spacing = profile.shape[0], offsets[1] - offsets[0]
+    for p in range(profile.shape[1]):
+        best = 0
+        for j in range(1, n_samples):
+            best = j if profile[j, p] > profile[best, p] else best
+        is_inside[p] = 0 < best < n_samples - 1
+        at = min(max(best, 1), n_samples - 2)
+        left, here, right = profile[at - 1, p], profile[at, p], profile[at + 1, p]
+        bend = min(left - np.float32(2.0) * here + right, np.float32(-1e-6))
+        shift = min(max(np.float32(0.5) * (left - right) / bend, np.float32(-1.0)), np.float32(1.0))
+        value[p] = here - np.float32(0.25) * (left - right) * shift
+        position[p] = offsets[at] + shift * spacing

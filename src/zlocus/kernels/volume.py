@@ -213,7 +213,7 @@ def centred(plane, size, centre, start, by_reach, n, grey):
             grey[j] = inner[j] * by_reach
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, (5,) f4, (r,d) u1 -> None
+# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, (6,) f4, (r,d) u1 -> None
 @kernel
 def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, block, measure, out):
     """Costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and as much,
@@ -222,9 +222,9 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     pixels, layout : see `resample_plane`; nodes : see `plane_grid`; heights : t of height index 0, t per index;
     relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; span : first height index and count; windows :
     half widths of the windows, ascending; seen : (3, i, r, c) int32, lowest and highest height index at which an image
-    covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (5,) float32,
-    variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused, the
-    weight where two views take part; out : (r, c * count) uint8.
+    covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (6,) float32,
+    variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused, what
+    `tile_costs` takes, the weight where two views take part; out : (r, c * count) uint8.
     A pair with a hidden view counts as uncorrelated (NCC 0), but for the excused share, which agrees as the visible
     pairs do: without it the ground beside a wall would rather be roof, which all views see; excusing all would favour
     heights that few views see, where chance agreement is larger. Heights that fewer than two images cover cost
@@ -234,7 +234,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     ranges = np.empty((seen.shape[1], 4), np.int32)
     height_ranges(seen, ranges)
     takes = taking_part(ranges, span)
-    floor, weight = measure[0], measure[4] if takes.shape[0] == 2 else measure[1]
+    floor, weight = measure[0], measure[5] if takes.shape[0] == 2 else measure[1]
     if takes.shape[0] < 2:
         out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
         return
@@ -277,6 +277,16 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     heights_last(codes, width, out)
 
 
+# (3,i,r,c) i4, (2,) i8, (w,) i8, i8 -> (w,) i8
+@kernel
+def windows_for(seen, span, windows, few):
+    """The windows of a block: all where at most `few` views take part, else the smallest, for many pairs of views
+    average noise as well, and their windows do not reach beyond a small crown."""
+    ranges = np.empty((seen.shape[1], 4), np.int32)
+    height_ranges(seen, ranges)
+    return windows if taking_part(ranges, span).shape[0] <= few else windows[:1]
+
+
 # as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
 @kernel
 def tile_costs(
@@ -286,10 +296,11 @@ def tile_costs(
 
     base : (r + 2 half, c + 2 half) float32 base surface, border included, in height indices; base_nodes : (b + 1,
     d + 1) float64, the base surface at the corners of blocks, which `nodes` follow; ranges : (2, b, d) int64, first
-    index and count of each block; address : (3, b, d) int64, see `HeightLattice.address`; volume : (v,) uint8, written.
+    index and count of each block; address : (3, b, d) int64, see `HeightLattice.address`; measure : (6,) float32, the
+    fifth is the most views of a block that takes all windows, see `windows_for`; volume : (v,) uint8, written.
     """
     n_rows, n_cols = seen.shape[2], seen.shape[3]
-    span, half = np.empty(2, np.int64), windows[-1]
+    span, few = np.empty(2, np.int64), np.int64(measure[4])
     for br in range(ranges.shape[1]):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         first, length = address[0, br, 0], address[1, br, 0]
@@ -298,10 +309,13 @@ def tile_costs(
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             span[0], span[1] = ranges[0, br, bc], ranges[1, br, bc]
             start = address[2, br, bc]
+            sizes = windows_for(seen[:, :, r0:r1, c0:c1], span, windows, few)
+            half, beside = sizes[-1], windows[-1] - sizes[-1]
             relief = np.empty((r1 - r0 + 2 * half, c1 - c0 + 2 * half), np.float32)
-            corners = base_nodes[br : br + 2, bc : bc + 2]
-            block_relief(base[r0 : r1 + 2 * half, c0 : c1 + 2 * half], corners, block, half, relief)
+            corners, r, c = base_nodes[br : br + 2, bc : bc + 2], r0 + beside, c0 + beside
+            around = base[r : r + relief.shape[0], c : c + relief.shape[1]]
+            block_relief(around, corners, block, half, relief)
             block_costs(
-                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, relief, span, windows,
+                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, relief, span, sizes,
                 seen[:, :, r0:r1, c0:c1], block, measure, rows[:, start : start + (c1 - c0) * span[1]],
             )  # fmt: skip

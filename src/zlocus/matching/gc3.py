@@ -81,13 +81,13 @@ class ImageSpace:
     rays: Rays
     views: tuple[View, ...]
 
-    def ground(self, row: int, z: NDArray[np.float32]) -> FloatArray:
-        """Ground points of some rows of pixels, of which `row` is the first. z : (r, c) hypotheses -> (r, c, 3) m, NaN
-        where there is none."""
+    def ground(self, row: int, z: NDArray[np.float32], col: int = 0) -> FloatArray:
+        """Ground points of a block of pixels, of which (row, col) is the first. z : (r, c) hypotheses -> (r, c, 3) m,
+        NaN where there is none."""
         known = np.isfinite(z)
         out = np.full((*z.shape, 3), np.nan)
         rows, cols = np.nonzero(known)
-        out[known] = self.rays.ground(np.column_stack([cols, rows + row]).astype(float), z[known].astype(float))
+        out[known] = self.rays.ground(np.column_stack([cols + col, rows + row]).astype(float), z[known].astype(float))
         return out
 
     def frame_from_ground(self, xyz: FloatArray) -> FloatArray:
@@ -193,8 +193,13 @@ def depth_options(config: RunConfig) -> RunConfig:
     never hidden; and a view counts as hidden only far below what hides it, for the coarser surface blurs outlines by
     some steps, and matching back finds what is hidden exactly.
     """
+    return _with_defaults(config, BY_DEPTH)
+
+
+def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> RunConfig:
+    """The options with other values, by stage, where they have their defaults."""
     changed = {}
-    for stage, values in BY_DEPTH.items():
+    for stage, values in defaults.items():
         mine, default = getattr(config, stage), getattr(RunConfig(), stage)
         chosen = {name: value for name, value in values.items() if getattr(mine, name) == getattr(default, name)}
         changed[stage] = replace(mine, **chosen)

@@ -18,15 +18,16 @@ def cost_volume(
     """64 (1 - NCC) + 64 w d of every cell and height, (v,) uint8, laid out as `HeightLattice.address` says.
 
     views : whose nodes follow `base`, see `BaseSurface.shear`. NCC is the mean over all pairs of views and over the
-    window sizes (the paper's SNCC, equation 2, for two views; for more it has no reference image, so that no single
-    view's noise is in every term). d is the mean over the same pairs of the two pixels' grey difference, in units of
-    `grey_reach` and at most 1: NCC knows nothing of plain roofs, on which all views show one grey, and blurs edges by
-    the width of its window (as AD-Census does: Mei et al. 2011, equation 3). w is `grey_weight`, and `grey_weight_two`
-    in blocks that two views take part in. seen : (3, i, r, c) int32, see `coverage`.
+    window sizes, of which there is one where more than `few_views` cover a block (the paper's SNCC, equation 2, for two
+    views; for more it has no reference image, so that no single view's noise is in every term). d is the mean over the
+    same pairs of the two pixels' grey difference, in units of `grey_reach` and at most 1: NCC knows nothing of plain
+    roofs, on which all views show one grey, and blurs edges by the width of its window (as AD-Census does: Mei et al.
+    2011, equation 3). w is `grey_weight`, and `grey_weight_two` in blocks that two views take part in. seen : (3, i, r,
+    c) int32, see `coverage`.
     """
     windows = np.unique([options.small_window // 2, options.large_window // 2])
-    greys = options.grey_weight, options.grey_reach, options.hidden_excused, options.grey_weight_two
-    measure = np.array([options.noise**2, *greys], np.float32)
+    greys = options.grey_weight, options.grey_reach, options.hidden_excused
+    measure = np.array([options.noise**2, *greys, options.few_views, options.grey_weight_two], np.float32)
     volume = np.empty(lattice.size, np.uint8)
     tile_costs(
         views.pixels, views.layout, views.nodes, views.heights, base.padded(int(windows.max())), base.nodes,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels.refine import tile_profile
+from zlocus.kernels.refine import profile_peaks, tile_profile
 from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.lattice import NARROW_BASE
 from zlocus.matching.views import TileViews
@@ -82,7 +82,7 @@ def refine(
             coefficients.pixels, coefficients.layout, coefficients.nodes, coefficients.heights,
             np.pad(surface, half, mode="edge"), offsets, coefficients.block, half, seen, np.float32(0.0), profiles,
         )  # fmt: skip
-        profile = profiles.sum(axis=0)
+        profile = profiles[0] if groups == 1 else profiles.sum(axis=0)
         found, best, inside = parabola_peak(profile, offsets)
         if groups > 1:
             middle = slice(len(offsets) // 2 - 1, len(offsets) // 2 + 2)
@@ -105,14 +105,11 @@ def default_window(step_cells: float) -> int:
 
 def parabola_peak(profile: NDArray[np.float32], offsets: FloatGrid) -> tuple[FloatGrid, FloatGrid, NDArray[np.bool_]]:
     """Position and value of the maximum of equally spaced samples (j, r, c), and whether it is not an end sample."""
-    at = profile.argmax(axis=0)
-    inside = (at > 0) & (at < len(offsets) - 1)
-    at = np.clip(at, 1, len(offsets) - 2)[None]
-    left, here, right = (np.take_along_axis(profile, at + d, axis=0)[0] for d in (-1, 0, 1))
-    bend = np.minimum(left - 2 * here + right, np.float32(-1e-6))
-    shift = np.clip(np.float32(0.5) * (left - right) / bend, -1, 1)
-    value = here - np.float32(0.25) * (left - right) * shift
-    return offsets[at[0]] + shift * (offsets[1] - offsets[0]), value, inside
+    shape = profile.shape[1:]
+    position, value, is_inside = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.bool_)
+    columns = np.ascontiguousarray(profile).reshape(len(profile), -1)
+    profile_peaks(columns, offsets, position.ravel(), value.ravel(), is_inside.ravel())
+    return position, value, is_inside
 
 
 def bend_at_centre(profile: NDArray[np.float32], spacing: np.float32) -> FloatGrid:

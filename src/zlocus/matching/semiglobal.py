@@ -68,8 +68,8 @@ def aggregate(
     """Sum of the path costs over 8 paths, and its minima.
 
     cost : (v,) uint8, see `HeightLattice.address`; step_cells : height of a step over the side of a cell. Two
-    predecessors find more roofs; with a narrow base there is little to find (a step is as high as a storey) and they
-    take more time than all the rest of the constraint.
+    predecessors find more roofs and take up to twice the time; with a narrow base there is little to find (a step is as
+    high as a storey).
     """
     if (options.predecessors or (1 if step_cells > NARROW_BASE else 2)) == 2:
         return pick(more_global_sums(cost, lattice, p2, options.p1), lattice)

@@ -17,7 +17,7 @@ class Quality(IntFlag):
     RANGE_END = 8  # best match at an end of the height range: the true height may lie beyond it
     NO_MATCH = 16  # images do not agree at any height
     FAILED = 32  # its tile could not be processed
-    UNCONFIRMED = 64  # no other image finds the same height when matched back (clouds only)
+    UNCONFIRMED = 64  # no other image finds the same height when matched back (image space only)
     WEAK = 256  # images agree poorly
     AMBIGUOUS = 512  # another height fits nearly as well
     JUMP = 1024  # next to a jump in height
