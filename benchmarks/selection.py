@@ -120,7 +120,7 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
 
     The reference is the first (most nadir) view used at a cell.
     """
-    half, options, block = config.measure.large_window // 2, config.selection, config.pyramid.block
+    half, options = config.measure.large_window // 2, config.selection
     surface = smoothed(result.heights.vertex, config.refine.jump_steps)
     rows, cols = (np.arange(half + spacing // 2, n - half, spacing) for n in surface.shape)
     cells = np.stack([v.ravel() for v in np.meshgrid(rows, cols, indexing="ij")], axis=1)
@@ -134,11 +134,11 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
     index = samples.first[:, None] + np.arange(samples.n_heights)
     windows = []
     for view in range(takes.shape[1]):
-        found = samples.windows(result.views, view, block, slice(None))
+        found = samples.windows(result.views, view, slice(None))
         found[index < result.seen[2, view, row, col][:, None]] = np.nan
         windows.append(found)
     reference, everyone = takes.argmax(axis=1), np.arange(len(cells))
-    per_step = np.array([cells_per_step(result.views, i, block) for i in range(takes.shape[1])])
+    per_step = np.array([cells_per_step(result.views, i) for i in range(takes.shape[1])])
     mean, widest_px = ProgressiveMean.empty(len(cells), samples.n_heights), np.zeros(len(cells))
     first = np.stack(windows)[reference, everyone]
     for view, found in enumerate(windows):
