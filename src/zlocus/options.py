@@ -158,9 +158,9 @@ class SemiGlobalOptions(Checked):
         None, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower); unset: 1 "
         "where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
-    p1: int = option(28, "Penalty of a neighbour one step away.", low=0, high=1000)
+    p1: int = option(45, "Penalty of a neighbour one step away.", low=0, high=1000)
     p2: int = option(400, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
-    p2_edge: int = option(30, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
+    p2_edge: int = option(45, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
     level_easing: float = option(
         0.85, "Penalties of jumps are eased by this at every coarser level, where a roof has fewer cells.",
         low=0.1, high=1.0,
