@@ -1,0 +1,137 @@
+"""What bounds each kernel on this machine, and what it reaches; then what a second thread gains.
+
+    python benchmarks/roofline.py [--program FOLDER]
+
+Counts are in `roofline_counts.py`, rates of the machine are measured (`machine.py`), kernels run on the scenes of
+`bench_kernels.py`. Times are CPU times of the thread, the best of short runs. A kernel faster than its bound would be a
+wrong count: exit status 1. FOLDER : a rendered scene; the whole program runs there with one worker and two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import bench_kernels as bench
+from bench_kernels import SGM_SIDE, SIDE, Case
+from machine import IN_L1, IN_L2, IN_L3, IN_MEMORY, Machine, measured
+from roofline_counts import MGM, ORTHO, REACH, RESAMPLE, SGM, SMOOTH, SPLINE, VISIBILITY, WINNERS, Count, costs, profile
+from threads import kernels_on_two, program_on_two
+
+SECONDS, FEWEST_RUNS = 1.5, 5
+STEPS = 32
+# Noise of the best of short runs: a kernel this much below its bound is one whose count is wrong.
+TOLERANCE = 1.05
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A line of the table. size : bytes of the arrays of the scene; lost : why it does not reach its bound."""
+
+    name: str
+    case: Callable[[], Case]
+    count: Count
+    size: int
+    lost: str
+
+
+CELLS, SUM_CELLS = SIDE * SIDE, SGM_SIDE * SGM_SIDE
+LOST_COSTS = ""
+KERNELS = (
+    Kernel("resample_plane", bench.resample_case, RESAMPLE, IN_L1, ""),
+    *(
+        Kernel(
+            f"tile_costs, {views} views, {name}", lambda views=views, windows=windows: bench.costs_case(views, windows, 1.0),
+            costs(views, windows, STEPS), CELLS * (STEPS + 16 * views), LOST_COSTS,
+        )
+        for views in (3, 6)
+        for name, windows in (("3 x 3", [1]), ("3 x 3 and 5 x 5", [1, 2]))
+    ),
+    Kernel("sgm.sweep, 64 heights", lambda: bench.sgm_case(64), SGM, SUM_CELLS * 64 * 3, ""),
+    Kernel("sgm.sweep, 16 heights", lambda: bench.sgm_case(16), SGM, SUM_CELLS * 16 * 3, ""),
+    Kernel("mgm.sweep_quarter, 64 heights", lambda: bench.mgm_case(64), MGM, SUM_CELLS * 64 * 3, ""),
+    Kernel("mgm.sweep_quarter, 16 heights", lambda: bench.mgm_case(16), MGM, SUM_CELLS * 16 * 3, ""),
+    Kernel("winners, ragged", lambda: bench.winners_case(None), WINNERS, SUM_CELLS * 40 * 2, ""),
+    Kernel("tile_profile, 9 x 9, 3 views", bench.profile_case, profile(4, 3, 5), CELLS * (4 * 5 + 3 * 16), ""),
+    Kernel("smooth_surface", bench.smooth_case, SMOOTH, CELLS * 16, ""),
+    Kernel("lowest_visible, by column", bench.visibility_case, VISIBILITY, CELLS * 8, ""),
+    Kernel("lowest_visible, by row", lambda: bench.visibility_case(0.2, 0.4), VISIBILITY, CELLS * 8, ""),
+    Kernel("block_reach, at borders", bench.reach_case, REACH, IN_L1, ""),
+    Kernel("spline_coefficients", bench.spline_case, SPLINE, 1200 * 1000 * 8, ""),
+    Kernel("tile_ortho", bench.ortho_case, ORTHO, CELLS * 12, ""),
+)  # fmt: skip
+
+
+def best_ns(case: Case) -> float:
+    """CPU time of a unit of work in the best of several runs, after one that compiles."""
+    case.call()
+    best, runs, end = float("inf"), 0, time.perf_counter() + SECONDS
+    while runs < FEWEST_RUNS or time.perf_counter() < end:
+        start = time.thread_time()
+        case.call()
+        best, runs = min(best, time.thread_time() - start), runs + 1
+    return best / case.n * 1e9
+
+
+def show_machine(machine: Machine) -> None:
+    """The rates of a core."""
+    print(f"One core of {bench.processor()}, as Numba's loops reach it:\n")
+    print("| what | rate |\n|---|---|")
+    print(f"| float32 multiplications and additions | {machine.arithmetic:.0f} G/s |")
+    print(f"| uint16 minima and additions | {machine.narrow:.0f} G/s |")
+    print(f"| float32 1 / sqrt | {machine.roots:.1f} G/s |")
+    print(f"| values read at an index | {machine.gathers:.1f} G/s |")
+    print(f"| loads, stores in the first cache | {machine.loads:.0f}, {machine.stores:.0f} GB/s |")
+    names = {IN_L1: "first cache", IN_L2: "second", IN_L3: "third", IN_MEMORY: "memory"}
+    found = ", ".join(f"{name} {machine.reads[size]:.0f}" for size, name in names.items())
+    print(f"| `b += a` | {found} GB/s |\n")
+
+
+def show_kernels(machine: Machine) -> bool:
+    """The table; whether every kernel is within its bound."""
+    print("| kernel | unit | operations | bytes in cache, from beyond | bound, ns | reached, ns | share | lost |")
+    print("|---|---|---|---|---|---|---|---|")
+    sound = True
+    for kernel in KERNELS:
+        case = kernel.case()
+        reached, bounds = best_ns(case), kernel.count.bounds_ns(machine, kernel.size)
+        what, bound = max(bounds.items(), key=lambda item: item[1])
+        sound = sound and bound <= reached * TOLERANCE
+        count = kernel.count
+        print(
+            f"| {kernel.name} | {case.unit} | {operations(count)} | {count.loads + count.stores:.3g}, {count.memory:.2g} "
+            f"| {bound:.2g} ({what}) | {reached:.3g} | {bound / reached:.0%} | {kernel.lost} |",
+            flush=True,
+        )
+    return sound
+
+
+def operations(count: Count) -> str:
+    """Operations as text, those of their own kind beside the others."""
+    parts = [f"{count.ops + count.narrow:.3g}"]
+    parts += [f"{count.roots:.2g} roots"] if count.roots else []
+    parts += [f"{count.gathers:.3g} gathers"] if count.gathers else []
+    return " + ".join(parts)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--program", type=Path, metavar="FOLDER", help="also the whole program on a rendered scene")
+    options = parser.parse_args()
+    machine = measured()
+    show_machine(machine)
+    sound = show_kernels(machine)
+    kernels_on_two({kernel.name: kernel.case for kernel in KERNELS})
+    if options.program:
+        program_on_two(options.program)
+    if not sound:
+        print("A kernel is faster than its bound: its count is wrong.", file=sys.stderr)
+    return 0 if sound else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
