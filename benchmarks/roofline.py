@@ -45,7 +45,8 @@ KERNELS = (
     Kernel("resample_plane", bench.resample_case, RESAMPLE, IN_L1, ""),
     *(
         Kernel(
-            f"tile_costs, {views} views, {name}", lambda views=views, windows=windows: bench.costs_case(views, windows, 1.0),
+            f"tile_costs, {views} views, {name}",
+            lambda views=views, windows=windows: bench.costs_case(views, windows, 1.0),
             costs(views, windows, STEPS), CELLS * (STEPS + 16 * views), LOST_COSTS,
         )
         for views in (3, 6)
@@ -102,9 +103,10 @@ def show_kernels(machine: Machine) -> bool:
         what, bound = max(bounds.items(), key=lambda item: item[1])
         sound = sound and bound <= reached * TOLERANCE
         count = kernel.count
+        moved = f"{count.loads + count.stores:.3g}, {count.memory:.2g}"
         print(
-            f"| {kernel.name} | {case.unit} | {operations(count)} | {count.loads + count.stores:.3g}, {count.memory:.2g} "
-            f"| {bound:.2g} ({what}) | {reached:.3g} | {bound / reached:.0%} | {kernel.lost} |",
+            f"| {kernel.name} | {case.unit} | {operations(count)} | {moved} | {bound:.2g} ({what}) "
+            f"| {reached:.3g} | {bound / reached:.0%} | {kernel.lost} |",
             flush=True,
         )
     return sound

@@ -57,7 +57,7 @@ def run_together(cases: list[Case], calls: int) -> Run:
 
 def kernels_on_two(cases: dict[str, Callable[[], Case]]) -> None:
     """Each kernel on one thread and on two, in turn; the best of each."""
-    print("\n| kernel | twice the work on two threads: wall | CPU per wall | CPU alone over CPU beside the other, x 2 |")
+    print("\n| kernel | two threads over one, wall | CPU per wall | the same from CPU: 2 x alone / beside the other |")
     print("|---|---|---|---|")
     for name, make in cases.items():
         two = [make(), make()]
@@ -92,14 +92,12 @@ def program_on_two(scene: Path, rounds: int = 2) -> None:
                 best[workers] = wall, sum(stage["cpu_s"] for stage in stages), stages
     print("\n| stage | wall, 1 worker | CPU | wall, 2 workers | CPU | gain |\n|---|---|---|---|---|---|")
     (wall, cpu, one), (wall_2, cpu_2, two) = best[1], best[2]
-    for a, b in zip(one, two, strict=True):
-        gain = a["wall_s"] / b["wall_s"] if b["wall_s"] else float("nan")
-        print(
-            f"| {a['name']} | {a['wall_s']:.1f} | {a['cpu_s']:.1f} | {b['wall_s']:.1f} | {b['cpu_s']:.1f} | {gain:.2f} |"
-        )
-    print(f"| all, with start and imports | {wall:.1f} | {cpu:.1f} | {wall_2:.1f} | {cpu_2:.1f} | {wall / wall_2:.2f} |")
-    serial = wall - next(stage["wall_s"] for stage in one if stage["name"] == "match")
+    rows = [(a["name"], a["wall_s"], a["cpu_s"], b["wall_s"], b["cpu_s"]) for a, b in zip(one, two, strict=True)]
+    for name, *figures in [*rows, ("all, with start and imports", wall, cpu, wall_2, cpu_2)]:
+        gain = figures[0] / figures[2] if figures[2] else float("nan")
+        print(f"| {name} | {' | '.join(f'{figure:.1f}' for figure in figures)} | {gain:.2f} |")
+    serial = cpu - next(stage["cpu_s"] for stage in one if stage["name"] == "match")
     print(
-        f"\nOutside matching: {serial / wall:.0%} of the wall time of one worker; were matching twice as fast, the whole "
-        f"would gain {wall / (serial + (wall - serial) / 2):.2f}. Bar: {BAR}."
+        f"\nOutside matching: {serial / cpu:.0%} of the CPU of one worker; were matching alone twice as fast, the whole "
+        f"would gain {cpu / (serial + (cpu - serial) / 2):.2f}. Bar: {BAR}."
     )
