@@ -120,8 +120,8 @@ def costs(n_views: int, windows: list[int], n_heights: int, with_greys: bool = T
 
 
 # path_cost: min, + P1, min, min, - least, + cost; minimum of the path; eight paths. Sums of four: 3, twice. Costs
-# become uint16, twice. Sums of the up sweep are added: 1. Reads: 3 path costs, 8 times; costs as uint16 twice, and once to
-# turn them round; sums to be turned round and those of the down sweep. Writes: 8 path costs, sums twice, turned
+# become uint16, twice. Sums of the up sweep are added: 1. Reads: 3 path costs, 8 times; costs as uint16 twice, and
+# once to turn them round; sums to be turned round and those of the down sweep. Writes: 8 path costs, sums twice, turned
 # costs, total. Memory: costs twice; sums written, then read and written.
 SGM = Count(narrow=8 * 7 + 6 + 2 + 1, loads=48 + 4 + 1 + 4, stores=16 + 4 + 1 + 2, memory=2 + 2 + 4)
 # One sweep, of four. run_along: two path costs of 5 and their minima, 12; offers 4; run_across: offers 4, sum 1;
@@ -165,8 +165,8 @@ REACH = Count(ops=8 + 8 + 3 + 2 + 7, loads=4 + 16, stores=4 + 16)
 # three sweeps over the image a filter, and the turned images.
 SPLINE = Count(ops=5, loads=20, stores=12, memory=24) * 2 + Count(loads=4, stores=4, memory=8) * 2
 # Level in float64 from the surface: product, sum, difference, 2 each, division, 2 conversions. Cells of a block:
-# quotient, remainder, conversions. Positions as in `profile`; fractions: floor and difference, x and y; index 5. Least and
-# greatest of the surface. Memory: surface, image, result.
+# quotient, remainder, conversions. Positions as in `profile`; fractions: floor and difference, x and y; index 5. Least
+# and greatest of the surface. Memory: surface, image, result.
 ORTHO = (
     Count(ops=8 + 4 + 48 + 4 + 5 + 2, roots=1, loads=4 + 24 + 8 + 8 + 8, stores=4 + 8 + 8 + 16 + 4, memory=12)
     + BILINEAR_GATHER

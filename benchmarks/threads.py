@@ -85,8 +85,10 @@ def program_on_two(scene: Path, rounds: int = 2) -> None:
             command = [sys.executable, "-c", "from zlocus.cli import main; main()", "dsm", *map(str, images)]
             command += ["-o", str(out), "--like", str(scene / "truth_dsm.tif"), "--workers", str(workers)]
             start = time.perf_counter()
-            subprocess.run(command, check=True, capture_output=True)
+            done = subprocess.run(command, capture_output=True, text=True)
             wall = time.perf_counter() - start
+            if done.returncode:
+                raise SystemExit(f"zlocus dsm exits {done.returncode}: {done.stderr.strip().splitlines()[-1]}")
             stages = json.loads((out / "run.json").read_text())["stages"]
             if turn and (workers not in best or wall < best[workers][0]):
                 best[workers] = wall, sum(stage["cpu_s"] for stage in stages), stages
@@ -98,6 +100,6 @@ def program_on_two(scene: Path, rounds: int = 2) -> None:
         print(f"| {name} | {' | '.join(f'{figure:.1f}' for figure in figures)} | {gain:.2f} |")
     serial = cpu - next(stage["cpu_s"] for stage in one if stage["name"] == "match")
     print(
-        f"\nOutside matching: {serial / cpu:.0%} of the CPU of one worker; were matching alone twice as fast, the whole "
-        f"would gain {cpu / (serial + (cpu - serial) / 2):.2f}. Bar: {BAR}."
+        f"\nOutside matching: {serial / cpu:.0%} of the CPU of one worker; were matching alone twice as fast, the "
+        f"whole would gain {cpu / (serial + (cpu - serial) / 2):.2f}. Bar: {BAR}."
     )
