@@ -46,11 +46,11 @@ COSTS = (
     "image with two windows) are read and written from the second cache, and 1 / sqrt takes 0.4 ns a window"
 )
 SGM_LOST = (
-    "80 ns a cell whatever its heights (registers spilled, minima across lanes, ends of loops); path costs of the row "
-    "before from the second cache"
+    "80 ns a cell whatever its heights (104 ns with 16, 175 with 64: minima across lanes, ends of loops, some 20 "
+    "pointers); the row before lies in the second cache (450 KB with 64)"
 )
 MGM_LOST = "some 200 ns a cell whatever its heights; volumes and sheets larger than the caches: see below"
-SEEN_LOST = "cell by cell: each waits for the one behind it, with a branch and conversions of its place"
+SEEN_LOST = "scalar code: places in float64 turned into indices, a branch a cell"
 REACH_LOST = (
     "`lengthen` (1.1 ns) is compiled to masked stores, which this processor does slowly; `step_cells` (1.4 ns) is "
     "float64, its verdicts narrowed to int32"
