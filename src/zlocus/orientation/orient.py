@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,13 +12,14 @@ from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
-from zlocus.orientation.adjust import Adjustment, adjust
+from zlocus.orientation.adjust import Adjustment, adjust, consistent, moved, renumbered
 from zlocus.orientation.locus import locate
-from zlocus.orientation.ties import Progress, Ties, find_ties
-from zlocus.orientation.triangulate import Observations
+from zlocus.orientation.sharpen import sharpened
+from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
+from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, triangulate
 from zlocus.scene import Scene, View
 from zlocus.sensors.correction import ShiftedModel
-from zlocus.sensors.model import FloatArray
+from zlocus.sensors.model import FloatArray, SensorModel
 
 FEWEST_FOR_RANGE = 20
 NEIGHBOURS = 8
@@ -25,6 +27,8 @@ SUPPORTERS = 3
 STEEPEST = 1.5
 HEIGHT_SIGMAS = 4.0
 RANGE_PERCENT = (0.5, 99.5)
+# Of `inlier_px`, for ties that were measured again.
+MEASURED_SHARE = 0.5
 KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex), which is not a random one
 
 
@@ -143,24 +147,71 @@ def orient(
     z_range_hint: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Orientation:
-    """Tie points, then one shift per image, solved with the heights of the ties.
+    """Tie points, measured again by correlation, then one shift per image, solved with the heights of the ties.
 
     z_range_hint: heights in m that hold the ground, where they are known; else the scene's.
     """
     ties = find_ties(scene, options, z_range_hint, progress)
     sensors = [view.sensor for view in scene.views]
-    adjusted = adjust(sensors, ties.seen, first_ground(scene, ties), options)
+    xyz = first_ground(scene, ties)
+    seen = sharpened(scene.views, ties.seen, ground_jacobian(sensors, ties.seen, xyz), options)
+    strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
+    adjusted = adjust(sensors, seen, xyz, strict)
+    ground = with_rough_ties(adjusted, sensors, ties.seen, xyz, options.inlier_px * looseness(scene.views, options))
     views = tuple(view_orientation(view, i, adjusted) for i, view in enumerate(scene.views))
-    sigma_px = np.sqrt(np.mean(adjusted.after_px**2)) if len(adjusted.seen) else np.nan
     return Orientation(
         views=views,
         pairs=pair_orientations(scene, adjusted, ties.z_range),
-        xyz=adjusted.points.xyz,
-        sigma_z_m=adjusted.points.sigma_z * sigma_px,
-        seen=adjusted.seen,
+        xyz=ground.xyz,
+        sigma_z_m=ground.sigma_z_m,
+        seen=ground.seen,
         model=options.model,
         n_seen=adjusted.n_seen,
         z_bounds=ties.z_range,
+    )
+
+
+@dataclass(frozen=True)
+class TiePoints:
+    """xyz : (n, 3) m; sigma_z_m : (n,), their height precision; seen: their observations."""
+
+    xyz: FloatArray
+    sigma_z_m: FloatArray
+    seen: Observations
+
+    @classmethod
+    def of(cls, points: GroundPoints, seen: Observations) -> TiePoints:
+        """Triangulated points with the noise that their residuals show."""
+        sigma_px = np.sqrt(np.mean(points.residual**2)) if len(seen) else np.nan
+        return cls(points.xyz, points.sigma_z * sigma_px, seen)
+
+
+def with_rough_ties(
+    adjusted: Adjustment, sensors: Sequence[SensorModel], every: Observations, xyz: FloatArray, inlier_px: float
+) -> TiePoints:
+    """The adjusted ties, then those that could not be measured again, or not well enough to tell the pointing.
+
+    Tree tops and edges of roofs look different from everywhere: as SIFT found them they still tell where the search
+    has to reach. every, xyz : all ties, observations and first ground points (n, 3) m.
+    """
+    precise = TiePoints.of(adjusted.points, adjusted.seen)
+    used = np.zeros(len(xyz), bool)
+    used[adjusted.numbers] = True
+    rough, start = renumbered(every.kept(~used[every.point]), xyz)
+    if not len(rough):
+        return precise
+    moved_rough = moved(rough, adjusted.shift_px)
+    rough, start = renumbered(consistent(rough, triangulate(sensors, moved_rough, start), inlier_px), start)
+    if not len(rough):
+        return precise
+    more = TiePoints.of(triangulate(sensors, moved(rough, adjusted.shift_px), start), rough)
+    seen = Observations(
+        np.concatenate([precise.seen.view, rough.view]),
+        np.concatenate([precise.seen.point, rough.point + len(precise.xyz)]),
+        np.concatenate([precise.seen.xy, rough.xy]),
+    )
+    return TiePoints(
+        np.concatenate([precise.xyz, more.xyz]), np.concatenate([precise.sigma_z_m, more.sigma_z_m]), seen
     )
 
 
