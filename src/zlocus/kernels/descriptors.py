@@ -7,6 +7,7 @@ import numpy as np
 from zlocus.kernels._jit import kernel
 
 CELL_PX = 64.0
+CORNER = 1.5
 SAME_PLACE_PX = 2.0  # a rival this near is another orientation of the same feature
 UNRELATED_DISTANCE = 0.9  # between RootSIFT descriptors of different ground; random pairs measure 0.9 to 1.2
 
@@ -48,10 +49,10 @@ def sort_into_cells(xy, corner, rows, cols, start, order):
 # (2) f8, (2) f8, (2) f8, f8 -> b1
 @kernel
 def is_near(low, high, point, max_px):
-    """Whether a point lies within `max_px` along and across of a segment."""
+    """Whether a point lies within `max_px` along and across of a segment; one without length counts as level."""
     by_x, by_y = high[0] - low[0], high[1] - low[1]
     length = np.sqrt(by_x * by_x + by_y * by_y)
-    by_x, by_y = by_x / max(length, 1e-9), by_y / max(length, 1e-9)
+    by_x, by_y = (by_x / length, by_y / length) if length > 1e-9 else (1.0, 0.0)
     x, y = point[0] - low[0], point[1] - low[1]
     along = x * by_x + y * by_y
     return abs(x * by_y - y * by_x) <= max_px and -max_px <= along <= length + max_px
@@ -60,13 +61,17 @@ def is_near(low, high, point, max_px):
 # (2) f8, (2) f8, f8, f8 -> (2) f8
 @kernel
 def span_in_row(low, high, top, max_px):
-    """Least and largest x of what lies within `max_px` of a segment in a row of cells that starts at y = `top`."""
+    """Least and largest x of what lies within `max_px` along and across of a segment, in a row of cells from y = `top`.
+
+    Beyond an end and beside it at once, a point is up to 1.4 times as far away.
+    """
+    reach = CORNER * max_px
     x0, x1, by_y = low[0], high[0], high[1] - low[1]
     if abs(by_y) > 1e-9:
-        one = min(max((top - max_px - low[1]) / by_y, 0.0), 1.0)
-        other = min(max((top + CELL_PX + max_px - low[1]) / by_y, 0.0), 1.0)
+        one = min(max((top - reach - low[1]) / by_y, 0.0), 1.0)
+        other = min(max((top + CELL_PX + reach - low[1]) / by_y, 0.0), 1.0)
         x0, x1 = low[0] + one * (high[0] - low[0]), low[0] + other * (high[0] - low[0])
-    return np.array([min(x0, x1) - 2.0 * max_px, max(x0, x1) + 2.0 * max_px])
+    return np.array([min(x0, x1) - reach, max(x0, x1) + reach])
 
 
 # (k,2) f8, (m) i8, (m) f4, i8, f8 -> b1
@@ -105,7 +110,8 @@ def nearest_descriptors(low, high, in_a, xy, in_b, max_px, ratio, best_a, best_b
     for i in range(len(low)):
         if not (np.isfinite(low[i]).all() and np.isfinite(high[i]).all()):
             continue
-        top, bottom = min(low[i, 1], high[i, 1]) - max_px, max(low[i, 1], high[i, 1]) + max_px
+        top = min(low[i, 1], high[i, 1]) - CORNER * max_px
+        bottom = max(low[i, 1], high[i, 1]) + CORNER * max_px
         first, last = int(np.floor((top - corner[1]) / CELL_PX)), int(np.floor((bottom - corner[1]) / CELL_PX))
         n_near = 0
         for row in range(max(first, 0), min(last, rows - 1) + 1):

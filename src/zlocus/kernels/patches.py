@@ -139,7 +139,10 @@ def patch_shifts(patches, squares, warps, centres, reach, out):
         for k in range(count):
             row, col = k // side + 1, k % side + 1
             values[k] = patch[row, col]
-            across, down = 0.5 * (patch[row, col + 1] - patch[row, col - 1]), 0.5 * (patch[row + 1, col] - patch[row - 1, col])
+            across, down = (
+                0.5 * (patch[row, col + 1] - patch[row, col - 1]),
+                0.5 * (patch[row + 1, col] - patch[row - 1, col]),
+            )
             slopes[k, 0] = (warp[1, 1] * across - warp[1, 0] * down) / determinant
             slopes[k, 1] = (warp[0, 0] * down - warp[0, 1] * across) / determinant
             by_col, by_row = col - 1 - half, row - 1 - half

@@ -58,8 +58,10 @@ def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOp
         xy, descriptor = detect_window(window, limit, factor)
         xy = xy + np.array([col, row])
         inside = (xy >= np.array([core[1], core[0]]) - 0.5) & (xy < np.array([core[3], core[2]]) - 0.5)
-        xys.append(xy[inside.all(axis=1)])
-        descriptors.append(descriptor[inside.all(axis=1)])
+        kept = np.flatnonzero(inside.all(axis=1))
+        kept = kept[: math.ceil(per_mpx * (core[2] - core[0]) * (core[3] - core[1]) / 1e6)]
+        xys.append(xy[kept])
+        descriptors.append(descriptor[kept])
     return Features(np.concatenate(xys), np.concatenate(descriptors))
 
 
@@ -89,29 +91,37 @@ def parts(shape: tuple[int, int]) -> Iterator[tuple[tuple[int, int], tuple[int, 
 
 
 def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
-    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), at most `limit` of them.
+    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), at most `limit` of them, the strongest first.
 
     factor : by which the window is reduced first, see `reduction`.
 
     `enable_precise_upscale` matters: without it OpenCV's positions are 0.25 px too large in both axes, because of how
     it doubles the image. Descriptors are compared as square roots (Arandjelovic and Zisserman 2012, section 2).
     """
-    pixels, valid = stretched(window), window.valid
-    full = np.array(pixels.shape[::-1])
+    full = np.array(window.pixels.shape[::-1])
     size = np.maximum(np.round(full / factor).astype(int), 1)
-    if factor > 1.0:
-        pixels = np.asarray(cv2.resize(pixels, size.tolist(), interpolation=cv2.INTER_AREA))
-        if not valid.all():
-            valid = cv2.resize(valid.astype(np.float32), size.tolist(), interpolation=cv2.INTER_AREA) > WHOLLY
+    window = window if factor == 1.0 else reduced(window, size)
+    pixels, valid = stretched(window), window.valid
     sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True)
     keypoints, found = sift.detectAndCompute(pixels, None)
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), np.float32)
+    strongest = np.argsort([-k.response for k in keypoints], kind="stable")
+    keypoints, found = [keypoints[k] for k in strongest], found[strongest]
     xy = np.array([k.pt for k in keypoints])
     size_px = np.array([k.size for k in keypoints])
     keep = far_from_nodata(xy, size_px, valid)
     descriptors = np.sqrt(found[keep] / np.maximum(found[keep].sum(axis=1, keepdims=True), 1e-12))
     return (xy[keep] + 0.5) * (full / size) - 0.5, descriptors.astype(np.float32)
+
+
+def reduced(window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
+    """The window with fewer pixels, (columns, rows), each the mean over its area, valid where all of that is."""
+    pixels = np.asarray(cv2.resize(window.pixels, size.tolist(), interpolation=cv2.INTER_AREA))
+    if window.valid.all():
+        return ImageWindow(pixels, np.ones(pixels.shape, bool))
+    valid = cv2.resize(window.valid.astype(np.float32), size.tolist(), interpolation=cv2.INTER_AREA)
+    return ImageWindow(pixels, valid > WHOLLY)
 
 
 def stretched(window: ImageWindow) -> NDArray[np.uint8]:

@@ -22,6 +22,7 @@ from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import FloatArray, SensorModel
 
 FEWEST_FOR_RANGE = 20
+ENOUGH_FOR_MEDIAN = 200  # ties of a pair whose distances are reported, about: up to twice as many
 NEIGHBOURS = 8
 SUPPORTERS = 3
 STEEPEST = 1.5
@@ -210,9 +211,7 @@ def with_rough_ties(
         np.concatenate([precise.seen.point, rough.point + len(precise.xyz)]),
         np.concatenate([precise.seen.xy, rough.xy]),
     )
-    return TiePoints(
-        np.concatenate([precise.xyz, more.xyz]), np.concatenate([precise.sigma_z_m, more.sigma_z_m]), seen
-    )
+    return TiePoints(np.concatenate([precise.xyz, more.xyz]), np.concatenate([precise.sigma_z_m, more.sigma_z_m]), seen)
 
 
 def first_ground(scene: Scene, ties: Ties) -> FloatArray:
@@ -235,21 +234,22 @@ def view_orientation(view: View, number: int, adjusted: Adjustment) -> ViewOrien
 
 
 def pair_orientations(scene: Scene, adjusted: Adjustment, z_range: tuple[float, float]) -> tuple[PairOrientation, ...]:
-    """Each pair's distances from the loci, over the ties that both its images see."""
+    """Each pair's distances from the loci, over ties that both its images see."""
     seen, found = adjusted.seen, []
     row_of = np.full((len(scene.views), len(adjusted.points.xyz)), -1)
     row_of[seen.view, seen.point] = np.arange(len(seen))
     for a in range(len(scene.views)):
         for b in range(a + 1, len(scene.views)):
-            both = (row_of[a] >= 0) & (row_of[b] >= 0)
-            if not both.any():
+            both = np.flatnonzero((row_of[a] >= 0) & (row_of[b] >= 0))
+            if not len(both):
                 continue  # such a pair has nothing to report
-            in_a, in_b = seen.xy[row_of[a][both]], seen.xy[row_of[b][both]]
+            few = both[:: max(len(both) // ENOUGH_FOR_MEDIAN, 1)]
+            in_a, in_b = seen.xy[row_of[a][few]], seen.xy[row_of[b][few]]
             sensors = scene.views[a].sensor, scene.views[b].sensor
             before = locate(*sensors, in_a, in_b, z_range).across_px
             after = locate(*sensors, in_a - adjusted.shift_px[a], in_b - adjusted.shift_px[b], z_range).across_px
             names = (scene.views[a].name, scene.views[b].name)
-            found.append(PairOrientation(names, int(both.sum()), median_distance(before), median_distance(after)))
+            found.append(PairOrientation(names, len(both), median_distance(before), median_distance(after)))
     return tuple(found)
 
 

@@ -115,9 +115,7 @@ def reference_patches(
     return patches, usable
 
 
-def squares_around(
-    view: View, whole: NDArray[np.int64], rows: NDArray[np.int64], half: int
-) -> Iterator[Squares]:
+def squares_around(view: View, whole: NDArray[np.int64], rows: NDArray[np.int64], half: int) -> Iterator[Squares]:
     """Squares of 2 half + 1 px around whole pixels, read part by part; those that leave the image are left out.
 
     whole : (m, 2) column and row of all points; rows : (k,) which of them.
