@@ -49,7 +49,7 @@ def correlation(a, b):
 
 
 def patch_shift(patch, square, warp, centre, reach, step=0.02):
-    """Shift (column, row) px by which a patch lies off `centre` in a square, and the NCC there: the best of whole pixels
+    """Shift (column, row) px by which a patch lies off `centre` in a square, and the NCC there: best of whole pixels
     within `reach`, then of all within 1.5 px of it on ever finer grids, on a cubic spline."""
     half = patch.shape[0] // 2 - 1
     col, row = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1))

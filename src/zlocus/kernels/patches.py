@@ -87,8 +87,8 @@ def whole_shift(square, values, x, y, reach, shift):
 def fine_shift(square, values, slopes, x, y, shift):
     """NCC at the shift that fits best, which goes to `shift`; 0 where none is found near the shift to start with.
 
-    Gauss-Newton on values = offset + gain square(x + shift) with the slopes (px of the square) of the values in place of
-    those of the square: least squares matching, Grün (1985), with shifts alone, and the normal matrix made once.
+    Gauss-Newton on values = offset + gain square(x + shift) with the slopes (per px of the square) of the values in
+    place of those of the square: least squares matching, Grün (1985), with shifts alone.
     """
     across, down = np.ascontiguousarray(slopes[:, 0]), np.ascontiguousarray(slopes[:, 1])
     xx, xy, yy = covariance(across, across), covariance(across, down), covariance(down, down)
@@ -121,8 +121,8 @@ def patch_shifts(patches, squares, warps, centres, reach, out):
     """How far patches lie from where squares of another image are expected to show them: column, row (px), NCC.
 
     patches : (n, p, p), p odd, the outermost pixels for slopes only; squares : (n, s, s); warps : (n, 2, 2) px of the
-    square per px of the patch; centres : (n, 2) px, where a square is expected to show the patch's middle; reach : whole
-    pixels looked at to either side; out : (n, 3), NCC 0 where no place is found or the square is too small.
+    square per px of the patch; centres : (n, 2) px, where a square is expected to show the patch's middle; reach :
+    whole pixels looked at to either side; out : (n, 3), NCC 0 where no place is found or the square is too small.
     """
     half = patches.shape[1] // 2 - 1
     side, last = 2 * half + 1, squares.shape[1] - 1

@@ -91,7 +91,7 @@ def parts(shape: tuple[int, int]) -> Iterator[tuple[tuple[int, int], tuple[int, 
 
 
 def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
-    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), at most `limit` of them, the strongest first.
+    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), the strongest first, at most `limit`.
 
     factor : by which the window is reduced first, see `reduction`.
 

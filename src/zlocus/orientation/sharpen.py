@@ -93,7 +93,10 @@ def inverses(matrix: FloatArray) -> FloatArray:
 
 
 def warps(reference: FloatArray, other: FloatArray) -> FloatArray:
-    """Pixels of the others per pixel of the references on level ground (n, 2, 2); 0 where unknown. (n, 2, 3) px per m."""
+    """Pixels of the others per pixel of the references (n, 2, 2) on level ground; 0 where unknown.
+
+    reference, other : (n, 2, 3) px per m.
+    """
     with np.errstate(invalid="ignore"):
         warp = other[:, :, :2] @ inverses(reference[:, :, :2])
     return np.where(np.isfinite(warp).all(axis=(1, 2), keepdims=True), warp, 0.0)
