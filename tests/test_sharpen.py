@@ -81,6 +81,19 @@ def test_what_looks_different_or_is_not_valid_is_left_out():
     assert np.bincount(found.point)[np.unique(found.point)].min() >= 2
 
 
+def test_invalid_pixels_count_even_where_their_value_is_an_ordinary_one():
+    scene = hill_scene([(0.0, 0.0)] * 3)
+    seen, true, _, by_ground = planted(scene)
+    pixels, valid = scene.views[2].image.pixels - 2000.0, np.ones((280, 280), bool)
+    col, row = np.rint(true[seen.view == 2][:5]).astype(int).T
+    valid[row, col] = False
+    scene = replace(scene, views=(*scene.views[:2], replace(scene.views[2], image=image_of(pixels, valid))))
+    found = sharpened(scene.views, seen, by_ground, OPTIONS)
+    kept = found.point[found.view == 2]
+    assert len(kept) > ENOUGH
+    assert (kept >= 5).all()
+
+
 def test_a_view_of_another_season_keeps_what_sift_found():
     scene = hill_scene([(0.0, 0.0)] * 3)
     noise = image_of(np.random.default_rng(3).normal(size=(280, 280)))
