@@ -82,7 +82,8 @@ class Orientation:
 
     xyz : (n, 3) m, ground points of the ties with the shifts applied; sigma_z_m : (n,) their height precision;
     seen: their observations; model: the kind of correction; n_seen: how many of the shifts' 2 i components the ties
-    could show; z_bounds: the heights (m) within which ties were looked for.
+    could show; z_bounds: the heights (m) within which ties were looked for; n_measured: the first so many ties were
+    measured again and agree, the others look different from everywhere, see `with_rough_ties`.
     """
 
     views: tuple[ViewOrientation, ...]
@@ -93,6 +94,12 @@ class Orientation:
     model: str
     n_seen: int
     z_bounds: tuple[float, float]
+    n_measured: int
+
+    @property
+    def measured(self) -> FloatArray:
+        """(k, 3) m, the ties that look the same in the images that see them."""
+        return self.xyz[: self.n_measured]
 
     def apply(self, scene: Scene) -> Scene:
         """The scene with corrected sensors."""
@@ -169,6 +176,7 @@ def orient(
         model=options.model,
         n_seen=adjusted.n_seen,
         z_bounds=ties.z_range,
+        n_measured=len(adjusted.points.xyz),
     )
 
 
