@@ -178,7 +178,8 @@ def settle(ready: OrientedScene, reference: str, options: RunConfig) -> tuple[Im
     if span is None:
         span = hypotheses_of_ties(space, ties[known & ready.trusted], options.orientation)
     n_measured = ready.orientation.n_measured
-    ground = ties[:n_measured][known[:n_measured]]
+    ground = ties[:n_measured]
+    ground = ground[np.isfinite(ground).all(axis=1)]
     return space, settle_image(space, span, ties[known], options.pyramid, ground)
 
 
