@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,9 +17,12 @@ import numpy as np
 import pytest
 
 from zlocus.kernels.mgm import sweep_quarter
-from zlocus.kernels.refine import tile_profile
+from zlocus.kernels.reach import block_reach
+from zlocus.kernels.refine import tile_ortho, tile_profile
 from zlocus.kernels.resample import RUN, resample_plane
 from zlocus.kernels.sgm import sweep, winners
+from zlocus.kernels.smooth import slopes, smooth_surface
+from zlocus.kernels.spline import spline_coefficients
 from zlocus.kernels.visibility import lowest_visible
 from zlocus.kernels.volume import flat_cells, tile_costs
 from zlocus.matching.lattice import HeightLattice
@@ -28,6 +33,15 @@ SGM_SIDE = 576
 HIGHEST = 10_000
 
 
+@dataclass(frozen=True)
+class Case:
+    """A kernel on a scene of its own. call : one pass; n : units of work of a pass; unit : what is counted."""
+
+    call: Callable[[], object]
+    n: int
+    unit: str
+
+
 def processor() -> str:
     """Name of the processor as the system gives it."""
     listed = Path("/proc/cpuinfo")
@@ -36,18 +50,18 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def timed(benchmark, call, n: int, unit: str) -> float:
+def timed(benchmark, case: Case) -> float:
     """CPU seconds of the best of a few calls, after one that compiles; ns and units a second go to `extra_info`."""
-    call()
+    case.call()
     seconds = []
 
     def once():
         start = time.thread_time()
-        call()
+        case.call()
         seconds.append(time.thread_time() - start)
 
     benchmark.pedantic(once, rounds=ROUNDS)
-    best = min(seconds)
+    best, n, unit = min(seconds), case.n, case.unit
     benchmark.extra_info.update(
         {f"ns per {unit}": best / n * 1e9, f"{unit} per s": n / best, "threads": 1, "machine": processor()}
     )
@@ -100,7 +114,8 @@ def rolling() -> np.ndarray:
     return (32 + 8 * np.sin(r / 30) * np.cos(c / 40)).astype(np.float32)
 
 
-def test_resample(benchmark):
+def resample_case() -> Case:
+    """Bilinear samples of one view on the plane of a block and its border."""
     pixels, layout, _, _ = views(1)
     side = BLOCK + 6
     grid = np.array([60.3, 60.7, 0.99, 0.01, -0.02, 1.01, 0.0, 0.0])
@@ -112,15 +127,11 @@ def test_resample(benchmark):
         for _ in range(500):
             resample_plane(pixels, layout[0], grid, cells, relief, velocity, index, fraction, out)
 
-    timed(benchmark, call, 500 * side * side, "sample")
+    return Case(call, 500 * side * side, "sample")
 
 
-@pytest.mark.parametrize(
-    ("n_views", "windows", "weight"),
-    [(2, [3], 0.0), (3, [1, 2], 0.0), (3, [1, 2], 1.0), (6, [1, 2], 1.0)],
-    ids=["2-views-7x7", "3-views-3x3-5x5", "3-views-3x3-5x5-greys", "6-views-3x3-5x5-greys"],
-)
-def test_costs(benchmark, n_views, windows, weight):
+def costs_case(n_views: int, windows: list[int], weight: float) -> Case:
+    """Costs of a tile: half widths of its windows, weight of grey differences."""
     heights = lattice(SIDE, 32)
     volume = np.empty(heights.size, np.uint8)
     seen, half = all_seen(n_views), np.array(windows, np.int64)
@@ -131,44 +142,139 @@ def test_costs(benchmark, n_views, windows, weight):
     def call():
         tile_costs(*scene, *base, heights.ranges, heights.address, half, seen, BLOCK, measure, volume)
 
-    n = heights.size * n_views
-    seconds = timed(benchmark, call, n, "cell, step and image")
-    if windows == [3]:
-        benchmark.extra_info["resample_ncc_ns"] = seconds / n * 1e9
+    return Case(call, heights.size * n_views, "cell, step and image")
 
 
-@pytest.mark.parametrize("count", [16, 32, 64, 128, None], ids=["16", "32", "64", "128", "ragged"])
-def test_sgm(benchmark, count):
-    side = SGM_SIDE // 2 if count == 128 else SGM_SIDE
-    heights = lattice(side, count)
+def sums_scene(side: int, heights: HeightLattice):
+    """Costs, penalties and sums of a volume."""
     rng = np.random.default_rng(5)
     cost = rng.integers(0, 129, heights.size).astype(np.uint8)
     p2 = rng.integers(60, 240, (4, side, side)).astype(np.uint16)
-    total = np.zeros(heights.size, np.uint16)
+    return cost, p2, np.zeros(heights.size, np.uint16)
+
+
+def sgm_case(count: int | None) -> Case:
+    """Eight paths, all cells with `count` heights, or ragged ranges."""
+    side = SGM_SIDE // 2 if count == 128 else SGM_SIDE
+    heights = lattice(side, count)
+    cost, p2, total = sums_scene(side, heights)
 
     def call():
         for sign in (1, -1):
             sweep(cost, heights.ranges, heights.address, BLOCK, p2, np.uint16(20), sign, total)
 
-    seconds = timed(benchmark, call, heights.size, "cell-step")
-    if count == 64:
-        benchmark.extra_info["sgm_cell_steps_per_s"] = heights.size / seconds
-        benchmark.extra_info["opencv_hh_cell_steps_per_s"] = opencv_speed(side, count)
+    return Case(call, heights.size, "cell-step")
 
 
-@pytest.mark.parametrize("count", [16, 32, 64, None, "city"], ids=["16", "32", "64", "ragged", "city"])
-def test_mgm(benchmark, count):
+def mgm_case(count: int | str | None) -> Case:
+    """Two predecessors, eight directions; as `sgm_case`, or with the ranges of a town."""
     heights = city_lattice(SGM_SIDE) if count == "city" else lattice(SGM_SIDE, count)
-    rng = np.random.default_rng(5)
-    cost = rng.integers(0, 129, heights.size).astype(np.uint8)
-    p2 = rng.integers(60, 240, (4, SGM_SIDE, SGM_SIDE)).astype(np.uint16)
-    total = np.zeros(heights.size, np.uint16)
+    cost, p2, total = sums_scene(SGM_SIDE, heights)
 
     def call():
         for turn in range(4):
             sweep_quarter(cost, heights.ranges, heights.address, BLOCK, p2, np.uint16(20), turn, total)
 
-    timed(benchmark, call, heights.size, "cell-step")
+    return Case(call, heights.size, "cell-step")
+
+
+def winners_case(count: int | None) -> Case:
+    """Minima of sums."""
+    heights = lattice(SGM_SIDE, count)
+    total = np.random.default_rng(5).integers(100, 2000, heights.size).astype(np.uint16)
+    shape = heights.shape
+    best, second = np.empty(shape, np.int32), np.empty(shape, np.int32)
+    margin, vertex = np.empty(shape, np.uint16), np.empty(shape, np.float32)
+
+    def call():
+        winners(total, heights.ranges, heights.address, BLOCK, best, second, margin, vertex)
+
+    return Case(call, heights.size, "cell-step")
+
+
+def profile_case() -> Case:
+    """The measure at five offsets around a surface, 9 x 9, three views."""
+    half, offsets = 4, np.linspace(-0.75, 0.75, 5).astype(np.float32)
+    surface, seen, scene = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
+    out = np.empty((1, len(offsets), SIDE, SIDE), np.float32)
+
+    def call():
+        tile_profile(*scene, surface, offsets, BLOCK, half, seen, np.float32(0), out)
+
+    return Case(call, out.size * 3, "cell, offset and image")
+
+
+def smooth_case() -> Case:
+    """One pass of 25 taps, two cells apart."""
+    surface = rolling()
+    by_row, by_col, out = np.empty_like(surface), np.empty_like(surface), np.empty_like(surface)
+    slopes(surface, 8, by_row, by_col)
+    return Case(lambda: smooth_surface(surface, by_row, by_col, 2, np.float32(2.0), out), surface.size, "cell")
+
+
+def visibility_case(by_col: float = 0.4, by_row: float = 0.2) -> Case:
+    """What hides a surface from a view; the sweep goes by column where the view looks rather along rows."""
+    surface = rolling()
+    out = np.empty_like(surface)
+    return Case(lambda: lowest_visible(surface, by_col, by_row, out), surface.size, "cell")
+
+
+def reach_case() -> Case:
+    """A block that the borders of three views cross at every one of 64 heights, so that each is judged cell by cell."""
+    pixels, layout, nodes, heights = views(3)
+    layout[:, 2] = 48 + BLOCK // 2
+    span = np.array([0, 64])
+    lowest, highest = np.empty((3, BLOCK, BLOCK), np.int32), np.empty((3, BLOCK, BLOCK), np.int32)
+    blocked, none = np.zeros(pixels.shape, bool), np.zeros(3, bool)
+    nodes = np.ascontiguousarray(nodes[:, :2, :2])
+
+    def call():
+        for _ in range(50):
+            block_reach(blocked, none, layout, nodes, heights, span, BLOCK, 3.0, lowest, highest)
+
+    return Case(call, 50 * span[1] * lowest.size, "cell, step and image")
+
+
+def spline_case() -> Case:
+    """Coefficients of an image."""
+    image = np.random.default_rng(7).normal(size=(1200, 1000)).astype(np.float32)
+    return Case(lambda: spline_coefficients(image), image.size, "pixel")
+
+
+def ortho_case() -> Case:
+    """One view on a surface, bilinear."""
+    surface, scene, out = rolling(), views(1), np.empty((SIDE, SIDE), np.float32)
+    return Case(lambda: tile_ortho(*scene, surface, 0, BLOCK, out), out.size, "cell")
+
+
+def test_resample(benchmark):
+    timed(benchmark, resample_case())
+
+
+@pytest.mark.parametrize(
+    ("n_views", "windows", "weight"),
+    [(2, [3], 0.0), (3, [1, 2], 0.0), (3, [1, 2], 1.0), (6, [1, 2], 1.0)],
+    ids=["2-views-7x7", "3-views-3x3-5x5", "3-views-3x3-5x5-greys", "6-views-3x3-5x5-greys"],
+)
+def test_costs(benchmark, n_views, windows, weight):
+    case = costs_case(n_views, windows, weight)
+    seconds = timed(benchmark, case)
+    if windows == [3]:
+        benchmark.extra_info["resample_ncc_ns"] = seconds / case.n * 1e9
+
+
+@pytest.mark.parametrize("count", [16, 32, 64, 128, None], ids=["16", "32", "64", "128", "ragged"])
+def test_sgm(benchmark, count):
+    case = sgm_case(count)
+    seconds = timed(benchmark, case)
+    if count == 64:
+        benchmark.extra_info["sgm_cell_steps_per_s"] = case.n / seconds
+        benchmark.extra_info["opencv_hh_cell_steps_per_s"] = opencv_speed(SGM_SIDE, count)
+
+
+@pytest.mark.parametrize("count", [16, 32, 64, None, "city"], ids=["16", "32", "64", "ragged", "city"])
+def test_mgm(benchmark, count):
+    timed(benchmark, mgm_case(count))
 
 
 def opencv_speed(side: int, n_disparities: int) -> float:
@@ -192,35 +298,29 @@ def opencv_speed(side: int, n_disparities: int) -> float:
 
 @pytest.mark.parametrize("count", [32, None], ids=["32", "ragged"])
 def test_winners(benchmark, count):
-    heights = lattice(SGM_SIDE, count)
-    total = np.random.default_rng(5).integers(100, 2000, heights.size).astype(np.uint16)
-    shape = heights.shape
-    best, second = np.empty(shape, np.int32), np.empty(shape, np.int32)
-    margin, vertex = np.empty(shape, np.uint16), np.empty(shape, np.float32)
-
-    def call():
-        winners(total, heights.ranges, heights.address, BLOCK, best, second, margin, vertex)
-
-    timed(benchmark, call, heights.size, "cell-step")
+    timed(benchmark, winners_case(count))
 
 
 def test_profile(benchmark):
-    half, offsets = 4, np.linspace(-0.75, 0.75, 5).astype(np.float32)
-    surface, seen, scene = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
-    out = np.empty((1, len(offsets), SIDE, SIDE), np.float32)
-
-    def call():
-        tile_profile(*scene, surface, offsets, BLOCK, half, seen, np.float32(0), out)
-
-    timed(benchmark, call, out.size * 3, "cell, offset and image")
+    timed(benchmark, profile_case())
 
 
 def test_smooth(benchmark):
     surface = rolling()
-    timed(benchmark, lambda: smoothed(surface, 2.0), surface.size, "cell")
+    timed(benchmark, Case(lambda: smoothed(surface, 2.0), surface.size, "cell"))
 
 
 def test_visibility(benchmark):
-    surface = rolling()
-    out = np.empty_like(surface)
-    timed(benchmark, lambda: lowest_visible(surface, 0.4, 0.2, out), surface.size, "cell")
+    timed(benchmark, visibility_case())
+
+
+def test_reach(benchmark):
+    timed(benchmark, reach_case())
+
+
+def test_spline(benchmark):
+    timed(benchmark, spline_case())
+
+
+def test_ortho(benchmark):
+    timed(benchmark, ortho_case())

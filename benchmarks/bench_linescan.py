@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench_kernels import timed
+from bench_kernels import Case, timed
 from zlocus.sensors.linescan import LineScanModel, LineTimes
 from zlocus.sensors.space import EarthSpace, FrameSpace
 from zlocus.synthetic.linescan import SPEED_M_S, focal_line, sampled
@@ -29,16 +29,16 @@ def scanner():
 
 def test_image_from_ground(benchmark, scanner):
     _, model, xyz = scanner
-    timed(benchmark, lambda: model.image_from_ground(xyz), len(xyz), "point")
+    timed(benchmark, Case(lambda: model.image_from_ground(xyz), len(xyz), "point"))
 
 
 def test_ground_from_image(benchmark, scanner):
     _, model, xyz = scanner
     xy = model.image_from_ground(xyz)
-    timed(benchmark, lambda: model.ground_from_image(xy, xyz[:, 2]), len(xyz), "point")
+    timed(benchmark, Case(lambda: model.ground_from_image(xy, xyz[:, 2]), len(xyz), "point"))
 
 
 def test_to_the_earth(benchmark, scanner):
     """What geocentric rays add to `image_from_ground`: projected coordinates to geocentric ones."""
     spec, _, xyz = scanner
-    timed(benchmark, lambda: EarthSpace(spec.crs).cartesian_from_ground(xyz), len(xyz), "point")
+    timed(benchmark, Case(lambda: EarthSpace(spec.crs).cartesian_from_ground(xyz), len(xyz), "point"))

@@ -94,7 +94,7 @@ def test_nothing_in_common_gives_no_range():
 def ground(xyz, sigma_m=0.3):
     """An orientation that knows ground points only."""
     seen = Observations(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
-    return Orientation((), (), xyz, np.full(len(xyz), sigma_m), seen, "shift", 0, (0.0, 1000.0))
+    return Orientation((), (), xyz, np.full(len(xyz), sigma_m), seen, "shift", 0, (0.0, 1000.0), len(xyz))
 
 
 def test_the_range_keeps_a_tower_and_drops_lone_wrong_heights():

@@ -49,7 +49,7 @@ def oriented(scene: Scene) -> Orientation:
     nothing = Residuals.of(np.zeros((0, 2)))
     views = tuple(ViewOrientation(v.name, (0.0, 0.0), 3, nothing, nothing) for v in scene.views)
     sigma = np.array([0.1, np.nan, np.nan])
-    return Orientation(views, (), xyz, sigma, seen, "shift", 6, HEIGHTS)
+    return Orientation(views, (), xyz, sigma, seen, "shift", 6, HEIGHTS, len(xyz))
 
 
 def test_ties_come_back(scene, tmp_path):

@@ -110,7 +110,8 @@ def test_every_sign_has_a_curve_and_every_cell_a_sigma():
     ],
 )
 def test_worse_signs_give_a_larger_sigma(better, worse):
+    """Each alone, others unchanged: signs that go together share the effect between them."""
     small, large = (
         sigma(refined(**{k: np.full(SHAPE, v, np.float32) for k, v in one.items()}))[INNER] for one in (better, worse)
     )
-    assert (large > 1.1 * small).all()
+    assert (large > 1.05 * small).all()

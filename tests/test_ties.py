@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,14 +13,14 @@ from orientation_scenes import AffineSensor, ArrayImage, hill, hill_scene, image
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
 from zlocus.orientation import features as features_module
-from zlocus.orientation.features import Features, detect, part_grid
+from zlocus.orientation.features import Features, detect, part_grid, reduction
 from zlocus.orientation.locus import Loci
 from zlocus.orientation.ties import PairMatches, find_ties, join_tracks, match_near_loci, widest_range
 from zlocus.sensors.correction import ShiftedModel
 
 OPTIONS = OrientationOptions(features_per_mpx=20000)
 FULL_DETAIL = OrientationOptions(features_per_mpx=100000, full_detail_mpx=100.0)
-HALVED = OrientationOptions(features_per_mpx=100000, full_detail_mpx=0.0)
+REDUCED = OrientationOptions(features_per_mpx=100000, full_detail_mpx=0.05)
 
 
 def everywhere(shape):
@@ -38,9 +39,9 @@ def blobs(size, sigma_px, spacing, seed=0):
     return image, centres
 
 
-@pytest.mark.parametrize(("options", "sigma_px"), [(FULL_DETAIL, 2.0), (HALVED, 4.0)])
+@pytest.mark.parametrize(("options", "sigma_px"), [(FULL_DETAIL, 2.0), (REDUCED, 4.0)])
 def test_positions_have_no_offset(options, sigma_px):
-    """(0, 0) is the centre of the first pixel, whether or not the image was halved."""
+    """(0, 0) is the centre of the first pixel, whether or not the image was reduced."""
     image, centres = blobs(240, sigma_px, 40)
     found = detect(image_of(image), everywhere(image.shape), options)
     offset = found.xy[:, None] - centres
@@ -58,6 +59,15 @@ def test_features_do_not_depend_on_gain_and_offset(gain):
     two = detect(image_of(image * gain + 7.0), everywhere(image.shape), OPTIONS)
     assert len(one) > 300
     assert abs(len(two) - len(one)) < 0.02 * len(one)
+
+
+def test_work_grows_with_the_square_root_of_the_pixels():
+    options = OrientationOptions()
+    assert reduction((500, 500), options) == 1.0
+    side = math.sqrt(options.full_detail_mpx * 1e6) + 1.0
+    assert reduction((side, side), options) == pytest.approx(2.0, abs=0.01)
+    looked_at = [n * n / reduction((n, n), options) ** 2 for n in (1000, 4000, 16000)]
+    assert np.diff(np.log2(looked_at)) == pytest.approx(2.0, abs=0.05)
 
 
 def test_the_edge_of_nodata_gives_no_features():
@@ -96,7 +106,7 @@ def test_large_images_are_read_part_by_part_and_features_spread(monkeypatch):
     image[:, :350] *= 4.0  # the stronger half must not take all the features
     watched = Watched(image.astype(np.float32), np.ones(image.shape, bool), [])
     found = detect(watched, everywhere(image.shape), replace(OPTIONS, features_per_image=1600))
-    assert max(watched.sizes) <= (234 + 2 * features_module.HALO_PX) ** 2
+    assert max(watched.sizes) <= (234 + 2 * math.ceil(features_module.HALO_PX * reduction(image.shape, OPTIONS))) ** 2
     assert 1000 < len(found) <= 1700
     left = (found.xy[:, 0] < 350).mean()
     assert 0.3 < left < 0.7

@@ -50,11 +50,21 @@ class OrientationOptions(Checked):
 
     model: str = option("shift", "Correction per image: a shift, or none.", choices=("shift", "none"))
     features_per_mpx: int = option(
-        5000, "SIFT features kept per megapixel, the strongest of each part.", low=100, high=100000
-    )
+        3000, "SIFT features kept of an image of one megapixel, the strongest of each part; four times as many pixels "
+        "give twice as many.", low=100, high=100000,
+    )  # fmt: skip
     features_per_image: int = option(30000, "SIFT features kept per image, at most.", low=100, high=10000000)
     full_detail_mpx: float = option(
-        0.6, "Images above this size are halved for SIFT, which costs no accuracy.", low=0.0, high=1e6, unit="Mpx"
+        0.6, "Images above this size are halved for SIFT, and reduced further by the fourth root of how far above it "
+        "they are: the pixels that SIFT looks at grow with the square root of the image's.",
+        low=1e-3, high=1e6, unit="Mpx",
+    )  # fmt: skip
+    patch_px: int = option(
+        9, "Side of the patch by which each tie is measured again in the images as they are.", low=5, high=51,
+        unit="px",
+    )  # fmt: skip
+    least_ncc: float = option(
+        0.7, "Correlation of such patches below which an observation says nothing of the pointing.", low=0.0, high=1.0
     )
     match_ratio: float = option(
         0.8, "Descriptor distance of a match over that of its best rival, at most.", low=0.1, high=1.0
@@ -162,9 +172,9 @@ class SemiGlobalOptions(Checked):
         None, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower); unset: 1 "
         "where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
-    p1: int = option(28, "Penalty of a neighbour one step away.", low=0, high=1000)
+    p1: int = option(45, "Penalty of a neighbour one step away.", low=0, high=1000)
     p2: int = option(400, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
-    p2_edge: int = option(30, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
+    p2_edge: int = option(45, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
     level_easing: float = option(
         0.85, "Penalties of jumps are eased by this at every coarser level, where a roof has fewer cells.",
         low=0.1, high=1.0,

@@ -180,7 +180,10 @@ def settle(ready: OrientedScene, reference: str, options: RunConfig) -> tuple[Im
     span = None if ready.z_range is None else hypotheses_of_heights(space, ready.z_range)
     if span is None:
         span = hypotheses_of_ties(space, ties[known & ready.trusted], options.orientation)
-    return space, settle_image(space, span, ties[known], options.pyramid)
+    n_measured = ready.orientation.n_measured
+    ground = ties[:n_measured]
+    ground = ground[np.isfinite(ground).all(axis=1)]
+    return space, settle_image(space, span, ties[known], options.pyramid, ground)
 
 
 def match_images(

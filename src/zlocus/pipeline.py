@@ -119,8 +119,9 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         z_range = _searched_heights(request, corrected, orientation, config, progress)
         grid = _grid(request, like, corrected, z_range)
         settled = settle(
-            corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid
-        )
+            corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
+            orientation.measured,
+        )  # fmt: skip
         settled = _with_dem(request, settled, scene.crs, config)
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
         workers = _workers(request, settled, config)

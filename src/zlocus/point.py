@@ -66,7 +66,9 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
     z = sum(z_range) / 2
     cell_m = request.resolution or float(f"{median_ground_pixel(ready, z):.2g}")
     check_resolution(cell_m, ready, z, "--resolution")
-    settled = settle(ready, cell_m, (0.0, 0.0), z_range, orientation.xyz, request.reference, config.pyramid)
+    settled = settle(
+        ready, cell_m, (0.0, 0.0), z_range, orientation.xyz, request.reference, config.pyramid, orientation.measured
+    )
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     place = located(request, settled, ties)
     check_shown(request, place.xyz, [view.name for view in settled.views if shows(view, place.xyz)], settled)

@@ -21,7 +21,7 @@ from zlocus.options import RunConfig
 from zlocus.scene import ImageWindow, View
 from zlocus.sensors.model import FloatArray
 
-GROUPS = ("match", "refine")
+GROUPS = ("orient", "match", "refine")
 SIDE = 96
 
 
@@ -83,8 +83,28 @@ def tiny_scene() -> MatchScene:
     )  # fmt: skip
 
 
+def warm_orientation(scene: MatchScene) -> None:
+    """Run the kernels of the orientation once."""
+    from zlocus.orientation.features import DESCRIPTOR_LENGTH, Features
+    from zlocus.orientation.locus import trace
+    from zlocus.orientation.sharpen import sharpened
+    from zlocus.orientation.ties import match_near_loci
+    from zlocus.orientation.triangulate import Observations, ground_jacobian
+
+    sensors, options = [view.sensor for view in scene.views], RunConfig().orientation
+    xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
+    features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
+    loci = trace(sensors[0], sensors[1], xy, (0.0, 1.0))
+    for moved in (loci, loci.moved(np.zeros(2))):
+        match_near_loci(moved, features.only(point), features, options.inlier_px, options.match_ratio)
+    seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
+    ground = sensors[0].ground_from_image(xy, np.zeros(4))
+    sharpened(scene.views, seen, ground_jacobian(sensors, seen, ground), options)
+
+
 def warm(group: str) -> None:
-    """Run a group of kernels once: `match` is everything up to the finest level's heights, `refine` what follows."""
+    """Run a group of kernels once: `orient` those of the orientation, `match` everything up to the finest level's
+    heights, `refine` what follows."""
     from zlocus import tile
     from zlocus.kernels.spline import spline_coefficients
     from zlocus.matching.refine import refine
@@ -92,6 +112,9 @@ def warm(group: str) -> None:
     from zlocus.matching.views import read_pixels, tile_views
 
     scene, config = tiny_scene(), RunConfig()
+    if group == "orient":
+        warm_orientation(scene)
+        return
     if group == "match":
         without = replace(config, refine=replace(config.refine, rounds=0))
         tile.match_tile(scene, scene.seen, without)

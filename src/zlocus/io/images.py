@@ -63,13 +63,20 @@ class RasterImage:
         pixels = np.zeros((int(window.height), int(window.width)), np.float32)
         valid = np.ones(pixels.shape, bool)
         for band, weight in zip(self.bands, self.weights, strict=True):
-            values = source.read(band, window=window, out_dtype=np.float32)
-            finite = np.isfinite(values)
-            valid &= finite
-            values[~finite] = 0.0
+            stored = source.read(band, window=window)
+            values = stored.astype(np.float32)
+            if stored.dtype.kind == "f":
+                finite = np.isfinite(values)
+                valid &= finite
+                values[~finite] = 0.0
             pixels += values if weight == 1.0 else np.float32(weight) * values
-        valid &= self._mask(source, window)
-        pixels[~valid] = 0.0
+        plain = len(self.bands) == 1 and stored.dtype.kind in "iu"
+        if plain and source.mask_flag_enums[self.bands[0] - 1] == [MaskFlags.nodata]:
+            valid = stored != source.nodata  # as GDAL masks it, without reading the band again
+        else:
+            valid &= self._mask(source, window)
+        if not valid.all():
+            pixels[~valid] = 0.0
         return ImageWindow(pixels, valid)
 
     def _mask(self, source: rasterio.DatasetReader, window: Window) -> NDArray[np.bool_]:

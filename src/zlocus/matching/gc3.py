@@ -146,12 +146,17 @@ def depth_rays(view: View, others: list[View]) -> DepthRays:
 
 
 def settle_image(
-    space: ImageSpace, z_range: tuple[float, float], ties: FloatArray, options: PyramidOptions
+    space: ImageSpace,
+    z_range: tuple[float, float],
+    ties: FloatArray,
+    options: PyramidOptions,
+    ground: FloatArray | None = None,
 ) -> MatchScene:
     """Lattice of hypotheses, levels and extent of a reference image.
 
     z_range : hypotheses, to which a few steps are added at both ends, for a peak there needs its neighbours; ties :
-    (n, 3), column, minus row, hypothesis. See `MatchScene`.
+    (n, 3), column, minus row, hypothesis; ground : (k, 3), those where grey values compare, None: all. See
+    `MatchScene`.
     """
     rows, cols = space.reference.image.shape
     views = tuple(bordered(view) for view in space.views)
@@ -167,7 +172,7 @@ def settle_image(
         n_steps=n_steps,
         levels=levels,
         seen=seen_window((-0.5, 0.5 - rows, cols - 0.5, 0.5), ANCHOR, 1.0, levels),
-        grey=grey_scales(views, ties),
+        grey=grey_scales(views, ties if ground is None else ground),
         ties=ties,
     )
 

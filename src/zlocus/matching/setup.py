@@ -207,8 +207,12 @@ def settle(
     ties: NDArray[np.float64],
     reference: str | None,
     options: PyramidOptions,
+    ground: NDArray[np.float64] | None = None,
 ) -> MatchScene:
-    """Lattice of heights, levels and extent of a scene. z_range : m; ties : (n, 3) m; see `MatchScene`."""
+    """Lattice of heights, levels and extent of a scene.
+
+    z_range : m; ties : (n, 3) m; see `MatchScene`. ground : (k, 3) m, where grey values compare; None: at the ties.
+    """
     z = (z_range[0] + z_range[1]) / 2
     views = leading_first(scene, z, reference)
     step = height_step(views, z, cell_m, options.max_shift_px)
@@ -223,6 +227,6 @@ def settle(
         n_steps=n_steps,
         levels=levels,
         seen=seen_window(shared_ground(scene, z_range), anchor, cell_m, levels),
-        grey=grey_scales(views, ties),
+        grey=grey_scales(views, ties if ground is None else ground),
         ties=ties,
     )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.options import OrientationOptions
 from zlocus.orientation.triangulate import GroundPoints, Observations, point_covariance, summed, triangulate
@@ -28,7 +29,7 @@ class Adjustment:
 
     shift_px : (i, 2) column and row to add to what each model projects; n_seen: how many of the 2 i components the ties
     show, the rest stay at zero; seen, points: the ties kept and their ground points with the shifts; before_px : (m, 2)
-    residuals of those ties with the models as delivered.
+    residuals of those ties with the models as delivered; numbers : (n,) which of the ties given are kept.
     """
 
     shift_px: FloatArray
@@ -36,6 +37,7 @@ class Adjustment:
     seen: Observations
     points: GroundPoints
     before_px: FloatArray
+    numbers: NDArray[np.int64]
 
     @property
     def after_px(self) -> FloatArray:
@@ -57,10 +59,11 @@ def adjust(
             shift, n_seen = solve_shifts(sensors, seen, xyz, options.prior_px, shift)
         points = triangulate(sensors, moved(seen, shift), xyz)
         seen, xyz = consistent(seen, points, options.inlier_px), points.xyz
+    numbers = np.unique(seen.point)
     seen, xyz = renumbered(seen, xyz)
     points = triangulate(sensors, moved(seen, shift), xyz)
     before = triangulate(sensors, seen, points.xyz, by_ground=points.by_ground)
-    return Adjustment(shift, n_seen, seen, points, before.residual)
+    return Adjustment(shift, n_seen, seen, points, before.residual, numbers)
 
 
 def solve_shifts(

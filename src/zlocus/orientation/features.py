@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -14,10 +15,11 @@ from zlocus.scene import ImageSource, ImageWindow
 from zlocus.sensors.model import FloatArray
 
 PART_PX = 1024
-HALO_PX = 32
+HALO_PX = 16  # of the reduced image
 STRETCH_PERCENT = (0.5, 99.5)
 CONTRAST_THRESHOLD = 0.02
 DESCRIPTOR_LENGTH = 128
+WHOLLY = 0.999  # valid share of what a reduced pixel covers
 
 
 @dataclass(frozen=True)
@@ -38,26 +40,39 @@ class Features:
 def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOptions) -> Features:
     """SIFT features of the wanted parts of an image, the strongest of each part.
 
-    wanted : (r, c) bool, one entry per part, as `part_grid` numbers them. Images larger than `full_detail_mpx` are
-    halved first: four times less work, and the shifts of the rendered hills come out as near the truth (0.04 px).
+    wanted : (r, c) bool, one entry per part, as `part_grid` numbers them. Large images are reduced first, see
+    `reduction`.
     """
     rows, cols = image.shape
     area_mpx = rows * cols / 1e6
-    halved = area_mpx > options.full_detail_mpx
-    per_mpx = min(options.features_per_mpx, options.features_per_image / area_mpx)
+    factor = reduction(image.shape, options)
+    halo = math.ceil(HALO_PX * factor)
+    per_mpx = min(options.features_per_mpx * math.sqrt(area_mpx), options.features_per_image) / area_mpx
     xys, descriptors = [np.empty((0, 2))], [np.empty((0, DESCRIPTOR_LENGTH), np.float32)]
     for part, core in parts(image.shape):
         if not wanted[part]:
             continue
-        row, col = max(core[0] - HALO_PX, 0), max(core[1] - HALO_PX, 0)
-        window = image.read(row, col, min(core[2] + HALO_PX, rows) - row, min(core[3] + HALO_PX, cols) - col)
+        row, col = max(core[0] - halo, 0), max(core[1] - halo, 0)
+        window = image.read(row, col, min(core[2] + halo, rows) - row, min(core[3] + halo, cols) - col)
         limit = int(np.ceil(per_mpx * window.valid.size / 1e6))
-        xy, descriptor = detect_window(window, limit, halved)
+        xy, descriptor = detect_window(window, limit, factor)
         xy = xy + np.array([col, row])
         inside = (xy >= np.array([core[1], core[0]]) - 0.5) & (xy < np.array([core[3], core[2]]) - 0.5)
-        xys.append(xy[inside.all(axis=1)])
-        descriptors.append(descriptor[inside.all(axis=1)])
+        kept = np.flatnonzero(inside.all(axis=1))
+        kept = kept[: math.ceil(per_mpx * (core[2] - core[0]) * (core[3] - core[1]) / 1e6)]
+        xys.append(xy[kept])
+        descriptors.append(descriptor[kept])
     return Features(np.concatenate(xys), np.concatenate(descriptors))
+
+
+def reduction(shape: tuple[int, int], options: OrientationOptions) -> float:
+    """How many pixels along an image become one for SIFT.
+
+    1 up to `full_detail_mpx`, 2 just above it, 3.3 at 4.4 Mpx, 10 at 400: work grows with the square root of the image.
+    What the reduced image cannot tell comes back when ties are measured again, see `sharpen`.
+    """
+    ratio = shape[0] * shape[1] / 1e6 / options.full_detail_mpx
+    return 1.0 if ratio <= 1.0 else 2.0 * ratio**0.25
 
 
 def part_grid(shape: tuple[int, int]) -> tuple[int, int]:
@@ -75,28 +90,38 @@ def parts(shape: tuple[int, int]) -> Iterator[tuple[tuple[int, int], tuple[int, 
             yield (i, j), (int(row_edges[i]), int(col_edges[j]), int(row_edges[i + 1]), int(col_edges[j + 1]))
 
 
-def detect_window(window: ImageWindow, limit: int, halved: bool) -> tuple[FloatArray, NDArray[np.float32]]:
-    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), at most `limit` of them.
+def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
+    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), the strongest first, at most `limit`.
+
+    factor : by which the window is reduced first, see `reduction`.
 
     `enable_precise_upscale` matters: without it OpenCV's positions are 0.25 px too large in both axes, because of how
     it doubles the image. Descriptors are compared as square roots (Arandjelovic and Zisserman 2012, section 2).
     """
+    full = np.array(window.pixels.shape[::-1])
+    size = np.maximum(np.round(full / factor).astype(int), 1)
+    window = window if factor == 1.0 else reduced(window, size)
     pixels, valid = stretched(window), window.valid
-    if halved:
-        even = (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2)
-        size = (even[1] // 2, even[0] // 2)
-        pixels = np.asarray(cv2.resize(pixels[: even[0], : even[1]], size, interpolation=cv2.INTER_AREA))
-        valid = valid[: even[0] : 2, : even[1] : 2] & valid[1 : even[0] : 2, 1 : even[1] : 2]
     sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True)
     keypoints, found = sift.detectAndCompute(pixels, None)
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), np.float32)
+    strongest = np.argsort([-k.response for k in keypoints], kind="stable")
+    keypoints, found = [keypoints[k] for k in strongest], found[strongest]
     xy = np.array([k.pt for k in keypoints])
     size_px = np.array([k.size for k in keypoints])
     keep = far_from_nodata(xy, size_px, valid)
     descriptors = np.sqrt(found[keep] / np.maximum(found[keep].sum(axis=1, keepdims=True), 1e-12))
-    xy = xy[keep] * 2.0 + 0.5 if halved else xy[keep]
-    return xy, descriptors.astype(np.float32)
+    return (xy[keep] + 0.5) * (full / size) - 0.5, descriptors.astype(np.float32)
+
+
+def reduced(window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
+    """The window with fewer pixels, (columns, rows), each the mean over its area, valid where all of that is."""
+    pixels = np.asarray(cv2.resize(window.pixels, size.tolist(), interpolation=cv2.INTER_AREA))
+    if window.valid.all():
+        return ImageWindow(pixels, np.ones(pixels.shape, bool))
+    valid = cv2.resize(window.valid.astype(np.float32), size.tolist(), interpolation=cv2.INTER_AREA)
+    return ImageWindow(pixels, valid > WHOLLY)
 
 
 def stretched(window: ImageWindow) -> NDArray[np.uint8]:

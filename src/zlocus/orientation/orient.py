@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,21 +12,25 @@ from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
-from zlocus.orientation.adjust import Adjustment, adjust
+from zlocus.orientation.adjust import Adjustment, adjust, consistent, moved, renumbered
 from zlocus.orientation.locus import locate
-from zlocus.orientation.ties import Progress, Ties, find_ties
-from zlocus.orientation.triangulate import Observations
+from zlocus.orientation.sharpen import sharpened
+from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
+from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, triangulate
 from zlocus.scene import Scene, View
 from zlocus.sensors.correction import ShiftedModel
-from zlocus.sensors.model import FloatArray
+from zlocus.sensors.model import FloatArray, SensorModel
 
 CLOSE_BY = 0.15
 FEWEST_FOR_RANGE = 20
+ENOUGH_FOR_MEDIAN = 200  # ties of a pair whose distances are reported, about: up to twice as many
 NEIGHBOURS = 8
 SUPPORTERS = 3
 STEEPEST = 1.5
 HEIGHT_SIGMAS = 4.0
 RANGE_PERCENT = (0.5, 99.5)
+# Of `inlier_px`, for ties that were measured again.
+MEASURED_SHARE = 0.5
 KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex), which is not a random one
 
 
@@ -78,7 +83,8 @@ class Orientation:
 
     xyz : (n, 3) m, ground points of the ties with the shifts applied; sigma_z_m : (n,) their height precision;
     seen: their observations; model: the kind of correction; n_seen: how many of the shifts' 2 i components the ties
-    could show; z_bounds: the heights (m) within which ties were looked for.
+    could show; z_bounds: the heights (m) within which ties were looked for; n_measured: the first so many ties were
+    measured again and agree, the others look different from everywhere, see `with_rough_ties`.
     """
 
     views: tuple[ViewOrientation, ...]
@@ -89,6 +95,12 @@ class Orientation:
     model: str
     n_seen: int
     z_bounds: tuple[float, float]
+    n_measured: int
+
+    @property
+    def measured(self) -> FloatArray:
+        """(k, 3) m, the ties that look the same in the images that see them."""
+        return self.xyz[: self.n_measured]
 
     def apply(self, scene: Scene) -> Scene:
         """The scene with corrected sensors."""
@@ -144,25 +156,71 @@ def orient(
     z_range_hint: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Orientation:
-    """Tie points, then one shift per image, solved with the heights of the ties.
+    """Tie points, measured again by correlation, then one shift per image, solved with the heights of the ties.
 
     z_range_hint: heights in m that hold the ground, where they are known; else the scene's.
     """
     ties = find_ties(scene, options, z_range_hint, progress)
     sensors = [view.sensor for view in scene.views]
-    adjusted = adjust(sensors, ties.seen, first_ground(scene, ties), options)
+    xyz = first_ground(scene, ties)
+    seen = sharpened(scene.views, ties.seen, ground_jacobian(sensors, ties.seen, xyz), options)
+    strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
+    adjusted = adjust(sensors, seen, xyz, strict)
+    ground = with_rough_ties(adjusted, sensors, ties.seen, xyz, options.inlier_px * looseness(scene.views, options))
     views = tuple(view_orientation(view, i, adjusted) for i, view in enumerate(scene.views))
-    sigma_px = np.sqrt(np.mean(adjusted.after_px**2)) if len(adjusted.seen) else np.nan
     return Orientation(
         views=views,
         pairs=pair_orientations(scene, adjusted, ties.z_range),
-        xyz=adjusted.points.xyz,
-        sigma_z_m=adjusted.points.sigma_z * sigma_px,
-        seen=adjusted.seen,
+        xyz=ground.xyz,
+        sigma_z_m=ground.sigma_z_m,
+        seen=ground.seen,
         model=options.model,
         n_seen=adjusted.n_seen,
         z_bounds=ties.z_range,
+        n_measured=len(adjusted.points.xyz),
     )
+
+
+@dataclass(frozen=True)
+class TiePoints:
+    """xyz : (n, 3) m; sigma_z_m : (n,), their height precision; seen: their observations."""
+
+    xyz: FloatArray
+    sigma_z_m: FloatArray
+    seen: Observations
+
+    @classmethod
+    def of(cls, points: GroundPoints, seen: Observations) -> TiePoints:
+        """Triangulated points with the noise that their residuals show."""
+        sigma_px = np.sqrt(np.mean(points.residual**2)) if len(seen) else np.nan
+        return cls(points.xyz, points.sigma_z * sigma_px, seen)
+
+
+def with_rough_ties(
+    adjusted: Adjustment, sensors: Sequence[SensorModel], every: Observations, xyz: FloatArray, inlier_px: float
+) -> TiePoints:
+    """The adjusted ties, then those that could not be measured again, or not well enough to tell the pointing.
+
+    Tree tops and edges of roofs look different from everywhere: as SIFT found them they still tell where the search
+    has to reach. every, xyz : all ties, observations and first ground points (n, 3) m.
+    """
+    precise = TiePoints.of(adjusted.points, adjusted.seen)
+    used = np.zeros(len(xyz), bool)
+    used[adjusted.numbers] = True
+    rough, start = renumbered(every.kept(~used[every.point]), xyz)
+    if not len(rough):
+        return precise
+    moved_rough = moved(rough, adjusted.shift_px)
+    rough, start = renumbered(consistent(rough, triangulate(sensors, moved_rough, start), inlier_px), start)
+    if not len(rough):
+        return precise
+    more = TiePoints.of(triangulate(sensors, moved(rough, adjusted.shift_px), start), rough)
+    seen = Observations(
+        np.concatenate([precise.seen.view, rough.view]),
+        np.concatenate([precise.seen.point, rough.point + len(precise.xyz)]),
+        np.concatenate([precise.seen.xy, rough.xy]),
+    )
+    return TiePoints(np.concatenate([precise.xyz, more.xyz]), np.concatenate([precise.sigma_z_m, more.sigma_z_m]), seen)
 
 
 def first_ground(scene: Scene, ties: Ties) -> FloatArray:
@@ -185,21 +243,22 @@ def view_orientation(view: View, number: int, adjusted: Adjustment) -> ViewOrien
 
 
 def pair_orientations(scene: Scene, adjusted: Adjustment, z_range: tuple[float, float]) -> tuple[PairOrientation, ...]:
-    """Each pair's distances from the loci, over the ties that both its images see."""
+    """Each pair's distances from the loci, over ties that both its images see."""
     seen, found = adjusted.seen, []
     row_of = np.full((len(scene.views), len(adjusted.points.xyz)), -1)
     row_of[seen.view, seen.point] = np.arange(len(seen))
     for a in range(len(scene.views)):
         for b in range(a + 1, len(scene.views)):
-            both = (row_of[a] >= 0) & (row_of[b] >= 0)
-            if not both.any():
+            both = np.flatnonzero((row_of[a] >= 0) & (row_of[b] >= 0))
+            if not len(both):
                 continue  # such a pair has nothing to report
-            in_a, in_b = seen.xy[row_of[a][both]], seen.xy[row_of[b][both]]
+            few = both[:: max(len(both) // ENOUGH_FOR_MEDIAN, 1)]
+            in_a, in_b = seen.xy[row_of[a][few]], seen.xy[row_of[b][few]]
             sensors = scene.views[a].sensor, scene.views[b].sensor
             before = locate(*sensors, in_a, in_b, z_range).across_px
             after = locate(*sensors, in_a - adjusted.shift_px[a], in_b - adjusted.shift_px[b], z_range).across_px
             names = (scene.views[a].name, scene.views[b].name)
-            found.append(PairOrientation(names, int(both.sum()), median_distance(before), median_distance(after)))
+            found.append(PairOrientation(names, len(both), median_distance(before), median_distance(after)))
     return tuple(found)
 
 

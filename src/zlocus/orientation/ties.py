@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
+from zlocus.kernels.descriptors import nearest_descriptors
 from zlocus.options import OrientationOptions
-from zlocus.orientation.features import Features, detect, part_grid, parts
+from zlocus.orientation.features import Features, detect, part_grid, parts, reduction
 from zlocus.orientation.locus import Loci, locate, trace
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.triangulate import Observations
@@ -20,9 +21,6 @@ from zlocus.sensors.model import FloatArray, lowest_station
 
 Progress = Callable[[str, float], None]
 
-BLOCK_PX = 128.0
-UNRELATED_DISTANCE = 0.9  # between RootSIFT descriptors of different ground; random pairs measure 0.9 to 1.2
-SAME_PLACE_PX = 2.0
 SAMPLE = 1000  # features of a pair's first search
 # Loci of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
 DEPTH_RATIO = 1.5
@@ -155,9 +153,11 @@ def match_pair(
     z_ranges : heights (m) that are looked at one after the other; that with the most matches counts.
 
     Twice: first a sample of the features within `max_pointing_px` of the loci; then, with the shift and the heights
-    found, all features within twice `inlier_px`, where fewer rivals let more matches through.
+    found, all features within twice `inlier_px`, where fewer rivals let more matches through. In reduced images the
+    distance counts by `looseness`.
     """
     a, b = pair
+    inlier_px = options.inlier_px * looseness([views[a], views[b]], options)
     sensors = views[a].sensor, views[b].sensor
     xy_a, xy_b = features[a].xy, features[b].xy
     sample = np.arange(0, len(xy_a), max(len(xy_a) // SAMPLE, 1))
@@ -170,21 +170,26 @@ def match_pair(
             continue
         first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
         here = locate(*sensors, xy_a[sample[first]], xy_b[second], z_range)
-        shift = find_shift(here, max_px, options.inlier_px)
+        shift = find_shift(here, max_px, inlier_px)
         if pointing is None or shift.inliers.sum() > pointing.inliers.sum():
             pointing, found = shift, here
     if pointing is None or found is None or not pointing.is_certain(options.min_ties):
         return empty
-    likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * options.inlier_px
+    likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * inlier_px
     loci = trace(*sensors, xy_a, likely).moved(pointing.shift_px)
     first, second = match_near_loci(loci, features[a], features[b], near_px, options.match_ratio)
     moved_b = xy_b[second] - pointing.shift_px
-    rest = find_shift(locate(*sensors, xy_a[first], moved_b, likely), near_px, options.inlier_px)
+    rest = find_shift(locate(*sensors, xy_a[first], moved_b, likely), near_px, inlier_px)
     if not rest.is_certain(options.min_ties):
         return empty
     keep = rest.inliers
     found = locate(*sensors, xy_a[first[keep]], xy_b[second[keep]], likely)
     return PairMatches(pair, first[keep], second[keep], found.z, len(first), pointing.shift_px + rest.shift_px)
+
+
+def looseness(views: Sequence[View], options: OrientationOptions) -> float:
+    """How much farther than in halved images features may lie from their loci: with the reduction they blur."""
+    return max(1.0, *(reduction(view.image.shape, options) / 2.0 for view in views))
 
 
 def likely_range(z: FloatArray) -> tuple[float, float]:
@@ -202,85 +207,15 @@ def match_near_loci(
     """Feature numbers (k,), (k,) of mutual best matches at most `max_px` from their locus.
 
     A match is taken where its descriptor distance is below `ratio` times that of the best rival elsewhere near
-    the locus. Features are compared block by block, so time grows with their number, not its square.
+    the locus. Features are looked up in cells of a grid, so time grows with their number, not its square.
     """
-    best_of_a = np.full(len(in_a), -1)
-    sure_of_a = np.zeros(len(in_a), bool)
-    best_of_b = np.full(len(in_b), -1)
-    closest_of_b = np.full(len(in_b), np.inf)
-    low, high = loci.low, loci.high
-    x_b, y_b = np.ascontiguousarray(in_b.xy.T)
-    for block in blocks_along(low, high):
-        left, top = np.minimum(low[block], high[block]).min(axis=0) - max_px
-        right, bottom = np.maximum(low[block], high[block]).max(axis=0) + max_px
-        near = np.flatnonzero((x_b >= left) & (x_b <= right) & (y_b >= top) & (y_b <= bottom))
-        if not len(near):
-            continue
-        allowed = near_segments(low[block], high[block], in_b.xy[near], max_px)
-        distance = descriptor_distances(in_a.descriptors[block], in_b.descriptors[near], allowed)
-        best, sure = best_and_sure(distance, in_b.xy[near], ratio)
-        best_of_a[block] = near[best]
-        sure_of_a[block] = sure
-        closest = distance.argmin(axis=0)
-        closer = distance[closest, np.arange(len(near))] < closest_of_b[near]
-        closest_of_b[near[closer]] = distance[closest[closer], np.flatnonzero(closer)]
-        best_of_b[near[closer]] = block[closest[closer]]
-    first = np.flatnonzero(sure_of_a)
+    best_of_a, best_of_b = np.empty(len(in_a), np.int64), np.empty(len(in_b), np.int64)
+    nearest_descriptors(
+        loci.low, loci.high, in_a.descriptors, in_b.xy, in_b.descriptors, max_px, ratio, best_of_a, best_of_b
+    )
+    first = np.flatnonzero(best_of_a >= 0)
     first = first[best_of_b[best_of_a[first]] == first]
     return first, best_of_a[first]
-
-
-def blocks_along(low: FloatArray, high: FloatArray) -> list[NDArray[np.int64]]:
-    """Groups of loci (row numbers) whose middles lie in the same cell of a coarse grid; NaN loci are left out."""
-    usable = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1))
-    if not len(usable):
-        return []
-    cell = np.floor((low[usable] + high[usable]) / (2.0 * BLOCK_PX)).astype(np.int64)
-    _, number = np.unique(cell, axis=0, return_inverse=True)
-    order = np.argsort(number, kind="stable")
-    return np.split(usable[order], np.flatnonzero(np.diff(number[order])) + 1)
-
-
-def near_segments(low: FloatArray, high: FloatArray, xy: FloatArray, max_px: float) -> NDArray[np.bool_]:
-    """(n, k) whether points xy (k, 2) lie within `max_px` along and across of segments (n, 2) to (n, 2) px."""
-    chord = high - low
-    length = np.hypot(*chord.T)
-    unit = (chord / np.maximum(length, 1e-9)[:, None]).astype(np.float32)
-    x = (xy[:, 0] - low[:, :1]).astype(np.float32)
-    y = (xy[:, 1] - low[:, 1:]).astype(np.float32)
-    along = x * unit[:, :1] + y * unit[:, 1:]
-    across = x * unit[:, 1:] - y * unit[:, :1]
-    return np.asarray((np.abs(across) <= max_px) & (along >= -max_px) & (along <= length[:, None] + max_px))
-
-
-def best_and_sure(
-    distance: NDArray[np.float32], xy: FloatArray, ratio: float
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Each row's nearest candidate (n,) and whether it clearly beats the best one at another place.
-
-    distance : (n, k), inf where not allowed; xy : (k, 2) px of the candidates.
-    """
-    rows = np.arange(len(distance))
-    best = distance.argmin(axis=1)
-    nearest = distance[rows, best]
-    x, y = xy.astype(np.float32).T
-    same_place = (np.abs(x[best, None] - x) <= SAME_PLACE_PX) & (np.abs(y[best, None] - y) <= SAME_PLACE_PX)
-    rival = np.where(same_place, np.float32(np.inf), distance).min(axis=1)
-    return best, nearest < ratio * np.minimum(rival, UNRELATED_DISTANCE)
-
-
-def descriptor_distances(
-    a: NDArray[np.float32], b: NDArray[np.float32], allowed: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Euclidean distances (n, k) of unit vectors a (n, 128) and b (k, 128); inf where not allowed (n, k).
-
-    Only the allowed ones, a few in a hundred, are computed: cheaper than a whole matrix product, and it wakes no
-    threads of the linear algebra library.
-    """
-    distance = np.full(allowed.shape, np.inf, np.float32)
-    row, col = np.nonzero(allowed)
-    distance[row, col] = np.sqrt(np.maximum(2.0 - 2.0 * np.einsum("nk,nk->n", a[row], b[col]), 0.0))
-    return distance
 
 
 def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_range: tuple[float, float]) -> Ties:
