@@ -56,7 +56,8 @@ SPIKE = np.ones((3, 3), np.uint8)
 class LevelResult:
     """What one level hands to the next: its window, heights, and between which heights views cover and see each cell.
 
-    seen and heights are in height indices of the level's lattice, whatever base surface they were found along.
+    seen, heights and lone are in height indices of the level's lattice, whatever base surface they were found along.
+    lone : (r, c) int32, heights of the least costs, each cell by itself; None at the finest level.
     evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
     """
 
@@ -66,6 +67,7 @@ class LevelResult:
     lattice: HeightLattice
     seen: NDArray[np.int32]
     heights: SemiGlobalHeights
+    lone: NDArray[np.int32] | None
     evaluations: int
     all_views: int
 
@@ -278,8 +280,9 @@ def _match_level(
     else:
         p2, step_cells = penalties(ortho, shape, level, config.semiglobal), scene.step_m / scene.cell_m
         heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal)
+    lone = alone(cost, lattice).above(base.cells).best if level else None
     worth = above_base(worth, base.cells)
-    return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), done, all_views)
+    return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), lone, done, all_views)
 
 
 def _choose(
@@ -366,13 +369,17 @@ def _doubled(values: NDArray[np.float32], source: CellWindow, target: CellWindow
 def _candidates(
     scene: MatchScene, coarser: LevelResult, window: CellWindow, level: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest height index worth a look in every cell: best, near rivals and tie points."""
+    """Lowest and highest height index worth a look in every cell: best, near rivals, tie points, and what a cell would
+    choose if its neighbours had no say.
+
+    The last is what keeps a tower of few coarse cells, or a crown, which the semi-global constraint levels there.
+    """
     heights = coarser.heights
+    assert coarser.lone is not None
     known = covers(coarser.seen).sum(axis=0) >= 2
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
-    low = np.minimum(heights.best, rival).astype(np.float32)
-    high = np.maximum(heights.best, rival).astype(np.float32)
-    low, high = _without_spikes(low, high, known)
+    found = np.stack([heights.best, rival, coarser.lone])
+    low, high = _without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
     low, high = (2 * _doubled(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):
         side = scene.cell_m * 2**level
