@@ -16,6 +16,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
+from zlocus.matching.planes import PlanarHeights, with_planes
 from zlocus.matching.ranges import UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
@@ -39,11 +40,12 @@ from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
 from zlocus.surface.precision import sigma_steps, signs_of_precision
-from zlocus.surface.reasons import is_empty
+from zlocus.surface.reasons import Quality, is_empty
 from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
+PLAIN_IN = 2  # views in which plain segments are looked for, one after the other
 STRIDE = 2  # cells between those that are looked at for the views that cover them
 FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
 # What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's; less where
@@ -59,6 +61,7 @@ class LevelResult:
     seen, heights and lone are in height indices of the level's lattice, whatever base surface they were found along.
     lone : (r, c) int32, heights of the least costs, each cell by itself; None at the finest level.
     evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
+    is_planar : (r, c) cells whose heights are those of planes through plain segments.
     """
 
     level: int
@@ -70,6 +73,7 @@ class LevelResult:
     lone: NDArray[np.int32] | None
     evaluations: int
     all_views: int
+    is_planar: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,8 @@ def match_tile(
         guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
         result = _match_level(scene, pixels, window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
+    if method != "mvll":
+        result = _with_planes(result, config)
     surface = _finish(scene, pixels, result, config)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
@@ -409,6 +415,16 @@ def _without_spikes(
     return np.where(known, np.minimum(floor, top), nothing), np.where(known, np.maximum(floor, top), nothing)
 
 
+def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
+    """The finest level with planes where the leading views show plain segments."""
+    heights, block = result.heights, config.pyramid.block
+    planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
+    for view in range(min(len(result.views.layout), PLAIN_IN)):
+        ortho = _ortho(result.views, planar.height, block, view)
+        planar = with_planes(result.views, ortho, planar, result.seen, block, config.planes)
+    return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
+
+
 def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:
     """Refine the finest level and judge it, halo included."""
     block = config.pyramid.block
@@ -421,14 +437,17 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
         heights=result.views.heights,
     )
     refined = refine(
-        coefficients, result.heights.vertex, result.seen, block, scene.step_m / scene.cell_m, config.refine
-    )
+        coefficients, result.heights.vertex, result.seen, block, scene.step_m / scene.cell_m, config.refine,
+        result.is_planar,
+    )  # fmt: skip
     at = refined.height[None]
     covering = covers(result.seen).sum(axis=0)
     seeing = sees(result.seen, at).sum(axis=0)
     last = scene.n_steps - 1
     signs = signs_of_precision(result.heights, refined, seeing)
     quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)
+    if result.is_planar is not None:
+        quality[result.is_planar] |= np.uint16(Quality.PLANE)
     height = result.lattice.metres(refined.height)
     sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan

@@ -24,6 +24,7 @@ class Quality(IntFlag):
     UNREFINED = 2048  # height to a fraction of a step only: sub-step refinement did not converge
     FILLED = 4096  # no match: interpolated from its neighbours
     DISPUTED = 8192  # two halves of the pairs of images find different heights around
+    PLANE = 16384  # too plain to be matched alone: height of a plane fitted to all of a plain segment
 
 
 EMPTY = (
