@@ -74,23 +74,27 @@ def test_a_block_that_nobody_saw_searches_the_least():
     assert (lattice.first[3:, 3:] == 0).all()
 
 
-def coarse_result(best, second, margin, window):
+def coarse_result(best, second, margin, lone, window):
     heights = SimpleNamespace(best=best, second=second, margin=margin)
     seen = np.zeros((3, 3, *best.shape), np.int32)
     seen[1] = 100
-    return SimpleNamespace(window=window, heights=heights, seen=seen)
+    return SimpleNamespace(window=window, heights=heights, lone=lone, seen=seen)
 
 
-def candidates(second_at, margin_at, ties=(), side=3):
-    """Candidates on 40 x 40 cells above 24 x 24 coarse ones, whose best index is 20; `side` x `side` have a rival."""
+def candidates(second_at, margin_at, ties=(), side=3, lone_at=20):
+    """Candidates on 40 x 40 cells above 24 x 24 coarse ones, whose best index is 20.
+
+    `side` x `side` have a rival, and other least costs.
+    """
     coarse = CellWindow(-2, -2, 24, 24)
     best = np.full((24, 24), 20, np.int32)
-    second, margin = best.copy(), np.full((24, 24), 65535, np.uint16)
-    second[10 : 10 + side, 12 : 12 + side], margin[10 : 10 + side, 12 : 12 + side] = second_at, margin_at
+    second, lone, margin = best.copy(), best.copy(), np.full((24, 24), 65535, np.uint16)
+    some = np.s_[10 : 10 + side, 12 : 12 + side]
+    second[some], margin[some], lone[some] = second_at, margin_at, lone_at
     scene = SimpleNamespace(
         ties=np.array(ties, float).reshape(-1, 3), cell_m=0.5, anchor=(1000.0, 2000.0), origin_m=10.0, step_m=0.25
     )
-    return _candidates(scene, coarse_result(best, second, margin, coarse), CellWindow(0, 0, 40, 40), 1)
+    return _candidates(scene, coarse_result(best, second, margin, lone, coarse), CellWindow(0, 0, 40, 40), 1)
 
 
 def test_a_near_rival_is_a_candidate():
@@ -101,6 +105,16 @@ def test_a_near_rival_is_a_candidate():
     low, high = candidates(5, RIVALS_KEPT - 1)
     assert (low == 10).sum() == 36
     assert (high == 40).all()
+
+
+def test_what_cells_would_choose_alone_is_a_candidate():
+    """However much more their neighbours make it cost; but not where fewer cells agree than make a tower."""
+    low, high = candidates(55, RIVALS_KEPT, lone_at=50)
+    assert (high[16:22, 20:26] == 100).all()
+    assert (high == 100).sum() == 36
+    assert (low == 40).all()
+    assert (candidates(55, RIVALS_KEPT, lone_at=5)[0] == 10).sum() == 36
+    assert (candidates(55, RIVALS_KEPT, lone_at=50, side=2)[1] == 40).all()
 
 
 @pytest.mark.parametrize("second_at", [55, 5])

@@ -209,6 +209,40 @@ class RefineOptions(Checked):
 
 
 @dataclass(frozen=True)
+class PlaneOptions(Checked):
+    """Planes in place of the heights of plain segments, such as roofs without texture (method section 6)."""
+
+    texture: float = option(
+        0.4, "Grey deviation below which a cell is plain, as a share of the tile's median; 0: no planes.",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    least_cells: int = option(60, "Cells of a plain segment, at least.", low=10, high=100000)
+    most_cells: int = option(20000, "Cells of a plain segment, at most.", low=10, high=1000000)
+    longest_cells: float = option(
+        160.0, "Longer side of a plain segment, at most: a street follows the ground.", low=4.0, high=1e4, unit="cells"
+    )
+    least_filled: float = option(
+        0.6, "Share of a rectangle of its extent that a plain segment fills, at least.", low=0.0, high=1.0
+    )
+    noise: float = option(
+        0.3, "Grey difference between views that says little, as a share of the tile's median deviation.",
+        low=0.01, high=10.0,
+    )  # fmt: skip
+    most_cost: float = option(
+        0.2, "A segment is plain, and a plane right, where views differ by less than this within, in noise squared.",
+        low=0.0, high=10.0,
+    )  # fmt: skip
+    near_steps: float = option(
+        3.0, "A height confirms a plane that is nearer than this.", low=0.1, high=100.0, unit="steps"
+    )
+    least_near: float = option(
+        0.8, "Share of the cells that confirm a plane, at least; half of them where the views agree better on it.",
+        low=0.5, high=1.0,
+    )  # fmt: skip
+    most_slope_steps: float = option(0.8, "Slope of a plane, at most, in steps per cell.", low=0.0, high=100.0)
+
+
+@dataclass(frozen=True)
 class SelectionOptions(Checked):
     """Which search images a cell is matched with, in which order, and when they are enough (method sections 2 to 4)."""
 
@@ -329,4 +363,5 @@ class RunConfig(Checked):
     selection: SelectionOptions = group(SelectionOptions, "Which images a block is matched with.")
     semiglobal: SemiGlobalOptions = group(SemiGlobalOptions, "Semi-global constraint.")
     refine: RefineOptions = group(RefineOptions, "Sub-step refinement.")
+    planes: PlaneOptions = group(PlaneOptions, "Planes through plain segments.")
     checks: CheckOptions = group(CheckOptions, "Empty and doubtful cells.")

@@ -16,6 +16,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
+from zlocus.matching.planes import PlanarHeights, with_planes
 from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
@@ -44,6 +45,7 @@ from zlocus.surface.surface import Surface
 
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
+PLAIN_IN = 2  # views in which plain segments are looked for, one after the other
 STRIDE = 2  # cells between those that are looked at for the views that cover them
 FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
 # What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's; less where
@@ -56,8 +58,10 @@ SPIKE = np.ones((3, 3), np.uint8)
 class LevelResult:
     """What one level hands to the next: its window, heights, and between which heights views cover and see each cell.
 
-    seen and heights are in height indices of the level's lattice, whatever base surface they were found along.
+    seen, heights and lone are in height indices of the level's lattice, whatever base surface they were found along.
+    lone : (r, c) int32, heights of the least costs, each cell by itself; None at the finest level.
     evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
+    is_planar : (r, c) cells whose heights are those of planes through plain segments.
     """
 
     level: int
@@ -66,8 +70,10 @@ class LevelResult:
     lattice: HeightLattice
     seen: NDArray[np.int32]
     heights: SemiGlobalHeights
+    lone: NDArray[np.int32] | None
     evaluations: int
     all_views: int
+    is_planar: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,8 @@ def match_tile(
         guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
         result = _match_level(scene, pixels, window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
+    if method != "mvll":
+        result = _with_planes(result, config)
     surface = _finish(scene, pixels, result, config)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
@@ -292,8 +300,9 @@ def _match_level(
     else:
         p2, step_cells = penalties(ortho, shape, level, config.semiglobal), scene.step_m / scene.cell_m
         heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal)
+    lone = alone(cost, lattice).above(base.cells).best if level else None
     worth = above_base(worth, base.cells)
-    return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), done, all_views)
+    return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), lone, done, all_views)
 
 
 def _needed_heights(
@@ -394,13 +403,17 @@ def _doubled(values: NDArray[np.float32], source: CellWindow, target: CellWindow
 def _candidates(
     scene: MatchScene, coarser: LevelResult, window: CellWindow, level: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest height index worth a look in every cell: best, near rivals and tie points."""
+    """Lowest and highest height index worth a look in every cell: best, near rivals, tie points, and what a cell would
+    choose if its neighbours had no say.
+
+    The last is what keeps a tower of few coarse cells, or a crown, which the semi-global constraint levels there.
+    """
     heights = coarser.heights
+    assert coarser.lone is not None
     known = covers(coarser.seen).sum(axis=0) >= 2
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
-    low = np.minimum(heights.best, rival).astype(np.float32)
-    high = np.maximum(heights.best, rival).astype(np.float32)
-    low, high = _without_spikes(low, high, known)
+    found = np.stack([heights.best, rival, coarser.lone])
+    low, high = _without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
     low, high = (2 * _doubled(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):
         side = scene.cell_m * 2**level
@@ -430,11 +443,23 @@ def _without_spikes(
     return np.where(known, np.minimum(floor, top), nothing), np.where(known, np.maximum(floor, top), nothing)
 
 
+def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
+    """The finest level with planes where the leading views show plain segments."""
+    heights = result.heights
+    planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
+    for view in range(min(len(result.views.layout), PLAIN_IN)):
+        ortho = _ortho(result.views, planar.height, view)
+        planar = with_planes(result.views, ortho, planar, result.seen, config.planes)
+    return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
+
+
 def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:
     """Refine the finest level and judge it, halo included."""
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
     coefficients = replace(result.views, pixels=splines)
-    refined = refine(coefficients, result.heights.vertex, result.seen, scene.step_m / scene.cell_m, config.refine)
+    refined = refine(
+        coefficients, result.heights.vertex, result.seen, scene.step_m / scene.cell_m, config.refine, result.is_planar
+    )
     at = refined.height[None]
     covering = covers(result.seen).sum(axis=0)
     seeing = sees(result.seen, at).sum(axis=0)
@@ -442,6 +467,8 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
     signs = signs_of_precision(result.heights, refined, seeing)
     quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)
     quality[left_out(result.views, quality.shape)] |= np.uint16(Quality.LEFT_OUT)
+    if result.is_planar is not None:
+        quality[result.is_planar] |= np.uint16(Quality.PLANE)
     height = result.lattice.metres(refined.height)
     sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan

@@ -61,13 +61,15 @@ def refine(
     seen: NDArray[np.int32],
     step_cells: float,
     options: RefineOptions,
+    fixed: NDArray[np.bool_] | None = None,
 ) -> RefinedHeights:
     """Refine height indices `coarse` (r, c) float32.
 
     coefficients : the views with cubic B-spline coefficients for pixels. Each round smooths the surface, measures the
     mean NCC at a few fractions of a step around it and puts a parabola through the best three. Windows that follow a
     noisy surface would see a different place in each image, hence the smoothing; a refined height further than
-    `reach_steps` from the semi-global one is not believed. step_cells : height of a step over the side of a cell.
+    `reach_steps` from the semi-global one is not believed. step_cells : height of a step over the side of a cell;
+    fixed : (r, c), cells that are measured like the others and keep their heights.
     """
     half = (options.window or default_window(step_cells)) // 2
     height, is_refined = coarse.astype(np.float32), np.zeros(coarse.shape, bool)
@@ -90,7 +92,7 @@ def refine(
             bend, apart = bend_at_centre(profile[middle], spacing), peaks_apart(profiles[:, middle], spacing)
         found += surface
         is_refined = inside & (np.abs(found - coarse) < options.reach_steps)
-        height = np.where(is_refined, found, height)
+        height = np.where(is_refined if fixed is None else is_refined & ~fixed, found, height)
     return RefinedHeights(height, best, is_refined, surface, bend, apart, (2 * half + 1) ** 2)
 
 

@@ -25,6 +25,7 @@ class Quality(IntFlag):
     FILLED = 4096  # no match: interpolated from its neighbours
     DISPUTED = 8192  # two halves of the pairs of images find different heights around
     LEFT_OUT = 16384  # an image that may show the cell took no part: it sees it too obliquely for the tables
+    PLANE = 32768  # too plain to be matched alone: height of a plane fitted to all of a plain segment
 
 
 EMPTY = (
