@@ -19,7 +19,7 @@ import pytest
 from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.reach import block_reach
 from zlocus.kernels.refine import tile_ortho, tile_profile
-from zlocus.kernels.resample import RUN, resample_plane
+from zlocus.kernels.resample import resample_plane
 from zlocus.kernels.sgm import sweep, winners
 from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.kernels.spline import spline_coefficients
@@ -119,13 +119,14 @@ def resample_case() -> Case:
     pixels, layout, _, _ = views(1)
     side = BLOCK + 6
     grid = np.array([60.3, 60.7, 0.99, 0.01, -0.02, 1.01, 0.0, 0.0])
-    index, fraction, cells = np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32), flat_cells((side, side))
+    n, cells = side * side, flat_cells((side, side))
+    index, fraction, pairs = np.empty(n, np.uint32), np.empty((2, n), np.float32), np.empty((2, n), np.complex64)
     relief, out = np.zeros(side * side, np.float32), np.empty(side * side, np.float32)
     velocity = np.array([0.5, 0.1], np.float32)
 
     def call():
         for _ in range(500):
-            resample_plane(pixels, layout[0], grid, cells, relief, velocity, index, fraction, out)
+            resample_plane(pixels, layout[0], grid, cells, relief, velocity, index, fraction, pairs, out)
 
     return Case(call, 500 * side * side, "sample")
 

@@ -31,12 +31,13 @@ KERNELS = all_kernels()
 
 
 DTYPES = {"f4": types.float32, "f8": types.float64, "i4": types.int32, "i8": types.int64, "u1": types.uint8,
-          "u2": types.uint16, "u4": types.uint32, "b1": types.boolean}  # fmt: skip
+          "u2": types.uint16, "u4": types.uint32, "u8": types.uint64, "c8": types.complex64,
+          "b1": types.boolean}  # fmt: skip
 
 
 def promised(comment):
     """Numba types of the arguments and of the result that a comment names."""
-    arguments, result = ([typed(*part) for part in re.findall(r"(?:\(([^)]*)\) )?(None|[fiub]\d)", side)]
+    arguments, result = ([typed(*part) for part in re.findall(r"(?:\(([^)]*)\) )?(None|[fiubc]\d)", side)]
                          for side in comment.split(" -> "))  # fmt: skip
     return tuple(arguments), result[0]
 

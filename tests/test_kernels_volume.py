@@ -22,10 +22,13 @@ from zlocus.kernels.agreement import (
     row_sums,
     window_moments,
 )
-from zlocus.kernels.resample import RUN, resample_plane
+from zlocus.kernels.resample import resample_plane
 from zlocus.kernels.volume import (
+    NOTHING,
+    WHOLE,
     block_costs,
     block_relief,
+    extent_at,
     flat_cells,
     flat_visibility,
     height_ranges,
@@ -35,6 +38,7 @@ from zlocus.kernels.volume import (
     shown_at,
     taking_part,
     tile_costs,
+    whole_views,
 )
 
 # Bilinear values of images with a spread of 1.4 grey values: positions are float32 within some 60 px of their origin.
@@ -112,13 +116,16 @@ def partly_seen(scene, seed=1):
     return seen
 
 
-def resampled(scene, view, b, d, t, relief, half):
+def resampled(scene, view, b, d, t, relief, half, run=100):
     nodes, cells = scene.nodes[:, b : b + 2, d : d + 2], flat_cells(relief.shape)
     grid, velocity = np.empty(8), np.empty(2, np.float32)
     plane_grid(nodes, view, t, scene.block, half, grid)
     plane_velocity(nodes, view, t, scene.heights[1], velocity)
-    out, index, fraction = np.empty(relief.size, np.float32), np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32)
-    resample_plane(scene.pixels, scene.layout[view], grid, cells, relief.ravel(), velocity, index, fraction, out)
+    out, index, fraction = np.empty(relief.size, np.float32), np.empty(run, np.uint32), np.empty((2, run), np.float32)
+    resample_plane(
+        scene.pixels, scene.layout[view], grid, cells, relief.ravel(), velocity, index, fraction,
+        np.empty((2, run), np.complex64), out,
+    )  # fmt: skip
     return out.reshape(relief.shape)
 
 
@@ -209,7 +216,7 @@ def test_box_sums(windows):
     out, done = np.empty(flat.shape[1], np.float32), 0
     for window in windows:
         column_moments(flat[0], half, done, window, width, n + SLACK, down[0], down[1])
-        column_products(flat[0], flat[1], half, done, window, width, n + SLACK, down[2])
+        column_products(flat, np.uint64(0), np.uint64(1), half, done, window, width, n + SLACK, down[2])
         trim = half - window
         a, b = planes[:, trim : rows + half + window, trim : cols + half + window].astype(float)
         for sums, expected in zip(down, (a, a * a, a * b), strict=True):
@@ -233,12 +240,13 @@ def flat_ncc(planes, half, floor=0.0):
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.3])
-@pytest.mark.parametrize("n_views", [2, 5])
-def test_pairs_against_plain_ncc(n_views, floor):
-    planes = np.random.default_rng(3).normal(size=(n_views, 15, 18)).astype(np.float32)
+@pytest.mark.parametrize(("n_views", "half"), [(2, 2), (5, 2), (2, 1), (3, 1), (4, 1), (5, 1), (8, 1), (4, 3)])
+def test_pairs_against_plain_ncc(n_views, half, floor):
+    """Also of couples of views, which windows of 3 x 3 are compared by."""
+    planes = np.random.default_rng(3).normal(size=(n_views, 11 + 2 * half, 14 + 2 * half)).astype(np.float32)
     everyone = np.ones((n_views, 11, 14), bool)
-    expected = twin.mean_ncc(planes, (everyone, everyone), 2, floor) * n_views * (n_views - 1) / 2
-    np.testing.assert_allclose(flat_ncc(planes, 2, floor), expected, rtol=0, atol=NCC * n_views**2)
+    expected = twin.mean_ncc(planes, (everyone, everyone), half, floor) * n_views * (n_views - 1) / 2
+    np.testing.assert_allclose(flat_ncc(planes, half, floor), expected, rtol=0, atol=NCC * n_views**2)
 
 
 @pytest.mark.parametrize("n_views", [2, 5])
@@ -371,13 +379,13 @@ def test_order_of_images_does_not_matter():
 
 def test_views_shown_at_a_height():
     """Shown from where nothing hides it, within what the image covers; covered whether hidden or not."""
-    bounds = np.array([[0, 5, 6, HIDDEN, 0], [9, 5, 9, -1, 4], [0, 5, 0, 0, 0]], np.int32)
+    bounds = np.array([[[0, 5, 6, HIDDEN, 0], [9, 5, 9, -1, 4], [0, 5, 0, 0, 0]]], np.int32)
     shown, counts = np.full(5, 7.0, np.float32), np.stack([np.arange(5), np.arange(10, 15)]).astype(np.float32)
-    shown_at(bounds, np.int32(5), 5, shown, counts)
+    shown_at(bounds, 0, np.int32(5), 5, shown, counts)
     np.testing.assert_array_equal(shown, [1, 1, 0, 0, 0])
     np.testing.assert_array_equal(counts, [[1, 2, 2, 3, 4], [11, 12, 12, 13, 14]])
-    bounds = np.array([[0, 0], [9, 9], [5, 6]], np.int32)
-    shown_at(bounds, np.int32(5), 2, shown, counts)
+    bounds = np.array([np.zeros((3, 2)), [[0, 0], [9, 9], [5, 6]]], np.int32)
+    shown_at(bounds, 1, np.int32(5), 2, shown, counts)
     np.testing.assert_array_equal(shown[:2], [1, 0])
     np.testing.assert_array_equal(counts[:, :2], [[2, 3], [12, 12]])
 
@@ -402,19 +410,27 @@ def test_heights_of_a_block_that_a_view_covers_and_shows():
     seen = partly_seen(kernel_scene(3, (10, 12), 16))
     seen[:, 0] = np.array([3, 30, 7])[:, None, None]
     seen[0, 0, 4, 5], seen[1, 0, 9, 11], seen[2, 0, 0, 0] = 8, 25, 9
-    ranges = np.empty((3, 4), np.int32)
-    height_ranges(seen, ranges)
-    np.testing.assert_array_equal(ranges[0], [3, 30, 9, 25])
+    ranges = height_ranges(seen)
+    np.testing.assert_array_equal(ranges[0], [3, 30, 9, 25, 7])
     low, high, visible = seen.reshape(3, 3, -1)
     np.testing.assert_array_equal(ranges[:, 0], low.min(axis=1))
     np.testing.assert_array_equal(ranges[:, 1], high.max(axis=1))
     np.testing.assert_array_equal(ranges[:, 2], np.maximum(low, visible).max(axis=1))
     np.testing.assert_array_equal(ranges[:, 3], high.min(axis=1))
+    np.testing.assert_array_equal(ranges[:, 4], np.maximum(low, visible).min(axis=1))
+    heights = np.arange(-2, 60)
+    shown = (np.maximum(low, visible)[..., None] <= heights) & (heights <= high[..., None])
+    found = np.array([[extent_at(ranges, view, np.int32(h)) for h in heights] for view in range(3)])
+    np.testing.assert_array_equal(found == WHOLE, shown.all(axis=1))
+    assert not shown.any(axis=1)[found == NOTHING].any()
+    assert (found == NOTHING).any()
+    takes = np.array([0, 2])
+    assert [whole_views(ranges, takes, np.int32(h)) for h in heights] == list(shown[takes].all(axis=1).sum(axis=0))
 
 
 def test_views_that_take_part():
     """Of heights 5 to 20: covering up to 4, from 21 on, all, one, and none at all."""
-    ranges = np.zeros((5, 4), np.int32)
+    ranges = np.zeros((5, 5), np.int32)
     ranges[:, :2] = [(0, 4), (21, 30), (0, 30), (20, 20), (HIDDEN, -1)]
     np.testing.assert_array_equal(taking_part(ranges, np.array([5, 16])), [2, 3])
     assert not taking_part(ranges, np.array([-40, 16])).size

@@ -54,35 +54,45 @@ def row_sums(a, half, n, out):
 def column_moments(plane, half, done, window, width, n, sums, squares):
     """Vertical sums of values and squares over 2 window + 1 rows around row `half` below each of the first n places.
 
-    done : `sums` and `squares` hold those over 2 done + 1 rows already; 0 if they hold nothing. A slice a row leaves no
-    index to be checked.
+    done : `sums` and `squares` hold those over 2 done + 1 rows already; 0 if they hold nothing. Places beyond an offset
+    are counted without sign, which leaves no index to be checked; a slice a row would too, but is counted by its owner.
     """
     if done == 0:
-        a, b, c = plane[(half - 1) * width :], plane[half * width :], plane[(half + 1) * width :]
-        for j in range(n):
-            sums[j] = a[j] + b[j] + c[j]
-            squares[j] = a[j] * a[j] + b[j] * b[j] + c[j] * c[j]
+        p, q, r = np.uint64((half - 1) * width), np.uint64(half * width), np.uint64((half + 1) * width)
+        for j in range(np.uint64(n)):
+            a, b, c = plane[p + j], plane[q + j], plane[r + j]
+            sums[j] = a + b + c
+            squares[j] = a * a + b * b + c * c
     for k in range(max(done, 1) + 1, window + 1):
-        a, b = plane[(half - k) * width :], plane[(half + k) * width :]
+        above, below = plane[(half - k) * width :], plane[(half + k) * width :]
         for j in range(n):
-            sums[j] += a[j] + b[j]
-            squares[j] += a[j] * a[j] + b[j] * b[j]
+            sums[j] += above[j] + below[j]
+            squares[j] += above[j] * above[j] + below[j] * below[j]
 
 
-# (p,) f4, (p,) f4, i8, i8, i8, i8, i8, (p,) f4 -> None
+# (i,p) f4, u8, u8, i8, i8, i8, i8, i8, (p,) f4 -> None
 @kernel
-def column_products(x, y, half, done, window, width, n, sums):
-    """As `column_moments`, of the products of two planes."""
+def column_products(planes, a, b, half, done, window, width, n, sums):
+    """As `column_moments`, of the products of planes a and b."""
     if done == 0:
-        a, b, c = x[(half - 1) * width :], x[half * width :], x[(half + 1) * width :]
-        d, e, f = y[(half - 1) * width :], y[half * width :], y[(half + 1) * width :]
-        for j in range(n):
-            sums[j] = a[j] * d[j] + b[j] * e[j] + c[j] * f[j]
+        p, q, r = np.uint64((half - 1) * width), np.uint64(half * width), np.uint64((half + 1) * width)
+        for j in range(np.uint64(n)):
+            first, second = planes[a, p + j] * planes[b, p + j], planes[a, q + j] * planes[b, q + j]
+            sums[j] = first + second + planes[a, r + j] * planes[b, r + j]
+    x, y = planes[a], planes[b]
     for k in range(max(done, 1) + 1, window + 1):
-        a, b = x[(half - k) * width :], x[(half + k) * width :]
-        d, e = y[(half - k) * width :], y[(half + k) * width :]
+        c, d, e, f = x[(half - k) * width :], x[(half + k) * width :], y[(half - k) * width :], y[(half + k) * width :]
         for j in range(n):
-            sums[j] += a[j] * d[j] + b[j] * e[j]
+            sums[j] += c[j] * e[j] + d[j] * f[j]
+
+
+# f4, f4, f4 -> f4
+@kernel
+def inverse_norm(value, square, added):
+    """1 / sqrt(square - value^2 + added), and 0 of an even window."""
+    spread = square - value * value
+    unit = np.float32(1.0) / np.sqrt(max(spread, np.float32(0.0)) + added)
+    return np.float32(0.0) if spread <= EVEN * square else unit
 
 
 # (p,) f4, (w,) i8, i8, i8, f4, (4,p) f4, (w,p) f4, (w,p) f4 -> None
@@ -95,71 +105,112 @@ def window_moments(plane, windows, width, n, floor, work, mean, scale):
     times sqrt(m), m = (2 window + 1)^2; scale : (w, p), 1 / sqrt(sum (x - mean)^2 + m floor), and 0 where the window is
     even (it agrees with none); work : (4, p), scratch.
     """
-    half, done = windows[-1], 0
-    sums, squares, total, square = work[0], work[1], work[2], work[3]
+    half, done, sums, squares, total, square = windows[-1], 0, work[0], work[1], work[2], work[3]
     for w in range(windows.shape[0]):
-        window = windows[w]
+        window, level, norm = windows[w], mean[w], scale[w]
         side = np.float32(2 * window + 1)
         inverse, added = np.float32(1.0) / side, side * side * floor + TINY
         column_moments(plane, half, done, window, width, n + SLACK, sums, squares)
-        row_sums(sums[half - window :], window, n, total)
-        row_sums(squares[half - window :], window, n, square)
-        level, norm = mean[w], scale[w]
-        for j in range(n):
-            value = total[j] * inverse
-            spread = square[j] - value * value
-            is_even = spread <= EVEN * square[j]
-            level[j] = value
-            unit = np.float32(1.0) / np.sqrt(max(spread, np.float32(0.0)) + added)
-            norm[j] = np.float32(0.0) if is_even else unit
+        x, y = sums[half - window :], squares[half - window :]
+        if window == 1:
+            for j in range(n):
+                level[j] = (x[j] + x[j + 1] + x[j + 2]) * inverse
+                norm[j] = inverse_norm(level[j], y[j] + y[j + 1] + y[j + 2], added)
+        elif window == 2:
+            for j in range(n):
+                level[j] = (x[j] + x[j + 1] + x[j + 2] + x[j + 3] + x[j + 4]) * inverse
+                norm[j] = inverse_norm(level[j], y[j] + y[j + 1] + y[j + 2] + y[j + 3] + y[j + 4], added)
+        else:
+            row_sums(x, window, n, total)
+            row_sums(y, window, n, square)
+            for j in range(n):
+                level[j] = total[j] * inverse
+                norm[j] = inverse_norm(level[j], square[j], added)
         done = window
 
 
-# (p,) f4, i8, i8, (p,) f4, (p,) f4, (p,) f4, (p,) f4, (p,) f4, (p,) f4 -> None
+# (p,) f4, i8, i8, u8, u8, i8, (i,w,p) f4, (i,w,p) f4, (p,) f4, (p,) f4 -> None
 @kernel
-def add_correlation(columns, window, n, scale_a, scale_b, mean_a, mean_b, work, total):
-    """Add the NCC of a pair of views at the first n places.
+def add_correlation(columns, window, n, a, b, w, mean, scale, work, total):
+    """Add the NCC of views a and b in windows w at the first n places.
 
-    columns : sums of their products down the columns of the windows, from the first of each on; work : (p,), scratch.
+    columns : sums of their products down the columns of the windows, from the first of each on; mean, scale : see
+    `window_moments`; work : (p,), scratch.
     """
-    x = columns
+    x, v = columns, np.uint64(w)
     if window == 1:
         for j in range(n):
             cross = x[j] + x[j + 1] + x[j + 2]
-            total[j] += scale_a[j] * scale_b[j] * (cross - mean_a[j] * mean_b[j])
+            total[j] += scale[a, v, j] * scale[b, v, j] * (cross - mean[a, v, j] * mean[b, v, j])
     elif window == 2:
         for j in range(n):
             cross = (x[j] + x[j + 1]) + (x[j + 2] + x[j + 3]) + x[j + 4]
-            total[j] += scale_a[j] * scale_b[j] * (cross - mean_a[j] * mean_b[j])
+            total[j] += scale[a, v, j] * scale[b, v, j] * (cross - mean[a, v, j] * mean[b, v, j])
     elif window == 3:
         for j in range(n):
             cross = ((x[j] + x[j + 1]) + (x[j + 2] + x[j + 3])) + ((x[j + 4] + x[j + 5]) + x[j + 6])
-            total[j] += scale_a[j] * scale_b[j] * (cross - mean_a[j] * mean_b[j])
+            total[j] += scale[a, v, j] * scale[b, v, j] * (cross - mean[a, v, j] * mean[b, v, j])
     else:
         row_sums(columns, window, n, work)
         for j in range(n):
-            total[j] += scale_a[j] * scale_b[j] * (work[j] - mean_a[j] * mean_b[j])
+            total[j] += scale[a, v, j] * scale[b, v, j] * (work[j] - mean[a, v, j] * mean[b, v, j])
 
 
-# (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (2,p) f4, (g,p) f4 -> None
+# (i,p) f4, i8, i8, i8, i8, (4,p) f4 -> None
+@kernel
+def couple_products(planes, first, second, width, n, sums):
+    """`column_products` of the four pairs of view `first` or the next with view `second` or the next, three rows."""
+    a, b, c, d = np.uint64(first), np.uint64(first + 1), np.uint64(second), np.uint64(second + 1)
+    q, r, ac, ad, bc, bd = np.uint64(width), np.uint64(2 * width), sums[0], sums[1], sums[2], sums[3]
+    for j in range(np.uint64(n)):
+        a0, a1, a2 = planes[a, j], planes[a, q + j], planes[a, r + j]
+        b0, b1, b2 = planes[b, j], planes[b, q + j], planes[b, r + j]
+        c0, c1, c2 = planes[c, j], planes[c, q + j], planes[c, r + j]
+        d0, d1, d2 = planes[d, j], planes[d, q + j], planes[d, r + j]
+        ac[j], ad[j] = a0 * c0 + a1 * c1 + a2 * c2, a0 * d0 + a1 * d1 + a2 * d2
+        bc[j], bd[j] = b0 * c0 + b1 * c1 + b2 * c2, b0 * d0 + b1 * d1 + b2 * d2
+
+
+# (4,p) f4, i8, i8, i8, (i,w,p) f4, (i,w,p) f4, (p,) f4 -> None
+@kernel
+def add_couples(sums, n, first, second, mean, scale, total):
+    """`add_correlation` of the four pairs of `couple_products`, windows of 3 x 3."""
+    a, b, c, d, w = np.uint64(first), np.uint64(first + 1), np.uint64(second), np.uint64(second + 1), np.uint64(0)
+    ac, ad, bc, bd = sums[0], sums[1], sums[2], sums[3]
+    for j in range(n):
+        mean_a, mean_b, mean_c, mean_d = mean[a, w, j], mean[b, w, j], mean[c, w, j], mean[d, w, j]
+        with_a = scale[c, w, j] * (ac[j] + ac[j + 1] + ac[j + 2] - mean_a * mean_c)
+        with_a += scale[d, w, j] * (ad[j] + ad[j + 1] + ad[j + 2] - mean_a * mean_d)
+        with_b = scale[c, w, j] * (bc[j] + bc[j + 1] + bc[j + 2] - mean_b * mean_c)
+        with_b += scale[d, w, j] * (bd[j] + bd[j + 1] + bd[j + 2] - mean_b * mean_d)
+        total[j] += scale[a, w, j] * with_a + scale[b, w, j] * with_b
+
+
+# (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (4,p) f4, (g,p) f4 -> None
 @kernel
 def add_pairs(planes, windows, mean, scale, width, n, work, total):
     """Add the NCC of all pairs of views, for every window, at the first n places.
 
     planes : (i, p); windows, mean, scale : see `window_moments`, a view takes part where its scale is not zero; work :
-    (2, p), scratch; total : (g, p), the pair of views a and b adds to row (a + b) % g. Plain formula: sum_{a<b} scale_a
-    scale_b (sum x_a x_b - mean_a mean_b).
+    (4, p), scratch; total : (g, p), the pair of views a and b adds to row (a + b) % g. Plain formula: sum_{a<b} scale_a
+    scale_b (sum x_a x_b - mean_a mean_b). In windows of 3 x 3 alone, two views at a time meet two others: each value
+    is read for two pairs.
     """
-    half, columns, n_groups = windows[-1], work[0], total.shape[0]
+    half, columns, beyond, n_groups = windows[-1], work[0], work[1], total.shape[0]
+    coupled = planes.shape[0] // 2 * 2 if half == 1 and n_groups == 1 else 0
+    for a in range(0, coupled, 2):
+        for b in range(a + 2, coupled, 2):
+            couple_products(planes, a, b, width, n + SLACK, work)
+            add_couples(work, n, a, b, mean, scale, total[0])
     for a in range(planes.shape[0]):
         for b in range(a + 1, planes.shape[0]):
-            done, into = 0, total[(a + b) % n_groups]
+            if b < coupled and a // 2 < b // 2:
+                continue
+            done, x, y, into = 0, np.uint64(a), np.uint64(b), total[(a + b) % n_groups]
             for w in range(windows.shape[0]):
                 window = windows[w]
-                column_products(planes[a], planes[b], half, done, window, width, n + SLACK, columns)
-                add_correlation(
-                    columns[half - window :], window, n, scale[a, w], scale[b, w], mean[a, w], mean[b, w], work[1], into
-                )
+                column_products(planes, x, y, half, done, window, width, n + SLACK, columns)
+                add_correlation(columns[half - window :], window, n, x, y, w, mean, scale, beyond, into)
                 done = window
 
 
@@ -171,9 +222,7 @@ def add_closeness(greys, weight, n, total):
     greys : (i, p) float32, grey values times weight / reach, reach being the grey difference from which on two views
     are strangers; total : (p,).
     """
-    for a in range(greys.shape[0]):
-        x = greys[a]
-        for b in range(a + 1, greys.shape[0]):
-            y = greys[b]
+    for a in range(np.uint64(greys.shape[0])):
+        for b in range(a):
             for j in range(n):
-                total[j] += max(weight - abs(x[j] - y[j]), np.float32(0.0))
+                total[j] += max(weight - abs(greys[a, j] - greys[b, j]), np.float32(0.0))

@@ -130,6 +130,7 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
     image = pixels[layout[0] : layout[0] + layout[1] * n_cols]
     position, whole, index = np.empty((2, RUN), np.float32), np.empty((2, RUN), np.float32), np.empty(RUN, np.uint32)
     across, down = np.empty((4, RUN), np.float32), np.empty((4, RUN), np.float32)
+    pairs = np.empty((2, RUN), np.complex64)
     for first in range(0, level.shape[0], RUN):
         end = min(first + RUN, level.shape[0])
         n = end - first
@@ -143,7 +144,7 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
         else:
             fractions(position, n, whole, across)
             pixel_indices(whole, n, start, np.int32(n_cols), index)
-            gather(pixels, layout, index, across, out[first:end])
+            gather(pixels, layout, index, across, pairs, out[first:end])
 
 
 # (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (3,i,r,c) i4, f4, (g,j,r,c) f4 -> None

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from zlocus.kernels._jit import kernel
 
-# Cells at a time: their positions and their pixels stay in the first level of the cache.
+# Cells at a time of a surface: what stands between its passes stays in the first level of the cache.
 RUN = 512
 
 
@@ -39,33 +40,42 @@ def pixel_positions(layout, grid, cells, relief, velocity, first, end, index, fr
         index[j] = np.uint32(np.int32(np.int32(top) * stride) + np.int32(left) + origin)
 
 
-# (p,) f4, (3,) i8, (n,) u4, (2,n) f4, (n,) f4 -> None
+# (p,) f4, (3,) i8, (n,) u4, (2,n) f4, (2,n) c8, (n,) f4 -> None
 @kernel
-def gather(pixels, layout, index, fraction, out):
-    """Bilinear values between the four pixels from each index on."""
+def gather(pixels, layout, index, fraction, pairs, out):
+    """Bilinear values between the four pixels from each index on.
+
+    pairs : (2, n) complex64, scratch: a pixel as real part, the one right of it as imaginary part, so that one load
+    reads both. Loads from an index are scalar code; once they are apart, the interpolation vectorises.
+    """
     image = pixels[layout[0] : layout[0] + layout[1] * layout[2]]
-    right, below, diagonal = np.uint64(1), np.uint64(layout[2]), np.uint64(layout[2] + 1)
-    fx, fy = fraction[0], fraction[1]
+    beside = as_strided(image[: image.shape[0] // 2 * 2].view(np.complex64), (image.shape[0] - 1,), (4,))
+    below, upper, lower = np.uint64(layout[2]), pairs[0], pairs[1]
     for j in range(out.shape[0]):
         p = np.uint64(index[j])
-        top = image[p] + fx[j] * (image[p + right] - image[p])
-        low = image[p + below] + fx[j] * (image[p + diagonal] - image[p + below])
+        upper[j] = beside[p]
+        lower[j] = beside[p + below]
+    fx, fy = fraction[0], fraction[1]
+    for j in range(out.shape[0]):
+        top = upper[j].real + fx[j] * (upper[j].imag - upper[j].real)
+        low = lower[j].real + fx[j] * (lower[j].imag - lower[j].real)
         out[j] = top + fy[j] * (low - top)
 
 
-# (p,) f4, (3,) i8, (8,) f8, (2,c) f4, (c,) f4, (2,) f4, (n,) u4, (2,n) f4, (c,) f4 -> None
+# (p,) f4, (3,) i8, (8,) f8, (2,c) f4, (c,) f4, (2,) f4, (n,) u4, (2,n) f4, (2,n) c8, (c,) f4 -> None
 @kernel
-def resample_plane(pixels, layout, grid, cells, relief, velocity, index, fraction, out):
+def resample_plane(pixels, layout, grid, cells, relief, velocity, index, fraction, pairs, out):
     """Bilinear image values at positions that are bilinear in row and column of the ground grid, moved by its relief.
 
     pixels : (p,) float32, all images one after the other; layout : (3,) int64, offset, rows and columns of this image
     in `pixels`; grid : (8,) float64, px: (x, y) at the first cell, step per column, step per row, mixed step per row
     and column; cells : (2, c) float32, rows and columns from the first cell; relief : (c,) float32 steps above those
-    positions' heights; velocity : (2,) float32, px per step (x, y); index : (RUN,) uint32 and fraction : (2, RUN)
-    float32, scratch; out : (c,) float32 or longer, written.
+    positions' heights; velocity : (2,) float32, px per step (x, y); index : (n,) uint32, fraction : (2, n) float32 and
+    pairs : (2, n) complex64, scratch for n cells at a time; out : (c,) float32 or longer, written.
     Positions outside the image are clamped to its border (the caller masks them).
     """
-    for first in range(0, relief.shape[0], RUN):
-        end = min(first + RUN, relief.shape[0])
+    run = index.shape[0]
+    for first in range(0, relief.shape[0], run):
+        end = min(first + run, relief.shape[0])
         pixel_positions(layout, grid, cells, relief, velocity, first, end, index, fraction)
-        gather(pixels, layout, index, fraction, out[first:end])
+        gather(pixels, layout, index, fraction, pairs, out[first:end])

@@ -6,13 +6,14 @@ import numpy as np
 
 from zlocus.kernels._jit import kernel
 from zlocus.kernels.agreement import SLACK, add_closeness, add_pairs, window_moments
-from zlocus.kernels.resample import RUN, resample_plane
+from zlocus.kernels.resample import resample_plane
 
 COST_SCALE = np.float32(64.0)
 UNSEEN_COST = np.float32(40.0)
 HIDDEN = np.int32(2**30)
 # Grey value of a view where it shows nothing, times its number: as far from any grey as from another view's.
 NOWHERE = np.float32(1e6)
+NOTHING, PART, WHOLE = 0, 1, 2
 
 
 # (n,) f8, f8 -> f8
@@ -68,22 +69,44 @@ def flat_visibility(seen, half, flat, pairs):
         pairs[j] = np.float32(2.0) / ordered if usable > np.float32(1.5) else np.float32(0.0)
 
 
-# (3,i,r,c) i4, (i,4) i4 -> None
+# (3,i,r,c) i4 -> (i,5) i4
 @kernel
-def height_ranges(seen, ranges):
+def height_ranges(seen):
     """Of every view, lowest and highest height index at which it covers any cell of a block, and at which it covers and
-    sees every cell. seen : see `block_costs`; ranges : (i, 4), written."""
+    sees every cell, and the lowest at which it sees any. seen : see `block_costs`."""
+    ranges = np.empty((seen.shape[1], 5), np.int32)
     for i in range(seen.shape[1]):
-        low, high, from_, to = HIDDEN, np.int32(-HIDDEN), np.int32(-HIDDEN), HIDDEN
+        low, high, from_, to, any_from = HIDDEN, np.int32(-HIDDEN), np.int32(-HIDDEN), HIDDEN, HIDDEN
         for r in range(seen.shape[2]):
             for c in range(seen.shape[3]):
+                visible = max(seen[0, i, r, c], seen[2, i, r, c])
                 low, high = min(low, seen[0, i, r, c]), max(high, seen[1, i, r, c])
-                from_ = max(from_, max(seen[0, i, r, c], seen[2, i, r, c]))
+                from_, any_from = max(from_, visible), min(any_from, visible)
                 to = min(to, seen[1, i, r, c])
-        ranges[i, 0], ranges[i, 1], ranges[i, 2], ranges[i, 3] = low, high, from_, to
+        ranges[i, 0], ranges[i, 1], ranges[i, 2], ranges[i, 3], ranges[i, 4] = low, high, from_, to, any_from
+    return ranges
 
 
-# (i,4) i4, (2,) i8 -> (i,) i8
+# (i,5) i4, i8, i4 -> i8
+@kernel
+def extent_at(ranges, view, height):
+    """What a view shows of a block at a height: NOTHING, PART or WHOLE. ranges : see `height_ranges`."""
+    if ranges[view, 2] <= height <= ranges[view, 3]:
+        return WHOLE
+    return PART if ranges[view, 4] <= height <= ranges[view, 1] else NOTHING
+
+
+# (i,5) i4, (i,) i8, i4 -> i8
+@kernel
+def whole_views(ranges, takes, height):
+    """How many views show the whole block at a height."""
+    n = 0
+    for view in takes:
+        n += 1 if extent_at(ranges, view, height) == WHOLE else 0
+    return n
+
+
+# (i,5) i4, (2,) i8 -> (i,) i8
 @kernel
 def taking_part(ranges, span):
     """The views that cover any cell of a block at any height of its range. ranges : see `height_ranges`."""
@@ -133,14 +156,14 @@ def block_relief(surface, corners, block, half, relief):
             relief[r, c] = np.float32(surface[r, c] - left - (c - half) / block * rise)
 
 
-# (3,p) i4, i4, i8, (p,) f4, (2,p) f4 -> None
+# (i,3,p) i4, i8, i4, i8, (p,) f4, (2,p) f4 -> None
 @kernel
-def shown_at(bounds, height, n, shown, counts):
+def shown_at(bounds, view, height, n, shown, counts):
     """Where a view covers and sees the cells at a height (1 or 0); counts the views that cover, and that see, a cell.
 
-    bounds : of one view, see `flat_visibility`.
+    bounds : see `flat_visibility`.
     """
-    low, high, visible = bounds[0], bounds[1], bounds[2]
+    low, high, visible = bounds[view, 0], bounds[view, 1], bounds[view, 2]
     for j in range(n):
         covered = np.float32(low[j] <= height and height <= high[j])
         shown[j] = covered * np.float32(visible[j] <= height)
@@ -160,16 +183,21 @@ def hide(shown, n, scale, grey, nowhere):
         grey[j] = grey[j] if shown[j] > np.float32(0.0) else nowhere
 
 
-# (p,) f4, (2,p) f4, f4, i8 -> None
+# (p,) f4, (2,p) f4, f4, i8, (p,) f4 -> None
 @kernel
-def excuse(pairs, counts, excused, n):
-    """Pass part of the weight of pairs with a hidden view on to the visible ones. counts : (2, p), views that cover and
-    that see each cell."""
+def excuse(pairs, counts, excused, n, out):
+    """Weights of pairs, part of that of those with a hidden view passed on to the visible ones. counts : (2, p), views
+    that cover and that see each cell.
+
+    A pair with a hidden view counts as uncorrelated (NCC 0), but for the excused share, which agrees as the visible
+    pairs do: without it the ground beside a wall would rather be roof, which all views see; excusing all would favour
+    heights that few views see, where chance agreement is larger.
+    """
     n_seeing, one = counts[1], np.float32(1.0)
     for j in range(n):
         m = n_seeing[j]
         visible = np.float32(2.0) / max(m * (m - one), one)
-        pairs[j] += excused * (visible - pairs[j])
+        out[j] = pairs[j] + excused * (visible - pairs[j])
 
 
 # (p,) f4, (p,) f4, (p,) f4, f4, i8, i8, (p,) u1 -> None
@@ -177,7 +205,8 @@ def excuse(pairs, counts, excused, n):
 def whole_costs(total, pairs, n_covering, weight, n_sizes, n, out):
     """Costs of a block at one height, rounded, from the sums over pairs of views; see `block_costs`.
 
-    pairs : (p,), weight of a visible pair.
+    pairs : (p,), weight of a visible pair. Heights that fewer than two images cover cost UNSEEN_COST, less than chance
+    agreement and more than a match: so a cell whose true height is outside the images is not matched elsewhere.
     """
     highest = COST_SCALE * (np.float32(1.0) + weight)
     unseen = UNSEEN_COST * (np.float32(1.0) + weight)
@@ -225,55 +254,55 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (6,) float32,
     variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused, what
     `tile_costs` takes, the weight where two views take part; out : (r, c * count) uint8.
-    A pair with a hidden view counts as uncorrelated (NCC 0), but for the excused share, which agrees as the visible
-    pairs do: without it the ground beside a wall would rather be roof, which all views see; excusing all would favour
-    heights that few views see, where chance agreement is larger. Heights that fewer than two images cover cost
-    UNSEEN_COST, less than chance agreement and more than a match: so a cell whose true height is outside the images is
-    not matched elsewhere.
+    Views that show nothing of the block at a height are left out there.
     """
-    ranges = np.empty((seen.shape[1], 4), np.int32)
-    height_ranges(seen, ranges)
+    ranges = height_ranges(seen)
     takes = taking_part(ranges, span)
     floor, weight = measure[0], measure[5] if takes.shape[0] == 2 else measure[1]
     if takes.shape[0] < 2:
         out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
         return
     n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
-    n, steps, start = seen.shape[2] * width, relief.ravel(), half * (width + 1)
+    n, start, steps, cells = seen.shape[2] * width, half * (width + 1), relief.ravel(), flat_cells(relief.shape)
     size = steps.shape[0] + SLACK
     planes, greys = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
     mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
     flat, codes = np.empty((seen.shape[1], 3, size), np.int32), np.empty((span[1], n), np.uint8)
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    counts, totals = np.empty((2, size), np.float32), total.reshape((1, size))
+    counts, sides = np.empty((2, size), np.float32), np.empty((2, size), np.complex64)
     work, grid, velocity = np.empty((4, size), np.float32), np.empty(8), np.empty(2, np.float32)
-    index, fraction, cells = np.empty(RUN, np.uint32), np.empty((2, RUN), np.float32), flat_cells(relief.shape)
+    index, fraction, totals = np.empty(size, np.uint32), np.empty((2, size), np.float32), total.reshape((1, size))
     flat_visibility(seen, half, flat, pairs)
     top, centre = weight * np.float32(n_sizes), np.float32(0.0)
     by_reach = top / measure[2]
     for k in range(span[1]):
-        height, total[:n] = np.int32(span[0] + k), 0.0
-        t = heights[0] + height * heights[1]
-        shows_all = (ranges[takes, 2] <= height) & (height <= ranges[takes, 3])
-        counts[:, :n] = shows_all.sum()
+        height, m = np.int32(span[0] + k), 0
+        t, n_whole = heights[0] + height * heights[1], whole_views(ranges, takes, height)
+        total[:n], counts[:, :n] = 0.0, n_whole
         for i in range(n_views):
-            view, plane, grey = takes[i], planes[i], greys[i]
+            view, plane, grey = takes[i], planes[m], greys[m]
+            extent = extent_at(ranges, view, height)
+            if extent < WHOLE:
+                shown_at(flat, view, height, n, shown, counts)
+            if extent == NOTHING and i > 0:
+                continue
             plane_grid(nodes, view, t, block, half, grid)
             plane_velocity(nodes, view, t, heights[1], velocity)
-            resample_plane(pixels, layout[view], grid, cells, steps, velocity, index, fraction, plane)
+            resample_plane(pixels, layout[view], grid, cells, steps, velocity, index, fraction, sides, plane)
             centre = plane[start] if i == 0 else centre
+            if extent == NOTHING:
+                continue
             centred(plane, steps.shape[0], centre, start, by_reach, n, grey)
-            window_moments(plane, windows, width, n, floor, work, mean[i], scale[i])
-            if not shows_all[i]:
-                shown_at(flat[view], height, n, shown, counts)
-                hide(shown, n, scale[i], grey, NOWHERE * np.float32(i + 1))
+            window_moments(plane, windows, width, n, floor, work, mean[m], scale[m])
+            if extent < WHOLE:
+                hide(shown, n, scale[m], grey, NOWHERE * np.float32(m + 1))
+            m += 1
         if weight > 0.0:
-            add_closeness(greys, top, n, total)
-        add_pairs(planes, windows, mean, scale, width, n, work, totals)
-        shown[:n] = pairs[:n]
-        if not shows_all.all():
-            excuse(shown, counts, measure[3], n)
-        whole_costs(total, shown, counts[0], weight, n_sizes, n, codes[k])
+            add_closeness(greys[:m], top, n, total)
+        add_pairs(planes[:m], windows, mean[:m], scale[:m], width, n, work, totals)
+        if n_whole < n_views:
+            excuse(pairs, counts, measure[3], n, shown)
+        whole_costs(total, shown if n_whole < n_views else pairs, counts[0], weight, n_sizes, n, codes[k])
     heights_last(codes, width, out)
 
 
@@ -282,9 +311,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
 def windows_for(seen, span, windows, few):
     """The windows of a block: all where at most `few` views take part, else the smallest, for many pairs of views
     average noise as well, and their windows do not reach beyond a small crown."""
-    ranges = np.empty((seen.shape[1], 4), np.int32)
-    height_ranges(seen, ranges)
-    return windows if taking_part(ranges, span).shape[0] <= few else windows[:1]
+    return windows if taking_part(height_ranges(seen), span).shape[0] <= few else windows[:1]
 
 
 # as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
