@@ -495,13 +495,14 @@ def speed(at: Workplace) -> list[Figure]:
     """CPU of the whole program on a large town, one worker, kernels cached; and how good the surface is."""
     scene, small, figures = at.out / "scene", at.scene("rendered-city"), []
     render(scene, "city", SPEED_SIDE_CELLS, "--seed", SPEED_SEED)
-    like = scene / "truth_dsm.tif"
-    with rasterio.open(like) as truth:
-        million_cells = truth.width * truth.height / 1e6
+    with rasterio.open(scene / "truth_dsm.tif") as truth:
+        crs, bounds = truth.crs.to_string(), tuple(truth.bounds)
+    area = ["--resolution", 0.5, "--crs", crs, "--bounds", *bounds, "--workers", 1]
+    million_cells = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / 0.5**2 / 1e6
     run([ZLOCUS, "dsm", *rendered_images(small), "-o", at.out / "compiled", "--resolution", 0.5, "--overwrite"])
     for name, bar in SPEED_BARS_S.items():
         out, images = at.out / name, rendered_images(scene, VIEWS[name])
-        used = run([ZLOCUS, "dsm", *images, "-o", out, "--like", like, "--workers", 1, "--overwrite"])
+        used = run([ZLOCUS, "dsm", *images, "-o", out, *area, "--overwrite"])
         per_million = used.cpu_s / million_cells
         figures.append(Figure(f"{name}, CPU per million cells", per_million, "s", at_most=bar))
         figures += town_figures(name, at.judge(out / "dsm.tif", scene), {})

@@ -72,14 +72,19 @@ def views(parallax=PARALLAX, roof_texture=0.0) -> TileViews:
     )  # fmt: skip
 
 
+def leading(seen_by: TileViews) -> np.ndarray:
+    """The ortho-image of the first view, which parallax does not move."""
+    _, rows, cols = seen_by.layout[0]
+    image = seen_by.pixels[: rows * cols].reshape(rows, cols)
+    return np.ascontiguousarray(image[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX])
+
+
 def fitted(seen_by: TileViews, height: np.ndarray, options: PlaneOptions = OPTIONS) -> PlanarHeights:
     n = len(seen_by.layout)
     seen = np.zeros((3, n, SIDE, SIDE), np.int32)
     seen[1], seen[2] = 100, -100
-    _, rows, cols = seen_by.layout[0]
-    ortho = seen_by.pixels[: rows * cols].reshape(rows, cols)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
     known = PlanarHeights(height, np.zeros(height.shape, bool))
-    return with_planes(seen_by, np.ascontiguousarray(ortho), known, seen, options)
+    return with_planes(seen_by, leading(seen_by), known, seen, options)
 
 
 def level_roof() -> np.ndarray:
@@ -113,6 +118,17 @@ def test_a_view_of_another_day_is_left_out():
     found = fitted(other, level_roof())
     middle = np.s_[ROOF.start + 3 : ROOF.stop - 3, ROOF.start + 3 : ROOF.stop - 3]
     assert np.abs(found.height - true_heights())[middle].max() < STEPS
+
+
+def test_no_plane_where_fewer_than_two_views_see():
+    seen_by = views()
+    seen = np.full((3, len(PARALLAX), SIDE, SIDE), -100, np.int32)
+    seen[1] = 100
+    seen[1, 1:, :, 48:] = -200
+    known = PlanarHeights(level_roof(), np.zeros((SIDE, SIDE), bool))
+    found = with_planes(seen_by, leading(seen_by), known, seen, OPTIONS)
+    assert found.is_planar[35:60, 35:45].all()
+    assert not found.is_planar[:, 48:].any()
 
 
 def test_no_plane_where_most_heights_were_matched_elsewhere():

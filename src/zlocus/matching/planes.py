@@ -82,7 +82,7 @@ def with_planes(
     better = costs[:, 1, 0] < costs[:, 0, 0]
     taken = is_plain & (costs[:, 1, 1] < options.most_cost) & (near > np.where(better, 0.5, options.least_near))
     taken &= np.hypot(planes[:, 1], planes[:, 2]) < options.most_slope_steps * SPAN
-    kept = taken[of_cell] & (found.is_inner | is_near)
+    kept = taken[of_cell] & (found.is_inner | is_near) & (visible.sum(axis=0) >= 2)
     result = PlanarHeights(height.copy(), known.is_planar.copy())
     result.height[found.row[kept], found.col[kept]] = after[kept]
     result.is_planar[found.row[kept], found.col[kept]] = True

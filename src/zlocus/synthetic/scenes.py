@@ -20,7 +20,7 @@ ADVANCE_M = 0.208
 WOBBLE_M, WOBBLE_DEG = 0.5, 0.03
 BORDER_PX = 4
 TALLEST_M = {"city": 66.0, "hills": 15.0}
-LARGE_SIZE = 2000
+LARGE_SIZE = 3000  # beyond, heights and truth are as coarse as the images, for the sake of memory
 
 MORNING, AFTERNOON = Sun(152.0, 46.0), Sun(232.0, 33.0)
 CLEAR = Optics()
