@@ -167,6 +167,20 @@ def calanques(at: Workplace) -> list[Figure]:
         Figure("shift east", aligned.shift.east_m, "m"),
         Figure("shift north", aligned.shift.north_m, "m"),
         Figure("CPU, kernels cached", used.cpu_s, "s", at_most=8),
+        *staircase(at.out),
+    ]
+
+
+def staircase(out: Path) -> list[Figure]:
+    """Fewest and most heights in a tenth of a height step, over the mean of the ten: even without a staircase."""
+    heights = json.loads((out / "run.json").read_text())["heights"]
+    with rasterio.open(out / "dsm.tif") as file:
+        found = file.read(1).astype(float)
+    steps = (found[np.isfinite(found)] - heights["range_m"][0]) / heights["step_m"]
+    share = np.bincount((10 * (steps % 1)).astype(int).clip(0, 9), minlength=10) / len(steps) * 10
+    return [
+        Figure("least of the tenths of a step", share.min(), at_least=0.8),
+        Figure("most of the tenths of a step", share.max(), at_most=1.2),
     ]
 
 
@@ -292,6 +306,7 @@ def ventoux(at: Workplace) -> list[Figure]:
     return [
         Figure("ground seen by both, filled", float(np.isfinite(z).mean()), at_least=0.6),
         Figure("|median difference to SRTM|", abs(float(np.nanmedian(z - xyz[:, 2]))), "m", at_most=10),
+        *staircase(at.out),
     ]
 
 
