@@ -53,8 +53,9 @@ class Count:
 # pixel_positions: x and y each c * (a + r * b) 3, + x0 1, + r * d 2, + z * v 2, min, max, floor, fraction: 12; index:
 # 2 conversions, 1 product, 2 sums. Reads row, column, relief; writes 2 fractions and the index.
 BILINEAR_POSITION = Count(ops=29, loads=12, stores=12)
-# gather: three times a + f * (b - a); reads index and 2 fractions, and the four pixels.
-BILINEAR_GATHER = Count(ops=9, gathers=4, loads=12, stores=4)
+# gather: reads the index and twice two pixels at once, which are written and read again; three times a + f * (b - a),
+# with 2 fractions.
+BILINEAR_GATHER = Count(ops=9, gathers=2, loads=12 + 16, stores=4 + 16)
 RESAMPLE = BILINEAR_POSITION + BILINEAR_GATHER
 
 
@@ -74,16 +75,37 @@ def moments(windows: list[int]) -> Count:
         if not done:
             found += Count(ops=7, loads=12, stores=8) * slack
         found += Count(ops=6, loads=16, stores=8) * ((window - max(done, 1)) * slack)
-        # row_sums of both, each value read for every sum it is in.
-        found += Count(ops=4 * window, loads=8 * (2 * window + 1), stores=8) * rows
+        # Sums across of both, each value read for every sum it is in; beyond 5 x 5 they are written and read again.
+        found += Count(ops=4 * window, loads=8 * (2 * window + 1)) * rows
+        if window > 2:
+            found += Count(loads=8, stores=8) * rows
         # value, spread 2, is_even 2, max, + added, selection; a root and a division.
-        found += Count(ops=8, roots=1, loads=8, stores=8) * rows
+        found += Count(ops=8, roots=1, stores=8) * rows
         done = window
     return found
 
 
-def correlation(windows: list[int]) -> Count:
+def correlation(windows: list[int], n_views: int) -> Count:
     """`add_pairs` per cell and pair of images."""
+    coupled = n_views // 2 * 2 if windows == [1] else 0
+    by_couples = coupled * (coupled - 2) // 2
+    share = by_couples / (n_views * (n_views - 1) // 2)
+    return couples() * share + single_pairs(windows) * (1 - share)
+
+
+def couples() -> Count:
+    """`couple_products` and `add_couples` per cell and pair, of which each does four."""
+    _, rows, slack = bordered(1)
+    # Three products and 2 sums a pair; twelve values read, four written.
+    found = Count(ops=4 * 5, loads=48, stores=16) * slack
+    # A pair: 2 sums across, - mean * mean, * scale: 5; joined 2, * scale 2, joined and added 2. Read are three sums a
+    # pair, four means and scales, the total.
+    found += Count(ops=4 * 5 + 6, loads=48 + 32 + 4, stores=4) * rows
+    return found * 0.25
+
+
+def single_pairs(windows: list[int]) -> Count:
+    """`column_products` and `add_correlation` per cell and pair."""
     _, rows, slack = bordered(windows[-1])
     found, done = Count(), 0
     for window in windows:
@@ -106,14 +128,14 @@ def costs(n_views: int, windows: list[int], n_heights: int, with_greys: bool = T
     pairs, share = (n_views - 1) / 2, 1 / n_views
     # centred: one subtraction a value; the grey times its weight.
     image = RESAMPLE * plane + Count(ops=1, loads=4, stores=4) * plane + moments(windows)
-    pair = correlation(windows)
+    pair = correlation(windows, n_views)
     if with_greys:
         image += Count(ops=1, loads=4, stores=4) * rows
         # add_closeness: difference, its magnitude, difference, maximum, sum.
         pair += Count(ops=5, loads=12, stores=4) * rows
-    # A step: total and counts set, pairs copied; whole_costs: 2 products, difference, comparison, selection, + 0.5,
-    # min, max, conversion; heights_last: a byte read and written.
-    step = (Count(stores=12) + Count(loads=4, stores=4) + Count(ops=9, loads=16, stores=5)) * rows
+    # A step: total and counts set; whole_costs: 2 products, difference, comparison, selection, + 0.5, min, max,
+    # conversion; heights_last: a byte read and written.
+    step = (Count(stores=12) + Count(ops=9, loads=16, stores=5)) * rows
     step += Count(loads=1, stores=1, memory=1)
     # Once a block: pixels of the images, and `seen` of 3 x 4 bytes.
     return image + pair * pairs + step * share + Count(memory=16 / n_heights)
@@ -149,7 +171,7 @@ def profile(half: int, n_views: int, n_offsets: int) -> Count:
     image += Count(ops=3, loads=8, stores=4) * rows
     # Mean over the pairs: 1; once: pixels, `seen`, and the result.
     mean = Count(ops=1, loads=8, stores=4, memory=4) * (1 / n_views)
-    return level + image + correlation([half]) * ((n_views - 1) / 2) + mean + Count(memory=16 / n_offsets)
+    return level + image + correlation([half], n_views) * ((n_views - 1) / 2) + mean + Count(memory=16 / n_offsets)
 
 
 # add_tap: the step less two slopes 5, away 1, weight 3 + 2, sums 3; reads two cells, two slopes, two sums. 25 of them,

@@ -222,7 +222,8 @@ def add_closeness(greys, weight, n, total):
     greys : (i, p) float32, grey values times weight / reach, reach being the grey difference from which on two views
     are strangers; total : (p,).
     """
-    for a in range(np.uint64(greys.shape[0])):
-        for b in range(a):
+    n_views, one = np.uint64(greys.shape[0]), np.uint64(1)
+    for a in range(n_views):
+        for b in range(a + one, n_views):
             for j in range(n):
                 total[j] += max(weight - abs(greys[a, j] - greys[b, j]), np.float32(0.0))
