@@ -198,8 +198,7 @@ def mean_cost(cost, part):
     return total / n if n else np.inf
 
 
-# (i,n) b1, (n,) b1, (n,) i8, (n,) i8, (n,) f8, (p,) f4, (i,3) i8, (i,b,d,2,k) f8, (2,) f8, i8, f8, f8, (3,) f8,
-# (2,2) f8, (n,) f8 -> b1
+# (i,n) b1,(n) b1,(n) i8,(n) i8,(n) f8,(p) f4,(i,3) i8,(i,b,d,2,k) f8,(2) f8,i8,f8,f8,(3) f8,(2,2) f8,(n) f8 -> b1
 @kernel
 def fit_segment(
     visible, is_core, row, col, height, pixels, layout, nodes, heights, block, noise, most_cost, plane, costs, out
@@ -237,8 +236,7 @@ def fit_segment(
     return True
 
 
-# (s+1,) i8, (i,n) b1, (n,) b1, (n,) i8, (n,) i8, (n,) f8, (p,) f4, (i,3) i8, (i,b,d,2,k) f8, (2,) f8, i8, f8, f8,
-# (s,) b1, (s,3) f8, (s,2,2) f8, (n,) f8 -> None
+# as fit_segment, with (s+1,) i8 first and (s,) b1, (s,3) f8, (s,2,2) f8, (n,) f8 last
 @kernel
 def fit_segments(
     start, visible, is_core, row, col, height, pixels, layout, nodes, heights, block, noise, most_cost, is_plain,
