@@ -131,6 +131,21 @@ def test_no_plane_where_fewer_than_two_views_see():
     assert not found.is_planar[:, 48:].any()
 
 
+def test_a_view_whose_table_does_not_hold_everywhere():
+    """Neither its missing grey values nor its missing positions spoil what the others show."""
+    seen_by = views()
+    seen_by.nodes[0, :2, :2] = np.nan
+    seen = np.full((3, len(PARALLAX), SIDE, SIDE), -100, np.int32)
+    seen[1] = 100
+    seen[1, 0, : 2 * BLOCK, : 2 * BLOCK] = -200
+    ortho = leading(seen_by)
+    ortho[: BLOCK - 8, : BLOCK - 8] = np.nan
+    found = with_planes(seen_by, ortho, PlanarHeights(level_roof(), np.zeros((SIDE, SIDE), bool)), seen, OPTIONS)
+    middle = np.s_[ROOF.start + 3 : ROOF.stop - 3, ROOF.start + 3 : ROOF.stop - 3]
+    assert found.is_planar[middle].all()
+    assert np.abs(found.height - true_heights())[middle].max() < STEPS
+
+
 def test_no_plane_where_most_heights_were_matched_elsewhere():
     """Half the roof far from any plane that the views could agree on."""
     height = level_roof()

@@ -107,8 +107,10 @@ def segment_greys(pixels, layout, locus, start, height, grey, slope):
         offset, n_rows, n_cols = layout[i, 0], layout[i, 1], layout[i, 2]
         for p in range(height.shape[0]):
             away = height[p] - start[p]
-            x = min(max(locus[i, p, 0] + away * locus[i, p, 2], 0.0), n_cols - 1.001)
-            y = min(max(locus[i, p, 1] + away * locus[i, p, 3], 0.0), n_rows - 1.001)
+            # Beyond the image its border goes on; where a table does not hold (NaN), what is read does not count.
+            x, y = locus[i, p, 0] + away * locus[i, p, 2], locus[i, p, 1] + away * locus[i, p, 3]
+            x = min(x, n_cols - 1.001) if x > 0.0 else 0.0
+            y = min(y, n_rows - 1.001) if y > 0.0 else 0.0
             c, r = int(x), int(y)
             fx, fy = x - c, y - r
             at = offset + r * n_cols + c

@@ -63,10 +63,11 @@ def with_planes(
     (3, i, r, c), see `coverage`. A plane is taken where most cells were matched near it, or the views agree better on
     it, and where they agree on its core to the noise: outlines may not.
     """
-    height = known.height
-    unit = float(np.median(deviation(ortho, AROUND)))
-    noise, is_plain = options.noise * unit, deviation(ortho, TEXTURE) < options.texture * unit
-    found = plain_segments(is_plain & ~known.is_planar, options)
+    height, shown = known.height, np.isfinite(ortho)
+    grey = np.where(shown, ortho, np.float32(0.0))
+    unit = float(np.median(deviation(grey, AROUND)[shown])) if shown.any() else 0.0
+    noise, is_plain = options.noise * unit, deviation(grey, TEXTURE) < options.texture * unit
+    found = plain_segments(is_plain & shown & ~known.is_planar, options)
     n_segments, cells = len(found.start) - 1, (found.row, found.col)
     if not (n_segments and noise > 0):
         return known
