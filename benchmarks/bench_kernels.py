@@ -18,7 +18,7 @@ import pytest
 
 from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.reach import block_reach
-from zlocus.kernels.refine import tile_ortho, tile_profile
+from zlocus.kernels.refine import CUBIC, tile_ortho, tile_profile
 from zlocus.kernels.resample import resample_plane
 from zlocus.kernels.sgm import sweep, winners
 from zlocus.kernels.smooth import slopes, smooth_surface
@@ -194,13 +194,13 @@ def winners_case(count: int | None) -> Case:
 
 
 def profile_case() -> Case:
-    """The measure at five offsets around a surface, 9 x 9, three views."""
-    half, offsets = 4, np.linspace(-0.75, 0.75, 5).astype(np.float32)
-    surface, seen, scene = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
+    """The measure at three offsets around a surface, cubic, 9 x 9, three views."""
+    half, offsets = 4, np.linspace(-0.5, 0.5, 3).astype(np.float32)
+    surface, seen, (pixels, *scene) = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
     out = np.empty((1, len(offsets), SIDE, SIDE), np.float32)
 
     def call():
-        tile_profile(*scene, surface, offsets, BLOCK, half, seen, np.float32(0), out)
+        tile_profile(pixels, CUBIC, *scene, surface, offsets, BLOCK, half, seen, np.float32(0), out)
 
     return Case(call, out.size * 3, "cell, offset and image")
 

@@ -43,11 +43,12 @@ JUDGED = (("city", 16), ("city", 17), ("hills", 43), ("hills", 50))
 VIEWS = {6: ("n1", "f1", "b1", "n2", "f2", "b2"), 3: ("n1", "f1", "b1"), 2: ("n1", "f1")}
 MARGIN_M, LARGE_ERROR_M = 10.0, 1.0
 KNOTS, SMOOTHNESS, LEAST_ERROR_STEPS = 9, 0.02, 1e-3
-# What is asked of one and of two sigma, and what each weighs; of each run at most so many cells, each class so much.
+# What is asked of one and of two sigma, and what each weighs; of each run at least and at most so many cells, each
+# class so much.
 # Signs that may only raise sigma (1) or lower it (-1).
 DIRECTION = {"noise": 1, "apart": 1, "rough": 1, "own": 1, "uneven": 1, "moved": 1, "bend": -1, "ncc": -1, "rival": -1}
 ASKED = ((0.68, 0.0, 1.0), (0.94, float(np.log(2.0)), 2.0))
-CELLS, CLASS_WEIGHT = 60000, {"ground": 1.0, "building": 0.4, "tree": 0.3}
+FEWEST, CELLS, CLASS_WEIGHT = 5000, 60000, {"ground": 1.0, "building": 0.4, "tree": 0.3}
 
 
 @dataclass(frozen=True)
@@ -169,9 +170,25 @@ def rising(names: list[str], n: int) -> tuple[np.ndarray, list[tuple[float | Non
 
 
 def fit(samples: list[Sample]) -> dict[str, Any]:
+    """Models of cells where groups of images can be told apart, and of single pairs."""
+    split = [is_split(one.signs) for one in samples]
+    return {
+        "SPLIT": fit_model([part(one, rows) for one, rows in zip(samples, split, strict=True)]),
+        "PAIR": fit_model([part(one, ~rows) for one, rows in zip(samples, split, strict=True)]),
+    }
+
+
+def part(one: Sample, rows: np.ndarray) -> Sample:
+    """Some cells of a sample."""
+    signs = {k: v[rows] for k, v in one.signs.items()}
+    return Sample(signs, one.is_refined[rows], one.error_m[rows], one.kind[rows], one.step_m)
+
+
+def fit_model(samples: list[Sample]) -> dict[str, Any]:
     """Curves of the additive model: least sum of the quantile losses of log |error| at one and two sigma."""
     rng = np.random.default_rng(0)
     chosen, weights = [], []
+    samples = [one for one in samples if len(one.error_m) >= FEWEST]
     for one in samples:
         few = rng.choice(len(one.error_m), min(CELLS, len(one.error_m)), replace=False)
         chosen.append(few)
@@ -187,7 +204,7 @@ def fit(samples: list[Sample]) -> dict[str, Any]:
     grid = {k: np.quantile(v, [0.005, 0.995]) for k, v in pooled.items()}
     grid = {k: (float(a), float(max(b - a, 1e-3) / (KNOTS - 1))) for k, (a, b) in grid.items()}
     columns = [hats(v, *grid[k]) for k, v in pooled.items()]
-    flags = [np.ones(len(target)), ~refined, ~is_split(pooled)]
+    flags = [np.ones(len(target)), ~refined]
     design = np.column_stack([*columns, *flags]).astype(np.float32)
     bend = np.zeros((len(grid) * (KNOTS - 2), design.shape[1]))
     for i in range(len(grid)):
@@ -215,7 +232,7 @@ def fit(samples: list[Sample]) -> dict[str, Any]:
     start = np.zeros(design.shape[1])
     b = whole @ minimize(loss_of_steps, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 800}).x
     curves = {k: (*grid[k], b[i * KNOTS : (i + 1) * KNOTS]) for i, k in enumerate(grid)}
-    return {"curves": curves, "constant": b[-3], "not_refined": b[-2], "no_split": b[-1]}
+    return {"curves": curves, "constant": b[-2], "not_refined": b[-1]}
 
 
 def write(model: dict[str, Any], path: Path) -> None:
@@ -224,23 +241,27 @@ def write(model: dict[str, Any], path: Path) -> None:
         '"""Curves of the precision model, made by benchmarks/precision.py; not to be edited."""', "",
         "from __future__ import annotations", "",
         "# fmt: off",
-        "CONSTANT, NOT_REFINED, NO_SPLIT = {constant:.4f}, {not_refined:.4f}, {no_split:.4f}".format(**model),
-        "# Sign: position of the first knot, spacing of the knots, logarithm of the factor at each.",
-        "CURVES: dict[str, tuple[float, float, tuple[float, ...]]] = {",
+        "# The logarithm of sigma: a constant; what is added where a height was not refined; and by sign: position of",
+        "# the first knot, spacing of the knots, logarithm of the factor at each.",
+        "Model = tuple[float, float, dict[str, tuple[float, float, tuple[float, ...]]]]",
     ]  # fmt: skip
-    for name, (first, spacing, curve) in model["curves"].items():
-        if not np.isfinite([first, spacing, *curve]).all():
-            raise ValueError(f"The curve of {name} is not finite: look at its signs before anything is written.")
-        lines.append(f'    "{name}": ({first:.5g}, {spacing:.5g}, ({", ".join(f"{v:.4f}" for v in curve)})),')
-    path.write_text("\n".join([*lines, "}"]) + "\n", encoding="utf-8")
+    for kind, one in model.items():
+        lines.append(f"{kind}: Model = ({one['constant']:.4f}, {one['not_refined']:.4f}, {{")
+        for name, (first, spacing, curve) in one["curves"].items():
+            if not np.isfinite([first, spacing, *curve]).all():
+                raise ValueError(f"The curve of {name} is not finite: look at its signs before anything is written.")
+            lines.append(f'    "{name}": ({first:.5g}, {spacing:.5g}, ({", ".join(f"{v:.4f}" for v in curve)})),')
+        lines.append("})")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def predicted_sigma(model: dict[str, Any], one: Sample) -> np.ndarray:
     """Sigma of a sample by a model, m (n,)."""
-    total = np.full(len(one.error_m), model["constant"])
-    for name, (first, spacing, curve) in model["curves"].items():
-        total += hats(one.signs[name], first, spacing) @ curve
-    total += np.where(one.is_refined, 0, model["not_refined"]) + np.where(is_split(one.signs), 0, model["no_split"])
+    split, total = is_split(one.signs), np.zeros(len(one.error_m))
+    for kind, rows in (("SPLIT", split), ("PAIR", ~split)):
+        total[rows] = model[kind]["constant"] + np.where(one.is_refined[rows], 0, model[kind]["not_refined"])
+        for name, (first, spacing, curve) in model[kind]["curves"].items():
+            total[rows] += hats(one.signs[name][rows], first, spacing) @ curve
     return np.exp(total) * one.step_m
 
 

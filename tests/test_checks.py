@@ -34,7 +34,14 @@ def judged(**changed):
     heights = SemiGlobalHeights(best, best, arrays["margin"].astype(np.uint16), best.astype(np.float32))
     height, nothing = arrays["height"].astype(np.float32), np.zeros((7, 9), np.float32)
     refined = RefinedHeights(
-        height, arrays["ncc"].astype(np.float32), arrays["refined"].astype(bool), height, nothing, nothing, 49
+        height,
+        arrays["ncc"].astype(np.float32),
+        arrays["refined"].astype(bool),
+        height,
+        nothing,
+        nothing,
+        nothing,
+        nothing.astype(bool),
     )
     apart = arrays["apart"].astype(np.float32)
     return judge(heights, refined, arrays["covering"], arrays["seeing"], apart, 99, OPTIONS)

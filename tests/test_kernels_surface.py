@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, spline_filter
 from kernel_scene import HIDDEN, even_lattice, kernel_scene
 from reference import agreement, surfaces
 from reference.projection import bilinear, cubic, positions
-from zlocus.kernels.reach import block_reach, surely_inside, tile_reach
+from zlocus.kernels.reach import block_reach, surely_covered, tile_reach
 from zlocus.kernels.refine import CUBIC, LINEAR, block_profile, resample_surface, tile_ortho, tile_profile
 from zlocus.kernels.resample import RUN
 from zlocus.kernels.smooth import add_tap, slopes, smaller_slope, smooth_surface
@@ -143,8 +143,15 @@ def covers(scene, i, node, cells, k, blocked):
 
 def test_reach_of_one_block_and_its_shortcut():
     scene = kernel_scene(2, (8, 8), 8)
-    assert surely_inside(scene.nodes, 0, -0.5, 0.5, 8, 3.0, scene.layout[0])
-    assert not surely_inside(scene.nodes, 0, -9.0, 0.5, 8, 3.0, scene.layout[0])
+    blocked = np.zeros(len(scene.pixels), bool)
+    assert surely_covered(scene.nodes, 0, -0.5, 0.5, 8, 3.0, scene.layout[0], blocked, False)
+    assert surely_covered(scene.nodes, 0, -0.5, 0.5, 8, 3.0, scene.layout[0], blocked, True)
+    assert not surely_covered(scene.nodes, 0, -9.0, 0.5, 8, 3.0, scene.layout[0], blocked, False)
+    for t in (-0.5, 0.0, 0.5):
+        at = positions(scene.nodes[0, :2, :2], t, (8, 8), 8)[4, 4].astype(int)
+        blocked[:] = False
+        blocked[at[1] * scene.layout[0, 2] + at[0]] = True
+        assert not surely_covered(scene.nodes, 0, -0.5, 0.5, 8, 3.0, scene.layout[0], blocked, True)
     lowest, highest = np.empty((2, 2, 8, 8), np.int32)
     block_reach(
         np.zeros(len(scene.pixels), bool), np.zeros(2, bool), scene.layout, scene.nodes, scene.heights,
@@ -239,8 +246,8 @@ def test_profiles(n_views, half):
     seen[0, 1, 3:9], seen[1, 0, :, :5] = HIDDEN, 3
     groups = np.empty((2, 3, *scene.shape), np.float32)
     tile_profile(
-        coefficients(scene), scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, half, seen,
-        np.float32(0.0), groups,
+        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, half,
+        seen, np.float32(0.0), groups,
     )  # fmt: skip
     out = groups.sum(axis=0)
     for b, d, rows, cols in scene.blocks():
@@ -265,7 +272,7 @@ def test_profile_of_one_block():
     scene = kernel_scene(3, (9, 11), 16)
     surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 1, 9, 11), np.float32)
     block_profile(
-        coefficients(scene), scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16, 2,
+        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16, 2,
         scene.all_seen(), np.float32(0.0), out,
     )  # fmt: skip
     expected = agreement.profile(

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from zlocus.kernels.precision import add_curve
 from zlocus.matching.progressive import predicted_sigma
-from zlocus.matching.refine import RefinedHeights
+from zlocus.matching.refine import RefinedHeights, peak_variance
 from zlocus.matching.semiglobal import SemiGlobalHeights
-from zlocus.surface.calibration import CURVES
+from zlocus.surface.calibration import PAIR, SPLIT
 from zlocus.surface.precision import LEAST_STEPS, is_split, sigma_steps, signs_of_precision
 
 SHAPE, LOGARITHM = (24, 30), 1e-5
@@ -20,9 +20,18 @@ INNER = (slice(6, -6), slice(6, -6))
 
 def refined(**changed) -> RefinedHeights:
     """Level heights of good cells."""
-    values = {"height": 20.0, "ncc": 0.9, "is_refined": True, "smooth": 20.0, "bend": 0.4, "apart": 0.1}
-    arrays = {k: np.full(SHAPE, v, bool if k == "is_refined" else np.float32) for k, v in values.items()}
-    return RefinedHeights(**{**arrays, **changed}, window_cells=49)
+    values = {
+        "height": 20.0,
+        "ncc": 0.9,
+        "is_refined": True,
+        "smooth": 20.0,
+        "bend": 0.4,
+        "apart": 0.1,
+        "is_fixed": False,
+    }
+    arrays = {k: np.full(SHAPE, v, bool if k.startswith("is_") else np.float32) for k, v in values.items()}
+    arrays |= changed
+    return RefinedHeights(**arrays, variance=peak_variance(arrays["ncc"], arrays["bend"], np.full(SHAPE, 4), 49))
 
 
 def semi_global(height) -> SemiGlobalHeights:
@@ -92,7 +101,7 @@ def test_every_sign_has_a_curve_and_every_cell_a_sigma():
         apart=np.full(SHAPE, np.nan, np.float32), bend=np.zeros(SHAPE, np.float32), ncc=np.full(SHAPE, -1, np.float32),
         is_refined=np.zeros(SHAPE, bool),
     )  # fmt: skip
-    assert set(signs(nothing)) == set(CURVES)
+    assert set(signs(nothing)) == set(PAIR[2]) == set(SPLIT[2])
     for n_seeing in (0, 1, 2, 200):
         found = sigma(nothing, n_seeing=n_seeing)
         assert found.dtype == np.float32

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orientation_scenes import AffineSensor, observe, random_ground
-from zlocus.orientation.locus import OnLocus, locate
+from zlocus.orientation.locus import OnLocus, Sightlines, locate
 from zlocus.orientation.ransac import find_shift
 
 N = 400
@@ -79,10 +79,11 @@ def test_distance_and_height_are_those_of_the_planted_point():
     xyz = random_ground(60)
     seen = observe(sensors, xyz)
     in_a, in_b = seen.xy[:60], seen.xy[60:]
-    exact = locate(*sensors, in_a, in_b, (0.0, 300.0))
+    lines = Sightlines.of(sensors[0], in_a, (0.0, 300.0))
+    exact = locate(lines, sensors[1], in_b, (0.0, 300.0))
     assert np.abs(exact.z - xyz[:, 2]).max() < 1e-6
     assert np.abs(exact.across_px).max() < 1e-6
-    moved = locate(*sensors, in_a, in_b + 2.5 * exact.normal, (0.0, 300.0))
+    moved = locate(lines, sensors[1], in_b + 2.5 * exact.normal, (0.0, 300.0))
     assert np.abs(moved.across_px - 2.5).max() < 1e-6
     assert np.abs(moved.z - xyz[:, 2]).max() < 1e-6
 
@@ -90,4 +91,5 @@ def test_distance_and_height_are_those_of_the_planted_point():
 def test_parallel_rays_have_no_locus():
     sensors = [AffineSensor(0.1, 0.0), AffineSensor(0.1, 0.0, (5.0, 5.0))]
     xy = np.zeros((3, 2))
-    assert np.isnan(locate(*sensors, xy, xy, (0.0, 300.0)).across_px).all()
+    lines = Sightlines.of(sensors[0], xy, (0.0, 300.0))
+    assert np.isnan(locate(lines, sensors[1], xy, (0.0, 300.0)).across_px).all()

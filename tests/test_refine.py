@@ -8,7 +8,16 @@ from affine import Affine
 from scipy.ndimage import spline_filter
 
 from rendered_scenes import CENTRE, FIELD, GSD_M, LOOKS, SIZE_PX, camera
-from zlocus.matching.refine import FARTHEST_APART, bend_at_centre, parabola_peak, peaks_apart, refine, smoothed
+from zlocus.matching.refine import (
+    FARTHEST_APART,
+    bend_at_centre,
+    parabola_peak,
+    peak_variance,
+    peaks_apart,
+    refine,
+    smoothed,
+    weighed,
+)
 from zlocus.matching.views import ViewPixels, tile_views
 from zlocus.options import RefineOptions
 from zlocus.synthetic.render import Sun, render
@@ -51,6 +60,43 @@ def test_bend_and_distance_of_two_parabolas():
     assert (peaks_apart(np.stack([profiles[0], nearly_flat]), spacing) == FARTHEST_APART).all()
 
 
+def test_a_peak_beyond_the_largest_sample_lies_between_the_samples():
+    """Of three samples the largest is an end one; the parabola's vertex still lies within them, or it does not."""
+    offsets = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
+    peaks = np.array([[0.3, -0.45, 0.55]], np.float32)
+    at, _, inside = parabola_peak(0.8 - 0.3 * (offsets[:, None, None] - peaks) ** 2, offsets)
+    np.testing.assert_allclose(at[0, :2], peaks[0, :2], rtol=0, atol=1e-5)
+    assert inside.tolist() == [[True, True, False]]
+
+
+def test_variance_of_a_peak():
+    """2 (1 - rho) / (c N m): 2 x 0.1 / (0.5 x 49 x 4)."""
+    grid = np.ones((1, 1), np.float32)
+    assert peak_variance(0.9 * grid, 0.5 * grid, np.array([[4]]), 49)[0, 0] == pytest.approx(0.2 / 98, rel=1e-5)
+    assert np.isfinite(peak_variance(grid, 0 * grid, np.array([[0]]), 49)).all()
+
+
+def test_noise_about_a_smooth_surface_is_taken_off_and_relief_kept():
+    """White noise of a variance that is known shrinks; relief of 20 times that, which nobody calls noise, stays."""
+    rng = np.random.default_rng(5)
+    away = rng.normal(0.0, 0.1, (60, 120)).astype(np.float32)
+    away[:, 60:] += np.float32(2.0) * (np.arange(60) // 6 % 2 - np.float32(0.5))
+    known = np.ones(away.shape, bool)
+    found = weighed(away, known, np.full(away.shape, 0.01, np.float32))
+    assert np.abs(found[:, :50]).mean() < 0.2 * np.abs(away[:, :50]).mean()
+    np.testing.assert_allclose(found[:, 70:], away[:, 70:], rtol=0.05, atol=0)
+    np.testing.assert_array_equal(weighed(away, known, np.zeros(away.shape, np.float32)), away)
+
+
+def test_what_does_not_count_says_nothing_of_the_spread():
+    """Far distances that were not believed would pass for relief."""
+    away = np.full((40, 40), 0.1, np.float32) * np.where(np.arange(40) % 2, 1, -1).astype(np.float32)
+    known, variance = np.ones(away.shape, bool), np.full(away.shape, 0.005, np.float32)
+    expected = weighed(away, known, variance)
+    away[10:30, 10:30:3], known[10:30, 10:30:3] = 5.0, False
+    np.testing.assert_allclose(weighed(away, known, variance)[known], expected[known], rtol=0, atol=1e-6)
+
+
 def test_smoothing_removes_single_cells_and_keeps_jumps():
     surface = np.full((20, 30), 10.0, np.float32)
     surface[:, 15:] = 40.0
@@ -62,14 +108,18 @@ def test_smoothing_removes_single_cells_and_keeps_jumps():
 
 @pytest.fixture(scope="module")
 def plane():
-    """The views of a plane at 50 m, as splines."""
+    """The views of a plane at 50 m."""
     ground, shape = analytic_ground("plane", CENTRE, GSD_M / 2, FIELD, seed=5), (SIZE_PX, SIZE_PX)
     images = []
     for name in LOOKS:
         pixels = render(ground, camera(name), shape, Sun(150.0, 50.0), samples=3)
-        pixels = pixels / pixels.std()
-        images.append((camera(name), spline_filter(pixels, 3, output=np.float32, mode="mirror")))
+        images.append((camera(name), (pixels / pixels.std()).astype(np.float32)))
     return images
+
+
+def splines(plane) -> np.ndarray:
+    """Their coefficients."""
+    return np.concatenate([spline_filter(pixels, 3, output=np.float32, mode="mirror").ravel() for _, pixels in plane])
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.13, 0.37, 0.5, 0.81])
@@ -86,14 +136,14 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
     seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 20.5, np.float32)
-    found = refine(views, coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=3))
+    found = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=3))
     inner = (slice(4, -4), slice(4, -4))
     assert found.is_refined[inner].mean() > 0.99
     assert abs(np.median(found.height[inner]) - 20 - fraction) < STEPS
     assert np.median(found.ncc) > 0.95
     assert (found.bend[inner] > 0).all()
     assert np.median(found.apart[inner]) < 0.1
-    assert found.window_cells == 49
+    assert np.median(found.variance[inner]) < STEPS**2
 
 
 def test_what_is_too_far_keeps_the_coarse_height(plane):
@@ -106,11 +156,11 @@ def test_what_is_too_far_keeps_the_coarse_height(plane):
     seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 32.0, np.float32)
-    found = refine(views, coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=1, reach_steps=0.1))
+    found = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=1, reach_steps=0.1))
     kept = found.height[~found.is_refined]
     assert kept.size > 100
     assert (kept == 32.0).all()
-    none = refine(views, coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=0))
+    none = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=0))
     assert (none.height == 32.0).all()
     assert not none.is_refined.any()
     assert np.isnan(none.apart).all()

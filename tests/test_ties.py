@@ -7,17 +7,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from scipy.spatial import cKDTree
 
 from orientation_scenes import AffineSensor, ArrayImage, hill, hill_scene, image_of, texture
+from rpc_fixtures import satellite_rpc
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
 from zlocus.orientation import features as features_module
 from zlocus.orientation.features import Features, detect, part_grid, reduction
-from zlocus.orientation.locus import Loci
+from zlocus.orientation.locus import Loci, Sightlines
 from zlocus.orientation.ties import PairMatches, find_ties, join_tracks, match_near_loci, widest_range
 from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.rpc import RpcModel
 
+SAME_RAY_PX = 1e-3
 OPTIONS = OrientationOptions(features_per_mpx=20000)
 FULL_DETAIL = OrientationOptions(features_per_mpx=100000, full_detail_mpx=100.0)
 REDUCED = OrientationOptions(features_per_mpx=100000, full_detail_mpx=0.05)
@@ -244,3 +248,30 @@ def test_orientations_of_one_place_are_one_feature():
     ties = join_tracks(views, (pair_of((0, 1), [0, 1], [0, 1], [10.0, 10.0]),), (0.0, 100.0))
     assert len(ties.z) == 1
     assert len(ties.seen) == 2
+
+
+def test_sightlines_are_the_rays_of_the_sensor():
+    """Over the whole height box of an RPC, and beyond it, where the sensor itself is asked."""
+    sensor = RpcModel(satellite_rpc(), CRS.from_epsg(32631))
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(15000, 25000, (200, 2))
+    lines, z = Sightlines.of(sensor, xy, (-50.0, 950.0)), rng.uniform(-200.0, 1100.0, 200)
+    back = sensor.image_from_ground(lines.at(z))
+    assert np.abs(back - xy).max() < SAME_RAY_PX
+    far = np.full(200, 2500.0)
+    np.testing.assert_array_equal(lines.at(far), sensor.ground_from_image(xy, far))
+    few = np.array([3, 77])
+    np.testing.assert_array_equal(lines.only(few).at(z[few]), lines.at(z)[few])
+
+
+def test_a_ray_that_one_end_of_the_heights_does_not_meet_is_the_sensors():
+    class Low:
+        """Knows no ground above 100 m."""
+
+        def ground_from_image(self, xy, z):
+            return np.where(np.asarray(z)[:, None] > 100.0, np.nan, np.column_stack([xy, z]))
+
+    xy = np.array([[3.0, 4.0], [5.0, 6.0]])
+    ground = Sightlines.of(Low(), xy, (0.0, 300.0)).at(np.array([50.0, 200.0]))
+    np.testing.assert_array_equal(ground[0], [3.0, 4.0, 50.0])
+    assert np.isnan(ground[1]).all()

@@ -456,9 +456,14 @@ def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
 def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:
     """Refine the finest level and judge it, halo included."""
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
-    coefficients = replace(result.views, pixels=splines)
     refined = refine(
-        coefficients, result.heights.vertex, result.seen, scene.step_m / scene.cell_m, config.refine, result.is_planar
+        result.views,
+        splines,
+        result.heights.vertex,
+        result.seen,
+        scene.step_m / scene.cell_m,
+        config.refine,
+        result.is_planar,
     )
     at = refined.height[None]
     covering = covers(result.seen).sum(axis=0)

@@ -86,7 +86,7 @@ def tiny_scene() -> MatchScene:
 def warm_orientation(scene: MatchScene) -> None:
     """Run the kernels of the orientation once."""
     from zlocus.orientation.features import DESCRIPTOR_LENGTH, Features
-    from zlocus.orientation.locus import trace
+    from zlocus.orientation.locus import Sightlines, trace
     from zlocus.orientation.sharpen import sharpened
     from zlocus.orientation.ties import match_near_loci
     from zlocus.orientation.triangulate import Observations, ground_jacobian
@@ -94,7 +94,7 @@ def warm_orientation(scene: MatchScene) -> None:
     sensors, options = [view.sensor for view in scene.views], RunConfig().orientation
     xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
     features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
-    loci = trace(sensors[0], sensors[1], xy, (0.0, 1.0))
+    loci = trace(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
     for moved in (loci, loci.moved(np.zeros(2))):
         match_near_loci(moved, features.only(point), features, options.inlier_px, options.match_ratio)
     seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
@@ -127,7 +127,7 @@ def warm(group: str) -> None:
     Samples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(views, 0, slice(None))
     seen = np.zeros((3, 2, *shape), np.int32)
     seen[1] = 16
-    refine(views, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
+    refine(views, views.pixels, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
 from zlocus.errors import InputError
-from zlocus.io.opening import check_complete, open_raster
+from zlocus.io.opening import check_complete, kept_raster, open_raster
 from zlocus.scene import ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
@@ -30,8 +30,7 @@ class RasterImage:
     an alpha band, NaN and infinities. An integer image that declares no nodata value is valid everywhere: 0 is a
     legal grey value and is never taken for nodata.
 
-    The file is opened for each read: a handle of GDAL must not be shared between threads, opening costs about
-    1 ms, and so the object is a plain value that threads and processes can share and that holds no cache.
+    The object is a plain value that threads and processes can share: open files are kept by thread, see `kept_raster`.
 
     bands : 1-based indices of the bands that are read, with `weights`.
     """
@@ -54,7 +53,7 @@ class RasterImage:
         """
         inside = 0 <= row <= row + rows <= self.shape[0] and 0 <= col <= col + cols <= self.shape[1]
         assert inside, f"window {row, col, rows, cols} leaves {self.path.name} of {self.shape}"
-        with open_raster(self.path) as source:
+        with kept_raster(self.path) as source:
             if source.shape != self.shape:
                 raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
             return self._read(source, Window(col, row, cols, rows))

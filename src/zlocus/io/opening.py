@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import threading
 import warnings
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import rasterio
@@ -16,7 +18,9 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.errors import InputError
 
-BLOCK_CACHE_MB = 64
+BLOCK_CACHE_BYTES = 128 << 20
+KEPT_OPEN = 32  # rasters of a thread
+_GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
 # `warnings.catch_warnings` swaps a global list, so two threads must not be inside it at once.
 _quiet = threading.Lock()
 
@@ -41,28 +45,82 @@ def existing_file(path: Path, what: str) -> Path:
 def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetReader]:
     """An open rasterio dataset; what rasterio or GDAL cannot do inside the block becomes an `InputError`.
 
-    GDAL's block cache is held to `BLOCK_CACHE_MB`, siblings of the file are probed by name instead of listing the
+    GDAL's block cache is held to `BLOCK_CACHE_BYTES`, siblings of the file are probed by name instead of listing the
     folder, and the warning that an image lacks a georeference (true of every unrectified one) is not shown.
     """
     path = existing_file(path, what)
-    with rasterio.Env(GDAL_CACHEMAX=BLOCK_CACHE_MB, GDAL_DISABLE_READDIR_ON_OPEN="TRUE"):
+    with rasterio.Env(**_GDAL), _opened(path) as dataset, _read_errors(path):
+        yield dataset
+
+
+@contextmanager
+def kept_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
+    """As `open_raster`, and the image stays open for this thread's next look at it, with the blocks that are in cache.
+
+    A file that has changed since is opened anew. GDAL's handles must not be shared, neither by threads nor by a process
+    and its fork.
+    """
+    path = existing_file(path, "image")
+    with rasterio.Env(**_GDAL):
+        dataset = _kept.dataset(path)
         try:
-            with _quiet, warnings.catch_warnings():
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                dataset = rasterio.open(path)
-        except (RasterioError, CPLE_BaseError, OSError) as error:
-            raise InputError(
-                f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
-                "GeoTIFF (or another format of GDAL)."
-            ) from error
-        with dataset:
-            try:
+            with _read_errors(path):
                 yield dataset
-            except (RasterioError, CPLE_BaseError) as error:
-                raise InputError(
-                    f"{path} cannot be read: {reason(error)}. It is damaged or truncated; copy it again from its "
-                    "source."
-                ) from error
+        except BaseException:
+            _kept.forget(path)
+            raise
+
+
+def _opened(path: Path) -> rasterio.DatasetReader:
+    try:
+        with _quiet, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            return rasterio.open(path)
+    except (RasterioError, CPLE_BaseError, OSError) as error:
+        raise InputError(
+            f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
+            "GeoTIFF (or another format of GDAL)."
+        ) from error
+
+
+@contextmanager
+def _read_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (RasterioError, CPLE_BaseError) as error:
+        raise InputError(
+            f"{path} cannot be read: {reason(error)}. It is damaged or truncated; copy it again from its source."
+        ) from error
+
+
+@dataclass
+class _Kept(threading.local):
+    """Open rasters of one thread, the one used last at the end, with the state of the file when it was opened."""
+
+    datasets: OrderedDict[Path, tuple[tuple[int, ...], rasterio.DatasetReader]] = field(default_factory=OrderedDict)
+
+    def dataset(self, path: Path) -> rasterio.DatasetReader:
+        """The raster, opened where it is not open yet."""
+        file = os.stat(path)
+        state = (os.getpid(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns)
+        known, dataset = self.datasets.get(path, (None, None))
+        if known != state or dataset is None:
+            self.forget(path)
+            dataset = _opened(path)
+            self.datasets[path] = state, dataset
+            if len(self.datasets) > KEPT_OPEN:
+                self.forget(next(iter(self.datasets)))
+        self.datasets.move_to_end(path)
+        return dataset
+
+    def forget(self, path: Path) -> None:
+        """Close a raster, unless the process it was opened by is another."""
+        state, dataset = self.datasets.pop(path, (None, None))
+        if state and dataset and state[0] == os.getpid():
+            dataset.close()
+
+
+_kept = _Kept()
 
 
 def check_complete(source: rasterio.DatasetReader, path: Path) -> None:

@@ -20,7 +20,7 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from zlocus.errors import InputError, OutputError
-from zlocus.io.opening import BLOCK_CACHE_MB, check_complete, open_raster, reason
+from zlocus.io.opening import BLOCK_CACHE_BYTES, check_complete, open_raster, reason
 
 BLOCK_SIZE = 512
 # Deflate is read everywhere. Heights, sigmas and grey values shrink by 1 % more at level 6, in nearly twice the time.
@@ -117,7 +117,7 @@ class RasterSink:
     def _guard(self) -> Iterator[None]:
         """GDAL's settings for writing, and its errors (of several unrelated kinds) as one."""
         try:
-            with rasterio.Env(GDAL_CACHEMAX=BLOCK_CACHE_MB, GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED=False):
+            with rasterio.Env(GDAL_CACHEMAX=BLOCK_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED=False):
                 yield
         except (RasterioError, CPLE_BaseError, InputError, OSError, SystemError) as error:
             self._remove()

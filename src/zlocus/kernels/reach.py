@@ -9,13 +9,33 @@ from zlocus.kernels.volume import HIDDEN, plane_grid
 
 # Positions this close to a bound (px) are judged cell by cell.
 ROUNDING = 1e-6
+BENT = 1.0  # px, below the margin from an image's border
 
 
-# (i,2,2,2,4) f8, i8, f8, f8, i8, f8, (3,) i8 -> b1
+# (3,) i8, f8, f8, f8, f8, (p,) b1 -> i8
 @kernel
-def surely_inside(nodes, view, t_low, t_high, block, margin, layout):
-    """Whether a block projects inside an image by `margin` px at both ends of its heights (loci are near straight)."""
+def count_blocked(layout, x_low, x_high, y_low, y_high, blocked):
+    """Blocked pixels in the rectangle around positions inside an image, and -1 in place of all of them."""
+    left, width = int(x_low), min(int(x_high) + 2, layout[2]) - int(x_low)
+    top, height = int(y_low), min(int(y_high) + 2, layout[1]) - int(y_low)
+    n_blocked = np.int64(0)
+    for row in range(top, top + height):
+        start = layout[0] + row * layout[2] + left
+        in_row = np.uint16(0)
+        for is_blocked in blocked[start : start + width]:
+            in_row = np.uint16(in_row + np.uint16(is_blocked))
+        n_blocked += np.int64(in_row)
+    return np.int64(-1) if n_blocked == width * height else n_blocked
+
+
+# (i,2,2,2,4) f8, i8, f8, f8, i8, f8, (3,) i8, (p,) b1, b1 -> b1
+@kernel
+def surely_covered(nodes, view, t_low, t_high, block, margin, layout, blocked, has_blocked):
+    """Whether a block projects inside an image by `margin` px, on pixels that are not blocked, at all heights between
+    two; loci are near straight, and those pixels are looked for `BENT` px around."""
     grid = np.empty(8)
+    x_low, y_low = np.inf, np.inf
+    x_high, y_high = -np.inf, -np.inf
     for end in range(2):
         plane_grid(nodes, view, t_low if end == 0 else t_high, block, 0, grid)
         for corner in range(4):
@@ -24,7 +44,11 @@ def surely_inside(nodes, view, t_low, t_high, block, margin, layout):
             y = grid[1] + r * grid[5] + c * (grid[3] + r * grid[7])
             if not (margin <= x <= layout[2] - 1 - margin and margin <= y <= layout[1] - 1 - margin):
                 return False
-    return True
+            x_low, x_high = min(x_low, x), max(x_high, x)
+            y_low, y_high = min(y_low, y), max(y_high, y)
+    if not has_blocked:
+        return True
+    return count_blocked(layout, x_low - BENT, x_high + BENT, y_low - BENT, y_high + BENT, blocked) == 0
 
 
 # (8,) f8, (2,) i8, f8, (3,) i8, (p,) b1, b1 -> i8
@@ -53,16 +77,8 @@ def plane_cover(grid, shape, margin, layout, blocked, has_blocked):
         return 0
     if not has_blocked:
         return 1
-    left, width = int(x_low), min(int(x_high) + 2, layout[2]) - int(x_low)
-    top, height = int(y_low), min(int(y_high) + 2, layout[1]) - int(y_low)
-    n_blocked = np.int64(0)
-    for row in range(top, top + height):
-        start = layout[0] + row * layout[2] + left
-        in_row = np.uint16(0)
-        for is_blocked in blocked[start : start + width]:
-            in_row = np.uint16(in_row + np.uint16(is_blocked))
-        n_blocked += np.int64(in_row)
-    return 1 if n_blocked == 0 else (-1 if n_blocked == width * height else 0)
+    n_blocked = count_blocked(layout, x_low, x_high, y_low, y_high, blocked)
+    return 1 if n_blocked == 0 else (-1 if n_blocked < 0 else 0)
 
 
 # (r,c) i4, i8, i8, (r,c) i4, (r,c) i4, (r,c) i4 -> None
@@ -118,7 +134,7 @@ def block_reach(blocked, has_blocked, layout, nodes, heights, span, block, margi
     longest = np.empty_like(run)
     t_low, t_high = heights[0] + first * heights[1], heights[0] + (end - 1) * heights[1]
     for i in range(layout.shape[0]):
-        if not has_blocked[i] and surely_inside(nodes, i, t_low, t_high, block, margin, layout[i]):
+        if surely_covered(nodes, i, t_low, t_high, block, margin, layout[i], blocked, has_blocked[i]):
             lowest[i] = first
             highest[i] = end - 1
             continue

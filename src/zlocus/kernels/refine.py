@@ -147,9 +147,9 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
             gather(pixels, layout, index, across, pairs, out[first:end])
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (3,i,r,c) i4, f4, (g,j,r,c) f4 -> None
+# (p,) f4, i8, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (3,i,r,c) i4, f4, (g,j,r,c) f4 -> None
 @kernel
-def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
+def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
     """Mean NCC over all pairs of the views that see the surface, at `surface` + `offsets`; windows follow the surface.
 
     surface : (r + 2 half, c + 2 half) float32 height indices, border included; offsets : (j,) float32, in steps;
@@ -189,7 +189,7 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
             for m in range(3):
                 t = heights[0] + (centre + (m - 1) * reach) * heights[1]
                 plane_grid(nodes, i, t, block, half, grids[m])
-            resample_surface(pixels, layout[i], grids, cells, level, CUBIC, planes[i])
+            resample_surface(pixels, layout[i], grids, cells, level, degree, planes[i])
             planes[i] -= planes[i, half * width + half]
             window_moments(planes[i], windows, width, n, floor, work, mean[i], scale[i])
             for p in range(n):
@@ -205,7 +205,7 @@ def block_profile(pixels, layout, nodes, heights, surface, offsets, block, half,
 
 # as block_profile, over every block of a tile; surface : (r + 2 half, c + 2 half)
 @kernel
-def tile_profile(pixels, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
+def tile_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
     """`block_profile` of every block of a tile; out : (g, j, r, c)."""
     n_rows, n_cols = out.shape[2], out.shape[3]
     for br in range((n_rows + block - 1) // block):
@@ -213,7 +213,7 @@ def tile_profile(pixels, layout, nodes, heights, surface, offsets, block, half, 
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             block_profile(
-                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights,
+                pixels, degree, layout, nodes[:, br : br + 2, bc : bc + 2], heights,
                 surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], offsets, block, half, seen[:, :, r0:r1, c0:c1],
                 floor, out[:, :, r0:r1, c0:c1],
             )  # fmt: skip
@@ -246,17 +246,18 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
 @kernel
 def profile_peaks(profile, offsets, position, value, is_inside):
     """Position and value of the maximum of equally spaced samples by the parabola through the three around the largest
-    one (at an end, the three at that end), and whether the largest is none at an end. profile : (j, n), a cell a
-    column, j >= 3."""
+    one (at an end, the three at that end), and whether there is one between the first and the last. profile : (j, n), a
+    cell a column, j >= 3."""
     n_samples, spacing = profile.shape[0], offsets[1] - offsets[0]
     for p in range(profile.shape[1]):
         best = 0
         for j in range(1, n_samples):
             best = j if profile[j, p] > profile[best, p] else best
-        is_inside[p] = 0 < best < n_samples - 1
         at = min(max(best, 1), n_samples - 2)
         left, here, right = profile[at - 1, p], profile[at, p], profile[at + 1, p]
         bend = min(left - np.float32(2.0) * here + right, np.float32(-1e-6))
-        shift = min(max(np.float32(0.5) * (left - right) / bend, np.float32(-1.0)), np.float32(1.0))
+        shift = np.float32(0.5) * (left - right) / bend
+        is_inside[p] = (bend < np.float32(-1e-6)) & (abs(shift) < np.float32(1.0))
+        shift = min(max(shift, np.float32(-1.0)), np.float32(1.0))
         value[p] = here - np.float32(0.25) * (left - right) * shift
         position[p] = offsets[at] + shift * spacing

@@ -8,20 +8,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels.refine import profile_peaks, tile_profile
+from zlocus.kernels.refine import CUBIC, LINEAR, profile_peaks, tile_profile
 from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.lattice import NARROW_BASE
 from zlocus.matching.views import TileViews
+from zlocus.matching.visibility import sees
 from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
 # Heights measured around the surface, in steps: wide in the first round, then three beside the peak.
-FIRST_OFFSETS = np.linspace(-1.5, 1.5, 5, dtype=np.float32)
+FIRST_OFFSETS = np.linspace(-1.0, 1.0, 3, dtype=np.float32)
 LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
+# Of a peak's variance by `peak_variance`, which knows nothing of what disturbs several images alike.
+NOISE_FACTOR = 1.5
+SPREAD_CELLS = 15  # around a cell, over which heights spread about the smooth surface
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
 WIDE_WINDOW, NARROW_WINDOW = 9, 7
 FARTHEST_APART, LEAST_BEND = np.float32(3.0), np.float32(1e-6)
+LEAST_PEAK, LEAST_NOISE = np.float32(1e-3), np.float32(1e-3)  # bend per step squared; 1 - NCC
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,8 @@ class RefinedHeights:
     height : float32 height indices; ncc : float32, the measure there; is_refined : bool, False where the semi-global
     height was kept; smooth : float32 height indices, the surface that the last windows followed; bend : float32,
     curvature of the measure per step squared, 0 where it has no peak; apart : float32 steps, distance of the peaks of
-    two groups of pairs of views, NaN where a group has none; window_cells : of the correlation window.
+    two groups of pairs of views, NaN where a group has none; variance : float32 steps squared, see `peak_variance`;
+    is_fixed : bool, cells that kept their heights because they were told to.
     """
 
     height: FloatGrid
@@ -40,7 +46,8 @@ class RefinedHeights:
     smooth: FloatGrid
     bend: FloatGrid
     apart: FloatGrid
-    window_cells: int
+    variance: FloatGrid
+    is_fixed: NDArray[np.bool_]
 
 
 def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
@@ -56,7 +63,8 @@ def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
 
 
 def refine(
-    coefficients: TileViews,
+    views: TileViews,
+    coefficients: NDArray[np.float32],
     coarse: FloatGrid,
     seen: NDArray[np.int32],
     step_cells: float,
@@ -65,35 +73,57 @@ def refine(
 ) -> RefinedHeights:
     """Refine height indices `coarse` (r, c) float32.
 
-    coefficients : the views with cubic B-spline coefficients for pixels. Each round smooths the surface, measures the
-    mean NCC at a few fractions of a step around it and puts a parabola through the best three. Windows that follow a
-    noisy surface would see a different place in each image, hence the smoothing; a refined height further than
-    `reach_steps` from the semi-global one is not believed. step_cells : height of a step over the side of a cell;
-    fixed : (r, c), cells that are measured like the others and keep their heights.
+    coefficients : of cubic B-splines, as `views` has pixels. Each round smooths the surface, measures the mean NCC at a
+    few fractions of a step around it and puts a parabola through the best three: linear values of the images will do
+    for all rounds but the last. Windows that follow a noisy surface would see a different place in each image, hence
+    the smoothing; a refined height further than `reach_steps` from the semi-global one is not believed, and what the
+    last round finds counts by how much of it is noise (see `weighed`). step_cells : height of a step over the side of a
+    cell; fixed : (r, c), cells that are measured like the others and keep their heights.
     """
+    fixed = np.zeros(coarse.shape, np.bool_) if fixed is None else fixed
     half = (options.window or default_window(step_cells)) // 2
+    window_cells = (2 * half + 1) ** 2
     height, is_refined = coarse.astype(np.float32), np.zeros(coarse.shape, bool)
     surface, best, bend = height, np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.float32)
-    apart = np.full(coarse.shape, np.nan, np.float32)
+    apart, variance = np.full(coarse.shape, np.nan, np.float32), np.ones(coarse.shape, np.float32)
     for number in range(options.rounds):
-        surface = smoothed(height, options.jump_steps)
+        surface, is_last = smoothed(height, options.jump_steps), number == options.rounds - 1
         offsets = FIRST_OFFSETS if number == 0 else LATER_OFFSETS
-        groups = 2 if number == options.rounds - 1 else 1
-        profiles = np.empty((groups, len(offsets), *coarse.shape), np.float32)
+        profiles = np.empty((2 if is_last else 1, len(offsets), *coarse.shape), np.float32)
+        values, degree = (coefficients, CUBIC) if is_last else (views.pixels, LINEAR)
         tile_profile(
-            coefficients.pixels, coefficients.layout, coefficients.nodes, coefficients.heights,
-            np.pad(surface, half, mode="edge"), offsets, coefficients.block, half, seen, np.float32(0.0), profiles,
+            values, degree, views.layout, views.nodes, views.heights, np.pad(surface, half, mode="edge"), offsets,
+            views.block, half, seen, np.float32(0.0), profiles,
         )  # fmt: skip
-        profile = profiles[0] if groups == 1 else profiles.sum(axis=0)
+        profile, spacing = profiles.sum(axis=0) if is_last else profiles[0], offsets[1] - offsets[0]
         found, best, inside = parabola_peak(profile, offsets)
-        if groups > 1:
-            middle = slice(len(offsets) // 2 - 1, len(offsets) // 2 + 2)
-            spacing = offsets[1] - offsets[0]
-            bend, apart = bend_at_centre(profile[middle], spacing), peaks_apart(profiles[:, middle], spacing)
-        found += surface
-        is_refined = inside & (np.abs(found - coarse) < options.reach_steps)
-        height = np.where(is_refined if fixed is None else is_refined & ~fixed, found, height)
-    return RefinedHeights(height, best, is_refined, surface, bend, apart, (2 * half + 1) ** 2)
+        is_refined = inside & (np.abs(found + surface - coarse) < options.reach_steps)
+        if is_last:
+            bend, apart = bend_at_centre(profile, spacing), peaks_apart(profiles, spacing)
+            variance = peak_variance(best, bend, sees(seen, surface[None]).sum(axis=0), window_cells)
+            found = weighed(found, is_refined, variance)
+        height = np.where(is_refined & ~fixed, found + surface, height)
+    return RefinedHeights(height, best, is_refined, surface, bend, apart, variance, fixed)
+
+
+def peak_variance(ncc: FloatGrid, bend: FloatGrid, n_images: NDArray[np.integer], window_cells: int) -> FloatGrid:
+    """Variance of the place of the measure's peak, steps squared: see `zlocus.matching.progressive.predicted_sigma`."""
+    noise = 2 * np.maximum(1 - ncc, LEAST_NOISE)
+    images = np.maximum(n_images, 1).astype(np.float32)
+    return np.asarray(noise / (np.maximum(bend, LEAST_PEAK) * window_cells * images), np.float32)
+
+
+def weighed(away: FloatGrid, known: NDArray[np.bool_], variance: FloatGrid) -> FloatGrid:
+    """Distances (r, c) from a smooth surface, each multiplied by the share of their spread that is not noise.
+
+    known : (r, c), distances that count; variance : (r, c), of their noise. Source: Lee (1980), "Digital image
+    enhancement and noise filtering by use of local statistics", equation 9, about the smooth surface for a mean.
+    """
+    side = (SPREAD_CELLS, SPREAD_CELLS)
+    squares = cv2.blur(np.where(known, away, np.float32(0.0)) ** 2, side, borderType=cv2.BORDER_REFLECT)
+    spread = squares / np.maximum(cv2.blur(known.astype(np.float32), side, borderType=cv2.BORDER_REFLECT), 1e-3)
+    signal = 1 - np.float32(NOISE_FACTOR) * variance / np.maximum(spread, np.float32(1e-9))
+    return np.asarray(away * np.clip(signal, 0, 1), np.float32)
 
 
 def default_window(step_cells: float) -> int:
@@ -106,7 +136,7 @@ def default_window(step_cells: float) -> int:
 
 
 def parabola_peak(profile: NDArray[np.float32], offsets: FloatGrid) -> tuple[FloatGrid, FloatGrid, NDArray[np.bool_]]:
-    """Position and value of the maximum of equally spaced samples (j, r, c), and whether it is not an end sample."""
+    """Position and value of the maximum of equally spaced samples (j, r, c), and whether it lies between them."""
     shape = profile.shape[1:]
     position, value, is_inside = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.bool_)
     columns = np.ascontiguousarray(profile).reshape(len(profile), -1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
 from zlocus.orientation.adjust import Adjustment, adjust, consistent, moved, renumbered
-from zlocus.orientation.locus import locate
+from zlocus.orientation.locus import Sightlines, locate
 from zlocus.orientation.sharpen import sharpened
 from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
 from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, triangulate
@@ -254,9 +254,10 @@ def pair_orientations(scene: Scene, adjusted: Adjustment, z_range: tuple[float, 
                 continue  # such a pair has nothing to report
             few = both[:: max(len(both) // ENOUGH_FOR_MEDIAN, 1)]
             in_a, in_b = seen.xy[row_of[a][few]], seen.xy[row_of[b][few]]
-            sensors = scene.views[a].sensor, scene.views[b].sensor
-            before = locate(*sensors, in_a, in_b, z_range).across_px
-            after = locate(*sensors, in_a - adjusted.shift_px[a], in_b - adjusted.shift_px[b], z_range).across_px
+            first, second = scene.views[a].sensor, scene.views[b].sensor
+            shift_a, shift_b = adjusted.shift_px[a], adjusted.shift_px[b]
+            before = locate(Sightlines.of(first, in_a, z_range), second, in_b, z_range).across_px
+            after = locate(Sightlines.of(first, in_a - shift_a, z_range), second, in_b - shift_b, z_range).across_px
             names = (scene.views[a].name, scene.views[b].name)
             found.append(PairOrientation(names, len(both), median_distance(before), median_distance(after)))
     return tuple(found)

@@ -13,7 +13,7 @@ from zlocus.errors import GeometryError
 from zlocus.kernels.descriptors import nearest_descriptors
 from zlocus.options import OrientationOptions
 from zlocus.orientation.features import Features, detect, part_grid, parts, reduction
-from zlocus.orientation.locus import Loci, locate, trace
+from zlocus.orientation.locus import Loci, Sightlines, locate, trace
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.triangulate import Observations
 from zlocus.scene import Scene, View
@@ -78,10 +78,14 @@ def find_ties(
     for i, view in enumerate(scene.views):
         features.append(detect(view.image, wanted[i], options))
         report("features", (i + 1) / len(scene.views))
+    lines = [
+        [Sightlines.of(view.sensor, found.xy, z_range) for z_range in z_ranges]
+        for view, found in zip(scene.views, features, strict=True)
+    ]
     pairs = []
     candidates = list(combinations(range(len(scene.views)), 2))
     for done, (a, b) in enumerate(candidates):
-        matches = match_pair(scene.views, features, (a, b), z_ranges, options)
+        matches = match_pair(scene.views, features, (a, b), lines[a], options)
         if len(matches):
             pairs.append(matches)
         report("matches", (done + 1) / len(candidates))
@@ -125,8 +129,9 @@ def shared_parts(
             xy = np.stack(np.meshgrid(col + edge * (col_end - col), row + edge * (row_end - row)), axis=-1).reshape(
                 -1, 2
             )
-            for other, z_range in product((v for v in views if v is not view), z_ranges):
-                loci = trace(view.sensor, other.sensor, xy, z_range)
+            lines = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges]
+            for other, line in product((v for v in views if v is not view), lines):
+                loci = trace(line, other.sensor, line.z_range)
                 wanted[i][part] |= may_fall_inside(loci, other.image.shape, margin_px)
     return wanted
 
@@ -145,12 +150,13 @@ def match_pair(
     views: Sequence[View],
     features: Sequence[Features],
     pair: tuple[int, int],
-    z_ranges: Sequence[tuple[float, float]],
+    lines: Sequence[Sightlines],
     options: OrientationOptions,
 ) -> PairMatches:
     """Matches of two images, guided by the loci, that agree with one pointing shift.
 
-    z_ranges : heights (m) that are looked at one after the other; that with the most matches counts.
+    lines : of the first image's features, for ranges of heights that are looked at one after the other; that with the
+    most matches counts.
 
     Twice: first a sample of the features within `max_pointing_px` of the loci; then, with the shift and the heights
     found, all features within twice `inlier_px`, where fewer rivals let more matches through. In reduced images the
@@ -158,32 +164,31 @@ def match_pair(
     """
     a, b = pair
     inlier_px = options.inlier_px * looseness([views[a], views[b]], options)
-    sensors = views[a].sensor, views[b].sensor
-    xy_a, xy_b = features[a].xy, features[b].xy
-    sample = np.arange(0, len(xy_a), max(len(xy_a) // SAMPLE, 1))
+    sensor, xy_b, n_a = views[b].sensor, features[b].xy, len(features[a])
+    sample = np.arange(0, n_a, max(n_a // SAMPLE, 1))
     nothing = np.empty(0, np.int64)
     empty = PairMatches(pair, nothing, nothing, np.empty(0), 0, np.zeros(2))
-    max_px, pointing, found = options.max_pointing_px, None, None
-    for z_range in z_ranges:
-        loci = trace(*sensors, xy_a[sample], z_range)
+    max_px, pointing, found, likely_lines = options.max_pointing_px, None, None, lines[0]
+    for line in lines:
+        loci = trace(line.only(sample), sensor, line.z_range)
         if not len(xy_b) or not may_fall_inside(loci, views[b].image.shape, max_px):
             continue
         first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
-        here = locate(*sensors, xy_a[sample[first]], xy_b[second], z_range)
+        here = locate(line.only(sample[first]), sensor, xy_b[second], line.z_range)
         shift = find_shift(here, max_px, inlier_px)
         if pointing is None or shift.inliers.sum() > pointing.inliers.sum():
-            pointing, found = shift, here
+            pointing, found, likely_lines = shift, here, line
     if pointing is None or found is None or not pointing.is_certain(options.min_ties):
         return empty
     likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * inlier_px
-    loci = trace(*sensors, xy_a, likely).moved(pointing.shift_px)
+    loci = trace(likely_lines, sensor, likely).moved(pointing.shift_px)
     first, second = match_near_loci(loci, features[a], features[b], near_px, options.match_ratio)
     moved_b = xy_b[second] - pointing.shift_px
-    rest = find_shift(locate(*sensors, xy_a[first], moved_b, likely), near_px, inlier_px)
+    rest = find_shift(locate(likely_lines.only(first), sensor, moved_b, likely), near_px, inlier_px)
     if not rest.is_certain(options.min_ties):
         return empty
     keep = rest.inliers
-    found = locate(*sensors, xy_a[first[keep]], xy_b[second[keep]], likely)
+    found = locate(likely_lines.only(first[keep]), sensor, xy_b[second[keep]], likely)
     return PairMatches(pair, first[keep], second[keep], found.z, len(first), pointing.shift_px + rest.shift_px)
 
 

@@ -4,7 +4,7 @@ The formula of `zlocus.matching.progressive.predicted_sigma` (noise, bend of the
 nothing of systematic errors, smoothing across edges and wrong matches. Signs of these are laid beside it, all in height
 steps or without a unit, so that they mean the same for every sensor, and an additive model maps them to a standard
 deviation: its logarithm is a sum of curves, one per sign (`zlocus.surface.calibration`, made by
-benchmarks/precision.py).
+benchmarks/precision.py). A single pair of images has a model of its own: no second pair contradicts its false heights.
 """
 
 from __future__ import annotations
@@ -14,27 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.precision import add_curve
-from zlocus.matching.refine import RefinedHeights
+from zlocus.matching.refine import LEAST_PEAK, RefinedHeights
 from zlocus.matching.semiglobal import SemiGlobalHeights
-from zlocus.surface.calibration import CONSTANT, CURVES, NO_SPLIT, NOT_REFINED
+from zlocus.surface.calibration import PAIR, SPLIT
 
 FloatGrid = NDArray[np.float32]
 # Cells around one that speak for it, of surface and of groups of images.
 NEAR, AROUND = 5, 7
 # Steps below which nothing is told apart.
 LEAST_STEPS, LEAST_APART = 0.03, 0.01
-LEAST_BEND, MOST_MARGIN = 1e-3, 2000.0
+MOST_MARGIN = 2000.0
 
 
 def sigma_steps(signs: dict[str, FloatGrid], refined: RefinedHeights) -> FloatGrid:
     """Standard deviation of heights in steps, (r, c) float32. signs : see `signs_of_precision`."""
-    total: FloatGrid = np.full(refined.height.shape, CONSTANT, np.float32)
-    for name, (first, spacing, curve) in CURVES.items():
-        values = np.ascontiguousarray(signs[name]).ravel()
-        add_curve(values, np.float32(first), np.float32(spacing), np.array(curve, np.float32), total.ravel())
-    total += np.where(refined.is_refined, np.float32(0.0), np.float32(NOT_REFINED))
-    total += np.where(is_split(signs), np.float32(0.0), np.float32(NO_SPLIT))
-    return np.asarray(np.exp(total, out=total))
+    sigma, split = np.empty(refined.height.shape, np.float32), is_split(signs)
+    for model, cells in ((SPLIT, split), (PAIR, ~split)):
+        if cells.any():
+            constant, not_refined, curves = model
+            total = np.where(refined.is_refined[cells], np.float32(constant), np.float32(constant + not_refined))
+            for name, (first, spacing, curve) in curves.items():
+                values = np.ascontiguousarray(signs[name][cells])
+                add_curve(values, np.float32(first), np.float32(spacing), np.array(curve, np.float32), total)
+            sigma[cells] = np.exp(total, out=total)
+    return sigma
 
 
 def is_split(signs: dict[str, FloatGrid]) -> NDArray[np.bool_]:
@@ -45,17 +48,16 @@ def is_split(signs: dict[str, FloatGrid]) -> NDArray[np.bool_]:
 def signs_of_precision(
     heights: SemiGlobalHeights, refined: RefinedHeights, n_seeing: NDArray[np.integer]
 ) -> dict[str, FloatGrid]:
-    """Signs of how precise heights are, each (r, c) float32, logarithms but for `ncc`.
+    """Signs of how precise heights are, each (r, c) float32, logarithms but for `ncc` and `plane`.
 
-    noise : `predicted_sigma` of the refined peak, steps; bend : of the measure there, per step squared; ncc : the
-    measure itself; apart : root mean square distance of the peaks of two groups of pairs of images, steps, around the
-    cell; rough, own : of the heights from the smooth surface that windows follow, around the cell and its own; uneven :
-    standard deviation of heights around; jump, ledge : highest less lowest within 5 and 9 cells; rival : how much worse
-    the second best height is; moved : from the semi-global height; images : that see it.
+    noise : `peak_variance` of the refined peak, as a standard deviation in steps; bend : of the measure there, per step
+    squared; ncc : the measure itself; apart : root mean square distance of the peaks of two groups of pairs of images,
+    steps, around the cell; rough, own : of the heights from the smooth surface that windows follow, around the cell and
+    its own; uneven : standard deviation of heights around; jump, ledge : highest less lowest within 5 and 9 cells;
+    rival : how much worse the second best height is; moved : from the semi-global height; images : that see it;
+    plane : 1 for heights of a plane through a plain segment, else 0.
     """
-    height, bend = refined.height, np.maximum(refined.bend, np.float32(LEAST_BEND))
-    n_images = np.maximum(n_seeing, 1).astype(np.float32)
-    noise = 2 * np.maximum(1 - refined.ncc, np.float32(1e-3)) / (bend * refined.window_cells * n_images)
+    height, n_images = refined.height, np.maximum(n_seeing, 1).astype(np.float32)
     median = cv2.medianBlur(height, NEAR)
     off, moved = np.abs(height - refined.smooth), np.abs(height - heights.vertex)
     known = np.isfinite(refined.apart)
@@ -64,8 +66,8 @@ def signs_of_precision(
     centred = height - np.float32(np.median(height))
     spread = _mean(centred * centred, AROUND) - _mean(centred, AROUND) ** 2
     signs = {
-        "noise": np.log(noise) / 2,
-        "bend": np.log(bend),
+        "noise": np.log(refined.variance) / 2,
+        "bend": np.log(np.maximum(refined.bend, LEAST_PEAK)),
         "ncc": refined.ncc,
         "apart": np.log(np.maximum(apart, np.float32(LEAST_APART))),
         "rough": np.log(np.sqrt(np.maximum(_mean(off * off, NEAR), 0)) + np.float32(LEAST_STEPS)),
@@ -76,6 +78,7 @@ def signs_of_precision(
         "rival": np.log(np.minimum(heights.margin, np.float32(MOST_MARGIN)) + np.float32(20)),
         "moved": np.log(moved + np.float32(0.05)),
         "images": np.log(n_images),
+        "plane": refined.is_fixed,
     }
     return {name: values.astype(np.float32, copy=False) for name, values in signs.items()}
 
