@@ -55,7 +55,7 @@ class OrientationOptions(Checked):
     )  # fmt: skip
     features_per_image: int = option(30000, "SIFT features kept per image, at most.", low=100, high=10000000)
     full_detail_mpx: float = option(
-        0.3, "Images above this size are halved for SIFT, and reduced further by the fourth root of how far above it "
+        0.6, "Images above this size are halved for SIFT, and reduced further by the fourth root of how far above it "
         "they are: the pixels that SIFT looks at grow with the square root of the image's.",
         low=1e-3, high=1e6, unit="Mpx",
     )  # fmt: skip

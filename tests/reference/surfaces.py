@@ -46,14 +46,19 @@ def longest_run(is_good):
 
 
 def slope(surface, reach, axis):
-    """The smaller of the slopes before and after each cell where they have one sign, else 0; 0 at the border."""
-    out = np.zeros(surface.shape)
+    """The smaller of the slopes before and after each cell where they have one sign, else 0; at the border that of the
+    nearest cell with so many cells on both sides, 0 where there is none."""
+    out, n = np.zeros(surface.shape), surface.shape[axis]
     for at in np.ndindex(surface.shape):
-        if reach <= at[axis] < surface.shape[axis] - reach:
-            step = np.array([reach if k == axis else 0 for k in (0, 1)])
-            before, after = surface[at] - surface[tuple(at - step)], surface[tuple(at + step)] - surface[at]
-            if before * after > 0:
-                out[at] = (before if abs(before) < abs(after) else after) / reach
+        if n <= 2 * reach:
+            continue
+        step = np.array([reach if k == axis else 0 for k in (0, 1)])
+        middle = np.array(at)
+        middle[axis] = min(max(at[axis], reach), n - 1 - reach)
+        before = surface[tuple(middle)] - surface[tuple(middle - step)]
+        after = surface[tuple(middle + step)] - surface[tuple(middle)]
+        if before * after > 0:
+            out[at] = (before if abs(before) < abs(after) else after) / reach
     return out
 
 

@@ -22,7 +22,8 @@ def smaller_slope(before, after):
 # (r,c) f4, i8, (r,c) f4, (r,c) f4 -> None
 @kernel
 def slopes(surface, reach, by_row, by_col):
-    """Slope per cell along rows and columns, over `reach` cells to both sides; 0 at the border and beside jumps."""
+    """Slope per cell along rows and columns, over `reach` cells to both sides; 0 beside jumps, and at the border that of
+    the nearest cell which has so many on both."""
     n_rows, n_cols = surface.shape
     by_row[:] = 0.0
     by_col[:] = 0.0
@@ -36,6 +37,12 @@ def slopes(surface, reach, by_row, by_col):
             if reach <= c < n_cols - reach:
                 before, after = here - surface[r, c - reach], surface[r, c + reach] - here
                 by_col[r, c] = smaller_slope(before, after) * inverse
+    if n_rows > 2 * reach:
+        for r in range(reach):
+            by_row[r], by_row[n_rows - 1 - r] = by_row[reach], by_row[n_rows - 1 - reach]
+    if n_cols > 2 * reach:
+        for r in range(n_rows):
+            by_col[r, :reach], by_col[r, n_cols - reach :] = by_col[r, reach], by_col[r, n_cols - 1 - reach]
 
 
 # (c,) f4, (c,) f4, (c,) f4, (c,) f4, (3,) f4, f4, (c,) f4, (c,) f4 -> None

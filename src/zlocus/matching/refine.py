@@ -20,7 +20,7 @@ FloatGrid = NDArray[np.float32]
 FIRST_OFFSETS = np.linspace(-1.0, 1.0, 3, dtype=np.float32)
 LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
 # Of a peak's variance by `peak_variance`, which knows nothing of what disturbs several images alike.
-NOISE_FACTOR = 1.5
+NOISE_FACTOR = 2.5
 SPREAD_CELLS = 15  # around a cell, over which heights spread about the smooth surface
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
@@ -114,16 +114,23 @@ def peak_variance(ncc: FloatGrid, bend: FloatGrid, n_images: NDArray[np.integer]
 
 
 def weighed(away: FloatGrid, known: NDArray[np.bool_], variance: FloatGrid) -> FloatGrid:
-    """Distances (r, c) from a smooth surface, each multiplied by the share of their spread that is not noise.
+    """Distances (r, c) from a smooth surface: their mean around the cell, and what they differ from it multiplied by
+    the share of their spread that is not noise.
 
     known : (r, c), distances that count; variance : (r, c), of their noise. Source: Lee (1980), "Digital image
-    enhancement and noise filtering by use of local statistics", equation 9, about the smooth surface for a mean.
+    enhancement and noise filtering by use of local statistics", equation 9.
     """
-    side = (SPREAD_CELLS, SPREAD_CELLS)
-    squares = cv2.blur(np.where(known, away, np.float32(0.0)) ** 2, side, borderType=cv2.BORDER_REFLECT)
-    spread = squares / np.maximum(cv2.blur(known.astype(np.float32), side, borderType=cv2.BORDER_REFLECT), 1e-3)
+    share = np.maximum(_around(known.astype(np.float32)), np.float32(1e-3))
+    counted = np.where(known, away, np.float32(0.0))
+    mean = _around(counted) / share
+    spread = _around(counted * counted) / share - mean * mean
     signal = 1 - np.float32(NOISE_FACTOR) * variance / np.maximum(spread, np.float32(1e-9))
-    return np.asarray(away * np.clip(signal, 0, 1), np.float32)
+    return np.asarray(mean + (away - mean) * np.clip(signal, 0, 1), np.float32)
+
+
+def _around(values: FloatGrid) -> FloatGrid:
+    """Means over `SPREAD_CELLS`."""
+    return np.asarray(cv2.blur(values, (SPREAD_CELLS, SPREAD_CELLS), borderType=cv2.BORDER_REFLECT), np.float32)
 
 
 def default_window(step_cells: float) -> int:

@@ -68,7 +68,7 @@ def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOp
 def reduction(shape: tuple[int, int], options: OrientationOptions) -> float:
     """How many pixels along an image become one for SIFT.
 
-    1 up to `full_detail_mpx`, 2 just above it, 3.9 at 4.4 Mpx, 12 at 400: work grows with the square root of the image.
+    1 up to `full_detail_mpx`, 2 just above it, 3.3 at 4.4 Mpx, 10 at 400: work grows with the square root of the image.
     What the reduced image cannot tell comes back when ties are measured again, see `sharpen`.
     """
     ratio = shape[0] * shape[1] / 1e6 / options.full_detail_mpx
