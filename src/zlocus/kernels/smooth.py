@@ -22,8 +22,8 @@ def smaller_slope(before, after):
 # (r,c) f4, i8, (r,c) f4, (r,c) f4 -> None
 @kernel
 def slopes(surface, reach, by_row, by_col):
-    """Slope per cell along rows and columns, over `reach` cells to both sides; 0 beside jumps, and at the border that of
-    the nearest cell which has so many on both."""
+    """Slope per cell along rows and columns, over `reach` cells to both sides; 0 beside jumps, and at the border that
+    of the nearest cell which has so many on both."""
     n_rows, n_cols = surface.shape
     by_row[:] = 0.0
     by_col[:] = 0.0
