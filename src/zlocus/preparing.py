@@ -139,6 +139,12 @@ def what_was_applied(orientation: Orientation) -> str:
     ]
     if not moved:
         return "Pointing: no correction applied."
+    if orientation.joint is not None:
+        return (
+            f"Cameras corrected jointly from {len(orientation.measured)} tie points, to "
+            f"{orientation.joint.solution.sigma0_px:.2f} px; their images moved by, px (column, row): "
+            f"{', '.join(moved)}."
+        )
     return f"Pointing corrected from {len(orientation.xyz)} tie points, px (column, row): {', '.join(moved)}."
 
 
