@@ -19,9 +19,10 @@ Correct = Callable[[SensorModel, FloatArray], SensorModel]
 Scanner = LineScanModel | RectifiedModel
 
 # A direction of the parameters counts as seen when its information, per observation and in px2, exceeds this over the
-# number of images squared. Shifts: see `adjust.SEEN_INFORMATION`; errors of physical cameras have honest priors.
+# number of images squared. Shifts: see `adjust.SEEN_INFORMATION`. Physical cameras have honest priors, which need no
+# help but where there is no information at all.
 SEEN_IN_IMAGE = 0.01
-SEEN_IN_SPACE = 1e-4
+SEEN_IN_SPACE = 1e-6
 SHIFT, AFFINE, POSE, FOCAL, DRIFT = "shift", "affine", "pose", "focal length", "drift"
 SHIFT_NAMES = ("column_px", "row_px")
 AFFINE_NAMES = ("column_by_column_px", "column_by_row_px", "row_by_column_px", "row_by_row_px")
@@ -136,17 +137,17 @@ def focal_block(numbers: Sequence[int], views: Sequence[View], sigma_px: float) 
 
 
 def drift_block(numbers: Sequence[int], views: Sequence[View], options: OrientationOptions) -> Block:
-    """A slow error of a trajectory while its images were exposed: a constant for short ones, a spline for long ones."""
+    """A slow error of a trajectory while its images were exposed: even for short ones, a spline for long ones."""
     ends = [raw(views[i].sensor).lines.times[[0, -1]] for i in numbers]
     start, end = float(np.min(ends)), float(np.max(ends))
-    n_knots = 1 + round((end - start) / options.joint.drift_s)
+    n_knots = 1 + int(np.ceil((end - start) / options.joint.drift_s))
     drift = Drift.zero(start, end, n_knots)
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
         assert isinstance(sensor, Scanner), "blocks fit their sensors"
         return sensor.corrected(drift.with_parameters(values))
 
-    names = POSE_NAMES if n_knots == 1 else tuple(f"knot{k}_{name}" for k in range(n_knots) for name in POSE_NAMES)
+    names = tuple(f"knot{k}_{name}" for k in range(n_knots) for name in POSE_NAMES)
     return Block(DRIFT, tuple(numbers), names, np.tile(pose_sigma(options), n_knots), SEEN_IN_SPACE, correct)
 
 

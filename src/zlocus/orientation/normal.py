@@ -22,9 +22,13 @@ from zlocus.sensors.model import FloatArray, SensorModel
 MAX_ITERATIONS = 20
 TOLERANCE_PX = 1e-3
 # Derivatives are taken again after a step that moves image points by more.
-RELINEARISE_PX = 0.5
-# Of a parameter's sigma, to both sides, for its derivative.
+RELINEARISE_PX = 5.0
+# Of a parameter's sigma, for its derivative.
 DIFFERENCE = 0.05
+# Errors that the ties of an image have in common (of matching, of lenses, of what blocks do not model): however many
+# ties there are, together they count as one that is off by this. Otherwise thousands of them would move a camera by
+# many times that where they hardly hold it, against all that is known beforehand.
+COMMON_PX = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +180,10 @@ def weights(problem: Problem, residual: FloatArray, linear: Linearised) -> tuple
     ties = problem.is_tie
     usable = linear.usable & np.isfinite(residual).all(axis=1)
     sigma = robust_sigma(residual[ties & usable])
-    base = np.where(ties, 1.0, (sigma / problem.control_px) ** 2)
-    weight = base * huber_weight(residual * np.sqrt(base)[:, None], sigma)
+    n_per_view = (ties & usable).sum() / max(len(np.unique(problem.seen.view[ties & usable])), 1)
+    scale = np.where(ties, 1.0, sigma / problem.control_px)
+    base = np.where(ties, 1.0 / (1.0 + n_per_view * (COMMON_PX / sigma) ** 2), scale**2)
+    weight = base * huber_weight(residual * scale[:, None], sigma)
     return sigma, np.where(usable, weight, 0.0)
 
 
@@ -185,16 +191,18 @@ def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Line
     """Derivatives of all image points, by differences; xyz : (n, 3) m."""
     sensors = corrected_sensors(problem.blocks, problem.sensors, parameters)
     by_ground = ground_jacobian(sensors, problem.seen, xyz)
+    here = project_points(sensors, problem.seen, xyz)
     rows_of = [np.flatnonzero(problem.seen.view == i) for i in range(len(sensors))]
     values, rows, columns = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     first = 0
     for block in problem.blocks:
         for k in range(first, first + len(block)):
-            ahead, behind = (stepped(problem, parameters, k, step, block.views) for step in (DIFFERENCE, -DIFFERENCE))
+            changed = parameters.copy()
+            changed[k] += DIFFERENCE
             for i in block.views:
                 at = xyz[problem.seen.point[rows_of[i]]]
-                moved = ahead[i].image_from_ground(at) - behind[i].image_from_ground(at)
-                values.append(moved.ravel() / (2 * DIFFERENCE))
+                moved = corrected_sensor(problem, changed, i).image_from_ground(at) - here[rows_of[i]]
+                values.append(moved.ravel() / DIFFERENCE)
                 rows.append((2 * rows_of[i][:, None] + np.arange(2)).ravel())
                 columns.append(np.full(2 * len(at), k))
         first += len(block)
@@ -204,15 +212,6 @@ def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Line
     shape = (2 * len(problem.seen), len(parameters))
     matrix = sparse.csr_array((np.nan_to_num(value), (row, np.concatenate(columns))), shape=shape)
     return Linearised(matrix, np.where(usable[:, None, None], by_ground, 0.0), usable)
-
-
-def stepped(
-    problem: Problem, parameters: FloatArray, k: int, step: float, views: tuple[int, ...]
-) -> dict[int, SensorModel]:
-    """The sensors of some views with one parameter changed by a step."""
-    changed = parameters.copy()
-    changed[k] += step
-    return {i: corrected_sensor(problem, changed, i) for i in views}
 
 
 def corrected_sensor(problem: Problem, parameters: FloatArray, view: int) -> SensorModel:

@@ -150,6 +150,7 @@ class Orientation:
         return {
             "views": {
                 v.name: {
+                    "sensor": v.sensor,
                     "shift_px": [round(v.shift_px[0], 4), round(v.shift_px[1], 4)],
                     "n_ties": v.n_ties,
                     "residual_before_px": v.before.as_dict(),
