@@ -28,7 +28,7 @@ DIFFERENCE = 0.05
 # Errors that the ties of an image have in common (of matching, of lenses, of what blocks do not model): however many
 # ties there are, together they count as one that is off by this. Otherwise thousands of them would move a camera by
 # many times that where they hardly hold it, against all that is known beforehand.
-COMMON_PX = 0.1
+COMMON_PX = 0.03
 
 
 @dataclass(frozen=True, eq=False)
