@@ -215,14 +215,23 @@ def test_terrain_heights_hold_the_ground_up():
 
 
 def test_many_ties_do_not_move_cameras_that_they_hardly_hold():
-    """A small error that all ties of an image share, growing over the image, as a lens bends it."""
-    exact = flight_of_frames(1, 3)
+    """Narrow fields from far above, and a small error that grows over the images: taken at their word, 6000 image
+    points would turn the cameras by 0.37 sigma, and the ground would sink by 28 m."""
+    exact = [replace(c, centre=(*c.centre[:2], 15_000.0), focal=60_000.0) for c in flight_of_frames(1, 3)]
     seen, xyz = seen_by(exact, frame_ground(3000), FRAME_SIZE, noise_px=0.1)
-    seen.xy[:, 1] += 0.1 * ((seen.xy[:, 0] - 3000.0) / 3000.0) ** 2
+    seen.xy[:, 1] += 0.1 * ((seen.xy[:, 0] - 3000.0) / 3000.0) ** 2 * (seen.view - 1)
     found = adjust_jointly(views_of(exact, FRAME_SIZE), seen, xyz, OPTIONS)
-    moved = found.adjusted.points.xyz - xyz[found.adjusted.numbers]
-    assert np.abs(moved.mean(axis=0)).max() < 0.2
-    assert np.abs(found.solution.parameters).max() < 0.3
+    assert np.abs(found.solution.parameters).max() < 0.1
+    assert abs(np.median(found.adjusted.points.xyz[:, 2] - xyz[found.adjusted.numbers, 2])) < 6.0
+
+
+def test_an_affine_correction_there_and_back():
+    model = AffineModel(affine_sensors()[1], (3.0, 0.1, -0.2), (-5.0, 0.05, 0.15))
+    xy = np.random.default_rng(1).uniform(0, 800, (50, 2))
+    xyz = model.ground_from_image(xy, np.linspace(100.0, 160.0, 50))
+    np.testing.assert_allclose(model.image_from_ground(xyz), xy, rtol=0, atol=1e-9)
+    base = model.base.image_from_ground(xyz)
+    np.testing.assert_allclose(xy - base, [[3.0, -5.0]] + base @ np.array([[0.1, 0.05], [-0.2, 0.15]]), atol=1e-9)
 
 
 def test_every_kind_of_sensor_at_once():

@@ -151,10 +151,12 @@ def test_line_scanners_in_the_frame(tmp_path, changes):
     assert_same(twice, again, (400.0, 500.0))
 
 
-def test_line_scanners_on_the_earth(tmp_path):
-    model, _ = on_earth(20.0, 2.0, 440.0, 8.5, 47.4)
-    write_trajectory(tmp_path / "path.csv", model.trajectory, "geocentric", quaternions=True)
-    inputs = scan_scene(tmp_path, rays="earth", crs="EPSG:4978")
+@pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:32632"])
+def test_line_scanners_on_the_earth(tmp_path, crs):
+    """The trajectory written is geocentric, whatever the one given was."""
+    flight = FLIGHT.trajectory() if crs == "EPSG:32632" else on_earth(20.0, 2.0, 440.0, 8.5, 47.4)[0].trajectory
+    write_trajectory(tmp_path / "path.csv", flight, "in its CRS", quaternions=crs == "EPSG:4978")
+    inputs = scan_scene(tmp_path, rays="earth", crs=crs)
     corrected, again, _ = rewritten(open_scene(inputs), tmp_path, inputs, drifted)
     assert_same(corrected, again, (400.0, 500.0))
 
