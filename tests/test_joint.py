@@ -34,8 +34,8 @@ from zlocus.sensors.correction import AffineModel, ShiftedModel
 from zlocus.sensors.trajectory import Drift
 
 OPTIONS = OrientationOptions()
-# Control points measured as exactly as the ties.
-EXACT = JointOptions(sigma_control_px=0.01)
+# Control points measured as exactly as the ties, and priors that the planted errors fit.
+EXACT = JointOptions(sigma_control_px=0.01, sigma_position_m=1.0, sigma_attitude_deg=0.05)
 SCAN_SIZE = (SCAN_COLUMNS, SCAN_ROWS)
 # Exact ties: what is left is the pull of the priors, which hold cameras against errors that all ties share.
 RECOVERED_PX = 0.05

@@ -54,10 +54,10 @@ class JointOptions(Checked):
         1.0, "Of each affine term, as far as it moves the image's border.", low=1e-4, high=1000.0, unit="px"
     )
     sigma_position_m: float = option(
-        1.0, "Of the position of a frame camera or line scanner, along each axis.", low=1e-4, high=1e5, unit="m"
+        0.3, "Of the position of a frame camera or line scanner, along each axis.", low=1e-4, high=1e5, unit="m"
     )
     sigma_attitude_deg: float = option(
-        0.05, "Of the attitude of a frame camera or line scanner, about each axis.", low=1e-7, high=45.0,
+        0.01, "Of the attitude of a frame camera or line scanner, about each axis.", low=1e-7, high=45.0,
         unit="degrees",
     )  # fmt: skip
     sigma_focal_px: float | None = option(
