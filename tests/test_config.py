@@ -100,7 +100,7 @@ def test_every_option_stands_in_the_file():
 
 def test_dictionary_is_complete_and_builds_the_same():
     values = config_as_dict(RunConfig())
-    assert values["orientation"]["model"] == "shift"
+    assert values["orientation"]["model"] == "auto"
     assert config_from_dict(values, "run.json") == RunConfig()
 
 
@@ -121,7 +121,7 @@ def test_what_is_left_out_keeps_its_default():
         ({"orientation": {"min_ties": None}}, "orientation.min_ties = None is of the wrong type"),
         ({"orientation": {"inlier_px": 99.0}}, "outside its range 0.1 to 10.0 px"),
         ({"orientation": {"inlier_px": float("nan")}}, "outside its range"),
-        ({"orientation": {"model": "affine"}}, "is not one of shift, none"),
+        ({"orientation": {"model": "affine"}}, "is not one of auto, shift, joint, none"),
         ([1, 2], "must hold named options"),
     ],
 )

@@ -354,9 +354,9 @@ def test_what_is_written_reads_back_equal(tmp_path):
     rng = np.random.default_rng(0)
     columns = {"time": np.cumsum(rng.random(50)), "x": rng.normal(size=50) * 1e6}
     write_numbers(tmp_path / "t.csv", columns, "a comment", {"word": ["a", "b"] * 25})
-    table = read_numbers(tmp_path / "t.csv", "table", columns, "word")
+    table = read_numbers(tmp_path / "t.csv", "table", columns, ("word",))
     for name, values in columns.items():
         np.testing.assert_array_equal(table.columns[name], values)
-    assert table.labels == ("a", "b") * 25
+    assert table.labels == {"word": ("a", "b") * 25}
     with pytest.raises(OutputError, match="cannot be written"):
         write_numbers(tmp_path / "none" / "t.csv", columns, "")

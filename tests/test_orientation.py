@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 from pyproj import CRS
 
-from orientation_scenes import hill_scene, image_of, observe, without_translation
+from orientation_scenes import hill, hill_scene, image_of, observe, rendered, texture, without_translation
 from zlocus.errors import GeometryError
-from zlocus.options import OrientationOptions
+from zlocus.options import JointOptions, OrientationOptions
 from zlocus.orientation.orient import Orientation, height_range, orient
-from zlocus.orientation.triangulate import Observations
+from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.scene import Scene, View
 from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 
 OPTIONS = OrientationOptions(features_per_mpx=20000)
@@ -60,7 +62,9 @@ def test_applied_shifts_are_the_reported_ones(scene, oriented):
 def test_the_report_is_plain_and_says_what_was_not_applied(oriented):
     report = json.loads(json.dumps(oriented.as_dict()))
     assert list(report["views"]) == ["view0", "view1", "view2"]
-    assert set(report["views"]["view1"]) == {"shift_px", "n_ties", "residual_before_px", "residual_after_px"}
+    assert set(report["views"]["view1"]) == {
+        "sensor", "shift_px", "n_ties", "residual_before_px", "residual_after_px",
+    }  # fmt: skip
     assert report["pairs"][0]["views"] == ["view0", "view1"]
     assert "3 of the 6" in report["unobservable"]
 
@@ -70,6 +74,45 @@ def test_no_correction_is_said_and_nothing_moves(scene):
     assert all(a is b for a, b in zip(found.apply(scene).views, scene.views, strict=True))
     assert "No correction" in found.as_dict()["unobservable"]
     assert len(found.xyz) > 100
+
+
+def turned_frames():
+    """Frame cameras above the hill that look at its middle, and the same with errors of their poses."""
+    exact = []
+    for x, y in ((0.0, 0.0), (250.0, 30.0), (-200.0, 150.0)):
+        forwards = np.array([-x, -y, -900.0]) / np.hypot(np.hypot(x, y), 900.0)
+        right = np.cross(forwards, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        rows = tuple(map(tuple, np.array([right, np.cross(forwards, right), forwards])))
+        exact.append(FrameModel((x, y, 1000.0), rows, 1800.0, (140.0, 140.0)))
+    rng = np.random.default_rng(2)
+    return exact, [c.corrected(rng.normal(0, 0.5, 3), np.deg2rad(rng.normal(0, 0.1, 3))) for c in exact]
+
+
+def test_frame_cameras_are_corrected_jointly():
+    """Poses, not images, are corrected, and on the ground what is left is a motion of everything together."""
+    coefficients, views = texture(), []
+    for i, (exact, flawed) in enumerate(zip(*turned_frames(), strict=True)):
+        views.append(View(f"view{i}", Path(f"view{i}.tif"), image_of(rendered(exact, 280, coefficients)), flawed))
+    scene = Scene(tuple(views), CRS.from_epsg(32631), heights=(60.0, 180.0))
+    found = orient(scene, replace(OPTIONS, joint=JointOptions(sigma_attitude_deg=0.1)))
+    assert found.model == "joint"
+    assert {view.sensor for view in found.views} == {"frame"}
+    corrected = found.apply(scene)
+    assert all(isinstance(view.sensor, FrameModel) for view in corrected.views)
+    for view in found.views:
+        assert view.n_ties > 100
+        assert view.before.rms > 0.5
+        assert view.after.rms < 0.3
+    for pair in found.pairs:
+        assert pair.across_after_px < 0.3 < pair.across_before_px
+    xyz, sensors = found.measured, [view.sensor for view in corrected.views]
+    assert np.median(np.abs(xyz[:, 2] - hill(*xyz[:, :2].T) - np.median(xyz[:, 2] - hill(*xyz[:, :2].T)))) < 0.5
+    seen = found.seen.kept(found.seen.point < found.n_measured)
+    assert np.median(np.hypot(*(project_points(sensors, seen, found.xyz) - seen.xy).T)) < 0.3
+    shift = orient(scene, replace(OPTIONS, model="shift"))
+    assert (shift.model, shift.joint) == ("shift", None)
+    assert "directions" in found.as_dict()["unobservable"]
 
 
 def test_an_image_that_shares_nothing_is_named(scene):

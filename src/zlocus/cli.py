@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from zlocus import __version__
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.progress import progress_for
-from zlocus.request import CloudRequest, CurvesRequest, DsmRequest, ImportRequest, check_output
+from zlocus.request import CloudRequest, CurvesRequest, DsmRequest, ImportRequest, OrientRequest, check_output
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
@@ -41,6 +41,10 @@ R = TypeVar("R")
 Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")]
 Resolution = Annotated[float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")]
 Crs = Annotated[str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")]
+TieHeights = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Range in which ties are looked for, m. Default: found.", metavar="ZMIN ZMAX"),
+]
 Workers = Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")]
 ConfigFile = Annotated[Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")]
@@ -245,10 +249,7 @@ def curves(
     ] = None,
     resolution: Resolution = None,
     crs: Crs = None,
-    heights: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Range in which ties are looked for, m. Default: found.", metavar="ZMIN ZMAX"),
-    ] = None,
+    heights: TieHeights = None,
     reference: Annotated[
         str | None, typer.Option(help="Name of the reference view. Default: chosen for the point.", metavar="VIEW")
     ] = None,
@@ -265,6 +266,52 @@ def curves(
     from zlocus.point import run_point
 
     print(run_point(request, run_config, progress_for(sys.stderr)))
+
+
+@app.command()
+@explained
+def orient(
+    inputs: Inputs,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the cameras and the report.")],
+    control: Annotated[
+        Path | None, typer.Option(help="Ground control and check points, a row per image point.", metavar="CSV")
+    ] = None,
+    dem: Annotated[
+        Path | None, typer.Option(help="Ellipsoidal heights that the ties should have.", metavar="RASTER")
+    ] = None,
+    crs: Crs = None,
+    heights: TieHeights = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
+) -> None:
+    """Correct the cameras of all images jointly, and write them with a report."""
+    request = OrientRequest(
+        inputs=tuple(inputs), out=out, control=control, dem=dem, crs=crs, heights=heights, overwrite=overwrite
+    )
+    check_output(out, overwrite)
+    run_config = _run_config(config)
+    from zlocus.orienting import run_orient
+
+    print(run_orient(request, run_config, progress_for(sys.stderr)))
+
+
+@app.command()
+@explained
+def ties(
+    inputs: Inputs,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the tie points.")],
+    crs: Crs = None,
+    heights: TieHeights = None,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
+) -> None:
+    """Find tie points, and nothing more."""
+    request = OrientRequest(inputs=tuple(inputs), out=out, cameras=False, crs=crs, heights=heights, overwrite=overwrite)
+    check_output(out, overwrite)
+    run_config = _run_config(config)
+    from zlocus.orienting import run_orient
+
+    print(run_orient(request, run_config, progress_for(sys.stderr)))
 
 
 @app.command("import")

@@ -13,6 +13,7 @@ from pyproj.exceptions import CRSError
 from zlocus.errors import ConfigError, GeometryError, OutputError
 from zlocus.io.crs import checked_crs
 from zlocus.options import OrientationOptions
+from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import Orientation, height_range, orient
 from zlocus.progress import Progress
 from zlocus.scene import Scene, View, footprint, is_shared
@@ -96,9 +97,14 @@ def _sees_as_high_as_itself(view: View) -> bool:
 
 
 def oriented(
-    scene: Scene, options: OrientationOptions, heights: tuple[float, float] | None, progress: Progress
+    scene: Scene,
+    options: OrientationOptions,
+    heights: tuple[float, float] | None,
+    progress: Progress,
+    control: GroundControl | None = None,
+    terrain: TerrainHeights | None = None,
 ) -> Orientation:
-    """Tie points and corrections, with progress."""
+    """Tie points and corrections, with progress. control, terrain : see `orient`."""
     if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
         heights = heights_below(scene)
     with progress.stage("Tie points", 1.0) as stage:
@@ -109,7 +115,7 @@ def oriented(
             stage.advance(share - done)
             done = share
 
-        return orient(scene, options, heights, report)
+        return orient(scene, options, heights, report, control, terrain)
 
 
 def heights_of_ties(scene: Scene, orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
@@ -139,6 +145,12 @@ def what_was_applied(orientation: Orientation) -> str:
     ]
     if not moved:
         return "Pointing: no correction applied."
+    if orientation.joint is not None:
+        return (
+            f"Cameras corrected jointly from {len(orientation.measured)} tie points, to "
+            f"{orientation.joint.solution.sigma0_px:.2f} px; their images moved by, px (column, row): "
+            f"{', '.join(moved)}."
+        )
     return f"Pointing corrected from {len(orientation.xyz)} tie points, px (column, row): {', '.join(moved)}."
 
 

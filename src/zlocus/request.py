@@ -10,7 +10,7 @@ from pathlib import Path
 from zlocus.errors import ConfigError, InputError, OutputError
 
 SCENE_SUFFIXES = (".yaml", ".yml")
-RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json")
+RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "orientation.json", "scene.yaml")
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 VERTICALS = ("ellipsoid",)
@@ -171,6 +171,35 @@ class CurvesRequest:
             numbers = [v for v in values or () if v is not None]
             if not all(map(math.isfinite, numbers)):
                 raise ConfigError(f"--{name} {' '.join(f'{v:g}' for v in numbers)} is no place. Give finite numbers.")
+
+
+@dataclass(frozen=True)
+class OrientRequest:
+    """Tie points to be found, and with `cameras` the cameras to be corrected. `None` means: not given.
+
+    inputs, crs, heights, overwrite : as in `DsmRequest`. control : table of ground control and check points; dem :
+    raster of ellipsoidal heights that the ties should have.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    cameras: bool = True
+    control: Path | None = None
+    dem: Path | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_heights(self.heights)
 
 
 @dataclass(frozen=True)

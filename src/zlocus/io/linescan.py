@@ -53,13 +53,15 @@ class Rectification(StrictModel):
 
     height : of the plane, ellipsoidal m; transform : a, b, c, d, e, f of GeoTIFF, x = a column + b row + c and y = d
     column + e row + f from the outer corner of the first pixel; crs : of x and y, by default the scene's; rows : of the
-    raw image.
+    raw image; trajectory : that by which the image was resampled, where the camera's has been corrected since; both
+    have the same crs, lever arm and boresight.
     """
 
     height: FiniteFloat
     transform: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
     crs: CrsName | None = None
     rows: int = Field(gt=1)
+    trajectory: str | None = None
 
     @model_validator(mode="after")
     def _turns_back(self) -> Rectification:
@@ -102,10 +104,14 @@ class LineScanCamera(Camera):
             lines = read_times(files[-1], n_rows)
         else:
             lines = LineTimes.regular(self.times.start, self.times.interval, n_rows)
-        crs = None if self.crs is None else CRS.from_user_input(self.crs)
-        trajectory = read_trajectory(files[1], crs, self.rays, np.array(self.boresight), np.array(self.lever_arm))
+        crs, n_own = None if self.crs is None else CRS.from_user_input(self.crs), len(files)
+        if self.rectification is not None and self.rectification.trajectory is not None:
+            files.append(folder / self.rectification.trajectory)
+        mounted = crs, self.rays, np.array(self.boresight), np.array(self.lever_arm)
+        trajectory, *others = (read_trajectory(file, *mounted) for file in (files[1], *files[n_own:]))
         _check_covered(trajectory, lines, n_rows, files[1], image)
-        return LineScanSource(line, lines, trajectory, self.rays, crs, self.rectification, tuple(files))
+        of_plane = others[0] if others else trajectory
+        return LineScanSource(line, lines, trajectory, of_plane, self.rays, crs, self.rectification, tuple(files))
 
     def given_in(self, crs: str | None) -> LineScanCamera:
         """See `Camera`; on the Earth a trajectory names its own CRS."""
@@ -136,11 +142,13 @@ def _check_covered(trajectory: Trajectory, lines: LineTimes, n_rows: int, file: 
 
 @dataclass(frozen=True, eq=False)
 class LineScanSource:
-    """A line scanner that has been read; see `LineScanCamera`."""
+    """A line scanner that has been read; see `LineScanCamera`. of_plane : the trajectory by which a level 1 image was
+    resampled."""
 
     line: FocalLine
     lines: LineTimes
     trajectory: Trajectory
+    of_plane: Trajectory
     rays: Rays
     crs: CRS | None
     rectification: Rectification | None
@@ -162,17 +170,16 @@ class LineScanSource:
         InputError
             Where the scene's frame is not the one in which rays are straight, or has no place on the Earth.
         """
-        raw = self._model(self._space(crs))
+        raw = LineScanModel(self.line, self.lines, self.trajectory, self._space(crs))
         if self.rectification is None:
             return raw
-        of_plane = self.rectification.crs
-        over_plane = raw if of_plane is None else self._model(self._space(CRS.from_user_input(of_plane)))
+        plane_crs, over_plane = self.rectification.crs, raw
+        if plane_crs is not None or self.of_plane is not self.trajectory:
+            space = self._space(crs if plane_crs is None else CRS.from_user_input(plane_crs))
+            over_plane = LineScanModel(self.line, self.lines, self.of_plane, space)
         # GeoTIFF counts from the outer corner of the first pixel.
         plane_from_image = Affine(*self.rectification.transform) * Affine.translation(0.5, 0.5)
         return RectifiedModel(raw, over_plane, self.rectification.height, plane_from_image)
-
-    def _model(self, space: Space) -> LineScanModel:
-        return LineScanModel(self.line, self.lines, self.trajectory, space)
 
     def _space(self, crs: CRS) -> Space:
         if self.rays == "earth":

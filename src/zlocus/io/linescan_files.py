@@ -40,7 +40,7 @@ def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine
     InputError
         For a malformed table, a line that is not there, or detectors that do not follow one another along a line.
     """
-    table = read_numbers(path, CALIBRATION, ("column", "x_mm", "y_mm"), "line")
+    table = read_numbers(path, CALIBRATION, ("column", "x_mm", "y_mm"), ("line",))
     _need(table, ("column", "x_mm", "y_mm"))
     table = _of_line(table, name)
     if len(table) < 2:
@@ -169,16 +169,17 @@ def _one_of(table: NumberTable, choices: tuple[tuple[str, ...], ...]) -> tuple[s
 
 def _of_line(table: NumberTable, name: str | None) -> NumberTable:
     """The rows of one line."""
-    held = sorted(set(table.labels))
+    lines = table.labels.get("line", ())
+    held = sorted(set(lines))
     if not held and name is None:
         return table
     if name not in held:
         advice = f"Write line: with one of {', '.join(held)}" if held else "Leave line: out, or add that column"
         said = "names no line" if name is None else f"asks for the line {name!r}"
         raise InputError(f"The {table.what} {table.path} has {len(held)} named lines, and the scene {said}. {advice}.")
-    rows = np.flatnonzero([label == name for label in table.labels])
+    rows = np.flatnonzero([line == name for line in lines])
     columns = {key: values[rows] for key, values in table.columns.items()}
-    return NumberTable(table.path, table.what, columns, (), tuple(table.lines[row] for row in rows))
+    return NumberTable(table.path, table.what, columns, {}, tuple(table.lines[row] for row in rows))
 
 
 def _platform(table: NumberTable, turn: tuple[str, ...]) -> FloatArray:

@@ -21,14 +21,14 @@ LONGEST_QUOTE = 40
 class NumberTable:
     """A table that has been read.
 
-    columns : by name, (n,) float64, all finite; labels : (n,) the words of the label column, empty without one;
+    columns : by name, (n,) float64, all finite; labels : the words of each column of words, (n,), by name;
     lines : (n,) the line of the file, from 1, on which a row stands.
     """
 
     path: Path
     what: str
     columns: dict[str, FloatArray]
-    labels: tuple[str, ...]
+    labels: dict[str, tuple[str, ...]]
     lines: tuple[int, ...]
 
     def __len__(self) -> int:
@@ -62,10 +62,11 @@ class NumberTable:
             )
 
 
-def read_numbers(path: Path, what: str, allowed: Iterable[str], label: str | None = None) -> NumberTable:
+def read_numbers(path: Path, what: str, allowed: Iterable[str], words: Sequence[str] = ()) -> NumberTable:
     """The table in a file. Lines that are empty or start with # are skipped; names are read in any case.
 
-    what : the role of the file, for messages; allowed : names a column may have; label : a column of words.
+    what : the role of the file, for messages; allowed : names a column of numbers may have; words : those of columns of
+    words.
 
     Raises
     ------
@@ -80,7 +81,7 @@ def read_numbers(path: Path, what: str, allowed: Iterable[str], label: str | Non
     (_, header), body = rows[0], rows[1:]
     separator = next((mark for mark in SEPARATORS if mark in header), None)
     names = [cell.strip().lower() for cell in header.split(separator)]
-    known = [*allowed, *([label] if label else [])]
+    known = [*allowed, *words]
     for name in names:
         if name not in known:
             raise InputError(
@@ -88,8 +89,9 @@ def read_numbers(path: Path, what: str, allowed: Iterable[str], label: str | Non
             )
         if names.count(name) > 1:
             raise InputError(f"The {what} {path} has the column {name} twice in its header. Remove one.")
-    values, labels = [], []
-    at = names.index(label) if label in names else None
+    numeric, labels = [name for name in names if name not in words], [name for name in names if name in words]
+    number_at, word_at = ([names.index(name) for name in group] for group in (numeric, labels))
+    values, said = [], []
     for number, line in body:
         cells = line.split(separator)
         if len(cells) != len(names):
@@ -97,12 +99,11 @@ def read_numbers(path: Path, what: str, allowed: Iterable[str], label: str | Non
                 f"The {what} {path}, line {number}: {len(cells)} values, but {len(names)} columns "
                 f"({', '.join(names)}). Mend the line, or copy the file again where it is cut off."
             )
-        if at is not None:
-            labels.append(cells.pop(at).strip())
-        values.append(_numbers(cells, what, path, number))
-    numeric = [name for name in names if name != label]
+        said.append([cells[i].strip() for i in word_at])
+        values.append(_numbers([cells[i] for i in number_at], what, path, number))
     columns = dict(zip(numeric, np.array(values, float).reshape(len(values), len(numeric)).T, strict=True))
-    return NumberTable(path, what, columns, tuple(labels), tuple(number for number, _ in body))
+    by_name = {name: tuple(row[k] for row in said) for k, name in enumerate(labels)}
+    return NumberTable(path, what, columns, by_name, tuple(number for number, _ in body))
 
 
 def write_numbers(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.errors import InputError
+from zlocus.errors import InputError, OutputError
 from zlocus.sensors.rpc import RpcCoefficients
 
 SCALARS = (
@@ -82,6 +82,28 @@ def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
         line_num=polynomial["LINE_NUM_COEFF"], line_den=polynomial["LINE_DEN_COEFF"],
         samp_num=polynomial["SAMP_NUM_COEFF"], samp_den=polynomial["SAMP_DEN_COEFF"],
     )  # fmt: skip
+
+
+def write_rpc_txt(path: Path, rpc: RpcCoefficients) -> None:
+    """Write an RPC as `_RPC.TXT`, to be read back equal.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+    units = ("pixels", "pixels", "degrees", "degrees", "meters") * 2
+    scalars = (
+        rpc.line_off, rpc.samp_off, rpc.lat_off, rpc.lon_off, rpc.height_off,
+        rpc.line_scale, rpc.samp_scale, rpc.lat_scale, rpc.lon_scale, rpc.height_scale,
+    )  # fmt: skip
+    lines = [f"{name}: {value!r} {unit}" for name, value, unit in zip(SCALARS, scalars, units, strict=True)]
+    for name, terms in zip(POLYNOMIALS, (rpc.line_num, rpc.line_den, rpc.samp_num, rpc.samp_den), strict=True):
+        lines += [f"{name}_{i}: {value!r}" for i, value in enumerate(terms, 1)]
+    try:
+        path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, path: Path) -> tuple[float, ...]:

@@ -51,11 +51,12 @@ def adjust(
     """Shifts that make the rays of all ties meet, with Huber's loss, and the ties that remain.
 
     xyz : (n, 3) m, first ground points. Observations further than 4 sigma (and at least `inlier_px`) from where the
-    rest of their tie puts them are dropped, then everything is solved again. With `model` "none" shifts stay zero.
+    rest of their tie puts them are dropped, then everything is solved again. With `model` "none" shifts stay
+    zero.
     """
     shift, n_seen = np.zeros((len(sensors), 2)), 0
     for _ in range(2):
-        if options.model == "shift":
+        if options.model != "none":
             shift, n_seen = solve_shifts(sensors, seen, xyz, options.prior_px, shift)
         points = triangulate(sensors, moved(seen, shift), xyz)
         seen, xyz = consistent(seen, points, options.inlier_px), points.xyz

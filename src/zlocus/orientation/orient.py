@@ -1,10 +1,10 @@
-"""Orientation: from a scene to corrected pointing, residuals before and after, and the height range of the ground."""
+"""Orientation: from a scene to corrected cameras, residuals before and after, and the height range of the ground."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
 from zlocus.orientation.adjust import Adjustment, adjust, consistent, moved, renumbered
+from zlocus.orientation.blocks import kind_of, needs_joint
+from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.locus import Sightlines, locate
 from zlocus.orientation.sharpen import sharpened
 from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
@@ -20,6 +22,9 @@ from zlocus.orientation.triangulate import GroundPoints, Observations, ground_ja
 from zlocus.scene import Scene, View
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import FloatArray, SensorModel
+
+if TYPE_CHECKING:
+    from zlocus.orientation.joint import JointAdjustment
 
 CLOSE_BY = 0.15
 FEWEST_FOR_RANGE = 20
@@ -31,6 +36,8 @@ HEIGHT_SIGMAS = 4.0
 RANGE_PERCENT = (0.5, 99.5)
 # Of `inlier_px`, for ties that were measured again.
 MEASURED_SHARE = 0.5
+# How much farther from one common shift of a pair its ties may lie where more than shifts is corrected.
+POSE_LOOSENESS = 3.0
 KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex), which is not a random one
 
 
@@ -58,13 +65,15 @@ class Residuals:
 
 @dataclass(frozen=True)
 class ViewOrientation:
-    """What was found for one image: the shift (column, row) px added to what its model projects, and its residuals."""
+    """What was found for one image: the shift (column, row) px added to what its model projects, or where more was
+    corrected the median of that at its ties, and its residuals. sensor : see `blocks.kind_of`."""
 
     name: str
     shift_px: tuple[float, float]
     n_ties: int
     before: Residuals
     after: Residuals
+    sensor: str = "rpc"
 
 
 @dataclass(frozen=True)
@@ -84,7 +93,8 @@ class Orientation:
     xyz : (n, 3) m, ground points of the ties with the shifts applied; sigma_z_m : (n,) their height precision;
     seen: their observations; model: the kind of correction; n_seen: how many of the shifts' 2 i components the ties
     could show; z_bounds: the heights (m) within which ties were looked for; n_measured: the first so many ties were
-    measured again and agree, the others look different from everywhere, see `with_rough_ties`.
+    measured again and agree, the others look different from everywhere, see `with_rough_ties`; joint: where all cameras
+    were corrected jointly.
     """
 
     views: tuple[ViewOrientation, ...]
@@ -96,6 +106,7 @@ class Orientation:
     n_seen: int
     z_bounds: tuple[float, float]
     n_measured: int
+    joint: JointAdjustment | None = None
 
     @property
     def measured(self) -> FloatArray:
@@ -104,6 +115,9 @@ class Orientation:
 
     def apply(self, scene: Scene) -> Scene:
         """The scene with corrected sensors."""
+        if self.joint is not None:
+            pairs = zip(scene.views, self.joint.sensors, strict=True)
+            return replace(scene, views=tuple(replace(view, sensor=sensor) for view, sensor in pairs))
         views = []
         for view, found in zip(scene.views, self.views, strict=True):
             moved = found.shift_px != (0.0, 0.0)
@@ -116,18 +130,27 @@ class Orientation:
         if self.model == "none":
             return "No correction was asked for: the models are used as delivered."
         total, alone = 2 * len(self.views), [v.name for v in self.views if not v.n_ties]
+        unlinked = f" Without ties, so not corrected: {', '.join(alone)}." if alone else ""
+        if self.joint is not None:
+            total = len(self.joint.solution.parameters)
+            return (
+                f"The ties show {self.n_seen} of {total} directions of the cameras' parameters; along the other "
+                f"{total - self.n_seen}, such as a common motion of all cameras and the ground, they stay where "
+                f"what was delivered, and control, put them.{unlinked}"
+            )
         text = (
             f"The ties show {self.n_seen} of the {total} components of the shifts; the other {total - self.n_seen} are "
             "left at zero: a common translation of the ground and, where only two images overlap, the shift along the "
             "locus, which is a height."
         )
-        return text + (f" Without ties, so not corrected: {', '.join(alone)}." if alone else "")
+        return text + unlinked
 
     def as_dict(self) -> dict[str, Any]:
         """For run.json."""
         return {
             "views": {
                 v.name: {
+                    "sensor": v.sensor,
                     "shift_px": [round(v.shift_px[0], 4), round(v.shift_px[1], 4)],
                     "n_ties": v.n_ties,
                     "residual_before_px": v.before.as_dict(),
@@ -155,29 +178,45 @@ def orient(
     options: OrientationOptions,
     z_range_hint: tuple[float, float] | None = None,
     progress: Progress | None = None,
+    control: GroundControl | None = None,
+    terrain: TerrainHeights | None = None,
 ) -> Orientation:
-    """Tie points, measured again by correlation, then one shift per image, solved with the heights of the ties.
+    """Tie points, measured again by correlation, then one shift per image, or all cameras, solved with the heights of
+    the ties.
 
-    z_range_hint: heights in m that hold the ground, where they are known; else the scene's.
+    z_range_hint: heights in m that hold the ground, where they are known; else the scene's. control, terrain : used
+    where cameras are corrected jointly.
     """
-    ties = find_ties(scene, options, z_range_hint, progress)
+    has_poses = needs_joint(scene.views)
+    is_joint = options.model == "joint" or (options.model == "auto" and has_poses)
+    loosely = replace(options, inlier_px=options.inlier_px * POSE_LOOSENESS) if is_joint and has_poses else options
+    ties = find_ties(scene, loosely, z_range_hint, progress)
     sensors = [view.sensor for view in scene.views]
     xyz = first_ground(scene, ties)
     seen = sharpened(scene.views, ties.seen, ground_jacobian(sensors, ties.seen, xyz), options)
     strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
-    adjusted = adjust(sensors, seen, xyz, strict)
-    ground = with_rough_ties(adjusted, sensors, ties.seen, xyz, options.inlier_px * looseness(scene.views, options))
-    views = tuple(view_orientation(view, i, adjusted) for i, view in enumerate(scene.views))
+    joint, corrected = None, sensors
+    if is_joint:
+        # SciPy's sparse matrices and linear algebra cost 0.2 s to import.
+        from zlocus.orientation.joint import adjust_jointly
+
+        joint = adjust_jointly(scene.views, seen, xyz, strict, control, terrain)
+        adjusted, corrected = joint.adjusted, list(joint.sensors)
+    else:
+        adjusted = adjust(sensors, seen, xyz, strict)
+    ground = with_rough_ties(adjusted, corrected, ties.seen, xyz, options.inlier_px * looseness(scene.views, options))
+    views = tuple(view_orientation(view, i, adjusted, corrected[i]) for i, view in enumerate(scene.views))
     return Orientation(
         views=views,
-        pairs=pair_orientations(scene, adjusted, ties.z_range),
+        pairs=pair_orientations(scene, corrected, adjusted, ties.z_range),
         xyz=ground.xyz,
         sigma_z_m=ground.sigma_z_m,
         seen=ground.seen,
-        model=options.model,
+        model="joint" if is_joint else "none" if options.model == "none" else "shift",
         n_seen=adjusted.n_seen,
         z_bounds=ties.z_range,
         n_measured=len(adjusted.points.xyz),
+        joint=joint,
     )
 
 
@@ -201,8 +240,9 @@ def with_rough_ties(
 ) -> TiePoints:
     """The adjusted ties, then those that could not be measured again, or not well enough to tell the pointing.
 
-    Tree tops and edges of roofs look different from everywhere: as SIFT found them they still tell where the search
-    has to reach. every, xyz : all ties, observations and first ground points (n, 3) m.
+    sensors : those that the shifts of `adjusted` are to be laid over; every, xyz : all ties, observations and first
+    ground points (n, 3) m. Tree tops and edges of roofs look different from everywhere: as SIFT found them they still
+    tell where the search has to reach.
     """
     precise = TiePoints.of(adjusted.points, adjusted.seen)
     used = np.zeros(len(xyz), bool)
@@ -234,16 +274,23 @@ def first_ground(scene: Scene, ties: Ties) -> FloatArray:
     return xyz
 
 
-def view_orientation(view: View, number: int, adjusted: Adjustment) -> ViewOrientation:
-    """One image's share of the result."""
+def view_orientation(view: View, number: int, adjusted: Adjustment, corrected: SensorModel) -> ViewOrientation:
+    """One image's share of the result. corrected : its sensor, but for its shift."""
     mine = adjusted.seen.view == number
     column, row = adjusted.shift_px[number]
+    if corrected is not view.sensor and mine.any():
+        xyz = adjusted.points.xyz[adjusted.seen.point[mine]]
+        column, row = np.nanmedian(corrected.image_from_ground(xyz) - view.sensor.image_from_ground(xyz), axis=0)
     before, after = Residuals.of(adjusted.before_px[mine]), Residuals.of(adjusted.after_px[mine])
-    return ViewOrientation(view.name, (float(column), float(row)), int(mine.sum()), before, after)
+    shift = (float(column), float(row))
+    return ViewOrientation(view.name, shift, int(mine.sum()), before, after, kind_of(view.sensor))
 
 
-def pair_orientations(scene: Scene, adjusted: Adjustment, z_range: tuple[float, float]) -> tuple[PairOrientation, ...]:
-    """Each pair's distances from the loci, over ties that both its images see."""
+def pair_orientations(
+    scene: Scene, corrected: Sequence[SensorModel], adjusted: Adjustment, z_range: tuple[float, float]
+) -> tuple[PairOrientation, ...]:
+    """Each pair's distances from the loci, over ties that both its images see. corrected : the sensors, but for their
+    shifts."""
     seen, found = adjusted.seen, []
     row_of = np.full((len(scene.views), len(adjusted.points.xyz)), -1)
     row_of[seen.view, seen.point] = np.arange(len(seen))
@@ -254,10 +301,10 @@ def pair_orientations(scene: Scene, adjusted: Adjustment, z_range: tuple[float, 
                 continue  # such a pair has nothing to report
             few = both[:: max(len(both) // ENOUGH_FOR_MEDIAN, 1)]
             in_a, in_b = seen.xy[row_of[a][few]], seen.xy[row_of[b][few]]
-            first, second = scene.views[a].sensor, scene.views[b].sensor
-            shift_a, shift_b = adjusted.shift_px[a], adjusted.shift_px[b]
-            before = locate(Sightlines.of(first, in_a, z_range), second, in_b, z_range).across_px
-            after = locate(Sightlines.of(first, in_a - shift_a, z_range), second, in_b - shift_b, z_range).across_px
+            first = Sightlines.of(scene.views[a].sensor, in_a, z_range)
+            before = locate(first, scene.views[b].sensor, in_b, z_range).across_px
+            first = Sightlines.of(corrected[a], in_a - adjusted.shift_px[a], z_range)
+            after = locate(first, corrected[b], in_b - adjusted.shift_px[b], z_range).across_px
             names = (scene.views[a].name, scene.views[b].name)
             found.append(PairOrientation(names, len(both), median_distance(before), median_distance(after)))
     return tuple(found)

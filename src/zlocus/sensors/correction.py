@@ -1,4 +1,4 @@
-"""Orientation corrections laid over a sensor model: a shift in the image."""
+"""Orientation corrections laid over a sensor model: a shift in the image, or an affine map of it."""
 
 from __future__ import annotations
 
@@ -32,3 +32,41 @@ class ShiftedModel:
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
         return self.base.height_bounds()
+
+
+@dataclass(frozen=True)
+class AffineModel:
+    """A sensor model whose image positions are moved by amounts that grow evenly over the image.
+
+    column, row : (constant px, per column, per row), what is added to the column and to the row that `base` projects.
+    Source: Grodecki and Dial 2003, Photogrammetric Engineering & Remote Sensing 69 (1), 59-68, equations 3 and 4, whose
+    line and sample are `row` and `column`.
+    """
+
+    base: SensorModel
+    column: tuple[float, float, float]
+    row: tuple[float, float, float]
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        xy = self.base.image_from_ground(xyz)
+        return np.asarray(self._constant + xy @ self._growth.T, float)
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        before = (np.asarray(xy, float) - self._constant) @ np.linalg.inv(self._growth).T
+        return self.base.ground_from_image(before, z)
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`."""
+        return self.base.height_bounds()
+
+    @property
+    def _constant(self) -> FloatArray:
+        """(2,) px."""
+        return np.array([self.column[0], self.row[0]])
+
+    @property
+    def _growth(self) -> FloatArray:
+        """(2, 2) corrected image positions per px of those that `base` projects."""
+        return np.asarray(np.eye(2) + np.array([self.column[1:], self.row[1:]]), float)

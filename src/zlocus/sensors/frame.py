@@ -9,7 +9,7 @@ from pyproj import CRS
 
 from zlocus.sensors.distortion import Distortion
 from zlocus.sensors.model import FloatArray
-from zlocus.sensors.rotation import from_photogrammetric
+from zlocus.sensors.rotation import from_photogrammetric, from_vectors
 from zlocus.sensors.space import FRAME_SPACE, EarthSpace, Space
 
 Row = tuple[float, float, float]
@@ -88,6 +88,13 @@ class FrameModel:
     def moved(self, column: float, row: float) -> FrameModel:
         """The camera whose image positions are `column` and `row` pixels larger."""
         return replace(self, principal_point=(self.principal_point[0] + column, self.principal_point[1] + row))
+
+    def corrected(self, offset: FloatArray, turn: FloatArray) -> FrameModel:
+        """The camera moved along its own axes by offset (3,) m and turned about them by turn (3,) rad: a vector, right,
+        down, forwards, of its length."""
+        centre = np.array(self.centre) + np.asarray(offset, float) @ self.rotation
+        rows = from_vectors(-np.asarray(turn, float)[None])[0] @ self.rotation
+        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
 
     def turned(self, rotation: FloatArray) -> FrameModel:
         """The camera in a Cartesian frame that is turned. rotation : (3, 3), new frame from old."""

@@ -1,0 +1,123 @@
+"""The order of an orientation that stands alone: scene, ties, cameras, files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zlocus.errors import GeometryError
+from zlocus.grid import grid_from_bounds
+from zlocus.io.config import config_as_dict
+from zlocus.io.control import read_control
+from zlocus.io.reference import read_dem
+from zlocus.io.scene_file import open_scene
+from zlocus.options import OrientationOptions, RunConfig
+from zlocus.orientation.control import TerrainHeights
+from zlocus.orientation.orient import Orientation
+from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
+from zlocus.products.cameras import SCENE, write_cameras
+from zlocus.products.orientation import orientation_record
+from zlocus.products.points import write_ties
+from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.progress import Progress
+from zlocus.request import OrientRequest
+from zlocus.scene import Scene, check_overlap, footprint, ground_sample_distance, is_local
+
+# Cells of the terrain model are this many ground pixels, its own resolution being coarser.
+TERRAIN_PX = 16.0
+# Tie points that an orientation needs at least, all images together.
+FEWEST_TIES = 4
+
+
+def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) -> str:
+    """Find ties, correct the cameras where that is asked for, and write all products to `request.out`; a sentence on
+    what came out.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError, OutputError
+        For what cannot be used, before anything is written.
+    """
+    watch = Stopwatch()
+    with watch.stage("open"), progress.stage("Opening images"):
+        scene = open_scene(request.inputs, asked_crs(request.crs))
+        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+        heights = request.heights or scene.heights
+        if not is_local(scene.crs) or heights is not None:
+            check_overlap(scene, possible_heights(scene, heights))
+        control = None if request.control is None else read_control(request.control, scene.views)
+        terrain = None if request.dem is None else terrain_heights(request.dem, scene, heights)
+    with watch.stage("orient"):
+        options = alone(config.orientation, request.cameras)
+        found = oriented(scene, options, heights, progress, control, terrain)
+        check_ties(found, scene)
+        progress.note(what_was_applied(found))
+    corrected = found.apply(scene)
+    with watch.stage("write"), made_folder(request.out):
+        write_ties(request.out / "ties.gpkg", found, corrected)
+        record: dict[str, Any] = orientation_record(found, scene)
+        if request.cameras:
+            record["cameras"] = write_cameras(request.out, request.inputs, corrected)
+        write_record(request.out / "orientation.json", record)
+    write_record(request.out / "run.json", run_record(request, config, scene, watch))
+    if not request.cameras:
+        return f"{request.out / 'ties.gpkg'}: {len(found.xyz)} tie points."
+    return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(found.measured)} tie points."
+
+
+def alone(options: OrientationOptions, cameras: bool) -> OrientationOptions:
+    """The options of a stage that stands alone: no correction for ties alone, all cameras jointly unless a file of
+    options says otherwise."""
+    if not cameras:
+        return replace(options, model="none")
+    return replace(options, model="joint") if options.model == "auto" else options
+
+
+def check_ties(found: Orientation, scene: Scene) -> None:
+    """Refuse an orientation that nothing holds together."""
+    if len(found.measured) < FEWEST_TIES:
+        raise GeometryError(
+            f"Only {len(found.measured)} tie points were found between {', '.join(v.name for v in scene.views)}, too "
+            f"few to orient the cameras ({FEWEST_TIES} are needed). Give --heights ZMIN ZMAX, or check that the images "
+            "overlap."
+        )
+
+
+def terrain_heights(dem: Path, scene: Scene, heights: tuple[float, float] | None) -> TerrainHeights:
+    """Heights of a DEM over all ground that the images may see.
+
+    Raises
+    ------
+    GeometryError
+        Where the frame is local, and a DEM has no place in it.
+    InputError
+        For a file that is no DEM or covers nothing of the ground.
+    """
+    if is_local(scene.crs):
+        raise GeometryError(f"The scene's frame is local, where {dem} has no place. Leave --dem out.")
+    levels = possible_heights(scene, heights)
+    outlines = np.concatenate([footprint(view, z) for view in scene.views for z in (levels[0], levels[-1])])
+    middle = levels[len(levels) // 2]
+    cell = TERRAIN_PX * float(np.nanmedian([ground_sample_distance(view, middle) for view in scene.views]))
+    (west, south), (east, north) = outlines.min(axis=0), outlines.max(axis=0)
+    geobox = grid_from_bounds((west, south, east, north), cell, scene.crs).geobox
+    z = read_dem(dem, geobox).astype(float)
+    first = geobox.transform * (0.5, 0.5)
+    return TerrainHeights(z, float(first[0]), float(first[1]), cell)
+
+
+def run_record(request: OrientRequest, config: RunConfig, scene: Scene, watch: Stopwatch) -> dict[str, Any]:
+    """What was asked and done, for run.json."""
+    asked = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
+    asked["inputs"] = [str(path) for path in request.inputs]
+    extra = [path for path in (request.control, request.dem) if path is not None]
+    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
+    return {
+        "config": {"request": asked, "options": config_as_dict(config)},
+        "versions": versions_record(),
+        "inputs": inputs_record(dict.fromkeys([*request.inputs, *files, *extra])),
+        "stages": watch.stages,
+    }
