@@ -21,7 +21,7 @@ from zlocus.request import DsmRequest
 from zlocus.sensors.linescan import LineScanModel
 from zlocus.synthetic.__main__ import main
 from zlocus.synthetic.files import RenderedScene, render_scene
-from zlocus.synthetic.linescan import TrajectoryNoise, noisy, sampled, write_linescan_scene
+from zlocus.synthetic.linescan import TrajectoryNoise, noisy, sampled, write_linescan_views, write_scene
 from zlocus.synthetic.scenes import SceneSpec, city_spec, demo_spec, exposures, with_ads40
 
 # Cubic splines through exact samples at 200 Hz (rows are 3 ms apart).
@@ -67,7 +67,8 @@ def test_what_is_read_is_the_exact_camera(spec, rendered):
 def test_the_demo_block_as_line_scanners(tmp_path):
     """Six images of three lines in two strips (Ji et al. 2014, table 2), written without rendering."""
     spec = demo_spec()
-    write_linescan_scene(spec, exposures(spec), tmp_path, TrajectoryNoise())
+    entries = write_linescan_views(spec, exposures(spec), tmp_path, TrajectoryNoise())
+    write_scene(spec, entries, tmp_path / "scene.yaml")
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"ads40.csv", "scene.yaml", *(f"trajectory_{view.name}.csv" for view in spec.views)}
     lines = {line.split(",")[0] for line in (tmp_path / "ads40.csv").read_text().splitlines()[2:]}

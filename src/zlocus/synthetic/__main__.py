@@ -40,6 +40,8 @@ def main(arguments: list[str] | None = None) -> int:
         "--trajectory-noise", type=float, nargs=2, default=(0.0, 0.0), metavar=("M", "DEG"),
         help="standard deviation of slow errors of the trajectories",
     )  # fmt: skip
+    parser.add_argument("--steady", action="store_true", help="line scanners of the demo: no shaking (as with RPCs)")
+    parser.add_argument("--level", type=int, choices=(0, 1), help="line scanners: raw, or resampled to a plane")
     given = parser.parse_args(arguments)
     try:
         make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "demo": demo_spec}
@@ -47,6 +49,10 @@ def main(arguments: list[str] | None = None) -> int:
         linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
         if linescan is not None:
             spec = with_ads40(spec)
+        if given.steady or linescan is None:
+            spec = replace(spec, shaken=False)
+        if given.level is not None:
+            spec = replace(spec, level=given.level)
         if given.size:
             coarse = spec.gsd_m if given.size > LARGE_SIZE else None
             spec = replace(spec, size=given.size, truth_step_m=coarse)
