@@ -15,6 +15,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Renders what the command line asks for; returns the exit status."""
     from zlocus.synthetic.files import render_scene
     from zlocus.synthetic.linescan import TrajectoryNoise
+    from zlocus.synthetic.mixed import render_mixed_scene
     from zlocus.synthetic.scenes import (
         LARGE_SIZE,
         SceneSpec,
@@ -27,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
-    parser.add_argument("--kind", choices=("city", "hills", "demo"), default="city")
+    parser.add_argument("--kind", choices=("city", "hills", "demo", "mixed"), default="city")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
     parser.add_argument("--views", type=int, help="render the first N views only")
@@ -43,7 +44,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steady", action="store_true", help="line scanners of the demo: no shaking (as with RPCs)")
     parser.add_argument("--level", type=int, choices=(0, 1), help="line scanners: raw, or resampled to a plane")
     given = parser.parse_args(arguments)
+
+    def say(step: str) -> None:
+        print(f"rendering {step}", file=sys.stderr)
+
     try:
+        if given.kind == "mixed":
+            size = {"size": given.size} if given.size else {}
+            render_mixed_scene(replace(demo_spec(given.seed), **size), given.output, say)
+            return 0
         make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "demo": demo_spec}
         spec = make[given.kind](given.seed)
         linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
@@ -60,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
             spec = replace(spec, views=spec.views[: given.views])
         if given.pointing:
             spec = with_pointing_errors(spec, given.pointing)
-        render_scene(spec, given.output, lambda step: print(f"rendering {step}", file=sys.stderr), linescan)
+        render_scene(spec, given.output, say, linescan)
     except ZlocusError as error:
         print(f"Error: {error}", file=sys.stderr)
         return error.exit_status

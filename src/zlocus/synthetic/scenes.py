@@ -249,8 +249,8 @@ def _camera(
     aside = FLIGHT_HEIGHT_M * np.tan(np.deg2rad(view.across_deg))
     east, north = aside * float(np.cos(heading)), -aside * float(np.sin(heading))
     position = (middle[0] - east, middle[1] - north, middle[2] + FLIGHT_HEIGHT_M)
-    strips = sorted({(each.heading_deg, each.across_deg) for each in spec.views})
-    shake = Shake((spec.seed, strips.index((view.heading_deg, view.across_deg)))) if spec.shaken else None
+    strip = (round(1e3 * (view.heading_deg % 360.0)), round(1e3 * (view.across_deg + 90.0)))
+    shake = Shake((spec.seed, *strip)) if spec.shaken else None
     return LineScanner(
         position, (0.0, 0.0), view.heading_deg, view.along_deg, ADVANCE_M, wobble_m=WOBBLE_M, wobble_deg=WOBBLE_DEG,
         shake=shake,
