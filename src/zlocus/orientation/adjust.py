@@ -21,8 +21,9 @@ SMALLEST_SIGMA_PX = 0.02
 # loci differ by less than 3 degrees do not fix the shift along them, while the slow bends of a long chain of n images,
 # whose information falls as 5 / n**2, are kept.
 SEEN_INFORMATION = 0.01
-# A translation of the ground counts as seen where its shifts leave the unseen ones by more than this, a sine.
-SEEN_TRANSLATION = 0.5
+# Shifts like a translation of the ground that are not unseen, by more than this sine, need the information that counts
+# for two images, however many there are: no chain of images adds any to them.
+APART_SINE = 0.5
 
 
 @dataclass(frozen=True)
@@ -155,9 +156,9 @@ def seen_directions(normal: FloatArray, weight_of_view: FloatArray, translated: 
 
     Information is judged per observation, so that an image with few ties counts like one with many; what is not seen
     (a translation of the ground; for two images the shift along their loci; images without ties) stays exactly zero.
-    translated : see `translations`. Where sensors of several kinds, or heights, are mixed, a translation changes the
-    scales of their images by different amounts, from which a height can be had to some decimetres; the cameras say it
-    better, so it stays zero all the same.
+    translated : see `translations`. Where sensors of several kinds are mixed, a translation changes the scales of their
+    images by different amounts, from which a height can be had to a decimetre or so; the cameras say it better, so it
+    stays zero all the same.
     """
     scale = np.repeat(np.sqrt(weight_of_view), 2)
     linked = scale > 0.0
@@ -169,9 +170,11 @@ def seen_directions(normal: FloatArray, weight_of_view: FloatArray, translated: 
     left, _, _ = np.linalg.svd(hidden, full_matrices=True)
     known = left[:, : hidden.shape[1]]
     apart, sine, _ = np.linalg.svd(translated - known @ (known.T @ translated), full_matrices=False)
-    is_seen = np.asarray(sine) > SEEN_TRANSLATION
-    if is_seen.any():
-        hidden = np.column_stack([known, apart[:, is_seen]])
+    scaled = apart * scale[:, None]
+    information = np.einsum("ik,ij,jk->k", apart, normal, apart) / np.maximum((scaled**2).sum(axis=0), 1e-12)
+    is_doubtful = (np.asarray(sine) > APART_SINE) & (information < SEEN_INFORMATION / 2**2)
+    if is_doubtful.any():
+        hidden = np.column_stack([known, apart[:, is_doubtful]])
         left, _, _ = np.linalg.svd(hidden, full_matrices=True)
     return np.where(linked[:, None], left[:, hidden.shape[1] :], 0.0)
 
