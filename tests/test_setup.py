@@ -146,6 +146,15 @@ def test_line_scanners_have_the_step_of_satellites():
 
 def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
     """Both see their own middle from straight above, and one place 30 degrees apart."""
-    left, right = scanners((2.0, -15.0), (2.0, 15.0))
-    step = height_step((left, right), 438.0, 0.2, 0.5)
+    spec = replace(
+        steady(demo_spec()), views=tuple(ViewSpec(name, 2.0, side) for name, side in (("a", -15), ("b", 15)))
+    )
+    views = []
+    for each in exposures(spec):
+        camera = replace(each.camera, centre=(3000.0, each.camera.centre[1]))
+        wide = replace(each, camera=camera, shape=(each.shape[0], 6001))
+        image = image_of(np.zeros(wide.shape))
+        views.append(View(each.view.name, Path(each.view.name), image, line_scanner(wide)))
+    assert np.hypot(*(nadir_offset(views[0], 438.0) - nadir_offset(views[1], 438.0))) < 0.02
+    step = height_step(tuple(views), 438.0, 0.2, 0.5)
     assert step == pytest.approx(0.5 * 0.208 / (2.0 * np.tan(np.deg2rad(15.0))), rel=0.05)
