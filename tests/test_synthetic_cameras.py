@@ -108,6 +108,22 @@ def test_level_1_keeps_places_on_its_plane_whatever_the_flight() -> None:
     assert np.std(apart, axis=0).min() > 0.2
 
 
+def test_a_flight_is_shaken_in_place_and_in_every_turn() -> None:
+    camera = shaken()
+    rows = np.linspace(-3000.0, 3000.0, 500)
+    (place, turned), (still, at_rest) = camera.poses(rows), replace(camera, shake=None).poses(rows)
+    assert camera.shake is not None
+    expected = camera.shake.at(rows - camera.centre[1])
+    apart = at_rest.mT @ turned
+    found = np.column_stack([apart[:, 0, 2], -apart[:, 1, 2], apart[:, 1, 0]])
+    # Products of a wobble of 5e-4 and a shake of 1e-4.
+    np.testing.assert_allclose(found, expected[:, 3:], rtol=0, atol=3e-7)
+    heading = np.deg2rad(camera.heading_deg)
+    right, forward = (np.cos(heading), -np.sin(heading), 0.0), (np.sin(heading), np.cos(heading), 0.0)
+    axes = np.array([right, forward, (0.0, 0.0, 1.0)])
+    np.testing.assert_allclose((place - still) @ axes.T, expected[:, :3], rtol=0, atol=1e-6)
+
+
 def test_shaking_is_as_strong_as_it_says_and_the_same_again() -> None:
     shake = Shake((7,), turn_deg=0.01, offset_m=0.1)
     found = shake.at(np.arange(0.0, 60_000.0))

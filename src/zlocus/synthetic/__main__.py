@@ -43,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
     parser.add_argument(
         "--kind", choices=("city", "hills", "demo", "mixed"), default="city",
-        help="mixed: the ground of the demo through three kinds of sensor; of the options below --seed and --size count",
+        help="mixed: the demo's kind of ground through three kinds of sensor; takes --seed and --size",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
