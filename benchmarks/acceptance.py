@@ -32,6 +32,8 @@ from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.io.scene_file import open_scene
 from zlocus.scene import Scene
+from zlocus.synthetic.mixed import SENSORS
+from zlocus.synthetic.scenes import demo_spec
 
 ROOT = Path(__file__).parents[1]
 ZLOCUS = Path(sys.executable).with_name("zlocus")
@@ -50,6 +52,8 @@ CITY_BARS = {
     "two": {"all": 0.925, "building": 0.72, "nmad": 0.25},
 }
 HILLS_NMAD_BAR_M = 0.16
+# Two ground pixels of the demo's line scanner, and shares of its surfaces within them.
+TWO_PIXELS_M, DEMO_BARS = 0.42, {"ground": 0.97, "building": 0.85}
 # A town of more than 4 M cells at 0.5 m, and CPU seconds per million cells that it may take.
 SPEED_SIDE_CELLS, SPEED_SEED = 2048, 12
 SPEED_BARS_S = {"six": 8.0, "three": 4.0}
@@ -85,6 +89,8 @@ class Figure:
         unit = f" {self.unit}" if self.unit else ""
         bar = "" if self.at_least is None else f">= {self.at_least:g}{unit}"
         bar = bar if self.at_most is None else f"<= {self.at_most:g}{unit}"
+        if self.at_least is not None and self.at_most is not None:
+            bar = f"{self.at_least:g} to {self.at_most:g}{unit}"
         above = self.at_least is None or self.value >= self.at_least
         below = self.at_most is None or self.value <= self.at_most
         verdict = "" if not bar else "pass" if above and below else "SHORT"
@@ -182,6 +188,66 @@ def staircase(out: Path) -> list[Figure]:
         Figure("least of the tenths of a step", share.min(), at_least=0.8),
         Figure("most of the tenths of a step", share.max(), at_most=1.2),
     ]
+
+
+def demo(at: Workplace) -> list[Figure]:
+    """The demo, and its ground seen from a steady flight, through the trajectories and through RPC fitted to them."""
+    run([ZLOCUS, "demo", "-o", at.out / "demo"])
+    scene, figures = at.out / "demo" / "scene", []
+    for limit, bars in ((TWO_PIXELS_M, DEMO_BARS), (1.0, {})):
+        found = at.judge(at.out / "demo" / "dsm.tif", scene, "--thr", str(limit))
+        for kind in surfaces_of("city", "tree"):
+            what = f"within {limit:g} m: {kind}"
+            figures.append(Figure(what, found[kind]["within"], at_least=bars.get(kind)))
+    heights = open_scene([scene / "scene.yaml"]).heights
+    for cameras in ("linescan", "rpc"):
+        folder = at.out / f"{cameras}-scene"
+        synthetic = [sys.executable, "-m", "zlocus.synthetic", "--kind", "demo", "--seed", demo_spec().seed]
+        run([*synthetic, "--steady", "--cameras", cameras, "-o", folder])
+        inputs = [folder / "scene.yaml"] if cameras == "linescan" else rendered_images(folder)
+        out = ["-o", at.out / cameras, "--resolution", 0.2, "--crs", "EPSG:32632", "--heights", *heights]
+        run([ZLOCUS, "dsm", *inputs, *out, "--overwrite"])
+    fits = json.loads((folder / "scene.json").read_text())["views"].values()
+    figures.append(
+        Figure("RPC of the steady flight, worst fit", max(v["rpc_fit_max_px"] for v in fits), "px", at_most=0.05)
+    )
+    nmad = {name: nmad_of(at.out / name, scene) for name in ("demo", "linescan", "rpc")}
+    for name, what in (("linescan", "steady flight"), ("demo", "demo")):
+        for kind, value in nmad[name].items():
+            off = value / nmad["rpc"][kind] - 1
+            figures.append(Figure(f"{what} over RPC, NMAD {kind}, off 1", off, at_least=-0.05, at_most=0.05))
+    return figures
+
+
+def nmad_of(out: Path, scene: Path) -> dict[str, float]:
+    """NMAD of a surface as it is, with all digits: of all and of ground."""
+    found = evaluate(out / "dsm.tif", scene / "truth_dsm.tif", classes=scene / "truth_class.tif")
+    return {"all": found.all.nmad, "ground": found.classes["ground"].nmad}
+
+
+def mixed(at: Workplace) -> list[Figure]:
+    """One rendered ground seen by a line scanner, a frame camera and a satellite with RPC: together, and each alone."""
+    scene = at.out / "scene"
+    run([sys.executable, "-m", "zlocus.synthetic", "--kind", "mixed", "--seed", demo_spec().seed, "-o", scene])
+    within, nmad, figures = {}, {}, []
+    for name in (*SENSORS, "mixed"):
+        out = at.out / name
+        run([ZLOCUS, "dsm", scene / f"{name}.yaml", "-o", out, "--resolution", 0.2, "--overwrite"])
+        nmad[name] = nmad_of(out, scene)["ground"]
+        for limit in (TWO_PIXELS_M, 1.0):
+            found = at.judge(out / "dsm.tif", scene, "--thr", str(limit))
+            for kind in surfaces_of("city", "tree"):
+                within[name, limit, kind] = found[kind]["within"]
+                figures.append(Figure(f"{name}: within {limit:g} m: {kind}", found[kind]["within"]))
+        figures.append(Figure(f"{name}: NMAD ground", nmad[name], "m"))
+    for limit, kind in product((TWO_PIXELS_M, 1.0), surfaces_of("city", "tree")):
+        gain = within["mixed", limit, kind] - max(within[name, limit, kind] for name in SENSORS)
+        figures.append(Figure(f"over the best alone, {limit:g} m: {kind}", gain, at_least=0.0))
+    best = min(nmad[name] for name in SENSORS)
+    figures.append(Figure("NMAD ground over the best alone", nmad["mixed"] / best, at_most=1.0))
+    views = json.loads((at.out / "mixed" / "run.json").read_text())["orientation"]["views"].values()
+    figures.append(Figure("worst shift of the exact cameras", max(np.abs(v["shift_px"]).max() for v in views), "px"))
+    return figures
 
 
 def city(at: Workplace) -> list[Figure]:
@@ -569,7 +635,8 @@ def clone(at: Workplace) -> list[Figure]:
 
 
 ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
-    "calanques": calanques, "city": city, "city-views": city_views, "hills": hills, "joint": joint,
+    "demo": demo, "mixed": mixed, "calanques": calanques, "city": city, "city-views": city_views, "hills": hills,
+    "joint": joint,
     "new-scenes": new_scenes, "ventoux": ventoux, "dmc": dmc, "tuniu": tuniu, "kernels": kernels,
     "selection": selection, "features": features, "middlebury": middlebury, "memory": memory, "speed": speed,
     "clone": clone,

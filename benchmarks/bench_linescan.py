@@ -9,15 +9,15 @@ from bench_kernels import Case, timed
 from zlocus.sensors.linescan import LineScanModel, LineTimes
 from zlocus.sensors.space import EarthSpace, FrameSpace
 from zlocus.synthetic.linescan import SPEED_M_S, focal_line, sampled
-from zlocus.synthetic.scenes import demo_spec, exposures
+from zlocus.synthetic.scenes import demo_spec, exposures, steady
 
 SIDE = 700
 
 
 @pytest.fixture(scope="module")
 def scanner():
-    """The forward line of the demo, and a grid of ground points that it sees."""
-    spec = demo_spec()
+    """The forward line of the demo, raw and of a steady flight, and a grid of ground points that it sees."""
+    spec = steady(demo_spec())
     exposure = exposures(spec)[1]
     interval = -exposure.camera.advance_m / SPEED_M_S
     lines = LineTimes.regular(0.0, interval, exposure.shape[0])

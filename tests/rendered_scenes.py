@@ -14,10 +14,14 @@ from zlocus.options import PyramidOptions, RunConfig
 from zlocus.pipeline import DsmResult, run_dsm
 from zlocus.progress import progress_for
 from zlocus.request import DsmRequest
+from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes
+from zlocus.sensors.space import FRAME_SPACE
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.files import write_image
+from zlocus.synthetic.linescan import NADIR_COLUMN, SPEED_M_S, focal_line, sampled
 from zlocus.synthetic.render import Optics, Sun, expose, render
 from zlocus.synthetic.rpc_fit import fit_rpc
+from zlocus.synthetic.scenes import Exposure
 from zlocus.synthetic.terrain import analytic_ground, analytic_height
 
 CENTRE = (462_000.0, 5_247_000.0)
@@ -46,6 +50,15 @@ class RenderedImages:
     @property
     def inputs(self) -> tuple[Path, ...]:
         return tuple(self.paths.values())
+
+
+def line_scanner(exposure: Exposure) -> LineScanModel:
+    """The sensor model of a rendered line scanner's raw image, straight from its exact camera."""
+    raw, first = exposure.taken, int(NADIR_COLUMN - exposure.taken.camera.centre[0])
+    line = focal_line(raw.camera)
+    line = FocalLine(line.xy_mm[first : first + raw.shape[1]], line.focal_mm)
+    times = LineTimes.regular(0.0, -raw.camera.advance_m / SPEED_M_S, raw.shape[0])
+    return LineScanModel(line, times, sampled(raw.camera, raw.shape[0]), FRAME_SPACE)
 
 
 def camera(name: str, size: int = SIZE_PX) -> SatelliteCamera:

@@ -12,6 +12,7 @@ from zlocus.options import OrientationOptions
 from zlocus.orientation.adjust import adjust
 from zlocus.orientation.triangulate import Observations, triangulate
 from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.frame import FrameModel, rotation_from_angles
 
 OPTIONS = OrientationOptions()
 LOOKS = ((0.0, 0.0), (0.3, 0.05), (-0.25, 0.1), (0.1, 0.3))
@@ -144,3 +145,24 @@ def test_no_correction_and_no_ties():
     assert as_delivered.after_px == pytest.approx(as_delivered.before_px, abs=1e-6)
     nothing = Observations(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
     assert not adjust(sensors, nothing, np.empty((0, 3)), OPTIONS).shift_px.any()
+
+
+def test_sensors_of_several_kinds_do_not_move_the_ground():
+    """The scales of frame images beside those of parallel rays tell a height to a tenth of a metre, the cameras better:
+    shifts of exact cameras are those of the noise, a hundredth of a pixel, and planted ones come back."""
+    planted = np.zeros((6, 2))
+    planted[4] = 1.0, -2.0
+    frames = [
+        FrameModel((0.0, north, 3500.0), rotation_from_angles(0.5, -0.7, 0.0), 7000.0, (0.0, 0.0))
+        for north in (-1300.0, 0.0, 1300.0)
+    ]
+    exact = [*frames, *(AffineSensor(*look) for look in ((0.02, 0.36), (0.0, 0.0), (0.05, -0.35)))]
+    xyz = random_ground(600)
+    sensors = [ShiftedModel(s, *(-shift)) for s, shift in zip(exact, planted, strict=True)]
+    seen = observe(exact, xyz, noise_px=0.1)
+    found = adjust(sensors, seen, xyz, OPTIONS)
+    assert found.n_seen == 2 * len(exact) - 3
+    true = adjust(exact, seen, xyz, OPTIONS)
+    assert np.abs(true.shift_px).max() < 0.02
+    assert abs(np.median(true.points.xyz[:, 2] - xyz[true.numbers, 2])) < 0.02
+    assert np.abs(without_translation(found.shift_px - planted, exact)).max() < 0.02

@@ -48,7 +48,8 @@ def pipeline(monkeypatch):
         def run_demo(self, out, progress):
             out.mkdir(exist_ok=True)
             figures = ErrorStatistics(1000, 0.99, 0.98, 0.01, 0.123, 0.2, 0.3)
-            return SimpleNamespace(out=out, evaluation=Evaluation(figures, {"ground": figures}, None, 1.0))
+            evaluations = tuple(Evaluation(figures, {"ground": figures}, None, limit) for limit in (0.42, 1.0))
+            return SimpleNamespace(out=out, evaluations=evaluations)
 
     fake = Pipeline()
     monkeypatch.setitem(sys.modules, "zlocus.pipeline", fake)
@@ -211,7 +212,10 @@ def test_demo_prints_accuracy_and_may_be_repeated(zl, pipeline, tmp_path, monkey
     assert result.exit_code == 0, result.output
     assert "99.00 %" in result.stdout
     assert "0.123" in result.stdout
-    assert json.loads(Path("demo/accuracy.json").read_text())["all"]["nmad"] == 0.123
+    assert "less than 0.42 m" in result.stdout
+    accuracy = json.loads(Path("demo/accuracy.json").read_text())
+    assert list(accuracy) == ["within_0.42_m", "within_1_m"]
+    assert accuracy["within_0.42_m"]["all"]["nmad"] == 0.123
     Path("demo/dsm.tif").touch()
     assert zl("demo").exit_code == 0
 

@@ -11,7 +11,7 @@ from zlocus.sensors.model import SensorModel
 from zlocus.sensors.rpc import RpcModel
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 from zlocus.synthetic.rpc_fit import fit_rpc
-from zlocus.synthetic.scenes import demo_spec, exposures
+from zlocus.synthetic.scenes import demo_spec, exposures, steady
 
 UTM32 = CRS.from_epsg(32632)
 SHAPE = (700, 631)
@@ -47,7 +47,7 @@ def test_satellites_are_fitted_exactly(angles: tuple[float, float, float]) -> No
 
 
 def test_every_view_of_the_demo_is_fitted() -> None:
-    spec = demo_spec()
+    spec = steady(demo_spec())
     for exposure in exposures(spec):
         assert fit_rpc(exposure.camera, exposure.shape, spec.crs, spec.height_range).max_error_px < SCANNER_PX
 

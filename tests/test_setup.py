@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from orientation_scenes import image_of
-from rendered_scenes import CENTRE, UTM
+from rendered_scenes import CENTRE, UTM, line_scanner
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import grey_scales
@@ -26,6 +27,7 @@ from zlocus.matching.setup import (
 from zlocus.options import PyramidOptions
 from zlocus.scene import Scene, View
 from zlocus.synthetic.cameras import SatelliteCamera
+from zlocus.synthetic.scenes import ViewSpec, demo_spec, exposures, steady
 
 GREY = np.random.default_rng(0).normal(500, 40, (120, 160))
 
@@ -122,3 +124,37 @@ def test_a_settled_scene():
     assert transform * (0, 0) == (12.0, 8.0)
     assert transform.a == 2.0
     assert transform.e == -2.0
+
+
+def scanners(*looks):
+    """Line scanners of steady flights, by their angles ahead and aside, degrees, over one place."""
+    views = tuple(ViewSpec(str(number), *look) for number, look in enumerate(looks))
+    spec = replace(steady(demo_spec()), views=views)
+    seen_by = exposures(spec)
+    return tuple(
+        View(each.view.name, Path(each.view.name), image_of(np.zeros(each.shape)), line_scanner(each))
+        for each in seen_by
+    )
+
+
+def test_line_scanners_have_the_step_of_satellites():
+    """Against the image that looks down, as RPCs of the same cameras would have it, not fore against aft."""
+    step = height_step(scanners((2.0, -6.0), (26.0, -6.0), (-14.0, -6.0)), 438.0, 0.2, 0.5)
+    slope = np.tan(np.deg2rad(26.0)) - np.tan(np.deg2rad(2.0))
+    assert step == pytest.approx(0.5 * 0.208 / slope, rel=0.03)
+
+
+def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
+    """Both see their own middle from straight above, and one place 30 degrees apart."""
+    spec = replace(
+        steady(demo_spec()), views=tuple(ViewSpec(name, 2.0, side) for name, side in (("a", -15), ("b", 15)))
+    )
+    views = []
+    for each in exposures(spec):
+        camera = replace(each.camera, centre=(3000.0, each.camera.centre[1]))
+        wide = replace(each, camera=camera, shape=(each.shape[0], 6001))
+        image = image_of(np.zeros(wide.shape))
+        views.append(View(each.view.name, Path(each.view.name), image, line_scanner(wide)))
+    assert np.hypot(*(nadir_offset(views[0], 438.0) - nadir_offset(views[1], 438.0))) < 0.02
+    step = height_step(tuple(views), 438.0, 0.2, 0.5)
+    assert step == pytest.approx(0.5 * 0.208 / (2.0 * np.tan(np.deg2rad(15.0))), rel=0.05)

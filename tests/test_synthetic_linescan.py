@@ -18,14 +18,17 @@ from zlocus.options import PyramidOptions, RunConfig
 from zlocus.pipeline import run_dsm
 from zlocus.progress import progress_for
 from zlocus.request import DsmRequest
-from zlocus.sensors.linescan import LineScanModel
+from zlocus.sensors.linescan import LineScanModel, RectifiedModel
 from zlocus.synthetic.__main__ import main
 from zlocus.synthetic.files import RenderedScene, render_scene
-from zlocus.synthetic.linescan import TrajectoryNoise, noisy, sampled, write_linescan_scene
+from zlocus.synthetic.linescan import TrajectoryNoise, noisy, sampled, write_linescan_views, write_scene
+from zlocus.synthetic.rectify import rectified
 from zlocus.synthetic.scenes import SceneSpec, city_spec, demo_spec, exposures, with_ads40
 
 # Cubic splines through exact samples at 200 Hz (rows are 3 ms apart).
 READ_PX = 1e-6
+# A shake of 24 rows' period has 14 samples.
+SHAKEN_PX = 1e-3
 # A tenth and a half of the pixel on the ground: roofs, trees and coarse textures, which the cameras have no part in.
 MEDIAN_M, NMAD_M = 0.02, 0.1
 AROUND_PX = 300
@@ -67,11 +70,51 @@ def test_what_is_read_is_the_exact_camera(spec, rendered):
 def test_the_demo_block_as_line_scanners(tmp_path):
     """Six images of three lines in two strips (Ji et al. 2014, table 2), written without rendering."""
     spec = demo_spec()
-    write_linescan_scene(spec, exposures(spec), tmp_path, TrajectoryNoise())
+    entries = write_linescan_views(spec, exposures(spec), tmp_path, TrajectoryNoise())
+    write_scene(spec, entries, tmp_path / "scene.yaml")
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"ads40.csv", "scene.yaml", *(f"trajectory_{view.name}.csv" for view in spec.views)}
     lines = {line.split(",")[0] for line in (tmp_path / "ads40.csv").read_text().splitlines()[2:]}
     assert lines == {"nadir", "forward", "backward"}
+
+
+def test_level_1_of_an_unsteady_flight_is_read_as_it_was_flown(spec, tmp_path):
+    unsteady = replace(spec, shaken=True, level=1)
+    seen_by = exposures(unsteady)
+    rendered = render_scene(replace(unsteady, views=unsteady.views[:2]), tmp_path / "scene", linescan=TrajectoryNoise())
+    scene = open_scene(rendered.inputs)
+    for view, exposure in zip(scene.views, seen_by, strict=False):
+        rows, cols = exposure.shape
+        assert isinstance(view.sensor, RectifiedModel)
+        assert view.image.shape == (rows, cols)
+        rng = np.random.default_rng(0)
+        xy = rng.uniform((-AROUND_PX, -AROUND_PX), (cols + AROUND_PX, rows + AROUND_PX), (500, 2))
+        xyz = exposure.camera.ground_from_image(xy, rng.uniform(*spec.height_range, 500))
+        np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=SHAKEN_PX)
+        with open_raster(rendered.images[view.name]) as image:
+            assert (image.read(1) > 0).all()
+    # The three lines of a strip fly together; the strips do not.
+    shakes = [exposure.taken.camera.shake for exposure in seen_by]
+    assert shakes[0] == shakes[1] == shakes[2] != shakes[3]
+
+
+def test_a_level_1_image_shows_what_the_raw_one_shows(spec):
+    exposure = exposures(replace(spec, shaken=True, level=1))[1]
+    row, col = np.mgrid[: exposure.taken.shape[0], : exposure.taken.shape[1]]
+
+    def grey(row, col):
+        return 3000.0 + 900.0 * np.sin(row / 9.0) + 900.0 * np.cos(col / 7.0)
+
+    raw = np.rint(grey(row, col)).astype(np.uint16)
+    raw[40, 50] = 0
+    found = rectified(raw, exposure.camera, exposure.shape)
+    row, col = np.mgrid[: exposure.shape[0], : exposure.shape[1]]
+    at = exposure.camera.raw_from_image(np.column_stack([col.ravel(), row.ravel()])).reshape(*exposure.shape, 2)
+    hole = (np.abs(at - (50, 40)) < 1.0).all(axis=2)
+    near = (np.abs(at - (50, 40)) < 6.0).all(axis=2)
+    assert (found[hole] == 0).all()
+    assert (found[~near] > 0).all()
+    assert np.abs(found.astype(float) - grey(at[..., 1], at[..., 0]))[~near].max() < 3.0
 
 
 def test_a_surface_from_line_scanners(rendered, spec, tmp_path):

@@ -10,19 +10,21 @@ import pytest
 from affine import Affine
 
 from orientation_scenes import image_of
-from rendered_scenes import CENTRE, camera
+from rendered_scenes import CENTRE, camera, line_scanner
 from zlocus.errors import GeometryError
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.views import ViewPixels, halved, read_pixels, tile_views
+from zlocus.matching.views import FINEST_BENT_PX, ViewPixels, halved, read_pixels, tile_views
 from zlocus.matching.visibility import coverage, covers, hide, left_out
 from zlocus.scene import View
 from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
-from zlocus.sensors.table import HIGHER_DEGREE, TOLERANCE_PX, projection_table
+from zlocus.sensors.linescan import RectifiedModel
+from zlocus.sensors.table import HIGHER_DEGREE, HIGHEST_DEGREE, TOLERANCE_PX, UNSTEADY_DEGREE, projection_table
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
+from zlocus.synthetic.scenes import demo_spec, exposures
 
 HEIGHTS = (20.0, 140.0)
 # Rounding of float32 grey values, in contrasts of the image.
@@ -160,6 +162,43 @@ def test_tables_hold_over_heights_that_reach_close_to_the_camera():
     views = tile_views([window], 0, grid(0.15, shape), shape, 32, (-15.0, 0.5), (-15.0, 100.0), 4)
     assert not views.lost.any()
     assert views.holds.mean() > 0.3
+
+
+@pytest.fixture(scope="module")
+def unsteady():
+    """Raw and level 1 models of a line that looks ahead from an unsteady flight."""
+    spec = replace(demo_spec(), size=200, views=demo_spec().views[1:2])
+    (exposure,) = exposures(spec)
+    raw = line_scanner(exposure)
+    plane = RectifiedModel(raw, raw, exposure.camera.height, exposure.camera.plane_from_image)
+    return spec, raw, plane
+
+
+def test_raw_lines_of_an_unsteady_flight_need_a_high_degree(unsteady):
+    spec, raw, plane = unsteady
+    shape, z = (64, 64), (430.0, 500.0)
+    around = Affine(0.2, 0.0, spec.west_m + 10.0, 0.0, -0.2, spec.north_m - 10.0)
+    assert projection_table(plane, around, shape, 16, z).holds.all()
+    with pytest.raises(GeometryError, match="px from the exact model"):
+        projection_table(raw, around, shape, 4, z, FINEST_BENT_PX, degree=HIGHEST_DEGREE)
+    pixels = np.zeros((300, 300), np.float32)
+    window = ViewPixels(raw, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    views = tile_views([window], 0, around, shape, 32, (430.0, 0.5), z, 4)
+    assert views.nodes.shape[-1] == UNSTEADY_DEGREE + 1
+    assert views.holds.any()
+    assert not views.lost.any()
+
+
+def test_flights_too_unsteady_for_raw_images_are_told_so(unsteady):
+    spec, raw, _ = unsteady
+    shape = (16, 16)
+    around = Affine(0.2, 0.0, spec.west_m + 10.0, 0.0, -0.2, spec.north_m - 10.0)
+    pixels = np.zeros((300, 300), np.float32)
+    jitter = np.random.default_rng(1).normal(0.0, 0.5, raw.trajectory.centres.shape)
+    shaken = replace(raw.trajectory, centres=raw.trajectory.centres + jitter)
+    window = ViewPixels(replace(raw, trajectory=shaken), (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    with pytest.raises(GeometryError, match=r"too unsteady for its raw images.*level 1"):
+        tile_views([window], 0, around, shape, 32, (430.0, 0.5), (430.0, 500.0), 4)
 
 
 def test_blocks_from_which_a_view_is_left_out_are_named():

@@ -134,9 +134,12 @@ def demo(
     from zlocus.pipeline import run_demo
 
     result = run_demo(out, progress_for(sys.stderr))
-    (out / DEMO_ACCURACY).write_text(json.dumps(result.evaluation.as_dict(), indent=2) + "\n", encoding="utf-8")
+    accuracy = {f"within_{each.threshold_m:g}_m": each.as_dict() for each in result.evaluations}
+    (out / DEMO_ACCURACY).write_text(json.dumps(accuracy, indent=2) + "\n", encoding="utf-8")
     print(f"Accuracy of {result.out} against the rendered truth:")
-    _print_evaluation(result.evaluation)
+    for evaluation in result.evaluations:
+        print()
+        _print_evaluation(evaluation)
 
 
 @app.command()

@@ -125,11 +125,14 @@ def read_trajectory(
     )
 
 
-def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str) -> None:
-    """Write the lines of a focal plane by name, as `read_calibration` reads them."""
-    xy_mm = np.concatenate([line.xy_mm for line in lines.values()])
-    column = np.concatenate([np.arange(len(line.xy_mm), dtype=float) for line in lines.values()])
-    names = [name for name, line in lines.items() for _ in line.xy_mm]
+def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str, every: int = 1) -> None:
+    """Write the lines of a focal plane by name, as `read_calibration` reads them: each `every`-th column and the last,
+    which are enough of straight lines."""
+    last = {name: len(line.xy_mm) - 1 for name, line in lines.items()}
+    columns = {name: np.unique([*range(0, last[name], every), last[name]]) for name in lines}
+    xy_mm = np.concatenate([line.xy_mm[columns[name]] for name, line in lines.items()])
+    column = np.concatenate([*columns.values()]).astype(float)
+    names = [name for name, held in columns.items() for _ in held]
     write_numbers(path, {"column": column, "x_mm": xy_mm[:, 0], "y_mm": xy_mm[:, 1]}, comment, {"line": names})
 
 

@@ -14,11 +14,12 @@ from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import GreyScale, grey_scales
 from zlocus.options import PyramidOptions
 from zlocus.scene import Scene, View, footprint, ground_sample_distance
+from zlocus.sensors.model import Scanning, bare
 
 FINEST_CELL = 0.1
 ON_GRID = 1e-6
 FEWEST_LEVELS = 3
-SHARED_SAMPLES = 9
+SHARED_SAMPLES, GROUND_SAMPLES = 9, 65
 SLANT_M = 0.5
 
 
@@ -119,27 +120,55 @@ def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: 
     """Step (m) that shifts the most sensitive image by `max_shift_px` against the leading one.
 
     Equivalent disparity (method section 1): |v_i - v_0| dz / g, with g the larger of the image's ground pixel and the
-    cell, since nothing finer is compared.
+    cell, since nothing finer is compared. Frame cameras have no leading image for the whole scene: all pairs count.
 
     Raises
     ------
     GeometryError
         When all views look along the same line, so that heights cannot be seen.
     """
-    if all(view.sensor.height_bounds() is None for view in views):
+    if all(isinstance(bare(view.sensor), Scanning) for view in views):
+        rates = _rates_against_first(views, z, cell_m) + _rates_against_nadir(views, z, cell_m)
+    elif all(view.sensor.height_bounds() is None for view in views):
         rates = _rates_where_shared(views, z, cell_m)
     else:
-        lead = nadir_offset(views[0], z)
-        rates = []
-        for view in views[1:]:
-            pixel = max(ground_sample_distance(view, z), cell_m)
-            rates.append(float(np.hypot(*(nadir_offset(view, z) - lead))) / pixel)
+        rates = _rates_against_first(views, z, cell_m)
     if not max(rates, default=0.0) > 1e-4:
         raise GeometryError(
             f"All images look along the same line (base-to-height below {max(rates, default=0.0) * cell_m:.1e}), so "
             "they show no heights. Add an image from another direction."
         )
     return max_shift_px / max(rates)
+
+
+def _rates_against_first(views: tuple[View, ...], z: float, cell_m: float) -> list[float]:
+    """Equivalent disparity per metre, px, of each view against the leading one, as the middles of their images look."""
+    lead = nadir_offset(views[0], z)
+    rates = []
+    for view in views[1:]:
+        pixel = max(ground_sample_distance(view, z), cell_m)
+        rates.append(float(np.hypot(*(nadir_offset(view, z) - lead))) / pixel)
+    return rates
+
+
+def _rates_against_nadir(views: tuple[View, ...], z: float, cell_m: float) -> list[float]:
+    """Equivalent disparity per metre, px, of each view against the most nadir one at a place, median over the ground
+    at a height.
+
+    Line scanners are compared as satellites are, but strips that all look straight down on their middle see what lies
+    between them from two sides.
+    """
+    outlines = np.concatenate([outline for outline in (footprint(view, z) for view in views) if len(outline)])
+    low, high = outlines.min(axis=0), outlines.max(axis=0)
+    x, y = np.meshgrid(*(np.linspace(a, b, GROUND_SAMPLES) for a, b in zip(low, high, strict=True)))
+    xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
+    slants, pixels = map(np.array, zip(*(_slants(view, xyz) for view in views), strict=True))
+    tilt = np.where(np.isnan(slants[..., 0]), np.inf, np.hypot(slants[..., 0], slants[..., 1]))
+    lead, place = tilt.argmin(axis=0), np.arange(len(xyz))
+    apart = np.hypot(*np.moveaxis(slants - slants[lead, place], -1, 0))
+    rates = apart / np.maximum(np.maximum(pixels, pixels[lead, place]), cell_m)
+    rates[lead, place] = np.nan
+    return [float(np.nanmedian(rate)) for rate in rates if np.isfinite(rate).any()]
 
 
 def _rates_where_shared(views: tuple[View, ...], z: float, cell_m: float) -> list[float]:

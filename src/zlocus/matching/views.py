@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 from zlocus.errors import GeometryError
 from zlocus.matching.radiometry import GreyScale
 from zlocus.scene import View
-from zlocus.sensors.model import SensorModel, capped, lowest_station
-from zlocus.sensors.table import DEGREE, HIGHER_DEGREE, HIGHEST_DEGREE, ProjectionTable, projection_table
+from zlocus.sensors.model import Scanning, SensorModel, bare, capped, lowest_station
+from zlocus.sensors.table import (
+    DEGREE,
+    HIGHER_DEGREE,
+    HIGHEST_DEGREE,
+    UNSTEADY_DEGREE,
+    ProjectionTable,
+    projection_table,
+)
 
 FloatImage = NDArray[np.float32]
 MARGIN_PX = 4
@@ -199,7 +206,8 @@ def _fitting_tables(
     range of heights only and of a higher degree, where need be halved, and where that is not enough either to the
     wider tolerance and of the highest degree. A view is left out of blocks (see `TileViews.lost`) only after all that.
 
-    Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones.
+    Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones. So does
+    an unsteady flight in raw images of line scanners, far more than any perspective, which get a still higher degree.
     """
     near, far = (COARSER_TABLE_PX, COARSER_BENT_PX) if level else (FINEST_TABLE_PX, FINEST_BENT_PX)
     blocks = [block]
@@ -207,7 +215,10 @@ def _fitting_tables(
         blocks.append(blocks[-1] // 2)
     attempts = [(block, z_ranges[0], near, DEGREE, 0.0)]
     attempts += [(b, z_ranges[1], px, HIGHER_DEGREE, 0.0) for px in (near, far) for b in blocks]
-    attempts += [(blocks[-1], z_ranges[1], far, HIGHEST_DEGREE, lost) for lost in (0.0, MOST_LOST)]
+    last = [(HIGHEST_DEGREE, 0.0), (HIGHEST_DEGREE, MOST_LOST)]
+    if any(isinstance(bare(view.sensor), Scanning) for view in views):
+        last.insert(1, (UNSTEADY_DEGREE, 0.0))
+    attempts += [(blocks[-1], z_ranges[1], far, degree, lost) for degree, lost in last]
     for number, (cells, z_range, px, degree, lost) in enumerate(attempts):
         try:
             return [
@@ -224,7 +235,12 @@ def _fitting_tables(
                 )
                 for view in views
             ], cells
-        except GeometryError:
-            if number == len(attempts) - 1:
+        except GeometryError as error:
+            if number < len(attempts) - 1:
+                continue
+            if len(last) == 2:
                 raise
+            raise GeometryError(
+                f"The flight is too unsteady for its raw images: {error} Or give images resampled to a plane (level 1)."
+            ) from error
     raise AssertionError("there is one attempt at least")

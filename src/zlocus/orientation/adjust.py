@@ -21,6 +21,9 @@ SMALLEST_SIGMA_PX = 0.02
 # loci differ by less than 3 degrees do not fix the shift along them, while the slow bends of a long chain of n images,
 # whose information falls as 5 / n**2, are kept.
 SEEN_INFORMATION = 0.01
+# Shifts like a translation of the ground that are not unseen, by more than this sine, need the information that counts
+# for two images, however many there are: no chain of images adds any to them.
+APART_SINE = 0.5
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,8 @@ def solve_shifts(
         weight = huber_weight(points.residual, sigma)
         normal, pull = reduced_normal_equations(seen, points, weight, len(sensors))
         information = normal / sigma**2 + np.eye(len(normal)) / prior_px**2
-        basis = seen_directions(normal, np.bincount(seen.view, weight, len(sensors)).astype(float))
+        of_views = np.bincount(seen.view, weight, len(sensors)).astype(float)
+        basis = seen_directions(normal, of_views, translations(seen, points, weight, len(sensors)))
         right = basis.T @ (pull / sigma**2 - shift.ravel() / prior_px**2)
         step = basis @ np.linalg.solve(basis.T @ information @ basis, right)
         shift, n_seen, xyz = shift + step.reshape(-1, 2), basis.shape[1], points.xyz
@@ -137,11 +141,25 @@ def between_views(seen: Observations, mixed: FloatArray, covariance: FloatArray,
     return total.reshape(2, 2, n_views, n_views).transpose(2, 0, 3, 1).reshape(2 * n_views, 2 * n_views)
 
 
-def seen_directions(normal: FloatArray, weight_of_view: FloatArray) -> FloatArray:
+def translations(seen: Observations, points: GroundPoints, weight: FloatArray, n_views: int) -> FloatArray:
+    """The shifts (2 i, k) that a common translation of the ground looks like, k at most 3, orthonormal."""
+    usable = np.asarray(np.isfinite(points.by_ground).all(axis=(1, 2)))
+    by_ground = np.where(usable[:, None, None], points.by_ground * weight[:, None, None], 0.0)
+    total = summed(by_ground.reshape(-1, 6), seen.view, n_views)
+    mean = total / np.maximum(np.bincount(seen.view, weight * usable, n_views), 1e-12)[:, None]
+    left, size, _ = np.linalg.svd(mean.reshape(2 * n_views, 3), full_matrices=False)
+    n_seen = int((size > 1e-6 * max(float(size[0]), 1e-12)).sum())
+    return np.asarray(left)[:, :n_seen]
+
+
+def seen_directions(normal: FloatArray, weight_of_view: FloatArray, translated: FloatArray) -> FloatArray:
     """Orthonormal basis (2 i, k) of the shifts that ties can tell from a change of the ground.
 
     Information is judged per observation, so that an image with few ties counts like one with many; what is not seen
     (a translation of the ground; for two images the shift along their loci; images without ties) stays exactly zero.
+    translated : see `translations`. Where sensors of several kinds are mixed, a translation changes the scales of their
+    images by different amounts, from which a height can be had to a decimetre or so; the cameras say it better, so it
+    stays zero all the same.
     """
     scale = np.repeat(np.sqrt(weight_of_view), 2)
     linked = scale > 0.0
@@ -151,6 +169,14 @@ def seen_directions(normal: FloatArray, weight_of_view: FloatArray) -> FloatArra
     unseen = vectors[:, values < SEEN_INFORMATION / n_views**2]
     hidden = np.where(linked[:, None], unseen * inverse[:, None], unseen)
     left, _, _ = np.linalg.svd(hidden, full_matrices=True)
+    known = left[:, : hidden.shape[1]]
+    apart, sine, _ = np.linalg.svd(translated - known @ (known.T @ translated), full_matrices=False)
+    scaled = apart * scale[:, None]
+    information = np.einsum("ik,ij,jk->k", apart, normal, apart) / np.maximum((scaled**2).sum(axis=0), 1e-12)
+    is_doubtful = (np.asarray(sine) > APART_SINE) & (information < SEEN_INFORMATION / 2**2)
+    if is_doubtful.any():
+        hidden = np.column_stack([known, apart[:, is_doubtful]])
+        left, _, _ = np.linalg.svd(hidden, full_matrices=True)
     return np.where(linked[:, None], left[:, hidden.shape[1] :], 0.0)
 
 

@@ -132,6 +132,10 @@ class LineScanModel:
         times = self.lines.time(np.linspace(self.lines.rows[0], self.lines.rows[-1], STATIONS))
         return float(self.space.ground_from_cartesian(self.trajectory.pose(times)[9:].T)[:, 2].min())
 
+    def flight_time(self) -> float:
+        """See `Scanning`."""
+        return abs(float(self.lines.times[-1] - self.lines.times[0]))
+
     def corrected(self, drift: Drift) -> LineScanModel:
         """The model with a drift of its trajectory added."""
         return replace(self, trajectory=drift.corrected(self.trajectory))
@@ -169,6 +173,10 @@ class RectifiedModel:
     def station_height(self) -> float:
         """See `Stationed`."""
         return self.raw.station_height()
+
+    def flight_time(self) -> float:
+        """See `Scanning`."""
+        return self.raw.flight_time()
 
     def corrected(self, drift: Drift) -> RectifiedModel:
         """The model with a drift of its trajectory added: the pixels stay where the flawed one put them."""

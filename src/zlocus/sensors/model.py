@@ -42,12 +42,26 @@ class Stationed(Protocol):
         ...
 
 
+@runtime_checkable
+class Scanning(Protocol):
+    """A sensor whose image was taken in flight, line by line, so that it looks the same way all along."""
+
+    def flight_time(self) -> float:
+        """How long that took, s."""
+        ...
+
+
+def bare(sensor: SensorModel) -> SensorModel:
+    """The sensor without the corrections laid over it."""
+    while hasattr(sensor, "base"):
+        sensor = sensor.base
+    return sensor
+
+
 def lowest_station(sensors: Iterable[SensorModel]) -> float | None:
     """Height (m) of the lowest projection centre; None where not all sensors know where they stood."""
     heights = []
-    for sensor in sensors:
-        while hasattr(sensor, "base"):  # a correction laid over it
-            sensor = sensor.base
+    for sensor in map(bare, sensors):
         if not isinstance(sensor, Stationed):
             return None
         heights.append(sensor.station_height())

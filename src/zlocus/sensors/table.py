@@ -15,6 +15,9 @@ TOLERANCE_PX = 0.01
 DEGREE = 3
 # For cameras so close that their scale changes a lot from the lowest to the highest ground.
 HIGHER_DEGREE, HIGHEST_DEGREE = 7, 11
+# For raw lines of an unsteady flight: each height on a slanted ray is another exposure. (Beyond about 35 the
+# coefficients lose their digits.)
+UNSTEADY_DEGREE = 31
 # Where a corner is put that the sensor cannot map: in no image, and finite, as the kernels need it.
 NOWHERE_PX = -1e9
 CHECKED = (-1.0, -0.7, 0.0, 0.7, 1.0)

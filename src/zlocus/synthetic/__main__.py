@@ -7,27 +7,44 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from zlocus.errors import ZlocusError
+
+if TYPE_CHECKING:
+    from zlocus.synthetic.scenes import SceneSpec
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Renders what the command line asks for; returns the exit status."""
     from zlocus.synthetic.files import render_scene
     from zlocus.synthetic.linescan import TrajectoryNoise
-    from zlocus.synthetic.scenes import (
-        LARGE_SIZE,
-        SceneSpec,
-        city_spec,
-        demo_spec,
-        hills_spec,
-        with_ads40,
-        with_pointing_errors,
-    )
+    from zlocus.synthetic.mixed import render_mixed_scene
 
+    given = _parser().parse_args(arguments)
+    try:
+        if given.kind == "mixed":
+            render_mixed_scene(_spec(given), given.output, _say)
+        else:
+            linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
+            render_scene(_spec(given), given.output, _say, linescan)
+    except ZlocusError as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+def _say(step: str) -> None:
+    print(f"rendering {step}", file=sys.stderr)
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
-    parser.add_argument("--kind", choices=("city", "hills", "demo"), default="city")
+    parser.add_argument(
+        "--kind", choices=("city", "hills", "demo", "mixed"), default="city",
+        help="mixed: the demo's kind of ground through three kinds of sensor; takes --seed and --size",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
     parser.add_argument("--views", type=int, help="render the first N views only")
@@ -40,25 +57,31 @@ def main(arguments: list[str] | None = None) -> int:
         "--trajectory-noise", type=float, nargs=2, default=(0.0, 0.0), metavar=("M", "DEG"),
         help="standard deviation of slow errors of the trajectories",
     )  # fmt: skip
-    given = parser.parse_args(arguments)
-    try:
-        make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "demo": demo_spec}
-        spec = make[given.kind](given.seed)
-        linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
-        if linescan is not None:
-            spec = with_ads40(spec)
-        if given.size:
-            coarse = spec.gsd_m if given.size > LARGE_SIZE else None
-            spec = replace(spec, size=given.size, truth_step_m=coarse)
-        if given.views:
-            spec = replace(spec, views=spec.views[: given.views])
-        if given.pointing:
-            spec = with_pointing_errors(spec, given.pointing)
-        render_scene(spec, given.output, lambda step: print(f"rendering {step}", file=sys.stderr), linescan)
-    except ZlocusError as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return error.exit_status
-    return 0
+    parser.add_argument("--steady", action="store_true", help="line scanners of the demo: no shaking (as with RPCs)")
+    parser.add_argument("--level", type=int, choices=(0, 1), help="line scanners: raw, or resampled to a plane")
+    return parser
+
+
+def _spec(given: argparse.Namespace) -> SceneSpec:
+    """What the command line asks for."""
+    from zlocus.synthetic.scenes import LARGE_SIZE, city_spec, demo_spec, hills_spec, with_ads40, with_pointing_errors
+
+    make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec}
+    spec = make.get(given.kind, demo_spec)(given.seed)
+    if given.kind == "mixed":
+        return replace(spec, size=given.size or spec.size)
+    if given.cameras == "linescan":
+        spec = with_ads40(spec)
+    if given.steady or given.cameras == "rpc":
+        spec = replace(spec, shaken=False)
+    if given.level is not None:
+        spec = replace(spec, level=given.level)
+    if given.size:
+        coarse = spec.gsd_m if given.size > LARGE_SIZE else None
+        spec = replace(spec, size=given.size, truth_step_m=coarse)
+    if given.views:
+        spec = replace(spec, views=spec.views[: given.views])
+    return with_pointing_errors(spec, given.pointing) if given.pointing else spec
 
 
 if __name__ == "__main__":

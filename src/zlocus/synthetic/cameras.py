@@ -1,6 +1,6 @@
 """Exact cameras for rendered scenes: straight rays in the scene's frame, whose easting, northing, height are Cartesian.
 
-Both are pushbroom: every image row has its own projection centre, so that rows are instants. Both are `SensorModel`s.
+All are pushbroom: every image row has its own projection centre, so that rows are instants. All are `SensorModel`s.
 """
 
 from __future__ import annotations
@@ -8,14 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from affine import Affine
 
 from zlocus.sensors.model import FloatArray
 
 CHORD_ITERATIONS = 20
 CHORD_TOLERANCE_ROWS = 1e-8
+SHAKE_STREAM = 83
+SHAKE_WAVES = 16
 
 
-def _axes(heading_deg: float) -> tuple[FloatArray, FloatArray]:
+def axes_of_heading(heading_deg: float) -> tuple[FloatArray, FloatArray]:
     """Forward and right unit vectors (east, north) of a flight heading, clockwise from north."""
     a = np.deg2rad(heading_deg)
     return np.array([np.sin(a), np.cos(a)]), np.array([np.cos(a), -np.sin(a)])
@@ -43,7 +46,7 @@ class SatelliteCamera:
 
     def _frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Forward, right, and the offset (east, north) from the target to the projection centre of the centre row."""
-        forward, right = _axes(self.heading_deg)
+        forward, right = axes_of_heading(self.heading_deg)
         look = np.tan(np.deg2rad(self.along_deg)) * forward + np.tan(np.deg2rad(self.across_deg)) * right
         return forward, right, -self.altitude_m * look
 
@@ -74,8 +77,35 @@ class SatelliteCamera:
 
 
 @dataclass(frozen=True)
+class Shake:
+    """How unsteady a flight is from row to row: sums of sines of random phase, the same for the same seed.
+
+    turn_deg : standard deviation of roll, pitch and yaw, amplitudes as 1 / frequency (what a stabilised mount leaves of
+    gusts and engines); offset_m : of the position along each axis, amplitudes as 1 / frequency^2. shortest_rows,
+    longest_rows : of the periods, which are spread evenly in between on a logarithmic scale.
+    """
+
+    seed: tuple[int, ...]
+    turn_deg: float = 0.006
+    offset_m: float = 0.03
+    shortest_rows: float = 24.0
+    longest_rows: float = 1200.0
+
+    def at(self, since: FloatArray) -> FloatArray:
+        """Offsets along three axes (m) and three turns (rad) at rows (n,) counted from anywhere: (n, 6)."""
+        rng = np.random.default_rng([*self.seed, SHAKE_STREAM])
+        shares = (np.arange(SHAKE_WAVES)[:, None] + rng.random((SHAKE_WAVES, 6))) / SHAKE_WAVES
+        periods = self.shortest_rows * (self.longest_rows / self.shortest_rows) ** shares
+        amplitudes = np.hstack([periods[:, :3] ** 2, periods[:, 3:]])
+        amplitudes *= np.sqrt(2.0 / (amplitudes**2).sum(axis=0))
+        amplitudes *= [self.offset_m] * 3 + [float(np.deg2rad(self.turn_deg))] * 3
+        phases = 2.0 * np.pi * rng.random((SHAKE_WAVES, 6))
+        return np.asarray((amplitudes * np.sin(2.0 * np.pi * since[:, None, None] / periods + phases)).sum(axis=1))
+
+
+@dataclass(frozen=True)
 class LineScanner:
-    """One line of an airborne three-line scanner (ADS40): a straight flight with slow, smooth wobble.
+    """One line of an airborne three-line scanner (ADS40): a straight flight with slow, smooth wobble, and shaken.
 
     The line sees `along_deg` ahead of the nadir (negative: behind). Rows are exposures, `advance_m` apart; row 0 is the
     last one flown, so that images of a flight to the north are north-up.
@@ -83,7 +113,7 @@ class LineScanner:
     position : easting, northing and height (m) of the projection centre at row `centre[1]`.
     centre : (column, row) px; the column lies in the flight's vertical plane.
     wobble_m, wobble_deg : amplitudes of the position (each axis) and of roll, pitch and yaw; wobble_rows : their
-    period.
+    period. shake : of the same flight, faster; None is none.
     """
 
     position: tuple[float, float, float]
@@ -96,20 +126,32 @@ class LineScanner:
     wobble_m: float = 0.0
     wobble_deg: float = 0.0
     wobble_rows: float = 6000.0
+    shake: Shake | None = None
 
     def poses(self, row: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Projection centres (n, 3) m and rotations frame_from_camera (n, 3, 3) of rows (n,); camera axes are right,
         forward and up at rest."""
-        forward, right = _axes(self.heading_deg)
+        if self.shake is not None:
+            # Images ask for all columns of a row: what a row costs is computed once.
+            row, where = np.unique(row, return_inverse=True)
+            centre, frame_from_camera = self._poses(row, self.shake.at(row - self.centre[1]))
+            return centre[where], frame_from_camera[where]
+        return self._poses(row, np.zeros((1, 6)))
+
+    def _poses(self, row: FloatArray, shaken: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Poses, with offsets to the right, forward and up (m) and roll, pitch and yaw (rad) to be added: (n, 6)."""
+        forward, right = axes_of_heading(self.heading_deg)
         since = row - self.centre[1]
         phase = 2.0 * np.pi * since / self.wobble_rows
         roll, pitch, yaw = (np.deg2rad(self.wobble_deg) * np.sin(rate * phase + lag)
                             for rate, lag in ((1.0, 0.3), (0.8, 1.9), (0.6, 4.0)))  # fmt: skip
+        roll, pitch, yaw = roll + shaken[:, 3], pitch + shaken[:, 4], yaw + shaken[:, 5]
         centre = np.empty((len(row), 3))
         centre[:, :2] = np.array(self.position[:2]) - (since * self.advance_m)[:, None] * forward
         centre[:, :2] += self.wobble_m * (np.sin(0.7 * phase + 0.5)[:, None] * right)
         centre[:, 2] = self.position[2] + self.wobble_m * np.sin(0.9 * phase + 2.2)
         rest = np.stack([np.append(right, 0.0), np.append(forward, 0.0), np.array([0.0, 0.0, 1.0])], axis=1)
+        centre += shaken[:, :3] @ rest.T
         cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
         turn = np.empty((len(row), 3, 3))
         turn[:, 0] = np.stack([cy * cr - sy * sp * sr, -sy * cp, cy * sr + sy * sp * cr], axis=-1)
@@ -156,3 +198,43 @@ class LineScanner:
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`: exact at any height."""
         return None
+
+
+@dataclass(frozen=True)
+class RectifiedScanner:
+    """A line scanner's image resampled to a plane (ADS40 level 1).
+
+    raw : the raw image's camera; raw_shape : its rows and columns; height : of the plane, m; plane_from_image : from
+    pixels (column, row), (0, 0) the centre of the first one, to easting and northing.
+    """
+
+    raw: LineScanner
+    raw_shape: tuple[int, int]
+    height: float
+    plane_from_image: Affine
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        on_plane = self.raw.ground_from_image(self.raw.image_from_ground(xyz), np.array(self.height))
+        return _mapped(~self.plane_from_image, on_plane)
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return self.raw.ground_from_image(self.raw_from_image(xy), z)
+
+    def raw_from_image(self, xy: FloatArray) -> FloatArray:
+        """Positions (n, 2) px in the raw image."""
+        on_plane = _mapped(self.plane_from_image, np.asarray(xy, float))
+        return self.raw.image_from_ground(np.column_stack([on_plane, np.full(len(on_plane), self.height)]))
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`: exact at any height."""
+        return None
+
+
+def _mapped(transform: Affine, xy: FloatArray) -> FloatArray:
+    """Points (n, 2 or more) through an affine map: (n, 2)."""
+    x, y = xy[:, 0], xy[:, 1]
+    return np.column_stack([
+        transform.a * x + transform.b * y + transform.c, transform.d * x + transform.e * y + transform.f
+    ])  # fmt: skip

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,10 +19,12 @@ from rasterio.transform import from_origin
 
 from zlocus.errors import OutputError
 from zlocus.sensors.rpc import RpcCoefficients
-from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_scene
+from zlocus.synthetic.cameras import RectifiedScanner
+from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
+from zlocus.synthetic.rectify import rectified
 from zlocus.synthetic.render import Sun, expose, render, sunlit
 from zlocus.synthetic.rpc_fit import RpcFit, fit_rpc
-from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures
+from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
 
 NOISE_STREAM = 9
@@ -58,21 +61,34 @@ def render_scene(
         For line scanners of a scene that has none.
     """
     folder = Path(folder)
+    with new_folder(folder) as part:
+        _write_scene(spec, part, progress, linescan)
+    images = {view.name: folder / image_name(view) for view in spec.views}
+    inputs = tuple(images.values()) if linescan is None else (folder / "scene.yaml",)
+    return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif", inputs)
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A folder to write to, which gets its name when all went well.
+
+    Raises
+    ------
+    OutputError
+        Where the folder exists already, or cannot be written.
+    """
     if folder.exists():
         raise OutputError(f"`{folder}` exists already: name a new folder for the rendered scene, or remove it.")
     part = folder.with_name(folder.name + ".part")
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        _write_scene(spec, part, progress, linescan)
+        yield part
         part.rename(folder)
     except OSError as error:
         raise OutputError(f"The rendered scene cannot be written to `{folder}` ({error}): name another.") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    images = {view.name: folder / image_name(view) for view in spec.views}
-    inputs = tuple(images.values()) if linescan is None else (folder / "scene.yaml",)
-    return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif", inputs)
 
 
 def _write_scene(
@@ -80,19 +96,13 @@ def _write_scene(
 ) -> None:
     seen_by = exposures(spec)
     if linescan is not None:
-        write_linescan_scene(spec, seen_by, folder, linescan)
+        write_scene(spec, write_linescan_views(spec, seen_by, folder, linescan), folder / "scene.yaml")
     progress("terrain")
-    ground = build_ground(spec, seen_by)
-    _write_truth(spec, ground, folder)
-    lit: dict[Sun, NDArray[np.bool_]] = {}
+    ground = build_ground(spec, exposures(steady(spec)))
+    write_truth(spec, ground, folder)
     described = {}
-    for index, exposure in enumerate(seen_by):
+    for exposure, numbers in exposed(spec, ground, seen_by, progress):
         view = exposure.view
-        progress(view.name)
-        if view.sun not in lit:
-            lit = {view.sun: sunlit(ground, view.sun)}
-        radiance = render(ground, exposure.camera, exposure.shape, view.sun, spec.samples, lit[view.sun])
-        numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]))
         fit = fit_exposure(spec, exposure) if linescan is None else None
         write_image(folder / image_name(view), numbers, None if fit is None else fit.rpc)
         described[view.name] = {
@@ -104,6 +114,23 @@ def _write_scene(
     text = {"crs": f"EPSG:{spec.epsg}", "gsd": spec.gsd_m, "seed": spec.seed, "kind": spec.kind, "camera": spec.camera,
             "size": spec.size, "zmin": low, "zmax": high, "views": described}  # fmt: skip
     (folder / "scene.json").write_text(json.dumps(text, indent=1) + "\n")
+
+
+def exposed(
+    spec: SceneSpec, ground: SyntheticGround, seen_by: tuple[Exposure, ...], progress: Callable[[str], None]
+) -> Iterator[tuple[Exposure, NDArray[np.integer]]]:
+    """Exposures and their images (r, c), one after the other; level 1 where they are rectified."""
+    lit: dict[Sun, NDArray[np.bool_]] = {}
+    for index, exposure in enumerate(seen_by):
+        view, taken = exposure.view, exposure.taken
+        progress(view.name)
+        if view.sun not in lit:
+            lit = {view.sun: sunlit(ground, view.sun)}
+        radiance = render(ground, taken.camera, taken.shape, view.sun, spec.samples, lit[view.sun])
+        numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]))
+        if isinstance(exposure.camera, RectifiedScanner):
+            numbers = rectified(numbers, exposure.camera, exposure.shape)
+        yield exposure, numbers
 
 
 def fit_exposure(spec: SceneSpec, exposure: Exposure) -> RpcFit:
@@ -134,7 +161,7 @@ def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients |
             file.write(numbers, 1)
 
 
-def _write_truth(spec: SceneSpec, ground: SyntheticGround, folder: Path) -> None:
+def write_truth(spec: SceneSpec, ground: SyntheticGround, folder: Path) -> None:
     """Heights and classes of the area, at the step of the height field."""
     n = round(spec.size * spec.gsd_m / spec.step_m)
     cells = ground.cells(spec.west_m, spec.north_m, (n, n))

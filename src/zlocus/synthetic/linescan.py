@@ -6,19 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from affine import Affine
 
 from zlocus.errors import ConfigError
-from zlocus.io.linescan import LineScanCamera, RegularTimes
+from zlocus.io.linescan import LineScanCamera, Rectification, RegularTimes
 from zlocus.io.linescan_files import write_calibration, write_trajectory
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
 from zlocus.sensors.linescan import MARGIN_PX, FocalLine
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.trajectory import Drift, Trajectory
-from zlocus.synthetic.cameras import LineScanner
+from zlocus.synthetic.cameras import LineScanner, RectifiedScanner
 from zlocus.synthetic.scenes import Exposure, SceneSpec, ViewSpec
 
 FOCAL_PLANE = "ads40.csv"
 DETECTORS, NADIR_COLUMN = 12_000, 6_000
+COLUMNS_WRITTEN = 500
 # Names of the ADS40's lines by their angle ahead of the nadir (degrees).
 LINES = {2.0: "nadir", 26.0: "forward", -14.0: "backward"}
 SPEED_M_S = 70.0
@@ -47,8 +49,10 @@ def image_name(view: ViewSpec) -> str:
     return f"img_{view.name}.tif"
 
 
-def write_linescan_scene(spec: SceneSpec, seen_by: tuple[Exposure, ...], folder: Path, noise: TrajectoryNoise) -> None:
-    """Write the focal plane, the trajectories and a `scene.yaml` that names them and the images to be rendered.
+def write_linescan_views(
+    spec: SceneSpec, seen_by: tuple[Exposure, ...], folder: Path, noise: TrajectoryNoise
+) -> tuple[ViewEntry, ...]:
+    """Write the focal plane and the trajectories; returns the images' entries of a scene file, yet to be rendered.
 
     Raises
     ------
@@ -57,7 +61,7 @@ def write_linescan_scene(spec: SceneSpec, seen_by: tuple[Exposure, ...], folder:
     """
     lines, entries, comment = {}, [], ""
     for index, exposure in enumerate(seen_by):
-        camera, view = exposure.camera, exposure.view
+        camera, view = exposure.taken.camera, exposure.view
         if not isinstance(camera, LineScanner):
             raise ConfigError(f"SceneSpec.camera = {spec.camera!r} is no line scanner: choose 'ads40'.")
         if view.bias_row_px or view.bias_col_px:
@@ -66,13 +70,18 @@ def write_linescan_scene(spec: SceneSpec, seen_by: tuple[Exposure, ...], folder:
         lines[name] = focal_line(camera)
         comment = f"{camera.focal_m * 1e3:g} mm, {camera.pixel_m * 1e6:g} um; x to the right, y forward"
         rng = np.random.default_rng([spec.seed, NOISE_STREAM, index])
-        trajectory = noisy(sampled(camera, exposure.shape[0]), noise, rng)
+        trajectory = noisy(sampled(camera, exposure.taken.shape[0]), noise, rng)
         write_trajectory(folder / f"trajectory_{view.name}.csv", trajectory, "s; m in the scene's frame; degrees")
         entries.append(ViewEntry(name=view.name, image=image_name(view), camera=_entry(spec, exposure, camera, name)))
-    write_calibration(folder / FOCAL_PLANE, lines, comment)
+    write_calibration(folder / FOCAL_PLANE, lines, comment, COLUMNS_WRITTEN)
+    return tuple(entries)
+
+
+def write_scene(spec: SceneSpec, entries: tuple[ViewEntry, ...], path: Path) -> None:
+    """A scene file of some views, in the CRS of the scene and with the heights that hold all of it."""
     crs, heights = {"crs": f"EPSG:{spec.epsg}"}, spec.height_range
-    scene = SceneFile.model_validate({"schema": 1, "frame": crs, "heights": heights, "views": tuple(entries)})
-    write_scene_file(folder / "scene.yaml", scene)
+    scene = SceneFile.model_validate({"schema": 1, "frame": crs, "heights": heights, "views": entries})
+    write_scene_file(path, scene)
 
 
 def focal_line(camera: LineScanner) -> FocalLine:
@@ -107,14 +116,22 @@ def _sigmas(offset_m: float, turn_deg: float) -> FloatArray:
 
 def _entry(spec: SceneSpec, exposure: Exposure, camera: LineScanner, line: str) -> LineScanCamera:
     """The entry of a camera in the scene file."""
-    first = NADIR_COLUMN - camera.centre[0]
-    if not 0 <= first <= DETECTORS - exposure.shape[1]:
+    first, n_cols = NADIR_COLUMN - camera.centre[0], exposure.taken.shape[1]
+    if not 0 <= first <= DETECTORS - n_cols:
         raise ConfigError(
-            f"View {exposure.view.name} needs the columns {first:.0f} to {first + exposure.shape[1] - 1:.0f} of a line "
+            f"View {exposure.view.name} needs the columns {first:.0f} to {first + n_cols - 1:.0f} of a line "
             f"of {DETECTORS}. Choose a smaller SceneSpec.size, or less across_deg."
         )
     return LineScanCamera(
         calibration=FOCAL_PLANE, line=line, focal_mm=1e3 * camera.focal_m, first_column=int(first),
         trajectory=f"trajectory_{exposure.view.name}.csv", crs=f"EPSG:{spec.epsg}", rays="frame",
         times=RegularTimes(start=0.0, interval=-camera.advance_m / SPEED_M_S),
+        rectification=_rectification(exposure.camera) if isinstance(exposure.camera, RectifiedScanner) else None,
     )  # fmt: skip
+
+
+def _rectification(camera: RectifiedScanner) -> Rectification:
+    """The plane of a level 1 image; its file counts from the outer corner of the first pixel."""
+    corner = camera.plane_from_image * Affine.translation(-0.5, -0.5)
+    a, b, c, d, e, f, *_ = corner
+    return Rectification(height=camera.height, transform=(a, b, c, d, e, f), rows=camera.raw_shape[0])

@@ -21,7 +21,7 @@ from zlocus.sensors.model import FloatArray, SensorModel
 from zlocus.synthetic.raycast import MISS, Field, Look, cast_rays, render_rows, sunlit_cells
 from zlocus.synthetic.terrain import SyntheticGround
 
-SPACINGS_PX = (64, 32, 16, 8, 4, 2)
+SPACINGS_PX = (64, 32, 16, 8, 4, 2, 1)
 TABLE_TOLERANCE_PX = 1e-3
 HEIGHT_MARGIN_M = 1.0
 ROWS_PER_BAND = 64

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from affine import Affine
 from pyproj import CRS
 
 from zlocus.errors import ConfigError
 from zlocus.options import Checked, option
-from zlocus.sensors.model import FloatArray
-from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
+from zlocus.sensors.model import FloatArray, SensorModel
+from zlocus.synthetic.cameras import LineScanner, RectifiedScanner, SatelliteCamera, Shake, axes_of_heading
 from zlocus.synthetic.objects import Objects, add_objects
 from zlocus.synthetic.render import Optics, Sun
 from zlocus.synthetic.terrain import SyntheticGround, natural_ground
@@ -18,6 +19,7 @@ from zlocus.synthetic.terrain import SyntheticGround, natural_ground
 FLIGHT_HEIGHT_M = 2000.0
 ADVANCE_M = 0.208
 WOBBLE_M, WOBBLE_DEG = 0.5, 0.03
+LEVEL_1_M = 0.21
 BORDER_PX = 4
 TALLEST_M = {"city": 66.0, "hills": 15.0}
 LARGE_SIZE = 3000  # beyond, heights and truth are as coarse as the images, for the sake of memory
@@ -77,6 +79,8 @@ class SceneSpec(Checked):
     size: int = option(520, "Side of the area with truth, in cells of `gsd_m`.", low=32, high=20000)
     gsd_m: float = option(0.5, "Ground pixel.", low=0.05, high=5.0, unit="m")
     camera: str = option("satellite", "At 600 km, or an airborne three-line scanner.", choices=("satellite", "ads40"))
+    shaken: bool = option(False, "Airborne: an unsteady flight (`Shake`), another one in each strip.")
+    level: int = option(0, "Of airborne images: as they were taken, or resampled to a plane.", choices=(0, 1))
     truth_step_m: float | None = option(None, "Cell of heights and truth; unset: half of `gsd_m`.", low=0.02, unit="m")
     samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
     base_m: float = option(430.0, "Lowest terrain, ellipsoidal.", low=-400.0, high=8000.0, unit="m")
@@ -127,8 +131,15 @@ class Exposure:
     """A view with its exact camera and the rows and columns of its image."""
 
     view: ViewSpec
-    camera: SatelliteCamera | LineScanner
+    camera: SensorModel
     shape: tuple[int, int]
+
+    @property
+    def taken(self) -> Exposure:
+        """As it was taken, before it was resampled to a plane."""
+        if isinstance(self.camera, RectifiedScanner):
+            return replace(self, camera=self.camera.raw, shape=self.camera.raw_shape)
+        return self
 
 
 def city_spec(seed: int, **changes: object) -> SceneSpec:
@@ -148,9 +159,12 @@ def hills_spec(seed: int, **changes: object) -> SceneSpec:
 
 
 def demo_spec(seed: int = 4) -> SceneSpec:
-    """The demo: a block of six ADS40 images in two strips over towers, houses, trees and a hill, 120 m square."""
+    """The demo: a block of six ADS40 images in two unsteady strips over towers, houses, trees and a hill, 120 m square.
+
+    Level 1, 62.5 mm, 2000 m above ground, 0.21 m pixels: table 2 of Ji et al. (2014).
+    """
     return SceneSpec(
-        kind="city", seed=seed, size=600, gsd_m=0.2, camera="ads40", relief_m=6.0, hill_m=9.0,
+        kind="city", seed=seed, size=600, gsd_m=0.2, camera="ads40", shaken=True, level=1, relief_m=6.0, hill_m=9.0,
         views=ADS40_VIEWS,
         objects=Objects(70.0, 3.6, 0.8, 14.0, plain_roofs=0.25, max_tree_m=12.0, tower_m=(25.0, 58.0)),
     )  # fmt: skip
@@ -159,6 +173,11 @@ def demo_spec(seed: int = 4) -> SceneSpec:
 def with_ads40(spec: SceneSpec) -> SceneSpec:
     """The scene as the demo's six ADS40 images see it, at their ground pixel."""
     return replace(spec, camera="ads40", views=ADS40_VIEWS, gsd_m=0.2)
+
+
+def steady(spec: SceneSpec) -> SceneSpec:
+    """The scene as raw images of a steady flight."""
+    return replace(spec, shaken=False, level=0)
 
 
 def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
@@ -174,21 +193,50 @@ def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
 
 def exposures(spec: SceneSpec) -> tuple[Exposure, ...]:
     """Exact cameras whose images hold all terrain of the area."""
-    side = spec.size * spec.gsd_m
-    low, high = spec.terrain_range
-    middle = (spec.west_m + side / 2, spec.north_m - side / 2, (low + high) / 2)
-    corners = np.array(
-        [(spec.west_m + e * side, spec.north_m - s * side, z) for e in (0, 1) for s in (0, 1) for z in (low, high)]
-    )
+    corners = area_corners(spec)
+    easting, northing, height = map(float, (corners.min(axis=0) + corners.max(axis=0)) / 2)
+    middle = easting, northing, height
     result = []
     for view in spec.views:
         camera = _camera(spec, view, middle)
-        xy = camera.image_from_ground(corners)
-        first = np.floor(xy.min(axis=0)) - BORDER_PX
-        cols, rows = np.ceil(xy.max(axis=0)) + BORDER_PX + 1 - first
-        placed = replace(camera, centre=(float(-first[0]), float(-first[1])))
-        result.append(Exposure(view, placed, (int(rows), int(cols))))
+        if isinstance(camera, LineScanner) and spec.level == 1:
+            result.append(_level_1(view, camera, middle, corners))
+            continue
+        first, shape = placed(camera.image_from_ground(corners))
+        result.append(Exposure(view, replace(camera, centre=(-first[0], -first[1])), shape))
     return tuple(result)
+
+
+def area_corners(spec: SceneSpec) -> FloatArray:
+    """Corners of the area at its lowest and highest terrain, (8, 3) m."""
+    side = spec.size * spec.gsd_m
+    return np.array([
+        (spec.west_m + e * side, spec.north_m - s * side, z) for e in (0, 1) for s in (0, 1) for z in spec.terrain_range
+    ])  # fmt: skip
+
+
+def placed(xy: FloatArray) -> tuple[tuple[float, float], tuple[int, int]]:
+    """First pixel (column, row) and shape of an image that holds positions (n, 2), and a border."""
+    first = np.floor(xy.min(axis=0)) - BORDER_PX
+    cols, rows = np.ceil(xy.max(axis=0)) + BORDER_PX + 1 - first
+    return (float(first[0]), float(first[1])), (int(rows), int(cols))
+
+
+def _level_1(view: ViewSpec, camera: LineScanner, middle: tuple[float, float, float], corners: FloatArray) -> Exposure:
+    """The exposure resampled to the plane at the height of `middle`, its rows across the flight, holding `corners`."""
+    forward, right = LEVEL_1_M * np.array(axes_of_heading(view.heading_deg))
+    around_middle = Affine(right[0], -forward[0], middle[0], right[1], -forward[1], middle[1])
+    rectified = RectifiedScanner(camera, (0, 0), middle[2], around_middle)
+    first, shape = placed(rectified.image_from_ground(corners))
+    rectified = replace(rectified, plane_from_image=around_middle * Affine.translation(*first))
+    rows, cols = np.arange(shape[0]), np.arange(shape[1])
+    outline = np.concatenate([
+        *(np.column_stack([np.full(shape[0], col), rows]) for col in (0, shape[1] - 1)),
+        *(np.column_stack([cols, np.full(shape[1], row)]) for row in (0, shape[0] - 1)),
+    ])  # fmt: skip
+    first, raw_shape = placed(rectified.raw_from_image(outline))
+    raw = replace(camera, centre=(-first[0], -first[1]))
+    return Exposure(view, replace(rectified, raw=raw, raw_shape=raw_shape), shape)
 
 
 def _camera(
@@ -201,13 +249,20 @@ def _camera(
     aside = FLIGHT_HEIGHT_M * np.tan(np.deg2rad(view.across_deg))
     east, north = aside * float(np.cos(heading)), -aside * float(np.sin(heading))
     position = (middle[0] - east, middle[1] - north, middle[2] + FLIGHT_HEIGHT_M)
+    strip = (round(1e3 * (view.heading_deg % 360.0)), round(1e3 * (view.across_deg + 90.0)))
+    shake = Shake((spec.seed, *strip)) if spec.shaken else None
     return LineScanner(
-        position, (0.0, 0.0), view.heading_deg, view.along_deg, ADVANCE_M, wobble_m=WOBBLE_M, wobble_deg=WOBBLE_DEG
-    )
+        position, (0.0, 0.0), view.heading_deg, view.along_deg, ADVANCE_M, wobble_m=WOBBLE_M, wobble_deg=WOBBLE_DEG,
+        shake=shake,
+    )  # fmt: skip
 
 
 def build_ground(spec: SceneSpec, seen_by: tuple[Exposure, ...]) -> SyntheticGround:
-    """The ground of a scene: the area, and as much around it as any of the images can see."""
+    """The ground of a scene: the area, and as much around it as any of the images can see.
+
+    What stands where depends on how far it goes: give the images of a steady flight to all scenes that are to have the
+    same ground (the rim of others may then miss some pixels).
+    """
     seen = np.concatenate([_footprint(spec, exposure) for exposure in seen_by])
     step = spec.step_m
     reach = np.ceil(np.array([
