@@ -44,7 +44,7 @@ LARGE_SIDE_CELLS = 4000
 COVERAGE_SHORT = 3
 # Kind and seed of scenes that are rendered to be judged, never to choose an option by: chosen by what the baselines
 # score there, before zlocus had seen them.
-NEW_SCENES = (("city", 16), ("city", 17), ("hills", 43), ("hills", 50))
+NEW_SCENES = (("city", 16), ("city", 20), ("hills", 43), ("hills", 50))
 # Of a town, by the views matched: within 1 m of all cells or of a class, cells with a height (valid), NMAD of ground.
 CITY_BARS = {
     "six": {"all": 0.97, "building": 0.92, "ground": 0.99, "tree": 0.60, "valid": 0.97, "nmad": 0.10},

@@ -39,7 +39,7 @@ CALIBRATION = Path(__file__).resolve().parents[1] / "src" / "zlocus" / "surface"
 SIZE, POINTING_PX = 520, 2.0
 # (kind, seed): those that calibrate, and those that judge.
 TRAINING = (("city", 61), ("city", 62), ("city", 63), ("hills", 61), ("hills", 62))
-JUDGED = (("city", 16), ("city", 17), ("hills", 43), ("hills", 50))
+JUDGED = (("city", 16), ("city", 20), ("hills", 43), ("hills", 50))
 VIEWS = {6: ("n1", "f1", "b1", "n2", "f2", "b2"), 3: ("n1", "f1", "b1"), 2: ("n1", "f1")}
 MARGIN_M, LARGE_ERROR_M = 10.0, 1.0
 KNOTS, SMOOTHNESS, LEAST_ERROR_STEPS = 9, 0.02, 1e-3
