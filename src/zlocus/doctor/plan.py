@@ -29,9 +29,9 @@ ROUGHLY = 3.0
 class RunPlan:
     """A run with the options given.
 
-    cell_m, shape : of the products; heights, step_m, n_steps : of the search; tile_bytes : memory of one tile; workers :
-    tiles at a time, as asked and as memory and tiles allow; machine_bytes : memory of this machine, None where it does
-    not say; view_cells : cells times images that see them; seconds : of matching, a rough estimate.
+    cell_m, shape : of the products; heights, step_m, n_steps : of the search; tile_bytes : memory of one tile;
+    workers : tiles at a time, as asked and as memory and tiles allow; machine_bytes : memory of this machine, None
+    where it does not say; view_cells : cells times images that see them; seconds : of matching, a rough estimate.
     """
 
     cell_m: float

@@ -96,7 +96,7 @@ def edge_ratios(pixels: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     if not known.any():
         return np.empty(0, np.float32)
     known &= far >= np.percentile(far[known], STRONG_PERCENT)
-    return near[known] / far[known]
+    return np.asarray(near[known] / far[known])
 
 
 def edge_width(ratios: NDArray[np.float32]) -> float:

@@ -52,7 +52,10 @@ class Diagnosis:
     @property
     def text(self) -> str:
         """A report to be read."""
-        parts = [_table("Images", _view_rows(self)), _table("Pairs", _pair_rows(self)), *_plan_lines(self)]
+        quick = (
+            "" if self.ties is None or not self.ties.is_quick else "Ties are of a quick pass: a run finds more of them."
+        )
+        parts = [_table("Images", _view_rows(self)), _table("Pairs", _pair_rows(self)), quick, *_plan_lines(self)]
         for level, heading in HEADINGS.items():
             told = [f"- {finding.sentence}" for finding in self.findings if finding.level == level]
             parts.append("\n".join([heading, *told]) if told else "")
@@ -69,6 +72,7 @@ class Diagnosis:
             "views": {view.name: self.view_record(i) for i, view in enumerate(self.views)},
             "refused": {each.name: {"path": str(each.path), "reason": each.reason} for each in self.refused},
             "pairs": [self.pair_record(pair) for pair in self.pairs],
+            "quick_ties": None if self.ties is None else self.ties.is_quick,
             "plan": None if self.plan is None else _plan_record(self.plan),
         }
 
@@ -132,6 +136,8 @@ def _view_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
         "name", "sensor", "rows x cols", "ground pixel", "nodata", "saturated", "black", "edges", "ties", "off before",
         "off after",
     )  # fmt: skip
+    greys: tuple[str, ...]
+    ties: tuple[str, ...]
     for i, view in enumerate(found.views):
         quality, oriented = found.quality[i], found.oriented(i)
         greys = ("-",) * 4
@@ -170,15 +176,15 @@ def _plan_lines(found: Diagnosis) -> Iterator[str]:
     rows, cols = plan.shape
     memory = f"{plan.tile_bytes * plan.workers / 1e9:.2f} GB"
     machine = "" if plan.machine_bytes is None else f"; this machine has {plan.machine_bytes / 1e9:.1f} GB"
-    few, many = plan.seconds / ROUGHLY, plan.seconds * ROUGHLY
+    which = "A full run of the images that can be used" if found.refused else "A full run"
     yield "\n".join(
         [
-            "A full run",
+            which,
             f"- searches heights from {low:.1f} to {high:.1f} m, {plan.n_steps} steps of {plan.step_m:.2g} m;",
             f"- makes {rows} x {cols} cells of {plan.cell_m:g} m in {plan.n_tiles} tiles, {plan.workers} at a time;",
             f"- needs about {memory} for its tiles{machine};",
-            f"- matches for {duration(few)} to {duration(many)}, a rough estimate: {plan.view_cells / 1e6:.2g} million "
-            "cells times images, at the rate of the benchmarks.",
+            f"- matches for about {duration(plan.seconds)}. This is a rough estimate, {plan.view_cells / 1e6:.2g} "
+            f"million cells times images at the rate of the benchmarks: it may take {ROUGHLY:g} times as long, or a third.",
         ]
     )
 

@@ -1,4 +1,4 @@
-"""The order of a look at the inputs: images, overlap, ties, geometry, plan. What fails is told, and the rest goes on."""
+"""The order of a look at the inputs: images, overlap, ties, geometry, plan. What fails is told, the rest goes on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from zlocus.doctor.findings import NOTE, POOR, STOPS, Finding
+from zlocus.doctor.findings import POOR, STOPS, Finding
 from zlocus.doctor.geometry import PairGeometry, ViewGeometry, geometry_findings, pair_geometries, view_geometry
 from zlocus.doctor.plan import plan_findings, run_plan
 from zlocus.doctor.quality import image_quality, quality_findings
@@ -122,10 +122,7 @@ def found_ties(
     told.tried(lambda: check_overlap(scene, levels))
     if any(finding.level == STOPS for finding in told.findings[before:]):
         return None
-    ties = told.tried(lambda: quick_ties(scene, config, asked, progress))
-    if ties is not None and not ties.is_quick:
-        told.findings.append(Finding(NOTE, "Few features were not enough to find the ties; all were taken, as in a run."))
-    return ties
+    return told.tried(lambda: quick_ties(scene, config, asked, progress))
 
 
 def ground_height(ties: QuickTies | None, levels: Sequence[float]) -> float:

@@ -26,8 +26,8 @@ NEAR_LIMIT = 0.7
 
 @dataclass(frozen=True)
 class QuickTies:
-    """orientation : as a run finds it; z_range : heights (m) that a run would search; is_quick : False where fewer
-    features were not enough and all were taken."""
+    """orientation : as a run finds it; z_range : heights (m) that a run would search; is_quick : with fewer features
+    than a run."""
 
     orientation: Orientation
     z_range: tuple[float, float]
@@ -46,7 +46,7 @@ def quick_options(options: OrientationOptions, scene: Scene) -> OrientationOptio
 
 
 def quick_ties(scene: Scene, config: RunConfig, asked: tuple[float, float] | None, progress: Progress) -> QuickTies:
-    """Ties and the heights that a run would search; with all features where few do not tell.
+    """Ties and the heights that a run would search; with all features where few tie not every image.
 
     asked : heights (m) of the request or of the scene file.
 
@@ -56,11 +56,14 @@ def quick_ties(scene: Scene, config: RunConfig, asked: tuple[float, float] | Non
         Where a run would find too few ties to go on.
     """
     quick = quick_options(config.orientation, scene)
-    try:
-        return _ties(scene, quick, asked, progress, is_quick=True)
-    except GeometryError:
-        if quick == config.orientation:
-            raise
+    if quick != config.orientation:
+        try:
+            found = _ties(scene, quick, asked, progress, is_quick=True)
+        except GeometryError:
+            pass
+        else:
+            if all(view.n_ties for view in found.orientation.views):
+                return found
     return _ties(scene, config.orientation, asked, progress, is_quick=False)
 
 
@@ -112,8 +115,8 @@ def tie_findings(
             findings.append(
                 Finding(
                     POOR,
-                    f"{a} and {b} share {100 * pair.overlap:.0f} % of their ground, but no tie point was found in both: "
-                    "they look too different (season, light, direction), and will hardly be matched with each other.",
+                    f"{a} and {b} share {100 * pair.overlap:.0f} % of their ground, but no tie point was found in "
+                    "both: they look too different (season, light, direction), and will hardly be matched with each other.",
                     (a, b),
                 )
             )

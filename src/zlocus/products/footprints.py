@@ -17,7 +17,7 @@ from zlocus.errors import OutputError
 from zlocus.scene import is_local
 
 SIDE_PX, RIM_PX, CAPTION_PX = 900, 24, 40
-INK, ALONE = (40, 40, 40), (225, 225, 225)
+INK, PAPER, ALONE = (40, 40, 40), (255, 255, 255), (225, 225, 225)
 MOST_NAMES = 40
 DEGREE_DIGITS = 8
 Feature = tuple[Any, dict[str, Any]]
@@ -67,7 +67,8 @@ def footprints_picture(path: Path, outlines: Sequence[Any], names: Sequence[str]
         cv2.polylines(picture, [ring], True, INK, 1, cv2.LINE_AA)
         if len(drawn) <= MOST_NAMES:
             at = (int(ring[:, 0].min()) + 4, int(ring[ring[:, 0].argmin(), 1]))
-            cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+            for colour, width in ((PAPER, 3), (INK, 1)):
+                cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, width, cv2.LINE_AA)
     strip = np.full((CAPTION_PX, max(cols, 420), 3), 255, np.uint8)
     text = f"seen by 1 image: grey; by 2 to {max(int(count.max()), 2)}: dark to bright"
     cv2.putText(strip, text, (6, CAPTION_PX - 14), cv2.FONT_HERSHEY_SIMPLEX, 0.5, INK, 1, cv2.LINE_AA)
