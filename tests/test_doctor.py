@@ -21,8 +21,7 @@ from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, camera, read, rendered, r
 from zlocus.cli import app
 from zlocus.doctor.quality import MOST_WINDOWS, SIDE_PX, image_quality, sample_windows
 from zlocus.io.scene_file import open_usable
-from zlocus.sensors.frame import FrameModel
-from zlocus.sensors.rotation import rotation_from_angles
+from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.files import write_image
 from zlocus.synthetic.mixed import render_mixed_scene

@@ -184,7 +184,7 @@ def _plan_lines(found: Diagnosis) -> Iterator[str]:
             f"- makes {rows} x {cols} cells of {plan.cell_m:g} m in {plan.n_tiles} tiles, {plan.workers} at a time;",
             f"- needs about {memory} for its tiles{machine};",
             f"- matches for about {duration(plan.seconds)}. This is a rough estimate, {plan.view_cells / 1e6:.2g} "
-            f"million cells times images at the rate of the benchmarks: it may take {ROUGHLY:g} times as long, or a third.",
+            f"million cells times images at the rate of the benchmarks; it may be {ROUGHLY:g} times as long or short.",
         ]
     )
 

@@ -116,7 +116,7 @@ def tie_findings(
                 Finding(
                     POOR,
                     f"{a} and {b} share {100 * pair.overlap:.0f} % of their ground, but no tie point was found in "
-                    "both: they look too different (season, light, direction), and will hardly be matched with each other.",
+                    "both: they look too different (season, light, direction) to be matched well.",
                     (a, b),
                 )
             )
