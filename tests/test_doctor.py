@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -19,8 +19,15 @@ from typer.testing import CliRunner
 from orientation_scenes import image_of
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, camera, read, rendered, run
 from zlocus.cli import app
+from zlocus.doctor.geometry import geometry_findings, view_geometry
+from zlocus.doctor.plan import RunPlan, plan_findings
 from zlocus.doctor.quality import MOST_WINDOWS, SIDE_PX, image_quality, sample_windows
+from zlocus.doctor.ties import tie_findings
 from zlocus.io.scene_file import open_usable
+from zlocus.options import OrientationOptions
+from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
+from zlocus.orientation.triangulate import Observations
+from zlocus.scene import View
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.files import write_image
@@ -426,3 +433,70 @@ def test_an_earlier_look_leaves_no_footprints(healthy, good, tmp_path):
     (out / "dsm.tif").write_bytes(b"of a run")
     doctor(out, tmp_path / "a.tif", tmp_path / "b.tif")
     assert sorted(path.name for path in out.iterdir()) == ["doctor.json", "dsm.tif"]
+
+
+def test_too_few_quick_features_give_way_to_all(good, tmp_path, monkeypatch):
+    _, text, report = doctor(tmp_path / "quick", *good.values(), "--config", more_features(tmp_path))
+    assert report["quick_ties"] is True
+    assert "Ties are of a quick pass" in text
+    monkeypatch.setattr("zlocus.doctor.ties.quick_options", lambda options, scene: replace(options, min_ties=10000))
+    status, _, report = doctor(tmp_path / "all", *good.values())
+    assert (status, report["quick_ties"]) == (0, False)
+
+
+def more_features(folder):
+    (folder / "options.toml").write_text("[orientation]\nfeatures_per_image = 30000\n")
+    return folder / "options.toml"
+
+
+@dataclass(frozen=True)
+class Twisted:
+    """A camera whose two directions disagree by 0.3 px and that has no ground left of a column."""
+
+    base: SatelliteCamera
+    first_column: float = -1.0
+
+    def image_from_ground(self, xyz):
+        return self.base.image_from_ground(xyz) + np.array([0.3, 0.0])
+
+    def ground_from_image(self, xy, z):
+        xyz = self.base.ground_from_image(xy, z)
+        xyz[xy[:, 0] < self.first_column] = np.nan
+        return xyz
+
+
+@pytest.mark.parametrize(("first_column", "share"), [(-1.0, 0.0), (50.0, 0.4)])
+def test_a_camera_that_does_not_agree_with_itself(first_column, share):
+    view = View("odd", Path("odd.tif"), image_of(np.zeros((150, 150))), Twisted(camera("nadir"), first_column))
+    found = view_geometry(view, 50.0)
+    assert found.closing_px == pytest.approx(0.3, abs=1e-6)
+    assert found.lost == pytest.approx(share)
+    told = [finding.sentence for finding in geometry_findings(["odd"], [found], [])]
+    assert any("miss themselves by up to 0.30 px" in sentence for sentence in told)
+    assert any("cannot map 40 %" in sentence for sentence in told) == (share > 0)
+
+
+@pytest.mark.parametrize(
+    ("n_ties", "left_px", "shift_px", "said"),
+    [
+        (500, 0.1, 2.0, None),
+        (0, np.nan, 0.0, "no tie point"),
+        (20, 0.1, 2.0, "only 20 tie points"),
+        (500, 0.4, 2.0, "still lie 0.40 px off"),
+        (500, 0.1, 25.0, "off by 25 px, close to the 30 px"),
+    ],
+)
+def test_what_ties_say_of_a_view(n_ties, left_px, shift_px, said):
+    left = Residuals(left_px, left_px, left_px)
+    views = (ViewOrientation("odd", (shift_px, -1.0), n_ties, left, left),)
+    nothing = np.empty(0)
+    seen = Observations(nothing.astype(int), nothing.astype(int), np.empty((0, 2)))
+    found = Orientation(views, (), np.empty((0, 3)), nothing, seen, "shift", 0, (0.0, 1.0), 0)
+    told = [finding.sentence for finding in tie_findings(["odd"], found, [], OrientationOptions())]
+    assert [said in sentence for sentence in told] == ([] if said is None else [True])
+
+
+@pytest.mark.parametrize(("machine", "level"), [(None, []), (9 * 10**9, []), (7 * 10**9, ["poor"])])
+def test_more_memory_than_the_machine_has(machine, level):
+    plan = RunPlan(0.5, (9, 9), (0.0, 1.0), 0.1, 10, 8, 2 * 10**9, 4, machine, 1.0, 1.0)
+    assert [finding.level for finding in plan_findings(plan, None)] == level
