@@ -67,8 +67,9 @@ def footprints_picture(path: Path, outlines: Sequence[Any], names: Sequence[str]
         cv2.polylines(picture, [ring], True, INK, 1, cv2.LINE_AA)
         if len(drawn) <= MOST_NAMES:
             at = (int(ring[:, 0].min()) + 4, int(ring[ring[:, 0].argmin(), 1]))
-            for colour, width in ((PAPER, 3), (INK, 1)):
-                cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, width, cv2.LINE_AA)
+            (width, height), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+            cv2.rectangle(picture, (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + 4), PAPER, cv2.FILLED)
+            cv2.putText(picture, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
     strip = np.full((CAPTION_PX, max(cols, 420), 3), 255, np.uint8)
     text = f"seen by 1 image: grey; by 2 to {max(int(count.max()), 2)}: dark to bright"
     cv2.putText(strip, text, (6, CAPTION_PX - 14), cv2.FONT_HERSHEY_SIMPLEX, 0.5, INK, 1, cv2.LINE_AA)
