@@ -73,7 +73,9 @@ def test_version(zl):
     assert zl("--version").stdout == f"zlocus {zlocus.__version__}\n"
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["dsm"], ["cloud"], ["curves"], ["evaluate"], ["config"]])
+@pytest.mark.parametrize(
+    "command", [[], ["demo"], ["dsm"], ["cloud"], ["curves"], ["doctor"], ["evaluate"], ["config"]]
+)
 def test_every_command_has_help(zl, command):
     result = zl(*command, "--help")
     assert result.exit_code == 0

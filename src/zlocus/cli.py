@@ -25,13 +25,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from zlocus import __version__
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.progress import progress_for
-from zlocus.request import CloudRequest, CurvesRequest, DsmRequest, ImportRequest, OrientRequest, check_output
+from zlocus.request import (
+    CloudRequest,
+    CurvesRequest,
+    DoctorRequest,
+    DsmRequest,
+    ImportRequest,
+    OrientRequest,
+    check_output,
+)
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
     from zlocus.options import RunConfig
 
 EXIT_OWN_FAULT = 1
+EXIT_WILL_FAIL = 2
 EXIT_INTERRUPTED = 130
 DEMO_ACCURACY = "accuracy.json"
 P = ParamSpec("P")
@@ -315,6 +324,37 @@ def ties(
     from zlocus.orienting import run_orient
 
     print(run_orient(request, run_config, progress_for(sys.stderr)))
+
+
+@app.command()
+@explained
+def doctor(
+    inputs: Inputs,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for the report and footprints. Default: print only.")
+    ] = None,
+    resolution: Resolution = None,
+    crs: Crs = None,
+    heights: TieHeights = None,
+    workers: Workers = 1,
+    memory: Annotated[float | None, typer.Option(help="Most memory that the run may use, GB.", metavar="GB")] = None,
+    config: ConfigFile = None,
+) -> None:
+    """Look at the inputs before a long run: what will not work, and why."""
+    request = DoctorRequest(
+        inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, heights=heights, workers=workers,
+        memory_gb=memory,
+    )  # fmt: skip
+    if out is not None:
+        # It writes no file that a run does.
+        check_output(out, overwrite=True)
+    run_config = _run_config(config)
+    from zlocus.doctor.run import run_doctor
+
+    diagnosis = run_doctor(request, run_config, progress_for(sys.stderr))
+    print(diagnosis.text)
+    if diagnosis.will_fail:
+        raise typer.Exit(EXIT_WILL_FAIL)
 
 
 @app.command("import")

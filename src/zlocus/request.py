@@ -203,6 +203,36 @@ class OrientRequest:
 
 
 @dataclass(frozen=True)
+class DoctorRequest:
+    """A run to be looked at before it is made. `None` means: not given, to be found, and of `out`: nothing is written.
+
+    inputs, resolution, crs, heights, workers, memory_gb : as in `DsmRequest`.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path | None = None
+    resolution: float | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    workers: int = 1
+    memory_gb: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_positive("--resolution", self.resolution, "m")
+        _check_heights(self.heights)
+        _check_workers(self.workers)
+        _check_positive("--memory", self.memory_gb, "GB")
+
+
+@dataclass(frozen=True)
 class ImportRequest:
     """Cameras of another program, to become a scene file. `None` means: not given.
 

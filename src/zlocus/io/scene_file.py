@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import datetime
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import yaml
@@ -27,7 +28,7 @@ from pydantic import Field, FiniteFloat, SerializeAsAny, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, InputError, OutputError
+from zlocus.errors import ConfigError, InputError, OutputError, ZlocusError
 from zlocus.io.camera_entry import Camera, CameraSource, Vector
 from zlocus.io.camera_kinds import KINDS, RpcCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
@@ -41,6 +42,7 @@ from zlocus.sensors.model import FloatArray
 
 SCENE_SUFFIXES = (".yaml", ".yml")
 OPPOSITE = 1e-12
+T = TypeVar("T")
 
 
 class Frame(StrictModel):
@@ -132,14 +134,58 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
     ConfigError
         For a CRS that is not projected in metres.
     """
-    paths = [Path(path) for path in inputs]
-    scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
-    if scene_files and len(paths) > 1:
-        raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
-    if scene_files:
-        return _from_scene_file(scene_files[0], crs)
-    views = [(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
-    return _build(views, Path(), crs)
+    asked = _asked(inputs, crs)
+    loaded = [_load(entry, asked.folder) for entry in asked.entries]
+    if len(loaded) < 2:
+        given = f"only {loaded[0].entry.path} was given" if loaded else "none was given"
+        raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
+    frame = _default_crs(loaded) if asked.crs is None else asked.crs
+    return asked.scene([each.view(frame) for each in loaded], frame)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A view that cannot be used, and why."""
+
+    name: str
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True)
+class Usable:
+    """The views that can be used, None where there is no single one, and the others."""
+
+    scene: Scene | None
+    refused: tuple[Refused, ...]
+
+
+def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
+    """As `open_scene`, but a view that cannot be used is named and the others are opened.
+
+    Raises
+    ------
+    InputError, ConfigError
+        Where nothing can be opened at all: a scene file that is wrong, an image given twice, a CRS that does not suit.
+    """
+    asked = _asked(inputs, crs)
+    refused: dict[str, Refused] = {}
+
+    def tried(entry: _Entry, step: Callable[[], T]) -> list[T]:
+        try:
+            return [step()]
+        except ZlocusError as error:
+            refused[entry.name] = Refused(entry.name, entry.path, str(error))
+            return []
+
+    loaded = [each for entry in asked.entries for each in tried(entry, partial(_load, entry, asked.folder))]
+    frame = asked.crs
+    if frame is None:
+        loaded = [each for each in loaded if tried(each.entry, partial(_default_crs, [each]))]
+        frame = _default_crs(loaded) if loaded else None
+    views = [] if frame is None else [v for each in loaded for v in tried(each.entry, partial(each.view, frame))]
+    scene = asked.scene(views, frame) if views and frame is not None else None
+    return Usable(scene, tuple(refused[entry.name] for entry in asked.entries if entry.name in refused))
 
 
 def read_scene_file(path: Path) -> SceneFile:
@@ -183,7 +229,68 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 
 
-def _from_scene_file(path: Path, crs: CRS | None) -> Scene:
+@dataclass(frozen=True)
+class _Entry:
+    name: str
+    path: Path
+    camera: Camera
+    date: datetime.date | None = None
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A scene before any image is opened. folder : where relative paths of cameras start; up : see `Frame`."""
+
+    entries: tuple[_Entry, ...]
+    folder: Path
+    crs: CRS | None
+    bounds: tuple[float, float, float, float] | None = None
+    heights: tuple[float, float] | None = None
+    up: tuple[float, float, float] | None = None
+
+    def scene(self, views: Sequence[View], crs: CRS) -> Scene:
+        """The scene of some views in its frame."""
+        scene = Scene(tuple(views), crs, self.bounds, self.heights)
+        return scene if self.up is None else _turned(scene, self.up)
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    """An image and its camera, read, before the scene's CRS is known."""
+
+    entry: _Entry
+    image: RasterImage
+    source: CameraSource
+
+    def view(self, crs: CRS) -> View:
+        """The view in the scene's frame."""
+        entry = self.entry
+        return View(entry.name, entry.path, self.image, self.source.sensor(crs), self.source.files, entry.date)
+
+
+def _asked(inputs: Sequence[Path], crs: CRS | None) -> _Asked:
+    paths = [Path(path) for path in inputs]
+    scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
+    if scene_files and len(paths) > 1:
+        raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
+    if scene_files:
+        asked = _from_scene_file(scene_files[0], crs)
+    else:
+        entries = [_Entry(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
+        asked = _Asked(tuple(entries), Path(), crs)
+    if asked.crs is not None and not is_local(asked.crs):
+        asked = replace(asked, crs=checked_crs(asked.crs))
+    _check_distinct([entry.path for entry in asked.entries])
+    return asked
+
+
+def _load(entry: _Entry, folder: Path) -> _Loaded:
+    image = open_image(entry.path)
+    check_content(image)
+    return _Loaded(entry, image, entry.camera.read(folder, entry.path))
+
+
+def _from_scene_file(path: Path, crs: CRS | None) -> _Asked:
     scene_file = read_scene_file(path)
     frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
     if frame is not None and is_local(frame) and crs is not None:
@@ -191,13 +298,12 @@ def _from_scene_file(path: Path, crs: CRS | None) -> Scene:
     if scene_file.area is not None and crs is not None and crs != frame:
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
     named = None if scene_file.frame is None else scene_file.frame.crs
-    views = [(view.name, path.parent / view.image, view.camera.given_in(named)) for view in scene_file.views]
+    entries = tuple(
+        _Entry(view.name, path.parent / view.image, view.camera.given_in(named), view.date) for view in scene_file.views
+    )
     bounds = None if scene_file.area is None else scene_file.area.bounds
-    scene = _build(views, path.parent, crs or frame, bounds, scene_file.heights)
-    if scene_file.frame is not None and scene_file.frame.up is not None:
-        scene = _turned(scene, scene_file.frame.up)
-    dated = zip(scene.views, scene_file.views, strict=True)
-    return replace(scene, views=tuple(replace(view, date=entry.date) for view, entry in dated))
+    up = None if scene_file.frame is None else scene_file.frame.up
+    return _Asked(entries, path.parent, crs or frame, bounds, scene_file.heights, up)
 
 
 def _turned(scene: Scene, up: tuple[float, float, float]) -> Scene:
@@ -230,39 +336,14 @@ def _frame_crs(frame: Frame, path: Path) -> CRS:
         raise InputError(f"{path}: frame.crs {frame.crs!r} is no CRS. Write it as EPSG:n.") from error
 
 
-def _build(
-    entries: Sequence[tuple[str, Path, Camera]],
-    folder: Path,
-    crs: CRS | None,
-    bounds: tuple[float, float, float, float] | None = None,
-    heights: tuple[float, float] | None = None,
-) -> Scene:
-    """Open images and cameras, then fix the frame."""
-    crs = crs if crs is None or is_local(crs) else checked_crs(crs)
-    _check_distinct([path for _, path, _ in entries])
-    images = [open_image(path) for _, path, _ in entries]
-    if len(entries) < 2:
-        given = f"only {entries[0][1]} was given" if entries else "none was given"
-        raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
-    for image in images:
-        check_content(image)
-    sources = [camera.read(folder, path) for _, path, camera in entries]
-    crs = _default_crs(images, sources) if crs is None else crs
-    views = tuple(
-        View(name, path, image, source.sensor(crs), source.files)
-        for (name, path, _), image, source in zip(entries, images, sources, strict=True)
-    )
-    return Scene(views, crs, bounds, heights)
-
-
-def _default_crs(images: Sequence[RasterImage], sources: Sequence[CameraSource]) -> CRS:
+def _default_crs(loaded: Sequence[_Loaded]) -> CRS:
     """The UTM zone of the mean of the images' centres (longitudes across the date line are neighbours)."""
     centres = []
-    for image, source in zip(images, sources, strict=True):
-        centre = source.centre(image.shape)
+    for each in loaded:
+        centre = each.source.centre(each.image.shape)
         if centre is None:
             raise InputError(
-                f"The camera of {image.path} does not place its centre on the Earth. Check it, or give --crs."
+                f"The camera of {each.image.path} does not place its centre on the Earth. Check it, or give --crs."
             )
         centres.append(centre)
     first = centres[0][0]
