@@ -89,6 +89,26 @@ def test_sigma0_is_the_noise_of_an_image_coordinate():
     assert found.solution.sigma0_px == pytest.approx(0.3, rel=0.1)
 
 
+def test_exact_cameras_stay_as_delivered():
+    """The noise of ties does not become corrections."""
+    exact = flight_of_frames()
+    found, _ = oriented(exact, exact, frame_ground(600), FRAME_SIZE, OPTIONS, noise_px=0.3)
+    assert found.sensors == tuple(exact)
+    assert found.solution.is_held.all()
+    moved, _, _ = frames(noise_px=0.3)
+    assert not moved.solution.is_held.any()
+
+
+def test_a_kind_of_correction_that_no_tie_asks_for_is_not_made():
+    """Positions are wrong, attitudes and one image's shift are not."""
+    exact = flight_of_frames()
+    rng = np.random.default_rng(3)
+    wrong = [camera.corrected(rng.normal(0.0, 0.5, 3), np.zeros(3)) for camera in exact]
+    options = OrientationOptions(joint=replace(EXACT, sigma_attitude_deg=1e-3))
+    found, _ = oriented(exact, wrong, frame_ground(600), FRAME_SIZE, options, 0.1)
+    assert found.solution.is_held.reshape(8, 6).tolist() == [[False] * 3 + [True] * 3] * 8
+
+
 def test_the_focal_length_is_found_on_request():
     exact = flight_of_frames()
     wrong = [replace(camera, focal=camera.focal + 8.0) for camera in exact]

@@ -22,9 +22,8 @@ from zlocus.synthetic.scenes import demo_spec
 
 # What splines make of a shaken trajectory.
 EXACT_PX = 1e-3
-# Exact cameras need no correction; what is found, shifts of RPCs, poses of frames and drifts of scanners, is the noise
-# of some hundred ties.
-SHIFT_PX = 0.1
+# Exact cameras need no correction; what is found is the noise of some hundred ties.
+SHIFT_PX = 0.05
 TWO_PIXELS_M = 0.42
 
 

@@ -143,6 +143,11 @@ def what_was_applied(orientation: Orientation) -> str:
     moved = [
         f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in orientation.views if v.shift_px != (0.0, 0.0)
     ]
+    if orientation.joint is not None and orientation.joint.solution.is_held.all():
+        return (
+            f"Cameras left as delivered: {len(orientation.measured)} tie points show no errors beyond their noise, "
+            f"{orientation.joint.solution.sigma0_px:.2f} px."
+        )
     if not moved:
         return "Pointing: no correction applied."
     if orientation.joint is not None:

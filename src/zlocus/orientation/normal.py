@@ -1,7 +1,9 @@
 """Normal equations of the joint orientation: Gauss-Newton with Huber's loss, ground points eliminated.
 
 The ground points leave the normal equations by the Schur complement (Triggs et al. 2000, *Bundle adjustment - a modern
-synthesis*, section 6.1); what is left, one block per camera, is solved by SciPy.
+synthesis*, section 6.1); what is left, one block per camera, is solved by SciPy. Variance
+components (Koch and Kusche 2002, *Regularization of geopotential determination from satellite data by variance
+components*) tell which kinds of corrections the ties ask for.
 """
 
 from __future__ import annotations
@@ -19,8 +21,14 @@ from zlocus.orientation.control import TerrainHeights
 from zlocus.orientation.triangulate import Observations, ground_jacobian, project_points, summed
 from zlocus.sensors.model import FloatArray, SensorModel
 
-MAX_ITERATIONS = 20
+MAX_ITERATIONS = 40
 TOLERANCE_PX = 1e-3
+# Variances of corrections are estimated again, with the corrections, until none changes by a larger share.
+VARIANCE_TOLERANCE = 0.1
+VARIANCE_ROUNDS = 12
+# Corrections of one kind say how large they are where ties show at least so many of them.
+LEAST_SHOWN = 0.5
+LEAST_VARIANCE = 1e-12
 # Derivatives are taken again after a step that moves image points by more.
 RELINEARISE_PX = 5.0
 # Of a parameter's sigma, for its derivative.
@@ -69,6 +77,12 @@ class Problem:
     def is_controlled(self) -> bool:
         """Whether anything is known of the ground."""
         return bool(len(self.control_xyz)) or self.terrain is not None
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """(p,) numbers of the kinds of parameters: those of one kind of block that have one standard deviation."""
+        kinds = [(block.kind, sigma) for block in self.blocks for sigma in block.sigma]
+        return np.array([kinds.index(kind) for kind in kinds], np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,17 +137,32 @@ class WeakDirections:
 
 
 @dataclass(frozen=True, eq=False)
+class Beforehand:
+    """How large parameters are thought to be.
+
+    variance : (p,) in units of their sigma squared; n_rounds : of estimation so far; is_settled : whether it ended;
+    is_held : (p,), see `Solution`.
+    """
+
+    variance: FloatArray
+    n_rounds: int
+    is_settled: bool
+    is_held: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Where the adjustment ended.
 
-    parameters : (p,) in units of their sigma; parameter_sigma : (p,), of those found, in the same units; xyz : (n, 3)
-    m, ties, then control points; residual : (m, 2) px; sigma0_px : noise of one image coordinate of a tie, from the
-    residuals of all ties kept and their redundancy; n_seen : how many directions of the parameters the ties show;
-    n_steps : taken.
+    parameters : (p,) in units of their sigma; parameter_sigma : (p,), of those found, in the same units; is_held : (p,)
+    which are zero because ties and control ask for none of their kind; xyz : (n, 3) m, ties, then control points;
+    residual : (m, 2) px; sigma0_px : noise of one image coordinate of a tie, from the residuals of all ties kept and
+    their redundancy; n_seen : how many directions of the parameters the ties show; n_steps : taken.
     """
 
     parameters: FloatArray
     parameter_sigma: FloatArray
+    is_held: NDArray[np.bool_]
     xyz: FloatArray
     residual: FloatArray
     sigma0_px: float
@@ -146,6 +175,7 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
     """Gauss-Newton from parameters (p,) and ground points of the ties xyz (n, 3) m, NaN where they are not known."""
     xyz = np.concatenate([xyz, problem.control_xyz])
     linear, weak, moved_px, n_steps = None, None, np.inf, 0
+    ahead = Beforehand(np.ones(len(parameters)), 0, False, np.zeros(len(parameters), bool))
     while True:
         sensors = corrected_sensors(problem.blocks, problem.sensors, parameters)
         if linear is None or moved_px > RELINEARISE_PX:
@@ -157,10 +187,13 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
         ties = reduced(problem, linear, residual, of_ties, None) if problem.is_controlled else full
         weak = weak_directions(problem, linear, of_ties, ties.normal) if weak is None else weak
         normal, pull = weak.without(full, ties)
-        information = normal + sigma**2 * np.eye(len(normal))
-        if n_steps == MAX_ITERATIONS or moved_px < TOLERANCE_PX:
+        covariance = covariance_of(normal, sigma, ahead.variance)
+        if n_steps == MAX_ITERATIONS or (ahead.is_settled and moved_px < TOLERANCE_PX):
             break
-        step = linalg.solve(information, pull - sigma**2 * parameters, assume_a="pos")
+        if moved_px < TOLERANCE_PX:
+            ahead = estimated(problem, ahead, parameters, np.diag(covariance))
+            covariance = covariance_of(normal, sigma, ahead.variance)
+        step = covariance @ (pull / sigma**2 - parameters / ahead.variance)
         rest = full.pull_of_points - (full.mixed.T @ step).reshape(-1, 3)
         parameters = parameters + step
         moved_px = float(np.abs(linear.by_parameters @ step).max(initial=0.0))
@@ -170,8 +203,36 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
     used = of_ties > 0.0
     redundancy = 2 * int(used.sum()) - 3 * len(np.unique(problem.seen.point[used])) - n_seen
     sigma0 = np.sqrt((residual[used] ** 2).sum() / redundancy) if redundancy > 0 else np.nan
-    spread = np.sqrt(np.diag(linalg.inv(information))) * sigma
-    return Solution(parameters, spread, xyz, residual, float(sigma0), redundancy, n_seen, n_steps)
+    parameters = np.where(ahead.is_held, 0.0, parameters)
+    found = parameters, np.sqrt(np.diag(covariance)), ahead.is_held
+    return Solution(*found, xyz, residual, float(sigma0), redundancy, n_seen, n_steps)
+
+
+def covariance_of(normal: FloatArray, sigma: float, variance: FloatArray) -> FloatArray:
+    """Of the parameters (p, p), in units of their sigma: normal (p, p) px2 of image coordinates, sigma px their noise;
+    variance (p,) beforehand."""
+    return np.asarray(linalg.inv(normal / sigma**2 + np.diag(1.0 / variance)))
+
+
+def estimated(problem: Problem, ahead: Beforehand, parameters: FloatArray, after: FloatArray) -> Beforehand:
+    """How large parameters (p,) are thought to be, from how large they came out. after : (p,) their variances now.
+
+    The variance of a kind is the sum of its squares over how many of its parameters are shown, at most 1. Parameters no
+    larger than what noise makes of them get less every time, until none is shown: ties ask for no correction of that
+    kind, and it is held at zero. All other kinds are given their sigma again: less of it would leave a part of their
+    errors.
+    """
+    kinds, variance = problem.kinds, ahead.variance
+    n_shown = np.bincount(kinds, 1.0 - after / variance, len(kinds))[kinds]
+    is_shown = n_shown > LEAST_SHOWN
+    squares = np.bincount(kinds, parameters**2, len(kinds))[kinds]
+    new = np.where(is_shown, np.clip(squares / np.where(is_shown, n_shown, 1.0), LEAST_VARIANCE, 1.0), variance)
+    n_rounds = ahead.n_rounds + 1
+    changed = np.abs(np.log(new / variance)).max(initial=0.0)
+    if changed > VARIANCE_TOLERANCE and n_rounds < VARIANCE_ROUNDS:
+        return Beforehand(new, n_rounds, False, ahead.is_held)
+    is_held = ~is_shown & (variance < 1.0)
+    return Beforehand(np.where(is_held, new, 1.0), n_rounds, True, is_held)
 
 
 def weights(problem: Problem, residual: FloatArray, linear: Linearised) -> tuple[float, FloatArray]:

@@ -59,9 +59,10 @@ def corrections_record(joint: JointAdjustment, names: list[str]) -> list[dict[st
     for block in joint.blocks:
         part = slice(first, first + len(block))
         first += len(block)
+        held = joint.solution.is_held[part]
         values = (
             joint.solution.parameters[part] * block.sigma,
-            joint.solution.parameter_sigma[part] * block.sigma,
+            np.where(held, np.nan, joint.solution.parameter_sigma[part]) * block.sigma,
             block.sigma,
         )
         added, after, before = (described(block, value) for value in values)
