@@ -118,23 +118,23 @@ def step_cells(grid, margin, layout, blocked, has_blocked, run):
                     row[c] = 0 if blocked[p] else row[c]
 
 
-# (p,) b1, (i,) b1, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, i8, f8, (i,r,c) i4, (i,r,c) i4 -> None
+# (p,) b1, (i,) b1, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (2,) i8, (2,i) i8, i8, f8, (i,r,c) i4, (i,r,c) i4 -> None
 @kernel
-def block_reach(blocked, has_blocked, layout, nodes, heights, span, block, margin, lowest, highest):
+def block_reach(blocked, has_blocked, layout, nodes, heights, span, limits, block, margin, lowest, highest):
     """Longest run of height indices at which each view covers each cell of a block.
 
     blocked : (p,) bool, pixels that may not be used (already grown by the window); has_blocked : (i,) whether a view
-    has any; margin : px from the image's border; lowest, highest : (i, r, c) int32, written; HIDDEN, -1 where there is
+    has any; limits : (2, i) lowest and highest index at which the nodes of a view hold; margin : px from the image's border; lowest, highest : (i, r, c) int32, written; HIDDEN, -1 where there is
     no such height.
     """
     grid = np.empty(8)
-    first, end = span[0], span[0] + span[1]
     shape = np.array([lowest.shape[1], lowest.shape[2]])
     run = np.empty((shape[0], shape[1]), np.int32)
     longest = np.empty_like(run)
-    t_low, t_high = heights[0] + first * heights[1], heights[0] + (end - 1) * heights[1]
     for i in range(layout.shape[0]):
-        if surely_covered(nodes, i, t_low, t_high, block, margin, layout[i], blocked, has_blocked[i]):
+        first, end = max(span[0], limits[0, i]), min(span[0] + span[1], limits[1, i] + 1)
+        t_low, t_high = heights[0] + first * heights[1], heights[0] + (end - 1) * heights[1]
+        if first < end and surely_covered(nodes, i, t_low, t_high, block, margin, layout[i], blocked, has_blocked[i]):
             lowest[i] = first
             highest[i] = end - 1
             continue
@@ -177,9 +177,9 @@ def ends_on_relief(relief, span, lowest, highest):
                 highest[r, c] = np.int32(np.floor(np.float32(high) - relief[r, c]))
 
 
-# as block_reach, with (r,c) f4 after its margin, over every block of a tile; ranges : (2,b,d) i8
+# as block_reach, with (r,c) f4 after its margin, over every block of a tile; ranges : (2,b,d) i8; limits : (2,i,b,d) i8
 @kernel
-def tile_reach(blocked, has_blocked, layout, nodes, heights, ranges, block, margin, relief, lowest, highest):
+def tile_reach(blocked, has_blocked, layout, nodes, heights, ranges, limits, block, margin, relief, lowest, highest):
     """`block_reach` of every block of a tile, whose heights are counted from a surface with `relief`.
 
     relief : (r, c) float32, steps by which that surface lies above the one that `nodes` follow within each block.
@@ -192,8 +192,8 @@ def tile_reach(blocked, has_blocked, layout, nodes, heights, ranges, block, marg
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             span[0], span[1] = ranges[0, br, bc], ranges[1, br, bc]
             block_reach(
-                blocked, has_blocked, layout, nodes[:, br : br + 2, bc : bc + 2], heights, span, block, margin,
-                lowest[:, r0:r1, c0:c1], highest[:, r0:r1, c0:c1],
+                blocked, has_blocked, layout, nodes[:, br : br + 2, bc : bc + 2], heights, span, limits[:, :, br, bc],
+                block, margin, lowest[:, r0:r1, c0:c1], highest[:, r0:r1, c0:c1],
             )  # fmt: skip
             for i in range(layout.shape[0]):
                 ends_on_relief(relief[r0:r1, c0:c1], span, lowest[i, r0:r1, c0:c1], highest[i, r0:r1, c0:c1])

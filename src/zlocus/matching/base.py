@@ -112,7 +112,7 @@ class BaseSurface:
         for j in range(n):
             for i in range(j, n):
                 moved[..., j] += comb(i, j) * views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
-        return replace(views, nodes=moved)
+        return replace(views, nodes=moved, ends=views.ends - self.nodes[None, :, :, None])
 
 
 def divided(corners: NDArray[np.float64], times: int) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from zlocus.errors import GeometryError
 from zlocus.matching.radiometry import GreyScale
 from zlocus.scene import View
 from zlocus.sensors.model import Scanning, SensorModel, bare, capped, lowest_station
+from zlocus.sensors.shown_table import shown_table
 from zlocus.sensors.table import (
     DEGREE,
     HIGHER_DEGREE,
@@ -24,14 +25,15 @@ from zlocus.sensors.table import (
 )
 
 FloatImage = NDArray[np.float32]
+FAR = 2**29  # no height index is as large
 MARGIN_PX = 4
 # Table against exact model, in pixels of the level. Coarser levels only guide, and a block of theirs spans so much
 # ground that an aircraft's unsteady flight bends it (0.011 px over the 102 m of the demo's).
 FINEST_TABLE_PX, COARSER_TABLE_PX = 0.01, 0.05
 # Where even the smallest blocks are too bent for that: a wide lens close to high things.
 FINEST_BENT_PX, COARSER_BENT_PX = 0.05, 0.25
-# And at last a view may be left out of this share of a tile's blocks.
-MOST_LOST = 0.5
+# A view may be left out of this share of what it shows (blocks by heights); and at last of this.
+LITTLE_LOST, MOST_LOST = 0.01, 0.5
 SMALLEST_BLOCK = 4
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
@@ -71,7 +73,8 @@ class TileViews:
     int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, n) float64, see `ProjectionTable`, in pixels of the
     window; holds : (i, b, d) bool, blocks that a view can show; lost : (i, b, d) bool, others that it may show, where
     it takes no part all the same because its table does not hold; heights : (2,) float64, t of the tables at height
-    index 0 and per index; block : cells between the nodes.
+    index 0 and per index; ends : (i, b + 1, d + 1, 2) float64, lowest and highest height index, counted from what the
+    nodes follow, over which a corner's polynomial holds; block : cells between the nodes.
     """
 
     pixels: FloatImage
@@ -82,7 +85,17 @@ class TileViews:
     holds: NDArray[np.bool_]
     lost: NDArray[np.bool_]
     heights: NDArray[np.float64]
+    ends: NDArray[np.float64]
     block: int
+
+    @property
+    def limits(self) -> NDArray[np.int64]:
+        """(2, i, b, d), lowest and highest height index at which a block may be seen; the first is the higher one where
+        there is none."""
+        corners = [self.ends[:, i:n, j:m] for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None))]
+        low = np.ceil(np.max([corner[..., 0] for corner in corners], axis=0))
+        high = np.floor(np.min([corner[..., 1] for corner in corners], axis=0))
+        return np.stack([np.where(self.holds, low, FAR), np.where(self.holds, high, -FAR)]).clip(-FAR, FAR).astype(np.int64)
 
 
 def pixel_window(
@@ -181,6 +194,7 @@ def tile_views(
             side = 2 * (half + 2) + 1
             unusable = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
         blocked.append(unusable)
+    heights = np.array([(lattice[0] - tables[0].z_mid) / tables[0].z_half, lattice[1] / tables[0].z_half])
     return TileViews(
         pixels=np.concatenate([view.pixels[level].ravel() for view in views]),
         blocked=np.concatenate([mask.ravel() for mask in blocked]),
@@ -189,7 +203,8 @@ def tile_views(
         nodes=np.ascontiguousarray(np.stack(nodes)),
         holds=np.stack([table.holds for table in tables]),
         lost=np.stack([table.lost for table in tables]),
-        heights=np.array([(lattice[0] - table.z_mid) / table.z_half, lattice[1] / table.z_half]),
+        heights=heights,
+        ends=(np.stack([table.ends for table in tables]) - heights[0]) / heights[1],
         block=block,
     )
 
@@ -213,34 +228,42 @@ def _fitting_tables(
     blocks = [block]
     while blocks[-1] >= 2 * SMALLEST_BLOCK:
         blocks.append(blocks[-1] // 2)
-    attempts = [(block, z_ranges[0], near, DEGREE, 0.0)]
-    attempts += [(b, z_ranges[1], px, HIGHER_DEGREE, 0.0) for px in (near, far) for b in blocks]
-    last = [(HIGHEST_DEGREE, 0.0), (HIGHEST_DEGREE, MOST_LOST)]
-    if any(isinstance(bare(view.sensor), Scanning) for view in views):
-        last.insert(1, (UNSTEADY_DEGREE, 0.0))
-    attempts += [(blocks[-1], z_ranges[1], far, degree, lost) for degree, lost in last]
-    for number, (cells, z_range, px, degree, lost) in enumerate(attempts):
-        try:
-            return [
-                projection_table(
-                    view.sensor,
-                    transform,
-                    shape,
-                    cells,
-                    z_range,
-                    px * 2.0**level,
-                    (*view.origin, *view.shape),
-                    degree,
-                    lost,
-                )
-                for view in views
-            ], cells
-        except GeometryError as error:
-            if number < len(attempts) - 1:
-                continue
-            if len(last) == 2:
-                raise
-            raise GeometryError(
-                f"The flight is too unsteady for its raw images: {error} Or give images resampled to a plane (level 1)."
-            ) from error
-    raise AssertionError("there is one attempt at least")
+    grid = transform, shape
+    whole = _tables(views, _over_all_heights, *grid, block, z_ranges[0], near * 2.0**level, DEGREE, 0.0)
+    if not isinstance(whole, GeometryError):
+        return whole, block
+    attempts = [(b, px, HIGHER_DEGREE, LITTLE_LOST) for px in (near, far) for b in blocks]
+    last = [(HIGHEST_DEGREE, LITTLE_LOST), (HIGHEST_DEGREE, MOST_LOST)]
+    is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in views)
+    if is_scanning:
+        last.insert(1, (UNSTEADY_DEGREE, LITTLE_LOST))
+    for cells, px, degree, lost in (*attempts, *((blocks[-1], far, degree, lost) for degree, lost in last)):
+        tables = _tables(views, _where_shown, *grid, cells, z_ranges[1], px * 2.0**level, degree, lost)
+        if not isinstance(tables, GeometryError):
+            return tables, cells
+    if not is_scanning:
+        raise tables
+    raise GeometryError(
+        f"The flight is too unsteady for its raw images: {tables} Or give images resampled to a plane (level 1)."
+    )
+
+
+def _tables(views, tabulated, transform, shape, block, z_range, tolerance_px, degree, lost):
+    """A table per view, or the error of the first that has none."""
+    try:
+        return [tabulated(view, transform, shape, block, z_range, tolerance_px, degree, lost) for view in views]
+    except GeometryError as error:
+        return error
+
+
+def _over_all_heights(view, transform, shape, block, z_range, tolerance_px, degree, lost):
+    window = (*view.origin, *view.shape)
+    table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px, window, degree)
+    if table.lost.any():
+        raise GeometryError("lost")
+    return table
+
+
+def _where_shown(view, transform, shape, block, z_range, tolerance_px, degree, lost):
+    window = (*view.origin, *view.shape)
+    return shown_table(view.sensor, transform, shape, block, z_range, tolerance_px, window, degree, lost)

@@ -19,6 +19,7 @@ from zlocus.matching.views import TileViews
 IntVolume = NDArray[np.int32]
 BORDER_PX = 3.0
 NOTHING_HIDDEN = -(2**29)
+FEWEST_TO_HIDE = 2
 # Cells per height step by which directions differ within a part of a tile, and parts along a side at most.
 TURN, MOST_PARTS = 0.2, 8
 
@@ -34,12 +35,9 @@ def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> Int
     seen = np.empty((3, len(views.layout), *lattice.shape), np.int32)
     seen[2] = NOTHING_HIDDEN
     tile_reach(
-        views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, lattice.block,
-        BORDER_PX, base.relief, seen[0], seen[1],
+        views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, views.limits,
+        lattice.block, BORDER_PX, base.relief, seen[0], seen[1],
     )  # fmt: skip
-    if not views.holds.all():
-        unmapped = _cells_of(~views.holds, lattice.block, lattice.shape)
-        seen[0][unmapped], seen[1][unmapped] = HIDDEN, -1
     return seen
 
 
@@ -63,6 +61,9 @@ def hide(
 ) -> None:
     """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
 
+    Where two views cover a cell none can be spared: hidden by a false height as likely as by a true one, nothing is left
+    that could tell.
+
     surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it; base : (r, c) float32,
     the base surface that the indices of `seen` are counted from.
     """
@@ -73,6 +74,7 @@ def hide(
             lowest -= base + np.float32(margin_steps)
             np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
             seen[2, i][part] = lowest[part]
+    seen[2][:, covers(seen).sum(axis=0) <= FEWEST_TO_HIDE] = NOTHING_HIDDEN
 
 
 def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -126,11 +128,21 @@ def cells_per_step(views: TileViews, i: int, part: tuple[slice, slice] | None = 
         if not len(shown):
             return 0.0, 0.0
         b, d = shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()]
-    here, right, below = nodes[b, d], nodes[b, d + 1], nodes[b + 1, d]
-    by_cell = np.column_stack([right[:, 0] - here[:, 0], below[:, 0] - here[:, 0]]) / views.block
-    by_step = here[:, 1] * views.heights[1]
+    # At a height where the block is seen: 0, or as near to it as may be.
+    t = min(max(0.0, *_ends_of(views, i, b, d, 0)), *_ends_of(views, i, b, d, 1))
+    powers = t ** np.arange(nodes.shape[-1])
+    slopes = np.arange(1, nodes.shape[-1]) * powers[:-1]
+    here, right, below = (nodes[at] @ powers for at in ((b, d), (b, d + 1), (b + 1, d)))
+    by_cell = np.column_stack([right - here, below - here]) / views.block
+    by_step = nodes[b, d][:, 1:] @ slopes * views.heights[1]
     col, row = -np.linalg.solve(by_cell, by_step)
     return float(col), float(row)
+
+
+def _ends_of(views: TileViews, i: int, b: int, d: int, end: int) -> list[float]:
+    """Lowest (0) or highest (1) t of a block's corners."""
+    at_corners = views.ends[i, b : b + 2, d : d + 2, end].ravel()
+    return [float(views.heights[0] + k * views.heights[1]) for k in at_corners]
 
 
 def metres_per_cell(transform: Affine) -> float:

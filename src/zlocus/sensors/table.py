@@ -30,8 +30,8 @@ class ProjectionTable:
     nodes : (b + 1, d + 1, 2, n) float64, px: corner row, corner column, (x, y), coefficients of 1, t, t^2, ... with
     t = (z - z_mid) / z_half. The corner (b, d) is the centre of cell (b block, d block); between corners positions are
     bilinear. holds : (b, d) bool, blocks in which that is so; the others are not in the image, or the sensor cannot map
-    all of them: they count as not seen. lost : (b, d) bool, those of them that the image may show all the same, at some
-    of the heights.
+    all of them: they count as not seen. lost : (b, d) bool, those that the image may show, at some of the heights, where
+    the table does not hold. ends : (b + 1, d + 1, 2), lowest and highest t over which the polynomial of a corner holds.
     """
 
     nodes: FloatArray
@@ -39,6 +39,7 @@ class ProjectionTable:
     z_half: float
     holds: NDArray[np.bool_]
     lost: NDArray[np.bool_]
+    ends: FloatArray
 
 
 def projection_table(
@@ -70,26 +71,31 @@ def projection_table(
     z_mid, z_half = (z_range[0] + z_range[1]) / 2, max((z_range[1] - z_range[0]) / 2, 0.5)
     t = np.cos((np.arange(degree + 1) + 0.5) * np.pi / (degree + 1))
     fit = np.linalg.inv(np.vander(t, increasing=True))
-    positions = np.stack([_project(sensor, transform, rows, cols, z_mid + z_half * v) for v in t], axis=-1)
+    positions = np.stack([project_cells(sensor, transform, rows, cols, z_mid + z_half * v) for v in t], axis=-1)
     shown = np.zeros(positions.shape[:2], bool) if window is None else _shows_any(positions, window)
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
     whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
     shows = shown[:-1, :-1] | shown[1:, :-1] | shown[:-1, 1:] | shown[1:, 1:]
-    table = ProjectionTable(nodes, z_mid, z_half, whole, ~whole & shows)
+    ends = np.broadcast_to((-np.inf, np.inf), (*known.shape, 2))
+    table = ProjectionTable(nodes, z_mid, z_half, whole, ~whole & shows, ends)
     gaps = table_gaps(table, sensor, transform, block)
     unmapped = (~whole | np.isnan(gaps)) & shows
     bad = table.holds & (gaps > tolerance_px)
     if bad.any() and window is not None:
         bad &= _may_show(table, gaps, window)
     if bad.sum() > most_lost * bad.size:
-        raise GeometryError(
-            f"A projection table of {block} cells is {gaps[bad].max():.3g} px from the exact model (allowed "
-            f"{tolerance_px} px) between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer "
-            "heights."
-        )
+        raise projection_error(block, float(gaps[bad].max()), tolerance_px, z_range)
     return replace(table, holds=table.holds & (gaps <= tolerance_px), lost=bad | unmapped)
+
+
+def projection_error(block: int, gap_px: float, tolerance_px: float, z_range: tuple[float, float]) -> GeometryError:
+    """What is wrong with a table."""
+    return GeometryError(
+        f"A projection table of {block} cells is {gap_px:.3g} px from the exact model (allowed {tolerance_px} px) between "
+        f"heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer heights."
+    )
 
 
 def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, block: int) -> FloatArray:
@@ -101,7 +107,7 @@ def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, b
     centre = 0.25 * (table.nodes[:-1, :-1] + table.nodes[1:, :-1] + table.nodes[:-1, 1:] + table.nodes[1:, 1:])
     worst = np.zeros((n_b, n_d))
     for t in CHECKED:
-        exact = _project(sensor, transform, rows, cols, table.z_mid + t * table.z_half)
+        exact = project_cells(sensor, transform, rows, cols, table.z_mid + t * table.z_half)
         worst = np.maximum(worst, np.linalg.norm(centre @ t ** np.arange(centre.shape[-1]) - exact, axis=-1))
     return worst
 
@@ -125,7 +131,7 @@ def _may_show(table: ProjectionTable, gaps: FloatArray, window: tuple[int, int, 
     return np.asarray(((high >= (col, row)) & (low <= (col + n_cols - 1, row + n_rows - 1))).all(axis=-1))
 
 
-def _project(sensor: SensorModel, transform: Affine, rows: FloatArray, cols: FloatArray, z: float) -> FloatArray:
+def project_cells(sensor: SensorModel, transform: Affine, rows: FloatArray, cols: FloatArray, z: float) -> FloatArray:
     """Image positions of cell centres at one height: (b, d, 2) px."""
     col, row = np.meshgrid(cols + 0.5, rows + 0.5)
     x, y = transform.a * col + transform.b * row + transform.c, transform.d * col + transform.e * row + transform.f
