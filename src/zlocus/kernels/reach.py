@@ -124,8 +124,8 @@ def block_reach(blocked, has_blocked, layout, nodes, heights, span, limits, bloc
     """Longest run of height indices at which each view covers each cell of a block.
 
     blocked : (p,) bool, pixels that may not be used (already grown by the window); has_blocked : (i,) whether a view
-    has any; limits : (2, i) lowest and highest index at which the nodes of a view hold; margin : px from the image's border; lowest, highest : (i, r, c) int32, written; HIDDEN, -1 where there is
-    no such height.
+    has any; limits : (2, i) lowest and highest index at which the nodes of a view hold; margin : px from the image's
+    border; lowest, highest : (i, r, c) int32, written; HIDDEN, -1 where there is no such height.
     """
     grid = np.empty(8)
     shape = np.array([lowest.shape[1], lowest.shape[2]])

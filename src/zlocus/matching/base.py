@@ -112,7 +112,9 @@ class BaseSurface:
         for j in range(n):
             for i in range(j, n):
                 moved[..., j] += comb(i, j) * views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
-        return replace(views, nodes=moved, ends=views.ends - self.nodes[None, :, :, None])
+        corners = np.stack([self.nodes[i:n, j:m] for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None))])
+        ends = views.ends - np.stack([corners.min(axis=0), corners.max(axis=0)], axis=-1)
+        return replace(views, nodes=moved, ends=ends)
 
 
 def divided(corners: NDArray[np.float64], times: int) -> NDArray[np.float64]:

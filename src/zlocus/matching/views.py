@@ -16,8 +16,6 @@ from zlocus.scene import View
 from zlocus.sensors.model import Scanning, SensorModel, bare, capped, lowest_station
 from zlocus.sensors.shown_table import shown_table
 from zlocus.sensors.table import (
-    DEGREE,
-    HIGHER_DEGREE,
     HIGHEST_DEGREE,
     UNSTEADY_DEGREE,
     ProjectionTable,
@@ -34,7 +32,7 @@ FINEST_TABLE_PX, COARSER_TABLE_PX = 0.01, 0.05
 FINEST_BENT_PX, COARSER_BENT_PX = 0.05, 0.25
 # A view may be left out of this share of what it shows (blocks by heights); and at last of this.
 LITTLE_LOST, MOST_LOST = 0.01, 0.5
-SMALLEST_BLOCK = 4
+SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
 
@@ -73,8 +71,8 @@ class TileViews:
     int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, n) float64, see `ProjectionTable`, in pixels of the
     window; holds : (i, b, d) bool, blocks that a view can show; lost : (i, b, d) bool, others that it may show, where
     it takes no part all the same because its table does not hold; heights : (2,) float64, t of the tables at height
-    index 0 and per index; ends : (i, b + 1, d + 1, 2) float64, lowest and highest height index, counted from what the
-    nodes follow, over which a corner's polynomial holds; block : cells between the nodes.
+    index 0 and per index; ends : (i, b, d, 2) float64, lowest and highest height index, counted from what the nodes
+    follow, over which a block's polynomials hold; block : cells between the nodes.
     """
 
     pixels: FloatImage
@@ -92,10 +90,9 @@ class TileViews:
     def limits(self) -> NDArray[np.int64]:
         """(2, i, b, d), lowest and highest height index at which a block may be seen; the first is the higher one where
         there is none."""
-        corners = [self.ends[:, i:n, j:m] for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None))]
-        low = np.ceil(np.max([corner[..., 0] for corner in corners], axis=0))
-        high = np.floor(np.min([corner[..., 1] for corner in corners], axis=0))
-        return np.stack([np.where(self.holds, low, FAR), np.where(self.holds, high, -FAR)]).clip(-FAR, FAR).astype(np.int64)
+        low = np.where(self.holds, np.ceil(self.ends[..., 0]), FAR)
+        high = np.where(self.holds, np.floor(self.ends[..., 1]), -FAR)
+        return np.stack([low, high]).clip(-FAR, FAR).astype(np.int64)
 
 
 def pixel_window(
@@ -217,53 +214,62 @@ def _fitting_tables(
     block: int,
     z_ranges: tuple[tuple[float, float], tuple[float, float]],
 ) -> tuple[list[ProjectionTable], int]:
-    """A table per view that holds to a tolerance, and its block: as asked for, where need be over the second, shorter
-    range of heights only and of a higher degree, where need be halved, and where that is not enough either to the
-    wider tolerance and of the highest degree. A view is left out of blocks (see `TileViews.lost`) only after all that.
+    """A table per view that holds to a tolerance, and its block: as asked for and over all heights, where need be over
+    those of the second, shorter range at which each block is shown and of a higher degree, where need be halved, and
+    where that is not enough either to the wider tolerance and of the highest degree. A view is left out of more than a
+    few blocks (see `TileViews.lost`) only after all that.
 
     Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones. So does
     an unsteady flight in raw images of line scanners, far more than any perspective, which get a still higher degree.
     """
     near, far = (COARSER_TABLE_PX, COARSER_BENT_PX) if level else (FINEST_TABLE_PX, FINEST_BENT_PX)
+    tables = _tables_over_all_heights(views, transform, shape, block, z_ranges[0], near * 2.0**level)
+    if tables is not None:
+        return tables, block
     blocks = [block]
-    while blocks[-1] >= 2 * SMALLEST_BLOCK:
+    while blocks[-1] >= 2 * SMALL_BLOCK:
         blocks.append(blocks[-1] // 2)
-    grid = transform, shape
-    whole = _tables(views, _over_all_heights, *grid, block, z_ranges[0], near * 2.0**level, DEGREE, 0.0)
-    if not isinstance(whole, GeometryError):
-        return whole, block
-    attempts = [(b, px, HIGHER_DEGREE, LITTLE_LOST) for px in (near, far) for b in blocks]
-    last = [(HIGHEST_DEGREE, LITTLE_LOST), (HIGHEST_DEGREE, MOST_LOST)]
     is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in views)
-    if is_scanning:
-        last.insert(1, (UNSTEADY_DEGREE, LITTLE_LOST))
-    for cells, px, degree, lost in (*attempts, *((blocks[-1], far, degree, lost) for degree, lost in last)):
-        tables = _tables(views, _where_shown, *grid, cells, z_ranges[1], px * 2.0**level, degree, lost)
-        if not isinstance(tables, GeometryError):
-            return tables, cells
+    attempts = [(b, near, HIGHEST_DEGREE, 0.0) for b in blocks if b > SMALL_BLOCK]
+    attempts += [(b, far, HIGHEST_DEGREE, 0.0) for b in blocks]
+    attempts += [(SMALL_BLOCK, far, HIGHEST_DEGREE, LITTLE_LOST), (SMALLEST_BLOCK, far, HIGHEST_DEGREE, 0.0)]
+    attempts += [(SMALLEST_BLOCK, far, UNSTEADY_DEGREE, 0.0)] * is_scanning
+    attempts += [(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MOST_LOST)]
+    for cells, px, degree, lost in attempts:
+        try:
+            return [
+                shown_table(
+                    view.sensor, transform, shape, cells, z_ranges[1], px * 2.0**level, (*view.origin, *view.shape),
+                    degree, lost > 0.0, max(lost, LITTLE_LOST),
+                )
+                for view in views
+            ], cells  # fmt: skip
+        except GeometryError as error:
+            bent = error
     if not is_scanning:
-        raise tables
+        raise bent
     raise GeometryError(
-        f"The flight is too unsteady for its raw images: {tables} Or give images resampled to a plane (level 1)."
+        f"The flight is too unsteady for its raw images: {bent} Or give images resampled to a plane (level 1)."
     )
 
 
-def _tables(views, tabulated, transform, shape, block, z_range, tolerance_px, degree, lost):
-    """A table per view, or the error of the first that has none."""
-    try:
-        return [tabulated(view, transform, shape, block, z_range, tolerance_px, degree, lost) for view in views]
-    except GeometryError as error:
-        return error
-
-
-def _over_all_heights(view, transform, shape, block, z_range, tolerance_px, degree, lost):
-    window = (*view.origin, *view.shape)
-    table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px, window, degree)
-    if table.lost.any():
-        raise GeometryError("lost")
-    return table
-
-
-def _where_shown(view, transform, shape, block, z_range, tolerance_px, degree, lost):
-    window = (*view.origin, *view.shape)
-    return shown_table(view.sensor, transform, shape, block, z_range, tolerance_px, window, degree, lost)
+def _tables_over_all_heights(
+    views: Sequence[ViewPixels],
+    transform: Affine,
+    shape: tuple[int, int],
+    block: int,
+    z_range: tuple[float, float],
+    tolerance_px: float,
+) -> list[ProjectionTable] | None:
+    """A table per view; None where one of them does not hold, or not wherever its window shows something."""
+    tables = []
+    for view in views:
+        window = (*view.origin, *view.shape)
+        try:
+            table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px, window)
+        except GeometryError:
+            return None
+        if table.lost.any():
+            return None
+        tables.append(table)
+    return tables

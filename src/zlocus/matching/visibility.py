@@ -61,8 +61,8 @@ def hide(
 ) -> None:
     """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
 
-    Where two views cover a cell none can be spared: hidden by a false height as likely as by a true one, nothing is left
-    that could tell.
+    Where two views cover a cell none can be spared: hidden by a false height as likely as by a true one, nothing is
+    left that could tell.
 
     surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it; base : (r, c) float32,
     the base surface that the indices of `seen` are counted from.
@@ -129,7 +129,8 @@ def cells_per_step(views: TileViews, i: int, part: tuple[slice, slice] | None = 
             return 0.0, 0.0
         b, d = shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()]
     # At a height where the block is seen: 0, or as near to it as may be.
-    t = min(max(0.0, *_ends_of(views, i, b, d, 0)), *_ends_of(views, i, b, d, 1))
+    low, high = views.heights[0] + views.ends[i, b, d] * views.heights[1]
+    t = float(min(max(0.0, low), high))
     powers = t ** np.arange(nodes.shape[-1])
     slopes = np.arange(1, nodes.shape[-1]) * powers[:-1]
     here, right, below = (nodes[at] @ powers for at in ((b, d), (b, d + 1), (b + 1, d)))
@@ -137,12 +138,6 @@ def cells_per_step(views: TileViews, i: int, part: tuple[slice, slice] | None = 
     by_step = nodes[b, d][:, 1:] @ slopes * views.heights[1]
     col, row = -np.linalg.solve(by_cell, by_step)
     return float(col), float(row)
-
-
-def _ends_of(views: TileViews, i: int, b: int, d: int, end: int) -> list[float]:
-    """Lowest (0) or highest (1) t of a block's corners."""
-    at_corners = views.ends[i, b : b + 2, d : d + 2, end].ravel()
-    return [float(views.heights[0] + k * views.heights[1]) for k in at_corners]
 
 
 def metres_per_cell(transform: Affine) -> float:

@@ -14,13 +14,13 @@ from affine import Affine
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from zlocus.errors import GeometryError
 from zlocus.sensors.model import FloatArray, SensorModel
 from zlocus.sensors.table import NOWHERE_PX, ProjectionTable, project_cells, projection_error
 
 BoolArray = NDArray[np.bool_]
-# Heights at which it is looked whether an image shows a block, and at which its table is checked.
-SAMPLES, CHECKS = 33, 7
+# Heights at which it is looked whether an image shows a block, and whether its table is exact.
+SAMPLES = 33
+CORNERS = tuple((slice(i, n), slice(j, m)) for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None)))
 # Coefficients this small (share of the tolerance) are dropped: over a short part of the heights they would be large
 # numbers that cancel.
 NEGLIGIBLE = 0.02
@@ -46,38 +46,51 @@ def shown_table(
     tolerance_px: float,
     window: tuple[int, int, int, int],
     degree: int,
+    may_bend: bool,
     most_lost: float,
 ) -> ProjectionTable:
-    """Tabulate `sensor` over a grid of cells, at each corner over the heights at which `window` shows what is around it.
+    """Tabulate `sensor` over a grid of cells, each block over the heights at which `window` shows it.
 
-    See `projection_table`. most_lost : share of what the window shows (blocks by heights) in which the table need not
-    hold.
+    See `projection_table`. Heights at which a block is too bent are left out, and with them those beyond. may_bend :
+    whether that may be; most_lost : share of what the window shows (blocks by heights) that may be left out.
 
     Raises
     ------
     GeometryError
-        Where it does not hold in more.
+        Where more is left out.
     """
     rows = block * np.arange(-(-shape[0] // block) + 1, dtype=np.float64)
     cols = block * np.arange(-(-shape[1] // block) + 1, dtype=np.float64)
     z_mid, z_half = (z_range[0] + z_range[1]) / 2, max((z_range[1] - z_range[0]) / 2, 0.5)
     t = np.linspace(-1.0, 1.0, SAMPLES)
-    shown = shown_at(np.stack([project_cells(sensor, transform, rows, cols, z_mid + z_half * v) for v in t], -1), window)
-    ends = corner_ends(shown, t)
+    shown = shown_at(_at_heights(sensor, transform, rows, cols, z_mid + z_half * t), window)
+    first, last = corner_runs(shown)
+    ends = np.stack([t[first], t[last]], axis=-1)
     nodes = fitted(sensor, transform, rows, cols, ends, (z_mid, z_half), degree, NEGLIGIBLE * tolerance_px)
-    low = np.max([ends[corner][..., 0] for corner in CORNERS], axis=0)
-    high = np.min([ends[corner][..., 1] for corner in CORNERS], axis=0)
-    table = ProjectionTable(nodes, z_mid, z_half, low <= high, np.zeros(low.shape, bool), ends)
-    gaps = gaps_where_shown(table, sensor, transform, block, np.stack([low, high], -1), window)
-    bent = table.holds & (gaps > tolerance_px)
-    outside = (t < low[..., None]) | (t > high[..., None]) | bent[..., None]
-    lost = shown.missed | (shown.near & outside)
-    if lost.sum() > most_lost * (shown.near | shown.missed).sum():
-        raise projection_error(block, float(gaps[bent].max(initial=0.0)), tolerance_px, z_range)
-    return ProjectionTable(nodes, z_mid, z_half, table.holds & ~bent, np.asarray(lost.any(axis=-1)), ends)
+    middle = np.mean([nodes[corner] for corner in CORNERS], axis=0)
+    exact = _at_heights(sensor, transform, rows[:-1] + block / 2, cols[:-1] + block / 2, z_mid + z_half * t)
+    gaps = np.linalg.norm(middle @ np.vander(t, degree + 1, increasing=True).T - exact, axis=2)
+    begins, stops = (f([k[corner] for corner in CORNERS], axis=0) for f, k in ((np.max, first), (np.min, last)))
+    fits = (np.arange(SAMPLES) >= begins[..., None]) & (np.arange(SAMPLES) <= stops[..., None])
+    bent = shown.near & fits & ~(gaps <= tolerance_px)
+    holds = shown.near & fits & ~bent
+    low, high = longest_run(holds)
+    some = holds.any(axis=-1)
+    kept = some[..., None] & (np.arange(SAMPLES) >= low[..., None]) & (np.arange(SAMPLES) <= high[..., None])
+    lost = shown.missed | (shown.near & ~kept)
+    if (bent.any() and not may_bend) or lost.sum() > most_lost * (shown.near | shown.missed).sum():
+        raise projection_error(block, float(np.nanmax(gaps[shown.near & fits], initial=0.0)), tolerance_px, z_range)
+    # What reaches the ends of the heights goes on beyond them.
+    low_t, high_t = np.where(low == 0, -np.inf, t[low]), np.where(high == SAMPLES - 1, np.inf, t[high])
+    limits = np.stack([np.where(some, low_t, np.inf), np.where(some, high_t, -np.inf)], axis=-1)
+    return ProjectionTable(nodes, z_mid, z_half, some, np.asarray(lost.any(axis=-1)), limits)
 
 
-CORNERS = tuple((slice(i, n), slice(j, m)) for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None)))
+def _at_heights(
+    sensor: SensorModel, transform: Affine, rows: FloatArray, cols: FloatArray, heights: FloatArray
+) -> FloatArray:
+    """Image positions (b, d, 2, s) px of cells at heights (s,) m."""
+    return np.stack([project_cells(sensor, transform, rows, cols, float(z)) for z in heights], axis=-1)
 
 
 def shown_at(positions: FloatArray, window: tuple[int, int, int, int]) -> Shown:
@@ -94,23 +107,15 @@ def shown_at(positions: FloatArray, window: tuple[int, int, int, int]) -> Shown:
     return Shown(known, meets & whole, meets & ~whole)
 
 
-def corner_ends(shown: Shown, t: FloatArray) -> FloatArray:
-    """(b + 1, d + 1, 2) lowest and highest t of the longest run of heights at which a block around each corner is shown,
-    and the samples before and after it where the corner is known there; inf and -inf where there is none."""
+def corner_runs(shown: Shown) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last of the longest run of heights (b + 1, d + 1) at which a block around each corner is shown; the
+    first is the higher one where there is none."""
     near = np.zeros(shown.known.shape, bool)
     for corner in CORNERS:
         near[corner] |= shown.near
-    near &= shown.known
-    first, last = longest_run(near)
-    b, d = np.indices(first.shape)
-    before, after = np.maximum(first - 1, 0), np.minimum(last + 1, len(t) - 1)
-    first = np.where(shown.known[b, d, before], before, first)
-    last = np.where(shown.known[b, d, after], after, last)
-    # What reaches the ends of the heights goes on beyond them.
-    low = np.where(first == 0, -np.inf, t[first])
-    high = np.where(last == len(t) - 1, np.inf, t[last])
+    first, last = longest_run(near & shown.known)
     some = near.any(axis=-1)
-    return np.stack([np.where(some, low, np.inf), np.where(some, high, -np.inf)], axis=-1)
+    return np.where(some, first, shown.known.shape[-1] - 1), np.where(some, last, 0)
 
 
 def longest_run(flags: BoolArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -134,16 +139,17 @@ def fitted(
     degree: int,
     negligible_px: float,
 ) -> FloatArray:
-    """Polynomials in t (b + 1, d + 1, 2, n) px through Chebyshev nodes between the ends of each corner; NOWHERE_PX where
-    a corner has none. heights : z_mid and z_half."""
+    """Polynomials in t (b + 1, d + 1, 2, n) px through Chebyshev nodes between the ends of each corner, (b + 1, d + 1,
+    2); NOWHERE_PX where it has none. heights : z_mid and z_half."""
     nodes = np.zeros((len(rows), len(cols), 2, degree + 1))
     nodes[..., 0] = NOWHERE_PX
     at = ends[..., 0] <= ends[..., 1]
-    low, high = np.clip(ends[at][:, 0], -1.0, 1.0), np.clip(ends[at][:, 1], -1.0, 1.0)
+    low, high = ends[at].T
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-3)
     s = np.cos((np.arange(degree + 1) + 0.5) * np.pi / (degree + 1))
     b, d = np.nonzero(at)
-    x, y = transform * (cols[d] + 0.5, rows[b] + 0.5)
+    col, row = cols[d] + 0.5, rows[b] + 0.5
+    x, y = transform.a * col + transform.b * row + transform.c, transform.d * col + transform.e * row + transform.f
     z = heights[0] + heights[1] * (middle[:, None] + half[:, None] * s)
     xyz = np.column_stack([np.repeat(x, len(s)), np.repeat(y, len(s)), z.ravel()])
     values = sensor.image_from_ground(xyz).reshape(-1, len(s), 2)
@@ -171,32 +177,4 @@ def shifted(local: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArr
         raised[..., 1:] += a * out[..., :-1]
         out = raised
         out[..., 0] += local[..., k]
-    return out
-
-
-def gaps_where_shown(
-    table: ProjectionTable,
-    sensor: SensorModel,
-    transform: Affine,
-    block: int,
-    ends: FloatArray,
-    window: tuple[int, int, int, int],
-) -> FloatArray:
-    """Largest distance (b, d) px of the table from the exact model at block centres, over heights between the ends
-    (b, d, 2) of each block at which it puts the centre into the window or about it."""
-    b, d = np.nonzero(table.holds)
-    row, col, n_rows, n_cols = window
-    low, high = np.clip(ends[b, d], -1.0, 1.0).T
-    x, y = transform * (block * (d + 0.5) + 0.5, block * (b + 0.5) + 0.5)
-    corners = np.stack([table.nodes[corner][b, d] for corner in CORNERS])
-    powers, worst = np.arange(table.nodes.shape[-1]), np.zeros(len(b))
-    for share in np.linspace(0.0, 1.0, CHECKS):
-        t = low + share * (high - low)
-        at = np.einsum("kcxp,cp->kcx", corners, t[:, None] ** powers)
-        exact = sensor.image_from_ground(np.column_stack([x, y, table.z_mid + table.z_half * t]))
-        gap = np.linalg.norm(at.mean(axis=0) - exact, axis=1)
-        inside = (at.max(axis=0) >= (col, row)) & (at.min(axis=0) <= (col + n_cols - 1, row + n_rows - 1))
-        worst = np.where(inside.all(axis=1), np.maximum(worst, np.nan_to_num(gap, nan=np.inf)), worst)
-    out = np.zeros(table.holds.shape)
-    out[b, d] = worst
     return out

@@ -30,8 +30,8 @@ class ProjectionTable:
     nodes : (b + 1, d + 1, 2, n) float64, px: corner row, corner column, (x, y), coefficients of 1, t, t^2, ... with
     t = (z - z_mid) / z_half. The corner (b, d) is the centre of cell (b block, d block); between corners positions are
     bilinear. holds : (b, d) bool, blocks in which that is so; the others are not in the image, or the sensor cannot map
-    all of them: they count as not seen. lost : (b, d) bool, those that the image may show, at some of the heights, where
-    the table does not hold. ends : (b + 1, d + 1, 2), lowest and highest t over which the polynomial of a corner holds.
+    all of them: they count as not seen. lost : (b, d) bool, those that the image may show, at some of the heights,
+    where the table does not hold. ends : (b, d, 2), lowest and highest t over which a block's polynomials hold.
     """
 
     nodes: FloatArray
@@ -78,7 +78,7 @@ def projection_table(
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
     whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
     shows = shown[:-1, :-1] | shown[1:, :-1] | shown[:-1, 1:] | shown[1:, 1:]
-    ends = np.broadcast_to((-np.inf, np.inf), (*known.shape, 2))
+    ends = np.broadcast_to((-np.inf, np.inf), (*whole.shape, 2))
     table = ProjectionTable(nodes, z_mid, z_half, whole, ~whole & shows, ends)
     gaps = table_gaps(table, sensor, transform, block)
     unmapped = (~whole | np.isnan(gaps)) & shows
@@ -93,8 +93,8 @@ def projection_table(
 def projection_error(block: int, gap_px: float, tolerance_px: float, z_range: tuple[float, float]) -> GeometryError:
     """What is wrong with a table."""
     return GeometryError(
-        f"A projection table of {block} cells is {gap_px:.3g} px from the exact model (allowed {tolerance_px} px) between "
-        f"heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer heights."
+        f"A projection table of {block} cells is {gap_px:.3g} px from the exact model (allowed {tolerance_px} px) "
+        f"between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer heights."
     )
 
 
