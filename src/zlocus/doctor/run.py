@@ -24,7 +24,7 @@ from zlocus.products.footprints import footprints_picture, write_footprints
 from zlocus.products.record import write_record
 from zlocus.progress import Progress
 from zlocus.request import DoctorRequest
-from zlocus.scene import Scene, check_overlap, is_local
+from zlocus.scene import Scene, check_overlap
 
 REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
 T = TypeVar("T")
@@ -143,11 +143,6 @@ def planned(
     told: Told,
 ) -> Any:
     """The plan of a run, unless it would fail before."""
-    if is_local(corrected.crs):
-        told.findings.append(
-            Finding(POOR, "The scene's frame is local: `zlocus cloud` takes it, `zlocus dsm` does not, for its grid.")
-        )
-        return None
     plan = told.tried(lambda: run_plan(request, config, corrected, ties, [each.outline for each in geometry]))
     if plan is not None:
         told.findings += plan_findings(plan, request.memory_gb)

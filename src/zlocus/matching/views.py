@@ -33,6 +33,8 @@ FINEST_BENT_PX, COARSER_BENT_PX = 0.05, 0.25
 # And at last a view may be left out of this share of a tile's blocks.
 MOST_LOST = 0.5
 SMALLEST_BLOCK = 4
+# The windows' borders make smaller blocks than this twice as slow per cell.
+LEAST_EFFICIENT = 8
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
 
@@ -213,8 +215,11 @@ def _fitting_tables(
     blocks = [block]
     while blocks[-1] >= 2 * SMALLEST_BLOCK:
         blocks.append(blocks[-1] // 2)
+    large, small = [b for b in blocks if b >= LEAST_EFFICIENT], [b for b in blocks if b < LEAST_EFFICIENT]
     attempts = [(block, z_ranges[0], near, DEGREE, 0.0)]
-    attempts += [(b, z_ranges[1], px, HIGHER_DEGREE, 0.0) for px in (near, far) for b in blocks]
+    attempts += [(b, z_ranges[1], near, HIGHER_DEGREE, 0.0) for b in large]
+    attempts += [(b, z_ranges[1], far, HIGHER_DEGREE, 0.0) for b in large[-1:]]
+    attempts += [(b, z_ranges[1], px, HIGHER_DEGREE, 0.0) for px in (near, far) for b in small]
     last = [(HIGHEST_DEGREE, 0.0), (HIGHEST_DEGREE, MOST_LOST)]
     if any(isinstance(bare(view.sensor), Scanning) for view in views):
         last.insert(1, (UNSTEADY_DEGREE, 0.0))
