@@ -13,6 +13,7 @@ import numpy as np
 from zlocus.doctor.findings import POOR, STOPS, Finding
 from zlocus.doctor.geometry import PairGeometry, ViewGeometry, geometry_findings, pair_geometries, view_geometry
 from zlocus.doctor.plan import plan_findings, run_plan
+from zlocus.doctor.plane import plane_findings
 from zlocus.doctor.quality import image_quality, quality_findings
 from zlocus.doctor.report import Diagnosis
 from zlocus.doctor.ties import QuickTies, quick_ties, tie_findings
@@ -103,6 +104,7 @@ def examined(
         told.findings += geometry_findings(names, geometry, pairs)
         if ties is not None:
             told.findings += tie_findings(names, ties.orientation, pairs, config.orientation)
+            told.findings += plane_findings(corrected, request.inputs, ties.orientation)
             plan = planned(request, config, corrected, ties, geometry, told)
     return Diagnosis(
         scene.views, tuple(quality), geometry, pairs, ties, plan, usable.refused, tuple(dict.fromkeys(told.findings))
