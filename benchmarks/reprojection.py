@@ -23,8 +23,8 @@ from zlocus.scene import View
 WINDOW = 11
 # A cell is hidden where the surface stands so many cells above its ray.
 CLEAR_CELLS = 3.0
-# Side of the squares of cells that a ray may pass over at once.
-SQUARE = 16
+# Side of the squares of cells that a ray may pass over at once, and of those that are hidden, or not, together.
+SQUARE, ALIKE = 16, 2
 # Share of a window that both images must see.
 LEAST_SEEN = 0.5
 # Product of the variances of two windows, grey values squared, of which one is even.
@@ -100,29 +100,40 @@ def clear_cells(height, highest, cam_col, cam_row, cam_height, margin, out):
     A square that the ray enters above its highest cell is skipped.
     """
     n_rows, n_cols = height.shape
-    top = highest.max() - margin
-    for r in range(n_rows):
-        for c in range(n_cols):
-            z = height[r, c]
-            out[r, c] = False
-            if np.isnan(z) or not cam_height > z:
-                continue
-            by_col, by_row, by_height = cam_col - c, cam_row - r, cam_height - z
-            n_steps = max(abs(by_col), abs(by_row))
-            by_col, by_row, by_height = by_col / n_steps, by_row / n_steps, by_height / n_steps
-            out[r, c], step = True, 1.0
-            while step <= n_steps:
-                ray, at_row, at_col = z + by_height * step, r + by_row * step, c + by_col * step
-                row, col = int(np.rint(at_row)), int(np.rint(at_col))
-                if ray > top or row < 0 or col < 0 or row >= n_rows or col >= n_cols:
+    for r in range(0, n_rows, ALIKE):
+        for c in range(0, n_cols, ALIKE):
+            clear = False
+            for k in range(ALIKE**2):
+                row, col = min(r + k // ALIKE, n_rows - 1), min(c + k % ALIKE, n_cols - 1)
+                if not np.isnan(height[row, col]):
+                    clear = is_clear(height, highest, row, col, (cam_col, cam_row, cam_height), margin)
                     break
-                if highest[row // SQUARE, col // SQUARE] > ray + margin:
-                    if height[row, col] > ray + margin:
-                        out[r, c] = False
-                        break
-                    step += 1.0
-                else:
-                    step += max(np.floor(min(way_out(at_row, by_row), way_out(at_col, by_col))), 1.0)
+            out[r : r + ALIKE, c : c + ALIKE] = clear
+
+
+# (r,c) f4, (b,d) f4, i8, i8, (3,) f8, f8 -> b1
+@kernel
+def is_clear(height, highest, r, c, camera, margin):
+    """Whether the ray from one cell stays above the surface. camera : column, row, height in cells."""
+    z, (n_rows, n_cols) = height[r, c], height.shape
+    if not camera[2] > z:
+        return False
+    by_col, by_row, by_height = camera[0] - c, camera[1] - r, camera[2] - z
+    n_steps = max(abs(by_col), abs(by_row))
+    by_col, by_row, by_height = by_col / n_steps, by_row / n_steps, by_height / n_steps
+    step = 1.0
+    while step <= n_steps:
+        ray, at_row, at_col = z + by_height * step, r + by_row * step, c + by_col * step
+        row, col = int(np.rint(at_row)), int(np.rint(at_col))
+        if row < 0 or col < 0 or row >= n_rows or col >= n_cols:
+            break
+        if highest[row // SQUARE, col // SQUARE] > ray + margin:
+            if height[row, col] > ray + margin:
+                return False
+            step += 1.0
+        else:
+            step += max(np.floor(min(way_out(at_row, by_row), way_out(at_col, by_col))), 1.0)
+    return True
 
 
 # f8, f8 -> f8
