@@ -28,9 +28,10 @@ from pyproj import CRS, Transformer
 import terrain_features
 from baselines import baselines
 from middlebury import CASES, judge
+from reprojection import Surface, reprojected
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
-from zlocus.io.scene_file import open_scene
+from zlocus.io.scene_file import open_scene, read_scene_file, write_scene_file
 from zlocus.scene import Scene
 from zlocus.synthetic.mixed import SENSORS
 from zlocus.synthetic.scenes import demo_spec
@@ -59,6 +60,9 @@ SPEED_SIDE_CELLS, SPEED_SEED = 2048, 12
 SPEED_BARS_S = {"six": 8.0, "three": 4.0}
 POINTING_PX = {"city": 0, "hills": 4}
 SHARED_SCENES = {"city": "rendered-city", "hills": "rendered-hills-biased"}
+# Directions in the axes of the facade's cameras: out of the wall, and up along it. Heights are moved by so much to see
+# what the correlations are worth.
+FACADE_UP, FACADE_NORTH, MOVED_M = (-0.733, 0.68, 0.0), (0.0, 0.0, -1.0), 0.05
 # In a small process of its own: a child's peak memory counts from what its parent held when it was started.
 MEASURE = """
 import resource, subprocess, sys
@@ -464,6 +468,38 @@ def tuniu(at: Workplace) -> list[Figure]:
     ]
 
 
+def herzjesu(at: Workplace) -> list[Figure]:
+    """Eight photographs of a facade in a local frame: heights from every second one, seen by the others."""
+    scene = at.scene("herzjesu_p8")
+    at.out.mkdir(parents=True, exist_ok=True)
+    frame = ["--up", *FACADE_UP, "--north", *FACADE_NORTH]
+    run([ZLOCUS, "import", "strecha", scene, *frame, "-o", at.out / "scene.yaml", "--overwrite"])
+    written = read_scene_file(at.out / "scene.yaml")
+    write_scene_file(at.out / "half.yaml", written.model_copy(update={"views": written.views[::2]}))
+    used = run([ZLOCUS, "dsm", at.out / "half.yaml", "-o", at.out / "dsm", "--overwrite"], accept=(0, COVERAGE_SHORT))
+    record = json.loads((at.out / "dsm" / "run.json").read_text())
+    views, surface = open_scene([at.out / "scene.yaml"]).views, Surface.read(at.out / "dsm" / "dsm.tif")
+    found = reprojected(surface, views[::2], views[1::2])
+    together = np.concatenate([one.ncc for one in found.values()])
+    figures = [Figure("left-out images, median NCC", float(np.median(together)), at_least=0.7)]
+    for name, one in found.items():
+        figures.append(Figure(f"image {name}, median NCC", one.median))
+        for what in ("hidden", "outside", "untextured", "at_rim"):
+            figures.append(Figure(f"image {name}, {what.replace('_', ' ')}", getattr(one, what) / one.with_height))
+        figures.append(Figure(f"image {name}, compared", len(one.ncc) / one.with_height))
+    worse = reprojected(surface, views[::2], views[1::2], MOVED_M)
+    ncc = float(np.median(np.concatenate([one.ncc for one in worse.values()])))
+    figures.append(Figure(f"heights moved by {MOVED_M:g} m, median NCC", ncc))
+    return [
+        *figures,
+        Figure("cell", surface.cell_m, "m"),
+        Figure("million cells", surface.xyz[..., 2].size / 1e6),
+        Figure("seen by two, filled", record["coverage"]),
+        Figure("CPU", used.cpu_s, "s"),
+        Figure("peak memory", used.peak_gb, "GB"),
+    ]
+
+
 def two_view_figures(
     error: np.ndarray, least_filled: float, most_nmad_m: float, most_median_m: float | None = None
 ) -> list[Figure]:
@@ -637,7 +673,7 @@ def clone(at: Workplace) -> list[Figure]:
 ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "demo": demo, "mixed": mixed, "calanques": calanques, "city": city, "city-views": city_views, "hills": hills,
     "joint": joint,
-    "new-scenes": new_scenes, "ventoux": ventoux, "dmc": dmc, "tuniu": tuniu, "kernels": kernels,
+    "new-scenes": new_scenes, "ventoux": ventoux, "dmc": dmc, "tuniu": tuniu, "herzjesu": herzjesu, "kernels": kernels,
     "selection": selection, "features": features, "middlebury": middlebury, "memory": memory, "speed": speed,
     "clone": clone,
 }  # fmt: skip

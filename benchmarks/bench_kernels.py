@@ -224,14 +224,14 @@ def reach_case() -> Case:
     """A block that the borders of three views cross at every one of 64 heights, so that each is judged cell by cell."""
     pixels, layout, nodes, heights = views(3)
     layout[:, 2] = 48 + BLOCK // 2
-    span = np.array([0, 64])
+    span, limits = np.array([0, 64]), np.array([[-1] * 3, [64] * 3])
     lowest, highest = np.empty((3, BLOCK, BLOCK), np.int32), np.empty((3, BLOCK, BLOCK), np.int32)
     blocked, none = np.zeros(pixels.shape, bool), np.zeros(3, bool)
     nodes = np.ascontiguousarray(nodes[:, :2, :2])
 
     def call():
         for _ in range(50):
-            block_reach(blocked, none, layout, nodes, heights, span, BLOCK, 3.0, lowest, highest)
+            block_reach(blocked, none, layout, nodes, heights, span, limits, BLOCK, 3.0, lowest, highest)
 
     return Case(call, 50 * span[1] * lowest.size, "cell, step and image")
 

@@ -79,3 +79,8 @@ def even_lattice(count=16, shape=(37, 70), block=16, first=0):
     """Every block with the same range."""
     blocks = (-(-shape[0] // block), -(-shape[1] // block))
     return HeightLattice(0.0, 1.0, shape, block, np.full(blocks, first), np.full(blocks, count))
+
+
+def at_all_heights(holds):
+    """`TileViews.ends` of blocks (i, b, d) that hold at every height."""
+    return np.broadcast_to((-np.inf, np.inf), (*holds.shape, 2))

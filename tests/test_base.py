@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kernel_scene import kernel_scene
+from kernel_scene import at_all_heights, kernel_scene
 from zlocus.kernels.volume import plane_grid
 from zlocus.matching.base import ANCHOR, PATCH, BaseSurface, integrated, patch_medians
 from zlocus.matching.views import TileViews
@@ -29,7 +29,7 @@ def views_of(scene):
     none = np.zeros(len(scene.pixels), bool)
     holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
     return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, holds, ~holds,
-                      scene.heights, scene.block)  # fmt: skip
+                      scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
 
 
 def test_sheared_views_project_where_the_base_lies():

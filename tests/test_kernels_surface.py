@@ -68,13 +68,18 @@ def test_a_tower_hides_what_its_shadow_covers():
     assert (found[:9] < 0).all()
 
 
-def reached(scene, lattice, blocked=None, relief=None):
+EVERYWHERE = np.array([-(2**29), 2**29])
+
+
+def reached(scene, lattice, blocked=None, relief=None, limits=None):
+    every = EVERYWHERE[:, None, None, None] + np.zeros((scene.n_views, *lattice.ranges.shape[1:]), np.int64)
+    limits = every if limits is None else limits
     relief = np.zeros(scene.shape, np.float32) if relief is None else relief
     blocked = np.zeros(len(scene.pixels), bool) if blocked is None else blocked
     has = np.array([blocked[o : o + r * c].any() for o, r, c in scene.layout])
     seen = np.empty((2, scene.n_views, *scene.shape), np.int32)
     tile_reach(
-        blocked, has, scene.layout, scene.nodes, scene.heights, lattice.ranges, scene.block, 3.0, relief,
+        blocked, has, scene.layout, scene.nodes, scene.heights, lattice.ranges, limits, scene.block, 3.0, relief,
         seen[0], seen[1],
     )  # fmt: skip
     return seen
@@ -117,6 +122,25 @@ def test_reach_whatever_index_heights_start_at():
     assert (lower[0] > lower[1])[never].all()
 
 
+def test_reach_ends_where_tables_do():
+    """Runs are looked for between the limits of each block and view, and nowhere where the lower one is above."""
+    scene, lattice = kernel_scene(), even_lattice(32, first=3)
+    limits = np.random.default_rng(2).integers(0, 40, (2, scene.n_views, *lattice.ranges.shape[1:]))
+    seen, empty = reached(scene, lattice, limits=limits), 0
+    for number, (b, d, rows, cols) in enumerate(scene.blocks()):
+        for i in range(scene.n_views):
+            low, high = limits[:, i, *np.unravel_index(number, limits.shape[2:])]
+            node, cells = scene.nodes[i, b : b + 2, d : d + 2], (rows.stop - rows.start, cols.stop - cols.start)
+            inside = [covers(scene, i, node, cells, k, np.zeros(len(scene.pixels), bool)) for k in range(3, 35)]
+            good = np.stack([at & (low <= k <= high) for k, at in zip(range(3, 35), inside, strict=True)], axis=-1)
+            for r, c in np.ndindex(cells):
+                run = surfaces.longest_run(good[r, c])
+                expected = (HIDDEN, -1) if run is None else (run[0] + 3, run[1] + 3)
+                assert tuple(seen[:, i, rows.start + r, cols.start + c]) == expected
+                empty += low > high
+    assert empty > 0
+
+
 def test_ends_of_reach_follow_the_relief():
     """A run that ends at the image's border ends by as much lower as the surface stands higher there; one that ends
     with the block's heights stays."""
@@ -155,7 +179,7 @@ def test_reach_of_one_block_and_its_shortcut():
     lowest, highest = np.empty((2, 2, 8, 8), np.int32)
     block_reach(
         np.zeros(len(scene.pixels), bool), np.zeros(2, bool), scene.layout, scene.nodes, scene.heights,
-        np.array([0, 16]), 8, 3.0, lowest, highest,
+        np.array([0, 16]), EVERYWHERE[:, None].repeat(2, axis=1), 8, 3.0, lowest, highest,
     )  # fmt: skip
     assert (lowest == 0).all()
     assert (highest == 15).all()

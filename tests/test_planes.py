@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from kernel_scene import at_all_heights
 from zlocus.kernels.planes import (
     SPAN,
     disagreement,
@@ -68,7 +69,7 @@ def views(parallax=PARALLAX, roof_texture=0.0) -> TileViews:
     held = np.ones((len(parallax), n_nodes - 1, n_nodes - 1), bool)
     return TileViews(
         pixels, np.zeros(len(pixels), bool), np.zeros(len(parallax), bool), layout, nodes, held, ~held,
-        np.array([0.0, 1.0]), BLOCK,
+        np.array([0.0, 1.0]), at_all_heights(held), BLOCK,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from kernel_scene import HIDDEN, kernel_scene
+from kernel_scene import HIDDEN, at_all_heights, kernel_scene
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.curve import FAIR, GOOD, POOR
 from zlocus.matching.lattice import HeightLattice
@@ -71,7 +71,7 @@ def textured(slope=(0.0, 0.0), spoiled=(), noise=0.0, speeds=SPEEDS):
     holds = np.ones((len(images), corners[0] - 1, corners[1] - 1), bool)
     return TileViews(
         pixels, np.zeros(len(pixels), bool), np.zeros(len(images), bool), np.array(layout, np.int64), np.stack(nodes),
-        holds, ~holds, heights, BLOCK,
+        holds, ~holds, heights, at_all_heights(holds), BLOCK,
     )  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     scene = kernel_scene()
     holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
     views = TileViews(scene.pixels, np.zeros(len(scene.pixels), bool), np.zeros(3, bool), scene.layout, scene.nodes,
-                      holds, ~holds, scene.heights, scene.block)  # fmt: skip
+                      holds, ~holds, scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
     rng = np.random.default_rng(2)
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)

@@ -16,13 +16,14 @@ from zlocus.io.scene_file import open_scene
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.views import FINEST_BENT_PX, ViewPixels, halved, read_pixels, tile_views
+from zlocus.matching.views import FINEST_BENT_PX, MOST_LOST, ViewPixels, halved, read_pixels, tile_views
 from zlocus.matching.visibility import coverage, covers, hide, left_out
 from zlocus.scene import View
 from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.linescan import RectifiedModel
-from zlocus.sensors.table import HIGHER_DEGREE, HIGHEST_DEGREE, TOLERANCE_PX, UNSTEADY_DEGREE, projection_table
+from zlocus.sensors.shown_table import longest_run, shifted, shown_table
+from zlocus.sensors.table import HIGHEST_DEGREE, TOLERANCE_PX, UNSTEADY_DEGREE, projection_table
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 from zlocus.synthetic.scenes import demo_spec, exposures
 
@@ -121,7 +122,7 @@ def test_what_a_lens_cannot_see_is_not_seen():
     ]
     whole = np.all(known, axis=0).reshape(x.shape)
     assert 0.1 < whole.mean() < 0.9
-    table = projection_table(sensor, transform, shape, block, (45.0, 55.0), 2.0, IMAGE, HIGHER_DEGREE)
+    table = projection_table(sensor, transform, shape, block, (45.0, 55.0), 2.0, IMAGE, HIGHEST_DEGREE)
     assert np.isfinite(table.nodes).all()
     corners = whole[:-1, :-1] & whole[1:, :-1] & whole[:-1, 1:] & whole[1:, 1:]
     assert not (table.holds & ~corners).any()
@@ -162,6 +163,76 @@ def test_tables_hold_over_heights_that_reach_close_to_the_camera():
     views = tile_views([window], 0, grid(0.15, shape), shape, 32, (-15.0, 0.5), (-15.0, 100.0), 4)
     assert not views.lost.any()
     assert views.holds.mean() > 0.3
+
+
+def shown_errors(table, sensor, transform, shape, block, window):
+    """(n,) px, of the table where it holds and the window shows a cell, at heights between its samples; and how many
+    cells and heights the window shows that it leaves out."""
+    rng, errors, left_out, n_shown = np.random.default_rng(4), [], 0, 0
+    for t in rng.uniform(-1.0, 1.0, 40):
+        row, col = rng.integers(0, shape[0], 400), rng.integers(0, shape[1], 400)
+        x, y = transform * (col + 0.5, row + 0.5)
+        exact = sensor.image_from_ground(np.column_stack([x, y, np.full(400, table.z_mid + t * table.z_half)]))
+        shown = ((exact >= window[1::-1]) & (exact <= np.array(window[1::-1]) + np.array(window[:1:-1]) - 1)).all(
+            axis=1
+        )
+        b, d = row // block, col // block
+        fr, fc = (row % block / block)[:, None], (col % block / block)[:, None]
+        at = [[table.nodes[b + i, d + j] @ t ** np.arange(table.nodes.shape[-1]) for j in (0, 1)] for i in (0, 1)]
+        xy = (1 - fr) * ((1 - fc) * at[0][0] + fc * at[0][1]) + fr * ((1 - fc) * at[1][0] + fc * at[1][1])
+        held = table.holds[b, d] & (table.ends[b, d, 0] <= t) & (t <= table.ends[b, d, 1])
+        errors.append(np.hypot(*(xy - exact)[shown & held].T))
+        left_out, n_shown = left_out + (shown & ~held).sum(), n_shown + shown.sum()
+    return np.concatenate(errors), left_out / n_shown
+
+
+@pytest.mark.parametrize("omega", [0.0, 30.0, 55.0])
+def test_each_block_is_tabulated_over_the_heights_at_which_it_is_shown(omega):
+    """From 130 to 15 m below a camera a block leaves the image, the lens and what is in front of it; where it is shown
+    the table is exact, and hardly anything is left out."""
+    shape, block, sensor = (500, 500), 2, drone(omega=omega)
+    transform = grid(0.4, shape)
+    heights = (25.0, 140.0)
+    with pytest.raises(GeometryError):
+        projection_table(sensor, transform, shape, block, heights, FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE)
+    table = shown_table(
+        sensor, transform, shape, block, heights, FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE, True, MOST_LOST
+    )
+    errors, left_out = shown_errors(table, sensor, transform, shape, block, IMAGE)
+    assert len(errors) > 300
+    assert errors.max() < 1.5 * FINEST_BENT_PX
+    assert left_out < 0.25
+    low = shown_table(
+        sensor, transform, shape, block, (25.0, 90.0), FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE, True, MOST_LOST
+    )
+    assert shown_errors(low, sensor, transform, shape, block, IMAGE)[1] < 0.02
+
+
+def test_what_is_too_bent_is_refused_unless_it_may_be_left_out():
+    shape, sensor = (200, 200), drone()
+    more = (grid(1.0, shape), shape, 4, (25.0, 140.0), FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE)
+    with pytest.raises(GeometryError, match=r"of 4 cells is .* Use a smaller block or fewer heights"):
+        shown_table(sensor, *more, False, MOST_LOST)
+    table = shown_table(sensor, *more, True, 1.0)
+    assert table.lost.any()
+    assert table.holds.any()
+    assert np.isfinite(table.nodes).all()
+
+
+def test_polynomials_of_a_part_of_the_heights_are_those_of_all():
+    local = np.random.default_rng(1).normal(size=(5, 2, 8))
+    middle, half = np.linspace(-0.5, 0.5, 5), np.linspace(0.2, 0.5, 5)
+    moved, t = shifted(local, middle, half), 0.37
+    s = (t - middle) / half
+    expected = np.einsum("cxp,cp->cx", local, s[:, None] ** np.arange(8))
+    np.testing.assert_allclose(moved @ t ** np.arange(8), expected, rtol=1e-9)
+
+
+def test_longest_runs():
+    flags = np.array([[1, 1, 0, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0, 1]], bool)
+    first, last = longest_run(flags)
+    assert (first[0], last[0]) == (3, 5)
+    assert (first[2], last[2]) == (6, 6)
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +308,7 @@ def test_perspective_shrinks_blocks_and_raises_the_degree_only_where_needed():
     assert (fitted(far).block, fitted(far).nodes.shape[-1]) == (32, 4)
     near = fitted(drone(None))
     assert near.block < 32
-    assert near.nodes.shape[-1] == HIGHER_DEGREE + 1
+    assert near.nodes.shape[-1] == HIGHEST_DEGREE + 1
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

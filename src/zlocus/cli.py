@@ -374,6 +374,10 @@ def import_cameras(
         tuple[float, float, float] | None,
         typer.Option(help="Direction that becomes z of a local frame.", metavar="X Y Z"),
     ] = None,
+    north: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Direction that becomes y, with --up.", metavar="X Y Z"),
+    ] = None,
     focal: Annotated[float | None, typer.Option(help="Focal length (eo), px.", metavar="PX")] = None,
     camera: Annotated[
         Path | None, typer.Option(help="Interior orientation (eo), as scene.yaml has it.", metavar="FILE")
@@ -385,8 +389,8 @@ def import_cameras(
 ) -> None:
     """Make a scene.yaml of the cameras of another program."""
     request = ImportRequest(
-        kind=kind, source=source, out=out, images=images, crs=crs, local=local, up=up, focal=focal, camera=camera,
-        earth=earth, overwrite=overwrite,
+        kind=kind, source=source, out=out, images=images, crs=crs, local=local, up=up, north=north, focal=focal,
+        camera=camera, earth=earth, overwrite=overwrite,
     )  # fmt: skip
     from zlocus.io.importers.scene import import_scene
 

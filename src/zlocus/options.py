@@ -82,7 +82,7 @@ class OrientationOptions(Checked):
 
     model: str = option(
         "auto", "Correction: a shift of each image, all cameras jointly (see `joint`), none; auto: a shift where all "
-        "images have RPCs, else jointly.", choices=("auto", "shift", "joint", "none"),
+        "images have RPCs, none in a local frame, else jointly.", choices=("auto", "shift", "joint", "none"),
     )  # fmt: skip
     features_per_mpx: int = option(
         3000, "SIFT features kept of an image of one megapixel, the strongest of each part; four times as many pixels "

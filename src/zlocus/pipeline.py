@@ -29,6 +29,7 @@ from zlocus.options import RunConfig
 from zlocus.orientation.orient import Orientation, supported
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
 from zlocus.preparing import (
+    area_to_match,
     asked_crs,
     heights_asked_for,
     heights_of_ties,
@@ -117,7 +118,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     with watch.stage("settle"):
         corrected = orientation.apply(scene)
         z_range = _searched_heights(request, corrected, orientation, config, progress)
-        grid = _grid(request, like, corrected, z_range)
+        grid = _grid(request, like, corrected, orientation, z_range)
         settled = settle(
             corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
             orientation.measured,
@@ -162,12 +163,19 @@ def _opened(request: DsmRequest, like: GeoBox | None) -> Scene:
     crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
     scene = open_scene(request.inputs, crs)
     if is_local(scene.crs):
-        raise GeometryError(
-            "The scene's frame is local, and a surface needs a grid on the Earth. Use `zlocus cloud`, or give the "
-            "cameras in a projected CRS."
-        )
+        _check_local(request)
     check_overlap(scene, possible_heights(scene, request.heights or scene.heights))
     return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+
+
+def _check_local(request: DsmRequest) -> None:
+    """Refuse what has a place on the Earth, in a local frame."""
+    for name in ("dem", "area", "mask"):
+        if path := getattr(request, name):
+            raise GeometryError(
+                f"The scene's frame is local, where {path} has no place. Leave --{name} out; --bounds and --heights "
+                "are in that frame."
+            )
 
 
 def run_demo(out: Path, progress: Progress) -> DemoResult:
@@ -295,7 +303,9 @@ def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunCon
     return replace(settled, prior=limits)
 
 
-def _grid(request: DsmRequest, like: GeoBox | None, scene: Scene, z_range: tuple[float, float]) -> Grid:
+def _grid(
+    request: DsmRequest, like: GeoBox | None, scene: Scene, orientation: Orientation, z_range: tuple[float, float]
+) -> Grid:
     """The grid asked for: another raster's, or the area at a resolution, both with defaults."""
     z = (z_range[0] + z_range[1]) / 2
     if like is not None:
@@ -304,7 +314,7 @@ def _grid(request: DsmRequest, like: GeoBox | None, scene: Scene, z_range: tuple
         return grid
     cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
     check_resolution(cell, scene, z, "--resolution")
-    bounds = request.bounds or scene.bounds or shared_ground(scene, z_range)
+    bounds = request.bounds or area_to_match(scene, orientation, z_range)
     return grid_from_bounds(bounds, cell, scene.crs)
 
 

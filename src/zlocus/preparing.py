@@ -12,11 +12,12 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, GeometryError, OutputError
 from zlocus.io.crs import checked_crs
+from zlocus.matching.setup import shared_ground
 from zlocus.options import OrientationOptions
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.orient import Orientation, height_range, orient
+from zlocus.orientation.orient import RANGE_PERCENT, Orientation, height_range, orient, supported
 from zlocus.progress import Progress
-from zlocus.scene import Scene, View, footprint, is_shared
+from zlocus.scene import Scene, View, footprint, is_local, is_shared
 from zlocus.sensors.model import capped, lowest_station
 
 HEIGHT_SAMPLES = 5
@@ -28,6 +29,8 @@ NEAREST_M, DEPTHS = 2.0, 49
 CLEARANCE = 0.25
 # The same where heights are asked for: a little more than what projection tables need.
 LEAST_CLEARANCE = 0.125
+# The area found from ties: added on all sides, as a share of their extent; and how many it takes.
+AREA_MARGIN, FEWEST_FOR_AREA = 0.05, 20
 
 
 def asked_crs(given: str | None) -> CRS | None:
@@ -122,6 +125,27 @@ def heights_of_ties(scene: Scene, orientation: Orientation, options: Orientation
     """Heights (m) to search, from the ties (see `height_range`), and not close to a camera."""
     station = lowest_station(view.sensor for view in scene.views)
     return capped(height_range(orientation, options, station), station, CLEARANCE)
+
+
+def area_to_match(
+    scene: Scene, orientation: Orientation, z_range: tuple[float, float]
+) -> tuple[float, float, float, float]:
+    """Bounds (xmin, ymin, xmax, ymax), m: what the scene asks for, else the ground that two views see between two
+    heights; in a local frame the part of it around the ties.
+
+    Cameras of a local frame may look at a wall from the side and see what lies far behind it, at the lowest of the
+    heights: there two footprints share many times the area of the wall.
+    """
+    if scene.bounds is not None:
+        return scene.bounds
+    shared = shared_ground(scene, z_range)
+    ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
+    if not is_local(scene.crs) or len(ties) < FEWEST_FOR_AREA:
+        return shared
+    low, high = np.percentile(ties[:, :2], RANGE_PERCENT, axis=0)
+    aside = AREA_MARGIN * (high - low)
+    low, high = np.maximum(low - aside, shared[:2]), np.minimum(high + aside, shared[2:])
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1])) if (low < high).all() else shared
 
 
 def heights_asked_for(

@@ -238,7 +238,8 @@ class ImportRequest:
 
     kind : format; source : its folder or file. images : folder of the images. crs : of the result. local : in the local
     frame of the source, at no place of the Earth. up : direction, in the axes of the source, that becomes z of a local
-    frame. focal : px; camera : file with the interior orientation. earth : how a map is understood.
+    frame; north : another, that becomes y. focal : px; camera : file with the interior orientation. earth : how a map
+    is understood.
 
     Raises
     ------
@@ -253,6 +254,7 @@ class ImportRequest:
     crs: str | None = None
     local: bool = False
     up: tuple[float, float, float] | None = None
+    north: tuple[float, float, float] | None = None
     focal: float | None = None
     camera: Path | None = None
     earth: str | None = None
@@ -264,10 +266,13 @@ class ImportRequest:
         _check_positive("--focal", self.focal, "px")
         if self.earth is not None:
             _check_choice("earth", self.earth, EARTHS)
-        if self.up is not None and not (all(map(math.isfinite, self.up)) and any(self.up)):
-            raise ConfigError(
-                f"--up {' '.join(f'{v:g}' for v in self.up)} is no direction. Give three numbers, not all 0."
-            )
+        for name, axis in (("up", self.up), ("north", self.north)):
+            if axis is not None and not (all(map(math.isfinite, axis)) and any(axis)):
+                raise ConfigError(
+                    f"--{name} {' '.join(f'{v:g}' for v in axis)} is no direction. Give three numbers, not all 0."
+                )
+        if self.north is not None and self.up is None:
+            raise ConfigError("--north turns the frame about what is up. Give --up too, or leave it out.")
         for one, other in (("crs", "local"), ("crs", "up"), ("focal", "camera")):
             if {one, other} <= set(self.given()):
                 raise ConfigError(f"--{one} and --{other} exclude each other. Leave one out.")
@@ -276,7 +281,7 @@ class ImportRequest:
 
     def given(self) -> list[str]:
         """Names of the options that only some formats know, where they are given."""
-        values = {name: getattr(self, name) for name in ("crs", "local", "up", "focal", "camera", "earth")}
+        values = {name: getattr(self, name) for name in ("crs", "local", "up", "north", "focal", "camera", "earth")}
         return [name for name, value in values.items() if value not in (None, False)]
 
 

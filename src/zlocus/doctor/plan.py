@@ -14,8 +14,9 @@ from zlocus.doctor.ties import QuickTies
 from zlocus.errors import GeometryError
 from zlocus.execution.plan import plan_tiles, tile_memory_bytes
 from zlocus.grid import grid_from_bounds
-from zlocus.matching.setup import check_resolution, median_ground_pixel, settle, shared_ground
+from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
+from zlocus.preparing import area_to_match
 from zlocus.request import DoctorRequest
 from zlocus.scene import Scene
 
@@ -60,7 +61,7 @@ def run_plan(
     z_range, z = ties.z_range, sum(ties.z_range) / 2
     cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
     check_resolution(cell, scene, z, "--resolution")
-    bounds = scene.bounds or shared_ground(scene, z_range)
+    bounds = area_to_match(scene, ties.orientation, z_range)
     grid = grid_from_bounds(bounds, cell, scene.crs)
     found = ties.orientation
     settled = settle(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.measured)

@@ -13,6 +13,7 @@ import numpy as np
 from zlocus.doctor.findings import POOR, STOPS, Finding
 from zlocus.doctor.geometry import PairGeometry, ViewGeometry, geometry_findings, pair_geometries, view_geometry
 from zlocus.doctor.plan import plan_findings, run_plan
+from zlocus.doctor.plane import plane_findings
 from zlocus.doctor.quality import image_quality, quality_findings
 from zlocus.doctor.report import Diagnosis
 from zlocus.doctor.ties import QuickTies, quick_ties, tie_findings
@@ -24,7 +25,7 @@ from zlocus.products.footprints import footprints_picture, write_footprints
 from zlocus.products.record import write_record
 from zlocus.progress import Progress
 from zlocus.request import DoctorRequest
-from zlocus.scene import Scene, check_overlap, is_local
+from zlocus.scene import Scene, check_overlap
 
 REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
 T = TypeVar("T")
@@ -103,6 +104,7 @@ def examined(
         told.findings += geometry_findings(names, geometry, pairs)
         if ties is not None:
             told.findings += tie_findings(names, ties.orientation, pairs, config.orientation)
+            told.findings += plane_findings(corrected, request.inputs, ties.orientation)
             plan = planned(request, config, corrected, ties, geometry, told)
     return Diagnosis(
         scene.views, tuple(quality), geometry, pairs, ties, plan, usable.refused, tuple(dict.fromkeys(told.findings))
@@ -143,11 +145,6 @@ def planned(
     told: Told,
 ) -> Any:
     """The plan of a run, unless it would fail before."""
-    if is_local(corrected.crs):
-        told.findings.append(
-            Finding(POOR, "The scene's frame is local: `zlocus cloud` takes it, `zlocus dsm` does not, for its grid.")
-        )
-        return None
     plan = told.tried(lambda: run_plan(request, config, corrected, ties, [each.outline for each in geometry]))
     if plan is not None:
         told.findings += plan_findings(plan, request.memory_gb)

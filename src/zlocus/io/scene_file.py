@@ -1,7 +1,7 @@
 """Scenes from files: a list of images with their own cameras, or one `scene.yaml` (schema 1).
 
 schema: 1
-frame: {crs: "EPSG:32631"}             # optional: else the UTM zone; or {local: true, up: [x, y, z]}
+frame: {crs: "EPSG:32631"}             # optional: else the UTM zone; or {local: true, up: [x, y, z], north: [x, y, z]}
 area: {bounds: [xmin, ymin, xmax, ymax]}   # optional, in that CRS
 heights: [zmin, zmax]                  # optional, ellipsoidal metres
 views:
@@ -41,19 +41,21 @@ from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.model import FloatArray
 
 SCENE_SUFFIXES = (".yaml", ".yml")
-OPPOSITE = 1e-12
+OPPOSITE, PARALLEL = 1e-12, 1e-6
 T = TypeVar("T")
 
 
 class Frame(StrictModel):
     """What all views share: a CRS, or local Cartesian axes in metres with z up.
 
-    up : direction, in the axes of the cameras, that becomes z of a local frame, which is turned as little as it takes.
+    up : direction, in the axes of the cameras, that becomes z of a local frame; north : another, which becomes y as far
+    as it is at right angles to `up`. Without it the frame is turned as little as it takes.
     """
 
     crs: str | None = None
     local: Literal[True] | None = None
     up: Vector | None = None
+    north: Vector | None = None
 
     @model_validator(mode="after")
     def _either(self) -> Frame:
@@ -63,6 +65,10 @@ class Frame(StrictModel):
             raise ValueError("up is for local: true; where there is a CRS, up is along the ellipsoid's normal")
         if self.up is not None and not any(self.up):
             raise ValueError("up is a direction: one of its three numbers is not 0")
+        if self.north is not None and self.up is None:
+            raise ValueError("north needs up, which says about what the frame is turned: add up: [x, y, z]")
+        if self.up is not None and self.north is not None and _is_along(self.up, self.north):
+            raise ValueError("north is a direction at an angle to up: give one that is neither along up nor 0")
         return self
 
 
@@ -239,7 +245,7 @@ class _Entry:
 
 @dataclass(frozen=True)
 class _Asked:
-    """A scene before any image is opened. folder : where relative paths of cameras start; up : see `Frame`."""
+    """A scene before any image is opened. folder : where relative paths of cameras start; up, north : see `Frame`."""
 
     entries: tuple[_Entry, ...]
     folder: Path
@@ -247,11 +253,12 @@ class _Asked:
     bounds: tuple[float, float, float, float] | None = None
     heights: tuple[float, float] | None = None
     up: tuple[float, float, float] | None = None
+    north: tuple[float, float, float] | None = None
 
     def scene(self, views: Sequence[View], crs: CRS) -> Scene:
         """The scene of some views in its frame."""
         scene = Scene(tuple(views), crs, self.bounds, self.heights)
-        return scene if self.up is None else _turned(scene, self.up)
+        return scene if self.up is None else _turned(scene, turn_to_axes(self.up, self.north))
 
 
 @dataclass(frozen=True)
@@ -302,13 +309,12 @@ def _from_scene_file(path: Path, crs: CRS | None) -> _Asked:
         _Entry(view.name, path.parent / view.image, view.camera.given_in(named), view.date) for view in scene_file.views
     )
     bounds = None if scene_file.area is None else scene_file.area.bounds
-    up = None if scene_file.frame is None else scene_file.frame.up
-    return _Asked(entries, path.parent, crs or frame, bounds, scene_file.heights, up)
+    axes = (None, None) if scene_file.frame is None else (scene_file.frame.up, scene_file.frame.north)
+    return _Asked(entries, path.parent, crs or frame, bounds, scene_file.heights, *axes)
 
 
-def _turned(scene: Scene, up: tuple[float, float, float]) -> Scene:
-    """The scene in a local frame whose z is `up` of its own."""
-    rotation = turn_to_z(up)
+def _turned(scene: Scene, rotation: FloatArray) -> Scene:
+    """The scene in a local frame turned against its own."""
     views = []
     for view in scene.views:
         assert isinstance(view.sensor, FrameModel), "other cameras know their place on the Earth"
@@ -325,6 +331,25 @@ def turn_to_z(up: tuple[float, float, float]) -> FloatArray:
     # Rodrigues' formula about the axis up x z, with 1 + cosine = 1 + z.
     cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
+
+
+def turn_to_axes(up: tuple[float, float, float], north: tuple[float, float, float] | None) -> FloatArray:
+    """The rotation, (3, 3), that makes `up` the z axis and what of `north` is at right angles to it the y axis; without
+    `north` the smallest one."""
+    rotation = turn_to_z(up)
+    if north is None:
+        return rotation
+    x, y, _ = rotation @ (np.array(north) / np.max(np.abs(north)))
+    x, y = np.array([x, y]) / np.hypot(x, y)
+    return np.asarray(np.array([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]) @ rotation)
+
+
+def _is_along(up: tuple[float, float, float], north: tuple[float, float, float]) -> bool:
+    """Whether two directions are the same or opposite, to rounding, or the second is none."""
+    if not any(north):
+        return True
+    one, other = (np.array(v) / np.max(np.abs(v)) for v in (up, north))
+    return bool(np.linalg.norm(np.cross(one, other)) < PARALLEL)
 
 
 def _frame_crs(frame: Frame, path: Path) -> CRS:

@@ -32,6 +32,7 @@ FINEST_TABLE_PX, COARSER_TABLE_PX = 0.01, 0.05
 FINEST_BENT_PX, COARSER_BENT_PX = 0.05, 0.25
 # A view may be left out of this share of what it shows (blocks by heights); and at last of this.
 LITTLE_LOST, MOST_LOST = 0.01, 0.5
+# The windows' borders make small blocks slow: these are twice as slow per cell as those of eight cells.
 SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
@@ -232,8 +233,8 @@ def _fitting_tables(
     is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in views)
     attempts = [(b, near, HIGHEST_DEGREE, 0.0) for b in blocks if b > SMALL_BLOCK]
     attempts += [(b, far, HIGHEST_DEGREE, 0.0) for b in blocks]
+    attempts += [(SMALL_BLOCK, far, UNSTEADY_DEGREE, 0.0)] * is_scanning
     attempts += [(SMALL_BLOCK, far, HIGHEST_DEGREE, LITTLE_LOST), (SMALLEST_BLOCK, far, HIGHEST_DEGREE, 0.0)]
-    attempts += [(SMALLEST_BLOCK, far, UNSTEADY_DEGREE, 0.0)] * is_scanning
     attempts += [(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MOST_LOST)]
     for cells, px, degree, lost in attempts:
         try:

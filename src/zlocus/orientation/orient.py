@@ -19,7 +19,7 @@ from zlocus.orientation.locus import Sightlines, locate
 from zlocus.orientation.sharpen import sharpened
 from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
 from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, triangulate
-from zlocus.scene import Scene, View
+from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import FloatArray, SensorModel
 
@@ -185,9 +185,12 @@ def orient(
     the ties.
 
     z_range_hint: heights in m that hold the ground, where they are known; else the scene's. control, terrain : used
-    where cameras are corrected jointly.
+    where cameras are corrected jointly. Cameras of a local frame come from an adjustment of their own, and nothing but
+    ties would hold them in place: `model` "auto" leaves them as they are.
     """
     has_poses = needs_joint(scene.views)
+    if options.model == "auto" and has_poses and is_local(scene.crs):
+        options = replace(options, model="none")
     is_joint = options.model == "joint" or (options.model == "auto" and has_poses)
     loosely = replace(options, inlier_px=options.inlier_px * POSE_LOOSENESS) if is_joint and has_poses else options
     ties = find_ties(scene, loosely, z_range_hint, progress)

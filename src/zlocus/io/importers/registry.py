@@ -24,10 +24,10 @@ class Importer:
 
 
 IMPORTERS = {
-    "colmap": Importer(read_colmap, ("crs", "up")),
+    "colmap": Importer(read_colmap, ("crs", "up", "north")),
     "opensfm": Importer(read_opensfm, ("crs", "local")),
-    "metashape": Importer(read_metashape, ("crs", "up")),
-    "bundler": Importer(read_bundler, ("crs", "up")),
-    "eo": Importer(read_eo, ("crs", "up", "focal", "camera", "earth")),
-    "strecha": Importer(read_strecha, ("up",)),
+    "metashape": Importer(read_metashape, ("crs", "up", "north")),
+    "bundler": Importer(read_bundler, ("crs", "up", "north")),
+    "eo": Importer(read_eo, ("crs", "up", "north", "focal", "camera", "earth")),
+    "strecha": Importer(read_strecha, ("up", "north")),
 }

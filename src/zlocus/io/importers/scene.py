@@ -70,6 +70,8 @@ def scene_of(imported: Imported, request: ImportRequest) -> SceneFile:
     frame: dict[str, Any] = {"local": True} if crs is None else {"crs": crs}
     if request.up is not None:
         frame["up"] = request.up
+    if request.north is not None:
+        frame["north"] = request.north
     return validated(SceneFile, {"schema": 1, "frame": frame, "views": views}, imported.path)
 
 
