@@ -21,6 +21,7 @@ from zlocus.matching.visibility import (
     hide,
     parts_of_one_direction,
     sees,
+    spare_pairs,
 )
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -184,6 +185,17 @@ def test_what_is_hidden_is_counted_from_the_base():
     np.testing.assert_array_equal(
         sees(at_ground, np.zeros((2, *SHAPE)))[1], sees(level, np.full((2, *SHAPE), 10.0))[1]
     )  # fmt: skip
+
+
+def test_nothing_hides_a_view_from_cells_that_two_cover():
+    seen = np.zeros((3, 3, 4, 6), np.int32)
+    seen[1], seen[2] = 20, 7
+    seen[0, 2, :, 4:], seen[1, 2, :, 4:] = HIDDEN, -1
+    before = seen.copy()
+    spare_pairs(seen)
+    np.testing.assert_array_equal(seen[..., :4], before[..., :4])
+    np.testing.assert_array_equal(seen[:2], before[:2])
+    assert (seen[2, :, :, 4:] == NOTHING_HIDDEN).all()
 
 
 def test_above_the_base_and_back():

@@ -35,7 +35,7 @@ from zlocus.matching.selection import (
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees
+from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees, spare_pairs
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
@@ -288,6 +288,7 @@ def _match_level(
     if guide.surface is not None and use_visibility:
         obstacle = cv2.erode(guide.surface, guide.obstacle)
         hide(seen, views, obstacle, base.cells, config.measure.hidden_margin_steps)
+        spare_pairs(seen)
     used, worth, added, all_views = seen, seen, 0, _evaluations(seen, lattice)
     if ranking is not None:
         ground = None if guide.surface is None else guide.surface - base.cells

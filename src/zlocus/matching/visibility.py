@@ -19,7 +19,7 @@ from zlocus.matching.views import TileViews
 IntVolume = NDArray[np.int32]
 BORDER_PX = 3.0
 NOTHING_HIDDEN = -(2**29)
-FEWEST_TO_HIDE = 2
+PAIR = 2
 # Cells per height step by which directions differ within a part of a tile, and parts along a side at most.
 TURN, MOST_PARTS = 0.2, 8
 
@@ -61,9 +61,6 @@ def hide(
 ) -> None:
     """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
 
-    Where two views cover a cell none can be spared: hidden by a false height as likely as by a true one, nothing is
-    left that could tell.
-
     surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it; base : (r, c) float32,
     the base surface that the indices of `seen` are counted from.
     """
@@ -74,7 +71,14 @@ def hide(
             lowest -= base + np.float32(margin_steps)
             np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
             seen[2, i][part] = lowest[part]
-    seen[2][:, covers(seen).sum(axis=0) <= FEWEST_TO_HIDE] = NOTHING_HIDDEN
+
+
+def spare_pairs(seen: IntVolume) -> None:
+    """Take back what hides a view from cells that two views cover; changes `seen`.
+
+    There neither can be spared: hidden by a false height as likely as by a true one, nothing is left that could tell.
+    """
+    seen[2][:, covers(seen).sum(axis=0) <= PAIR] = NOTHING_HIDDEN
 
 
 def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
