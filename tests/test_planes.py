@@ -13,6 +13,7 @@ from zlocus.kernels.planes import (
     SPAN,
     disagreement,
     leave_out,
+    level_greys,
     plane_heights,
     plane_through,
     segment_greys,
@@ -119,6 +120,31 @@ def test_a_view_of_another_day_is_left_out():
     found = fitted(other, level_roof())
     middle = np.s_[ROOF.start + 3 : ROOF.stop - 3, ROOF.start + 3 : ROOF.stop - 3]
     assert np.abs(found.height - true_heights())[middle].max() < STEPS
+
+
+@pytest.mark.parametrize("brighter", [-1.5, 1.5])
+def test_a_roof_may_be_brighter_from_one_side(brighter):
+    """No sensor, and no side of a roof, shows the grey of another."""
+    other = views()
+    start, rows, cols = other.layout[1]
+    other.pixels[start : start + rows * cols] += brighter
+    found = fitted(other, level_roof())
+    middle = np.s_[ROOF.start + 3 : ROOF.stop - 3, ROOF.start + 3 : ROOF.stop - 3]
+    assert found.is_planar[middle].all()
+    assert np.abs(found.height - true_heights())[middle].max() < STEPS
+
+
+def test_greys_are_levelled_over_the_core():
+    rng = np.random.default_rng(3)
+    grey, visible, is_core = rng.normal(size=(4, 60)), rng.random((4, 60)) < 0.8, rng.random(60) < 0.7
+    visible[3, is_core] = False
+    expected = grey.copy()
+    for i in range(3):
+        seen = visible[i] & is_core & (visible.sum(axis=0) >= 2)
+        middle = [np.median(grey[visible[:, p], p]) for p in np.flatnonzero(seen)]
+        expected[i] -= (grey[i, seen] - middle).mean()
+    level_greys(grey, visible, is_core)
+    np.testing.assert_allclose(grey, expected, rtol=0, atol=1e-12)
 
 
 def test_no_plane_where_fewer_than_two_views_see():

@@ -16,7 +16,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.planes import PlanarHeights, with_planes
+from zlocus.matching.planes import PlanarHeights, texture_unit, with_planes
 from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
@@ -46,6 +46,8 @@ from zlocus.surface.surface import Surface
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
 PLAIN_IN = 2  # views in which plain segments are looked for, one after the other
+# Texture of the sharpest view over that of one that is sharp, at most.
+SHARP = 1.5
 STRIDE = 2  # cells between those that are looked at for the views that cover them
 FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
 # What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's; less where
@@ -445,10 +447,13 @@ def _without_spikes(
 
 
 def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
-    """The finest level with planes where the leading views show plain segments."""
+    """The finest level with planes where the leading views show plain segments, of those that are sharp enough to
+    tell a plain roof from a blurred one."""
     heights = result.heights
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
-    for view in range(min(len(result.views.layout), PLAIN_IN)):
+    units = [texture_unit(_ortho(result.views, planar.height, view)) for view in range(len(result.views.layout))]
+    sharp = [view for view, unit in enumerate(units) if unit * SHARP > max(units)]
+    for view in sharp[:PLAIN_IN]:
         ortho = _ortho(result.views, planar.height, view)
         planar = with_planes(result.views, ortho, planar, result.seen, config.planes)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)

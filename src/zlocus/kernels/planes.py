@@ -171,6 +171,32 @@ def disagreement(grey, slope, visible, is_core, noise, weight, value, cost):
             cost[i, part] = cost[i, part] / n[i, part] if n[i, part] > 0.0 else np.inf
 
 
+# (i,n) f8, (i,n) b1, (n,) b1 -> None
+@kernel
+def level_greys(grey, visible, is_core):
+    """Take off each view's grey what it is brighter over the core than the median of the views, on average."""
+    n_views, seen = grey.shape[0], np.empty(grey.shape[0])
+    total, n = np.zeros(n_views), np.zeros(n_views)
+    for p in range(grey.shape[1]):
+        m = 0
+        for i in range(n_views):
+            if visible[i, p] and is_core[p]:
+                seen[m] = grey[i, p]
+                m += 1
+        if m < 2:
+            continue
+        middle = median_of(seen, m)
+        for i in range(n_views):
+            if visible[i, p]:
+                total[i] += grey[i, p] - middle
+                n[i] += 1.0
+    for i in range(n_views):
+        if n[i] > 0.0:
+            brighter = total[i] / n[i]
+            for p in range(grey.shape[1]):
+                grey[i, p] -= brighter
+
+
 # (i,n) b1, (i,2) f8, f8 -> i8
 @kernel
 def leave_out(visible, cost, most_cost):
@@ -214,6 +240,7 @@ def fit_segment(
     normal, right = np.empty((3, 3)), np.empty(3)
     segment_loci(nodes, heights, block, row, col, height, locus)
     segment_greys(pixels, layout, locus, height, height, grey, slope)
+    level_greys(grey, visible, is_core)
     disagreement(grey, slope, visible, is_core, noise, weight, value, cost)
     if not mean_cost(cost, 1) < most_cost:
         if leave_out(visible, cost, most_cost) < 2:
@@ -226,6 +253,7 @@ def fit_segment(
     for _ in range(ROUNDS):
         plane_heights(row, col, middle, now, out)
         segment_greys(pixels, layout, locus, height, out, grey, slope)
+        level_greys(grey, visible, is_core)
         disagreement(grey, slope, visible, is_core, noise, weight, value, cost)
         if mean_cost(cost, 0) < costs[1, 0]:
             costs[1] = mean_cost(cost, 0), mean_cost(cost, 1)

@@ -65,7 +65,7 @@ def with_planes(
     """
     height, shown = known.height, np.isfinite(ortho)
     grey = np.where(shown, ortho, np.float32(0.0))
-    unit = float(np.median(deviation(grey, AROUND)[shown])) if shown.any() else 0.0
+    unit = texture_unit(ortho)
     noise, is_plain = options.noise * unit, deviation(grey, TEXTURE) < options.texture * unit
     found = plain_segments(is_plain & shown & ~known.is_planar, options)
     n_segments, cells = len(found.start) - 1, (found.row, found.col)
@@ -88,6 +88,12 @@ def with_planes(
     result.height[found.row[kept], found.col[kept]] = after[kept]
     result.is_planar[found.row[kept], found.col[kept]] = True
     return result
+
+
+def texture_unit(ortho: NDArray[np.float32]) -> float:
+    """Median standard deviation of grey values (r, c) in small windows; 0 where nothing is shown."""
+    shown = np.isfinite(ortho)
+    return float(np.median(deviation(np.where(shown, ortho, np.float32(0.0)), AROUND)[shown])) if shown.any() else 0.0
 
 
 def deviation(grey: NDArray[np.float32], window: tuple[int, int]) -> NDArray[np.float32]:
