@@ -5,16 +5,25 @@ from __future__ import annotations
 from pyproj import CRS
 
 from zlocus.errors import ConfigError
+from zlocus.io.text import shown
 
 LOCAL = (
     'ENGCRS["Local Cartesian frame, z up",EDATUM["Local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
     'LENGTHUNIT["metre",1]]'
 )
+# Semi-major axis, and by how much those of ellipsoids and spheres in use differ.
+EARTH_M, EARTHS_DIFFER_M = 6378137.0, 3e4
 
 
 def local_frame() -> CRS:
     """Cartesian axes in metres, z up, at no known place of the Earth."""
     return CRS.from_wkt(LOCAL)
+
+
+def is_on_earth(crs: CRS) -> bool:
+    """Whether a CRS has the size of the Earth; others cannot be converted to its coordinates."""
+    ellipsoid = crs.ellipsoid
+    return ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_M) < EARTHS_DIFFER_M
 
 
 def checked_crs(crs: CRS) -> CRS:
@@ -26,6 +35,8 @@ def checked_crs(crs: CRS) -> CRS:
         For any other CRS, saying what to use instead.
     """
     flat = crs.to_2d()
+    if not is_on_earth(flat):
+        raise ConfigError(f"The CRS {shown(crs.to_string())} is not of the size of the Earth. Use one that is.")
     advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
     if not flat.is_projected:
         kind = "geographic (degrees)" if flat.is_geographic else "not projected"

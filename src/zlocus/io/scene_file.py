@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import Field, FiniteFloat, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
@@ -32,10 +32,12 @@ from zlocus.errors import ConfigError, InputError, OutputError, ZlocusError
 from zlocus.io.camera_entry import Camera, CameraSource, Vector
 from zlocus.io.camera_kinds import KINDS, RpcCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
+from zlocus.io.documents import read_yaml
 from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.images import RasterImage, check_content, open_image
 from zlocus.io.opening import existing_file
-from zlocus.io.strict import StrictModel, validated
+from zlocus.io.strict import Number, StrictModel, validated
+from zlocus.io.text import shown
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.model import FloatArray
@@ -69,7 +71,7 @@ class Frame(StrictModel):
 class Area(StrictModel):
     """The part of the ground asked for. bounds : xmin, ymin, xmax, ymax in the frame's CRS."""
 
-    bounds: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    bounds: tuple[Number, Number, Number, Number]
 
     @model_validator(mode="after")
     def _ordered(self) -> Area:
@@ -94,7 +96,7 @@ class SceneFile(StrictModel):
     schema_version: Literal[1] = Field(alias="schema")
     frame: Frame | None = None
     area: Area | None = None
-    heights: tuple[FiniteFloat, FiniteFloat] | None = None
+    heights: tuple[Number, Number] | None = None
     views: tuple[ViewEntry, ...]
 
     @model_validator(mode="after")
@@ -197,10 +199,7 @@ def read_scene_file(path: Path) -> SceneFile:
         Naming the file, the key and what is allowed there.
     """
     path = existing_file(path, "scene file")
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
+    document = read_yaml(path)
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
     views = document.get("views")
@@ -331,9 +330,11 @@ def _frame_crs(frame: Frame, path: Path) -> CRS:
     if frame.local:
         return local_frame()
     try:
-        return CRS.from_user_input(frame.crs)
+        return checked_crs(CRS.from_user_input(frame.crs))
     except CRSError as error:
-        raise InputError(f"{path}: frame.crs {frame.crs!r} is no CRS. Write it as EPSG:n.") from error
+        raise InputError(f"{path}: frame.crs {shown(frame.crs)} is no CRS. Write it as EPSG:n.") from error
+    except ConfigError as error:
+        raise ConfigError(f"{path}: frame.crs: {error}") from error
 
 
 def _default_crs(loaded: Sequence[_Loaded]) -> CRS:

@@ -4,11 +4,26 @@ from __future__ import annotations
 
 import reprlib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from zlocus.errors import InputError
+from zlocus.io.text import is_decimal
+
+# What is measured is smaller; larger numbers are damage, and would overflow.
+LARGEST = 1e15
+
+
+def _plain(value: Any) -> Any:
+    """Pydantic takes true for 1, and in text 1_0 for 10."""
+    if isinstance(value, bool) or (isinstance(value, str) and not is_decimal(value)):
+        raise ValueError("is not a number")
+    return value
+
+
+Number = Annotated[FiniteFloat, BeforeValidator(_plain), Field(ge=-LARGEST, le=LARGEST)]
+Whole = Annotated[int, BeforeValidator(_plain), Field(ge=-LARGEST, le=LARGEST)]
 
 
 class StrictModel(BaseModel):
@@ -23,7 +38,10 @@ class StrictModel(BaseModel):
         if isinstance(value, dict):
             unknown = [str(key) for key in value if key not in allowed and key not in allowed.values()]
             if unknown:
-                raise ValueError(f"unknown key {', '.join(unknown)}; allowed here: {', '.join(allowed.values())}")
+                raise ValueError(f"unknown key {', '.join(unknown)[:80]}; allowed here: {', '.join(allowed.values())}")
+            empty = [str(key) for key, held in value.items() if held is None]
+            if empty:
+                raise ValueError(f"{', '.join(empty)} has no value; give one, or leave the key out")
         return value
 
 
