@@ -163,14 +163,16 @@ class Usable:
 
 
 def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
-    """As `open_scene`, but a view that cannot be used is named and the others are opened.
+    """As `open_scene`, but a view that cannot be used, or whose entry is wrong, is named and the others are opened.
 
     Raises
     ------
     InputError, ConfigError
-        Where nothing can be opened at all: a scene file that is wrong, an image given twice, a CRS that does not suit.
+        Where nothing can be opened at all: a scene file that is wrong elsewhere, an image given twice, a CRS that does
+        not suit.
     """
-    asked = _asked(inputs, crs)
+    wrong: list[Refused] = []
+    asked = _asked(inputs, crs, wrong)
     refused: dict[str, Refused] = {}
 
     def tried(entry: _Entry, step: Callable[[], T]) -> list[T]:
@@ -187,11 +189,12 @@ def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
         frame = _default_crs(loaded) if loaded else None
     views = [] if frame is None else [v for each in loaded for v in tried(each.entry, partial(each.view, frame))]
     scene = asked.scene(views, frame) if views and frame is not None else None
-    return Usable(scene, tuple(refused[entry.name] for entry in asked.entries if entry.name in refused))
+    return Usable(scene, (*wrong, *(refused[entry.name] for entry in asked.entries if entry.name in refused)))
 
 
-def read_scene_file(path: Path) -> SceneFile:
-    """A `scene.yaml`, checked, its images and cameras unread.
+def read_scene_file(path: Path, wrong: list[Refused] | None = None) -> SceneFile:
+    """A `scene.yaml`, checked, its images and cameras unread. wrong : takes the views whose entries are, without which
+    the file is read then.
 
     Raises
     ------
@@ -203,10 +206,28 @@ def read_scene_file(path: Path) -> SceneFile:
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
     views = document.get("views")
-    for index, view in enumerate(views if isinstance(views, list) else []):
-        if isinstance(view, dict) and "camera" in view:
-            view["camera"] = _camera(view["camera"], path, f"views[{index}].camera")
+    if isinstance(views, list):
+        entries = [entry for i in range(len(views)) for entry in _view_entry(views, i, path, wrong)]
+        document = document | {"views": entries}
     return validated(SceneFile, document, path)
+
+
+def _view_entry(views: list[Any], index: int, path: Path, wrong: list[Refused] | None) -> list[ViewEntry]:
+    """One view of a scene file; none where its entry is noted as wrong."""
+    view, where = views[index], f"views[{index}]"
+    given = view if isinstance(view, dict) else {}
+    try:
+        if "camera" in given:
+            view = given | {"camera": _camera(given["camera"], path, f"{where}.camera")}
+        return [validated(ViewEntry, view, path, where)]
+    except InputError as error:
+        if wrong is None:
+            raise
+        name, image = given.get("name"), given.get("image")
+        alone = isinstance(name, str) and sum(isinstance(v, dict) and v.get("name") == name for v in views) == 1
+        file = path.parent / image if isinstance(image, str) else path
+        wrong.append(Refused(name if isinstance(name, str) and alone else where, file, str(error)))
+        return []
 
 
 def write_scene_file(path: Path, scene_file: SceneFile) -> None:
@@ -267,13 +288,13 @@ class _Loaded:
         return View(entry.name, entry.path, self.image, self.source.sensor(crs), self.source.files, entry.date)
 
 
-def _asked(inputs: Sequence[Path], crs: CRS | None) -> _Asked:
+def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[Refused] | None = None) -> _Asked:
     paths = [Path(path) for path in inputs]
     scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
     if scene_files and len(paths) > 1:
         raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
     if scene_files:
-        asked = _from_scene_file(scene_files[0], crs)
+        asked = _from_scene_file(scene_files[0], crs, wrong)
     else:
         entries = [_Entry(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
         asked = _Asked(tuple(entries), Path(), crs)
@@ -289,8 +310,8 @@ def _load(entry: _Entry, folder: Path) -> _Loaded:
     return _Loaded(entry, image, entry.camera.read(folder, entry.path))
 
 
-def _from_scene_file(path: Path, crs: CRS | None) -> _Asked:
-    scene_file = read_scene_file(path)
+def _from_scene_file(path: Path, crs: CRS | None, wrong: list[Refused] | None) -> _Asked:
+    scene_file = read_scene_file(path, wrong)
     frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
     if frame is not None and is_local(frame) and crs is not None:
         raise ConfigError(f"{path} has a local frame, which --crs cannot place on the Earth. Leave --crs out.")
