@@ -98,7 +98,8 @@ def _read_errors(path: Path) -> Iterator[None]:
         yield
     except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path} cannot be read: {reason(error)}. It is damaged or truncated; copy it again from its source."
+            f"{path} cannot be read: {reason(error)}. It, or a file beside it that belongs to it, is damaged or "
+            "truncated; copy both again from their source."
         ) from error
 
 
