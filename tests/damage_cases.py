@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
@@ -54,9 +55,9 @@ def toml_number(text: str) -> float | None:
     """TOML has numbers to other bases, and underscores in them."""
     try:
         found = tomllib.loads(f"x = {text}\n")["x"]
-    except (tomllib.TOMLDecodeError, ValueError):
+        return float(found) if type(found) in (int, float) and math.isfinite(found) else None
+    except (tomllib.TOMLDecodeError, ValueError, OverflowError):
         return None
-    return found if isinstance(found, int | float) and not isinstance(found, bool) and np.isfinite(found) else None
 
 
 @dataclass(frozen=True)

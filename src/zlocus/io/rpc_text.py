@@ -18,6 +18,7 @@ SCALARS = (
     "LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE",
 )  # fmt: skip
 POLYNOMIALS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
+TXT_NAMES = {*SCALARS, *(f"{name}_{i}" for name in POLYNOMIALS for i in range(1, 21))}
 ADVICE = "Get the RPC from its source again."
 # Of a file; they have a hundredth of it.
 MOST_BYTES = 1_000_000
@@ -38,8 +39,8 @@ def read_rpc_txt(path: Path) -> RpcCoefficients:
     text, fields = _text(path), Fields(path)
     lines = text.splitlines()
     for number, line in enumerate(lines, 1):
-        name, separator, rest = line.partition(":")
-        if separator:
+        name, _, rest = line.partition(":")
+        if name.strip().upper() in TXT_NAMES:
             words = rest.split()
             # A unit may follow the number, another number may not.
             fields.add(name.strip().upper(), " ".join(words if len(words) > 1 and is_decimal(words[1]) else words[:1]))
