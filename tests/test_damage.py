@@ -265,6 +265,13 @@ def test_counts_of_colmap_are_not_believed(good, at, count):
     assert "truncated or damaged" in outcome(this, content)
 
 
+def test_numbers_of_colmap_that_would_overflow(good):
+    content = good("colmap-binary-images").content
+    assert "not a finite number" in outcome(
+        good("colmap-binary-images"), content[:12] + struct.pack("<d", 1e300) + content[20:]
+    )
+
+
 @pytest.mark.parametrize("name", ["colmap-binary-cameras", "colmap-binary-images"])
 def test_bytes_too_many(good, name):
     assert "1 bytes too many" in outcome(good(name), good(name).content + b"\0")
@@ -319,6 +326,7 @@ FOUND = [
     ("config-toml", b"least_cells = 60", b"least_cells = 60\nleast_cells = 6"),
     ("colmap-text-cameras", b"70.0", "١٢".encode()),
     ("metashape", b"6378137", b"1.0"),
+    ("metashape", b"0.0174532925199433", b"0.0"),
     ("opensfm", b'"width"', b'"width": 64, "width"'),
     ("eo", b"b 30.0", b"b 1 30.0"),
     ("area-geojson", b"[ 700110.0, 4790210.0 ], ", b""),

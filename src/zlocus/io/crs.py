@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pyproj import CRS
+from pyproj.exceptions import ProjError
 
 from zlocus.errors import ConfigError
 from zlocus.io.text import shown
+from zlocus.sensors.space import WGS84, between
 
 LOCAL = (
     'ENGCRS["Local Cartesian frame, z up",EDATUM["Local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
@@ -21,9 +23,15 @@ def local_frame() -> CRS:
 
 
 def is_on_earth(crs: CRS) -> bool:
-    """Whether a CRS has the size of the Earth; others cannot be converted to its coordinates."""
+    """Whether coordinates in a CRS are places on the Earth: it has its size, and PROJ can convert them."""
     ellipsoid = crs.ellipsoid
-    return ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_M) < EARTHS_DIFFER_M
+    if ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_M) > EARTHS_DIFFER_M:
+        return False
+    try:
+        between(crs.to_2d(), WGS84)
+    except ProjError:
+        return False
+    return True
 
 
 def checked_crs(crs: CRS) -> CRS:
@@ -35,14 +43,14 @@ def checked_crs(crs: CRS) -> CRS:
         For any other CRS, saying what to use instead.
     """
     flat = crs.to_2d()
-    if not is_on_earth(flat):
-        raise ConfigError(f"The CRS {shown(crs.to_string())} is not of the size of the Earth. Use one that is.")
     advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
     if not flat.is_projected:
         kind = "geographic (degrees)" if flat.is_geographic else "not projected"
         raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is {kind}. {advice}, or leave --crs out.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
         raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is in {flat.axis_info[0].unit_name}. {advice}.")
+    if not is_on_earth(flat):
+        raise ConfigError(f"The CRS {shown(crs.to_string())} cannot be converted to places on the Earth. {advice}.")
     return flat
 
 

@@ -10,12 +10,10 @@ import numpy as np
 
 from zlocus.errors import InputError, OutputError
 from zlocus.io.opening import existing_file
-from zlocus.io.text import AGAIN, LONGEST_LINE, decimal, shown, text_lines
+from zlocus.io.text import AGAIN, LARGEST, LONGEST_LINE, decimal, shown, text_lines
 from zlocus.sensors.model import FloatArray
 
 SEPARATORS = (",", ";")
-# What is measured is smaller; larger numbers are damage, and would overflow.
-LARGEST = 1e15
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,7 +144,9 @@ def _known_crs(given: Any, path: Path) -> CRS:
             f"{path} has a CRS that PROJ does not know: {error}. Assign one (gdal_edit -a_srs)."
         ) from error
     if not is_on_earth(crs):
-        raise InputError(f"{path} has the CRS {shown(crs.name)}, which is not of the Earth. Assign another.")
+        raise InputError(
+            f"{path} has the CRS {shown(crs.name)}, which cannot be converted to places on the Earth. Assign another."
+        )
     return crs
 
 

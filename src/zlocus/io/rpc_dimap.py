@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 from zlocus.errors import InputError
 from zlocus.io.documents import read_xml
-from zlocus.io.rpc_text import LARGEST, POLYNOMIALS, SCALARS, rpc_from_fields
-from zlocus.io.text import AGAIN, decimal, shown
+from zlocus.io.rpc_text import POLYNOMIALS, SCALARS, rpc_from_fields
+from zlocus.io.text import AGAIN, LARGEST, decimal, shown
 from zlocus.sensors.rpc import RpcCoefficients
 
 TILE = re.compile(r"_R(\d+)C(\d+)$", re.IGNORECASE)

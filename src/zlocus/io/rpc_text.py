@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from zlocus.errors import InputError, OutputError
-from zlocus.io.text import BYTE_ORDER_MARK, decimal, is_decimal, read_bytes, shown, stops_within
+from zlocus.io.text import BYTE_ORDER_MARK, LARGEST, decimal, is_decimal, read_bytes, shown, stops_within
 from zlocus.sensors.rpc import RpcCoefficients
 
 SCALARS = (
@@ -22,8 +22,6 @@ TXT_NAMES = {*SCALARS, *(f"{name}_{i}" for name in POLYNOMIALS for i in range(1,
 ADVICE = "Get the RPC from its source again."
 # Of a file; they have a hundredth of it.
 MOST_BYTES = 1_000_000
-# Larger numbers are damage, and would overflow.
-LARGEST = 1e15
 # What is less is taken for 0 where it divides.
 LEAST = 1e-12
 RPB_NAMES = {

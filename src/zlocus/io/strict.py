@@ -9,10 +9,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from zlocus.errors import InputError
-from zlocus.io.text import is_decimal
-
-# What is measured is smaller; larger numbers are damage, and would overflow.
-LARGEST = 1e15
+from zlocus.io.text import LARGEST, is_decimal
 
 
 def _plain(value: Any) -> Any:

@@ -14,6 +14,8 @@ AGAIN = "Export it again, or copy it again from its source."
 LONGEST_SHOWN = 40
 # Of a line that a person or a program writes a table in, with room to spare.
 LONGEST_LINE = 100_000
+# What is measured is smaller; larger numbers are damage, and would overflow.
+LARGEST = 1e15
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # What ends a value for certain, where no line end does.
 CLOSING = ("]", "}", '"', "'")

@@ -12,7 +12,7 @@ import numpy as np
 
 from zlocus.errors import InputError
 from zlocus.io.opening import existing_file
-from zlocus.io.text import AGAIN, decimal, shown
+from zlocus.io.text import AGAIN, LARGEST, decimal, shown
 from zlocus.sensors.model import FloatArray
 
 UNIT = 1e-3
@@ -74,7 +74,7 @@ def number(value: Any, path: Path, where: str) -> float:
         found = decimal(value) if isinstance(value, str) else math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
         found = math.nan
-    if not math.isfinite(found):
+    if not abs(found) <= LARGEST:
         raise InputError(f"{path}: {where} is {shown(value)}, not a finite number. {AGAIN}")
     return found
 

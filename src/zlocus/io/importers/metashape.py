@@ -97,7 +97,8 @@ def _chunk_crs(chunk: Element, path: Path) -> CRS | None:
         raise InputError(f"{path} has the reference {shown(text)}, which is no CRS. {AGAIN}") from error
     if crs.is_engineering:
         return None
-    if crs.to_2d().geodetic_crs is None or not is_on_earth(crs):
+    geographic = crs.to_2d().geodetic_crs
+    if geographic is None or not is_on_earth(geographic):
         raise InputError(f"{path} has the reference {crs.name}, whose place on the Earth is not known. {AGAIN}")
     return crs.to_2d()
 
