@@ -36,9 +36,6 @@ class StrictModel(BaseModel):
             unknown = [str(key) for key in value if key not in allowed and key not in allowed.values()]
             if unknown:
                 raise ValueError(f"unknown key {', '.join(unknown)[:80]}; allowed here: {', '.join(allowed.values())}")
-            empty = [str(key) for key, held in value.items() if held is None]
-            if empty:
-                raise ValueError(f"{', '.join(empty)} has no value; give one, or leave the key out")
         return value
 
 
@@ -57,6 +54,10 @@ def validated(model: type[Document], document: Any, path: Path, where: str = "")
     InputError
         For the first thing that is wrong: file, key, what stands there and what is allowed.
     """
+    empty = _empty_key(document)
+    if empty is not None:
+        place = f"{where}.{empty}" if where else empty
+        raise InputError(f"{path}: {place} has no value. Give one, or leave the key out.")
     try:
         return model.model_validate(document)
     except ValidationError as error:
@@ -69,3 +70,16 @@ def validated(model: type[Document], document: Any, path: Path, where: str = "")
         message = first["msg"].removeprefix("Value error, ")
         value = "" if isinstance(first["input"], dict) else f" (there: {SHORT.repr(first['input'])})"
         raise InputError(f"{path}: {key or 'the document'}: {message}{value}.") from error
+
+
+def _empty_key(document: Any) -> str | None:
+    """The first key of a document, as a path, after which nothing stands: whoever wrote it meant something."""
+    if not isinstance(document, dict):
+        return None
+    for key, value in document.items():
+        if value is None:
+            return str(key)
+        inside = _empty_key(value)
+        if inside is not None:
+            return f"{key}.{inside}"
+    return None
