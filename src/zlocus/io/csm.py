@@ -35,7 +35,8 @@ TOLERANCE_PX = 1e-3
 # Of the image's time, before its first row and after its last.
 BEYOND = 0.1
 REGULAR_ROWS = 1e-6
-MOST_ROWS = 10_000_000
+# Three times those of the longest strips; more would take half a gigabyte and more.
+MOST_ROWS = 4_000_000
 
 
 class CsmState(StrictModel):
