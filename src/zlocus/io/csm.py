@@ -35,7 +35,7 @@ TOLERANCE_PX = 1e-3
 # Of the image's time, before its first row and after its last.
 BEYOND = 0.1
 REGULAR_ROWS = 1e-6
-# Three times those of the longest strips; more would take half a gigabyte and more.
+# Twice as many would take 500 MB.
 MOST_ROWS = 4_000_000
 
 
