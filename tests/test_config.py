@@ -142,8 +142,9 @@ def test_unknown_keys_are_refused_at_every_level():
     ("name", "content", "says"),
     [
         ("a.toml", b"[orientation\n", "not a valid configuration file"),
-        ("a.yaml", b"orientation: [\n", "not a valid configuration file"),
-        ("a.toml", b"\xff\xfe", "not UTF-8"),
+        ("a.yaml", b"orientation: [\n", "cannot be read as YAML"),
+        ("a.toml", b"\xff\xfe", "not text in UTF-8"),
+        ("a.toml", b"[orientation]\nmin_ties = 3", "stops within line 2"),
         ("missing.toml", None, "cannot be read"),
         ("a.toml", b"[orientation]\nmodel = 2020-01-01\n", "wrong type"),
     ],

@@ -161,7 +161,7 @@ def test_lagrange_is_exact_for_polynomials_of_its_order():
         ({"m_quaternions": [1.0] * 4}, "m_quaternions: Tuple should have at least 8 items"),
         ({"m_iTransL": [0.0, 0.0, 0.0]}, "are parallel"),
         ({"m_zDirection": 2}, "m_zDirection"),
-        ({"m_focalLength": float("nan")}, "m_focalLength: Input should be"),
+        ({"m_focalLength": float("nan")}, "it holds NaN, which is no number"),
         ({"m_intTimeStartTimes": [70.0]}, "known from -1.000000 to 1.000000 s only"),
         ({"m_detectorSampleSumming": 0.0}, "do not lie along a line"),
     ],

@@ -23,7 +23,8 @@ from zlocus.doctor.geometry import geometry_findings, view_geometry
 from zlocus.doctor.plan import RunPlan, plan_findings
 from zlocus.doctor.quality import MOST_WINDOWS, SIDE_PX, image_quality, sample_windows
 from zlocus.doctor.ties import tie_findings
-from zlocus.io.scene_file import open_usable
+from zlocus.errors import InputError
+from zlocus.io.scene_file import open_scene, open_usable
 from zlocus.options import OrientationOptions
 from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations
@@ -383,6 +384,62 @@ def test_a_scene_file_with_a_missing_view(good, tmp_path):
     assert report["plan"]["heights"] == [25.0, 80.0]
     usable = open_usable([scene])
     assert [view.name for view in usable.scene.views] == list(good)
+
+
+BAD_ENTRIES = {
+    "kind": ("name: bad, image: bad.tif, camera: {kind: rcp}", "bad", r"views[1].camera.kind is 'rcp'"),
+    "key": ("name: bad, image: bad.tif, camera: {kind: frame, focal: 70.0}", "bad", "views[1].camera.principal_point"),
+    "number": ("name: bad, image: bad.tif, camera: {kind: rpc, shift: [yes, 0]}", "bad", "views[1].camera.shift[0]"),
+    "image": ("name: bad, camera: {kind: rpc}", "bad", "the key views[1].image is missing"),
+    "name": ("image: bad.tif, camera: {kind: rpc}", "views[1]", "the key views[1].name is missing"),
+    "no camera": ("name: bad, image: bad.tif", "bad", "the key views[1].camera is missing"),
+    "same name": ("name: nadir, camera: {kind: rpc}", "views[1]", "the key views[1].image is missing"),
+}
+
+
+def scene_of(folder, good, bad):
+    """A scene file of good images, with another entry in the second place."""
+    entries = [f"name: {p.stem}, image: '{p}', camera: {{kind: rpc}}" for p in good.values()]
+    lines = [f"  - {{{entry}}}" for entry in (entries[0], *bad, *entries[1:])]
+    scene = folder / "scene.yaml"
+    scene.write_text("\n".join(["schema: 1", "heights: [25, 80]", "views:", *lines]) + "\n")
+    return scene
+
+
+@pytest.mark.parametrize("bad", BAD_ENTRIES)
+def test_a_scene_file_with_a_bad_entry(good, tmp_path, bad):
+    """The others are opened all the same; the entry is named as a run names it."""
+    entry, name, says = BAD_ENTRIES[bad]
+    scene = scene_of(tmp_path, good, [entry])
+    usable = open_usable([scene])
+    assert [view.name for view in usable.scene.views] == list(good)
+    (refused,) = usable.refused
+    assert refused.name == name
+    assert says in refused.reason
+    assert "scene.yaml" in refused.reason
+    with pytest.raises(InputError) as caught:
+        open_scene([scene])
+    assert str(caught.value) == refused.reason
+
+
+def test_the_doctor_goes_on_after_bad_entries(good, tmp_path):
+    scene = scene_of(tmp_path, good, [BAD_ENTRIES["key"][0], "what: 6"])
+    status, text, report = doctor(tmp_path / "out", scene)
+    assert status == 2
+    assert list(report["refused"]) == ["bad", "views[2]"]
+    assert report["refused"]["bad"]["path"] == str(tmp_path / "bad.tif")
+    assert len(sentences(report, "stops")) == 2
+    assert set(report["views"]) == set(good)
+    assert all(view["n_ties"] > 30 for view in report["views"].values())
+    assert "cannot be used" in text
+
+
+def test_a_scene_file_of_bad_entries_only(tmp_path):
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(f"schema: 1\nviews:\n  - {{{BAD_ENTRIES['kind'][0]}}}\n  - 7\n")
+    status, _, report = doctor(tmp_path / "out", scene)
+    assert status == 2
+    assert list(report["refused"]) == ["bad", "views[1]"]
 
 
 def test_every_kind_of_sensor(tmp_path):

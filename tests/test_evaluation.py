@@ -168,9 +168,9 @@ def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
     text = tmp_path / "text.tif"
     text.write_text("not an image")
     for error, says, arguments in (
-        (InputError, "missing.tif does not exist", (tmp_path / "missing.tif", good, {})),
-        (InputError, "missing.tif does not exist", (good, tmp_path / "missing.tif", {})),
-        (InputError, "text.tif cannot be read", (text, good, {})),
+        (InputError, "There is no raster of heights .*missing.tif", (tmp_path / "missing.tif", good, {})),
+        (InputError, "There is no raster of heights .*missing.tif", (good, tmp_path / "missing.tif", {})),
+        (InputError, "text.tif cannot be opened as a raster", (text, good, {})),
         (InputError, "do not overlap", (far, good, {})),
         (InputError, "is in degrees", (good, degrees, {})),
         (InputError, "has no height", (good, empty, {})),
@@ -180,8 +180,12 @@ def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
         (ConfigError, "is negative", (good, good, {"margin_m": -1.0})),
         (ConfigError, "is not a size", (good, good, {"threshold_m": 0.0})),
         (ConfigError, "is not on the grid", (good, good, {"classes": classes})),
-        (InputError, "nowhere.tif does not exist", (good, good, {"classes": tmp_path / "nowhere.tif"})),
-        (InputError, "cannot be read as a raster of classes", (good, good, {"classes": text})),
+        (
+            InputError,
+            "There is no raster of classes .*nowhere.tif",
+            (good, good, {"classes": tmp_path / "nowhere.tif"}),
+        ),
+        (InputError, "cannot be opened as a raster", (good, good, {"classes": text})),
     ):
         with pytest.raises(error, match=says) as caught:
             evaluate(arguments[0], arguments[1], **arguments[2])

@@ -280,9 +280,10 @@ def changed(kind, line, text):
         ("trajectory", changed("trajectory", 3, "0.2,1,2,nan,0,0,0"), "line 4: 'nan' is not a finite number"),
         ("trajectory", changed("trajectory", 3, "0.2,1,2,1e999,0,0,0"), "line 4: '1e999' is not a finite number"),
         ("trajectory", changed("trajectory", 3, "0.2,1,2,1_0,0,0,0"), "line 4: '1_0' is not a finite number"),
-        ("trajectory", changed("trajectory", 3, "0.2,1,2," + "7" * 10**7 + ",0,0,0"), "line 4: '7{40}...' is not a"),
-        ("trajectory", "x" * 10**7, "holds no rows"),
-        ("trajectory", "x" * 10**7 + "\n1", "column 'x{40}...' in its header"),
+        ("trajectory", changed("trajectory", 3, "0.2,1,2," + "7" * 90_000 + ",0,0,0"), "line 4: '7{40}...' is not a"),
+        ("trajectory", changed("trajectory", 3, "0.2,1,2," + "7" * 10**7 + ",0,0,0"), "line 4: 10000014 letters are"),
+        ("trajectory", "x" * 90_000, "holds no rows"),
+        ("trajectory", "x" * 90_000 + "\n1", "column 'x{40}...' in its header"),
         (
             "calibration",
             changed("calibration", 1, "1;-1;0"),
@@ -299,7 +300,7 @@ def changed(kind, line, text):
 )
 def test_what_a_table_must_not_hold(tmp_path, kind, content, message):
     path = tmp_path / "table.txt"
-    path.write_text(content)
+    path.write_text(content + "\n")
     with pytest.raises(InputError, match=message) as caught:
         READERS[kind][1](path)
     assert "table.txt" in str(caught.value)
@@ -308,7 +309,7 @@ def test_what_a_table_must_not_hold(tmp_path, kind, content, message):
 
 
 def test_quaternions_of_length_one(tmp_path):
-    (tmp_path / "q.csv").write_text("time,x,y,z,qx,qy,qz,qw\n" + "\n".join(f"{t},1,2,3,0,0,1,0.5" for t in range(5)))
+    (tmp_path / "q.csv").write_text("time,x,y,z,qx,qy,qz,qw\n" + "".join(f"{t},1,2,3,0,0,1,0.5\n" for t in range(5)))
     with pytest.raises(InputError, match=r"q\.csv, line 2: the quaternion .* is not of length 1"):
         read_trajectory(tmp_path / "q.csv", None, "frame", NOTHING, NOTHING)
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from affine import Affine
 from rasterio.crs import CRS
-from rasterio.errors import RasterioError
 
 from zlocus.errors import InputError
+from zlocus.io.opening import open_raster
 from zlocus.sensors.model import FloatArray
 
 # What other programs write where they have no height, without declaring it.
@@ -64,14 +63,12 @@ def read_heights(path: Path) -> HeightRaster:
     InputError
         The file is missing, cannot be read, or is too small to hold a surface.
     """
-    if not path.exists():
-        raise InputError(f"{path} does not exist. Check the name.")
-    try:
-        with rasterio.open(path) as source:
-            z = source.read(1).astype(np.float64)
-            nodata, transform, crs = source.nodata, source.transform, source.crs
-    except (RasterioError, OSError) as error:
-        raise InputError(f"{path} cannot be read as a raster of heights: {error}. Check the file.") from error
+    with open_raster(path, "raster of heights") as source:
+        stored, nodata, transform, crs = source.read(1), source.nodata, source.transform, source.crs
+    if stored.dtype.kind == "c":
+        raise InputError(f"{path} holds complex numbers, which are no heights. Check the file.")
+    with np.errstate(invalid="ignore"):  # some kinds of NaN
+        z = stored.astype(np.float64)
     if min(z.shape) < 2:
         raise InputError(f"{path} has {z.shape[0]} x {z.shape[1]} cells, too few for a surface. Check the file.")
     if nodata is not None:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
 
 from zlocus.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
+from zlocus.io.opening import open_raster
 from zlocus.sensors.model import FloatArray
 
 BLOCK_M = 0.5
@@ -97,13 +96,8 @@ def read_classes(path: Path, reference: HeightRaster) -> NDArray[np.uint8]:
     ConfigError
         It lies on another grid.
     """
-    if not path.exists():
-        raise InputError(f"{path} does not exist. Check the name.")
-    try:
-        with rasterio.open(path) as source:
-            classes, transform = source.read(1), source.transform
-    except (RasterioError, OSError) as error:
-        raise InputError(f"{path} cannot be read as a raster of classes: {error}. Check the file.") from error
+    with open_raster(path, "raster of classes") as source:
+        classes, transform = source.read(1), source.transform
     if classes.shape != reference.z.shape or not transform.almost_equals(reference.transform):
         raise ConfigError(f"{path} is not on the grid of {reference.path}. Resample it to that grid first.")
     return np.asarray(classes)

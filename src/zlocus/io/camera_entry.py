@@ -6,13 +6,12 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Protocol
 
-from pydantic import FiniteFloat
 from pyproj import CRS
 
-from zlocus.io.strict import StrictModel
+from zlocus.io.strict import Number, StrictModel
 from zlocus.sensors.model import SensorModel
 
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Vector = tuple[Number, Number, Number]
 
 
 class CameraSource(Protocol):

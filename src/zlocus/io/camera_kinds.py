@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import FiniteFloat
 from pyproj import CRS
 
 from zlocus.io.camera_entry import Camera
 from zlocus.io.cameras import find_sidecar, read_rpc
 from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.linescan import LineScanCamera
+from zlocus.io.strict import Number
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import SensorModel
 from zlocus.sensors.rpc import RpcCoefficients, RpcModel
@@ -46,7 +46,7 @@ class RpcCamera(Camera):
 
     kind: Literal["rpc"] = "rpc"
     file: str | None = None
-    shift: tuple[FiniteFloat, FiniteFloat] | None = None
+    shift: tuple[Number, Number] | None = None
 
     def read(self, folder: Path, image: Path) -> RpcSource:
         """See `Camera`."""

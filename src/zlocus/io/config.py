@@ -11,13 +11,16 @@ from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from zlocus.errors import ConfigError
+from zlocus.errors import ConfigError, InputError
+from zlocus.io.documents import read_yaml
+from zlocus.io.text import check_ended, read_text
 from zlocus.options import RunConfig
 
 COMMENT_WIDTH = 100
+# Bytes of a file; a complete one has a tenth of it.
+LARGEST = 200_000
 HEADING = "# Every option of zlocus. What is left out keeps its default; read with --config FILE."
 T = TypeVar("T")
 
@@ -55,16 +58,20 @@ def read_config(path: Path) -> RunConfig:
         The file cannot be read, or see `config_from_dict`.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ConfigError(f"{path} cannot be read: {reason}. `zlocus config -o FILE` writes a complete one.") from error
+        is_yaml = path.suffix.lower() in (".yaml", ".yml")
+        values = read_yaml(path, LARGEST) if is_yaml else _read_toml(path)
+    except InputError as error:
+        raise ConfigError(f"{error} `zlocus config -o FILE` writes a complete one.") from error
+    return config_from_dict({} if values is None else values, str(path))
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    text = read_text(path, LARGEST)
+    check_ended(text.rstrip(" \t"), path)
     try:
-        values = yaml.safe_load(text) or {} if path.suffix.lower() in (".yaml", ".yml") else tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path} is not a valid configuration file: {reason}. Mend that line.") from error
-    return config_from_dict(values, str(path))
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a valid configuration file: {' '.join(str(error).split())}.") from error
 
 
 def write_config(config: RunConfig) -> str:

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 from pyproj import CRS
+from pyproj.exceptions import ProjError
 
 from zlocus.errors import ConfigError
+from zlocus.io.text import shown
+from zlocus.sensors.space import WGS84, between
 
 LOCAL = (
     'ENGCRS["Local Cartesian frame, z up",EDATUM["Local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
     'LENGTHUNIT["metre",1]]'
 )
+# Semi-major axis, and by how much those of ellipsoids and spheres in use differ.
+EARTH_M, EARTHS_DIFFER_M = 6378137.0, 3e4
 
 
 def local_frame() -> CRS:
     """Cartesian axes in metres, z up, at no known place of the Earth."""
     return CRS.from_wkt(LOCAL)
+
+
+def is_on_earth(crs: CRS) -> bool:
+    """Whether coordinates in a CRS are places on the Earth: it has its size, and PROJ can convert them."""
+    ellipsoid = crs.ellipsoid
+    if ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_M) > EARTHS_DIFFER_M:
+        return False
+    try:
+        between(crs.to_2d(), WGS84)
+    except ProjError:
+        return False
+    return True
 
 
 def checked_crs(crs: CRS) -> CRS:
@@ -32,6 +49,8 @@ def checked_crs(crs: CRS) -> CRS:
         raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is {kind}. {advice}, or leave --crs out.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
         raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is in {flat.axis_info[0].unit_name}. {advice}.")
+    if not is_on_earth(flat):
+        raise ConfigError(f"The CRS {shown(crs.to_string())} cannot be converted to places on the Earth. {advice}.")
     return flat
 
 

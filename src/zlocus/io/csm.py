@@ -6,20 +6,20 @@ distortion. Adjusted parameters that are not zero, other distortions and other b
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from zlocus.errors import InputError
 from zlocus.io.camera_entry import Vector
+from zlocus.io.documents import read_json
 from zlocus.io.linescan import LineScanCamera, RegularTimes
-from zlocus.io.linescan_files import write_calibration, write_times, write_trajectory
+from zlocus.io.linescan_files import MOST_COLUMNS, write_calibration, write_times, write_trajectory
 from zlocus.io.opening import existing_file
-from zlocus.io.strict import StrictModel, validated
+from zlocus.io.strict import Number, StrictModel, Whole, validated
 from zlocus.sensors.linescan import FocalLine, LineTimes
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rotation import from_quaternions
@@ -35,38 +35,40 @@ TOLERANCE_PX = 1e-3
 # Of the image's time, before its first row and after its last.
 BEYOND = 0.1
 REGULAR_ROWS = 1e-6
+# Twice as many would take 500 MB.
+MOST_ROWS = 4_000_000
 
 
 class CsmState(StrictModel):
     """The fields that are read; see UsgsAstroLsSensorModel in usgscsm for what they mean."""
 
     m_modelName: str
-    m_nLines: int = Field(gt=1)
-    m_nSamples: int = Field(gt=1)
-    m_platformFlag: int = 1
-    m_intTimeLines: tuple[FiniteFloat, ...] = Field(min_length=1)
-    m_intTimeStartTimes: tuple[FiniteFloat, ...]
-    m_intTimes: tuple[FiniteFloat, ...]
-    m_detectorSampleSumming: FiniteFloat = 1.0
-    m_startingDetectorSample: FiniteFloat = 0.0
-    m_startingDetectorLine: FiniteFloat = 0.0
-    m_detectorSampleOrigin: FiniteFloat
-    m_detectorLineOrigin: FiniteFloat
+    m_nLines: Whole = Field(gt=1, le=MOST_ROWS)
+    m_nSamples: Whole = Field(gt=1, le=MOST_COLUMNS)
+    m_platformFlag: Whole = 1
+    m_intTimeLines: tuple[Number, ...] = Field(min_length=1)
+    m_intTimeStartTimes: tuple[Number, ...]
+    m_intTimes: tuple[Number, ...]
+    m_detectorSampleSumming: Number = 1.0
+    m_startingDetectorSample: Number = 0.0
+    m_startingDetectorLine: Number = 0.0
+    m_detectorSampleOrigin: Number
+    m_detectorLineOrigin: Number
     m_iTransS: Vector
     m_iTransL: Vector
-    m_focalLength: FiniteFloat = Field(gt=0)
+    m_focalLength: Number = Field(gt=0)
     m_zDirection: Literal[1, -1]
-    m_distortionType: int
-    m_opticalDistCoeffs: tuple[FiniteFloat, ...]
-    m_majorAxis: FiniteFloat
-    m_minorAxis: FiniteFloat
-    m_t0Ephem: FiniteFloat
-    m_dtEphem: FiniteFloat = Field(gt=0)
-    m_positions: tuple[FiniteFloat, ...] = Field(min_length=6)
-    m_t0Quat: FiniteFloat
-    m_dtQuat: FiniteFloat = Field(gt=0)
-    m_quaternions: tuple[FiniteFloat, ...] = Field(min_length=8)
-    m_currentParameterValue: tuple[FiniteFloat, ...] = ()
+    m_distortionType: Whole
+    m_opticalDistCoeffs: tuple[Number, ...]
+    m_majorAxis: Number
+    m_minorAxis: Number
+    m_t0Ephem: Number
+    m_dtEphem: Number = Field(gt=0)
+    m_positions: tuple[Number, ...] = Field(min_length=6)
+    m_t0Quat: Number
+    m_dtQuat: Number = Field(gt=0)
+    m_quaternions: tuple[Number, ...] = Field(min_length=8)
+    m_currentParameterValue: tuple[Number, ...] = ()
 
     @field_validator("m_zDirection", mode="before")
     @classmethod
@@ -150,11 +152,7 @@ def convert_csm(path: Path, folder: Path, name: str) -> LineScanCamera:
 
 def _state(path: Path) -> CsmState:
     """The state in a file; the name of the model may stand before it."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        document = json.loads(text[max(text.find("{"), 0) :])
-    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {str(error)[:200]}. Give a CSM model state.") from error
+    document = read_json(path, start="{")
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a CSM model state: it must hold m_modelName: {MODEL}.")
     return validated(CsmState, {key: document[key] for key in CsmState.model_fields if key in document}, path)

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import (
     BeforeValidator,
     Field,
-    FiniteFloat,
     PlainSerializer,
     SerializerFunctionWrapHandler,
     model_serializer,
@@ -22,7 +21,8 @@ from pyproj.exceptions import CRSError
 from zlocus.errors import ConfigError, InputError
 from zlocus.io.camera_entry import Camera, Vector
 from zlocus.io.crs import checked_crs
-from zlocus.io.strict import StrictModel
+from zlocus.io.strict import Number, StrictModel
+from zlocus.io.text import shown
 from zlocus.scene import is_local
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
@@ -33,10 +33,12 @@ ORTHONORMAL = 1e-4
 # What no camera on or above the Earth exceeds; larger numbers are damage, and would overflow.
 FARTHEST_M = 1e9
 LARGEST_PX = 1e7
+# What is less is taken for 0.
+LEAST_PX = 1e-6
 
-Coordinate = Annotated[FiniteFloat, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
-Pixels = Annotated[FiniteFloat, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
-FocalLength = Annotated[FiniteFloat, Field(gt=0, le=LARGEST_PX)]
+Coordinate = Annotated[Number, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+Pixels = Annotated[Number, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
+FocalLength = Annotated[Number, Field(gt=LEAST_PX, le=LARGEST_PX)]
 
 
 def _pair(value: Any) -> Any:
@@ -67,14 +69,14 @@ class BrownEntry(Sparse):
     """See `BrownDistortion`; what is left out is 0."""
 
     kind: Literal["brown"] = "brown"
-    k1: FiniteFloat = 0.0
-    k2: FiniteFloat = 0.0
-    p1: FiniteFloat = 0.0
-    p2: FiniteFloat = 0.0
-    k3: FiniteFloat = 0.0
-    k4: FiniteFloat = 0.0
-    k5: FiniteFloat = 0.0
-    k6: FiniteFloat = 0.0
+    k1: Number = 0.0
+    k2: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    k5: Number = 0.0
+    k6: Number = 0.0
 
     def model(self) -> BrownDistortion | None:
         """The distortion; None where there is none."""
@@ -86,10 +88,10 @@ class FisheyeEntry(Sparse):
     """See `FisheyeDistortion`; what is left out is 0."""
 
     kind: Literal["fisheye"] = "fisheye"
-    k1: FiniteFloat = 0.0
-    k2: FiniteFloat = 0.0
-    k3: FiniteFloat = 0.0
-    k4: FiniteFloat = 0.0
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
 
     def model(self) -> FisheyeDistortion:
         """The distortion."""
@@ -157,7 +159,11 @@ def map_crs(text: str, image: Path) -> CRS:
     try:
         return checked_crs(CRS.from_user_input(text))
     except CRSError as error:
-        raise InputError(f"The camera of {image} is given in {text!r}, which is no CRS. Write it as EPSG:n.") from error
+        raise InputError(
+            f"The camera of {image} is given in {shown(text)}, which is no CRS. Write it as EPSG:n."
+        ) from error
+    except ConfigError as error:
+        raise ConfigError(f"The camera of {image}: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -107,9 +107,15 @@ def open_image(path: Path) -> RasterImage:
         bands, weights = _grey_bands(source)
         image = RasterImage(path, source.shape, source.dtypes[0], source.count, source.nodata, bands, weights)
         check_complete(source, path)
-        last = list(source.block_windows(bands[0]))[-1][1]
-        image._read(source, last)
+        image._read(source, _last_block(source, bands[0]))
         return image
+
+
+def _last_block(source: rasterio.DatasetReader, band: int) -> Window:
+    """The window of the last block of a band, without a list of all."""
+    rows, cols = source.block_shapes[band - 1]
+    row, col = (source.height - 1) // rows * rows, (source.width - 1) // cols * cols
+    return Window(col, row, source.width - col, source.height - row)
 
 
 def check_content(image: RasterImage) -> None:

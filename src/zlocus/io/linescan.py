@@ -8,15 +8,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 from affine import Affine
-from pydantic import AfterValidator, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.errors import InputError
 from zlocus.io.camera_entry import Camera, Vector
+from zlocus.io.crs import is_on_earth
 from zlocus.io.linescan_files import Rays, read_calibration, read_times, read_trajectory
 from zlocus.io.opening import open_raster
-from zlocus.io.strict import StrictModel
+from zlocus.io.strict import Number, StrictModel, Whole
 from zlocus.scene import is_local
 from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes, RectifiedModel
 from zlocus.sensors.model import SensorModel
@@ -26,24 +27,28 @@ from zlocus.sensors.trajectory import Trajectory
 
 def _known(crs: str) -> str:
     try:
-        CRS.from_user_input(crs)
+        known = is_on_earth(CRS.from_user_input(crs))
     except CRSError:
-        raise ValueError("is no CRS; write it as EPSG:n") from None
+        known = False
+    if not known:
+        raise ValueError("is no CRS; write it as EPSG:n")
     return crs
 
 
+# s, mm, or m2 of a pixel: what is less is taken for 0.
+LEAST = 1e-12
 CrsName = Annotated[str, AfterValidator(_known)]
 
 
 class RegularTimes(StrictModel):
     """Rows exposed every `interval` s, negative where row 0 is the last one flown; the middle of row 0 at `start` s."""
 
-    start: FiniteFloat
-    interval: FiniteFloat
+    start: Number
+    interval: Number
 
     @model_validator(mode="after")
     def _moving(self) -> RegularTimes:
-        if self.interval == 0.0:
+        if abs(self.interval) < LEAST:
             raise ValueError("interval is the time from row to row, which is not 0")
         return self
 
@@ -57,15 +62,15 @@ class Rectification(StrictModel):
     have the same crs, lever arm and boresight.
     """
 
-    height: FiniteFloat
-    transform: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    height: Number
+    transform: tuple[Number, Number, Number, Number, Number, Number]
     crs: CrsName | None = None
-    rows: int = Field(gt=1)
+    rows: Whole = Field(gt=1)
     trajectory: str | None = None
 
     @model_validator(mode="after")
     def _turns_back(self) -> Rectification:
-        if not abs(Affine(*self.transform).determinant) > 0:
+        if not abs(Affine(*self.transform).determinant) > LEAST:
             raise ValueError("transform flattens the image to a line; give a, b, c, d, e, f with a e - b d not 0")
         return self
 
@@ -81,8 +86,8 @@ class LineScanCamera(Camera):
     kind: Literal["linescan"] = "linescan"
     calibration: str
     line: str | None = None
-    focal_mm: FiniteFloat = Field(gt=0)
-    first_column: int = Field(default=0, ge=0)
+    focal_mm: Number = Field(gt=LEAST)
+    first_column: Whole = Field(default=0, ge=0)
     trajectory: str
     crs: CrsName | None = None
     rays: Rays = "earth"

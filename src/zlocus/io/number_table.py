@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,10 @@ import numpy as np
 
 from zlocus.errors import InputError, OutputError
 from zlocus.io.opening import existing_file
+from zlocus.io.text import AGAIN, LARGEST, LONGEST_LINE, decimal, shown, text_lines
 from zlocus.sensors.model import FloatArray
 
 SEPARATORS = (",", ";")
-LONGEST_QUOTE = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +84,7 @@ def read_numbers(path: Path, what: str, allowed: Iterable[str], words: Sequence[
     for name in names:
         if name not in known:
             raise InputError(
-                f"The {what} {path} has the column {_quote(name)} in its header. Allowed: {', '.join(known)}."
+                f"The {what} {path} has the column {shown(name)} in its header. Allowed: {', '.join(known)}."
             )
         if names.count(name) > 1:
             raise InputError(f"The {what} {path} has the column {name} twice in its header. Remove one.")
@@ -130,33 +129,23 @@ def write_numbers(
 
 def _rows(path: Path, what: str) -> list[tuple[int, str]]:
     """Lines that count, with their numbers from 1."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"The {what} {path} is not text in UTF-8 (byte {error.start}). Save it as such.") from error
-    except OSError as error:
-        raise InputError(f"The {what} {path} cannot be read: {error.strerror}. Check the path.") from error
-    lines = enumerate(text.split("\n"), 1)
-    return [(number, line.strip()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    rows = []
+    for number, line in text_lines(path):
+        if len(line) > LONGEST_LINE:
+            raise InputError(f"The {what} {path}, line {number}: {len(line)} letters are no row. {AGAIN}")
+        if line.strip() and not line.lstrip().startswith("#"):
+            rows.append((number, line.strip()))
+    return rows
 
 
 def _numbers(cells: list[str], what: str, path: Path, line: int) -> list[float]:
     """The finite numbers of a row."""
     values: list[float] = []
     for cell in cells:
-        try:
-            value = float(cell)
-        except ValueError:
-            value = math.nan
-        # Python reads 1_000 as a number; no table means it so.
-        if not math.isfinite(value) or "_" in cell:
+        value = decimal(cell)
+        if not abs(value) <= LARGEST:
             raise InputError(
-                f"The {what} {path}, line {line}: {_quote(cell.strip())} is not a finite number. Mend it there."
+                f"The {what} {path}, line {line}: {shown(cell.strip())} is not a finite number. Mend it there."
             )
         values.append(value)
     return values
-
-
-def _quote(text: str) -> str:
-    """A value for a message, shortened."""
-    return repr(text if len(text) <= LONGEST_QUOTE else text[:LONGEST_QUOTE] + "...")

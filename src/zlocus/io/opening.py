@@ -17,8 +17,12 @@ from rasterio.enums import Interleaving
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.errors import InputError
+from zlocus.io.text import shown
 
 BLOCK_CACHE_BYTES = 128 << 20
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# Its place in a TIFF alone.
+LEAST_BLOCK_BYTES = 4
 KEPT_OPEN = 32  # rasters of a thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
 # `warnings.catch_warnings` swaps a global list, so two threads must not be inside it at once.
@@ -34,9 +38,14 @@ def existing_file(path: Path, what: str) -> Path:
         When there is no such file, or it is a folder.
     """
     path = Path(path)
-    if path.is_dir():
+    try:
+        is_there, is_folder = path.exists(), path.is_dir()
+    except (OSError, ValueError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise InputError(f"There can be no {what} {shown(str(path))}: {why.lower()}. Check the path.") from error
+    if is_folder:
         raise InputError(f"The {what} {path} is a folder. Give the files in it one by one.")
-    if not path.exists():
+    if not is_there:
         raise InputError(f"There is no {what} {path}. Check the path.")
     return path
 
@@ -76,7 +85,7 @@ def _opened(path: Path) -> rasterio.DatasetReader:
         with _quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             return rasterio.open(path)
-    except (RasterioError, CPLE_BaseError, OSError) as error:
+    except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
             "GeoTIFF (or another format of GDAL)."
@@ -87,9 +96,10 @@ def _opened(path: Path) -> rasterio.DatasetReader:
 def _read_errors(path: Path) -> Iterator[None]:
     try:
         yield
-    except (RasterioError, CPLE_BaseError) as error:
+    except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path} cannot be read: {reason(error)}. It is damaged or truncated; copy it again from its source."
+            f"{path} cannot be read: {reason(error)}. It, or a file beside it that belongs to it, is damaged or "
+            "truncated; copy both again from their source."
         ) from error
 
 
@@ -124,20 +134,28 @@ _kept = _Kept()
 
 
 def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
-    """Compare the offsets and sizes of all TIFF blocks with the length of the file, decoding nothing.
+    """Compare the offsets and sizes of all TIFF blocks, or of the chunks of a PNG, with the length of the file,
+    decoding nothing.
 
-    Other formats pass.
+    Other formats pass: GDAL itself finds them truncated, which it does not of a PNG.
 
     Raises
     ------
     InputError
-        When pixels lie behind the end of the file.
+        When pixels lie behind the end of the file, or there are too many of them.
     """
+    if source.driver == "PNG":
+        _check_png(path)
     if source.driver not in ("GTiff", "COG"):
         return
     length = os.path.getsize(path)
     block_rows, block_cols = source.block_shapes[0]
     n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
+    if n_down * n_across * LEAST_BLOCK_BYTES > length:
+        raise InputError(
+            f"{path} is damaged: it says that it has {n_down * n_across} blocks of pixels, which its {length} bytes "
+            "cannot list. Copy it again from its source."
+        )
     for band in source.indexes if source.interleaving == Interleaving.band else (1,):
         for y in range(n_down):
             for x in range(n_across):
@@ -148,6 +166,23 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
                         f"{path} is truncated: it has {length} bytes, and pixels of row {y * block_rows} on lie behind "
                         "its end. Copy it again from its source."
                     )
+
+
+def _check_png(path: Path) -> None:
+    """Follow the chunks of a PNG to its last one. Source: PNG specification (ISO/IEC 15948), 5.2 and 5.3."""
+    length, at, kind = os.path.getsize(path), len(PNG_SIGNATURE), b""
+    with path.open("rb") as file:
+        while kind != b"IEND":
+            file.seek(at)
+            head = file.read(8)
+            # Length and name before, and a checksum behind what the chunk holds.
+            at += 12 + int.from_bytes(head[:4], "big")
+            kind = head[4:]
+            if len(head) < 8 or at > length:
+                raise InputError(
+                    f"{path} is truncated: it has {length} bytes, and ends before its last chunk. Copy it again from "
+                    "its source."
+                )
 
 
 def reason(error: BaseException) -> str:

@@ -19,11 +19,14 @@ from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
 
 from zlocus.errors import InputError, ZlocusWarning
-from zlocus.io.crs import checked_crs
+from zlocus.io.crs import checked_crs, is_on_earth
 from zlocus.io.opening import existing_file, open_raster
+from zlocus.io.text import shown
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200
+# No extent on the Earth, in any unit, is larger.
+FARTHEST = 1e9
 
 
 def read_geobox(path: Path) -> GeoBox:
@@ -76,7 +79,6 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     """
     # pyogrio brings pandas, a third of a second that only runs with polygons need.
     import pyogrio.raw
-    from pyogrio.errors import DataLayerError, DataSourceError
 
     path = existing_file(path, "vector file")
     try:
@@ -85,20 +87,29 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
             raise InputError(
                 f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
             )
-        meta, _, wkb, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
-    except (DataSourceError, DataLayerError) as error:
+        with warnings.catch_warnings():
+            # What they warn of, rings that are not closed or numbers that are not finite, is refused.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            meta, _, wkb, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
+            polygons = shapely.from_wkb(wkb)
+    except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # pyogrio's own are of these kinds
+        why = "some text in it is not UTF-8" if isinstance(error, UnicodeError) else " ".join(str(error).split())
         raise InputError(
-            f"{path} cannot be read as vector file: {error}. Give GeoJSON, GeoPackage or Shapefile."
+            f"{path} cannot be read as vector file: {why}. Give GeoJSON, GeoPackage or Shapefile."
         ) from error
-    polygons = shapely.from_wkb(wkb)
     polygons = polygons[~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)]
     if not len(polygons) or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
         raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
     if meta["crs"] is None:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
     west, south, east, north = shapely.total_bounds(polygons)
-    polygons = shapely.segmentize(polygons, max(east - west, north - south) / EDGE_PIECES)
-    transformer = Transformer.from_crs(CRS.from_user_input(meta["crs"]).to_2d(), crs.to_2d(), always_xy=True)
+    largest = max(east - west, north - south)
+    if not (0 < largest < FARTHEST and np.isfinite(shapely.get_coordinates(polygons)).all()):
+        raise InputError(
+            f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
+        )
+    polygons = shapely.segmentize(polygons, largest / EDGE_PIECES)
+    transformer = Transformer.from_crs(_known_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
     return np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
 
 
@@ -122,12 +133,21 @@ def read_area(path: Path, geobox: GeoBox) -> NDArray[np.bool_]:
 def _crs(source: rasterio.DatasetReader, path: Path) -> CRS:
     if source.crs is None:
         raise InputError(f"{path} has no CRS, so its place on the ground is unknown. Assign one (gdal_edit -a_srs).")
+    return _known_crs(source.crs, path)
+
+
+def _known_crs(given: Any, path: Path) -> CRS:
     try:
-        return CRS.from_user_input(source.crs)
+        crs = CRS.from_user_input(given)
     except CRSError as error:
         raise InputError(
             f"{path} has a CRS that PROJ does not know: {error}. Assign one (gdal_edit -a_srs)."
         ) from error
+    if not is_on_earth(crs):
+        raise InputError(
+            f"{path} has the CRS {shown(crs.name)}, which cannot be converted to places on the Earth. Assign another."
+        )
+    return crs
 
 
 def _grid_crs(geobox: GeoBox) -> CRS:

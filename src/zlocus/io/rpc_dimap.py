@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from zlocus.errors import InputError
+from zlocus.io.documents import read_xml
 from zlocus.io.rpc_text import POLYNOMIALS, SCALARS, rpc_from_fields
+from zlocus.io.text import AGAIN, LARGEST, decimal, shown
 from zlocus.sensors.rpc import RpcCoefficients
 
 TILE = re.compile(r"_R(\d+)C(\d+)$", re.IGNORECASE)
@@ -29,28 +30,29 @@ def find_dimap(image: Path) -> Path | None:
         if path.exists():
             return path
     for path in sorted(image.parent.glob("DIM_*.[xX][mM][lL]")):
-        if _data_file(_parse(path), image) is not None:
+        if _data_file(read_xml(path), image) is not None:
             return path
     return None
 
 
 def read_dimap_rpc(path: Path, image: Path) -> RpcCoefficients:
     """The RPC of an `RPC_*.XML`, or of the one a `DIM_*.XML` names, for `image`, which may be a tile of the product."""
-    root = _parse(path)
+    root = read_xml(path)
     if root.find(".//RFM_Validity") is None:
         path = _named_rpc_file(root, path)
-        root = _parse(path)
+        root = read_xml(path)
     model = root.find(".//Inverse_Model")
     model = root.find(".//GroundtoImage_Values") if model is None else model
     validity = root.find(".//RFM_Validity")
     if model is None or validity is None:
         raise InputError(f"{path} holds no Inverse_Model with its RFM_Validity. Give the RPC_*.XML of the product.")
-    fields = {name: _child_text(validity, name) for name in SCALARS}
+    fields = {name: _child_text(validity, name, path) for name in SCALARS}
     for name in POLYNOMIALS:
-        fields[name] = " ".join(_child_text(model, f"{name}_{i}") for i in range(1, 21))
+        fields[name] = " ".join(_child_text(model, f"{name}_{i}", path) for i in range(1, 21))
     domain = root.find(".//ImagetoGround_Validity_Domain")
-    first_row = float(_child_text(domain, "FIRST_ROW") or 1.0) if domain is not None else 1.0
-    first_col = float(_child_text(domain, "FIRST_COL") or 1.0) if domain is not None else 1.0
+    first_row, first_col = (
+        1.0 if domain is None else _first_pixel(domain, name, path) for name in ("FIRST_ROW", "FIRST_COL")
+    )
     rpc = rpc_from_fields(fields, path)
     tile_row, tile_col = _tile_origin(path, image)
     return rpc.moved(column=-first_col - tile_col, row=-first_row - tile_row)
@@ -66,16 +68,32 @@ def _tile_origin(path: Path, image: Path) -> tuple[int, int]:
         raise InputError(
             f"{image} is a tile of a larger product whose RPC counts its pixels, and {dim} is missing. Add it."
         )
-    root = _parse(dim)
+    root = read_xml(dim)
     size = root.find(".//Regular_Tiling/NTILES_SIZE")
-    overlap = [int(_child_text(root, f".//Regular_Tiling/OVERLAP_{axis}") or 0) for axis in ("ROW", "COL")]
+    overlap = [_child_text(root, f".//Regular_Tiling/OVERLAP_{axis}", dim) or "0" for axis in ("ROW", "COL")]
     entry = _data_file(root, image)
-    if size is None or entry is None or any(overlap):
+    if size is None or entry is None or any(decimal(each) != 0 for each in overlap):
         raise InputError(
             f"{dim} does not say where {image.name} lies in the product. Mosaic the tiles first (gdalbuildvrt)."
         )
-    rows, cols = int(size.attrib["nrows"]), int(size.attrib["ncols"])
-    return (int(entry.attrib["tile_R"]) - 1) * rows, (int(entry.attrib["tile_C"]) - 1) * cols
+    rows, cols = (_whole(size, name, dim) for name in ("nrows", "ncols"))
+    return (_whole(entry, "tile_R", dim) - 1) * rows, (_whole(entry, "tile_C", dim) - 1) * cols
+
+
+def _whole(element: Element, name: str, path: Path) -> int:
+    """An attribute that counts from 1."""
+    text = element.attrib.get(name, "")
+    if not re.fullmatch(r"0*[1-9]\d{0,8}", text, re.ASCII):
+        raise InputError(f"{path}: {name} is {shown(text)}, not a whole number above 0. {AGAIN}")
+    return int(text)
+
+
+def _first_pixel(domain: Element, name: str, path: Path) -> float:
+    """How the file counts the first pixel: 1 unless it says otherwise."""
+    text = _child_text(domain, name, path) or "1"
+    if not abs(decimal(text)) <= LARGEST:
+        raise InputError(f"{path}: {name} is {shown(text)}, not a finite number. {AGAIN}")
+    return decimal(text)
 
 
 def _data_file(root: Element, image: Path) -> Element | None:
@@ -99,13 +117,9 @@ def _named_rpc_file(root: Element, path: Path) -> Path:
     return sibling
 
 
-def _child_text(element: Element, name: str) -> str:
-    child = element.find(name)
-    return (child.text or "").strip() if child is not None else ""
-
-
-def _parse(path: Path) -> Element:
-    try:
-        return ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"{path} cannot be read as XML: {error}. Copy it again from its source.") from error
+def _child_text(element: Element, name: str, path: Path) -> str:
+    """What stands in a child, without blanks around it; empty where there is none."""
+    found = {(child.text or "").strip() for child in element.findall(name)}
+    if len(found) > 1:
+        raise InputError(f"{path} holds {name} twice, with different values. {AGAIN}")
+    return found.pop() if found else ""

@@ -9,9 +9,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from zlocus.errors import InputError, OutputError
+from zlocus.io.text import BYTE_ORDER_MARK, LARGEST, decimal, is_decimal, read_bytes, shown, stops_within
 from zlocus.sensors.rpc import RpcCoefficients
 
 SCALARS = (
@@ -19,7 +18,12 @@ SCALARS = (
     "LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE",
 )  # fmt: skip
 POLYNOMIALS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
+TXT_NAMES = {*SCALARS, *(f"{name}_{i}" for name in POLYNOMIALS for i in range(1, 21))}
 ADVICE = "Get the RPC from its source again."
+# Of a file; they have a hundredth of it.
+MOST_BYTES = 1_000_000
+# What is less is taken for 0 where it divides.
+LEAST = 1e-12
 RPB_NAMES = {
     "lineOffset": "LINE_OFF", "sampOffset": "SAMP_OFF", "latOffset": "LAT_OFF", "longOffset": "LONG_OFF",
     "heightOffset": "HEIGHT_OFF", "lineScale": "LINE_SCALE", "sampScale": "SAMP_SCALE", "latScale": "LAT_SCALE",
@@ -30,11 +34,16 @@ RPB_NAMES = {
 
 def read_rpc_txt(path: Path) -> RpcCoefficients:
     """The RPC of a `_RPC.TXT` file: `LINE_OFF: +018339.50 pixels`, `LINE_NUM_COEFF_1: ...`."""
-    fields: dict[str, str] = {}
-    for line in _text(path).splitlines():
-        name, separator, rest = line.partition(":")
-        if separator:
-            fields[name.strip().upper()] = rest.split()[0] if rest.split() else ""
+    text, fields = _text(path), Fields(path)
+    lines = text.splitlines()
+    for number, line in enumerate(lines, 1):
+        name, _, rest = line.partition(":")
+        if name.strip().upper() in TXT_NAMES:
+            words = rest.split()
+            # A unit may follow the number, another number may not.
+            fields.add(name.strip().upper(), " ".join(words if len(words) > 1 and is_decimal(words[1]) else words[:1]))
+            if number == len(lines) and len(words) == 1 and not text.endswith(("\n", "\r")):
+                raise stops_within(path, number)
     for name in POLYNOMIALS:
         terms = [fields[key] for i in range(1, 21) if (key := f"{name}_{i}") in fields]
         if terms:
@@ -50,12 +59,40 @@ def read_rpb(path: Path) -> RpcCoefficients:
         raise InputError(
             f"{path} is an {specification[1]} model, of another term order. Only RPC00B is read; convert it."
         )
-    fields = {
-        RPB_NAMES[name]: value.strip().strip("()").replace(",", " ")
-        for name, value in re.findall(r"(\w+)\s*=\s*(\([^)]*\)|[^;(]+);", text)
-        if name in RPB_NAMES
-    }
+    fields = Fields(path)
+    # What follows the last semicolon is not complete.
+    for statement in text.split(";")[:-1]:
+        # The beginning of a group has no semicolon.
+        before, _, value = statement.rpartition("=")
+        name = (before.split() or [""])[-1]
+        if name in RPB_NAMES:
+            fields.add(RPB_NAMES[name], _listed(value.strip()))
     return rpc_from_fields(fields, path)
+
+
+class Fields(dict[str, str]):
+    """Fields of a file by name, of which none says two things."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def add(self, name: str, value: str) -> None:
+        """Note the value of a field.
+
+        Raises
+        ------
+        InputError
+            Where it has another one already.
+        """
+        if self.setdefault(name, value) != value:
+            raise InputError(f"{self.path}: {shown(name)} of the RPC is there twice, with different values. {ADVICE}")
+
+
+def _listed(value: str) -> str:
+    """The numbers of (a, b, ...), or one number, with blanks between them."""
+    if value.startswith("(") and value.endswith(")"):
+        value = value[1:-1].replace(",", " ")
+    return value
 
 
 def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
@@ -69,11 +106,11 @@ def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
     scalar = {name: _numbers(fields, name, 1, path)[0] for name in SCALARS}
     polynomial = {name: _numbers(fields, name, 20, path) for name in POLYNOMIALS}
     for name in SCALARS[5:]:
-        if scalar[name] == 0.0:
-            raise InputError(f"{path}: {name} of the RPC is 0. {ADVICE}")
+        if abs(scalar[name]) < LEAST:
+            raise InputError(f"{path}: {name} of the RPC is {scalar[name]:g}. {ADVICE}")
     for name in ("LINE_DEN_COEFF", "SAMP_DEN_COEFF"):
-        if polynomial[name][0] == 0.0:
-            raise InputError(f"{path}: {name}_1 of the RPC is 0, a pole at its centre. {ADVICE}")
+        if abs(polynomial[name][0]) < LEAST:
+            raise InputError(f"{path}: {name}_1 of the RPC is {polynomial[name][0]:g}, a pole at its centre. {ADVICE}")
     return RpcCoefficients(
         line_off=scalar["LINE_OFF"], samp_off=scalar["SAMP_OFF"],
         lat_off=scalar["LAT_OFF"], lon_off=scalar["LONG_OFF"], height_off=scalar["HEIGHT_OFF"],
@@ -114,17 +151,11 @@ def _numbers(fields: Mapping[str, str], name: str, count: int, path: Path) -> tu
     if len(text) != count:
         raise InputError(f"{path}: {name} of the RPC has {len(text)} numbers, not {count}. {ADVICE}")
     for number in text:
-        try:
-            finite = np.isfinite(float(number))
-        except ValueError:
-            finite = False
-        if not finite:
-            raise InputError(f"{path}: {name} of the RPC holds {number!r}, not a finite number. {ADVICE}")
+        if not abs(decimal(number)) <= LARGEST:
+            raise InputError(f"{path}: {name} of the RPC holds {shown(number)}, not a finite number. {ADVICE}")
     return tuple(float(number) for number in text)
 
 
 def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="ascii", errors="replace")
-    except OSError as error:
-        raise InputError(f"The RPC file {path} cannot be read: {error.strerror}. Check the path.") from error
+    content = read_bytes(path, MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
+    return content.decode("ascii", errors="replace")

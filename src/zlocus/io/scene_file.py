@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import Field, FiniteFloat, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
@@ -32,10 +32,12 @@ from zlocus.errors import ConfigError, InputError, OutputError, ZlocusError
 from zlocus.io.camera_entry import Camera, CameraSource, Vector
 from zlocus.io.camera_kinds import KINDS, RpcCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
+from zlocus.io.documents import read_yaml
 from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.images import RasterImage, check_content, open_image
 from zlocus.io.opening import existing_file
-from zlocus.io.strict import StrictModel, validated
+from zlocus.io.strict import Number, StrictModel, validated
+from zlocus.io.text import shown
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.model import FloatArray
@@ -75,7 +77,7 @@ class Frame(StrictModel):
 class Area(StrictModel):
     """The part of the ground asked for. bounds : xmin, ymin, xmax, ymax in the frame's CRS."""
 
-    bounds: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    bounds: tuple[Number, Number, Number, Number]
 
     @model_validator(mode="after")
     def _ordered(self) -> Area:
@@ -100,7 +102,7 @@ class SceneFile(StrictModel):
     schema_version: Literal[1] = Field(alias="schema")
     frame: Frame | None = None
     area: Area | None = None
-    heights: tuple[FiniteFloat, FiniteFloat] | None = None
+    heights: tuple[Number, Number] | None = None
     views: tuple[ViewEntry, ...]
 
     @model_validator(mode="after")
@@ -167,14 +169,16 @@ class Usable:
 
 
 def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
-    """As `open_scene`, but a view that cannot be used is named and the others are opened.
+    """As `open_scene`, but a view that cannot be used, or whose entry is wrong, is named and the others are opened.
 
     Raises
     ------
     InputError, ConfigError
-        Where nothing can be opened at all: a scene file that is wrong, an image given twice, a CRS that does not suit.
+        Where nothing can be opened at all: a scene file that is wrong elsewhere, an image given twice, a CRS that does
+        not suit.
     """
-    asked = _asked(inputs, crs)
+    wrong: list[Refused] = []
+    asked = _asked(inputs, crs, wrong)
     refused: dict[str, Refused] = {}
 
     def tried(entry: _Entry, step: Callable[[], T]) -> list[T]:
@@ -191,11 +195,12 @@ def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
         frame = _default_crs(loaded) if loaded else None
     views = [] if frame is None else [v for each in loaded for v in tried(each.entry, partial(each.view, frame))]
     scene = asked.scene(views, frame) if views and frame is not None else None
-    return Usable(scene, tuple(refused[entry.name] for entry in asked.entries if entry.name in refused))
+    return Usable(scene, (*wrong, *(refused[entry.name] for entry in asked.entries if entry.name in refused)))
 
 
-def read_scene_file(path: Path) -> SceneFile:
-    """A `scene.yaml`, checked, its images and cameras unread.
+def read_scene_file(path: Path, wrong: list[Refused] | None = None) -> SceneFile:
+    """A `scene.yaml`, checked, its images and cameras unread. wrong : takes the views whose entries are, without which
+    the file is read then.
 
     Raises
     ------
@@ -203,17 +208,32 @@ def read_scene_file(path: Path) -> SceneFile:
         Naming the file, the key and what is allowed there.
     """
     path = existing_file(path, "scene file")
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
+    document = read_yaml(path)
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
     views = document.get("views")
-    for index, view in enumerate(views if isinstance(views, list) else []):
-        if isinstance(view, dict) and "camera" in view:
-            view["camera"] = _camera(view["camera"], path, f"views[{index}].camera")
+    if isinstance(views, list):
+        entries = [entry for i in range(len(views)) for entry in _view_entry(views, i, path, wrong)]
+        document = document | {"views": entries}
     return validated(SceneFile, document, path)
+
+
+def _view_entry(views: list[Any], index: int, path: Path, wrong: list[Refused] | None) -> list[ViewEntry]:
+    """One view of a scene file; none where its entry is noted as wrong."""
+    view, where = views[index], f"views[{index}]"
+    given = view if isinstance(view, dict) else {}
+    try:
+        if "camera" in given:
+            view = given | {"camera": _camera(given["camera"], path, f"{where}.camera")}
+        return [validated(ViewEntry, view, path, where)]
+    except InputError as error:
+        if wrong is None:
+            raise
+        name, image = given.get("name"), given.get("image")
+        alone = isinstance(name, str) and sum(isinstance(v, dict) and v.get("name") == name for v in views) == 1
+        file = path.parent / image if isinstance(image, str) else path
+        wrong.append(Refused(name if isinstance(name, str) and alone else where, file, str(error)))
+        return []
 
 
 def write_scene_file(path: Path, scene_file: SceneFile) -> None:
@@ -275,13 +295,13 @@ class _Loaded:
         return View(entry.name, entry.path, self.image, self.source.sensor(crs), self.source.files, entry.date)
 
 
-def _asked(inputs: Sequence[Path], crs: CRS | None) -> _Asked:
+def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[Refused] | None = None) -> _Asked:
     paths = [Path(path) for path in inputs]
     scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
     if scene_files and len(paths) > 1:
         raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
     if scene_files:
-        asked = _from_scene_file(scene_files[0], crs)
+        asked = _from_scene_file(scene_files[0], crs, wrong)
     else:
         entries = [_Entry(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
         asked = _Asked(tuple(entries), Path(), crs)
@@ -297,8 +317,8 @@ def _load(entry: _Entry, folder: Path) -> _Loaded:
     return _Loaded(entry, image, entry.camera.read(folder, entry.path))
 
 
-def _from_scene_file(path: Path, crs: CRS | None) -> _Asked:
-    scene_file = read_scene_file(path)
+def _from_scene_file(path: Path, crs: CRS | None, wrong: list[Refused] | None) -> _Asked:
+    scene_file = read_scene_file(path, wrong)
     frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
     if frame is not None and is_local(frame) and crs is not None:
         raise ConfigError(f"{path} has a local frame, which --crs cannot place on the Earth. Leave --crs out.")
@@ -356,9 +376,11 @@ def _frame_crs(frame: Frame, path: Path) -> CRS:
     if frame.local:
         return local_frame()
     try:
-        return CRS.from_user_input(frame.crs)
+        return checked_crs(CRS.from_user_input(frame.crs))
     except CRSError as error:
-        raise InputError(f"{path}: frame.crs {frame.crs!r} is no CRS. Write it as EPSG:n.") from error
+        raise InputError(f"{path}: frame.crs {shown(frame.crs)} is no CRS. Write it as EPSG:n.") from error
+    except ConfigError as error:
+        raise ConfigError(f"{path}: frame.crs: {error}") from error
 
 
 def _default_crs(loaded: Sequence[_Loaded]) -> CRS:

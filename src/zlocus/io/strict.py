@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import reprlib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from zlocus.errors import InputError
+from zlocus.io.text import LARGEST, is_decimal
+
+
+def _plain(value: Any) -> Any:
+    """Pydantic takes true for 1, and in text 1_0 for 10."""
+    if isinstance(value, bool) or (isinstance(value, str) and not is_decimal(value)):
+        raise ValueError("is not a number")
+    return value
+
+
+Number = Annotated[FiniteFloat, BeforeValidator(_plain), Field(ge=-LARGEST, le=LARGEST)]
+Whole = Annotated[int, BeforeValidator(_plain), Field(ge=-LARGEST, le=LARGEST)]
 
 
 class StrictModel(BaseModel):
@@ -23,7 +35,7 @@ class StrictModel(BaseModel):
         if isinstance(value, dict):
             unknown = [str(key) for key in value if key not in allowed and key not in allowed.values()]
             if unknown:
-                raise ValueError(f"unknown key {', '.join(unknown)}; allowed here: {', '.join(allowed.values())}")
+                raise ValueError(f"unknown key {', '.join(unknown)[:80]}; allowed here: {', '.join(allowed.values())}")
         return value
 
 
@@ -42,6 +54,10 @@ def validated(model: type[Document], document: Any, path: Path, where: str = "")
     InputError
         For the first thing that is wrong: file, key, what stands there and what is allowed.
     """
+    empty = _empty_key(document)
+    if empty is not None:
+        place = f"{where}.{empty}" if where else empty
+        raise InputError(f"{path}: {place} has no value. Give one, or leave the key out.")
     try:
         return model.model_validate(document)
     except ValidationError as error:
@@ -54,3 +70,16 @@ def validated(model: type[Document], document: Any, path: Path, where: str = "")
         message = first["msg"].removeprefix("Value error, ")
         value = "" if isinstance(first["input"], dict) else f" (there: {SHORT.repr(first['input'])})"
         raise InputError(f"{path}: {key or 'the document'}: {message}{value}.") from error
+
+
+def _empty_key(document: Any) -> str | None:
+    """The first key of a document, as a path, after which nothing stands: whoever wrote it meant something."""
+    if not isinstance(document, dict):
+        return None
+    for key, value in document.items():
+        if value is None:
+            return str(key)
+        inside = _empty_key(value)
+        if inside is not None:
+            return f"{key}.{inside}"
+    return None

@@ -14,17 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.errors import InputError
-from zlocus.io.importers.base import (
-    AGAIN,
-    Exposure,
-    Imported,
-    found_file,
-    number,
-    numbers,
-    rotation_matrix,
-    shown,
-    text_lines,
-)
+from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix
+from zlocus.io.text import AGAIN, shown, text_lines
 from zlocus.request import ImportRequest
 
 FILES = ("bundle.out", "bundle/bundle.out", "bundle.rd.out", "bundler.out")

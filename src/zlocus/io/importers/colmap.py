@@ -16,19 +16,8 @@ from typing import Any
 import numpy as np
 
 from zlocus.errors import InputError
-from zlocus.io.importers.base import (
-    AGAIN,
-    UNIT,
-    Exposure,
-    Imported,
-    found_file,
-    number,
-    numbers,
-    read_bytes,
-    shown,
-    size,
-    text_lines,
-)
+from zlocus.io.importers.base import UNIT, Exposure, Imported, found_file, number, numbers, size
+from zlocus.io.text import AGAIN, read_bytes, shown, text_lines
 from zlocus.request import ImportRequest
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rotation import from_quaternions

@@ -11,7 +11,7 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, utm_zone
-from zlocus.io.importers.base import shown
+from zlocus.io.text import shown
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.space import EarthSpace, between
 

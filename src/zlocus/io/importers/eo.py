@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from zlocus.errors import ConfigError, InputError
+from zlocus.io.documents import read_yaml
 from zlocus.io.frame_camera import Interior
-from zlocus.io.importers.base import AGAIN, Exposure, Imported, found_file, number, read_text, shown, text_lines
+from zlocus.io.importers.base import Exposure, Imported, found_file, number
+from zlocus.io.opening import existing_file
 from zlocus.io.strict import validated
+from zlocus.io.text import AGAIN, LONGEST_LINE, decimal, shown, text_lines
 from zlocus.request import ImportRequest
 from zlocus.sensors.frame import rotation_from_angles
 
@@ -33,6 +35,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "kappa": ("kappa", "ka"),
 }
 LARGEST_ANGLE = 1e4
+# Bytes.
 LONGEST_INTERIOR = 100_000
 
 
@@ -50,7 +53,7 @@ def read_eo(request: ImportRequest) -> Imported:
     interior = _interior(request)
     order: dict[str, int] = {name: i for i, name in enumerate(COLUMNS)}
     exposures: list[Exposure] = []
-    is_first = True
+    is_first, n_columns = True, 0
     for line_number, line in text_lines(path):
         fields = _fields(line, path, line_number)
         if not fields or fields[0].startswith("#"):
@@ -61,10 +64,17 @@ def read_eo(request: ImportRequest) -> Imported:
             order = _checked_heading(heading, path)
         else:
             exposures.append(_exposure(fields, order, interior, path, f"line {line_number}"))
+        n_columns = n_columns or len(fields)
+        if len(fields) != n_columns:
+            raise InputError(
+                f"{path}: line {line_number} has {len(fields)} columns, and lines before it {n_columns}. {AGAIN}"
+            )
     return Imported(path, tuple(exposures), request.crs, flat=request.earth == "flat")
 
 
 def _fields(line: str, path: Path, line_number: int) -> list[str]:
+    if len(line) > LONGEST_LINE:
+        raise InputError(f"{path}: line {line_number} has {len(line)} letters, too many for a row. {AGAIN}")
     delimiter = next((mark for mark in ",;\t" if mark in line), " ")
     quote = "'" if line.lstrip().startswith("'") else '"'
     try:
@@ -78,11 +88,8 @@ def _fields(line: str, path: Path, line_number: int) -> list[str]:
 def _heading(fields: Sequence[str]) -> list[str] | None:
     """The names of columns, where the line holds no numbers."""
     for field in fields[1:]:
-        try:
-            float(field)
-        except ValueError:
-            continue
-        return None
+        if np.isfinite(decimal(field)):
+            return None
     return [field.lower().strip("# ") for field in fields]
 
 
@@ -120,16 +127,7 @@ def _interior(request: ImportRequest) -> dict[str, Any]:
                 "A table of exterior orientations holds no interior one. Give --focal in pixels, or --camera FILE."
             )
         return {"focal": request.focal}
-    text = read_text(Path(request.camera))
-    if len(text) > LONGEST_INTERIOR:
-        raise InputError(
-            f"{request.camera} has {len(text)} letters, too many for an interior orientation. Check --camera."
-        )
-    try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{request.camera} cannot be read as YAML: {reason}. Mend it there.") from error
+    document = read_yaml(existing_file(request.camera, "interior orientation"), LONGEST_INTERIOR)
     given = document if isinstance(document, dict) else {}
     # The centre of the image stands in where the principal point is not given.
     filled = {"principal_point": [0.0, 0.0]} | given

@@ -18,19 +18,11 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.errors import InputError
-from zlocus.io.importers.base import (
-    AGAIN,
-    Exposure,
-    Imported,
-    found_file,
-    number,
-    numbers,
-    read_xml,
-    rotation_matrix,
-    shown,
-    size,
-)
+from zlocus.io.crs import is_on_earth
+from zlocus.io.documents import read_xml
+from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix, size
 from zlocus.io.importers.earth import crs_name, map_poses
+from zlocus.io.text import AGAIN, shown
 from zlocus.request import ImportRequest
 from zlocus.sensors.model import FloatArray
 
@@ -105,7 +97,8 @@ def _chunk_crs(chunk: Element, path: Path) -> CRS | None:
         raise InputError(f"{path} has the reference {shown(text)}, which is no CRS. {AGAIN}") from error
     if crs.is_engineering:
         return None
-    if crs.to_2d().geodetic_crs is None:
+    geographic = crs.to_2d().geodetic_crs
+    if geographic is None or not is_on_earth(geographic):
         raise InputError(f"{path} has the reference {crs.name}, whose place on the Earth is not known. {AGAIN}")
     return crs.to_2d()
 

@@ -14,19 +14,10 @@ from typing import Any
 import numpy as np
 
 from zlocus.errors import InputError
-from zlocus.io.importers.base import (
-    AGAIN,
-    Exposure,
-    Imported,
-    found_file,
-    number,
-    numbers,
-    read_json,
-    rotation_matrix,
-    shown,
-    size,
-)
+from zlocus.io.documents import read_json
+from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix, size
 from zlocus.io.importers.earth import crs_name, map_poses
+from zlocus.io.text import AGAIN, shown
 from zlocus.request import ImportRequest
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rotation import from_vectors

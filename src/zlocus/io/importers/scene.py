@@ -10,12 +10,13 @@ from typing import Any
 
 from zlocus.errors import ConfigError, InputError, OutputError
 from zlocus.io.frame_camera import FrameCamera
-from zlocus.io.importers.base import AGAIN, Exposure, Imported, shown
+from zlocus.io.importers.base import Exposure, Imported
 from zlocus.io.importers.earth import asked_crs, crs_name
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.opening import open_raster
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
 from zlocus.io.strict import validated
+from zlocus.io.text import AGAIN, shown
 from zlocus.request import ImportRequest
 from zlocus.sensors.frame import as_row, as_rows
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.errors import InputError
-from zlocus.io.importers.base import AGAIN, Exposure, Imported, numbers, rotation_matrix, size, text_lines
+from zlocus.io.importers.base import Exposure, Imported, numbers, rotation_matrix, size
+from zlocus.io.text import AGAIN, text_lines
 from zlocus.request import ImportRequest
 
 FOLDERS = ("", "gt_dense_cameras", "cameras")
