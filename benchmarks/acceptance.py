@@ -438,7 +438,7 @@ def dmc(at: Workplace) -> list[Figure]:
     run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", at.out / "scene.yaml"])
     run([ZLOCUS, "dsm", at.out / "scene.yaml", "-o", at.out / "dsm"], accept=(0, COVERAGE_SHORT))
     # Columns in front of what a terrain model of 24 m cells says; a blunder is far beyond what it may be wrong by.
-    error = errors_where_two_see(at.out, scene / "reference" / "dem_24m_egm2008.tif")
+    error, _ = errors_where_two_see(at.out, scene / "reference" / "dem_24m_egm2008.tif")
     return [
         *two_view_figures(error, least_filled=0.7, most_nmad_m=8.0, most_median_m=6.0),
         Figure("found heights > 50 m off", float((np.abs(error[np.isfinite(error)]) > 50.0).mean())),
@@ -460,10 +460,12 @@ def tuniu(at: Workplace) -> list[Figure]:
     table = ["--crs", "EPSG:32651", "--earth", "flat", "--camera", camera]
     run([ZLOCUS, "import", "eo", scene, *table, "-o", at.out / "scene.yaml"])
     run([ZLOCUS, "dsm", at.out / "scene.yaml", "-o", at.out / "dsm"], accept=(0, COVERAGE_SHORT))
-    error = errors_where_two_see(at.out, scene / "reference" / "odm_dsm_0.8m.tif")
+    error, sigma = errors_where_two_see(at.out, scene / "reference" / "odm_dsm_0.8m.tif")
+    precise = np.where(sigma <= PRECISE_M, error, np.nan)
     left_out = json.loads((at.out / "dsm" / "run.json").read_text())["left_out_cells"]
     return [
         *two_view_figures(error, least_filled=0.6, most_nmad_m=0.5),
+        *two_view_figures(precise, least_filled=0.6, most_nmad_m=0.5, which=f", sigma <= {PRECISE_M:g} m"),
         Figure("cells an image was left out of", float(left_out)),
     ]
 
@@ -501,21 +503,23 @@ def herzjesu(at: Workplace) -> list[Figure]:
 
 
 def two_view_figures(
-    error: np.ndarray, least_filled: float, most_nmad_m: float, most_median_m: float | None = None
+    error: np.ndarray, least_filled: float, most_nmad_m: float, most_median_m: float | None = None, which: str = ""
 ) -> list[Figure]:
-    """Of the ground that two images see. error : (n,) m, NaN where there is no height."""
+    """Of the ground that two images see. error : (n,) m, NaN where there is no height; which : of them, as a label."""
     found = error[np.isfinite(error)]
     median = float(np.median(found))
     return [
-        Figure("ground seen by two, filled", float(np.isfinite(error).mean()), at_least=least_filled),
-        Figure("|median difference|", abs(median), "m", at_most=most_median_m),
-        Figure("NMAD", float(1.4826 * np.median(np.abs(found - median))), "m", at_most=most_nmad_m),
+        Figure(f"ground seen by two, filled{which}", float(np.isfinite(error).mean()), at_least=least_filled),
+        Figure(f"|median difference|{which}", abs(median), "m", at_most=most_median_m),
+        Figure(f"NMAD{which}", float(1.4826 * np.median(np.abs(found - median))), "m", at_most=most_nmad_m),
     ]
 
 
-def errors_where_two_see(folder: Path, reference: Path) -> np.ndarray:
-    """Heights of a surface less those of a reference, at the reference's cells that two images see. (n,) m."""
-    opened, dsm = open_scene([folder / "scene.yaml"]), read_heights(folder / "dsm" / "dsm.tif")
+def errors_where_two_see(folder: Path, reference: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Heights of a surface less those of a reference, at the reference's cells that two images see, and their standard
+    deviations by the surface, (n,) m each."""
+    opened = open_scene([folder / "scene.yaml"])
+    dsm, sigma = (read_heights(folder / "dsm" / f"{name}.tif") for name in ("dsm", "sigma"))
     with rasterio.open(reference) as source:
         z, transform = source.read(1, masked=True).astype(float).filled(np.nan), source.transform
     col, row = np.meshgrid(np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5)
@@ -527,7 +531,7 @@ def errors_where_two_see(folder: Path, reference: Path) -> np.ndarray:
         xy = view.sensor.image_from_ground(xyz)
         n_seeing += ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
     xyz = xyz[n_seeing >= 2]
-    return np.asarray(dsm.nearest(xyz[:, :2]) - xyz[:, 2])
+    return np.asarray(dsm.nearest(xyz[:, :2]) - xyz[:, 2]), np.asarray(sigma.nearest(xyz[:, :2]))
 
 
 def selection(at: Workplace) -> list[Figure]:

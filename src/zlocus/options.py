@@ -391,6 +391,10 @@ class CheckOptions(Checked):
         64, "A cell is marked as ambiguous when another height costs less than this more over the eight paths.",
         low=0, high=10000,
     )  # fmt: skip
+    most_sigma_m: float | None = option(
+        None, "A cell of a surface is left empty where the standard deviation of its height is larger; unset: none is.",
+        low=1e-6, high=1e5, unit="m",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from zlocus.matching.gc3 import (
     widest_disparities,
 )
 from zlocus.matching.setup import FEWEST_LEVELS, MatchScene
-from zlocus.options import OrientationOptions, PyramidOptions, RunConfig
+from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.orient import Orientation, supported
 from zlocus.preparing import heights_of_ties, oriented, possible_heights
 from zlocus.progress import Progress
@@ -194,7 +194,9 @@ def match_images(
     progress: Progress,
     area: Area | None = None,
 ) -> list[Matched]:
-    """Every tile of every reference image, or those that may show an area."""
+    """Every tile of every reference image, or those that may show an area; of any precision, for there it is not in
+    metres."""
+    options = replace(options, checks=replace(options.checks, most_sigma_m=None))
     images = [CellWindow(0, 0, *space.reference.image.shape) for space, _ in settled]
     surfaces = [Surface.nothing(window) for window in images]
     tasks = [
@@ -284,16 +286,15 @@ def pixel_heights(one: Matched, before: Matched, z: float) -> PixelHeights:
     return PixelHeights(one.image, one.surface, before.surface, step, abs(float(high - low)), pixel_m)
 
 
-def grid_tile(
-    matched: GridImages, scene: MatchScene, core: CellWindow, options: PyramidOptions, fill: str
-) -> TileResult:
+def grid_tile(matched: GridImages, scene: MatchScene, core: CellWindow, config: RunConfig, fill: str) -> TileResult:
     """A tile of the ground grid from the pixels that fall on it. scene : its lattice of cells and heights."""
     if not (core.rows and core.cols):
         return TileResult(Surface.nothing(core))
-    window = core.at_level(0, options.halo)
+    halo = config.pyramid.halo
+    window = core.at_level(0, halo)
     z_range = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
     cells = Cells((window.rows, window.cols), scene.transform(window, 0), z_range)
-    surface = gridded(matched.images, cells, matched.matched)
+    surface = gridded(matched.images, cells, matched.matched).precise(config.checks.most_sigma_m)
     if fill == "interpolate":
-        surface = filled(surface, options.halo // 2)
+        surface = filled(surface, halo // 2)
     return TileResult(surface.part(core, window))

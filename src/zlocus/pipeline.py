@@ -226,7 +226,7 @@ def _matcher(
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
     matched = match_for_grid(ready, leading, Area(bounds, z_range), config, use_visibility, workers, progress)
     tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
-    return lambda core: grid_tile(matched, settled, core, config.pyramid, request.fill)
+    return lambda core: grid_tile(matched, settled, core, config, request.fill)
 
 
 def _match(

@@ -137,7 +137,7 @@ def match_tile(
         done, every = done + result.evaluations, every + result.all_views
     if method != "mvll":
         result = _with_planes(result, config)
-    surface = _finish(scene, pixels, result, config)
+    surface = _finish(scene, pixels, result, config).precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
     done += 0 if ranking is None else ranking.evaluations

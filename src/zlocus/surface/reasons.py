@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Quality(IntFlag):
-    """Bits of `quality.tif`. The first seven empty a cell, the others only warn."""
+    """Bits of `quality.tif`. The first eight empty a cell, the others only warn."""
 
     OUTSIDE = 1  # not asked for: outside the area, or inside a mask
     UNSEEN = 2  # fewer than two images cover the cell
@@ -18,6 +18,7 @@ class Quality(IntFlag):
     NO_MATCH = 16  # images do not agree at any height
     FAILED = 32  # its tile could not be processed
     UNCONFIRMED = 64  # no other image finds the same height when matched back (image space only)
+    IMPRECISE = 128  # its standard deviation is larger than asked for (checks.most_sigma_m)
     WEAK = 256  # images agree poorly
     AMBIGUOUS = 512  # another height fits nearly as well
     JUMP = 1024  # next to a jump in height
@@ -30,7 +31,7 @@ class Quality(IntFlag):
 
 EMPTY = (
     Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
-    | Quality.UNCONFIRMED
+    | Quality.UNCONFIRMED | Quality.IMPRECISE
 )  # fmt: skip
 
 

@@ -43,6 +43,16 @@ class Surface:
         height, sigma, ortho = (np.where(outside, nothing, v) for v in (self.height, self.sigma, self.ortho))
         return Surface(height, sigma, quality, np.where(outside, np.uint8(0), self.views), ortho)
 
+    def precise(self, most_sigma_m: float | None) -> Surface:
+        """The surface without the heights whose standard deviation is larger; None keeps all."""
+        if most_sigma_m is None:
+            return self
+        too_much = self.sigma > most_sigma_m
+        quality = self.quality | np.where(too_much, np.uint16(Quality.IMPRECISE), np.uint16(0))
+        nothing = np.float32(np.nan)
+        height, sigma, ortho = (np.where(too_much, nothing, v) for v in (self.height, self.sigma, self.ortho))
+        return Surface(height, sigma, quality, np.where(too_much, np.uint8(0), self.views), ortho)
+
     @property
     def arrays(self) -> tuple[NDArray[Any], ...]:
         """All of them, in the order above."""
