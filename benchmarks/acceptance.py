@@ -54,12 +54,12 @@ CITY_BARS = {
 }
 HILLS_NMAD_BAR_M = 0.16
 # Two ground pixels of the demo's line scanner, and shares of its surfaces within them.
-TWO_PIXELS_M, # Standard deviation of heights that a user of oblique drone images may ask for (checks.most_sigma_m).
-PRECISE_M = 1.0
-DEMO_BARS = 0.42, {"ground": 0.97, "building": 0.85}
+TWO_PIXELS_M, DEMO_BARS = 0.42, {"ground": 0.97, "building": 0.85}
 # A town of more than 4 M cells at 0.5 m, and CPU seconds per million cells that it may take.
 SPEED_SIDE_CELLS, SPEED_SEED = 2048, 12
 SPEED_BARS_S = {"six": 8.0, "three": 4.0}
+# Standard deviation of heights that a user of oblique drone images may ask for (checks.most_sigma_m).
+PRECISE_M = 1.0
 POINTING_PX = {"city": 0, "hills": 4}
 SHARED_SCENES = {"city": "rendered-city", "hills": "rendered-hills-biased"}
 # Directions in the axes of the facade's cameras: out of the wall, and up along it. Heights are moved by so much to see
