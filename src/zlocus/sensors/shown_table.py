@@ -1,4 +1,4 @@
-"""Projection tables of cameras close by, each corner over the heights at which the image shows it.
+"""Projection tables of cameras close by, each block over the heights at which the image shows it.
 
 Perspective bends a projection without bound towards the height of the camera, and a lens maps only what is in front of
 it. Over all heights of a scene such a table would need any degree, or hold nowhere; over those at which a block is in
@@ -18,7 +18,7 @@ from zlocus.sensors.model import FloatArray, SensorModel
 from zlocus.sensors.table import NOWHERE_PX, ProjectionTable, project_cells, projection_error
 
 BoolArray = NDArray[np.bool_]
-# Heights at which it is looked whether an image shows a block, and whether its table is exact.
+# Heights at which it is looked whether an image shows a block; there and between them, whether its table is exact.
 SAMPLES = 33
 CORNERS = tuple((slice(i, n), slice(j, m)) for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None)))
 # Coefficients this small (share of the tolerance) are dropped: over a short part of the heights they would be large
@@ -28,12 +28,12 @@ NEGLIGIBLE = 0.02
 
 @dataclass(frozen=True)
 class Shown:
-    """Where an image shows blocks. known : (b + 1, d + 1, s) corners that the sensor maps; near : (b, d, s) blocks that
-    may be in the image and whose corners are known; missed : (b, d, s) blocks that are in it though a corner is not
-    known; s heights."""
+    """Where an image shows blocks, (b, d, s) at s heights. near : blocks that may be in the image and whose corners the
+    sensor maps; around : these, and as many at the heights before and after, between which a block leaves the image;
+    missed : blocks that may be in it though a corner is not mapped."""
 
-    known: BoolArray
     near: BoolArray
+    around: BoolArray
     missed: BoolArray
 
 
@@ -67,23 +67,24 @@ def shown_table(
     first, last = corner_runs(shown)
     ends = np.stack([t[first], t[last]], axis=-1)
     nodes = fitted(sensor, transform, rows, cols, ends, (z_mid, z_half), degree, NEGLIGIBLE * tolerance_px)
+    fine = np.linspace(-1.0, 1.0, 2 * SAMPLES - 1)
     middle = np.mean([nodes[corner] for corner in CORNERS], axis=0)
-    exact = _at_heights(sensor, transform, rows[:-1] + block / 2, cols[:-1] + block / 2, z_mid + z_half * t)
-    gaps = np.linalg.norm(middle @ np.vander(t, degree + 1, increasing=True).T - exact, axis=2)
-    begins, stops = (f([k[corner] for corner in CORNERS], axis=0) for f, k in ((np.max, first), (np.min, last)))
-    fits = (np.arange(SAMPLES) >= begins[..., None]) & (np.arange(SAMPLES) <= stops[..., None])
-    bent = shown.near & fits & ~(gaps <= tolerance_px)
-    holds = shown.near & fits & ~bent
+    exact = _at_heights(sensor, transform, rows[:-1] + block / 2, cols[:-1] + block / 2, z_mid + z_half * fine)
+    gaps = np.linalg.norm(middle @ np.vander(fine, degree + 1, increasing=True).T - exact, axis=2)
+    begins, stops = (2 * f([k[corner] for corner in CORNERS], axis=0) for f, k in ((np.max, first), (np.min, last)))
+    at = np.arange(len(fine))
+    holds = between(shown.around) & (at >= begins[..., None]) & (at <= stops[..., None]) & (gaps <= tolerance_px)
     low, high = longest_run(holds)
     some = holds.any(axis=-1)
-    kept = some[..., None] & (np.arange(SAMPLES) >= low[..., None]) & (np.arange(SAMPLES) <= high[..., None])
-    lost = shown.missed | (shown.near & ~kept)
-    if (bent.any() and not may_bend) or lost.sum() > most_lost * (shown.near | shown.missed).sum():
-        raise projection_error(block, float(np.nanmax(gaps[shown.near & fits], initial=0.0)), tolerance_px, z_range)
+    kept = some[..., None] & (at >= low[..., None]) & (at <= high[..., None])
+    bent = shown.near & ~kept[..., ::2]
+    if (bent.any() and not may_bend) or (shown.missed | bent).sum() > most_lost * (shown.near | shown.missed).sum():
+        raise projection_error(block, float(np.nanmax(gaps[..., ::2][shown.near], initial=0.0)), tolerance_px, z_range)
     # What reaches the ends of the heights goes on beyond them.
-    low_t, high_t = np.where(low == 0, -np.inf, t[low]), np.where(high == SAMPLES - 1, np.inf, t[high])
+    low_t, high_t = np.where(low == 0, -np.inf, fine[low]), np.where(high == at[-1], np.inf, fine[high])
     limits = np.stack([np.where(some, low_t, np.inf), np.where(some, high_t, -np.inf)], axis=-1)
-    return ProjectionTable(nodes, z_mid, z_half, some, np.asarray(lost.any(axis=-1)), limits)
+    lost = np.asarray((shown.missed | bent).any(axis=-1))
+    return ProjectionTable(nodes, z_mid, z_half, some, lost, limits)
 
 
 def _at_heights(
@@ -104,18 +105,30 @@ def shown_at(positions: FloatArray, window: tuple[int, int, int, int]) -> Shown:
     first, last = np.array([col, row])[:, None], np.array([col + n_cols - 1, row + n_rows - 1])[:, None]
     meets = ((most >= first) & (least <= last)).all(axis=2)
     whole = np.logical_and.reduce([known[corner] for corner in CORNERS])
-    return Shown(known, meets & whole, meets & ~whole)
+    near = meets & whole
+    around = near.copy()
+    around[..., 1:] |= near[..., :-1]
+    around[..., :-1] |= near[..., 1:]
+    return Shown(near, around & whole, meets & ~whole)
+
+
+def between(flags: BoolArray) -> BoolArray:
+    """Flags (..., s) at heights, and between each two for which both are set: (..., 2 s - 1)."""
+    out = np.empty((*flags.shape[:-1], 2 * flags.shape[-1] - 1), bool)
+    out[..., ::2], out[..., 1::2] = flags, flags[..., :-1] & flags[..., 1:]
+    return out
 
 
 def corner_runs(shown: Shown) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last of the longest run of heights (b + 1, d + 1) at which a block around each corner is shown; the
     first is the higher one where there is none."""
-    near = np.zeros(shown.known.shape, bool)
+    n_b, n_d, n = shown.around.shape
+    around = np.zeros((n_b + 1, n_d + 1, n), bool)
     for corner in CORNERS:
-        near[corner] |= shown.near
-    first, last = longest_run(near & shown.known)
-    some = near.any(axis=-1)
-    return np.where(some, first, shown.known.shape[-1] - 1), np.where(some, last, 0)
+        around[corner] |= shown.around
+    first, last = longest_run(around)
+    some = around.any(axis=-1)
+    return np.where(some, first, n - 1), np.where(some, last, 0)
 
 
 def longest_run(flags: BoolArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
