@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.errors import OutputError
 from zlocus.matching.order import Evidence
 from zlocus.matching.point import JudgedCurves, PointCurves
 from zlocus.options import SelectionOptions
-from zlocus.products.record import write_record
+from zlocus.products.record import write_record, write_whole
 from zlocus.sensors.model import FloatArray
 
 if TYPE_CHECKING:
@@ -224,22 +222,9 @@ def write_point(folder: Path, report: PointReport, loci: Sequence[Locus], option
         "loci.png": loci_figure(loci),
     }
     for name, figure in figures.items():
-        _whole(folder / name, partial(figure.savefig, format="png", dpi=DPI))
-    _whole(folder / "curves.csv", lambda part: _write_csv(part, report))
+        write_whole(folder / name, partial(figure.savefig, format="png", dpi=DPI))
+    write_whole(folder / "curves.csv", lambda part: _write_csv(part, report))
     write_record(folder / "point.json", point_record(report, options))
-
-
-def _whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file to a temporary name, then rename it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        write(part)
-        os.replace(part, path)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _write_csv(path: Path, report: PointReport) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
-from zlocus.errors import OutputError
+from zlocus.products.record import write_whole
 from zlocus.scene import is_local
 
 SIDE_PX, RIM_PX, CAPTION_PX = 900, 24, 40
@@ -39,7 +38,8 @@ def write_footprints(path: Path, features: Sequence[Feature], crs: CRS) -> None:
         {"type": "Feature", "properties": properties, "geometry": _geometry(polygon, crs)}
         for polygon, properties in features
     ]
-    _write(path, (json.dumps(collection, indent=1, allow_nan=False) + "\n").encode())
+    text = json.dumps(collection, indent=1, allow_nan=False) + "\n"
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def footprints_picture(path: Path, outlines: Sequence[Any], names: Sequence[str]) -> None:
@@ -77,7 +77,7 @@ def footprints_picture(path: Path, outlines: Sequence[Any], names: Sequence[str]
     wide[:, :cols] = picture
     done, png = cv2.imencode(".png", np.vstack([strip, wide]))
     assert done, "memory is all it needs"
-    _write(path, png.tobytes())
+    write_whole(path, lambda part: part.write_bytes(png.tobytes()))
 
 
 def overlap_colours(count: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -104,15 +104,3 @@ def _geometry(polygon: Any, crs: CRS) -> dict[str, Any] | None:
         to_wgs84 = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
         ring = np.column_stack(to_wgs84.transform(*ring.T))
     return {"type": "Polygon", "coordinates": [np.round(ring, DEGREE_DIGITS).tolist()]}
-
-
-def _write(path: Path, content: bytes) -> None:
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(content)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror}. Check the folder and the space left."
-        ) from error

@@ -9,7 +9,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -80,17 +80,27 @@ def versions_record() -> dict[str, str]:
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
+    text = json.dumps(_finite({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Write a file to a temporary name beside it, then rename it: whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        Where it cannot be written.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(
-            json.dumps(_finite({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n", encoding="utf-8"
-        )
+        write(part)
         os.replace(part, path)
     except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
+    finally:
         part.unlink(missing_ok=True)
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror}. Check the folder and the space left."
-        ) from error
 
 
 def _finite(value: Any) -> Any:
