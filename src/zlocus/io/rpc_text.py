@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from zlocus.errors import InputError, OutputError
-from zlocus.io.text import BYTE_ORDER_MARK, LARGEST, decimal, is_decimal, read_bytes, shown, stops_within
+from zlocus.io.text import BYTE_ORDER_MARK, LARGEST, decimal, is_decimal, read_bytes, shown, stops_within, written
 from zlocus.sensors.rpc import RpcCoefficients
 
 SCALARS = (
@@ -35,15 +35,19 @@ RPB_NAMES = {
 def read_rpc_txt(path: Path) -> RpcCoefficients:
     """The RPC of a `_RPC.TXT` file: `LINE_OFF: +018339.50 pixels`, `LINE_NUM_COEFF_1: ...`."""
     text, fields = _text(path), Fields(path)
-    lines = text.splitlines()
+    lines, above = text.splitlines(), set[tuple[int, int] | None]()
     for number, line in enumerate(lines, 1):
         name, _, rest = line.partition(":")
         if name.strip().upper() in TXT_NAMES:
             words = rest.split()
             # A unit may follow the number, another number may not.
             fields.add(name.strip().upper(), " ".join(words if len(words) > 1 and is_decimal(words[1]) else words[:1]))
-            if number == len(lines) and len(words) == 1 and not text.endswith(("\n", "\r")):
+            digits = written(words[0]) if words else None
+            is_ended = number < len(lines) or len(words) > 1 or text.endswith(("\n", "\r"))
+            if not is_ended and (digits is None or {digits} != above):
                 raise stops_within(path, number)
+            if "_COEFF" in name.upper():
+                above.add(digits)
     for name in POLYNOMIALS:
         terms = [fields[key] for i in range(1, 21) if (key := f"{name}_{i}") in fields]
         if terms:

@@ -19,6 +19,7 @@ LARGEST = 1e15
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # What ends a value for certain, where no line end does.
 CLOSING = ("]", "}", '"', "'")
+WORD = re.compile(r"[^\s,;]+")
 DECIMAL = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 
@@ -51,18 +52,24 @@ def read_text(path: Path, most: int | None = None) -> str:
 
 
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, from 1, read one at a time; every line, the last too, has an end.
+    """Lines with their numbers, from 1, read one at a time; every line has an end, or the last one's last number is
+    written as those above it are (see `written`).
 
     Raises
     ------
     InputError
         Where the file cannot be read, is not UTF-8, or stops within a line.
     """
+    above: set[tuple[int, int] | None] = set()
     try:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
-                if not line.endswith("\n"):
+                words = WORD.findall(line)
+                last = written(words[-1]) if words else None
+                if not line.endswith("\n") and (last is None or {last} != above):
                     raise stops_within(path, number)
+                if words and is_decimal(words[-1]):
+                    above.add(last)
                 yield number, line.rstrip("\n")
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8. {AGAIN}") from error
@@ -73,6 +80,16 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
 def stops_within(path: Path, line: int) -> InputError:
     """The error of a file whose last line has no end, so that its last number may be half of one."""
     return InputError(f"{path} stops within line {line}: it may be truncated. Copy it again, or end that line.")
+
+
+def written(number: str) -> tuple[int, int] | None:
+    """Digits behind the point and of the exponent; None where no digit is behind the point, or for no number.
+
+    Where all numbers are written alike, one that was cut short is not.
+    """
+    mantissa, _, exponent = number.lower().partition("e")
+    digits = len(mantissa.partition(".")[2])
+    return (digits, len(exponent.lstrip("+-"))) if digits and is_decimal(number) else None
 
 
 def check_ended(text: str, path: Path) -> None:
