@@ -16,6 +16,8 @@ from zlocus.scene import View
 from zlocus.sensors.model import Scanning, SensorModel, bare, capped, lowest_station
 from zlocus.sensors.shown_table import shown_table
 from zlocus.sensors.table import (
+    DEGREE,
+    HIGHER_DEGREE,
     HIGHEST_DEGREE,
     UNSTEADY_DEGREE,
     ProjectionTable,
@@ -215,24 +217,27 @@ def _fitting_tables(
     block: int,
     z_ranges: tuple[tuple[float, float], tuple[float, float]],
 ) -> tuple[list[ProjectionTable], int]:
-    """A table per view that holds to a tolerance, and its block: as asked for and over all heights, where need be over
-    those of the second, shorter range at which each block is shown and of a higher degree, where need be halved, and
-    where that is not enough either to the wider tolerance and of the highest degree. A view is left out of more than a
+    """A table per view that holds to a tolerance, and its block: as asked for, where need be over the second, shorter
+    range of heights only and of a higher degree, where need be halved; where that is not enough, of the highest degree,
+    each block over the heights at which it is shown; and then to the wider tolerance. A view is left out of more than a
     few blocks (see `TileViews.lost`) only after all that.
 
     Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones. So does
     an unsteady flight in raw images of line scanners, far more than any perspective, which get a still higher degree.
     """
     near, far = (COARSER_TABLE_PX, COARSER_BENT_PX) if level else (FINEST_TABLE_PX, FINEST_BENT_PX)
-    tables = _tables_over_all_heights(views, transform, shape, block, z_ranges[0], near * 2.0**level)
-    if tables is not None:
-        return tables, block
     blocks = [block]
     while blocks[-1] >= 2 * SMALL_BLOCK:
         blocks.append(blocks[-1] // 2)
+    large = [b for b in blocks if b > SMALL_BLOCK]
+    for cells, z_range, degree in ((block, z_ranges[0], DEGREE), *((b, z_ranges[1], HIGHER_DEGREE) for b in large)):
+        tables = _tables_over_all_heights(views, transform, shape, cells, z_range, near * 2.0**level, degree)
+        if tables is not None:
+            return tables, cells
     is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in views)
-    attempts = [(b, near, HIGHEST_DEGREE, 0.0) for b in blocks if b > SMALL_BLOCK]
-    attempts += [(b, far, HIGHEST_DEGREE, 0.0) for b in blocks]
+    attempts = [(b, near, HIGHEST_DEGREE, 0.0) for b in large]
+    attempts += [(b, far, HIGHEST_DEGREE, 0.0) for b in large[-1:]]
+    attempts += [(SMALL_BLOCK, px, HIGHEST_DEGREE, 0.0) for px in (near, far)]
     attempts += [(SMALL_BLOCK, far, UNSTEADY_DEGREE, 0.0)] * is_scanning
     attempts += [(SMALL_BLOCK, far, HIGHEST_DEGREE, LITTLE_LOST), (SMALLEST_BLOCK, far, HIGHEST_DEGREE, 0.0)]
     attempts += [(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MOST_LOST)]
@@ -261,13 +266,14 @@ def _tables_over_all_heights(
     block: int,
     z_range: tuple[float, float],
     tolerance_px: float,
+    degree: int,
 ) -> list[ProjectionTable] | None:
     """A table per view; None where one of them does not hold, or not wherever its window shows something."""
     tables = []
     for view in views:
         window = (*view.origin, *view.shape)
         try:
-            table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px, window)
+            table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px, window, degree)
         except GeometryError:
             return None
         if table.lost.any():

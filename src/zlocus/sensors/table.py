@@ -14,7 +14,7 @@ from zlocus.sensors.model import FloatArray, SensorModel
 TOLERANCE_PX = 0.01
 DEGREE = 3
 # For cameras so close that their scale changes a lot from the lowest to the highest ground.
-HIGHEST_DEGREE = 11
+HIGHER_DEGREE, HIGHEST_DEGREE = 7, 11
 # For raw lines of an unsteady flight: each height on a slanted ray is another exposure. (Beyond about 35 the
 # coefficients lose their digits.)
 UNSTEADY_DEGREE = 31
