@@ -46,7 +46,7 @@ from zlocus.surface.surface import Surface
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
 PLAIN_IN = 2  # views in which plain segments are looked for, one after the other
-# Texture of the sharpest view over that of one that is sharp, at most.
+# Texture of the second sharpest view (the sharpest may be noise) over that of one that is sharp, at most.
 SHARP = 1.5
 STRIDE = 2  # cells between those that are looked at for the views that cover them
 FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is looked at
@@ -452,7 +452,7 @@ def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
     heights = result.heights
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
     units = [texture_unit(_ortho(result.views, planar.height, view)) for view in range(len(result.views.layout))]
-    sharp = [view for view, unit in enumerate(units) if unit * SHARP > max(units)]
+    sharp = [view for view, unit in enumerate(units) if unit * SHARP > sorted(units)[-2]]
     for view in sharp[:PLAIN_IN]:
         ortho = _ortho(result.views, planar.height, view)
         planar = with_planes(result.views, ortho, planar, result.seen, config.planes)
