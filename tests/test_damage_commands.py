@@ -47,14 +47,20 @@ def refused(folder, *arguments):
     return said[0]
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("name", IMPORTED)
+def with_damages(names):
+    """Each name with every damage that can be done to it: binary files have no encoding, and of a raster whose grid
+    alone is read, which stands at its beginning, nothing is missed where it is cut."""
+    return [
+        (name, damage)
+        for name in names
+        for damage in DAMAGES
+        if (CASES[name].text or damage != "utf-16") and (name, damage) != ("like", "cut")
+    ]
+
+
+@pytest.mark.parametrize(("name", "damage"), with_damages(IMPORTED))
 def test_import(tmp_path, name, damage):
     path = CASES[name].write(tmp_path)
-    if damage == "utf-16" and "binary" in name:
-        pytest.skip("a binary file has no encoding")
-    if (name, damage) == ("like", "cut"):
-        pytest.skip("its grid stands at its beginning, and no more is read")
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     options = ["--camera", tmp_path / "p" / "camera.yaml"] if name == "eo" else []
     sentence = refused(tmp_path, "import", IMPORTED[name], tmp_path / "p", "-o", tmp_path / "scene.yaml", *options)
@@ -112,14 +118,9 @@ def test_control_points(tmp_path, good, damage):
     assert "control.csv" in refused(tmp_path, "orient", *good, "--control", path, "-o", tmp_path / "out")
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("name", ["dem", "like", "area-geojson", "area-gpkg"])
+@pytest.mark.parametrize(("name", "damage"), with_damages(["dem", "like", "area-geojson", "area-gpkg"]))
 def test_side_files(tmp_path, good, name, damage):
     path = CASES[name].write(tmp_path)
-    if damage == "utf-16" and not CASES[name].text:
-        pytest.skip("a binary file has no encoding")
-    if (name, damage) == ("like", "cut"):
-        pytest.skip("its grid stands at its beginning, and no more is read")
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     option = f"--{name.split('-')[0]}"
     heights = [] if name == "dem" else ["--heights", 20, 90]
