@@ -88,7 +88,7 @@ def quaternion(matrix):
     ]) / 3.0  # fmt: skip
     _, vectors = np.linalg.eigh(k)
     x, y, z, w = vectors[:, -1]
-    return np.array([w, x, y, z])
+    return np.array([w, x, y, z]) * np.copysign(1.0, w)
 
 
 COLMAP = {

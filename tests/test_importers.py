@@ -211,7 +211,7 @@ FAULTS = [
     ("colmap", files.write_colmap, "sparse/0/images.txt", " 7 a.tif", " 8 a.tif", "camera 8, which is not in"),
     ("colmap", files.write_colmap, "sparse/0/images.txt", "a.tif", "z.tif", "Give the folder with --images"),
     ("colmap", files.write_colmap, "sparse/0/images.txt", "b 2.tif", "z.tif", "lacks 1 of 3 images"),
-    ("colmap", files.write_colmap, "sparse/0/images.txt", "\n1 -0.", "\n1 -9.", "quaternion of length"),
+    ("colmap", files.write_colmap, "sparse/0/images.txt", "\n1 0.", "\n1 9.", "quaternion of length"),
     ("bundler", files.write_bundler, "bundle.out", "v0.3", "v9", "does not begin with"),
     ("bundler", files.write_bundler, "bundle.out", "4 1", "5 1", "5 cameras, and .* lists 4 images"),
     ("bundler", files.write_bundler, "bundle.out", "4 1", "4 99", "truncated: 99 points"),

@@ -3,17 +3,23 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import tracemalloc
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 from rasterio.enums import MaskFlags
 from rio_cogeo.cogeo import cog_validate
 
 from zlocus.errors import OutputError
+from zlocus.io.cells import WaitingCells
 from zlocus.io.raster import RasterSink, write_cog
 
 RNG = np.random.default_rng(5)
@@ -89,6 +95,42 @@ def test_blocks_from_threads(tmp_path):
             thread.join()
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(1), HEIGHTS)
+
+
+def test_gdal_sees_no_cell_before_the_end(tmp_path, monkeypatch):
+    """Its cache loses cells of blocks that are changed while other threads read; see `zlocus.io.cells`."""
+    opened = []
+    monkeypatch.setattr(
+        rasterio, "open", lambda *args, open=rasterio.open, **kw: opened.append(args) or open(*args, **kw)
+    )
+    with RasterSink(tmp_path / "a.tif", GRID, "uint8", has_mask=True) as sink:
+        sink.write(0, 0, np.ones((5, 6), np.uint8))
+        assert not opened
+    assert opened
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.data())
+def test_waiting_cells_are_an_array_on_disk(data):
+    shape = tuple(data.draw(st.integers(1, most)) for most in (3, 23, 23))
+    expected, came = np.full(shape, np.nan), np.zeros(shape[1:], bool)
+    side = data.draw(st.integers(1, 9))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(WaitingCells(Path(folder) / "cells", shape, np.dtype(float), np.nan, side)) as waiting,
+    ):
+        for number in range(data.draw(st.integers(0, 6))):
+            row, col = (data.draw(st.integers(0, n - 1)) for n in shape[1:])
+            rows, cols = (data.draw(st.integers(1, n - first)) for n, first in zip(shape[1:], (row, col), strict=True))
+            cells = number + RNG.random((shape[0], rows, cols))
+            waiting.put(row, col, cells)
+            expected[:, row : row + rows, col : col + cols] = cells
+            came[row : row + rows, col : col + cols] = True
+        found = np.full(shape, np.nan)
+        for (rows, cols), cells in waiting:
+            assert came[rows, cols].any()
+            found[:, rows, cols] = cells
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize(("nodata", "dtype"), [(np.nan, "float32"), (0, "uint8"), (None, "uint16")])

@@ -20,6 +20,7 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from zlocus.errors import InputError, OutputError
+from zlocus.io.cells import WaitingCells
 from zlocus.io.opening import BLOCK_CACHE_BYTES, check_complete, open_raster, reason
 
 BLOCK_SIZE = 512
@@ -32,9 +33,9 @@ FLOAT_PREDICTOR, INTEGER_PREDICTOR = "FLOATING_POINT", "STANDARD"
 class RasterSink:
     """A raster of a grid that is written block by block; `close` makes it a COG under its own name.
 
-    Until then the cells wait in an uncompressed tiled file beside it (never in memory), so blocks may come in any
-    order, of any size, from any thread. Cells never written have the nodata value, or 0 where there is none. As a
-    context it closes at the end and aborts on an exception.
+    Until then the cells wait in a file beside it (never in memory), so blocks may come in any order, of any size, from
+    any thread; `close` is for when no other thread reads rasters. Cells never written have the nodata value, or 0 where
+    there is none. As a context it closes at the end and aborts on an exception.
 
     path : of the COG. geobox : its grid. dtype : of the cells.
     nodata : value that means no data; None where all cells mean something.
@@ -61,18 +62,22 @@ class RasterSink:
         self.path, self.dtype, self.has_mask = Path(path), np.dtype(dtype), has_mask
         self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part.tif")
         self._cog = self.path.with_name(f".{self.path.name}.{os.getpid()}.cog.tif")
+        # Of the cells and of the mask.
+        names = ("cells", "mask") if has_mask else ("cells",)
+        self._paths = [self.path.with_name(f".{self.path.name}.{os.getpid()}.{name}") for name in names]
+        self._waiting: list[WaitingCells] = []
         self._lock = threading.Lock()
         rows, cols = geobox.shape
-        profile = {
+        self._descriptions, self._units = descriptions, units
+        self._profile = {
             "driver": "GTiff", "width": cols, "height": rows, "count": len(descriptions), "dtype": self.dtype.name,
             "crs": None if geobox.crs is None else geobox.crs.to_wkt(), "transform": geobox.transform, "nodata": nodata,
             "tiled": True, "blockxsize": BLOCK_SIZE, "blockysize": BLOCK_SIZE, "BIGTIFF": "IF_SAFER", "SPARSE_OK": True,
         }  # fmt: skip
         with self._guard():
-            self._dataset = rasterio.open(self._part, "w", **profile)
-            for band, description in enumerate(descriptions, 1):
-                self._dataset.set_band_description(band, description)
-            self._dataset.units = (units,) * len(descriptions)
+            kinds = ((len(descriptions), self.dtype, nodata or 0), (1, np.dtype(bool), 0))
+            for path, (count, kind, empty) in zip(self._paths, kinds, strict=False):
+                self._waiting.append(WaitingCells(path, (count, rows, cols), kind, empty, BLOCK_SIZE))
 
     def write(self, row: int, col: int, array: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> None:
         """Put a block with its first cell at (row, col).
@@ -80,12 +85,10 @@ class RasterSink:
         array : (r, c) or (bands, r, c). mask : (r, c) bool, True is valid; None is all valid.
         """
         bands = array if array.ndim == 3 else array[np.newaxis]
-        window = Window(col, row, bands.shape[2], bands.shape[1])
         with self._lock, self._guard():
-            self._dataset.write(bands.astype(self.dtype, copy=False), window=window)
-            if self.has_mask:
-                valid = np.ones(bands.shape[1:], bool) if mask is None else mask
-                self._dataset.write_mask(valid, window=window)
+            valid = np.ones(bands.shape[1:], bool) if mask is None else mask
+            for waiting, cells in zip(self._waiting, (bands, valid[np.newaxis]), strict=False):
+                waiting.put(row, col, cells)
 
     def close(self) -> None:
         """Convert to COG and rename to `path`."""
@@ -96,20 +99,33 @@ class RasterSink:
             "OVERVIEW_RESAMPLING": "AVERAGE" if floating or self.has_mask else "NEAREST",
         }
         with self._guard():
-            self._dataset.close()
+            self._gather()
             _check_written(self._part)
             rasterio.shutil.copy(self._part, self._cog, driver="COG", **options)
             _check_written(self._cog)
             os.replace(self._cog, self.path)
-            self._part.unlink()
+        self._remove()
 
     def abort(self) -> None:
         """Remove everything that was begun; harmless after `close`."""
-        self._dataset.close()
         self._remove()
 
+    def _gather(self) -> None:
+        """The cells as a GeoTIFF, block by block, each once and whole."""
+        with rasterio.open(self._part, "w", **self._profile) as dataset:
+            for band, description in enumerate(self._descriptions, 1):
+                dataset.set_band_description(band, description)
+            dataset.units = (self._units,) * len(self._descriptions)
+            for slices, cells in self._waiting[0]:
+                dataset.write(cells, window=Window.from_slices(*slices))
+            for slices, cells in self._waiting[1] if self.has_mask else ():
+                dataset.write_mask(cells[0], window=Window.from_slices(*slices))
+
     def _remove(self) -> None:
-        for path in (self._part, self._cog):
+        for waiting in self._waiting:
+            with suppress(OSError):  # of a full disk
+                waiting.close()
+        for path in (*self._paths, self._part, self._cog):
             with suppress(OSError):  # where it could not be made
                 path.unlink()
 
