@@ -84,7 +84,7 @@ KERNELS = (
         "some 60 ns a cell whatever its heights: two minima across lanes, ends of loops, the parabola; 0.6 ns a step",
     ),
     Kernel(
-        "tile_profile, 9 x 9, 3 views", bench.profile_case, profile(4, 3, 3), CELLS * (4 * 3 + 3 * 16),
+        "tile_profile, 5 x 5 and 9 x 9, 3 views", bench.profile_case, profile([2, 4], 3, 3), CELLS * (4 * 3 + 3 * 16),
         "the 35 operations on 4 x 4 pixels are scalar code (6.3 ns with the border); 9 rows are summed anew for every "
         "cell (moments 2.2 ns, pairs 2.3 ns)",
     ),

@@ -155,9 +155,9 @@ MGM = MGM_SWEEP * 4
 WINNERS = Count(ops=5 + 14, narrow=2, loads=8, memory=2)
 
 
-def profile(half: int, n_views: int, n_offsets: int) -> Count:
+def profile(windows: list[int], n_views: int, n_offsets: int) -> Count:
     """`tile_profile` per cell, offset and image."""
-    plane, rows, _ = bordered(half)
+    plane, rows, _ = bordered(windows[-1])
     # level: sum, difference, division; once for all images.
     level = Count(ops=2, roots=0.5, loads=4, stores=4) * (plane / n_views)
     # positions_along, x and y: three bilinear forms of 6, u * (b + u * c) added 4, min, max: 24.
@@ -167,11 +167,11 @@ def profile(half: int, n_views: int, n_offsets: int) -> Count:
     weights = Count(ops=2 * 19, loads=2 * 4, stores=2 * 20) + Count(ops=5, loads=8, stores=4)
     gather = Count(ops=35, gathers=16, loads=4 + 32, stores=4)
     # The plane less its middle; scale times whether it is seen: comparison, conversion, product.
-    image = (position + weights + gather + Count(ops=1, loads=4, stores=4)) * plane + moments([half])
-    image += Count(ops=3, loads=8, stores=4) * rows
+    image = (position + weights + gather + Count(ops=1, loads=4, stores=4)) * plane + moments(windows)
+    image += Count(ops=3, loads=8, stores=4) * (rows * len(windows))
     # Mean over the pairs: 1; once: pixels, `seen`, and the result.
-    mean = Count(ops=1, loads=8, stores=4, memory=4) * (1 / n_views)
-    return level + image + correlation([half], n_views) * ((n_views - 1) / 2) + mean + Count(memory=16 / n_offsets)
+    mean = Count(ops=1, loads=8, stores=4, memory=4) * (len(windows) / n_views)
+    return level + image + correlation(windows, n_views) * ((n_views - 1) / 2) + mean + Count(memory=16 / n_offsets)
 
 
 # add_tap: the step less two slopes 5, away 1, weight 3 + 2, sums 3; reads two cells, two slopes, two sums. 25 of them,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -268,41 +269,45 @@ def test_profiles(n_views, half):
     offsets = np.array([-1.5, 0.0, 0.7], np.float32)
     seen = scene.all_seen()
     seen[0, 1, 3:9], seen[1, 0, :, :5] = HIDDEN, 3
-    groups = np.empty((2, 3, *scene.shape), np.float32)
+    windows = np.array([1, half])
+    groups = np.empty((2, 2, 3, *scene.shape), np.float32)
     tile_profile(
-        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, half,
+        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, windows,
         seen, np.float32(0.0), groups,
     )  # fmt: skip
-    out = groups.sum(axis=0)
-    for b, d, rows, cols in scene.blocks():
-        around = surface[rows.start : rows.stop + 2 * half, cols.start : cols.stop + 2 * half].astype(float)
+    out = groups.sum(axis=1)
+    for (b, d, rows, cols), (w, window) in product(scene.blocks(), enumerate(windows)):
+        trim = half - window
+        around = surface[
+            rows.start + trim : rows.stop + half + window, cols.start + trim : cols.stop + half + window
+        ].astype(float)
         nodes = scene.nodes[:, b : b + 2, d : d + 2]
         for j, offset in enumerate(offsets):
             expected = agreement.profile(
-                scene.images, nodes, scene.heights, around, offset, scene.block, half, seen[:, :, rows, cols]
+                scene.images, nodes, scene.heights, around, offset, scene.block, window, seen[:, :, rows, cols]
             )
-            np.testing.assert_allclose(out[j, rows, cols], expected, rtol=0, atol=NCC)
+            np.testing.assert_allclose(out[w, j, rows, cols], expected, rtol=0, atol=NCC)
             for group in range(2):
                 expected = agreement.profile(
-                    scene.images, nodes, scene.heights, around, offset, scene.block, half, seen[:, :, rows, cols],
+                    scene.images, nodes, scene.heights, around, offset, scene.block, window, seen[:, :, rows, cols],
                     group=(group, 2),
                 )  # fmt: skip
-                np.testing.assert_allclose(groups[group, j, rows, cols], expected, rtol=0, atol=NCC)
+                np.testing.assert_allclose(groups[w, group, j, rows, cols], expected, rtol=0, atol=NCC)
     if n_views == 2:
-        assert (out[:, 3:9] == 0).all()
+        assert (out[:, :, 3:9] == 0).all()
 
 
 def test_profile_of_one_block():
     scene = kernel_scene(3, (9, 11), 16)
-    surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 1, 9, 11), np.float32)
+    surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 1, 1, 9, 11), np.float32)
     block_profile(
-        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16, 2,
-        scene.all_seen(), np.float32(0.0), out,
+        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16,
+        np.array([2]), scene.all_seen(), np.float32(0.0), out,
     )  # fmt: skip
     expected = agreement.profile(
         scene.images, scene.nodes, scene.heights, surface.astype(float), 0.0, 16, 2, scene.all_seen()
     )
-    np.testing.assert_allclose(out[0, 0], expected, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(out[0, 0, 0], expected, rtol=0, atol=1e-3)
 
 
 def test_ortho_image():

@@ -235,7 +235,7 @@ def flat_ncc(planes, half, floor=0.0):
     work, out = np.empty((4, flat.shape[1]), np.float32), np.zeros(flat.shape[1], np.float32)
     for i in range(n_views):
         window_moments(flat[i], windows, width, n, np.float32(floor), work, mean[i], scale[i])
-    add_pairs(flat, windows, mean, scale, width, n, work, out[None])
+    add_pairs(flat, windows, mean, scale, width, n, work, out[None, None])
     return out[:n].reshape(rows, width)[:, :cols]
 
 

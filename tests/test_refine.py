@@ -15,6 +15,7 @@ from zlocus.matching.refine import (
     peak_variance,
     peaks_apart,
     refine,
+    sharpened,
     smoothed,
     weighed,
 )
@@ -97,6 +98,33 @@ def test_what_does_not_count_says_nothing_of_the_spread():
     expected = weighed(away, known & (away != 0), variance)
     away[10:30, 10:30:3], known[10:30, 10:30:3] = 5.0, False
     np.testing.assert_allclose(weighed(away, known, variance)[known], expected[known], rtol=0, atol=1e-6)
+
+
+def test_narrow_windows_count_where_they_find_relief():
+    """Left, what they differ by is their own noise; right, relief that wide windows level."""
+    rng = np.random.default_rng(3)
+    wide = rng.normal(0.0, 0.1, (60, 120)).astype(np.float32)
+    narrow = wide + rng.normal(0.0, 0.05, wide.shape).astype(np.float32)
+    narrow[:, 60:] += np.float32(0.5) * (np.arange(60) // 3 % 2 - np.float32(0.5))
+    known = np.ones(wide.shape, bool)
+    variance, of_narrow = (np.full(wide.shape, value, np.float32) for value in (0.002, 0.004))
+    found, together = sharpened(wide, variance, narrow, of_narrow, known)
+    assert np.abs(found - wide)[:, :50].mean() < 0.2 * np.abs(narrow - wide)[:, :50].mean()
+    np.testing.assert_allclose(found[:, 70:], narrow[:, 70:], rtol=0, atol=0.05)
+    assert (together[:, :50] < 0.0022).all()
+    assert (together[:, 70:] > 0.0035).all()
+    nothing, same = sharpened(wide, variance, narrow, of_narrow, ~known)
+    np.testing.assert_array_equal(nothing, wide)
+    np.testing.assert_array_equal(same, variance)
+
+
+def test_relief_is_small():
+    """Another peak far away, found by a narrow window, moves no height and does not pass for its neighbours' relief."""
+    wide, known = np.zeros((40, 40), np.float32), np.ones((40, 40), bool)
+    narrow = np.where(np.arange(40) % 4 == 0, np.float32(0.8), np.float32(0.01)) * np.ones_like(wide)
+    variance, of_narrow = (np.full(wide.shape, value, np.float32) for value in (0.001, 0.003))
+    found, _ = sharpened(wide, variance, narrow, of_narrow, known)
+    np.testing.assert_allclose(found, 0.0, rtol=0, atol=1e-6)
 
 
 def test_smoothing_removes_single_cells_and_keeps_jumps():

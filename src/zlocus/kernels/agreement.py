@@ -186,30 +186,31 @@ def add_couples(sums, n, first, second, mean, scale, total):
         total[j] += scale[a, w, j] * with_a + scale[b, w, j] * with_b
 
 
-# (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (4,p) f4, (g,p) f4 -> None
+# (i,p) f4, (w,) i8, (i,w,p) f4, (i,w,p) f4, i8, i8, (4,p) f4, (v,g,p) f4 -> None
 @kernel
 def add_pairs(planes, windows, mean, scale, width, n, work, total):
     """Add the NCC of all pairs of views, for every window, at the first n places.
 
     planes : (i, p); windows, mean, scale : see `window_moments`, a view takes part where its scale is not zero; work :
-    (4, p), scratch; total : (g, p), the pair of views a and b adds to row (a + b) % g. Plain formula: sum_{a<b} scale_a
-    scale_b (sum x_a x_b - mean_a mean_b). In windows of 3 x 3 alone, two views at a time meet two others: each value
-    is read for two pairs.
+    (4, p), scratch; total : (v, g, p), the pair of views a and b in window w adds to row (w % v, (a + b) % g): v is 1
+    for the sum over the windows, or their number. Plain formula: sum_{a<b} scale_a scale_b (sum x_a x_b - mean_a
+    mean_b). In windows of 3 x 3 alone, two views at a time meet two others: each value is read for two pairs.
     """
-    half, columns, beyond, n_groups = windows[-1], work[0], work[1], total.shape[0]
+    half, columns, beyond, n_groups = windows[-1], work[0], work[1], total.shape[1]
     coupled = planes.shape[0] // 2 * 2 if half == 1 and n_groups == 1 else 0
     for a in range(0, coupled, 2):
         for b in range(a + 2, coupled, 2):
             couple_products(planes, a, b, width, n + SLACK, work)
-            add_couples(work, n, a, b, mean, scale, total[0])
+            add_couples(work, n, a, b, mean, scale, total[0, 0])
     for a in range(planes.shape[0]):
         for b in range(a + 1, planes.shape[0]):
             if b < coupled and a // 2 < b // 2:
                 continue
-            done, x, y, into = 0, np.uint64(a), np.uint64(b), total[(a + b) % n_groups]
+            done, x, y, group = 0, np.uint64(a), np.uint64(b), (a + b) % n_groups
             for w in range(windows.shape[0]):
                 window = windows[w]
                 column_products(planes, x, y, half, done, window, width, n + SLACK, columns)
+                into = total[w % total.shape[0], group]
                 add_correlation(columns[half - window :], window, n, x, y, w, mean, scale, beyond, into)
                 done = window
 

@@ -147,23 +147,25 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
             gather(pixels, layout, index, across, pairs, out[first:end])
 
 
-# (p,) f4, i8, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, i8, (3,i,r,c) i4, f4, (g,j,r,c) f4 -> None
+# (p,) f4, i8, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, (w,) i8, (3,i,r,c) i4, f4, (w,g,j,r,c) f4
+# -> None
 @kernel
-def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
+def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, windows, seen, floor, out):
     """Mean NCC over all pairs of the views that see the surface, at `surface` + `offsets`; windows follow the surface.
 
     surface : (r + 2 half, c + 2 half) float32 height indices, border included; offsets : (j,) float32, in steps;
-    seen : (3, i, r, c) int32, see `block_costs`; out : (g, j, r, c) float32, written; 0 where fewer than two views see
-    the cell. The pairs are dealt to g groups (see `add_pairs`); their sum is the mean over all.
+    windows : (w,) half widths, ascending, the last is `half`; seen : (3, i, r, c) int32, see `block_costs`; out : (w,
+    g, j, r, c) float32, written; 0 where fewer than two views see the cell. The pairs are dealt to g groups (see
+    `add_pairs`); their sum is the mean over all.
     """
-    rows, cols = out.shape[2], out.shape[3]
-    n_views = layout.shape[0]
+    n_windows, n_groups, rows, cols = out.shape[0], out.shape[1], out.shape[3], out.shape[4]
+    n_views, half = layout.shape[0], windows[-1]
     width = cols + 2 * half
     n, size = rows * width, surface.size + SLACK
-    planes, windows = np.zeros((n_views, size), np.float32), np.full(1, half)
-    mean, scale = np.zeros((n_views, 1, size), np.float32), np.zeros((n_views, 1, size), np.float32)
+    planes = np.zeros((n_views, size), np.float32)
+    mean, scale = np.zeros((n_views, n_windows, size), np.float32), np.zeros((n_views, n_windows, size), np.float32)
     flat = np.empty((n_views, 3, size), np.int32)
-    pairs, agreed = np.empty(size, np.float32), np.empty((out.shape[0], size), np.float32)
+    pairs, agreed = np.empty(size, np.float32), np.empty((n_windows, n_groups, size), np.float32)
     work = np.empty((4, size), np.float32)
     grids, level, cells = np.empty((3, 8)), np.empty(surface.size, np.float32), flat_cells(surface.shape)
     at_surface = np.zeros((3, n_views, rows, cols), np.int32)
@@ -192,30 +194,32 @@ def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, bloc
             resample_surface(pixels, layout[i], grids, cells, level, degree, planes[i])
             planes[i] -= planes[i, half * width + half]
             window_moments(planes[i], windows, width, n, floor, work, mean[i], scale[i])
-            for p in range(n):
-                scale[i, 0, p] *= np.float32(flat[i, 0, p] < HIDDEN)
+            for w in range(n_windows):
+                for p in range(n):
+                    scale[i, w, p] *= np.float32(flat[i, 0, p] < HIDDEN)
         agreed[:] = 0.0
         add_pairs(planes, windows, mean, scale, width, n, work, agreed)
-        for g in range(out.shape[0]):
-            for r in range(rows):
-                for c in range(cols):
-                    p = r * width + c
-                    out[g, j, r, c] = agreed[g, p] * pairs[p]
+        for w in range(n_windows):
+            for g in range(n_groups):
+                for r in range(rows):
+                    for c in range(cols):
+                        p = r * width + c
+                        out[w, g, j, r, c] = agreed[w, g, p] * pairs[p]
 
 
 # as block_profile, over every block of a tile; surface : (r + 2 half, c + 2 half)
 @kernel
-def tile_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, half, seen, floor, out):
-    """`block_profile` of every block of a tile; out : (g, j, r, c)."""
-    n_rows, n_cols = out.shape[2], out.shape[3]
+def tile_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, windows, seen, floor, out):
+    """`block_profile` of every block of a tile; out : (w, g, j, r, c)."""
+    n_rows, n_cols, half = out.shape[3], out.shape[4], windows[-1]
     for br in range((n_rows + block - 1) // block):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             block_profile(
                 pixels, degree, layout, nodes[:, br : br + 2, bc : bc + 2], heights,
-                surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], offsets, block, half, seen[:, :, r0:r1, c0:c1],
-                floor, out[:, :, r0:r1, c0:c1],
+                surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], offsets, block, windows, seen[:, :, r0:r1, c0:c1],
+                floor, out[:, :, :, r0:r1, c0:c1],
             )  # fmt: skip
 
 

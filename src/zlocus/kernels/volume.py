@@ -271,7 +271,7 @@ def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, blo
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     counts, sides = np.empty((2, size), np.float32), np.empty((2, size), np.complex64)
     work, grid, velocity = np.empty((4, size), np.float32), np.empty(8), np.empty(2, np.float32)
-    index, fraction, totals = np.empty(size, np.uint32), np.empty((2, size), np.float32), total.reshape((1, size))
+    index, fraction, totals = np.empty(size, np.uint32), np.empty((2, size), np.float32), total.reshape((1, 1, size))
     flat_visibility(seen, half, flat, pairs)
     top, centre = weight * np.float32(n_sizes), np.float32(0.0)
     by_reach = top / measure[2]

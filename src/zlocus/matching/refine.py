@@ -21,6 +21,7 @@ FIRST_OFFSETS = np.linspace(-1.0, 1.0, 3, dtype=np.float32)
 LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
 # Of a peak's variance by `peak_variance`, which knows nothing of what disturbs several images alike.
 NOISE_FACTOR = 2.5
+LARGEST_RELIEF = np.float32(0.5)  # steps within a window
 SPREAD_CELLS = 15  # around a cell, over which heights spread about the smooth surface
 SPACINGS = (1, 2, 4)
 SLOPE_REACH = 8
@@ -76,32 +77,39 @@ def refine(
     coefficients : of cubic B-splines, as `views` has pixels. Each round smooths the surface, measures the mean NCC at a
     few fractions of a step around it and puts a parabola through the best three: linear values of the images will do
     for all rounds but the last. Windows that follow a noisy surface would see a different place in each image, hence
-    the smoothing; a refined height further than `reach_steps` from the semi-global one is not believed, and what the
-    last round finds counts by how much of it is noise (see `weighed`). step_cells : height of a step over the side of a
+    the smoothing; a refined height further than `reach_steps` from the semi-global one is not believed. What the last
+    round finds counts by how much of it is noise: what narrow windows find beside wide ones (see `sharpened`), then
+    what either finds beside the smooth surface (see `weighed`). step_cells : height of a step over the side of a
     cell; fixed : (r, c), cells that are measured like the others and keep their heights.
     """
     fixed = np.zeros(coarse.shape, np.bool_) if fixed is None else fixed
     half = (options.window or default_window(step_cells)) // 2
-    window_cells = (2 * half + 1) ** 2
     height, is_refined = coarse.astype(np.float32), np.zeros(coarse.shape, bool)
     surface, best, bend = height, np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.float32)
     apart, variance = np.full(coarse.shape, np.nan, np.float32), np.ones(coarse.shape, np.float32)
     for number in range(options.rounds):
         surface, is_last = smoothed(height, options.jump_steps), number == options.rounds - 1
         offsets = FIRST_OFFSETS if number == 0 else LATER_OFFSETS
-        profiles = np.empty((2 if is_last else 1, len(offsets), *coarse.shape), np.float32)
+        windows = np.unique([(half + 1) // 2, half]) if is_last else np.array([half])
+        profiles = np.empty((len(windows), 2 if is_last else 1, len(offsets), *coarse.shape), np.float32)
         values, degree = (coefficients, CUBIC) if is_last else (views.pixels, LINEAR)
         tile_profile(
             values, degree, views.layout, views.nodes, views.heights, np.pad(surface, half, mode="edge"), offsets,
-            views.block, half, seen, np.float32(0.0), profiles,
+            views.block, windows, seen, np.float32(0.0), profiles,
         )  # fmt: skip
-        profile, spacing = profiles.sum(axis=0) if is_last else profiles[0], offsets[1] - offsets[0]
+        profile, spacing = profiles[-1].sum(axis=0), offsets[1] - offsets[0]
         found, best, inside = parabola_peak(profile, offsets)
         is_refined = inside & (np.abs(found + surface - coarse) < options.reach_steps)
         if is_last:
-            bend, apart = bend_at_centre(profile, spacing), peaks_apart(profiles, spacing)
-            variance = peak_variance(best, bend, sees(seen, surface[None]).sum(axis=0), window_cells)
-            found = weighed(found, is_refined, variance)
+            bend, apart = bend_at_centre(profile, spacing), peaks_apart(profiles[-1], spacing)
+            n_seeing = sees(seen, surface[None]).sum(axis=0)
+            variance = peak_variance(best, bend, n_seeing, (2 * half + 1) ** 2)
+            noise = variance
+            for window, narrow in zip(windows[:-1], profiles[:-1].sum(axis=1), strict=True):
+                sharp, ncc, known = parabola_peak(narrow, offsets)
+                of_sharp = peak_variance(ncc, bend_at_centre(narrow, spacing), n_seeing, (2 * int(window) + 1) ** 2)
+                found, noise = sharpened(found, variance, sharp, of_sharp, is_refined & known)
+            found = weighed(found, is_refined, noise)
         height = np.where(is_refined & ~fixed, found + surface, height)
     return RefinedHeights(height, best, is_refined, surface, bend, apart, variance, fixed)
 
@@ -111,6 +119,26 @@ def peak_variance(ncc: FloatGrid, bend: FloatGrid, n_images: NDArray[np.integer]
     noise = 2 * np.maximum(1 - ncc, LEAST_NOISE)
     images = np.maximum(n_images, 1).astype(np.float32)
     return np.asarray(noise / (np.maximum(bend, LEAST_PEAK) * window_cells * images), np.float32)
+
+
+def sharpened(
+    wide: FloatGrid, variance: FloatGrid, narrow: FloatGrid, of_narrow: FloatGrid, known: NDArray[np.bool_]
+) -> tuple[FloatGrid, FloatGrid]:
+    """Distances (r, c) from a smooth surface as wide windows find them, with as much of what narrow ones find beside
+    them as is relief: the share of the spread of their differences that is not noise. And the variance of both.
+
+    variance, of_narrow : (r, c), of the noise of either; known : (r, c), where both are to be believed. Narrow windows
+    lie in wide ones, whose noise they share: the variance of their difference is the difference of theirs. Source: as
+    `weighed`.
+    """
+    beside = np.where(known & (np.abs(narrow - wide) < LARGEST_RELIEF), narrow - wide, np.float32(0.0))
+    more = np.maximum(of_narrow - variance, np.float32(0.0))
+    share_known = np.maximum(_around(known.astype(np.float32)), np.float32(1e-3))
+    noise = _around(np.where(known, more, np.float32(0.0))) / share_known
+    spread = _around(beside * beside) / share_known
+    share = np.clip(1 - np.float32(NOISE_FACTOR) * noise / np.maximum(spread, np.float32(1e-9)), 0, 1)
+    together = variance + np.where(known, share * share * more, np.float32(0.0))
+    return np.asarray(wide + share * beside, np.float32), np.asarray(together, np.float32)
 
 
 def weighed(away: FloatGrid, known: NDArray[np.bool_], variance: FloatGrid) -> FloatGrid:
