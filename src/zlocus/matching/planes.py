@@ -20,6 +20,8 @@ from zlocus.options import PlaneOptions
 TEXTURE, RIM, INNER = (3, 3), np.ones((3, 3), np.uint8), np.ones((3, 3), np.uint8)
 # Deviations are compared with those of windows of this side, at the median of the tile.
 AROUND = (5, 5)
+# By how much less the views may agree on a plane than on the heights before, as a share of what a plain core may have.
+MOST_WORSE = 0.25
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def with_planes(
 
     ortho : (r, c) grey values at the known heights, which are (r, c) height indices; cells that are planar stay; seen :
     (3, i, r, c), see `coverage`. A plane is taken where most cells were matched near it, or the views agree better on
-    it, and where they agree on its core to the noise: outlines may not.
+    it, and where they agree on its core to the noise, not much less than on the heights before: outlines may not.
     """
     height, shown = known.height, np.isfinite(ortho)
     grey = np.where(shown, ortho, np.float32(0.0))
@@ -82,6 +84,7 @@ def with_planes(
     near = np.bincount(of_cell, is_near & found.is_core, n_segments) / np.bincount(of_cell, found.is_core, n_segments)
     better = costs[:, 1, 0] < costs[:, 0, 0]
     taken = is_plain & (costs[:, 1, 1] < options.most_cost) & (near > np.where(better, 0.5, options.least_near))
+    taken &= costs[:, 1, 1] - costs[:, 0, 1] < MOST_WORSE * options.most_cost
     taken &= np.hypot(planes[:, 1], planes[:, 2]) < options.most_slope_steps * SPAN
     kept = taken[of_cell] & (found.is_inner | is_near) & (visible.sum(axis=0) >= 2)
     result = PlanarHeights(height.copy(), known.is_planar.copy())
