@@ -130,7 +130,11 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         _check_polygons(request, grid, settled, polygons[0])
     tally = Tally()
     out, dtype = request.out, settled.views[0].image.dtype
-    with watch.stage("match"), made_folder(out), SurfaceRasters(out, grid.geobox, dtype) as rasters:
+    with (
+        watch.stage("match"),
+        made_folder(out),
+        SurfaceRasters(out, grid.geobox, dtype, settled.has_colours and request.method != "gc3-sgm") as rasters,
+    ):
         match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     with watch.stage("points"):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import date as Date
 from itertools import combinations
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,20 @@ class ImageSource(Protocol):
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """The window that starts at (row, col); it lies inside the image."""
+        ...
+
+
+@runtime_checkable
+class ColourSource(ImageSource, Protocol):
+    """An image that may have colours."""
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether its file declares red, green and blue."""
+        ...
+
+    def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
+        """Red, green and blue (3, r, c) of the same window, in the file's own numbers, of an image that has them."""
         ...
 
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels.refine import tile_ortho
 from zlocus.kernels.spline import spline_coefficients
 from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
+from zlocus.matching.ortho import ortho_image, true_ortho
 from zlocus.matching.planes import PlanarHeights, texture_unit, with_planes
 from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.ranking import KnownGround, ranked_at_ties
@@ -36,6 +36,7 @@ from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees, spare_pairs
 from zlocus.options import RunConfig
+from zlocus.scene import ColourSource
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
 from zlocus.surface.precision import sigma_steps, signs_of_precision
@@ -136,7 +137,8 @@ def match_tile(
         done, every = done + result.evaluations, every + result.all_views
     if method != "mvll":
         result = _with_planes(result, config)
-    surface = _finish(scene, pixels, result, config).precise(config.checks.most_sigma_m)
+    coloured = scene.coloured(which)
+    surface = _finish(scene, pixels, result, config, coloured).precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
     done += 0 if ranking is None else ranking.evaluations
@@ -278,7 +280,7 @@ def _match_level(
         ground = None if guide.surface is None else guide.surface - base.cells
         used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
     done = _evaluations(used, lattice) + added
-    ortho = None if smooth is None else _ortho(views, smooth)
+    ortho = None if smooth is None else ortho_image(views, smooth)
     cost = cost_volume(along_base, base, lattice, used, config.measure)
     if method == "mvll":
         heights = alone(cost, lattice)
@@ -352,27 +354,6 @@ def _only(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLat
     return kept
 
 
-def _ortho(views: TileViews, surface: NDArray[np.float32], view: int = 0) -> NDArray[np.float32]:
-    """One view, by default the leading one, on a surface of height indices."""
-    out = np.empty(surface.shape, np.float32)
-    tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, view, views.block, out)
-    return out
-
-
-def _true_ortho(pixels: list[ViewPixels], result: LevelResult, surface: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Grey values of the first view that sees each cell of a surface; NaN where none does."""
-    out = np.full(surface.shape, np.nan, np.float32)
-    for i, view in enumerate(pixels):
-        shown = np.isnan(out) & sees(result.seen[:, i], surface)
-        if shown.any():
-            grey = _ortho(result.views, surface, i)[shown]
-            out[shown] = grey * np.float32(view.contrast) + np.float32(view.mean)
-            if view.trend is not None:
-                trend = np.concatenate([p.pixels[0].ravel() if p.trend is None else p.trend.ravel() for p in pixels])
-                out[shown] += _ortho(replace(result.views, pixels=trend), surface, i)[shown]
-    return out
-
-
 def _finer(coarser: LevelResult, window: CellWindow) -> NDArray[np.float32]:
     """Height indices of the coarser level on the cells, and in the steps, of the finer."""
     return 2 * _doubled(coarser.heights.vertex, coarser.window, window)
@@ -433,15 +414,17 @@ def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
     tell a plain roof from a blurred one."""
     heights = result.heights
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
-    units = [texture_unit(_ortho(result.views, planar.height, view)) for view in range(len(result.views.layout))]
+    units = [texture_unit(ortho_image(result.views, planar.height, view)) for view in range(len(result.views.layout))]
     sharp = [view for view, unit in enumerate(units) if unit * SHARP > sorted(units)[-2]]
     for view in sharp[:PLAIN_IN]:
-        ortho = _ortho(result.views, planar.height, view)
+        ortho = ortho_image(result.views, planar.height, view)
         planar = with_planes(result.views, ortho, planar, result.seen, config.planes)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
 
 
-def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig) -> Surface:
+def _finish(
+    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig, coloured: list[ColourSource]
+) -> Surface:
     """Refine the finest level and judge it, halo included."""
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
     refined = refine(
@@ -466,7 +449,7 @@ def _finish(scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, co
     sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
-    ortho = _true_ortho(pixels, result, refined.height)
+    ortho = true_ortho(pixels, result.views, result.seen, refined.height, coloured)
     ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
     return Surface(height, sigma, quality, used, ortho)

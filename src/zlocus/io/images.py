@@ -58,6 +58,24 @@ class RasterImage:
                 raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
             return self._read(source, Window(col, row, cols, rows))
 
+    @property
+    def has_colours(self) -> bool:
+        """Whether the file declares red, green and blue."""
+        return len(self.bands) == len(LUMINANCE)
+
+    def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
+        """Red, green and blue (3, r, c) of a window, in the file's own numbers.
+
+        Raises
+        ------
+        InputError
+            When the file can no longer be read.
+        """
+        assert self.has_colours, f"{self.path.name} is grey"
+        with kept_raster(self.path) as source:
+            values = source.read(list(self.bands), window=Window(col, row, cols, rows), out_dtype=np.float32)
+        return np.nan_to_num(np.asarray(values, np.float32), copy=False, posinf=0.0, neginf=0.0)
+
     def _read(self, source: rasterio.DatasetReader, window: Window) -> ImageWindow:
         pixels = np.zeros((int(window.height), int(window.width)), np.float32)
         valid = np.ones(pixels.shape, bool)

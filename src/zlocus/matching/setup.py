@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -13,7 +14,7 @@ from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import GreyScale, grey_scales
 from zlocus.options import PyramidOptions
-from zlocus.scene import Scene, View, footprint, ground_sample_distance
+from zlocus.scene import ColourSource, Scene, View, footprint, ground_sample_distance
 from zlocus.sensors.model import Scanning, bare
 
 FINEST_CELL = 0.1
@@ -45,6 +46,17 @@ class MatchScene:
     grey: tuple[GreyScale, ...]
     ties: NDArray[np.float64] = field(repr=False)
     prior: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether all images have, and so an ortho-image can."""
+        return len(self.coloured(range(len(self.views)))) > 0
+
+    def coloured(self, which: Sequence[int]) -> list[ColourSource]:
+        """The images of some views; none where not all of the scene's have colours."""
+        images = [view.image for view in self.views]
+        found = [image for image in images if isinstance(image, ColourSource) and image.has_colours]
+        return [found[number] for number in which] if len(found) == len(images) else []
 
     def transform(self, window: CellWindow, level: int) -> Affine:
         """Cell corners to ground of a window of a level."""

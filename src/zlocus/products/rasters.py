@@ -15,6 +15,8 @@ from zlocus.errors import OutputError
 from zlocus.io.raster import RasterSink
 from zlocus.surface.surface import Surface
 
+GREY, COLOURS = ("grey value",), ("red", "green", "blue")
+
 
 class SurfaceRasters:
     """The rasters of a `Surface`, on one grid, complete when the context ends, else not there.
@@ -22,14 +24,14 @@ class SurfaceRasters:
     dsm.tif, sigma.tif, quality.tif, views.tif and ortho.tif.
     """
 
-    def __init__(self, folder: Path, geobox: GeoBox, ortho_dtype: DTypeLike) -> None:
+    def __init__(self, folder: Path, geobox: GeoBox, ortho_dtype: DTypeLike, has_colours: bool = False) -> None:
         self._stack = ExitStack()
-        self._ortho_dtype = np.dtype(ortho_dtype)
+        self._ortho_dtype, self._bands = np.dtype(ortho_dtype), COLOURS if has_colours else GREY
         self._paths: list[Path] = []
 
-        def sink(name: str, dtype: DTypeLike, description: str, **options: Any) -> RasterSink:
+        def sink(name: str, dtype: DTypeLike, *bands: str, **options: Any) -> RasterSink:
             self._paths.append(folder / name)
-            raster = RasterSink(folder / name, geobox, dtype, descriptions=(description,), **options)
+            raster = RasterSink(folder / name, geobox, dtype, descriptions=bands, **options)
             return self._stack.enter_context(raster)
 
         with ExitStack() as undo:
@@ -38,7 +40,7 @@ class SurfaceRasters:
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
             self._quality = sink("quality.tif", "uint16", "quality bit flags")
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
-            self._ortho = sink("ortho.tif", self._ortho_dtype, "grey value", has_mask=True)
+            self._ortho = sink("ortho.tif", self._ortho_dtype, *self._bands, has_mask=True)
             undo.pop_all()
 
     def write(self, row: int, col: int, surface: Surface) -> None:
@@ -47,8 +49,12 @@ class SurfaceRasters:
         self._sigma.write(row, col, surface.sigma)
         self._quality.write(row, col, surface.quality)
         self._views.write(row, col, surface.views)
-        valid = np.isfinite(surface.ortho)
-        self._ortho.write(row, col, as_source(np.where(valid, surface.ortho, 0), self._ortho_dtype), valid)
+        bands = np.moveaxis(np.atleast_3d(surface.ortho), -1, 0)
+        valid = np.asarray(np.isfinite(bands).all(axis=0))
+        shape = (len(self._bands), *valid.shape)
+        self._ortho.write(
+            row, col, as_source(np.broadcast_to(np.where(valid, bands, 0), shape), self._ortho_dtype), valid
+        )
 
     def __enter__(self) -> SurfaceRasters:
         return self

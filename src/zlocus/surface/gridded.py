@@ -87,9 +87,9 @@ def agreed(layers: Sequence[Surface], least: int, tolerance_m: float) -> Surface
     agrees &= agrees.sum(axis=0) >= least
     known, nothing = agrees.any(axis=0), np.float32(np.nan)
     views = np.max([np.where(a, layer.views, np.uint8(0)) for a, layer in zip(agrees, layers, strict=True)], axis=0)
-    ortho = np.full(height.shape, nothing)
+    ortho = np.full_like(layers[0].ortho, nothing)
     for a, layer in zip(agrees, layers, strict=True):
-        np.copyto(ortho, layer.ortho, where=a & np.isnan(ortho))
+        np.copyto(ortho, layer.ortho, where=_of_bands(a, ortho) & np.isnan(ortho))
     sigma = _sigma(heights, np.stack([layer.sigma for layer in layers]), agrees)
     return Surface(
         height=np.where(known, height, nothing),
@@ -107,7 +107,8 @@ def drawn(one: PixelHeights, pixels: Surface, cells: Cells) -> Surface:
     block = _pixels_of(one.image, cells)
     hypotheses = np.ascontiguousarray(pixels.height[block])
     if not hypotheses.size:
-        return Surface(height, height, np.zeros(cells.shape, np.uint16), np.zeros(cells.shape, np.uint8), height)
+        ortho = np.full(cells.shape + pixels.ortho.shape[2:], np.nan, np.float32)
+        return Surface(height, height, np.zeros(cells.shape, np.uint16), np.zeros(cells.shape, np.uint8), ortho)
     ground = one.image.space.ground(block[0].start, hypotheses, block[1].start)
     sigma = pixels.sigma[block] * np.float32(one.step_m / one.step)
     ground[..., 0], ground[..., 1] = on_ground(~cells.transform, ground[..., 0], ground[..., 1])
@@ -125,8 +126,13 @@ def drawn(one: PixelHeights, pixels: Surface, cells: Cells) -> Surface:
         np.where(shown, sigma[at], nothing),
         np.where(shown, quality, np.uint16(0)),
         np.where(shown, views, np.uint8(0)),
-        np.where(shown, ortho, nothing),
+        np.where(_of_bands(shown, ortho), ortho, nothing),
     )
+
+
+def _of_bands(cells: NDArray[np.bool_], ortho: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """What holds for cells (r, c), for what an ortho-image has of them."""
+    return cells if ortho.ndim == 2 else cells[..., None]
 
 
 def why_empty(images: Sequence[PixelHeights], cells: Cells, height: NDArray[np.float32]) -> NDArray[np.uint16]:
