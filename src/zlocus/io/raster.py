@@ -40,6 +40,7 @@ class RasterSink:
     path : of the COG. geobox : its grid. dtype : of the cells.
     nodata : value that means no data; None where all cells mean something.
     descriptions : name of each band, as many as there are bands. units : of all bands, "" for none.
+    has_colours : whether the bands are red, green and blue.
     has_mask : whether an internal mask is written with the blocks (for images, where no value can be spared).
 
     Raises
@@ -57,6 +58,7 @@ class RasterSink:
         nodata: float | None = None,
         descriptions: tuple[str, ...] = ("",),
         units: str = "",
+        has_colours: bool = False,
         has_mask: bool = False,
     ) -> None:
         self.path, self.dtype, self.has_mask = Path(path), np.dtype(dtype), has_mask
@@ -73,6 +75,7 @@ class RasterSink:
             "driver": "GTiff", "width": cols, "height": rows, "count": len(descriptions), "dtype": self.dtype.name,
             "crs": None if geobox.crs is None else geobox.crs.to_wkt(), "transform": geobox.transform, "nodata": nodata,
             "tiled": True, "blockxsize": BLOCK_SIZE, "blockysize": BLOCK_SIZE, "BIGTIFF": "IF_SAFER", "SPARSE_OK": True,
+            "photometric": "RGB" if has_colours else "MINISBLACK",
         }  # fmt: skip
         with self._guard():
             kinds = ((len(descriptions), self.dtype, nodata or 0), (1, np.dtype(bool), 0))

@@ -40,7 +40,7 @@ class SurfaceRasters:
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
             self._quality = sink("quality.tif", "uint16", "quality bit flags")
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
-            self._ortho = sink("ortho.tif", self._ortho_dtype, *self._bands, has_mask=True)
+            self._ortho = sink("ortho.tif", self._ortho_dtype, *self._bands, has_colours=has_colours, has_mask=True)
             undo.pop_all()
 
     def write(self, row: int, col: int, surface: Surface) -> None:

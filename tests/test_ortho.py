@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from rasterio.enums import ColorInterp
+
+from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, UTM, camera, run
+from zlocus.io.images import open_image
+from zlocus.matching.base import BaseSurface
+from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.ortho import best_view, ortho_image, pixels_per_cell, true_ortho
+from zlocus.matching.views import ViewPixels, tile_views
+from zlocus.matching.visibility import coverage
+from zlocus.sensors.frame import FrameModel
+from zlocus.synthetic.cameras import SatelliteCamera
+from zlocus.synthetic.files import write_image
+from zlocus.synthetic.render import Sun, render
+from zlocus.synthetic.rpc_fit import fit_rpc
+from zlocus.synthetic.terrain import analytic_ground
+
+CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (40, 60)
+ORIGIN_M, N_STEPS = 40.0, 64
+LOW, HIGH = 4.0, 28.0  # steps: a tower of 12 m
+TOWER = np.s_[14:26, 24:36]
+RIM = 1  # cells beside an edge that other views may show, for its place is not known better
+GREY = 2.0
+
+
+def sensor(along=0.0, across=0.0, gsd=0.5):
+    return SatelliteCamera((*CENTRE, 50.0), (100.0, 100.0), gsd, along, across)
+
+
+def tile(sensors, greys=None, contrast=1.0, mean=0.0):
+    """Views of a grid around the scene's centre, each of one grey value, and what they cover."""
+    transform = Affine(CELL_M, 0, CENTRE[0] - 15.0, 0, -CELL_M, CENTRE[1] + 10.0)
+    greys = range(len(sensors)) if greys is None else greys
+    mask = (np.ones((201, 201), bool),)
+    pixels = [
+        ViewPixels(s, (0, 0), mean, contrast, (np.full((201, 201), g, np.float32),), mask)
+        for s, g in zip(sensors, greys, strict=True)
+    ]
+    blocks = (-(-SHAPE[0] // BLOCK), -(-SHAPE[1] // BLOCK))
+    lattice = HeightLattice(
+        ORIGIN_M, STEP_M, SHAPE, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
+    )
+    z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
+    views = tile_views(pixels, 0, transform, SHAPE, BLOCK, (ORIGIN_M, STEP_M), z, 2)
+    return pixels, views, coverage(views, BaseSurface.level(SHAPE, BLOCK), lattice)
+
+
+def tower() -> np.ndarray:
+    surface = np.full(SHAPE, LOW, np.float32)
+    surface[TOWER] = HIGH
+    return surface
+
+
+def test_pixels_of_a_cell():
+    """A camera in the air that looks aside shows a level cell on fewer, by its cosine and its distance."""
+    rotation = np.diag([1.0, -1.0, -1.0])
+    o = np.radians(40.0)
+    aside = np.array([[np.cos(o), 0, np.sin(o)], [0, 1, 0], [-np.sin(o), 0, np.cos(o)]])
+    above, beside = np.array([*CENTRE, 1050.0]), np.array([CENTRE[0] + 1000.0 * np.tan(o), CENTRE[1], 1050.0])
+    looks = [
+        FrameModel(tuple(centre), tuple(map(tuple, axes)), 2000.0, (100.0, 100.0))
+        for axes, centre in ((rotation, above), (rotation @ aside.T, beside))
+    ]
+    _, views, _ = tile([sensor(), sensor(gsd=1.0), *looks])
+    size = pixels_per_cell(views)
+    for found, expected in zip(size, (1.0, 0.25, 1.0, np.cos(o) ** 3), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize(("across", "behind"), [(30.0, np.s_[16:24, 37:48]), (-30.0, np.s_[16:24, 12:23])])
+def test_what_a_tower_hides_is_shown_by_another_view(across, behind):
+    """12 m high, seen 30 degrees from one side: 7 m, or 13 cells, of the ground behind it."""
+    slanted, opposite = sensor(across=across), sensor(across=-across)
+    _, views, seen = tile([slanted, opposite])
+    best = best_view(views, seen, tower())
+    hidden = best == 1
+    side = behind if hidden[behind].any() else np.s_[16:24, 60 - behind[1].stop : 60 - behind[1].start]
+    assert hidden[side].all()
+    far = np.ones(SHAPE, bool)
+    far[TOWER[0].start - 2 : TOWER[0].stop + 2, :] = False
+    assert (best[far] == 0).all()
+    inner = np.s_[TOWER[0].start + RIM : TOWER[0].stop - RIM, TOWER[1].start + RIM : TOWER[1].stop - RIM]
+    assert (best[inner] == 0).all()
+
+
+def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
+    _, views, seen = tile([sensor(across=30.0), sensor(across=-30.0)])
+    best = best_view(views, seen, tower())
+    _, views, seen = tile([sensor(across=-30.0), sensor(across=30.0)])
+    other = best_view(views, seen, tower())
+    # Where the first of the two is hidden, the second is shown, and it is the first elsewhere.
+    assert not ((best == 1) & (other == 1)).any()
+    assert (best >= 0).all()
+    assert (best == 1).sum() > 100 < (other == 1).sum()
+
+
+def test_cells_that_no_view_sees():
+    pixels, views, seen = tile([sensor(across=30.0), sensor(across=31.0)])
+    best = best_view(views, seen, tower())
+    ortho = true_ortho(pixels, views, seen, tower())
+    assert (best < 0).sum() > 80
+    np.testing.assert_array_equal(np.isnan(ortho), best < 0)
+
+
+def test_the_finer_view_is_shown_where_it_is_clearly_finer():
+    flat = np.full(SHAPE, LOW, np.float32)
+    for gsds, expected in (((0.5, 0.48), 0), ((0.5, 0.25), 1), ((0.25, 0.5), 0)):
+        _, views, seen = tile([sensor(gsd=gsd) for gsd in gsds])
+        assert (best_view(views, seen, flat) == expected).all()
+
+
+def test_grey_values_are_those_of_the_image():
+    """Scaled back from what is matched."""
+    pixels, views, seen = tile([sensor(), sensor(along=20.0)], greys=(0.25, -3.0), contrast=40.0, mean=500.0)
+    flat = np.full(SHAPE, LOW, np.float32)
+    np.testing.assert_allclose(true_ortho(pixels, views, seen, flat), 510.0, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(ortho_image(views, flat, 1), -3.0, rtol=0, atol=1e-6)
+
+
+@pytest.fixture(scope="module", params=["uint8", "uint16"])
+def coloured(tmp_path_factory, request) -> tuple[Path, ...]:
+    """Three images of a plane with red, green and blue, each band another multiple of the grey value."""
+    folder = tmp_path_factory.mktemp("coloured")
+    ground, paths = analytic_ground("plane", CENTRE, GSD_M / 2, (640, 640), seed=5), []
+    for name in ("nadir", "fore", "aft"):
+        radiance = render(ground, camera(name), (150, 150), Sun(150.0, 50.0))
+        grey = np.rint(100 * radiance / radiance.mean()).astype(request.param)
+        paths.append(folder / f"{name}.tif")
+        write_image(paths[-1], grey, fit_rpc(camera(name), grey.shape, UTM, (0.0, 120.0)).rpc)
+        with rasterio.open(paths[-1]) as source:
+            profile, rpcs = source.profile, source.rpcs
+        with rasterio.open(paths[-1], "w", **profile | {"count": 3, "photometric": "RGB"}, rpcs=rpcs) as file:
+            file.write(np.stack([grey, grey // 2, 255 - grey]))
+    return tuple(paths)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_an_ortho_image_has_the_colours_of_the_images(coloured, tmp_path):
+    assert open_image(coloured[0]).has_colours
+    out = run(coloured, tmp_path / "out", SMALL_TILES, bounds=PART, heights=HEIGHTS).out
+    with rasterio.open(out / "ortho.tif") as source:
+        bands, valid, meanings = source.read().astype(float), source.dataset_mask() > 0, source.colorinterp
+        assert source.descriptions == ("red", "green", "blue")
+    assert meanings == (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+    with rasterio.open(out / "dsm.tif") as source:
+        np.testing.assert_array_equal(valid, np.isfinite(source.read(1)))
+    red, green, blue = (band[valid] for band in bands)
+    np.testing.assert_allclose(green, red / 2, rtol=0, atol=GREY)
+    np.testing.assert_allclose(blue, 255 - red, rtol=0, atol=GREY)
+    assert red.std() > 5
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_grey_where_not_all_images_have_colours(coloured, images, tmp_path):
+    out = run((*coloured[:2], images("plane").paths["aft"]), tmp_path / "out", SMALL_TILES, bounds=PART).out
+    with rasterio.open(out / "ortho.tif") as source:
+        assert source.count == 1
