@@ -172,7 +172,7 @@ def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
         (InputError, "There is no raster of heights .*missing.tif", (good, tmp_path / "missing.tif", {})),
         (InputError, "text.tif cannot be opened as a raster", (text, good, {})),
         (InputError, "do not overlap", (far, good, {})),
-        (InputError, "is in degrees", (good, degrees, {})),
+        (InputError, "EPSG:4326.* do not overlap", (good, degrees, {})),
         (InputError, "has no height", (good, empty, {})),
         (InputError, "nothing to align", (empty, good, {"align": True})),
         (InputError, "too few", (tiny, good, {})),
