@@ -29,6 +29,8 @@ APART = 3
 TUKEY = 4.685
 WEIGHT_ROUNDS = 5
 LEAST_SIGMA_M = 1e-6
+# A shift after which differences spread more than before is none, however still it stands.
+WORSE = 1.05
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
     Raises
     ------
     InputError
-        Too few heights in common, ground too flat, or no convergence.
+        Too few heights in common, ground too flat, or no convergence to a place where heights agree better.
     """
     rise, height = truth.gradient, truth.mean
     usable = np.isfinite(rise).all(axis=1) & ~truth.is_edge & (np.hypot(*rise.T) < STEEPEST_SLOPE)
@@ -63,21 +65,29 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
     # (east, north) of the shift and the vertical offset, to heights.
     design = np.column_stack([-rise[usable], np.ones(np.count_nonzero(usable))])
     at, height = points.where(usable), height[usable]
-    shift, moved = np.zeros(2), np.inf
+    shift, moved, before = np.zeros(2), np.inf, np.inf
     for step in range(1, MOST_ITERATIONS + 1):
         difference = surface.between_cells(at.moved(shift)) - height
         found = np.isfinite(difference)
-        _check_enough(surface, int(np.count_nonzero(found)))
+        n = int(np.count_nonzero(found))
+        if step == 1:
+            _check_enough(surface, n)
+            before = _nmad(difference[found])
+        if n < LEAST_BLOCKS:
+            break
         rest = _robust_fit(design[found], difference[found])[:2]
         shift, moved = shift + rest, float(np.hypot(*rest))
-        if moved < TOLERANCE_M:
+        if moved < TOLERANCE_M and _nmad(difference[found]) <= WORSE * before + TOLERANCE_M:
             return Coregistration(float(shift[0]), float(shift[1]), step)
-        if not np.isfinite(moved):
-            break
     raise InputError(
-        f"The co-registration of {surface.path} did not converge in {MOST_ITERATIONS} steps: the last moved it by "
-        f"{moved:.3g} m. Align it another way (--align finds shifts of up to 4 m), or judge it as it is."
+        f"The co-registration of {surface.path} did not converge: after {step} steps it had moved it by "
+        f"{shift[0]:+.3g} m east and {shift[1]:+.3g} m north, the last time by {moved:.3g} m. Align it another way "
+        "(--align finds shifts of up to 4 m), or judge it as it is."
     )
+
+
+def _nmad(values: FloatArray) -> float:
+    return NORMAL_SIGMA_FROM_MAD * float(np.median(np.abs(values - np.median(values))))
 
 
 def _robust_fit(design: FloatArray, difference: FloatArray) -> FloatArray:
@@ -87,8 +97,7 @@ def _robust_fit(design: FloatArray, difference: FloatArray) -> FloatArray:
         normal = design.T @ (design * weight[:, None])
         parameters = np.linalg.lstsq(normal, design.T @ (difference * weight), rcond=None)[0]
         left = difference - design @ parameters
-        sigma = NORMAL_SIGMA_FROM_MAD * float(np.median(np.abs(left - np.median(left))))
-        weight = np.clip(1 - (left / (TUKEY * max(sigma, LEAST_SIGMA_M))) ** 2, 0, None) ** 2
+        weight = np.clip(1 - (left / (TUKEY * max(_nmad(left), LEAST_SIGMA_M))) ** 2, 0, None) ** 2
         if not weight.any():
             break
     return np.asarray(parameters)

@@ -1,0 +1,166 @@
+"""Co-registration by slope and aspect: planted shifts are found whatever lies on them, or it says why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rasterio.transform import from_origin
+
+from evaluation_rasters import NORTH, WEST, grid, moved, rolling, write
+from zlocus.errors import ConfigError, InputError
+from zlocus.evaluation.coregistration import TOLERANCE_M, coregister
+from zlocus.evaluation.evaluate import evaluate
+from zlocus.evaluation.frame import Points
+from zlocus.evaluation.heights import read_heights
+from zlocus.evaluation.table import evaluation_table
+from zlocus.evaluation.truth import truth_blocks
+
+N = 240
+# Heights are exact, and interpolated the same way on both sides.
+EXACT_TOLERANCE_M = 0.002
+# Noise of 0.3 m on 200 x 200 blocks, slopes of 0.25 east and north: 0.3 / (0.25 * 200) = 6 mm, times four.
+NOISY_TOLERANCE_M = 0.024
+# One cell in 20 that is too high spoils one height in 5 between four cells; their median moves by 0.29 of 0.17 m.
+OUTLIERS_UP_TOLERANCE_M = 0.06
+# Between two grids, heights are interpolated over 0.8 m: ground of 15 m radius is cut off by less than this.
+OTHER_GRID_TOLERANCE_M = 0.01
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    return moved(tmp_path_factory.mktemp("reference") / "reference.tif", N, (0, 0, 0))
+
+
+def found(dsm, reference, **options):
+    shift = evaluate(dsm, reference, coregister="nuth-kaab", **options).shift
+    return shift.east_m, shift.north_m, shift.up_m
+
+
+@pytest.mark.parametrize("planted", [(0, 0, 0), (1.23, -0.68, 0.75), (-3.1, 0.4, -40), (0.2, 5.5, 3), (-6, -4, 0)])
+def test_a_planted_shift_is_found(tmp_path, reference, planted):
+    assert found(moved(tmp_path / "d.tif", N, planted), reference) == pytest.approx(planted, abs=EXACT_TOLERANCE_M)
+
+
+@settings(max_examples=15)
+@given(east=st.floats(-5, 5), north=st.floats(-5, 5), up=st.floats(-100, 100))
+def test_any_shift_within_five_metres_is_found(tmp_path_factory, reference, east, north, up):
+    dsm = moved(tmp_path_factory.mktemp("dsm") / "d.tif", N, (east, north, up))
+    assert found(dsm, reference) == pytest.approx((east, north, up), abs=EXACT_TOLERANCE_M)
+
+
+def test_it_is_found_through_noise(tmp_path, reference):
+    rng = np.random.default_rng(1)
+    dsm = moved(tmp_path / "d.tif", N, (2.1, -1.7, 5), change=lambda z: z + rng.normal(0, 0.3, z.shape))
+    assert found(dsm, reference) == pytest.approx((2.1, -1.7, 5), abs=NOISY_TOLERANCE_M)
+
+
+def test_it_is_found_through_outliers_and_holes(tmp_path, reference):
+    rng = np.random.default_rng(2)
+
+    def spoiled(z):
+        z = z + rng.normal(0, 0.3, z.shape)
+        z[rng.random(z.shape) < 0.05] += 20.0
+        z[60:120, 60:150] = np.nan
+        z[rng.random(z.shape) < 0.02] = np.nan
+        return z
+
+    east, north, up = found(moved(tmp_path / "d.tif", N, (2.1, -1.7, 5), change=spoiled), reference)
+    assert (east, north) == pytest.approx((2.1, -1.7), abs=NOISY_TOLERANCE_M)
+    assert up == pytest.approx(5, abs=OUTLIERS_UP_TOLERANCE_M)
+
+
+def test_what_stands_on_the_ground_does_not_pull(tmp_path, reference):
+    # A wood of 6 m on the slopes to the north alone: a mean of each slope would shift the ground by metres.
+    x, y = grid(N)
+    faces_north = np.gradient(rolling(x, y), axis=0) < -0.1
+    patch = faces_north & (x < 50)
+    dsm = moved(tmp_path / "d.tif", N, (0.5, -0.5, 0), change=lambda z: z + 6.0 * patch)
+    east, north, _ = found(dsm, reference)
+    assert (east, north) == pytest.approx((0.5, -0.5), abs=NOISY_TOLERANCE_M)
+
+
+def test_it_is_found_between_other_grids(tmp_path, reference):
+    at = (np.arange(160) + 0.5) * 0.8 - 2.0
+    z = rolling(*np.meshgrid(at, at)).astype(np.float32)
+    dsm = write(tmp_path / "d.tif", z, from_origin(WEST - 2.0 + 1.1, NORTH + 2.0 + 0.6, 0.8, 0.8))
+    east, north, _ = found(dsm, reference)
+    assert (east, north) == pytest.approx((1.1, 0.6), abs=OTHER_GRID_TOLERANCE_M)
+
+
+def test_noise_of_the_reference_is_no_slope_that_pulls(tmp_path):
+    rng = np.random.default_rng(5)
+    noisy = moved(tmp_path / "r.tif", N, (0, 0, 0), change=lambda z: z + rng.normal(0, 0.1, z.shape))
+    dsm = moved(tmp_path / "d.tif", N, (1.5, -2.0, 0))
+    east, north, _ = found(dsm, noisy)
+    assert (east, north) == pytest.approx((1.5, -2.0), abs=NOISY_TOLERANCE_M)
+
+
+def test_what_is_left_does_not_move_again(tmp_path, reference):
+    surface, heights = read_heights(moved(tmp_path / "d.tif", N, (1.0, 2.0, 3.0))), read_heights(reference)
+    truth = truth_blocks(heights, 10.0, None)
+    first = coregister(surface, truth, Points(truth.xy))
+    again = coregister(surface, truth, Points(Points(truth.xy).moved((first.east_m, first.north_m))))
+    assert again.steps == 1
+    assert np.hypot(again.east_m, again.north_m) < TOLERANCE_M
+
+
+def test_the_shift_is_said_with_the_figures_before(tmp_path, reference):
+    result = evaluate(moved(tmp_path / "d.tif", N, (1.0, 2.0, 3.0)), reference, coregister="nuth-kaab")
+    table, record = evaluation_table(result), result.as_dict()
+    assert "removed first: +1.000 m east, +2.000 m north, +3.000 m up (nuth-kaab, " in table
+    assert record["shift_method"] == "nuth-kaab"
+    assert record["shift_m"]["north"] == pytest.approx(2.0, abs=EXACT_TOLERANCE_M)
+    assert record["unshifted"]["median"] == pytest.approx(3.0, abs=1.0)
+    assert record["all"]["rmse"] < 0.01
+    assert table.splitlines()[2].startswith("as it lies")
+
+
+@pytest.mark.parametrize(
+    "ground",
+    [
+        lambda x, _: np.zeros_like(x),
+        lambda x, y: 0.3 * x - 0.2 * y,
+        lambda x, _: 4 * np.sin(x / 12),
+        lambda x, _: np.random.default_rng(3).normal(0, 0.1, x.shape),
+    ],
+    ids=["flat", "tilted", "one direction", "flat but for noise"],
+)
+def test_too_flat_ground_is_refused(tmp_path, ground):
+    reference, dsm = (moved(tmp_path / f"{name}.tif", N, (0, 0, 0), ground) for name in "rd")
+    with pytest.raises(InputError, match=r"too flat to co-register: in one direction its slopes differ by 0\.\d %"):
+        evaluate(dsm, reference, coregister="nuth-kaab")
+
+
+def test_no_convergence_is_said(tmp_path, reference):
+    # Other ground altogether.
+    rng = np.random.default_rng(4)
+    dsm = moved(tmp_path / "d.tif", N, (0, 0, 0), lambda x, _: rng.normal(100, 30, x.shape))
+    with pytest.raises(
+        InputError, match=r"did not converge: after \d+ steps it had moved it by .* the last time by .* m\."
+    ):
+        evaluate(dsm, reference, coregister="nuth-kaab")
+
+
+def test_too_little_in_common_is_said(tmp_path, reference):
+    def one_corner(z):
+        z[8:] = np.nan
+        return z
+
+    dsm = moved(tmp_path / "d.tif", N, (0, 0, 0), change=one_corner)
+    with pytest.raises(InputError, match="sloping blocks in common, too few"):
+        evaluate(dsm, reference, coregister="nuth-kaab")
+
+
+def test_one_way_to_align_at_a_time(reference):
+    with pytest.raises(ConfigError, match="both look for the shift"):
+        evaluate(reference, reference, align=True, coregister="nuth-kaab")
+    with pytest.raises(ConfigError, match=r"--coregister icp is not known\. Give nuth-kaab"):
+        evaluate(reference, reference, coregister="icp")
+
+
+def test_search_and_slopes_agree(tmp_path, reference):
+    dsm = moved(tmp_path / "d.tif", N, (1.23, -0.68, 0.75))
+    searched = evaluate(dsm, reference, align=True).shift
+    assert (searched.east_m, searched.north_m) == pytest.approx(found(dsm, reference)[:2], abs=0.03)
