@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
+from scipy.ndimage import gaussian_filter
 
 from evaluation_rasters import NORTH, WEST, grid, moved, rolling, write
 from zlocus.errors import ConfigError, InputError
@@ -91,7 +92,8 @@ def test_it_is_found_between_other_grids(tmp_path, reference):
 
 def test_noise_of_the_reference_is_no_slope_that_pulls(tmp_path):
     rng = np.random.default_rng(5)
-    noisy = moved(tmp_path / "r.tif", N, (0, 0, 0), change=lambda z: z + rng.normal(0, 0.1, z.shape))
+    # As steep as the ground between neighbours: each step finds half of what is left.
+    noisy = moved(tmp_path / "r.tif", N, (0, 0, 0), change=lambda z: z + rng.normal(0, 0.3, z.shape))
     dsm = moved(tmp_path / "d.tif", N, (1.5, -2.0, 0))
     east, north, _ = found(dsm, noisy)
     assert (east, north) == pytest.approx((1.5, -2.0), abs=NOISY_TOLERANCE_M)
@@ -123,9 +125,10 @@ def test_the_shift_is_said_with_the_figures_before(tmp_path, reference):
         lambda x, _: np.zeros_like(x),
         lambda x, y: 0.3 * x - 0.2 * y,
         lambda x, _: 4 * np.sin(x / 12),
+        lambda x, y: 4 * np.sin(x / 12) + 0.3 * y,
         lambda x, _: np.random.default_rng(3).normal(0, 0.1, x.shape),
     ],
-    ids=["flat", "tilted", "one direction", "flat but for noise"],
+    ids=["flat", "tilted", "one direction", "the other tilted", "flat but for noise"],
 )
 def test_too_flat_ground_is_refused(tmp_path, ground):
     reference, dsm = (moved(tmp_path / f"{name}.tif", N, (0, 0, 0), ground) for name in "rd")
@@ -133,14 +136,43 @@ def test_too_flat_ground_is_refused(tmp_path, ground):
         evaluate(dsm, reference, coregister="nuth-kaab")
 
 
-def test_no_convergence_is_said(tmp_path, reference):
-    # Other ground altogether.
-    rng = np.random.default_rng(4)
-    dsm = moved(tmp_path / "d.tif", N, (0, 0, 0), lambda x, _: rng.normal(100, 30, x.shape))
-    with pytest.raises(
-        InputError, match=r"did not converge: after \d+ steps it had moved it by .* the last time by .* m\."
-    ):
-        evaluate(dsm, reference, coregister="nuth-kaab")
+def rough(seed, sigma_cells=12):
+    """Ground that is not like that of another seed."""
+    z = gaussian_filter(np.random.default_rng(seed).normal(size=(N + 60, N + 60)), sigma_cells)[30:-30, 30:-30]
+    return 4 * z / z.std()
+
+
+def test_no_convergence_is_said(tmp_path, reference, monkeypatch):
+    says = (
+        r"did not converge: after {} steps it had moved it by .* m east and .* m north, the last time by .* m\. Align"
+    )
+    # Other ground altogether, which leads far away.
+    noise = moved(tmp_path / "noise.tif", N, (0, 0, 0), lambda *_: 30 * rough(4, 0))
+    with pytest.raises(InputError, match=says.format(r"\d+")):
+        evaluate(noise, reference, coregister="nuth-kaab")
+    monkeypatch.setattr("zlocus.evaluation.coregistration.MOST_ITERATIONS", 2)
+    with pytest.raises(InputError, match=says.format(2)):
+        evaluate(moved(tmp_path / "d.tif", N, (4.0, 2.0, 3.0)), reference, coregister="nuth-kaab")
+
+
+def test_a_shift_as_long_as_the_landforms_is_found(tmp_path):
+    # Hills some 20 m across, 20 m away.
+    ground = np.pad(rough(0), 40, mode="wrap")
+    one = write(tmp_path / "r.tif", ground[40:-40, 40:-40].astype(np.float32))
+    other = write(tmp_path / "d.tif", ground[12:-68, 10:-70].astype(np.float32))
+    east, north, _ = found(other, one)
+    assert (east, north) == pytest.approx((15.0, -14.0), abs=EXACT_TOLERANCE_M)
+
+
+def test_a_reference_without_slopes_is_refused(tmp_path):
+    # Every other row is missing: no block has its neighbours.
+    def rows(z):
+        z[::2] = np.nan
+        return z
+
+    reference = moved(tmp_path / "r.tif", N, (0, 0, 0), change=rows)
+    with pytest.raises(InputError, match="have 0 sloping blocks in common"):
+        evaluate(reference, reference, coregister="nuth-kaab")
 
 
 def test_too_little_in_common_is_said(tmp_path, reference):

@@ -242,6 +242,39 @@ def test_a_slope_has_its_angle_whatever_its_direction(tmp_path):
         np.testing.assert_allclose(truth.slope_deg, np.degrees(np.arctan(0.5)), atol=0.01)
 
 
+def test_a_case_computed_by_hand(tmp_path):
+    # Cells of 1 m under cells of 2 m that start a metre further north-west; a hole in each.
+    nan = np.nan
+    reference = np.array([[10, 11, 12], [13, 14, 15], [16, nan, 18]], np.float32)
+    surface = np.array([[10.5, 12], [nan, 15]], np.float32)
+    result = evaluate(
+        write(tmp_path / "d.tif", surface, from_origin(WEST - 1, NORTH + 1, 2, 2)),
+        write(tmp_path / "r.tif", reference, from_origin(WEST, NORTH, 1, 1)),
+        margin_m=0,
+    )
+    # Errors 0.5, 1, 0 / -, 1, 0 / -, (no reference), -3.
+    figures = result.all
+    assert (figures.n, figures.completeness, figures.within) == (8, 6 / 8, 3 / 8)
+    assert (figures.median, figures.le90, figures.le95) == pytest.approx((0.25, 2.0, 2.5))
+    assert figures.nmad == pytest.approx(1.4826 * 0.5)
+    assert figures.rmse == pytest.approx(math.sqrt(11.25 / 6))
+    assert figures.mean == pytest.approx(-0.5 / 6)
+    assert (result.mvs3dm.completeness, result.mvs3dm.median_error_m) == (3 / 8, 0.75)
+    expected = [[0.5, 1, 0], [nan, 1, 0], [nan, nan, -3]]
+    np.testing.assert_array_equal(result.error_map.errors, np.array(expected, np.float32))
+
+
+def test_many_cells_are_judged_as_few_at_a_time(tmp_path, hills, monkeypatch):
+    truth = hills(*grid(60))
+    dsm = truth + np.linspace(-2, 2, 60, dtype=np.float32)
+    paths = write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth)
+    whole = evaluate(*paths, margin_m=3).mvs3dm
+    monkeypatch.setattr("zlocus.evaluation.mvs3dm.CELLS_AT_A_TIME", 150)
+    assert evaluate(*paths, margin_m=3).mvs3dm == whole
+    # Columns 15 to 44 are within 1 m, of columns 6 to 53 inside the margin.
+    assert whole.completeness == 30 / 48
+
+
 def test_the_definitions_of_mvs3dm(tmp_path):
     # 100 quarter-metre cells, two of them empty in the reference; blocks and edges would judge them otherwise.
     truth = np.full((10, 10), 10.0, np.float32)

@@ -11,6 +11,7 @@ from rasterio.transform import from_origin
 from evaluation_rasters import CRS, NORTH, WEST, grid, moved, rolling, write
 from zlocus.errors import ConfigError, InputError, ZlocusWarning
 from zlocus.evaluation.evaluate import evaluate
+from zlocus.evaluation.files import write_evaluation
 from zlocus.evaluation.frame import frame_of, in_metres, points_on
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.table import evaluation_table
@@ -140,7 +141,19 @@ def test_a_local_map_beside_one_of_the_earth_is_refused(tmp_path):
     site, earth = (write(tmp_path / f"{n}.tif", rolling(*grid(80)), crs=crs) for n, crs in (("s", local), ("e", CRS)))
     with pytest.raises(InputError, match=r"s\.tif has the CRS .* which cannot be converted"):
         evaluate(site, earth)
-    assert evaluate(site, site, margin_m=2, align=True).shift.east_m == 0
+    result = evaluate(site, site, margin_m=2, align=True)
+    assert result.shift.east_m == 0
+    write_evaluation(tmp_path / "out", result)
+    with rasterio.open(tmp_path / "out" / "error.tif") as source:
+        assert source.crs == read_heights(site).crs
+
+
+def test_places_outside_of_their_map_are_refused_unless_both_are_there(tmp_path):
+    away = write(tmp_path / "away.tif", rolling(*grid(80)), from_origin(1e9, NORTH, 0.5, 0.5))
+    other = write(tmp_path / "other.tif", rolling(*grid(80)), crs="EPSG:32633")
+    with pytest.raises(InputError, match=r"away\.tif lies outside of its CRS WGS 84 / UTM zone 32N"):
+        evaluate(other, away)
+    assert evaluate(away, away, margin_m=2).all.rmse == 0
 
 
 def test_heights_above_different_things_are_refused(tmp_path):

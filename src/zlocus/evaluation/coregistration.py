@@ -29,8 +29,6 @@ APART = 3
 TUKEY = 4.685
 WEIGHT_ROUNDS = 5
 LEAST_SIGMA_M = 1e-6
-# A shift after which differences spread more than before is none, however still it stands.
-WORSE = 1.05
 
 
 @dataclass(frozen=True)
@@ -57,27 +55,26 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
     Raises
     ------
     InputError
-        Too few heights in common, ground too flat, or no convergence to a place where heights agree better.
+        Too few heights in common, ground too flat, or no convergence.
     """
     rise, height = truth.gradient, truth.mean
-    usable = np.isfinite(rise).all(axis=1) & ~truth.is_edge & (np.hypot(*rise.T) < STEEPEST_SLOPE)
+    usable = np.isfinite(rise).all(axis=1) & (np.hypot(*rise.T) < STEEPEST_SLOPE)
     _check_relief(surface, truth, usable)
     # (east, north) of the shift and the vertical offset, to heights.
     design = np.column_stack([-rise[usable], np.ones(np.count_nonzero(usable))])
     at, height = points.where(usable), height[usable]
-    shift, moved, before = np.zeros(2), np.inf, np.inf
+    shift, moved = np.zeros(2), np.inf
     for step in range(1, MOST_ITERATIONS + 1):
         difference = surface.between_cells(at.moved(shift)) - height
         found = np.isfinite(difference)
         n = int(np.count_nonzero(found))
         if step == 1:
             _check_enough(surface, n)
-            before = _nmad(difference[found])
         if n < LEAST_BLOCKS:
             break
         rest = _robust_fit(design[found], difference[found])[:2]
         shift, moved = shift + rest, float(np.hypot(*rest))
-        if moved < TOLERANCE_M and _nmad(difference[found]) <= WORSE * before + TOLERANCE_M:
+        if moved < TOLERANCE_M:
             return Coregistration(float(shift[0]), float(shift[1]), step)
     raise InputError(
         f"The co-registration of {surface.path} did not converge: after {step} steps it had moved it by "

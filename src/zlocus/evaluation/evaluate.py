@@ -87,9 +87,8 @@ class Evaluation:
         if self.unshifted is not None:
             record["unshifted"] = self.unshifted.as_dict()
         if mvs3dm is not None:
-            median = mvs3dm.median_error_m
-            record["mvs3dm_completeness"] = mvs3dm.completeness
-            record["mvs3dm_median_error"] = None if math.isnan(median) else median
+            for name, value in (("completeness", mvs3dm.completeness), ("median_error", mvs3dm.median_error_m)):
+                record[f"mvs3dm_{name}"] = None if math.isnan(value) else value
         return record
 
 

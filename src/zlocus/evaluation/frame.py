@@ -68,6 +68,8 @@ def frame_of(surface: HeightRaster, reference: HeightRaster) -> CRS | None:
     x, y = reference.centre
     lon, lat = between(theirs, WGS84).transform(x, y)
     if not np.isfinite([lon, lat]).all():
+        if mine == theirs and in_metres(mine):
+            return mine
         raise InputError(f"{reference.path} lies outside of its CRS {theirs.name}. Check its CRS and transform.")
     measuring = (crs for crs in (mine, theirs) if in_metres(crs) and _true_to_scale(crs, lon, lat))
     return next(measuring, utm_zone(lon, lat))

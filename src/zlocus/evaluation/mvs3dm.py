@@ -40,19 +40,19 @@ def mvs3dm_figures(
 
     shift : (east, north, up) m to be removed from the surface first, None for the surface as it is (nearest cell).
     """
-    known = np.isfinite(reference.z)
-    row, col = (place.astype(np.float64) + 0.5 for place in np.nonzero(known))
-    xy = places(reference.transform, row, col)
-    keep = inside_margin(reference, margin_m, unit_m(reference, frame), xy)
-    xy, height = xy[keep], reference.z[known][keep]
-    errors = [
-        np.abs(_looked_up(surface, reference, frame, xy[part], shift) - height[part])
-        for part in (slice(at, at + CELLS_AT_A_TIME) for at in range(0, len(xy), CELLS_AT_A_TIME))
-    ]
-    error = np.concatenate(errors)
-    met = np.isfinite(error)
-    median = float(np.median(error[met])) if met.any() else math.nan
-    return Mvs3dm(float(np.count_nonzero(error < WITHIN_M) / error.size), median)
+    unit = unit_m(reference, frame)
+    rows_at_a_time = max(1, CELLS_AT_A_TIME // reference.z.shape[1])
+    n, n_met, found = 0, 0, [np.zeros(0, np.float32)]
+    for first in range(0, reference.z.shape[0], rows_at_a_time):
+        band = reference.z[first : first + rows_at_a_time]
+        row, col = (place.astype(np.float64) + 0.5 for place in np.nonzero(np.isfinite(band)))
+        xy = places(reference.transform, row + first, col)
+        keep = inside_margin(reference, margin_m, unit, xy)
+        error = np.abs(_looked_up(surface, reference, frame, xy[keep], shift) - band[np.isfinite(band)][keep])
+        n, n_met = n + error.size, n_met + int(np.count_nonzero(error < WITHIN_M))
+        found.append(error[np.isfinite(error)].astype(np.float32))
+    errors = np.concatenate(found)
+    return Mvs3dm(n_met / n if n else math.nan, float(np.median(errors)) if errors.size else math.nan)
 
 
 def _looked_up(

@@ -89,7 +89,10 @@ def truth_blocks(
     heights = cells.reshape(rows, size, cols, size).transpose(0, 2, 1, 3).reshape(rows * cols, size * size)
     row, col = (index.ravel() * size for index in np.mgrid[:rows, :cols])
     xy = places(transform, row + size / 2, col + size / 2)
-    keep = inside_margin(reference, margin_m, unit, xy) & np.isfinite(heights).all(axis=1)
+    keep = inside_margin(reference, margin_m, unit, xy)
+    if not keep.any():
+        raise InputError(f"A margin of {margin_m:g} m leaves nothing of {reference.path}. Give a smaller --margin.")
+    keep &= np.isfinite(heights).all(axis=1)
     if not keep.any():
         raise InputError(f"{reference.path} has no height inside its margin of {margin_m:g} m. Check its nodata value.")
     gradient = block_gradient(reference, size, frame, keep.reshape(rows, cols))
@@ -108,21 +111,12 @@ def places(transform: Affine, row: FloatArray, col: FloatArray) -> FloatArray:
 def inside_margin(
     reference: HeightRaster, margin_m: float, unit: tuple[float, float], xy: FloatArray
 ) -> NDArray[np.bool_]:
-    """Which points (n, 2) lie further from the rim of a reference than a margin. unit : metres of its x and y.
-
-    Raises
-    ------
-    InputError
-        None does.
-    """
+    """Which points (n, 2) lie further from the rim of a reference than a margin. unit : metres of its x and y."""
     transform, x, y = reference.transform, xy[:, 0], xy[:, 1]
     left, top = transform.c, transform.f
     right, bottom = transform * (reference.z.shape[1], reference.z.shape[0])
     width, height = margin_m / unit[0], margin_m / unit[1]
-    inside = (x > left + width) & (x < right - width) & (y > bottom + height) & (y < top - height)
-    if not inside.any():
-        raise InputError(f"A margin of {margin_m:g} m leaves nothing of {reference.path}. Give a smaller --margin.")
-    return np.asarray(inside)
+    return np.asarray((x > left + width) & (x < right - width) & (y > bottom + height) & (y < top - height))
 
 
 def read_classes(path: Path, reference: HeightRaster) -> NDArray[np.uint8]:
