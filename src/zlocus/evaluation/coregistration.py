@@ -29,15 +29,23 @@ APART = 3
 TUKEY = 4.685
 WEIGHT_ROUNDS = 5
 LEAST_SIGMA_M = 1e-6
+# Of a surface that has nothing to do with the reference, some shift fits a little better than those around it; but it
+# is not known to half a cell.
+MOST_SIGMA_CELLS = 0.5
 
 
 @dataclass(frozen=True)
 class Coregistration:
-    """Where a surface lies: this much east and north of the reference, in m of the frame. steps : taken to find it."""
+    """Where a surface lies: this much east and north of the reference, in m of the frame.
+
+    steps : taken to find it. sigma_m : standard error of the shift in the direction that is known least, m, as if the
+    errors of the blocks were independent.
+    """
 
     east_m: float
     north_m: float
     steps: int
+    sigma_m: float
 
 
 def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Coregistration:
@@ -55,7 +63,7 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
     Raises
     ------
     InputError
-        Too few heights in common, ground too flat, or no convergence.
+        Too few heights in common, ground too flat, no convergence, or a shift that is known to half a cell only.
     """
     rise, height = truth.gradient, truth.mean
     usable = np.isfinite(rise).all(axis=1) & (np.hypot(*rise.T) < STEEPEST_SLOPE)
@@ -72,10 +80,11 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
             _check_enough(surface, n)
         if n < LEAST_BLOCKS:
             break
-        rest = _robust_fit(design[found], difference[found])[:2]
+        rest, sigma_m = _robust_fit(design[found], difference[found])
         shift, moved = shift + rest, float(np.hypot(*rest))
         if moved < TOLERANCE_M:
-            return Coregistration(float(shift[0]), float(shift[1]), step)
+            _check_known(surface, points, sigma_m)
+            return Coregistration(float(shift[0]), float(shift[1]), step, sigma_m)
     raise InputError(
         f"The co-registration of {surface.path} did not converge: after {step} steps it had moved it by "
         f"{shift[0]:+.3g} m east and {shift[1]:+.3g} m north, the last time by {moved:.3g} m. Align it another way "
@@ -87,17 +96,32 @@ def _nmad(values: FloatArray) -> float:
     return NORMAL_SIGMA_FROM_MAD * float(np.median(np.abs(values - np.median(values))))
 
 
-def _robust_fit(design: FloatArray, difference: FloatArray) -> FloatArray:
-    """Parameters (k,) of differences (n,) m that are linear in a design (n, k), outliers without weight."""
+def _robust_fit(design: FloatArray, difference: FloatArray) -> tuple[FloatArray, float]:
+    """The shift (2,) m that explains differences (n,) m, outliers without weight, and its largest standard error, m.
+
+    design : (n, 3), heights per metre east and north, and per metre up.
+    """
     weight = np.ones(len(difference))
     for _ in range(WEIGHT_ROUNDS + 1):
         normal = design.T @ (design * weight[:, None])
         parameters = np.linalg.lstsq(normal, design.T @ (difference * weight), rcond=None)[0]
         left = difference - design @ parameters
-        weight = np.clip(1 - (left / (TUKEY * max(_nmad(left), LEAST_SIGMA_M))) ** 2, 0, None) ** 2
+        sigma = max(_nmad(left), LEAST_SIGMA_M)
+        weight = np.clip(1 - (left / (TUKEY * sigma)) ** 2, 0, None) ** 2
         if not weight.any():
             break
-    return np.asarray(parameters)
+    covariance = sigma**2 * np.linalg.pinv(normal)[:2, :2]
+    return np.asarray(parameters[:2]), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def _check_known(surface: HeightRaster, points: Points, sigma_m: float) -> None:
+    per_metre = 1.0 if points.per_metre is None else float(np.hypot(*points.per_metre[0, :, 0]))
+    most_m = MOST_SIGMA_CELLS * abs(surface.transform.a) / per_metre
+    if sigma_m > most_m:
+        raise InputError(
+            f"{surface.path} differs too much from the reference to co-register: the shift would be known to "
+            f"{sigma_m:.2g} m, half a cell is {most_m:.2g} m. Check that both show the same ground."
+        )
 
 
 def _check_enough(surface: HeightRaster, n: int) -> None:

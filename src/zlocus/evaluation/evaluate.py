@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ SEARCH = "search"
 class Shift:
     """What was removed before judging: the surface lies this much east, north and above the reference, in m.
 
-    method : that found it. steps : it took to converge, None for a search.
+    method : that found it. steps, sigma_m : it took to converge, and its standard error, m; None for a search.
     """
 
     east_m: float
@@ -41,6 +41,7 @@ class Shift:
     up_m: float
     method: str = SEARCH
     steps: int | None = None
+    sigma_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ class Evaluation:
             "shift_m": None if shift is None else {"east": shift.east_m, "north": shift.north_m, "up": shift.up_m},
             "shift_method": None if shift is None else shift.method,
             "shift_steps": None if shift is None else shift.steps,
+            "shift_sigma": None if shift is None else shift.sigma_m,
             "geoid_added_to": None if self.geoid_added_to is None else str(self.geoid_added_to),
             "all": self.all.as_dict(),
             **{name: figures.as_dict() for name, figures in self.classes.items()},
@@ -169,17 +171,16 @@ def _aligned(
     surface: HeightRaster, truth: TruthBlocks, points: Points, align: bool, coregister: str | None
 ) -> tuple[Shift, FloatArray] | None:
     """The shift found, and the errors (n,) m once it is removed; None where none was asked for."""
-    method, steps = SEARCH, None
     if coregister is not None:
         found = coregistration.coregister(surface, truth, points)
-        east, north, method, steps = found.east_m, found.north_m, coregister, found.steps
+        shift = Shift(found.east_m, found.north_m, 0.0, coregister, found.steps, found.sigma_m)
     elif align:
-        east, north = best_shift(surface, truth, points)
+        shift = Shift(*best_shift(surface, truth, points), 0.0)
     else:
         return None
-    z = surface.bilinear(points.moved((east, north)))
+    z = surface.bilinear(points.moved((shift.east_m, shift.north_m)))
     up = float(np.nanmedian(truth.errors(z)))
-    return Shift(east, north, up, method, steps), truth.errors(z - up)
+    return replace(shift, up_m=up), truth.errors(z - up)
 
 
 def _check_overlap(surface: HeightRaster, reference: HeightRaster, points: Points) -> None:

@@ -57,5 +57,6 @@ def _notes(evaluation: Evaluation, thresholds: list[float]) -> Iterator[str]:
 
 
 def _shift_line(shift: Shift) -> str:
-    how = "" if shift.steps is None else f" ({shift.method}, {shift.steps} steps)"
+    known = "" if shift.sigma_m is None else f", sigma {shift.sigma_m:.3f} m"
+    how = "" if shift.steps is None else f" ({shift.method}, {shift.steps} steps{known})"
     return f"removed first: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, {shift.up_m:+.3f} m up{how}"
