@@ -153,8 +153,21 @@ def test_other_ground_is_refused(tmp_path, reference):
     # Some shift fits even noise a little better than those around it.
     for seed in range(3):
         noise = moved(tmp_path / "noise.tif", N, (0, 0, 0), lambda *_, seed=seed: 30 * rough(seed, 0))
-        with pytest.raises(InputError, match=r"known to \d+\.?\d* m, half a cell is 0\.25 m|did not converge"):
+        with pytest.raises(InputError, match=r"known to|did not converge"):
             evaluate(noise, reference, coregister="nuth-kaab")
+
+
+@pytest.mark.parametrize(("most_cells", "is_refused"), [(0.01, True), (0.02, False)])
+def test_a_shift_that_is_not_known_well_is_refused(tmp_path, reference, monkeypatch, most_cells, is_refused):
+    # It is known to 6 mm; a hundredth of a cell are 5 mm.
+    monkeypatch.setattr("zlocus.evaluation.coregistration.MOST_SIGMA_CELLS", most_cells)
+    rng = np.random.default_rng(1)
+    dsm = moved(tmp_path / "d.tif", N, (1.0, -0.5, 0), change=lambda z: z + rng.normal(0, 0.3, z.shape))
+    if is_refused:
+        with pytest.raises(InputError, match=r"the shift would be known to 0\.00\d+ m, and 0\.005 m are needed"):
+            evaluate(dsm, reference, coregister="nuth-kaab")
+    else:
+        assert evaluate(dsm, reference, coregister="nuth-kaab").shift.sigma_m < 0.01
 
 
 def test_the_shift_is_as_precise_as_it_says(tmp_path, reference):
@@ -187,7 +200,7 @@ def test_a_reference_without_slopes_is_refused(tmp_path):
         return z
 
     reference = moved(tmp_path / "r.tif", N, (0, 0, 0), change=rows)
-    with pytest.raises(InputError, match="have 0 sloping blocks in common"):
+    with pytest.raises(InputError, match="have 0 blocks with a slope in common"):
         evaluate(reference, reference, coregister="nuth-kaab")
 
 
@@ -197,7 +210,7 @@ def test_too_little_in_common_is_said(tmp_path, reference):
         return z
 
     dsm = moved(tmp_path / "d.tif", N, (0, 0, 0), change=one_corner)
-    with pytest.raises(InputError, match="sloping blocks in common, too few"):
+    with pytest.raises(InputError, match="blocks with a slope in common, fewer than the 100"):
         evaluate(dsm, reference, coregister="nuth-kaab")
 
 

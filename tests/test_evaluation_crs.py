@@ -9,7 +9,7 @@ from pyproj import Transformer
 from rasterio.transform import from_origin
 
 from evaluation_rasters import CRS, NORTH, WEST, grid, moved, rolling, write
-from zlocus.errors import ConfigError, InputError, ZlocusWarning
+from zlocus.errors import ConfigError, InputError
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.files import write_evaluation
 from zlocus.evaluation.frame import frame_of, in_metres, points_on
@@ -171,9 +171,14 @@ def test_heights_above_different_things_are_refused(tmp_path):
 
 def test_heights_that_do_not_say_are_taken_as_the_other_and_it_is_said(tmp_path):
     said, unsaid = flat(tmp_path / "said.tif", 1, EGM96), flat(tmp_path / "unsaid.tif", 1)
-    for pair in ((said, unsaid), (unsaid, said)):
-        with pytest.warns(ZlocusWarning, match=r"said\.tif are above EGM96 height; those of .*unsaid\.tif, which"):
-            assert evaluate(*pair, margin_m=2).all.rmse == 0
+    for pair, heights in (((said, unsaid), ("EGM96 height", None)), ((unsaid, said), (None, "EGM96 height"))):
+        result = evaluate(*pair, margin_m=2)
+        assert result.all.rmse == 0
+        line = f"{unsaid} does not say what its heights are above: taken to be EGM96 height, as of the other"
+        assert line in evaluation_table(result).splitlines()
+        assert (result.as_dict()["dsm_heights"], result.as_dict()["reference_heights"]) == heights
+    for pair in ((said, said), (unsaid, unsaid)):
+        assert "does not say" not in evaluation_table(evaluate(*pair, margin_m=2))
 
 
 def test_a_geoid_is_added_to_what_is_above_it(tmp_path):
@@ -182,6 +187,7 @@ def test_a_geoid_is_added_to_what_is_above_it(tmp_path):
     result = evaluate(ellipsoidal, above, geoid=up, margin_m=2)
     assert result.all.median == pytest.approx(0.3, abs=HEIGHT_TOLERANCE_M)
     assert result.geoid_added_to == above
+    assert result.assumed is None
     assert f"the geoid's heights were added to those of {above}" in evaluation_table(result)
     assert result.as_dict()["geoid_added_to"] == str(above)
     # The same where the surface is the one above the geoid, and where no file says anything: then the reference is.

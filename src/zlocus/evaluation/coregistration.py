@@ -120,15 +120,15 @@ def _check_known(surface: HeightRaster, points: Points, sigma_m: float) -> None:
     if sigma_m > most_m:
         raise InputError(
             f"{surface.path} differs too much from the reference to co-register: the shift would be known to "
-            f"{sigma_m:.2g} m, half a cell is {most_m:.2g} m. Check that both show the same ground."
+            f"{sigma_m:.2g} m, and {most_m:.2g} m are needed. Check that both show the same ground."
         )
 
 
 def _check_enough(surface: HeightRaster, n: int) -> None:
     if n < LEAST_BLOCKS:
         raise InputError(
-            f"{surface.path} and the reference have {n} sloping blocks in common, too few of the {LEAST_BLOCKS} that "
-            "co-registration needs. Check that they overlap, or judge it as it is."
+            f"{surface.path} and the reference have {n} blocks with a slope in common, fewer than the {LEAST_BLOCKS} "
+            "that co-registration needs. Check that they overlap, or judge it as it is."
         )
 
 

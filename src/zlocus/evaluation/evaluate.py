@@ -58,8 +58,9 @@ class Evaluation:
 
     shift : removed first, None where the surface was judged as it is. threshold_m : limit of `within`.
     slopes : figures by band of slope of the reference, degrees. mvs3dm : figures by the definitions of that benchmark.
-    unshifted : figures of all blocks before the shift was removed. geoid_added_to : raster that a geoid's heights were
-    added to. error_map : for files.
+    unshifted : figures of all blocks before the shift was removed. heights : what those of surface and reference are
+    above by their files, None where one does not say; assumed : what was taken for granted of that, as a sentence.
+    geoid_added_to : raster that a geoid's heights were added to. error_map : for files.
     """
 
     all: ErrorStatistics
@@ -69,6 +70,8 @@ class Evaluation:
     slopes: dict[str, ErrorStatistics] = field(default_factory=dict)
     mvs3dm: Mvs3dm | None = None
     unshifted: ErrorStatistics | None = None
+    heights: tuple[str | None, str | None] = (None, None)
+    assumed: str | None = None
     geoid_added_to: Path | None = None
     error_map: ErrorMap | None = field(default=None, repr=False, compare=False)
 
@@ -81,6 +84,8 @@ class Evaluation:
             "shift_method": None if shift is None else shift.method,
             "shift_steps": None if shift is None else shift.steps,
             "shift_sigma": None if shift is None else shift.sigma_m,
+            "dsm_heights": self.heights[0],
+            "reference_heights": self.heights[1],
             "geoid_added_to": None if self.geoid_added_to is None else str(self.geoid_added_to),
             "all": self.all.as_dict(),
             **{name: figures.as_dict() for name, figures in self.classes.items()},
@@ -150,6 +155,8 @@ def evaluate(
             shift=None if shift is None else (shift.east_m, shift.north_m, shift.up_m),
         ),
         unshifted=None if shift is None else error_statistics(as_it_lies, threshold_m, more_thresholds_m),
+        heights=compared.datums,
+        assumed=compared.assumed,
         geoid_added_to=compared.converted,
         error_map=_error_map(truth, heights.horizontal, errors),
     )  # fmt: skip

@@ -50,6 +50,8 @@ def _notes(evaluation: Evaluation, thresholds: list[float]) -> Iterator[str]:
             f"MVS3DM (single cells): completeness {100 * evaluation.mvs3dm.completeness:.2f} %, "
             f"median error {evaluation.mvs3dm.median_error_m:.3f} m"
         )
+    if evaluation.assumed is not None:
+        yield evaluation.assumed
     if evaluation.geoid_added_to is not None:
         yield f"the geoid's heights were added to those of {evaluation.geoid_added_to}"
     if evaluation.shift is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from zlocus.errors import ConfigError, InputError, ZlocusWarning
+from zlocus.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.io.reference import read_dem
 
@@ -22,12 +21,23 @@ METRE_TOLERANCE = 1e-9
 class Compared:
     """Two rasters whose heights may be subtracted.
 
-    converted : that of the two to whose heights the geoid's were added, None for neither.
+    datums : what the files say that the heights of surface and reference are above, None for nothing. converted : that
+    of the two to whose heights the geoid's were added, None for neither.
     """
 
     surface: HeightRaster
     reference: HeightRaster
+    datums: tuple[str | None, str | None]
     converted: Path | None = None
+
+    @property
+    def assumed(self) -> str | None:
+        """What had to be taken for granted, as a sentence; None for nothing."""
+        mine, theirs = self.datums
+        if self.converted is not None or (mine is None) == (theirs is None):
+            return None
+        silent, datum = (self.reference, mine) if theirs is None else (self.surface, theirs)
+        return f"{silent.path} does not say what its heights are above: taken to be {_above(datum)}, as of the other"
 
 
 def same_heights(surface: HeightRaster, reference: HeightRaster, geoid: Path | None) -> Compared:
@@ -52,15 +62,7 @@ def same_heights(surface: HeightRaster, reference: HeightRaster, geoid: Path | N
             f"The heights of {surface.path} are above {_above(mine)} and those of {reference.path} above "
             f"{_above(theirs)}. Add the geoid's heights with --geoid RASTER, or convert one of them (gdalwarp -t_srs)."
         )
-    if (mine is None) != (theirs is None):
-        known, other, datum = (surface, reference, mine) if theirs is None else (reference, surface, theirs)
-        warnings.warn(
-            f"The heights of {known.path} are above {_above(datum)}; those of {other.path}, which does not say, are "
-            "taken to be so too. If they are not, give --geoid RASTER.",
-            ZlocusWarning,
-            stacklevel=3,
-        )
-    return Compared(surface, reference)
+    return Compared(surface, reference, (mine, theirs))
 
 
 def datum_of(raster: HeightRaster) -> str | None:
@@ -113,8 +115,8 @@ def _with_geoid(
             "is not enough. Convert one of them to the ellipsoid first (gdalwarp -t_srs)."
         )
     if theirs == ELLIPSOID or mine not in (None, ELLIPSOID):
-        return Compared(_raised(surface, geoid), reference, surface.path)
-    return Compared(surface, _raised(reference, geoid), reference.path)
+        return Compared(_raised(surface, geoid), reference, datums, surface.path)
+    return Compared(surface, _raised(reference, geoid), datums, reference.path)
 
 
 def _raised(raster: HeightRaster, geoid: Path) -> HeightRaster:
