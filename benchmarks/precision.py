@@ -31,6 +31,7 @@ from scipy.optimize import minimize
 
 from zlocus import cli, pipeline, tile
 from zlocus.evaluation.alignment import best_shift
+from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
 from zlocus.surface.precision import is_split
@@ -121,7 +122,7 @@ def errors_of(folder: Path, dsm: Path) -> tuple[TruthBlocks, np.ndarray, np.ndar
     xy = truth.xy
     if "hills" not in folder.name:
         return truth, xy, truth.errors(surface.nearest(xy))
-    xy = xy + np.array(best_shift(surface, truth, xy))
+    xy = xy + np.array(best_shift(surface, truth, Points(xy)))
     errors = truth.errors(surface.bilinear(xy))
     return truth, xy, errors - np.nanmedian(errors)
 

@@ -24,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
+from zlocus.evaluation.command import evaluate
 from zlocus.progress import progress_for
 from zlocus.request import (
     CloudRequest,
@@ -420,30 +421,7 @@ def import_cameras(
     print(f"{out}: {len(scene.views)} views.")
 
 
-@app.command()
-@explained
-def evaluate(
-    dsm: Annotated[Path, typer.Argument(help="Surface to judge.", metavar="DSM")],
-    reference: Annotated[Path, typer.Argument(help="Reference heights on a projected grid.", metavar="REFERENCE")],
-    classes: Annotated[
-        Path | None,
-        typer.Option(help="Classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
-    ] = None,
-    align: Annotated[
-        bool, typer.Option("--align", help="First find and remove the best shift; it is reported.")
-    ] = False,
-    margin: Annotated[float, typer.Option(help="Rim of the reference left out, m.", metavar="M")] = 10.0,
-    threshold: Annotated[float, typer.Option(help="An error below this is within, m.", metavar="M")] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-) -> None:
-    """Compare a surface with a reference surface."""
-    from zlocus.evaluation.evaluate import evaluate as compare
-
-    evaluation = compare(dsm, reference, classes=classes, align=align, margin_m=margin, threshold_m=threshold)
-    if as_json:
-        print(json.dumps(evaluation.as_dict(), indent=2))
-    else:
-        _print_evaluation(evaluation)
+app.command()(explained(evaluate))
 
 
 @app.command()

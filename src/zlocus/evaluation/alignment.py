@@ -8,20 +8,20 @@ import itertools
 import numpy as np
 
 from zlocus.errors import InputError
+from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.evaluation.truth import TruthBlocks
-from zlocus.sensors.model import FloatArray
 
 REACH_M = 4
 FIRST_STEP_M = 0.5
 LAST_STEP_M = 0.02
 
 
-def best_shift(surface: HeightRaster, truth: TruthBlocks, xy: FloatArray) -> tuple[float, float]:
+def best_shift(surface: HeightRaster, truth: TruthBlocks, points: Points) -> tuple[float, float]:
     """The horizontal shift (east, north) in m of the look-up that makes the height differences most alike.
 
     Every metre within 4 m first, then a pattern search down to steps of about 0.02 m, on the median absolute deviation
-    over blocks without an edge. xy : (n, 2) centres of the blocks in the surface's CRS.
+    over blocks without an edge. points : centres of the blocks as the surface has them.
 
     Raises
     ------
@@ -29,11 +29,11 @@ def best_shift(surface: HeightRaster, truth: TruthBlocks, xy: FloatArray) -> tup
         The surface has no height to align.
     """
     flat = ~truth.is_edge
-    at, height = xy[flat], truth.mean[flat]
+    at, height = points.where(flat), truth.mean[flat]
 
     @functools.cache
     def spread(shift: tuple[float, float]) -> float:
-        difference = surface.bilinear(at + np.array(shift)) - height
+        difference = surface.bilinear(at.moved(shift)) - height
         difference = difference[np.isfinite(difference)]
         return float(np.median(np.abs(difference - np.median(difference)))) if difference.size else np.inf
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import pyproj
 from affine import Affine
+from pyproj.exceptions import CRSError
 from rasterio.crs import CRS
 
 from zlocus.errors import InputError
@@ -15,6 +18,8 @@ from zlocus.sensors.model import FloatArray
 
 # What other programs write where they have no height, without declaring it.
 LOWEST_M, HIGHEST_M = -1e4, 1e5
+# Row and column of a point that a map cannot show.
+OUTSIDE = -10.0
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,36 @@ class HeightRaster:
     transform: Affine
     crs: CRS | None
 
+    @cached_property
+    def spatial(self) -> pyproj.CRS | None:
+        """The CRS with its heights, where it says what they are above.
+
+        Raises
+        ------
+        InputError
+            It is none that PROJ knows.
+        """
+        if not self.crs:
+            return None
+        try:
+            return pyproj.CRS.from_wkt(self.crs.to_wkt())
+        except CRSError as error:
+            raise InputError(
+                f"{self.path} has a CRS that PROJ does not know. Assign one (gdal_edit -a_srs)."
+            ) from error
+
+    @cached_property
+    def horizontal(self) -> pyproj.CRS | None:
+        """The CRS of x and y."""
+        return None if self.spatial is None else self.spatial.to_2d()
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """x and y of the middle of the raster."""
+        rows, cols = self.z.shape
+        x, y = self.transform * (cols / 2, rows / 2)
+        return float(x), float(y)
+
     def nearest(self, xy: FloatArray) -> FloatArray:
         """Height of the cell that holds each point. xy : (n, 2) in the raster's CRS -> (n,) m, NaN outside."""
         cell = np.floor(self.cells(xy)).astype(int)
@@ -36,6 +71,11 @@ class HeightRaster:
 
     def bilinear(self, xy: FloatArray) -> FloatArray:
         """Height between the four cell centres around each point; as `nearest` where one of the four is missing."""
+        z = self.between_cells(xy)
+        return np.where(np.isfinite(z), z, self.nearest(xy))
+
+    def between_cells(self, xy: FloatArray) -> FloatArray:
+        """Height between the four cell centres around each point, NaN where one of the four is missing."""
         cell = self.cells(xy) - 0.5
         corner = np.floor(cell).astype(int)
         down, right = (cell - corner).T
@@ -43,16 +83,18 @@ class HeightRaster:
         row, col = np.where(inside[:, None], corner, 0).T
         upper = self.z[row, col] * (1 - right) + self.z[row, col + 1] * right
         lower = self.z[row + 1, col] * (1 - right) + self.z[row + 1, col + 1] * right
-        z = upper * (1 - down) + lower * down
-        return np.where(inside & np.isfinite(z), z, self.nearest(xy))
+        return np.where(inside, upper * (1 - down) + lower * down, np.nan)
 
     def cells(self, xy: FloatArray) -> FloatArray:
-        """(row, col) with (0, 0) at the outer corner of the first cell. (n, 2) -> (n, 2)."""
+        """(row, col) with (0, 0) at the outer corner of the first cell, outside for what is not finite.
+
+        (n, 2) -> (n, 2).
+        """
         inverse = ~self.transform
         x, y = xy[:, 0], xy[:, 1]
         col = inverse.a * x + inverse.b * y + inverse.c
         row = inverse.d * x + inverse.e * y + inverse.f
-        return np.column_stack([row, col])
+        return np.asarray(np.nan_to_num(np.column_stack([row, col]), nan=OUTSIDE, posinf=OUTSIDE, neginf=OUTSIDE))
 
 
 def read_heights(path: Path) -> HeightRaster:

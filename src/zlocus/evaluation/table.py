@@ -2,25 +2,63 @@
 
 from __future__ import annotations
 
-from zlocus.evaluation.evaluate import Evaluation
+from collections.abc import Iterator
+
+from zlocus.evaluation.evaluate import Evaluation, Shift
+from zlocus.evaluation.slopes import UNKNOWN
 from zlocus.evaluation.statistics import ErrorStatistics
 
-COLUMNS = ("", "cells", "complete", "within", "median", "NMAD", "RMSE", "LE90")
+ERROR_COLUMNS = ("median", "NMAD", "RMSE", "LE90", "LE95")
 
 
 def evaluation_table(evaluation: Evaluation) -> str:
-    """Lines of text: the shift removed (if any), then a row for all cells and one per class, errors in m."""
-    rows = [COLUMNS, *(_row(name, figures) for name, figures in {"all": evaluation.all, **evaluation.classes}.items())]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(COLUMNS))]
+    """Lines of text: a row for all cells, one per class and per band of slope, errors in m; then what they mean.
+
+    A shift that was removed is said, with the figures of the surface before.
+    """
+    thresholds = [limit for limit, _ in evaluation.all.shares]
+    within = [f"< {limit:g} m" for limit in thresholds] if len(thresholds) > 1 else ["within"]
+    groups = {"all": evaluation.all}
+    if evaluation.unshifted is not None:
+        groups["as it lies"] = evaluation.unshifted
+    groups |= evaluation.classes | {_band_name(name): figures for name, figures in evaluation.slopes.items()}
+    rows = [("", "cells", "complete", *within, *ERROR_COLUMNS)]
+    rows += [_row(name, figures) for name, figures in groups.items()]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
-    lines.append(f"within: share of all cells in error by less than {evaluation.threshold_m:g} m; errors in m")
-    if evaluation.shift is not None:
-        shift = evaluation.shift
-        lines.append(f"removed first: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, {shift.up_m:+.3f} m up")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_notes(evaluation, thresholds)])
 
 
 def _row(name: str, figures: ErrorStatistics) -> tuple[str, ...]:
-    shares = (f"{100 * share:.2f} %" for share in (figures.completeness, figures.within))
-    errors = (f"{error:.3f}" for error in (figures.median, figures.nmad, figures.rmse, figures.le90))
+    within = [share for _, share in figures.shares] or [figures.within]
+    shares = (f"{100 * share:.2f} %" for share in (figures.completeness, *within))
+    errors = (f"{e:.3f}" for e in (figures.median, figures.nmad, figures.rmse, figures.le90, figures.le95))
     return (name, str(figures.n), *("-" if "nan" in text else text for text in (*shares, *errors)))
+
+
+def _band_name(name: str) -> str:
+    return "slope unknown" if name == UNKNOWN else f"{name} deg"
+
+
+def _notes(evaluation: Evaluation, thresholds: list[float]) -> Iterator[str]:
+    if len(thresholds) > 1:
+        yield "< M m: share of all cells in error by less; errors in m"
+    else:
+        yield f"within: share of all cells in error by less than {evaluation.threshold_m:g} m; errors in m"
+    if evaluation.mvs3dm is not None:
+        yield (
+            f"MVS3DM (single cells): completeness {100 * evaluation.mvs3dm.completeness:.2f} %, "
+            f"median error {evaluation.mvs3dm.median_error_m:.3f} m"
+        )
+    if evaluation.assumed is not None:
+        yield evaluation.assumed
+    if evaluation.geoid_added_to is not None:
+        yield f"the geoid's heights were added to those of {evaluation.geoid_added_to}"
+    if evaluation.shift is not None:
+        yield _shift_line(evaluation.shift)
+
+
+def _shift_line(shift: Shift) -> str:
+    known = "" if shift.sigma_m is None else f", sigma {shift.sigma_m:.3f} m"
+    how = "" if shift.steps is None else f" ({shift.method}, {shift.steps} steps{known})"
+    return f"removed first: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, {shift.up_m:+.3f} m up{how}"

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from zlocus.errors import ConfigError, InputError
+from zlocus.evaluation.frame import unit_m
 from zlocus.evaluation.heights import HeightRaster
+from zlocus.evaluation.slopes import block_gradient, slope_deg
 from zlocus.io.opening import open_raster
 from zlocus.sensors.model import FloatArray
 
@@ -23,12 +27,18 @@ class TruthBlocks:
     """Blocks of a reference surface.
 
     xy : (n, 2) float64, centres in the reference's CRS. heights : (n, k) float64, m, the block's cells.
-    classes : (n,) uint8 class of the block's first cell, or None.
+    classes : (n,) uint8 class of the block's first cell, or None. gradient : (n, 2) float64, m per metre east and north
+    of the frame, NaN where a neighbour has no height. cells : (n, 2) row and column of the block on the grid of all
+    blocks, which has `shape` and `transform`.
     """
 
     xy: FloatArray
     heights: FloatArray
     classes: NDArray[np.uint8] | None
+    gradient: FloatArray
+    cells: NDArray[np.int64]
+    shape: tuple[int, int]
+    transform: Affine
 
     @property
     def mean(self) -> FloatArray:
@@ -39,6 +49,11 @@ class TruthBlocks:
     def is_edge(self) -> NDArray[np.bool_]:
         """Blocks that hold a jump: either side of it is right. (n,)."""
         return np.asarray(np.ptp(self.heights, axis=1) > EDGE_SPREAD_M)
+
+    @property
+    def slope_deg(self) -> FloatArray:
+        """Slope of the ground, degrees, NaN where a neighbour has no height. (n,)."""
+        return slope_deg(self.gradient)
 
     def errors(self, z: FloatArray) -> FloatArray:
         """Errors of heights z (n,) m at the centres: against the mean, at an edge against the nearest member."""
@@ -53,37 +68,55 @@ class TruthBlocks:
         return np.isin(self.classes, CLASS_NAMES[name])
 
 
-def truth_blocks(reference: HeightRaster, margin_m: float, classes: NDArray[np.uint8] | None) -> TruthBlocks:
+def truth_blocks(
+    reference: HeightRaster, margin_m: float, classes: NDArray[np.uint8] | None, frame: CRS | None = None
+) -> TruthBlocks:
     """The blocks of a reference whose cells all have a height, away from its rim.
 
-    classes : (r, c) on the reference's grid.
+    classes : (r, c) on the reference's grid. frame : map in metres for slopes and sizes; None: that of the reference.
 
     Raises
     ------
     InputError
-        A geographic reference, one without a height, or one the margin leaves nothing of.
+        A geographic reference without a frame, one without a height, or one the margin leaves nothing of.
     """
-    if reference.crs is not None and reference.crs.is_geographic:
+    if frame is None and reference.horizontal is not None and reference.horizontal.is_geographic:
         raise InputError(f"{reference.path} is in degrees ({reference.crs}). Reproject it to a CRS in metres first.")
-    transform = reference.transform
-    size = max(1, round(BLOCK_M / abs(transform.a)))
+    transform, unit = reference.transform, unit_m(reference, frame)
+    size = max(1, round(BLOCK_M / (abs(transform.a) * unit[0])))
     rows, cols = reference.z.shape[0] // size, reference.z.shape[1] // size
     cells = reference.z[: rows * size, : cols * size]
     heights = cells.reshape(rows, size, cols, size).transpose(0, 2, 1, 3).reshape(rows * cols, size * size)
     row, col = (index.ravel() * size for index in np.mgrid[:rows, :cols])
-    centre_row, centre_col = row + size / 2, col + size / 2
-    x = transform.a * centre_col + transform.b * centre_row + transform.c
-    y = transform.d * centre_col + transform.e * centre_row + transform.f
-    left, top = transform.c, transform.f
-    right, bottom = transform * (reference.z.shape[1], reference.z.shape[0])
-    keep = (x > left + margin_m) & (x < right - margin_m) & (y > bottom + margin_m) & (y < top - margin_m)
+    xy = places(transform, row + size / 2, col + size / 2)
+    keep = inside_margin(reference, margin_m, unit, xy)
     if not keep.any():
         raise InputError(f"A margin of {margin_m:g} m leaves nothing of {reference.path}. Give a smaller --margin.")
     keep &= np.isfinite(heights).all(axis=1)
     if not keep.any():
         raise InputError(f"{reference.path} has no height inside its margin of {margin_m:g} m. Check its nodata value.")
+    gradient = block_gradient(reference, size, frame, keep.reshape(rows, cols))
     chosen = None if classes is None else classes[row[keep], col[keep]]
-    return TruthBlocks(np.column_stack([x[keep], y[keep]]), heights[keep], chosen)
+    block = np.column_stack([row[keep], col[keep]]) // size
+    return TruthBlocks(xy[keep], heights[keep], chosen, gradient, block, (rows, cols), transform * Affine.scale(size))
+
+
+def places(transform: Affine, row: FloatArray, col: FloatArray) -> FloatArray:
+    """Coordinates (n, 2) of places on a grid, (0, 0) being the outer corner of its first cell."""
+    x = transform.a * col + transform.b * row + transform.c
+    y = transform.d * col + transform.e * row + transform.f
+    return np.column_stack([x, y])
+
+
+def inside_margin(
+    reference: HeightRaster, margin_m: float, unit: tuple[float, float], xy: FloatArray
+) -> NDArray[np.bool_]:
+    """Which points (n, 2) lie further from the rim of a reference than a margin. unit : metres of its x and y."""
+    transform, x, y = reference.transform, xy[:, 0], xy[:, 1]
+    left, top = transform.c, transform.f
+    right, bottom = transform * (reference.z.shape[1], reference.z.shape[0])
+    width, height = margin_m / unit[0], margin_m / unit[1]
+    return np.asarray((x > left + width) & (x < right - width) & (y > bottom + height) & (y < top - height))
 
 
 def read_classes(path: Path, reference: HeightRaster) -> NDArray[np.uint8]:

@@ -1,0 +1,52 @@
+"""What an evaluation leaves in a folder: figures, a map of the errors, their histogram."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from zlocus.errors import ConfigError, OutputError
+from zlocus.evaluation.evaluate import Evaluation
+from zlocus.evaluation.histogram import histogram_figure
+from zlocus.io.raster import write_cog
+from zlocus.products.record import write_record, write_whole
+
+FIGURES, ERROR_MAP, HISTOGRAM = "evaluation.json", "error.tif", "histogram.png"
+NAMES = (FIGURES, ERROR_MAP, HISTOGRAM)
+DPI = 120
+
+
+def check_not_input(out: Path, *inputs: Path | None) -> None:
+    """Refuse to write over a raster that is to be read.
+
+    Raises
+    ------
+    ConfigError
+        An input is one of the files that the evaluation writes.
+    """
+    for path in inputs:
+        if path is not None and path.name in NAMES and path.resolve().parent == out.resolve():
+            raise ConfigError(f"{path} would be written over. Choose another folder with -o.")
+
+
+def write_evaluation(out: Path, evaluation: Evaluation) -> None:
+    """Write `FIGURES`, `ERROR_MAP` and `HISTOGRAM` into a folder, each whole or not at all; the figures last.
+
+    Raises
+    ------
+    OutputError
+        Where they cannot be written.
+    """
+    assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{out} cannot be made: {error.strerror}. Choose another folder with -o.") from error
+    # They belong together: figures of another evaluation must not stay beside a new map.
+    (out / FIGURES).unlink(missing_ok=True)
+    write_cog(
+        out / ERROR_MAP, evaluation.error_map.errors, evaluation.error_map.geobox, nodata=float("nan"),
+        descriptions=("height of the surface less that of the reference",), units="m",
+    )  # fmt: skip
+    figure = histogram_figure(evaluation)
+    write_whole(out / HISTOGRAM, lambda part: figure.savefig(part, format="png", dpi=DPI))
+    write_record(out / FIGURES, evaluation.as_dict())

@@ -1,0 +1,78 @@
+"""How steep the reference is: slopes of its blocks, and figures by bands of slope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from zlocus.errors import ConfigError
+from zlocus.evaluation.frame import converted
+from zlocus.evaluation.heights import HeightRaster
+from zlocus.sensors.model import FloatArray
+
+SLOPE_EDGES_DEG = (5.0, 15.0, 30.0, 45.0)
+UNKNOWN = "unknown"
+
+
+def slope_deg(gradient: FloatArray) -> FloatArray:
+    """Steepest slope, degrees, of a surface that rises by (east, north) m per metre. (n, 2) -> (n,)."""
+    return np.asarray(np.degrees(np.arctan(np.hypot(gradient[:, 0], gradient[:, 1]))))
+
+
+def slope_bands(slopes: FloatArray, edges: Sequence[float]) -> dict[str, NDArray[np.bool_]]:
+    """Members of each band of slope, by name ("5-15": from 5 up to but not including 15 degrees).
+
+    slopes : (n,) degrees. edges : limits between the bands, degrees; none: no bands. Where the slope is not known
+    (NaN), a block belongs to the band `UNKNOWN`, which is there only where it has members.
+
+    Raises
+    ------
+    ConfigError
+        Edges that do not rise, or are not between 0 and 90 degrees.
+    """
+    if not edges:
+        return {}
+    if not all(0 < edge < 90 for edge in edges) or any(low >= high for low, high in pairwise(edges)):
+        listed = ",".join(f"{edge:g}" for edge in edges)
+        raise ConfigError(f"--slopes {listed} must rise from above 0 to below 90 degrees, for example 5,15,30,45.")
+    bands = {
+        f"{low:g}-{high:g}": (slopes >= low) & (slopes < high) for low, high in pairwise((0.0, *edges, 90.0))
+    }  # fmt: skip
+    unknown = np.isnan(slopes)
+    return bands | ({UNKNOWN: unknown} if unknown.any() else {})
+
+
+def block_gradient(reference: HeightRaster, size: int, frame: CRS | None, chosen: NDArray[np.bool_]) -> FloatArray:
+    """Rise of the blocks' mean heights, m per metre to the east and to the north of the frame. (n, 2) float64.
+
+    size : cells along a side of a block. chosen : (r, c) bool, the n blocks asked for.
+    From the eight blocks around, as Horn (1981, Proc. IEEE 69) takes the gradient; NaN where one of them, or a cell of
+    one, has no height.
+    """
+    rows, cols = chosen.shape
+    cells = reference.z[: rows * size, : cols * size].reshape(rows, size, cols, size)
+    z = np.pad(cells.mean(axis=(1, 3)), 1, constant_values=np.nan)
+    across = z[:, 2:] - z[:, :-2]
+    down = z[2:] - z[:-2]
+    per_col = (across[:-2] + 2 * across[1:-1] + across[2:])[chosen] / 8
+    per_row = (down[:, :-2] + 2 * down[:, 1:-1] + down[:, 2:])[chosen] / 8
+    # The gradient along the grid is the transposed step of the grid times that along the frame.
+    step = _block_steps(reference, size, frame, chosen)
+    along_grid = np.column_stack([per_col, per_row])
+    return np.asarray(np.linalg.solve(np.swapaxes(step, -1, -2), along_grid[..., None])[..., 0])
+
+
+def _block_steps(reference: HeightRaster, size: int, frame: CRS | None, chosen: NDArray[np.bool_]) -> FloatArray:
+    """(east, north) m of a step of a block along the columns ([..., 0]) and rows ([..., 1]). (2, 2) or (n, 2, 2)."""
+    t, theirs = reference.transform, reference.horizontal
+    step = np.array([[t.a, t.b], [t.d, t.e]]) * size
+    if frame is None or theirs is None or theirs == frame:
+        return step
+    row, col = (np.nonzero(chosen)[axis] + 0.5 for axis in (0, 1))
+    xy = np.column_stack([col, row]) @ step.T + (t.c, t.f)
+    ends = [(converted(theirs, frame, xy + half), converted(theirs, frame, xy - half)) for half in step.T / 2]
+    return np.stack([after - before for after, before in ends], axis=-1)
