@@ -42,6 +42,7 @@ class RasterSink:
     nodata : value that means no data; None where all cells mean something.
     descriptions : name of each band, as many as there are bands. units : of all bands, "" for none.
     has_mask : whether an internal mask is written with the blocks (for images, where no value can be spared).
+    average : whether overviews are averages; None: those of heights and images are, those of flags and counts are not.
 
     Raises
     ------
@@ -59,6 +60,7 @@ class RasterSink:
         descriptions: tuple[str, ...] = ("",),
         units: str = "",
         has_mask: bool = False,
+        average: bool | None = None,
     ) -> None:
         self.path, self.dtype, self.has_mask = Path(path), np.dtype(dtype), has_mask
         self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part.tif")
@@ -70,6 +72,7 @@ class RasterSink:
         self._lock = threading.Lock()
         rows, cols = geobox.shape
         self._descriptions, self._units = descriptions, units
+        self._average = (self.dtype.kind == "f" or has_mask) if average is None else average
         self._profile = {
             "driver": "GTiff", "width": cols, "height": rows, "count": len(descriptions), "dtype": self.dtype.name,
             "crs": None if geobox.crs is None else geobox.crs.to_wkt(), "transform": geobox.transform, "nodata": nodata,
@@ -93,11 +96,9 @@ class RasterSink:
 
     def close(self) -> None:
         """Convert to COG and rename to `path`."""
-        floating = self.dtype.kind == "f"
         options = COG_OPTIONS | {
-            "PREDICTOR": FLOAT_PREDICTOR if floating else INTEGER_PREDICTOR,
-            # Flags and counts must not be averaged; heights and grey values may.
-            "OVERVIEW_RESAMPLING": "AVERAGE" if floating or self.has_mask else "NEAREST",
+            "PREDICTOR": FLOAT_PREDICTOR if self.dtype.kind == "f" else INTEGER_PREDICTOR,
+            "OVERVIEW_RESAMPLING": "AVERAGE" if self._average else "NEAREST",
         }
         with self._guard():
             self._gather()
