@@ -71,7 +71,8 @@ def test_buildings_trees_and_pits_on_tilted_ground():
     z = ground.copy()
     z[20:40, 30:55] += 12
     row, col = np.mgrid[:90, :110]
-    z += np.maximum(0, 6 - 0.5 * np.hypot(row - 65, col - 30) ** 2).astype(np.float32)
+    away = np.hypot(row - 65, col - 30)
+    z += np.where(away <= 4, 8 - 0.3 * away**2, 0).astype(np.float32)
     z[50:70, 95:] += 8  # at the rim
     z[75, 60] -= 50
     found = terrain(z, CELL_M, OPTIONS)

@@ -76,9 +76,9 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         return float(self._file.transform.a)
 
     @property
-    def dtype(self) -> np.dtype[Any]:
-        """Of its cells."""
-        return np.dtype(self._file.dtypes[0])
+    def dtype(self) -> str:
+        """Of its cells, as NumPy names it."""
+        return str(self._file.dtypes[0])
 
     def statistic(self, name: str) -> float | None:
         """MINIMUM, MAXIMUM, MEAN, STDDEV, VALID_PERCENT; None where no cell is valid, or the file does not say."""
