@@ -408,8 +408,8 @@ class ProductOptions(Checked):
         45.0, "Hillshade: height of the sun above the horizon.", low=0.0, high=90.0, unit="degrees"
     )
     contour_interval_m: float | None = option(
-        None, "Height between contours; unset: 1, 2 or 5 times a power of ten that gives 10 to 30 of them within two "
-        "standard deviations of the mean height.", low=1e-3, high=1e4, unit="m",
+        None, "Height between contours; unset: 1, 2 or 5 times a power of ten that gives 10 to 25 of them within two "
+        "standard deviations of the mean height, but at least 0.1.", low=1e-3, high=1e4, unit="m",
     )  # fmt: skip
     contours_of: str = option(
         "dsm", "What contours are drawn of: the surface, or the terrain, which then must be among the products.",

@@ -89,6 +89,10 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         """Cells of a strip with what is beside it, (r, c)."""
         return np.asarray(self._file.read(1, window=self._window(strip)))
 
+    def read_rows(self, row: int, rows: int) -> NDArray[Any]:
+        """Cells of some rows, (r, c)."""
+        return self.read(Strip(row, rows, 0, 0))
+
     def read_bands(self, strip: Strip) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Cells of all bands, (bands, r, c), and whether they are valid, (r, c)."""
         window = self._window(strip)
