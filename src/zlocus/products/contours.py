@@ -80,7 +80,7 @@ class _Chain:
     def points(self) -> FloatArray:
         """All of it, (n, 2), rounded; a closed line starts at its first point from the north-west."""
         parts = [self.pieces[0], *(piece[1:] for piece in self.pieces[1:])]
-        line: FloatArray = np.round(np.concatenate(parts), DIGITS)
+        line = np.asarray(np.round(np.concatenate(parts), DIGITS), np.float64)
         if self.is_closed:
             line[-1] = line[0]
         line = line[np.r_[True, (np.diff(line, axis=0) != 0).any(axis=1)]]
