@@ -18,6 +18,7 @@ from rasterio.windows import Window
 
 from zlocus.errors import InputError
 from zlocus.io.opening import open_raster
+from zlocus.io.statistics import BandStatistics
 
 # A quarter of a block of a COG, which stays in GDAL's cache meanwhile; work on a strip takes many times its cells.
 STRIP_ROWS = 128
@@ -58,6 +59,7 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         self.path = path
         self._opening = open_raster(path, "raster")
         self._file: rasterio.DatasetReader = self._opening.__enter__()
+        self._counted: dict[str, str] = {}
 
     @property
     def geobox(self) -> GeoBox:
@@ -81,9 +83,20 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         return str(self._file.dtypes[0])
 
     def statistic(self, name: str) -> float | None:
-        """MINIMUM, MAXIMUM, MEAN, STDDEV, VALID_PERCENT; None where no cell is valid, or the file does not say."""
-        value = self._file.tags(1).get(f"STATISTICS_{name}")
+        """MINIMUM, MAXIMUM, MEAN, STDDEV, VALID_PERCENT of the band, None where no cell is valid; read from the cells
+        where the file does not say."""
+        tags = self._file.tags(1)
+        if "STATISTICS_MEAN" not in tags:
+            tags = self._counted = self._counted or self._count()
+        value = tags.get(f"STATISTICS_{name}")
         return None if value is None else float(value)
+
+    def _count(self) -> dict[str, str]:
+        statistics = BandStatistics()
+        for strip in strips_of(self._file.height):
+            window = self._window(strip)
+            statistics.add(self._file.read(1, window=window), self._file.read_masks(1, window=window) > 0)
+        return statistics.tags()
 
     def read(self, strip: Strip) -> NDArray[Any]:
         """Cells of a strip with what is beside it, (r, c)."""
