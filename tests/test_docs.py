@@ -11,6 +11,7 @@ import typer.main
 from zlocus.cli import app
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
+from zlocus.products.item import PRODUCTS
 from zlocus.surface import reasons
 from zlocus.surface.reasons import EMPTY, Quality
 
@@ -61,6 +62,13 @@ def test_the_readme_lists_every_option_of_dsm():
     command = typer.main.get_command(app).commands["dsm"]
     options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
     assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z]+)", readme, re.MULTILINE))
+
+
+def test_every_product_is_documented():
+    rows = re.findall(r"^\| `(\S+)` \|", (ROOT / "docs" / "products.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(rows) == sorted([*(product.name for product in PRODUCTS), "item.json"])
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in readme for name in rows)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

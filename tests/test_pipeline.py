@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -32,12 +33,14 @@ from rendered_scenes import (
 from rpc_fixtures import rpc_txt, write_image
 from zlocus.errors import ConfigError, CoverageError, GeometryError, TileError
 from zlocus.io.rpc_text import rpc_from_fields
-from zlocus.options import CheckOptions, PyramidOptions, RunConfig
+from zlocus.options import CheckOptions, ProductOptions, PyramidOptions, RunConfig
 from zlocus.progress import progress_for
 from zlocus.request import DsmRequest
 from zlocus.surface.reasons import Quality, is_empty
 
 PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+MAPS = ("hillshade.tif", "dtm.tif")
+ALL_MAPS = ("hillshade", "contours", "dtm", "laz")
 # Base-to-height about 0.6 and 0.5 m pixels: 0.05 m of height is 0.06 px.
 BIAS_M, SPREAD_M = 0.02, {"plane": 0.05, "tilt": 0.06, "sine": 0.08, "step": 0.08}
 BLUNDERS, RIM_BLUNDERS = 0.005, 0.02
@@ -49,7 +52,7 @@ LEFT_PX = 0.1
 @pytest.fixture(scope="session")
 def whole(images, tmp_path_factory):
     """A run over all of the sine, in tiles of 64 cells."""
-    return run(images("sine"), tmp_path_factory.mktemp("whole") / "out", SMALL_TILES).out
+    return run(images("sine"), tmp_path_factory.mktemp("whole") / "out", SMALL_TILES, products=ALL_MAPS).out
 
 
 def spread(error):
@@ -122,7 +125,8 @@ def test_products(whole, images):
     height, dsm = read(whole / "dsm.tif")
     for name, dtype, nodata in (
         ("dsm.tif", "float32", np.nan), ("sigma.tif", "float32", np.nan), ("quality.tif", "uint16", None),
-        ("views.tif", "uint8", 0), ("ortho.tif", "uint16", None),
+        ("views.tif", "uint8", 0), ("ortho.tif", "uint16", None), ("hillshade.tif", "uint8", 0),
+        ("dtm.tif", "float32", np.nan),
     ):  # fmt: skip
         _, source = read(whole / name)
         assert source.dtypes == (dtype,)
@@ -130,6 +134,10 @@ def test_products(whole, images):
         assert (source.transform, source.shape, source.crs) == (dsm.transform, dsm.shape, dsm.crs)
         valid, problems, warnings = cog_validate(whole / name, strict=True)
         assert valid, (problems, warnings)
+        with rasterio.open(whole / name) as file:
+            assert "STATISTICS_MEAN" in file.tags(1)
+    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "run.json", "item.json"}
+    assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
     np.testing.assert_array_equal(np.isnan(height), views == 0)
@@ -163,10 +171,14 @@ def test_record(whole, images):
     assert record["schema"] == 1
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in images("sine").inputs]
     assert all(len(entry["sha256"]) == 64 for entry in record["inputs"])
-    assert [stage["name"] for stage in record["stages"]] == ["open", "orient", "settle", "match", "points", "record"]
+    assert [stage["name"] for stage in record["stages"]] == [
+        "open", "orient", "settle", "match", "points", "record", "products",
+    ]  # fmt: skip
     assert all(set(stage) == {"name", "wall_s", "cpu_s", "peak_mb"} for stage in record["stages"])
     assert record["evaluations"]["done"] <= record["evaluations"]["all_images"]
     assert record["evaluations"]["done"] > 1e6
+    assert record["image_dates"] == [None] * 3
+    assert abs((datetime.now(UTC) - datetime.fromisoformat(record["created"])).total_seconds()) < 3600
     assert record["config"]["options"]["pyramid"]["tile"] == 64
     assert record["config"]["request"]["heights"] == list(HEIGHTS)
     height, quality = read(whole / "dsm.tif")[0], read(whole / "quality.tif")[0]
@@ -205,17 +217,31 @@ def test_cells_finer_than_the_images_are_refused(images, tmp_path):
 
 
 def test_same_bytes_with_two_workers(whole, images, tmp_path):
-    other = run(images("sine"), tmp_path / "out", SMALL_TILES, workers=2).out
-    for name in PRODUCTS:
+    other = run(images("sine"), tmp_path / "out", SMALL_TILES, workers=2, products=ALL_MAPS).out
+    for name in (*PRODUCTS, *MAPS):
         assert (other / name).read_bytes() == (whole / name).read_bytes(), name
 
 
 def test_same_bytes_for_another_order_of_tiles(whole, images, tmp_path, monkeypatch):
     plan = zlocus.pipeline.plan_tiles
     monkeypatch.setattr(zlocus.pipeline, "plan_tiles", lambda *given: plan(*given)[::-1])
-    other = run(images("sine"), tmp_path / "out", SMALL_TILES).out
-    for name in PRODUCTS:
+    other = run(images("sine"), tmp_path / "out", SMALL_TILES, products=ALL_MAPS).out
+    for name in (*PRODUCTS, *MAPS):
         assert (other / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
+    out = run(images("plane"), tmp_path / "out", bounds=PART, products=("dtm", "laz")).out
+    assert {"dtm.tif", "surface.laz", "item.json"} <= {path.name for path in out.iterdir()}
+    run(images("plane"), out, bounds=PART, products=(), overwrite=True)
+    assert {path.name for path in out.iterdir()} == {*PRODUCTS, "ties.gpkg", "run.json", "item.json"}
+
+
+def test_contours_of_a_terrain_that_is_not_made_are_refused_at_once(images, tmp_path):
+    with pytest.raises(ConfigError, match=r"Add dtm to --products"):
+        run(images("plane"), tmp_path / "out", RunConfig(products=ProductOptions(contours_of="dtm")),
+            products=("contours",))  # fmt: skip
+    assert not (tmp_path / "out").exists()
 
 
 def shared_cells(out, whole, name):

@@ -133,6 +133,55 @@ def test_waiting_cells_are_an_array_on_disk(data):
     np.testing.assert_array_equal(found, expected)
 
 
+DIGITS = 1e-12  # relative, of statistics written with 14 digits
+
+
+def statistics_of(path):
+    with rasterio.open(path) as file:
+        tags = [file.tags(band) for band in file.indexes]
+    names = ("MINIMUM", "MAXIMUM", "MEAN", "STDDEV", "VALID_PERCENT")
+    return [[float(band[f"STATISTICS_{name}"]) for name in names] for band in tags]
+
+
+def expected_statistics(valid, n):
+    return [valid.min(), valid.max(), valid.mean(), valid.std(), float(f"{100 * valid.size / n:.4g}")]
+
+
+def test_statistics_of_heights(tmp_path):
+    # A mean far above the spread is where sums of squares lose their digits.
+    high = (HEIGHTS + np.float32(60000)).astype(np.float32)
+    write_cog(tmp_path / "dsm.tif", high, GRID, nodata=np.nan)
+    expected = expected_statistics(high[np.isfinite(high)].astype(float), high.size)
+    np.testing.assert_allclose(statistics_of(tmp_path / "dsm.tif"), [expected], rtol=DIGITS)
+    assert_is_cog(tmp_path / "dsm.tif")
+    assert os.listdir(tmp_path) == ["dsm.tif"]
+
+
+def test_statistics_count_cells_that_were_never_written(tmp_path):
+    block = RNG.integers(1, 200, (300, 400)).astype(np.uint8)
+    whole = np.zeros(GRID.shape, np.uint8)
+    whole[20:320, 90:490] = block
+    for nodata, valid in ((None, whole.astype(float)), (0, block.astype(float))):
+        with RasterSink(tmp_path / "a.tif", GRID, "uint8", nodata=nodata) as sink:
+            sink.write(20, 90, block)
+        expected = expected_statistics(valid, whole.size)
+        np.testing.assert_allclose(statistics_of(tmp_path / "a.tif"), [expected], rtol=DIGITS)
+
+
+def test_statistics_under_a_mask_band_by_band(tmp_path):
+    ortho = RNG.integers(0, 4000, (3, *GRID.shape)).astype(np.uint16)
+    mask = np.isfinite(HEIGHTS)
+    write_cog(tmp_path / "ortho.tif", ortho, GRID, mask=mask)
+    expected = [expected_statistics(band[mask].astype(float), mask.size) for band in ortho]
+    np.testing.assert_allclose(statistics_of(tmp_path / "ortho.tif"), expected, rtol=DIGITS)
+
+
+def test_no_statistics_of_nothing(tmp_path):
+    write_cog(tmp_path / "a.tif", np.full(GRID.shape, np.nan, np.float32), GRID, nodata=np.nan)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert not [name for name in file.tags(1) if name.startswith("STATISTICS")]
+
+
 @pytest.mark.parametrize(("nodata", "dtype"), [(np.nan, "float32"), (0, "uint8"), (None, "uint16")])
 def test_cells_never_written_are_nodata(tmp_path, nodata, dtype: str):
     with RasterSink(tmp_path / "a.tif", GRID, dtype, nodata=nodata) as sink:

@@ -23,10 +23,12 @@ import typer
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
+from zlocus.cli_products import PRODUCTS_HELP, products
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.evaluation.command import evaluate
 from zlocus.progress import progress_for
 from zlocus.request import (
+    DEFAULT_PRODUCTS,
     CloudRequest,
     CurvesRequest,
     DoctorRequest,
@@ -35,6 +37,7 @@ from zlocus.request import (
     OrientRequest,
     RankRequest,
     check_output,
+    product_names,
 )
 
 if TYPE_CHECKING:
@@ -191,6 +194,7 @@ def dsm(
     ] = False,
     workers: Workers = 1,
     memory: Annotated[float | None, typer.Option(help="Most memory to use, GB.", metavar="GB")] = None,
+    maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(DEFAULT_PRODUCTS),
     overwrite: Overwrite = False,
     config: ConfigFile = None,
 ) -> None:
@@ -199,6 +203,7 @@ def dsm(
         inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, bounds=bounds, like=like, area=area, mask=mask,
         heights=heights, dem=dem, reference=reference, views=views, method=method, vertical=vertical, fill=fill,
         partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
+        products=product_names(maps),
     )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)
@@ -206,6 +211,9 @@ def dsm(
 
     result = run_dsm(request, run_config, progress_for(sys.stderr))
     print(f"{result.out}: {100 * result.coverage:.1f} % of the cells seen by two images or more have a height.")
+
+
+app.command()(explained(products))
 
 
 @app.command()

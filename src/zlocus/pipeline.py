@@ -38,10 +38,11 @@ from zlocus.preparing import (
     possible_heights,
     what_was_applied,
 )
+from zlocus.products.maps import check_maps, make_maps, remove_maps
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.products.record import Stopwatch, inputs_record, now, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
@@ -90,6 +91,14 @@ class Tally:
         self.evaluations += result.evaluations
         self.all_images += result.all_images
 
+    def as_dict(self) -> dict[str, Any]:
+        """As run.json holds it."""
+        return {
+            "evaluations": {"done": self.evaluations, "all_images": self.all_images},
+            "coverage": round(self.coverage, 6),
+            "left_out_cells": self.n_left_out,
+        }
+
     @property
     def coverage(self) -> float:
         """Share of the cells seen by two images or more that have a height."""
@@ -107,6 +116,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
     watch = Stopwatch()
+    check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):
         like = None if request.like is None else read_geobox(request.like)
         scene = _opened(request, like)
@@ -137,29 +147,43 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     ):
         match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
+    remove_maps(out)
     with watch.stage("points"):
-        write_ties(out / "ties.gpkg", orientation, corrected)
-        if tally.ranked:
-            write_ranking(out / "ranking.gpkg", tally.ranked, [view.name for view in settled.views], scene.crs)
+        _write_points(out, orientation, corrected, tally, settled)
     with watch.stage("record"):
-        record = inputs_record(_files(request, scene))
-    write_record(
-        out / "run.json",
-        {
-            "config": {"request": _request_record(request), "options": config_as_dict(config)},
-            "versions": versions_record(),
-            "inputs": record,
-            "stages": watch.stages,
-            "orientation": orientation.as_dict(),
-            "grid": _grid_record(grid, scene.crs),
-            "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
-            "evaluations": {"done": tally.evaluations, "all_images": tally.all_images},
-            "coverage": round(tally.coverage, 6),
-            "left_out_cells": tally.n_left_out,
-        },
-    )
+        inputs = inputs_record(_files(request, scene))
+    record = {
+        "config": {"request": _request_record(request), "options": config_as_dict(config)},
+        "created": now(),
+        "versions": versions_record(),
+        "inputs": inputs,
+        "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
+        "stages": watch.stages,
+        "orientation": orientation.as_dict(),
+        "grid": _grid_record(grid, scene.crs),
+        "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
+        **tally.as_dict(),
+    }
+    _write_maps(request, config, watch, record, progress)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
+
+
+def _write_points(out: Path, orientation: Orientation, corrected: Scene, tally: Tally, settled: MatchScene) -> None:
+    """ties.gpkg, and ranking.gpkg where ties were ranked."""
+    write_ties(out / "ties.gpkg", orientation, corrected)
+    if tally.ranked:
+        write_ranking(out / "ranking.gpkg", tally.ranked, [view.name for view in settled.views], corrected.crs)
+
+
+def _write_maps(
+    request: DsmRequest, config: RunConfig, watch: Stopwatch, record: dict[str, Any], progress: Progress
+) -> None:
+    """run.json and the maps: the record first, for maps may fail, and again with the time that they took."""
+    write_record(request.out / "run.json", record)
+    with watch.stage("products"):
+        make_maps(request.out, request.products, config.products, progress)
+    write_record(request.out / "run.json", record)
 
 
 def _opened(request: DsmRequest, like: GeoBox | None) -> Scene:

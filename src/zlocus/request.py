@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,9 @@ VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 VERTICALS = ("ellipsoid",)
 FILLS = ("none", "interpolate")
+PRODUCTS = ("hillshade", "contours", "dtm", "laz")
+# The first thing anyone looks at, at the cost of a second per million cells; the others take a choice.
+DEFAULT_PRODUCTS = ("hillshade",)
 EARTHS = ("curved", "flat")
 
 
@@ -28,7 +32,7 @@ class DsmRequest:
     heights : (zmin, zmax), m above the ellipsoid. dem : raster the heights are searched around.
     reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
     memory_gb : most memory the tiles may take together, GB.
-    partial : a surface with too few heights counts as a success.
+    partial : a surface with too few heights counts as a success. products : maps made of the surface, see `PRODUCTS`.
 
     Raises
     ------
@@ -57,10 +61,12 @@ class DsmRequest:
     workers: int = 1
     memory_gb: float | None = None
     overwrite: bool = False
+    products: tuple[str, ...] = DEFAULT_PRODUCTS
 
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         self._check_grid()
+        _check_products(self.products)
         _check_heights(self.heights)
         if self.heights is not None and self.dem is not None:
             raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
@@ -312,6 +318,27 @@ class ImportRequest:
         """Names of the options that only some formats know, where they are given."""
         values = {name: getattr(self, name) for name in ("crs", "local", "up", "north", "focal", "camera", "earth")}
         return [name for name, value in values.items() if value not in (None, False)]
+
+
+def product_names(text: str) -> tuple[str, ...]:
+    """The names of --products, in the order of `PRODUCTS`; `none` is none.
+
+    Raises
+    ------
+    ConfigError
+        A name that is not known.
+    """
+    names = [] if text.strip() == "none" else [name.strip() for name in text.split(",")]
+    _check_products(names)
+    return tuple(name for name in PRODUCTS if name in names)
+
+
+def _check_products(names: Iterable[str]) -> None:
+    for name in names:
+        if name not in PRODUCTS:
+            raise ConfigError(
+                f"--products {name} is not known; choose from {', '.join(PRODUCTS)} with commas between them, or none."
+            )
 
 
 def _check_inputs(inputs: tuple[Path, ...]) -> None:

@@ -22,6 +22,7 @@ from rasterio.windows import Window
 from zlocus.errors import InputError, OutputError
 from zlocus.io.cells import WaitingCells
 from zlocus.io.opening import BLOCK_CACHE_BYTES, check_complete, open_raster, reason
+from zlocus.io.statistics import BandStatistics, is_data
 
 BLOCK_SIZE = 512
 # Deflate is read everywhere. Heights, sigmas and grey values shrink by 1 % more at level 6, in nearly twice the time.
@@ -35,13 +36,14 @@ class RasterSink:
 
     Until then the cells wait in a file beside it (never in memory), so blocks may come in any order, of any size, from
     any thread; `close` is for when no other thread reads rasters. Cells never written have the nodata value, or 0 where
-    there is none. As a context it closes at the end and aborts on an exception.
+    there is none. Each band carries its statistics. As a context it closes at the end and aborts on an exception.
 
     path : of the COG. geobox : its grid. dtype : of the cells.
     nodata : value that means no data; None where all cells mean something.
     descriptions : name of each band, as many as there are bands. units : of all bands, "" for none.
     has_colours : whether the bands are red, green and blue.
     has_mask : whether an internal mask is written with the blocks (for images, where no value can be spared).
+    average : whether overviews are averages; None: those of heights and images are, those of flags and counts are not.
 
     Raises
     ------
@@ -60,6 +62,7 @@ class RasterSink:
         units: str = "",
         has_colours: bool = False,
         has_mask: bool = False,
+        average: bool | None = None,
     ) -> None:
         self.path, self.dtype, self.has_mask = Path(path), np.dtype(dtype), has_mask
         self._part = self.path.with_name(f".{self.path.name}.{os.getpid()}.part.tif")
@@ -71,6 +74,7 @@ class RasterSink:
         self._lock = threading.Lock()
         rows, cols = geobox.shape
         self._descriptions, self._units = descriptions, units
+        self._average = (self.dtype.kind == "f" or has_mask) if average is None else average
         self._profile = {
             "driver": "GTiff", "width": cols, "height": rows, "count": len(descriptions), "dtype": self.dtype.name,
             "crs": None if geobox.crs is None else geobox.crs.to_wkt(), "transform": geobox.transform, "nodata": nodata,
@@ -95,11 +99,9 @@ class RasterSink:
 
     def close(self) -> None:
         """Convert to COG and rename to `path`."""
-        floating = self.dtype.kind == "f"
         options = COG_OPTIONS | {
-            "PREDICTOR": FLOAT_PREDICTOR if floating else INTEGER_PREDICTOR,
-            # Flags and counts must not be averaged; heights and grey values may.
-            "OVERVIEW_RESAMPLING": "AVERAGE" if floating or self.has_mask else "NEAREST",
+            "PREDICTOR": FLOAT_PREDICTOR if self.dtype.kind == "f" else INTEGER_PREDICTOR,
+            "OVERVIEW_RESAMPLING": "AVERAGE" if self._average else "NEAREST",
         }
         with self._guard():
             self._gather()
@@ -119,10 +121,26 @@ class RasterSink:
             for band, description in enumerate(self._descriptions, 1):
                 dataset.set_band_description(band, description)
             dataset.units = (self._units,) * len(self._descriptions)
+            statistics = [BandStatistics() for _ in self._descriptions]
+            masks = iter(self._waiting[1]) if self.has_mask else None
             for slices, cells in self._waiting[0]:
-                dataset.write(cells, window=Window.from_slices(*slices))
-            for slices, cells in self._waiting[1] if self.has_mask else ():
-                dataset.write_mask(cells[0], window=Window.from_slices(*slices))
+                window = Window.from_slices(*slices)
+                dataset.write(cells, window=window)
+                valid = None
+                if masks is not None:
+                    # Both came in the same blocks.
+                    valid = next(masks)[1][0]
+                    dataset.write_mask(valid, window=window)
+                for one, band in zip(statistics, cells, strict=True):
+                    one.add(band, is_data(band, dataset.nodata) if valid is None else valid)
+            for number, one in enumerate(statistics, 1):
+                n_left = dataset.width * dataset.height - one.n
+                if self.has_mask or dataset.nodata is not None:
+                    one.add_nothing(n_left)
+                else:
+                    one.add_zeros(n_left)
+                # GDAL copies them into the COG; computed by a reader they would go to a file beside it.
+                dataset.update_tags(number, **one.tags())
 
     def _remove(self) -> None:
         for waiting in self._waiting:

@@ -134,21 +134,42 @@ def write_points(
 ) -> None:
     """A GeoPackage of one layer of 3-D points, whole or not at all. xyz : (n, 3) m; columns, nulls : (n,) each, NULL
     where NaN or in `nulls`; a local frame has no CRS."""
+    from shapely import points
+
+    write_features(path, layer, "Point Z", points(xyz), columns, crs, nulls)
+
+
+def write_features(
+    path: Path,
+    layer: str,
+    geometry_type: str,
+    geometries: NDArray[np.object_],
+    columns: dict[str, NDArray[np.generic]],
+    crs: CRS,
+    nulls: dict[str, NDArray[np.bool_]] | None = None,
+) -> None:
+    """A GeoPackage of one layer, whole or not at all. geometries : (n,) of shapely's; the rest as in `write_points`.
+
+    Raises
+    ------
+    OutputError
+        Where the file cannot be written.
+    """
     # pyogrio brings pandas, a third of a second.
     import pyogrio.raw
     from pyogrio.errors import DataLayerError, DataSourceError
-    from shapely import points, to_wkb
+    from shapely import to_wkb
 
     # GDAL minds another ending.
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.gpkg")
-    masks = [(nulls or {}).get(name, np.zeros(len(xyz), bool)) for name in columns]
+    masks = [(nulls or {}).get(name, np.zeros(len(geometries), bool)) for name in columns]
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="'crs' was not provided")
             pyogrio.raw.write(
-                part, np.asarray(to_wkb(points(xyz), output_dimension=3, flavor="iso"), dtype=object),
+                part, np.asarray(to_wkb(geometries, output_dimension=3, flavor="iso"), dtype=object),
                 list(columns.values()), np.array(list(columns), dtype=object), field_mask=masks, layer=layer,
-                driver="GPKG", geometry_type="Point Z", crs=None if is_local(crs) else crs.to_wkt(),
+                driver="GPKG", geometry_type=geometry_type, crs=None if is_local(crs) else crs.to_wkt(),
             )  # fmt: skip
         os.replace(part, path)
     except (OSError, DataSourceError, DataLayerError) as error:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,11 @@ def inputs_record(paths: Iterable[Path]) -> list[dict[str, str]]:
                 digest.update(chunk)
         records.append({"path": str(path), "sha256": digest.hexdigest()})
     return records
+
+
+def now() -> str:
+    """The time, as ISO 8601 in UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def versions_record() -> dict[str, str]:

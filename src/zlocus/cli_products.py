@@ -1,0 +1,35 @@
+"""`zlocus products`: maps of a surface that is there already."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zlocus.progress import progress_for
+from zlocus.request import PRODUCTS, check_output, product_names
+
+PRODUCTS_HELP = f"Made of the surface: {', '.join(PRODUCTS)} (with commas between them), or none."
+
+
+def products(
+    out: Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")],
+    names: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(PRODUCTS),
+    config: Annotated[
+        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Make maps of a surface that is there already; those of the same name are replaced."""
+    chosen = product_names(names)
+    check_output(out, overwrite=True)
+    from zlocus.io.config import read_config
+    from zlocus.io.opening import existing_file
+    from zlocus.options import RunConfig
+    from zlocus.products.maps import FILES, make_maps
+
+    existing_file(out / "dsm.tif", "surface")
+    options = (RunConfig() if config is None else read_config(config)).products
+    make_maps(out, chosen, options, progress_for(sys.stderr))
+    print(f"{out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")
