@@ -110,8 +110,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     """
     watch = Stopwatch()
     with watch.stage("open"), progress.stage("Opening images"):
-        like = None if request.like is None else read_geobox(request.like)
-        vertical = vertical_datum(request.vertical)
+        like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
         scene = _opened(request, like, vertical)
         polygons = _area_polygons(request, scene.crs)
     with watch.stage("orient"):

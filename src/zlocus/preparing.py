@@ -92,7 +92,8 @@ def with_heights(
         return scene if asked is None else replace(scene, heights=asked)
     area = shared_ground(scene, asked)
     if inside := bounds or scene.bounds:
-        west, south, east, north = (*np.maximum(area[:2], inside[:2]), *np.minimum(area[2:], inside[2:]))
+        west, south = max(area[0], inside[0]), max(area[1], inside[1])
+        east, north = min(area[2], inside[2]), min(area[3], inside[3])
         area = (west, south, east, north) if west < east and south < north else area
     low, high = vertical.span(area, scene.crs)
     return replace(scene, heights=(asked[0] + low, asked[1] + high))

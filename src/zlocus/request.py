@@ -124,11 +124,11 @@ class CloudRequest:
     references: tuple[str, ...] = ()
     crs: str | None = None
     heights: tuple[float, float] | None = None
-    vertical: str = "ellipsoid"
     fill: str = "none"
     partial: bool = False
     workers: int = 1
     overwrite: bool = False
+    vertical: str = "ellipsoid"
 
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)

@@ -132,8 +132,8 @@ class VerticalDatum:
     def compound(self, horizontal: CRS) -> CRS:
         """The CRS of heights on a map: horizontal and vertical.
 
-        Ellipsoidal heights keep the horizontal one: GeoTIFF has no projected CRS with ellipsoidal heights, and GDAL
-        (3.10) puts it into a file beside the raster.
+        Ellipsoidal heights keep the horizontal one: GeoTIFF has no projected CRS with ellipsoidal heights; GDAL (3.10)
+        puts such a one into a file beside the raster, which then has none of its own.
         """
         if self.crs is None:
             return horizontal
