@@ -285,7 +285,7 @@ def test_the_page_lists_every_option():
     page = (ROOT / "docs" / "cloud.md").read_text(encoding="utf-8")
     command = typer.main.get_command(app).commands["cloud"]
     options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
-    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z]+)", page, re.MULTILINE))
+    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z-]+)", page, re.MULTILINE))
     for path in re.findall(r"`((?:[a-z]+/)+[a-z0-9_]+\.py)`", page):
         assert (ROOT / "src" / "zlocus" / path).exists() or (ROOT / path).exists(), path
 

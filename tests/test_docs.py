@@ -11,6 +11,7 @@ import typer.main
 from zlocus.cli import app
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
+from zlocus.io.vertical import KNOWN
 from zlocus.products.item import PRODUCTS
 from zlocus.surface import reasons
 from zlocus.surface.reasons import EMPTY, Quality
@@ -61,7 +62,21 @@ def test_the_readme_lists_every_option_of_dsm():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     command = typer.main.get_command(app).commands["dsm"]
     options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
-    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z]+)", readme, re.MULTILINE))
+    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z-]+)", readme, re.MULTILINE))
+
+
+def test_the_page_of_vertical_datums_names_what_there_is():
+    page = (ROOT / "docs" / "vertical.md").read_text(encoding="utf-8")
+    for name, known in KNOWN.items():
+        assert f"| `{name}` | {', '.join(f'`{grid}`' for grid in known.grids)} |" in page
+        assert f"| `{name}` | {known.title}, " in page
+        assert f"horizontal + EPSG:{known.epsg} |" in page
+    commands = typer.main.get_command(app).commands
+    for line in re.findall(r"^zlocus .+$", page, re.MULTILINE):
+        _, name, *arguments = line.split()
+        # An option that there is not raises.
+        command = commands[name]
+        command.make_parser(command.context_class(command)).parse_args(arguments)
 
 
 def test_every_product_is_documented():

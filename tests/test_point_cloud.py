@@ -13,6 +13,7 @@ from zlocus.io.opening import open_raster
 from zlocus.products.cloud import LAZ_STEP_M, PLY_POINT, PointCloud, file_names, write_map
 
 UTM = CRS.from_epsg(32632)
+LAMBERT = CRS("+proj=lcc +lat_1=46 +lat_2=48 +lat_0=47 +lon_0=8 +datum=WGS84 +units=m")
 XYZ = np.array([[462_000.1234, 5_247_000.5678, 431.25], [462_010.0, 5_247_020.0, -3.5], [461_990.5, 5_246_980.0, 0.0]])
 RGB = np.array([[65535, 0, 256], [1000, 2000, 3000], [0, 0, 0]], np.uint16)
 
@@ -46,6 +47,14 @@ def test_ply_holds_the_same(tmp_path):
     assert "comment crs EPSG:32632" in header
     np.testing.assert_array_equal(points["xyz"], XYZ)
     np.testing.assert_array_equal(points["rgb"], RGB >> 8)
+
+
+def test_ply_names_a_crs_with_heights_or_without_a_code(tmp_path):
+    for crs, expected in ((CRS("EPSG:32632+5773"), "EPSG:32632+5773"), (LAMBERT, 'PROJCRS["unknown",')):
+        parts = CRS.from_wkt(crs.to_wkt())
+        (line,) = [s for s in read_ply(written(tmp_path, parts) / "cloud.ply")[0] if s.startswith("comment crs")]
+        assert line.startswith(f"comment crs {expected}")
+        assert laspy.read(tmp_path / "cloud.laz").header.parse_crs().sub_crs_list == parts.sub_crs_list
 
 
 def test_a_local_frame_has_no_crs(tmp_path):

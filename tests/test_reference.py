@@ -10,9 +10,11 @@ from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
 
 from rpc_fixtures import write_image
-from zlocus.errors import ConfigError, InputError, ZlocusWarning
+from zlocus.errors import ConfigError, InputError
+from zlocus.io import vertical
 from zlocus.io.raster import write_cog
-from zlocus.io.reference import read_area, read_dem, read_geobox
+from zlocus.io.reference import dem_datum, read_area, read_dem, read_geobox
+from zlocus.io.vertical import vertical_datum
 
 GRID = GeoBox.from_bbox((690000, 4790000, 690400, 4790300), crs="EPSG:32631", resolution=2)
 DEGREE_PLANE_M = 0.02
@@ -99,23 +101,37 @@ def test_nodata_of_a_dem_is_nan_and_not_mixed_in(tmp_path):
     assert hole[in_hole].all()
 
 
-def test_geoid_is_added(tmp_path):
+def test_heights_above_a_geoid_become_ellipsoidal(tmp_path):
     path, _ = degree_plane(tmp_path / "dem.tif")
     geoid, _ = degree_plane(tmp_path / "geoid.tif", slope_lon=10.0, slope_lat=0.0)
     lon, _ = geographic_centres()
-    difference = read_dem(path, GRID, geoid) - read_dem(path, GRID)
+    difference = read_dem(path, GRID, vertical_datum(str(geoid))) - read_dem(path, GRID)
     np.testing.assert_allclose(difference, 10 * lon, atol=DEGREE_PLANE_M)
 
 
-def test_dem_that_says_its_heights_are_above_a_geoid(tmp_path):
+def test_dem_that_says_its_heights_are_above_a_geoid(tmp_path, monkeypatch):
+    """Its grid is used where it is there; else heights are no guess, unless the user says what they are above."""
+    monkeypatch.setattr(vertical, "proj_folders", lambda: [tmp_path])
     path, _ = degree_plane(tmp_path / "dem.tif", crs="EPSG:4326+5773")
-    with pytest.warns(ZlocusWarning, match="EGM96 height heights by its CRS"):
+    with pytest.raises(ConfigError, match=r"dem\.tif has EGM96 heights by its CRS, which needs .*us_nga_egm96"):
         read_dem(path, GRID)
-    geoid, _ = degree_plane(tmp_path / "geoid.tif", slope_lon=0.0, slope_lat=1.0)
-    read_dem(path, GRID, geoid)
+    plain, lon = read_dem(path, GRID, dem_datum(path, "ellipsoid")), geographic_centres()[0]
+    geoid, _ = degree_plane(tmp_path / "us_nga_egm96_15.tif", slope_lon=10.0, slope_lat=0.0)
+    assert dem_datum(path).files == (geoid,)
+    np.testing.assert_allclose(read_dem(path, GRID) - plain, 10 * lon, atol=DEGREE_PLANE_M)
     feet, _ = degree_plane(tmp_path / "feet.tif", crs="EPSG:4326+6360")
-    with pytest.raises(InputError, match=r"heights of .*feet\.tif are in US survey foot"):
-        read_dem(feet, GRID)
+    for datum in (None, dem_datum(path)):
+        with pytest.raises(InputError, match=r"heights of .*feet\.tif are in US survey foot"):
+            read_dem(feet, GRID, datum)
+
+
+def test_national_heights_of_the_aerial_block(shared_data):
+    """EGM2008 without a code of its own, in a map without one."""
+    dem = shared_data / "aerial_ngi_dmc" / "reference" / "dem_24m_egm2008.tif"
+    if not any((folder / "us_nga_egm08_25.tif").is_file() for folder in vertical.proj_folders()):
+        with pytest.raises(ConfigError, match=r"has EGM2008 heights by its CRS, which needs .*us_nga_egm08_25\.tif"):
+            dem_datum(dem)
+    assert dem_datum(dem, "ellipsoid").geoid is None
 
 
 def test_dem_elsewhere(tmp_path):
@@ -135,7 +151,8 @@ def test_srtm_under_the_ventoux_pair(shared_data):
     srtm = reference / "srtm3_v2_egm96_heights.tif"
     assert read_dem(srtm, grid)[0, 0] == pytest.approx(464.7, abs=0.2)
     # EGM96 is +50.9 m here (README of the data).
-    assert read_dem(srtm, grid, reference / "geoid_egm96_15min.tif")[0, 0] == pytest.approx(464.7 + 50.9, abs=0.3)
+    geoid = vertical_datum(str(reference / "geoid_egm96_15min.tif"))
+    assert read_dem(srtm, grid, geoid)[0, 0] == pytest.approx(464.7 + 50.9, abs=0.3)
 
 
 @pytest.mark.parametrize(

@@ -55,9 +55,20 @@ R = TypeVar("R")
 Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")]
 Resolution = Annotated[float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")]
 Crs = Annotated[str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")]
+ABOVE = "ellipsoid|egm96|egm2008|FILE"
+DemVertical = Annotated[
+    str | None, typer.Option(help="What the DEM's heights are above. Default: what its CRS says.", metavar=ABOVE)
+]
+Vertical = Annotated[
+    str, typer.Option(help="What heights are above, --heights too: FILE is a raster of a geoid.", metavar=ABOVE)
+]
 TieHeights = Annotated[
     tuple[float, float] | None,
     typer.Option(help="Range in which ties are looked for, m. Default: found.", metavar="ZMIN ZMAX"),
+]
+SearchedHeights = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Range searched, m. Default: found from tie points.", metavar="ZMIN ZMAX"),
 ]
 Workers = Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")]
@@ -175,19 +186,15 @@ def dsm(
     ] = None,
     area: Annotated[Path | None, typer.Option(help="Polygons to work in.", metavar="VECTOR")] = None,
     mask: Annotated[Path | None, typer.Option(help="Polygons to leave out.", metavar="VECTOR")] = None,
-    heights: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            help="Range searched, m above the ellipsoid. Default: found from tie points.", metavar="ZMIN ZMAX"
-        ),
-    ] = None,
+    heights: SearchedHeights = None,
     dem: Annotated[Path | None, typer.Option(help="Search around the heights of a raster.", metavar="RASTER")] = None,
+    dem_vertical: DemVertical = None,
     reference: Annotated[
         str | None, typer.Option(help="Name of the view that leads; of gc3-sgm, that gives heights.", metavar="VIEW")
     ] = None,
     views: Annotated[str, typer.Option(help="Views used for a cell.", metavar="auto|all")] = "auto",
     method: Annotated[str, typer.Option(help="How heights are found.", metavar="mvll-sgm|mvll|gc3-sgm")] = "mvll-sgm",
-    vertical: Annotated[str, typer.Option(help="Heights are above this.", metavar="ellipsoid")] = "ellipsoid",
+    vertical: Vertical = "ellipsoid",
     fill: Annotated[str, typer.Option(help="What to do with small gaps.", metavar="none|interpolate")] = "none",
     partial: Annotated[
         bool, typer.Option("--partial", help="Count a surface with too few heights as a success.")
@@ -201,8 +208,8 @@ def dsm(
     """Make a surface from images."""
     request = DsmRequest(
         inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, bounds=bounds, like=like, area=area, mask=mask,
-        heights=heights, dem=dem, reference=reference, views=views, method=method, vertical=vertical, fill=fill,
-        partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
+        heights=heights, dem=dem, dem_vertical=dem_vertical, reference=reference, views=views, method=method,
+        vertical=vertical, fill=fill, partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
         products=product_names(maps),
     )  # fmt: skip
     check_output(out, overwrite)
@@ -226,10 +233,8 @@ def cloud(
         typer.Option(help="Name of a view whose pixels get heights; may be repeated. Default: all.", metavar="VIEW"),
     ] = None,
     crs: Crs = None,
-    heights: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Range searched, m. Default: found from tie points.", metavar="ZMIN ZMAX"),
-    ] = None,
+    heights: SearchedHeights = None,
+    vertical: Vertical = "ellipsoid",
     fill: Annotated[
         str, typer.Option(help="What to do with gaps of the height maps.", metavar="none|interpolate")
     ] = "none",
@@ -240,8 +245,8 @@ def cloud(
 ) -> None:
     """Make a coloured point cloud, with a height for every pixel of the images."""
     request = CloudRequest(
-        inputs=tuple(inputs), out=out, references=tuple(reference or ()), crs=crs, heights=heights, fill=fill,
-        partial=partial, workers=workers, overwrite=overwrite,
+        inputs=tuple(inputs), out=out, references=tuple(reference or ()), crs=crs, heights=heights, vertical=vertical,
+        fill=fill, partial=partial, workers=workers, overwrite=overwrite,
     )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)
@@ -298,9 +303,11 @@ def orient(
     control: Annotated[
         Path | None, typer.Option(help="Ground control and check points, a row per image point.", metavar="CSV")
     ] = None,
-    dem: Annotated[
-        Path | None, typer.Option(help="Ellipsoidal heights that the ties should have.", metavar="RASTER")
+    control_vertical: Annotated[
+        str | None, typer.Option(help="What their heights are above. Default: the ellipsoid.", metavar=ABOVE)
     ] = None,
+    dem: Annotated[Path | None, typer.Option(help="Heights that the ties should have.", metavar="RASTER")] = None,
+    dem_vertical: DemVertical = None,
     crs: Crs = None,
     heights: TieHeights = None,
     overwrite: Overwrite = False,
@@ -308,8 +315,9 @@ def orient(
 ) -> None:
     """Correct the cameras of all images jointly, and write them with a report."""
     request = OrientRequest(
-        inputs=tuple(inputs), out=out, control=control, dem=dem, crs=crs, heights=heights, overwrite=overwrite
-    )
+        inputs=tuple(inputs), out=out, control=control, control_vertical=control_vertical, dem=dem,
+        dem_vertical=dem_vertical, crs=crs, heights=heights, overwrite=overwrite,
+    )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)
     from zlocus.orienting import run_orient

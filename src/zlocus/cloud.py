@@ -9,21 +9,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pyproj import CRS
 
 from zlocus.errors import CoverageError
 from zlocus.io.colour import read_colours
 from zlocus.io.config import config_as_dict
 from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
 from zlocus.matching.confirm import ROWS_AT_ONCE
 from zlocus.matching.gc3 import depth_options, is_by_depth
 from zlocus.options import RunConfig
-from zlocus.per_image import Matched, chosen_references, confirmed_images, match_images, orient_scene, settle_all
-from zlocus.preparing import asked_crs, made_folder, what_was_applied
+from zlocus.per_image import (
+    Matched,
+    OrientedScene,
+    chosen_references,
+    confirmed_images,
+    match_images,
+    orient_scene,
+    settle_all,
+)
+from zlocus.preparing import AREA_MARGIN, asked_crs, made_folder, what_was_applied, with_heights
 from zlocus.products.cloud import PointCloud, file_names, write_map
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import CloudRequest
-from zlocus.scene import Scene, View
+from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.rays import DepthRays
 from zlocus.surface.behind import filled_from_behind
 from zlocus.surface.reasons import Quality
@@ -58,21 +68,24 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     with watch.stage("open"), progress.stage("Opening images"):
         scene = open_scene(request.inputs, asked_crs(request.crs))
         scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+        vertical = vertical_datum(request.vertical)
+        scene = with_heights(scene, request.heights, vertical)
         references = chosen_references(scene, request.references)
     options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
-        ready = orient_scene(scene, request.heights or scene.heights, config.orientation, progress)
+        ready = orient_scene(scene, scene.heights, config.orientation, progress)
         progress.note(what_was_applied(ready.orientation))
     with watch.stage("settle"):
         settled, options = settle_all(ready, references, options)
+        check_geoid(vertical, ready)
     with watch.stage("match"):
         matched = match_images(settled, options, True, request.workers, progress)
     with watch.stage("match back"):
         matched = confirmed_images(matched, progress)
     with watch.stage("write"), made_folder(request.out), progress.stage("Writing", len(matched)) as stage:
-        n_points = write_cloud(request.out, matched, scene)
+        n_points = write_cloud(request.out, matched, scene, vertical)
         for one, name in zip(matched, file_names(references), strict=True):
-            write_maps(request.out, name, one, request.fill)
+            write_maps(request.out, name, one, request.fill, scene.crs, vertical)
             stage.advance()
     n_seen = sum(int(((m.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) == 0).sum()) for m in matched)
     coverage = n_points / n_seen if n_seen else 0.0
@@ -82,9 +95,10 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         {
             "config": {"request": request_record(request), "options": config_as_dict(options)},
             "versions": versions_record(),
-            "inputs": inputs_record(dict.fromkeys([*request.inputs, *files])),
+            "inputs": inputs_record(dict.fromkeys([*request.inputs, *files, *vertical.files])),
             "stages": watch.stages,
             "orientation": ready.orientation.as_dict(),
+            "vertical": vertical.as_dict(),
             "images": {name: image_record(m) for name, m in zip(references, matched, strict=True)},
             "points": n_points,
             "coverage": round(coverage, 6),
@@ -99,18 +113,28 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     return CloudResult(request.out, n_points, coverage)
 
 
-def write_cloud(out: Path, matched: Sequence[Matched], scene: Scene) -> int:
-    """All points with their colours; their number."""
+def check_geoid(vertical: VerticalDatum, ready: OrientedScene) -> None:
+    """Refuse, before the long work, a geoid that does not cover the tie points and a little beside them."""
+    xy = ready.ties[ready.trusted, :2]
+    if vertical.geoid is not None and len(xy):
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        (west, south), (east, north) = low - AREA_MARGIN * (high - low), high + AREA_MARGIN * (high - low)
+        vertical.check_covers((west, south, east, north), ready.scene.crs)
+
+
+def write_cloud(out: Path, matched: Sequence[Matched], scene: Scene, vertical: VerticalDatum = ELLIPSOIDAL) -> int:
+    """All points with their colours, their heights above what is asked for; their number."""
     n_points = sum(int(np.isfinite(m.image.height).sum()) for m in matched)
     white = white_level(scene.views)
     number = {view.name: k for k, view in enumerate(scene.views, 1)}
-    with PointCloud(out, n_points, scene.crs) as cloud:
+    with PointCloud(out, n_points, vertical.compound(scene.crs)) as cloud:
         for one in matched:
             view, height = one.image.space.reference, one.image.height
             for row, rows in strips(len(height)):
                 known = np.isfinite(height[row : row + rows])
                 if known.any():
                     xyz = one.image.space.ground(row, height[row : row + rows])[known]
+                    xyz[:, 2] -= vertical.undulation(xyz[:, :2], scene.crs)
                     share = np.clip(read_colours(view.path, row, rows)[known] / white, 0.0, 1.0)
                     cloud.write(number[view.name], xyz, np.rint(share * 65535.0).astype(np.uint16))
     return n_points
@@ -136,7 +160,7 @@ def white_level(views: Sequence[View]) -> float:
     return max(float(np.percentile(known, WHITE_PERCENT)), 1e-6) if len(known) else 1.0
 
 
-def write_maps(out: Path, name: str, one: Matched, fill: str) -> None:
+def write_maps(out: Path, name: str, one: Matched, fill: str, crs: CRS, vertical: VerticalDatum = ELLIPSOIDAL) -> None:
     """NAME_height.tif, NAME_quality.tif and, for frame cameras, NAME_depth.tif."""
     space, height, quality = one.image.space, one.image.height, one.quality
     if fill == "interpolate":
@@ -146,8 +170,12 @@ def write_maps(out: Path, name: str, one: Matched, fill: str) -> None:
         height = whole
     z = np.empty(height.shape, np.float32)
     for row, rows in strips(len(height)):
-        z[row : row + rows] = space.ground(row, height[row : row + rows])[..., 2]
-    write_map(out / f"{name}_height.tif", z, "height of what the pixel shows", "m")
+        xyz = space.ground(row, height[row : row + rows])
+        known = np.isfinite(xyz).all(axis=-1)
+        xyz[known, 2] -= vertical.undulation(xyz[known, :2], crs)
+        z[row : row + rows] = xyz[..., 2]
+    above = "" if is_local(crs) else f" above {vertical.surface}"
+    write_map(out / f"{name}_height.tif", z, f"height{above} of what the pixel shows", "m")
     if isinstance(space.rays, DepthRays):
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(height > 0, np.float32(space.rays.scale) / height, np.float32(np.nan))

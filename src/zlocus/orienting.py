@@ -12,10 +12,11 @@ from zlocus.errors import GeometryError
 from zlocus.grid import grid_from_bounds
 from zlocus.io.config import config_as_dict
 from zlocus.io.control import read_control
-from zlocus.io.reference import read_dem
+from zlocus.io.reference import dem_datum, read_dem
 from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
 from zlocus.options import OrientationOptions, RunConfig
-from zlocus.orientation.control import TerrainHeights
+from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import Orientation
 from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
 from zlocus.products.cameras import SCENE, write_cameras
@@ -48,8 +49,8 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         heights = request.heights or scene.heights
         if not is_local(scene.crs) or heights is not None:
             check_overlap(scene, possible_heights(scene, heights))
-        control = None if request.control is None else read_control(request.control, scene.views)
-        terrain = None if request.dem is None else terrain_heights(request.dem, scene, heights)
+        control = None if request.control is None else control_points(request, scene)
+        terrain = None if request.dem is None else terrain_heights(request.dem, scene, heights, request.dem_vertical)
     with watch.stage("orient"):
         options = alone(config.orientation, request.cameras)
         found = oriented(scene, options, heights, progress, control, terrain)
@@ -86,8 +87,34 @@ def check_ties(found: Orientation, scene: Scene) -> None:
         )
 
 
-def terrain_heights(dem: Path, scene: Scene, heights: tuple[float, float] | None) -> TerrainHeights:
-    """Heights of a DEM over all ground that the images may see.
+def control_datum(request: OrientRequest) -> VerticalDatum:
+    """What the heights of control points are above."""
+    return vertical_datum(request.control_vertical or ELLIPSOID, "--control-vertical")
+
+
+def control_points(request: OrientRequest, scene: Scene) -> GroundControl:
+    """The control points of the request, with ellipsoidal heights.
+
+    Raises
+    ------
+    GeometryError
+        Where the frame is local, and nothing in it is above a geoid.
+    InputError
+        See `read_control`.
+    """
+    assert request.control is not None, "callers make sure"
+    vertical = control_datum(request)
+    if vertical.geoid is not None and is_local(scene.crs):
+        raise GeometryError(
+            f"The scene's frame is local, where no place is above {vertical.surface}. Leave --control-vertical out."
+        )
+    return read_control(request.control, scene.views, vertical, scene.crs)
+
+
+def terrain_heights(
+    dem: Path, scene: Scene, heights: tuple[float, float] | None, vertical: str | None = None
+) -> TerrainHeights:
+    """Ellipsoidal heights of a DEM over all ground that the images may see. vertical : see `dem_datum`.
 
     Raises
     ------
@@ -104,7 +131,7 @@ def terrain_heights(dem: Path, scene: Scene, heights: tuple[float, float] | None
     cell = TERRAIN_PX * float(np.nanmedian([ground_sample_distance(view, middle) for view in scene.views]))
     (west, south), (east, north) = outlines.min(axis=0), outlines.max(axis=0)
     geobox = grid_from_bounds((west, south, east, north), cell, scene.crs).geobox
-    z = read_dem(dem, geobox).astype(float)
+    z = read_dem(dem, geobox, dem_datum(dem, vertical)).astype(float)
     first = geobox.transform * (0.5, 0.5)
     return TerrainHeights(z, float(first[0]), float(first[1]), cell)
 
@@ -114,6 +141,9 @@ def run_record(request: OrientRequest, config: RunConfig, scene: Scene, watch: S
     asked = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
     asked["inputs"] = [str(path) for path in request.inputs]
     extra = [path for path in (request.control, request.dem) if path is not None]
+    extra += control_datum(request).files
+    if request.dem is not None:
+        extra += dem_datum(request.dem, request.dem_vertical).files
     files = [path for view in scene.views for path in (view.path, *view.camera_files)]
     return {
         "config": {"request": asked, "options": config_as_dict(config)},

@@ -21,8 +21,9 @@ from zlocus.execution.plan import Tile, plan_tiles, tile_memory_bytes
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.io.config import config_as_dict
-from zlocus.io.reference import cells_inside, read_dem, read_geobox, read_polygons
+from zlocus.io.reference import cells_inside, dem_datum, read_dem, read_geobox, read_polygons
 from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import VerticalDatum, vertical_datum
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
@@ -37,6 +38,7 @@ from zlocus.preparing import (
     oriented,
     possible_heights,
     what_was_applied,
+    with_heights,
 )
 from zlocus.products.maps import check_maps, make_maps, remove_maps
 from zlocus.products.picture import picture_beside_truth
@@ -118,12 +120,11 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     watch = Stopwatch()
     check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):
-        like = None if request.like is None else read_geobox(request.like)
-        scene = _opened(request, like)
+        like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
+        scene = _opened(request, like, vertical)
         polygons = _area_polygons(request, scene.crs)
     with watch.stage("orient"):
-        heights = request.heights or scene.heights
-        orientation = oriented(scene, config.orientation, heights, progress)
+        orientation = oriented(scene, config.orientation, scene.heights, progress)
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
         corrected = orientation.apply(scene)
@@ -136,14 +137,15 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         settled = _with_dem(request, settled, scene.crs, config)
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
         workers = _workers(request, settled, config)
-        _check_area(grid, settled)
+        vertical.check_covers(_area_matched(grid, settled), scene.crs)
         _check_polygons(request, grid, settled, polygons[0])
     tally = Tally()
     out, dtype = request.out, settled.views[0].image.dtype
+    has_colours = settled.has_colours and request.method != "gc3-sgm"
     with (
         watch.stage("match"),
         made_folder(out),
-        SurfaceRasters(out, grid.geobox, dtype, settled.has_colours and request.method != "gc3-sgm") as rasters,
+        SurfaceRasters(out, grid.geobox, dtype, vertical, has_colours) as rasters,
     ):
         match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
@@ -151,7 +153,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     with watch.stage("points"):
         _write_points(out, orientation, corrected, tally, settled)
     with watch.stage("record"):
-        inputs = inputs_record(_files(request, scene))
+        inputs = inputs_record(_files(request, scene, vertical))
     record = {
         "config": {"request": _request_record(request), "options": config_as_dict(config)},
         "created": now(),
@@ -161,6 +163,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         "stages": watch.stages,
         "orientation": orientation.as_dict(),
         "grid": _grid_record(grid, scene.crs),
+        "vertical": vertical.as_dict(),
         "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
         **tally.as_dict(),
     }
@@ -186,13 +189,15 @@ def _write_maps(
     write_record(request.out / "run.json", record)
 
 
-def _opened(request: DsmRequest, like: GeoBox | None) -> Scene:
-    """The scene, its views by name, so that the order of the inputs changes nothing."""
+def _opened(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
+    """The scene, its views by name, so that the order of the inputs changes nothing, with the heights asked for."""
     crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
     scene = open_scene(request.inputs, crs)
     if is_local(scene.crs):
         _check_local(request)
-    check_overlap(scene, possible_heights(scene, request.heights or scene.heights))
+    bounds = request.bounds if like is None else like.boundingbox.bbox
+    scene = with_heights(scene, request.heights, vertical, bounds)
+    check_overlap(scene, possible_heights(scene, scene.heights))
     return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
 
 
@@ -305,14 +310,15 @@ def _searched_heights(
     request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
 ) -> tuple[float, float]:
     """Height range of the search: as asked for, else from the DEM, else from the ties."""
-    if asked := request.heights or scene.heights:
-        return heights_asked_for(scene, asked, progress)
+    if scene.heights:
+        return heights_asked_for(scene, scene.heights, progress)
     if request.dem is None:
         return heights_of_ties(scene, orientation, config.orientation)
-    z = possible_heights(scene, request.heights or scene.heights)
+    z = possible_heights(scene, None)
     bounds = shared_ground(scene, (z[0], z[-1]))
     cell = median_ground_pixel(scene, sum(z) / len(z)) * 16
-    heights = read_dem(request.dem, grid_from_bounds(bounds, cell, scene.crs).geobox)
+    geobox = grid_from_bounds(bounds, cell, scene.crs).geobox
+    heights = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
     if not np.isfinite(heights).any():
         raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
@@ -326,7 +332,8 @@ def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunCon
         return settled
     level = settled.levels - 1
     window = settled.seen.at_level(level, 0)
-    dem = read_dem(request.dem, GeoBox((window.rows, window.cols), settled.transform(window, level), crs))
+    geobox = GeoBox((window.rows, window.cols), settled.transform(window, level), crs)
+    dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
     limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
     return replace(settled, prior=limits)
 
@@ -346,11 +353,14 @@ def _grid(
     return grid_from_bounds(bounds, cell, scene.crs)
 
 
-def _check_area(grid: Grid, settled: MatchScene) -> None:
-    """Refuse an area that no two images see."""
+def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:
+    """Bounds of the area asked for that two images see; refuses one without any."""
     shared = grid.window.within(settled.seen)
     if shared.rows and shared.cols:
-        return
+        (west, north), (east, south) = (
+            settled.transform(shared, 0) * corner for corner in ((0, 0), (shared.cols, shared.rows))
+        )
+        return west, south, east, north
     west, north = settled.transform(settled.seen, 0) * (0, 0)
     east, south = settled.transform(settled.seen, 0) * (settled.seen.cols, settled.seen.rows)
     asked = grid.geobox.extent.boundingbox
@@ -434,9 +444,12 @@ def _lattice_record(settled: MatchScene) -> dict[str, Any]:
     return {"step_m": settled.step_m, "levels": settled.levels, "leading_view": settled.views[0].name}
 
 
-def _files(request: DsmRequest, scene: Scene) -> list[Path]:
+def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[Path]:
     """Every file whose content the result depends on."""
     extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
+    extra += vertical.files
+    if request.dem is not None:
+        extra += dem_datum(request.dem, request.dem_vertical).files
     listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
     return list(dict.fromkeys(listed))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, GeometryError, OutputError
 from zlocus.io.crs import checked_crs
+from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.setup import shared_ground
 from zlocus.options import OrientationOptions
 from zlocus.orientation.control import GroundControl, TerrainHeights
@@ -64,6 +66,37 @@ def possible_heights(scene: Scene, given: tuple[float, float] | None) -> list[fl
         return [float(z) for z in np.linspace(*heights_below(scene), HEIGHT_SAMPLES)]
     low, high = max(b[0] for b in bounds), min(b[1] for b in bounds)
     return [float(z) for z in np.linspace(low, max(high, low), HEIGHT_SAMPLES)]
+
+
+def with_heights(
+    scene: Scene,
+    asked: tuple[float, float] | None,
+    vertical: VerticalDatum,
+    bounds: Sequence[float] | None = None,
+) -> Scene:
+    """The scene with the ellipsoidal heights of a request, where it has some, to be searched.
+
+    asked : (zmin, zmax) m above `vertical`; what is searched holds them wherever two views see the same ground, in
+    `bounds` (None: in the area that the scene asks for, where it does).
+
+    Raises
+    ------
+    GeometryError
+        Where the frame is local, and nothing in it is above a geoid.
+    """
+    if vertical.geoid is not None and is_local(scene.crs):
+        raise GeometryError(
+            f"The scene's frame is local, where no place is above {vertical.surface}. Leave --vertical out."
+        )
+    if asked is None or vertical.geoid is None:
+        return scene if asked is None else replace(scene, heights=asked)
+    area = shared_ground(scene, asked)
+    if inside := bounds or scene.bounds:
+        west, south = max(area[0], inside[0]), max(area[1], inside[1])
+        east, north = min(area[2], inside[2]), min(area[3], inside[3])
+        area = (west, south, east, north) if west < east and south < north else area
+    low, high = vertical.span(area, scene.crs)
+    return replace(scene, heights=(asked[0] + low, asked[1] + high))
 
 
 def heights_below(scene: Scene) -> tuple[float, float]:

@@ -14,7 +14,8 @@ SCENE_SUFFIXES = (".yaml", ".yml")
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
-VERTICALS = ("ellipsoid",)
+# Or the file of a geoid.
+VERTICALS = ("ellipsoid", "egm96", "egm2008")
 FILLS = ("none", "interpolate")
 PRODUCTS = ("hillshade", "contours", "dtm", "laz")
 # The first thing anyone looks at, at the cost of a second per million cells; the others take a choice.
@@ -29,8 +30,10 @@ class DsmRequest:
     inputs : two or more images with a camera, or one scene file.
     resolution : cell size, m. crs : grid's CRS. bounds : (xmin, ymin, xmax, ymax) in the grid's CRS, m.
     like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
-    heights : (zmin, zmax), m above the ellipsoid. dem : raster the heights are searched around.
+    heights : (zmin, zmax), m, above what `vertical` says. dem : raster the heights are searched around; dem_vertical :
+    what its heights are above, as `vertical`, None is what its CRS says.
     reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
+    vertical : what the heights written are above: one of `VERTICALS`, or the file of a geoid.
     memory_gb : most memory the tiles may take together, GB.
     partial : a surface with too few heights counts as a success. products : maps made of the surface, see `PRODUCTS`.
 
@@ -52,6 +55,7 @@ class DsmRequest:
     mask: Path | None = None
     heights: tuple[float, float] | None = None
     dem: Path | None = None
+    dem_vertical: str | None = None
     reference: str | None = None
     views: str = "auto"
     method: str = "mvll-sgm"
@@ -78,10 +82,11 @@ class DsmRequest:
         for name, value, choices in (
             ("views", self.views, VIEWS),
             ("method", self.method, METHODS),
-            ("vertical", self.vertical, VERTICALS),
             ("fill", self.fill, FILLS),
         ):
             _check_choice(name, value, choices)
+        _check_vertical("vertical", self.vertical)
+        _check_vertical_of("dem", self.dem, self.dem_vertical)
         _check_workers(self.workers)
         _check_positive("--memory", self.memory_gb, "GB")
 
@@ -109,8 +114,8 @@ class DsmRequest:
 class CloudRequest:
     """A point cloud to be made. `None` means: not given, to be found by the run.
 
-    inputs, crs, heights, partial, workers, overwrite : as in `DsmRequest`. references : names of the views whose pixels
-    get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
+    inputs, crs, heights, vertical, partial, workers, overwrite : as in `DsmRequest`. references : names of the views
+    whose pixels get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
 
     Raises
     ------
@@ -129,11 +134,13 @@ class CloudRequest:
     partial: bool = False
     workers: int = 1
     overwrite: bool = False
+    vertical: str = "ellipsoid"
 
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         _check_heights(self.heights)
         _check_choice("fill", self.fill, FILLS)
+        _check_vertical("vertical", self.vertical)
         _check_workers(self.workers)
         for name in self.references:
             if self.references.count(name) > 1:
@@ -183,8 +190,9 @@ class CurvesRequest:
 class OrientRequest:
     """Tie points to be found, and with `cameras` the cameras to be corrected. `None` means: not given.
 
-    inputs, crs, heights, overwrite : as in `DsmRequest`. control : table of ground control and check points; dem :
-    raster of ellipsoidal heights that the ties should have.
+    inputs, crs, heights (above the ellipsoid), overwrite : as in `DsmRequest`. control : table of ground control and
+    check points; dem : raster of heights that the ties should have. control_vertical, dem_vertical : what their heights
+    are above, as in `DsmRequest`; None is the ellipsoid of control, and of a DEM what its CRS says.
 
     Raises
     ------
@@ -198,7 +206,9 @@ class OrientRequest:
     out: Path
     cameras: bool = True
     control: Path | None = None
+    control_vertical: str | None = None
     dem: Path | None = None
+    dem_vertical: str | None = None
     crs: str | None = None
     heights: tuple[float, float] | None = None
     overwrite: bool = False
@@ -206,6 +216,8 @@ class OrientRequest:
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         _check_heights(self.heights)
+        _check_vertical_of("control", self.control, self.control_vertical)
+        _check_vertical_of("dem", self.dem, self.dem_vertical)
 
 
 @dataclass(frozen=True)
@@ -368,6 +380,22 @@ def _check_heights(heights: tuple[float, float] | None) -> None:
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ConfigError(f"--{name} {value} is not known; choose from {', '.join(choices)}.")
+
+
+def _check_vertical(name: str, value: str) -> None:
+    if value not in VERTICALS and not Path(value).is_file():
+        raise ConfigError(
+            f"--{name} {value} is neither {', '.join(VERTICALS)} nor the file of a geoid. Check the name."
+        )
+
+
+def _check_vertical_of(name: str, of: Path | None, value: str | None) -> None:
+    """What the heights of a file are above, which makes sense with the file only."""
+    if value is None:
+        return
+    if of is None:
+        raise ConfigError(f"--{name}-vertical {value} is given without --{name}. Give both, or leave it out.")
+    _check_vertical(f"{name}-vertical", value)
 
 
 def _check_workers(workers: int) -> None:

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from pyproj import CRS
 
 from zlocus.errors import InputError
 from zlocus.io.number_table import NumberTable, read_numbers
+from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.orientation.control import GroundControl
 from zlocus.orientation.triangulate import Observations
 from zlocus.scene import View
@@ -21,17 +23,20 @@ WORDS = ("name", "role", "image")
 CONTROL, CHECK = "control", "check"
 
 
-def read_control(path: Path, views: Sequence[View]) -> GroundControl:
+def read_control(
+    path: Path, views: Sequence[View], vertical: VerticalDatum = ELLIPSOIDAL, crs: CRS | None = None
+) -> GroundControl:
     """Control and check points: `name`, `x`, `y`, `z` in the scene's frame, `image`, `column`, `row`, and where given
     `sigma` (m, of each coordinate), `sigma_z` (m, of z alone) and `role` (control or check).
 
-    image : name of a view, or of its file.
+    image : name of a view, or of its file. vertical : what z is above; crs : of x and y, needed above a geoid.
 
     Raises
     ------
     InputError
         For a malformed table, an image that is not in the scene, an image point outside its image or given twice, rows
-        of one point that contradict each other, or a check point in one image only.
+        of one point that contradict each other, a check point in one image only, or a point that the geoid does not
+        cover.
     """
     table = read_numbers(path, WHAT, NUMBERS, WORDS)
     for name in NEEDED:
@@ -52,9 +57,10 @@ def read_control(path: Path, views: Sequence[View]) -> GroundControl:
                 row, f"the point {names[point[row]]} has other coordinates, sigma or role than on line "
                 f"{table.lines[start]}; give all its rows the same",
             )  # fmt: skip
-    found = GroundControl(
-        tuple(map(str, names)), xyz[first], sigma[first], is_check[first], Observations(view, point, xy)
-    )
+    ground = xyz[first]
+    if crs is not None:
+        ground = np.column_stack([ground[:, :2], ground[:, 2] + vertical.undulation(ground[:, :2], crs)])
+    found = GroundControl(tuple(map(str, names)), ground, sigma[first], is_check[first], Observations(view, point, xy))
     alone = found.is_check & (np.bincount(point) < 2)
     if alone.any():
         which = int(np.flatnonzero(alone)[0])

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from pyproj import CRS
-from pyproj.exceptions import ProjError
+from pathlib import Path
+from typing import Any
 
-from zlocus.errors import ConfigError
+import rasterio
+from pyproj import CRS
+from pyproj.exceptions import CRSError, ProjError
+
+from zlocus.errors import ConfigError, InputError
 from zlocus.io.text import shown
 from zlocus.sensors.space import WGS84, between
 
@@ -58,3 +62,31 @@ def utm_zone(lon: float, lat: float) -> CRS:
     """The WGS84 UTM zone of a place (degrees), the 6-degree bands without the exceptions of Norway and Svalbard."""
     zone = int((lon + 180.0) % 360.0 // 6.0) + 1
     return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+
+
+def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:
+    """The CRS of an open raster.
+
+    Raises
+    ------
+    InputError
+        Where it has none, or one that is no place on the Earth.
+    """
+    if source.crs is None:
+        raise InputError(f"{path} has no CRS, so its place on the ground is unknown. Assign one (gdal_edit -a_srs).")
+    return known_crs(source.crs, path)
+
+
+def known_crs(given: Any, path: Path) -> CRS:
+    """A file's CRS, in whatever form pyproj understands; see `raster_crs`."""
+    try:
+        crs = CRS.from_user_input(given)
+    except CRSError as error:
+        raise InputError(
+            f"{path} has a CRS that PROJ does not know: {error}. Assign one (gdal_edit -a_srs)."
+        ) from error
+    if not is_on_earth(crs):
+        raise InputError(
+            f"{path} has the CRS {shown(crs.name)}, which cannot be converted to places on the Earth. Assign another."
+        )
+    return crs

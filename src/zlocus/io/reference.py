@@ -12,16 +12,15 @@ import shapely
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
 from rasterio.enums import Resampling
 from rasterio.features import rasterize
 from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
 
-from zlocus.errors import InputError, ZlocusWarning
-from zlocus.io.crs import checked_crs, is_on_earth
+from zlocus.errors import InputError
+from zlocus.io.crs import checked_crs, known_crs, raster_crs
 from zlocus.io.opening import existing_file, open_raster
-from zlocus.io.text import shown
+from zlocus.io.vertical import VerticalDatum, check_heights, grid_crs, vertical_datum, vertical_datum_of
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200
@@ -40,33 +39,49 @@ def read_geobox(path: Path) -> GeoBox:
         For a CRS that is not projected in metres.
     """
     with open_raster(path, "raster") as source:
-        crs = _crs(source, path)
+        crs = raster_crs(source, path)
         transform = source.transform
         if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
             raise InputError(f"{path} is rotated or not north-up, so it cannot be the grid. Warp it first (gdalwarp).")
         return GeoBox(source.shape, transform, checked_crs(crs).to_string())
 
 
-def read_dem(path: Path, geobox: GeoBox, geoid: Path | None = None) -> NDArray[np.float32]:
-    """Heights of a DEM at the cell centres of a grid, bilinear. (r, c) float32 m, NaN where the DEM has none.
+def read_dem(path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None) -> NDArray[np.float32]:
+    """Ellipsoidal heights of a DEM at the cell centres of a grid, bilinear. (r, c) float32 m, NaN where it has none.
 
-    The DEM's heights are taken as ellipsoidal. geoid : a raster of undulations (m) that is added to them, for a DEM
-    above a geoid.
+    vertical : what the DEM's heights are above, see `dem_datum`; None is what its CRS says.
 
     Raises
     ------
     InputError
-        For a file that is no DEM (no CRS, heights not in metres) or covers no cell of the grid.
+        For a file that is no DEM (no CRS, heights not in metres) or covers no cell of the grid, heights above a geoid
+        that is not known, or a geoid that does not cover the DEM's part of the grid.
+    ConfigError
+        For a geoid of PROJ whose grid is not installed.
     """
     with open_raster(path, "DEM") as source:
-        crs = _crs(source, path)
-        _check_vertical(crs, path, geoid)
-        heights = _resampled(source, geobox)
+        crs = raster_crs(source, path)
+        check_heights(crs, path)
+        heights = _resampled(source, crs.to_2d(), geobox)
     if not np.isfinite(heights).any():
         raise InputError(
             f"The DEM {path} has no height anywhere on the grid ({_extent(geobox)}). Give one that covers it."
         )
-    return heights if geoid is None else heights + read_dem(geoid, geobox)
+    return (vertical or dem_datum(path)).ellipsoidal_of_cells(heights, geobox)
+
+
+def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
+    """What a DEM's heights are above: what is given (see `vertical_datum`), else what its CRS says.
+
+    Raises
+    ------
+    InputError, ConfigError
+        See `vertical_datum` and `vertical_datum_of`.
+    """
+    if given is not None:
+        return vertical_datum(given, "--dem-vertical")
+    with open_raster(path, "DEM") as source:
+        return vertical_datum_of(raster_crs(source, path), path, "--dem-vertical")
 
 
 def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
@@ -109,7 +124,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
             f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
         )
     polygons = shapely.segmentize(polygons, largest / EDGE_PIECES)
-    transformer = Transformer.from_crs(_known_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
+    transformer = Transformer.from_crs(known_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
     return np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
 
 
@@ -127,53 +142,16 @@ def read_area(path: Path, geobox: GeoBox) -> NDArray[np.bool_]:
     InputError
         See `read_polygons`.
     """
-    return cells_inside(read_polygons(path, _grid_crs(geobox)), geobox)
+    return cells_inside(read_polygons(path, grid_crs(geobox)), geobox)
 
 
-def _crs(source: rasterio.DatasetReader, path: Path) -> CRS:
-    if source.crs is None:
-        raise InputError(f"{path} has no CRS, so its place on the ground is unknown. Assign one (gdal_edit -a_srs).")
-    return _known_crs(source.crs, path)
+def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDArray[np.float32]:
+    """The first band on a grid, reading only the part under it. (r, c) float32, NaN where there is nothing.
 
-
-def _known_crs(given: Any, path: Path) -> CRS:
-    try:
-        crs = CRS.from_user_input(given)
-    except CRSError as error:
-        raise InputError(
-            f"{path} has a CRS that PROJ does not know: {error}. Assign one (gdal_edit -a_srs)."
-        ) from error
-    if not is_on_earth(crs):
-        raise InputError(
-            f"{path} has the CRS {shown(crs.name)}, which cannot be converted to places on the Earth. Assign another."
-        )
-    return crs
-
-
-def _grid_crs(geobox: GeoBox) -> CRS:
-    assert geobox.crs is not None, "the grid of a run has a CRS"
-    return geobox.crs.proj
-
-
-def _check_vertical(crs: CRS, path: Path, geoid: Path | None) -> None:
-    """Refuse heights that are not in metres; warn where the file says that they are above a geoid and none is given."""
-    vertical = [part for part in crs.sub_crs_list if part.is_vertical]
-    if not vertical:
-        return
-    if abs(vertical[0].axis_info[0].unit_conversion_factor - 1.0) > 1e-9:
-        raise InputError(f"The heights of {path} are in {vertical[0].axis_info[0].unit_name}. Convert them to metres.")
-    if geoid is None:
-        warnings.warn(
-            f"{path} has {vertical[0].name} heights by its CRS, but they are taken as ellipsoidal. Give a geoid.",
-            ZlocusWarning,
-            stacklevel=3,
-        )
-
-
-def _resampled(source: rasterio.DatasetReader, geobox: GeoBox) -> NDArray[np.float32]:
-    """The first band on a grid, reading only the part under it. (r, c) float32, NaN where there is nothing."""
+    crs : of the raster, without heights, which GDAL would try to convert.
+    """
     out = np.full(tuple(geobox.shape), np.nan, np.float32)
-    bounds = transform_bounds(_grid_crs(geobox).to_wkt(), source.crs, *geobox.boundingbox.bbox)
+    bounds = transform_bounds(grid_crs(geobox).to_wkt(), crs.to_wkt(), *geobox.boundingbox.bbox)
     corners = [~source.transform * (x, y) for x in bounds[::2] for y in bounds[1::2]]
     # Two cells more on each side, for the bilinear neighbours.
     low = np.clip(np.floor(np.min(corners, axis=0)).astype(int) - 2, 0, (source.width, source.height))
@@ -183,8 +161,8 @@ def _resampled(source: rasterio.DatasetReader, geobox: GeoBox) -> NDArray[np.flo
     window = Window(low[0], low[1], high[0] - low[0], high[1] - low[1])
     heights = source.read(1, window=window, masked=True, out_dtype=np.float32).filled(np.nan)
     reproject(
-        heights, out, src_transform=source.window_transform(window), src_crs=source.crs, src_nodata=np.nan,
-        dst_transform=geobox.transform, dst_crs=_grid_crs(geobox).to_wkt(), dst_nodata=np.nan,
+        heights, out, src_transform=source.window_transform(window), src_crs=crs.to_wkt(), src_nodata=np.nan,
+        dst_transform=geobox.transform, dst_crs=grid_crs(geobox).to_wkt(), dst_nodata=np.nan,
         resampling=Resampling.bilinear,
     )  # fmt: skip
     return out

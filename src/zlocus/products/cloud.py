@@ -113,9 +113,17 @@ def ply_header(n_points: int, crs: CRS | None) -> str:
     """What stands before the points of a binary PLY file."""
     lines = ["ply", "format binary_little_endian 1.0", f"comment zlocus {__version__}"]
     if crs is not None:
-        lines.append(f"comment crs {crs.to_string().splitlines()[0]}")
+        lines.append(f"comment crs {_plain(crs)}")
     lines += [f"element vertex {n_points}", *(f"property {name}" for name in PLY_PROPERTIES), "end_header", ""]
     return "\n".join(lines)
+
+
+def _plain(crs: CRS) -> str:
+    """A CRS in one line of ASCII: its code, or those of its horizontal and vertical parts, or else WKT."""
+    codes = [part.to_epsg() for part in crs.sub_crs_list or [crs]]
+    if None not in codes:
+        return "EPSG:" + "+".join(map(str, codes))
+    return crs.to_wkt().encode("ascii", "replace").decode("ascii")
 
 
 def write_map(path: Path, values: NDArray[np.generic], description: str, units: str = "") -> None:

@@ -13,6 +13,7 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.errors import OutputError
 from zlocus.io.raster import RasterSink
+from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.surface.surface import Surface
 
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
@@ -21,22 +22,32 @@ GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 class SurfaceRasters:
     """The rasters of a `Surface`, on one grid, complete when the context ends, else not there.
 
-    dsm.tif, sigma.tif, quality.tif, views.tif and ortho.tif.
+    dsm.tif, sigma.tif, quality.tif, views.tif and ortho.tif. vertical : what the heights of dsm.tif are above; its CRS
+    says so, and those of the others, which hold no heights, are horizontal.
     """
 
-    def __init__(self, folder: Path, geobox: GeoBox, ortho_dtype: DTypeLike, has_colours: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        geobox: GeoBox,
+        ortho_dtype: DTypeLike,
+        vertical: VerticalDatum = ELLIPSOIDAL,
+        has_colours: bool = False,
+    ) -> None:
+        self._vertical, self._geobox = vertical, geobox
         self._stack = ExitStack()
         self._ortho_dtype, self._bands = np.dtype(ortho_dtype), COLOURS if has_colours else GREY
         self._paths: list[Path] = []
 
-        def sink(name: str, dtype: DTypeLike, *bands: str, **options: Any) -> RasterSink:
+        def sink(name: str, dtype: DTypeLike, *bands: str, box: GeoBox = geobox, **options: Any) -> RasterSink:
             self._paths.append(folder / name)
-            raster = RasterSink(folder / name, geobox, dtype, descriptions=bands, **options)
+            raster = RasterSink(folder / name, box, dtype, descriptions=bands, **options)
             return self._stack.enter_context(raster)
 
         with ExitStack() as undo:
             undo.push(self._stack)
-            self._dsm = sink("dsm.tif", "float32", "height above the ellipsoid", nodata=float("nan"), units="m")
+            above = f"height above {vertical.surface}"
+            self._dsm = sink("dsm.tif", "float32", above, box=vertical.of_map(geobox), nodata=float("nan"), units="m")
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
             self._quality = sink("quality.tif", "uint16", "quality bit flags")
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
@@ -45,7 +56,7 @@ class SurfaceRasters:
 
     def write(self, row: int, col: int, surface: Surface) -> None:
         """Put a block of cells with its first cell at (row, col) of the grid."""
-        self._dsm.write(row, col, surface.height)
+        self._dsm.write(row, col, self._vertical.of_cells(surface.height, self._geobox, row, col))
         self._sigma.write(row, col, surface.sigma)
         self._quality.write(row, col, surface.quality)
         self._views.write(row, col, surface.views)

@@ -1,0 +1,157 @@
+"""Geoids: rasters of undulations, looked up at points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from affine import Affine
+from pyproj import CRS
+from rasterio.windows import Window
+
+from zlocus.errors import InputError
+from zlocus.io.crs import raster_crs
+from zlocus.io.opening import check_complete, open_raster
+from zlocus.sensors.model import FloatArray
+from zlocus.sensors.space import between
+
+# Between the lowest undulation of the Earth, -107 m, and the highest, 86 m, with room for local geoids.
+MOST_UNDULATION_M = 120.0
+METRES = ("", "m", "metre", "metres", "meter", "meters")
+# A point this close to the outermost posts, of the distance between two, is on them.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class GeoidRaster:
+    """Undulations, m above the ellipsoid, on a grid of posts: the centres of a raster's cells.
+
+    crs : horizontal; transform, shape : of the raster; period : columns once around the Earth, None on a map or where
+    longitude does not run along the rows.
+    """
+
+    path: Path
+    crs: CRS
+    transform: Affine
+    shape: tuple[int, int]
+    period: float | None
+
+    @classmethod
+    def open(cls, path: Path) -> GeoidRaster:
+        """The raster of a file; undulations are read when they are asked for.
+
+        Raises
+        ------
+        InputError
+            For a file that is no raster, has no CRS, no two rows and columns, or values that are not in metres.
+        """
+        with open_raster(path, "geoid") as source:
+            check_complete(source, path)
+            crs = raster_crs(source, path).to_2d()
+            if min(source.shape) < 2:
+                raise InputError(
+                    f"The geoid {path} has {source.height} x {source.width} posts, too few to lie between. Give "
+                    "another raster."
+                )
+            if (unit := (source.units[0] or "").lower()) not in METRES:
+                raise InputError(f"The undulations of {path} are in {unit}. Convert them to metres.")
+            transform, shape = source.transform, (source.height, source.width)
+        turns = crs.is_geographic and transform.b == transform.d == 0
+        around = 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor
+        return cls(Path(path), crs, transform, shape, around / abs(transform.a) if turns else None)
+
+    def undulation(self, xy: FloatArray, crs: CRS) -> FloatArray:
+        """Undulations (n,) m at points (n, 2) of a CRS, x or longitude first; bilinear between the four posts around.
+
+        The same for a point whatever the others are. Memory: of the posts between the outermost points.
+
+        Raises
+        ------
+        InputError
+            Where a point lies outside the posts or beside one without a value, or values are no undulations.
+        """
+        if not len(xy):
+            return np.empty(0)
+        cell = self._cells(xy, crs)
+        last = np.array(self.shape) - 1
+        inside = ((cell >= -ROUNDING) & (cell <= last + ROUNDING)).all(axis=1)
+        if self._is_around:  # between the last post and the first
+            inside = (cell[:, 0] >= -ROUNDING) & (cell[:, 0] <= last[0] + ROUNDING)
+        if not inside.all():
+            raise self._not_covered(xy[np.argmin(inside)], crs)
+        cell[:, 0] = np.clip(cell[:, 0], 0, last[0])
+        cell[:, 1] = np.maximum(cell[:, 1], 0) if self._is_around else np.clip(cell[:, 1], 0, last[1])
+        first = np.minimum(np.floor(cell).astype(int), last - (1, 0 if self._is_around else 1))
+        down, right = (cell - first).T
+        row, col = first.T
+        beside = (col + 1) % self.shape[1]
+        at_row, at_col = int(row.min()), int(min(col.min(), beside.min()))
+        posts = self._posts(at_row, at_col, int(row.max()) + 2, int(max(col.max(), beside.max())) + 1)
+        row, col, beside = row - at_row, col - at_col, beside - at_col
+        upper = posts[row, col] * (1.0 - right) + posts[row, beside] * right
+        lower = posts[row + 1, col] * (1.0 - right) + posts[row + 1, beside] * right
+        found = upper * (1.0 - down) + lower * down
+        self._check(found, xy, crs)
+        return np.asarray(found)
+
+    def spacing_m(self, xy: FloatArray, crs: CRS) -> float:
+        """About how far apart, in units of a projected CRS, the posts lie around a point (2,)."""
+        x, y = between(crs.to_2d(), self.crs).transform(xy[0], xy[1])
+        a, b, _, d, e = self.transform[:5]
+        around = np.array([[x, y], [x + a, y + d], [x + b, y + e]])
+        there = np.column_stack(
+            between(crs.to_2d(), self.crs).transform(around[:, 0], around[:, 1], direction="INVERSE")
+        )
+        return float(np.hypot(*(there[1:] - there[0]).T).min())
+
+    @property
+    def _is_around(self) -> bool:
+        """Whether the last column is followed by the first."""
+        return self.period is not None and abs(self.shape[1] - self.period) < 0.5
+
+    def _cells(self, xy: FloatArray, crs: CRS) -> FloatArray:
+        """(row, col) of points, whole numbers at the posts; longitudes are turned to where the raster has them."""
+        x, y = between(crs.to_2d(), self.crs).transform(xy[:, 0], xy[:, 1])
+        a, b, c, d, e, f = (~self.transform)[:6]
+        row, col = d * x + e * y + f - 0.5, a * x + b * y + c - 0.5
+        if self.period is not None:
+            with np.errstate(invalid="ignore"):  # of points that the CRS cannot express
+                col = np.mod(col + ROUNDING, self.period) - ROUNDING
+        return np.column_stack([row, col])
+
+    def _posts(self, top: int, left: int, bottom: int, right: int) -> FloatArray:
+        """Undulations of posts (r, c) m, NaN where there is none."""
+        with open_raster(self.path, "geoid") as source:
+            window = Window(left, top, right - left, bottom - top)
+            posts = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
+            return np.asarray(posts * source.scales[0] + source.offsets[0])
+
+    def _check(self, found: FloatArray, xy: FloatArray, crs: CRS) -> None:
+        if not np.isfinite(found).all():
+            x, y = xy[np.argmin(np.isfinite(found))]
+            raise InputError(
+                f"The geoid {self.path} has no value (nodata) around {x:.10g}, {y:.10g} ({named_crs(crs)}). Give one "
+                "that is whole where the heights are."
+            )
+        largest = found[np.argmax(np.abs(found))]
+        if abs(largest) > MOST_UNDULATION_M:
+            raise InputError(
+                f"{self.path} is no geoid: it holds {largest:.1f} m, and undulations lie between -107 and 86 m "
+                "everywhere on the Earth. Give a raster of geoid heights above the ellipsoid."
+            )
+
+    def _not_covered(self, xy: FloatArray, crs: CRS) -> InputError:
+        corners = self.transform * (0.5, 0.5), self.transform * (self.shape[1] - 0.5, self.shape[0] - 0.5)
+        (west, east), (south, north) = (sorted(pair) for pair in zip(*corners, strict=True))
+        return InputError(
+            f"The geoid {self.path} does not cover {xy[0]:.10g}, {xy[1]:.10g} ({named_crs(crs)}): its posts lie "
+            f"between {west:.10g} and {east:.10g}, {south:.10g} and {north:.10g} ({named_crs(self.crs)}). "
+            "Give one that covers the area."
+        )
+
+
+def named_crs(crs: CRS) -> str:
+    """A CRS for messages: its code, or else its name."""
+    code = crs.to_2d().to_epsg()
+    return crs.name if code is None else f"EPSG:{code}"

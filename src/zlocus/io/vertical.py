@@ -1,0 +1,265 @@
+"""What heights are above: the ellipsoid, as everywhere inside, or a geoid, where files say or want so.
+
+A height H above a geoid and the ellipsoidal height h of the same point differ by the geoid's undulation N there:
+h = H + N. N is read from a raster and nowhere else: PROJ, asked for a conversion whose grid is missing, may return the
+height as it was.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from pyproj import CRS
+from pyproj.crs import CompoundCRS
+from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
+
+from zlocus.errors import ConfigError, InputError
+from zlocus.io.geoid import GeoidRaster
+from zlocus.sensors.model import FloatArray
+
+ELLIPSOID = "ellipsoid"
+# Points a side at which the posts under an area are looked at.
+LEAST_POINTS, MOST_POINTS = 9, 513
+
+
+@dataclass(frozen=True)
+class KnownGeoid:
+    """A geoid that PROJ has grids of. title : what heights above it are called; epsg : their vertical CRS; datum :
+    name of its datum; grids : files, those of today first."""
+
+    title: str
+    epsg: int
+    datum: str
+    grids: tuple[str, ...]
+
+
+KNOWN = {
+    "egm96": KnownGeoid("EGM96", 5773, "EGM96 geoid", ("us_nga_egm96_15.tif", "egm96_15.gtx")),
+    "egm2008": KnownGeoid("EGM2008", 3855, "EGM2008 geoid", ("us_nga_egm08_25.tif", "egm08_25.gtx")),
+}
+
+
+@dataclass(frozen=True)
+class VerticalDatum:
+    """What heights are above.
+
+    name : ellipsoid, egm96, egm2008, or the file of a geoid; geoid : its undulations, None of the ellipsoid; crs :
+    vertical CRS, None of the ellipsoid.
+    """
+
+    name: str
+    geoid: GeoidRaster | None = None
+    crs: CRS | None = None
+
+    @property
+    def surface(self) -> str:
+        """For descriptions: "the ellipsoid", "the EGM96 geoid"."""
+        if self.geoid is None:
+            return "the ellipsoid"
+        return f"the {KNOWN[self.name].title} geoid" if self.name in KNOWN else f"the geoid of {self.geoid.path.name}"
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that heights above it depend on."""
+        return () if self.geoid is None else (self.geoid.path,)
+
+    def undulation(self, xy: FloatArray, crs: CRS) -> FloatArray:
+        """Its height above the ellipsoid, (n,) m, at points (n, 2) of a CRS; see `GeoidRaster.undulation`."""
+        return np.zeros(len(xy)) if self.geoid is None else self.geoid.undulation(xy, crs)
+
+    def of_cells(
+        self, ellipsoidal: NDArray[np.float32], geobox: GeoBox, row: int = 0, col: int = 0
+    ) -> NDArray[np.float32]:
+        """Heights above it of cells' centres, whose ellipsoidal heights are given.
+
+        ellipsoidal : (r, c) m, NaN where there is none, the first of them at (row, col) of the grid: a cell gets the
+        same height whatever it is given with. Returns (r, c) float32 m.
+        """
+        return self._cells(ellipsoidal, geobox, row, col, -1.0)
+
+    def ellipsoidal_of_cells(self, heights: NDArray[np.float32], geobox: GeoBox) -> NDArray[np.float32]:
+        """Ellipsoidal heights of cells' centres, whose heights above it are given; (r, c) m, see `of_cells`."""
+        return self._cells(heights, geobox, 0, 0, 1.0)
+
+    def _cells(
+        self, heights: NDArray[np.float32], geobox: GeoBox, row: int, col: int, sign: float
+    ) -> NDArray[np.float32]:
+        if self.geoid is None:
+            return heights
+        known = np.isfinite(heights)
+        rows, cols = np.nonzero(known)
+        a, b, c, d, e, f = geobox.transform[:6]
+        across, down = cols + (col + 0.5), rows + (row + 0.5)
+        xy = np.column_stack([a * across + b * down + c, d * across + e * down + f])
+        out = heights.copy()
+        out[known] = heights[known] + sign * self.undulation(xy, grid_crs(geobox))
+        return out
+
+    def check_covers(self, bounds: tuple[float, float, float, float], crs: CRS) -> None:
+        """Look at undulations all over an area (xmin, ymin, xmax, ymax) m of a projected CRS, and about each post
+        there, as far as there are not too many.
+
+        Raises
+        ------
+        InputError
+            See `GeoidRaster.undulation`.
+        """
+        self.span(bounds, crs)
+
+    def span(self, bounds: tuple[float, float, float, float], crs: CRS) -> tuple[float, float]:
+        """Lowest and highest undulation of an area, m; see `check_covers`."""
+        if self.geoid is None:
+            return 0.0, 0.0
+        xmin, ymin, xmax, ymax = bounds
+        middle = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2])
+        step = self.geoid.spacing_m(middle, crs) / 2
+        n_x, n_y = (
+            int(np.clip(np.ceil(size / step) + 1, LEAST_POINTS, MOST_POINTS)) if np.isfinite(step) else LEAST_POINTS
+            for size in (xmax - xmin, ymax - ymin)
+        )
+        x, y = np.meshgrid(np.linspace(xmin, xmax, n_x), np.linspace(ymin, ymax, n_y))
+        found = self.undulation(np.column_stack([x.ravel(), y.ravel()]), crs)
+        return float(found.min()), float(found.max())
+
+    def compound(self, horizontal: CRS) -> CRS:
+        """The CRS of heights on a map: horizontal and vertical.
+
+        Ellipsoidal heights keep the horizontal one: GeoTIFF has no projected CRS with ellipsoidal heights; GDAL (3.10)
+        puts such a one into a file beside the raster, which then has none of its own.
+        """
+        if self.crs is None:
+            return horizontal
+        flat = horizontal.to_2d()
+        parts = CompoundCRS(name=f"{flat.name} + {self.crs.name}", components=[flat, self.crs])
+        return CRS.from_wkt(parts.to_wkt())
+
+    def of_map(self, geobox: GeoBox) -> GeoBox:
+        """The same grid with the CRS of heights on it."""
+        if self.crs is None:
+            return geobox
+        return GeoBox(geobox.shape, geobox.transform, self.compound(grid_crs(geobox)))
+
+    def as_dict(self) -> dict[str, Any]:
+        """As run.json has it."""
+        record: dict[str, Any] = {"heights_above": self.surface}
+        if self.crs is not None and self.geoid is not None:
+            code = self.crs.to_epsg()
+            record |= {"crs": self.crs.name if code is None else f"EPSG:{code}", "geoid": str(self.geoid.path)}
+        return record
+
+
+ELLIPSOIDAL = VerticalDatum(ELLIPSOID)
+
+
+def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
+    """What `given` names: ellipsoid, egm96, egm2008, or the file of a geoid. option : for messages.
+
+    Raises
+    ------
+    ConfigError
+        For a geoid of PROJ whose grid is not installed.
+    InputError
+        For a file that is no geoid; see `GeoidRaster.open`.
+    """
+    if given == ELLIPSOID:
+        return ELLIPSOIDAL
+    if given in KNOWN:
+        return _installed(given, f"{option} {given}", f"{option} FILE")
+    geoid = GeoidRaster.open(Path(given))
+    return VerticalDatum(given, geoid, _named(geoid.path))
+
+
+def vertical_datum_of(crs: CRS, path: Path, option: str) -> VerticalDatum:
+    """What the heights of a file are above by its CRS: the ellipsoid where that has no vertical part.
+
+    option : that says it instead, for messages.
+
+    Raises
+    ------
+    InputError
+        For heights above anything that is not known here.
+    ConfigError
+        For a geoid of PROJ whose grid is not installed.
+    """
+    vertical = _vertical_part(crs)
+    if vertical is None:
+        return ELLIPSOIDAL
+    for name, known in KNOWN.items():
+        if vertical.to_epsg() == known.epsg or (vertical.datum is not None and vertical.datum.name == known.datum):
+            return _installed(name, f"{path} has {known.title} heights by its CRS, which", f"{option} FILE")
+    raise InputError(
+        f"{path} has heights above something that zlocus has no geoid of ({vertical.name}, by its CRS). Give its geoid "
+        f"with {option} FILE, or {option} ellipsoid if they are ellipsoidal."
+    )
+
+
+def check_heights(crs: CRS, path: Path) -> None:
+    """Refuse heights of a file that are not in metres, or go down, by its CRS.
+
+    Raises
+    ------
+    InputError
+        For such heights.
+    """
+    vertical = _vertical_part(crs)
+    axis = vertical.axis_info[0] if vertical is not None else crs.axis_info[2] if len(crs.axis_info) > 2 else None
+    if axis is None:
+        return
+    if abs(axis.unit_conversion_factor - 1.0) > 1e-9:
+        raise InputError(f"The heights of {path} are in {axis.unit_name}. Convert them to metres.")
+    if axis.direction.lower() != "up":
+        raise InputError(f"The heights of {path} go {axis.direction}, by its CRS. Convert them to heights that go up.")
+
+
+def _vertical_part(crs: CRS) -> CRS | None:
+    return next((part for part in crs.sub_crs_list if part.is_vertical), None)
+
+
+def grid_crs(geobox: GeoBox) -> CRS:
+    """The CRS of a run's grid."""
+    assert geobox.crs is not None, "the grid of a run has a CRS"
+    return CRS.from_user_input(geobox.crs.proj)
+
+
+def proj_folders() -> list[Path]:
+    """Where grids of PROJ may be installed: those of pyproj, of the environment, and of the system's packages."""
+    named = [get_data_dir(), os.environ.get("PROJ_DATA", ""), os.environ.get("PROJ_LIB", "")]
+    listed = [Path(part) for names in named for part in names.split(os.pathsep) if part]
+    shares = [Path(prefix) / "share" / "proj" for prefix in (sys.prefix, "/usr/local", "/usr")]
+    return list(dict.fromkeys([Path(get_user_data_dir()), *listed, *shares]))
+
+
+def _installed(name: str, who: str, instead: str) -> VerticalDatum:
+    """A geoid of PROJ, from its grid on this machine; never from the network."""
+    known = KNOWN[name]
+    folders = proj_folders()
+    for grid in known.grids:
+        for folder in folders:
+            if (folder / grid).is_file():
+                return VerticalDatum(name, GeoidRaster.open(folder / grid), CRS.from_epsg(known.epsg))
+    raise ConfigError(
+        f"{who} needs PROJ's grid {known.grids[0]}, which is not in {', '.join(map(str, folders))}. Get it with "
+        f"`pyproj sync --file {known.grids[0]}` or the package proj-data, or give a geoid raster with {instead}."
+    )
+
+
+def _named(path: Path) -> CRS:
+    """The vertical CRS of heights above the geoid of a file, by its name as far as GeoTIFF can hold it."""
+    name = re.sub(r"[^\w .()+-]", "_", path.name, flags=re.ASCII)
+    axis = {"name": "Gravity-related height", "abbreviation": "H", "direction": "up", "unit": "metre"}
+    return CRS.from_json_dict(
+        {
+            "type": "VerticalCRS",
+            "name": f"height above the geoid of {name}",
+            "datum": {"type": "VerticalReferenceFrame", "name": f"geoid of {name}"},
+            "coordinate_system": {"subtype": "vertical", "axis": [axis]},
+        }
+    )

@@ -1,0 +1,298 @@
+"""Whole runs above a geoid: what is written, what is searched, and what terrain models and control points say."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+from pyproj import CRS, Transformer
+from rasterio.transform import from_origin
+from typer.testing import CliRunner
+
+from geoids import write_geoid
+from joint_scenes import views_of
+from rendered_scenes import CENTRE, HEIGHTS, PART, SMALL_TILES, UTM, read, run
+from zlocus.cli import app
+from zlocus.cloud import run_cloud
+from zlocus.errors import ConfigError, GeometryError, InputError
+from zlocus.evaluation.evaluate import evaluate
+from zlocus.io.control import read_control
+from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import vertical_datum
+from zlocus.options import RunConfig
+from zlocus.orienting import control_points, terrain_heights
+from zlocus.pipeline import run_dsm
+from zlocus.progress import SilentProgress, progress_for
+from zlocus.request import CloudRequest, DsmRequest, OrientRequest
+from zlocus.synthetic.terrain import analytic_height
+
+# Steeper than any geoid, so that a cell's neighbour would be seen: 4 mm over a cell, 1 m over the posts.
+AT_CENTRE_M, EAST_SLOPE, NORTH_SLOPE = 48.0, 8e-3, -4e-3
+POST_M = 100.0
+# float32 heights, of which an undulation is taken.
+FLOAT_M = 2e-5
+ACCEPTED_M = 0.01
+
+
+def undulation(x, y):
+    return AT_CENTRE_M + EAST_SLOPE * (x - CENTRE[0]) + NORTH_SLOPE * (y - CENTRE[1])
+
+
+@pytest.fixture(scope="session")
+def geoid(tmp_path_factory):
+    """A plane on a map, which bilinear interpolation gives back exactly."""
+    west, north = CENTRE[0] - 1000.0, CENTRE[1] + 1000.0
+    at = POST_M * (np.arange(20) + 0.5)
+    posts = undulation(west + at, (north - at)[:, None])
+    path = tmp_path_factory.mktemp("geoid") / "slope.tif"
+    return write_geoid(path, posts, from_origin(west, north, POST_M, POST_M), UTM.to_wkt())
+
+
+def centres(source):
+    col, row = np.meshgrid(np.arange(source.width) + 0.5, np.arange(source.height) + 0.5)
+    return source.transform * (col, row)
+
+
+@pytest.fixture(scope="session")
+def both(images, geoid, tmp_path_factory):
+    """The same surface, ellipsoidal and above the geoid, in other tiles."""
+    folder = tmp_path_factory.mktemp("both")
+    asked = {"heights": None, "bounds": PART}
+    plain = run(images("sine"), folder / "plain", SMALL_TILES, **asked).out
+    return plain, run(images("sine"), folder / "geoid", SMALL_TILES, vertical=str(geoid), **asked).out
+
+
+def test_a_surface_is_the_ellipsoidal_one_less_the_geoid(both):
+    (height, source), (above, its) = (read(out / "dsm.tif") for out in both)
+    assert np.isfinite(height).sum() > 1000
+    np.testing.assert_allclose(above, height - undulation(*centres(source)), rtol=0, atol=FLOAT_M)
+    assert its.transform == source.transform
+    assert its.crs != source.crs
+    for name in ("sigma.tif", "quality.tif", "views.tif", "ortho.tif"):
+        assert (both[0] / name).read_bytes() == (both[1] / name).read_bytes(), name
+
+
+def test_run_json_says_what_heights_are_above(both, geoid):
+    plain, above = (json.loads((out / "run.json").read_text()) for out in both)
+    assert plain["vertical"] == {"heights_above": "the ellipsoid"}
+    name = "height above the geoid of slope.tif"
+    assert above["vertical"] == {"heights_above": "the geoid of slope.tif", "crs": name, "geoid": str(geoid)}
+    assert str(geoid) in [entry["path"] for entry in above["inputs"]]
+    assert above["heights"] == plain["heights"]
+
+
+def test_a_surface_above_a_geoid_is_judged_and_gives_its_grid(both, images, tmp_path):
+    found = evaluate(both[1] / "dsm.tif", both[1] / "dsm.tif", margin_m=0.0).all
+    assert found.median == 0.0
+    assert found.completeness > 0.95
+    again = run(images("sine"), tmp_path / "again", SMALL_TILES, like=both[1] / "dsm.tif", heights=HEIGHTS).out
+    with rasterio.open(again / "dsm.tif") as mine, rasterio.open(both[0] / "dsm.tif") as plain:
+        assert (mine.crs, mine.transform, mine.shape) == (plain.crs, plain.transform, plain.shape)
+
+
+def test_heights_asked_for_are_above_the_same(images, geoid, tmp_path):
+    asked = (HEIGHTS[0] - AT_CENTRE_M, HEIGHTS[1] - AT_CENTRE_M)
+    out = run(images("sine"), tmp_path / "out", SMALL_TILES, heights=asked, bounds=PART, vertical=str(geoid)).out
+    record = json.loads((out / "run.json").read_text())
+    assert record["config"]["request"]["heights"] == list(asked)
+    # The geoid is 0.28 m lower and higher at the corners of the part.
+    corners = [undulation(x, y) - AT_CENTRE_M for x in PART[::2] for y in PART[1::2]]
+    expected = HEIGHTS[0] + min(corners), HEIGHTS[1] + max(corners)
+    assert record["heights"]["range_m"] == pytest.approx(expected, abs=0.01)
+    height, source = read(out / "dsm.tif")
+    x, y = centres(source)
+    truth = analytic_height("sine", x - CENTRE[0], y - CENTRE[1])
+    assert np.nanmedian(height + undulation(x, y) - truth) == pytest.approx(0.0, abs=0.03)
+
+
+def write_dem(path, geoid_too, crs):
+    """The true sine, ellipsoidal or above the geoid."""
+    west, north = CENTRE[0] - 100.0, CENTRE[1] + 100.0
+    at = 2.0 * (np.arange(100) + 0.5)
+    x, y = np.meshgrid(west + at, north - at)
+    z = analytic_height("sine", x - CENTRE[0], y - CENTRE[1]) - (undulation(x, y) if geoid_too else 0.0)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=100, height=100, count=1, dtype="float32", crs=crs,
+        transform=from_origin(west, north, 2.0, 2.0),
+    ) as file:  # fmt: skip
+        file.write(z.astype(np.float32), 1)
+    return path
+
+
+def test_a_terrain_model_above_a_geoid(images, geoid, tmp_path):
+    plain = write_dem(tmp_path / "plain.tif", False, UTM.to_wkt())
+    above = write_dem(tmp_path / "above.tif", True, UTM.to_wkt())
+    scene = open_scene(images("sine").inputs)
+    z = [
+        terrain_heights(dem, scene, HEIGHTS, name).z
+        for dem, name in ((plain, None), (above, str(geoid)), (above, None))
+    ]
+    # Bilinear heights of cells of 8 m, of which the plane is exact.
+    np.testing.assert_allclose(z[1], z[0], rtol=0, atol=1e-3)
+    assert np.nanmedian(z[2] - z[0]) == pytest.approx(-AT_CENTRE_M, abs=0.5)
+    out = run(
+        images("sine"), tmp_path / "out", SMALL_TILES, heights=None, dem=above, dem_vertical=str(geoid), bounds=PART
+    ).out
+    height, source = read(out / "dsm.tif")
+    x, y = centres(source)
+    assert np.nanmax(np.abs(height - analytic_height("sine", x - CENTRE[0], y - CENTRE[1]))) < 0.5
+    assert str(geoid) in [entry["path"] for entry in json.loads((out / "run.json").read_text())["inputs"]]
+
+
+def test_a_terrain_model_whose_geoid_is_missing_is_refused(images, tmp_path, monkeypatch):
+    monkeypatch.setattr("zlocus.io.vertical.proj_folders", lambda: [tmp_path])
+    dem = write_dem(tmp_path / "dem.tif", True, "EPSG:32632+5773")
+    with pytest.raises(ConfigError, match=r"dem\.tif has EGM96 heights by its CRS, which needs .*--dem-vertical FILE"):
+        run(images("sine"), tmp_path / "out", heights=None, dem=dem, bounds=PART)
+    assert not (tmp_path / "out").exists()
+
+
+def test_control_points_above_a_geoid(geoid, tmp_path):
+    x, y = CENTRE[0] + 20.0, CENTRE[1] - 30.0
+    table = tmp_path / "points.csv"
+    table.write_text(
+        f"name,x,y,z,image,column,row\np,{x},{y},5.25,view0,4,5\np,{x},{y},5.25,view1,4,5\nq,{x},{y + 50},6,view0,9,9\n"
+    )
+    views = views_of([None, None], (100, 80))
+    found = read_control(table, views, vertical_datum(str(geoid)), UTM)
+    assert found.names == ("p", "q")
+    expected = [5.25 + undulation(x, y), 6.0 + undulation(x, y + 50)]
+    np.testing.assert_allclose(found.xyz[:, 2], expected, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(found.xyz[:, :2], [[x, y], [x, y + 50]])
+    scene = replace(open_scene_of(views), crs=UTM)
+    request = OrientRequest(inputs=(tmp_path / "scene.yaml",), out=tmp_path, control=table, control_vertical=str(geoid))
+    np.testing.assert_array_equal(control_points(request, scene).xyz, found.xyz)
+    np.testing.assert_array_equal(control_points(replace(request, control_vertical=None), scene).xyz[:, 2], [5.25, 6])
+
+
+def open_scene_of(views):
+    from zlocus.io.crs import local_frame
+    from zlocus.scene import Scene
+
+    return Scene(tuple(views), local_frame())
+
+
+def test_nothing_is_above_a_geoid_in_a_local_frame(geoid, tmp_path, monkeypatch):
+    scene = open_scene_of(views_of([None, None], (100, 80)))
+    monkeypatch.setattr("zlocus.pipeline.open_scene", lambda *_: scene)
+    monkeypatch.setattr("zlocus.cloud.open_scene", lambda *_: scene)
+    inputs, above = (tmp_path / "scene.yaml",), str(geoid)
+    says = r"frame is local, where no place is above the geoid of slope\.tif\. Leave --vertical out"
+    with pytest.raises(GeometryError, match=says):
+        run_dsm(DsmRequest(inputs, tmp_path / "o", vertical=above), RunConfig(), progress_for(io.StringIO()))
+    with pytest.raises(GeometryError, match=says):
+        run_cloud(CloudRequest(inputs, tmp_path / "o", vertical=above), RunConfig(), SilentProgress())
+    request = OrientRequest(inputs, tmp_path / "o", control=tmp_path / "points.csv", control_vertical=above)
+    with pytest.raises(GeometryError, match="Leave --control-vertical out"):
+        control_points(request, scene)
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_geoid_of_another_place_is_refused_before_the_first_tile(images, geoid, tmp_path):
+    away = write_geoid(tmp_path / "away.tif", np.zeros((4, 4), np.float32), from_origin(5, 44, 0.25, 0.25))
+    for asked in (None, HEIGHTS):
+        with pytest.raises(InputError, match=r"away\.tif does not cover 46\d+"):
+            run(images("sine"), tmp_path / "out", SMALL_TILES, heights=asked, bounds=PART, vertical=str(away))
+    with pytest.raises(InputError, match=r"away\.tif does not cover 46\d+"):
+        run_cloud(
+            CloudRequest(images("step").inputs, tmp_path / "out", crs="EPSG:32632", vertical=str(away)),
+            RunConfig(), SilentProgress(),
+        )  # fmt: skip
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cloud_above_a_geoid(images, geoid, tmp_path):
+    found = []
+    for name in ("ellipsoid", str(geoid)):
+        out = tmp_path / str(len(found))
+        request = CloudRequest(
+            images("step").inputs, out, references=("nadir",), crs="EPSG:32632", vertical=name, partial=True
+        )
+        run_cloud(request, RunConfig(), SilentProgress())
+        with rasterio.open(out / "nadir_height.tif") as file:
+            found.append((laspy.read(out / "cloud.laz"), file.read(1), file.descriptions[0]))
+    (plain, plain_map, said), (above, above_map, its) = found
+    assert (said, its) == tuple(
+        f"height above {what} of what the pixel shows" for what in ("the ellipsoid", "the geoid of slope.tif")
+    )
+    xyz = np.asarray(plain.xyz)
+    expected = xyz[:, 2] - undulation(xyz[:, 0], xyz[:, 1])
+    # Both in steps of 1 mm; positions too, over which the plane changes by less.
+    np.testing.assert_allclose(np.asarray(above.xyz)[:, 2], expected, rtol=0, atol=1.1e-3)
+    np.testing.assert_array_equal(np.asarray(above.xyz)[:, :2], xyz[:, :2])
+    known = np.isfinite(plain_map)
+    np.testing.assert_allclose(above_map[known], expected, rtol=0, atol=1.1e-3)
+    crs = above.header.parse_crs()
+    assert crs.to_2d().to_epsg() == 32632
+    assert [part.name for part in crs.sub_crs_list][1] == "height above the geoid of slope.tif"
+    record = json.loads((tmp_path / "1" / "run.json").read_text())
+    assert record["vertical"]["heights_above"] == "the geoid of slope.tif"
+    assert str(geoid) in [entry["path"] for entry in record["inputs"]]
+
+
+@pytest.mark.parametrize(
+    ("name", "bounds"),
+    [
+        ("pleiades_triplet_calanques", (698_250.0, 4_792_750.0, 698_370.0, 4_792_870.0)),
+        ("pleiades_pair_ventoux", (675_290.0, 4_897_070.0, 675_410.0, 4_897_180.0)),
+    ],
+)
+def test_real_surfaces_above_the_geoid_that_came_with_them(shared_data, tmp_path, name, bounds):
+    """The acceptance line: 1 cm. The geoid is read and interpolated here by other code, post by post."""
+    folder = shared_data / name
+    geoid = folder / "reference" / "geoid_egm96_15min.tif"
+    inputs = tuple(sorted(folder.glob("*.tif")))
+    outs = []
+    for vertical in ("ellipsoid", str(geoid)):
+        asked = {"crs": "EPSG:32631", "resolution": 1.0, "bounds": bounds, "heights": None, "partial": True}
+        outs.append(run(inputs, tmp_path / str(len(outs)), vertical=vertical, **asked).out)
+    (plain, source), (above, its) = (read(out / "dsm.tif") for out in outs)
+    known = np.isfinite(plain)
+    assert known.sum() > 1000
+    np.testing.assert_array_equal(np.isfinite(above), known)
+    lon, lat = Transformer.from_crs(32631, 4326, always_xy=True).transform(*centres(source))
+    with rasterio.open(geoid) as file:
+        posts, transform = file.read(1).astype(float), file.transform
+    col, row = (lon - transform.c) / transform.a - 0.5, (lat - transform.f) / transform.e - 0.5
+    c, r = int(col.min()), int(row.min())
+    assert (c, r) == (int(col.max()), int(row.max())), "one square of posts holds the area"
+    corners = posts[r : r + 2, c : c + 2]
+    expected = sum(
+        corners[i, j] * np.abs(1 - i - (row - r)) * np.abs(1 - j - (col - c)) for i in (0, 1) for j in (0, 1)
+    )
+    assert np.abs(plain - expected - above)[known].max() < ACCEPTED_M
+    assert 45 < expected.mean() < 55
+    assert CRS.from_user_input(its.crs).is_compound
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["dsm", "--vertical", "moon"], "--vertical moon is neither ellipsoid, egm96, egm2008 nor the file of a geoid"),
+        (["cloud", "--vertical", "moon"], "--vertical moon is neither"),
+        (["dsm", "--dem", "d.tif", "--dem-vertical", "moon"], "--dem-vertical moon is neither"),
+        (["dsm", "--dem-vertical", "egm96"], "--dem-vertical egm96 is given without --dem"),
+        (["orient", "--dem-vertical", "egm96"], "--dem-vertical egm96 is given without --dem"),
+        (["orient", "--control-vertical", "egm96"], "--control-vertical egm96 is given without --control"),
+    ],
+)
+def test_requests_that_make_no_sense(tmp_path, arguments, says):
+    command, *rest = arguments
+    result = CliRunner().invoke(app, [command, "a.tif", "b.tif", "-o", str(tmp_path / "out"), *rest])
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_grid_ends_the_command_line_before_anything_is_written(images, tmp_path, monkeypatch):
+    monkeypatch.setattr("zlocus.io.vertical.proj_folders", lambda: [tmp_path])
+    paths = [str(path) for path in images("sine").inputs]
+    result = CliRunner().invoke(app, ["dsm", *paths, "-o", str(tmp_path / "out"), "--vertical", "egm2008"])
+    assert result.exit_code == 2
+    assert "pyproj sync --file us_nga_egm08_25.tif" in result.stderr
+    assert not (tmp_path / "out").exists()
