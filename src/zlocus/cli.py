@@ -23,6 +23,7 @@ import typer
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
+from zlocus.cli_report import report
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.progress import progress_for
 from zlocus.request import (
@@ -190,13 +191,14 @@ def dsm(
     workers: Workers = 1,
     memory: Annotated[float | None, typer.Option(help="Most memory to use, GB.", metavar="GB")] = None,
     overwrite: Overwrite = False,
+    report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.")] = True,
     config: ConfigFile = None,
 ) -> None:
     """Make a surface from images."""
     request = DsmRequest(
         inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, bounds=bounds, like=like, area=area, mask=mask,
         heights=heights, dem=dem, reference=reference, views=views, method=method, vertical=vertical, fill=fill,
-        partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
+        partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite, report=report,
     )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)
@@ -422,6 +424,9 @@ def evaluate(
         print(json.dumps(evaluation.as_dict(), indent=2))
     else:
         _print_evaluation(evaluation)
+
+
+app.command()(explained(report))
 
 
 @app.command()

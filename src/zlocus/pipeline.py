@@ -43,6 +43,7 @@ from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
+from zlocus.reporting import Matched, forget_report, try_report, write_shown
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
 from zlocus.surface.reasons import Quality
@@ -95,6 +96,14 @@ class Tally:
         """Share of the cells seen by two images or more that have a height."""
         return self.n_matched / self.n_seen if self.n_seen else 0.0
 
+    def as_dict(self) -> dict[str, Any]:
+        """For run.json."""
+        return {
+            "evaluations": {"done": self.evaluations, "all_images": self.all_images},
+            "coverage": round(self.coverage, 6),
+            "left_out_cells": self.n_left_out,
+        }
+
 
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
     """Make a surface and write all products to `request.out`.
@@ -134,9 +143,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     with watch.stage("points"):
-        write_ties(out / "ties.gpkg", orientation, corrected)
-        if tally.ranked:
-            write_ranking(out / "ranking.gpkg", tally.ranked, [view.name for view in settled.views], scene.crs)
+        _write_points(out, orientation, corrected, tally.ranked, settled)
+    _show(request, Matched(corrected, settled, grid, orientation.xyz), config, watch, progress)
     with watch.stage("record"):
         record = inputs_record(_files(request, scene))
     write_record(
@@ -149,11 +157,11 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
             "orientation": orientation.as_dict(),
             "grid": _grid_record(grid, scene.crs),
             "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
-            "evaluations": {"done": tally.evaluations, "all_images": tally.all_images},
-            "coverage": round(tally.coverage, 6),
-            "left_out_cells": tally.n_left_out,
+            **tally.as_dict(),
         },
     )
+    if request.report:
+        try_report(out, progress)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
 
@@ -271,6 +279,27 @@ def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | Non
     if mask is not None:
         outside |= cells_inside(mask, geobox)
     return surface.without(outside) if outside.any() else surface
+
+
+def _write_points(
+    out: Path, orientation: Orientation, corrected: Scene, ranked: list[RankedPoints], settled: MatchScene
+) -> None:
+    """Ties and ranking; of an earlier run's ranking and report, which are not this one's, nothing stays."""
+    forget_report(out)
+    write_ties(out / "ties.gpkg", orientation, corrected)
+    if ranked:
+        write_ranking(out / "ranking.gpkg", ranked, [view.name for view in settled.views], corrected.crs)
+    else:
+        (out / "ranking.gpkg").unlink(missing_ok=True)
+
+
+def _show(request: DsmRequest, matched: Matched, config: RunConfig, watch: Stopwatch, progress: Progress) -> None:
+    """What the report shows that no other product holds."""
+    if not request.report:
+        return
+    (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
+    with watch.stage("curves"), progress.stage("Match curves"):
+        write_shown(request.out, matched, config, match_s, progress)
 
 
 def _searched_heights(

@@ -28,7 +28,7 @@ class DsmRequest:
     heights : (zmin, zmax), m above the ellipsoid. dem : raster the heights are searched around.
     reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
     memory_gb : most memory the tiles may take together, GB.
-    partial : a surface with too few heights counts as a success.
+    partial : a surface with too few heights counts as a success. report : whether report.html is made.
 
     Raises
     ------
@@ -57,6 +57,7 @@ class DsmRequest:
     workers: int = 1
     memory_gb: float | None = None
     overwrite: bool = False
+    report: bool = True
 
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
