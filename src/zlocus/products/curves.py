@@ -330,9 +330,11 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
     title = f"{report.reference} with {which}: {_signed(label)} {LABELS[label]}, {figures}"
     if is_small:
         figure.legend(loc="outside lower center", fontsize=8, frameon=False, ncols=2)
-    else:
-        axes.set_title(title, fontsize=9, loc="left")
-        figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+        axes.set_xlabel("height, m", fontsize=9)  # the figure's own would be under the legend
+        axes.set_ylabel("correlation", fontsize=9)
+        return figure
+    axes.set_title(title, fontsize=9, loc="left")
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     _labelled(figure, None)
     return figure
 

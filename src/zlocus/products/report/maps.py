@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 RELIEF_PX, MAP_PX = 1400, 800
 SPAN_PERCENT = (2.0, 98.0)
-# Smaller pictures are kept as they are, larger ones as JPEG.
-MOST_PNG_BYTES, JPEG_QUALITY = 250_000, 88
+# Pictures of smooth quantities larger than this are kept as JPEG, which is a tenth as long.
+MOST_PNG_PX, JPEG_QUALITY = 400, 88
 STOPS = 17
 TICKS = 5
 WHITE = (255, 255, 255)
@@ -47,11 +47,12 @@ PLAIN = ("height without a warning", (225, 225, 225))
 
 @dataclass(frozen=True)
 class Picture:
-    """An inlined picture. uri : data URI; alt : what it shows, for those who do not see it; width : px."""
+    """An inlined picture. uri : data URI; alt : what it shows, for those who do not see it; width, height : px."""
 
     uri: str
     alt: str
     width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -91,10 +92,11 @@ def sigma_map(folder: Path) -> tuple[Picture, Scale]:
     """Standard deviations as colours."""
     sigma, _ = averaged(folder / "sigma.tif", MAP_PX)
     top = span(sigma)[1]
-    share = np.clip(np.nan_to_num(sigma) / max(top, 1e-6), 0.0, 1.0)
+    # The square root keeps the many small ones apart.
+    share = np.sqrt(np.clip(np.nan_to_num(sigma) / max(top, 1e-6), 0.0, 1.0))
     colours = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
     colours[~np.isfinite(sigma)] = WHITE
-    ticks = tuple(size(top * share, "m") for share in np.linspace(0, 1, TICKS))
+    ticks = tuple(size(top * share**2, "m") for share in np.linspace(0, 1, TICKS))
     ticks = (*ticks[:-1], f"{ticks[-1]} or more")
     alt = f"Standard deviation of height, dark at 0 m to bright at {size(top, 'm')}; white where there is no height."
     return picture(np.asarray(colours), alt), Scale("standard deviation, m", gradient(cv2.COLORMAP_CIVIDIS), ticks)
@@ -112,7 +114,7 @@ def views_map(found: Survey) -> tuple[Picture, list[Swatch]]:
         Swatch(css(table[n - 1]), f"{n} image{'s' if n > 1 else ''}", percent(found.n_used[n], total)) for n in used
     ]
     alt = f"Number of images each height rests on, dark for few to bright for {top}; white where there is no height."
-    return picture(shrunk(colours), alt), swatches
+    return picture(shrunk(colours), alt, is_smooth=False), swatches
 
 
 def reasons_map(found: Survey) -> tuple[Picture, list[Swatch]]:
@@ -125,7 +127,7 @@ def reasons_map(found: Survey) -> tuple[Picture, list[Swatch]]:
         Swatch(css(colours[k]), names[k], percent(counts[k], counts.sum())) for k in range(len(names)) if counts[k]
     ]
     alt = "Reasons why cells have no height, or one to be checked; grey where there is nothing to be said."
-    return picture(shrunk(colours[group[found.quality]]), alt), swatches
+    return picture(shrunk(colours[group[found.quality]]), alt, is_smooth=False), swatches
 
 
 def groups_of(code: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -173,13 +175,14 @@ def shrunk(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return colours[step // 2 :: step, step // 2 :: step]
 
 
-def picture(colours: NDArray[Any], alt: str) -> Picture:
-    """An inlined picture of colours (r, c, 3) uint8 in OpenCV's order."""
-    written, kind = cv2.imencode(".png", colours, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes(), "png"
-    if len(written) > MOST_PNG_BYTES:
+def picture(colours: NDArray[Any], alt: str, is_smooth: bool = True) -> Picture:
+    """An inlined picture of colours (r, c, 3) uint8 in OpenCV's order; is_smooth : of a quantity, not of classes."""
+    if is_smooth and max(colours.shape) > MOST_PNG_PX:
         written = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
         kind = "jpeg"
-    return Picture(data_uri(written, f"image/{kind}"), alt, colours.shape[1])
+    else:
+        written, kind = cv2.imencode(".png", colours)[1].tobytes(), "png"
+    return Picture(data_uri(written, f"image/{kind}"), alt, colours.shape[1], colours.shape[0])
 
 
 def data_uri(content: bytes, media_type: str) -> str:

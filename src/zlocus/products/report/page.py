@@ -33,6 +33,8 @@ KIND_WORDS = {"typical": "Typical", "doubtful": "Doubtful", "failed": "No height
 FEWEST_RANKED = 7
 MOST_NUMBERED = 40
 DRAWN = 1000.0
+# Of a small figure of match curves.
+SVG_PX = (355, 336)
 # Folded tables are printed too. Nothing else needs it.
 SCRIPT = 'addEventListener("beforeprint",()=>document.querySelectorAll("details").forEach(d=>{d.open=true}));'
 
@@ -237,7 +239,7 @@ def curve_card(cell: Mapping[str, Any]) -> dict[str, Any]:
     )
     uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
     alt = f"Correlation against height at this cell. {says}"
-    return card | {"lines": [*lines, says], "picture": maps.Picture(uri, alt, 0)}
+    return card | {"lines": [*lines, says], "picture": maps.Picture(uri, alt, *SVG_PX)}
 
 
 def reference_part(out: Path, compared: Compared) -> dict[str, Any]:

@@ -84,7 +84,8 @@ def image_rows(views: Mapping[str, Mapping[str, Any]]) -> list[ImageRow]:
     for i, (name, view) in enumerate(views.items(), 1):
         before, after = view["residual_before_px"], view["residual_after_px"]
         bars = tuple(100 * (each["median"] or 0.0) / (widest or 1.0) for each in (before, after))
-        shift = f"{view['shift_px'][0]:+.2f}, {view['shift_px'][1]:+.2f}"
+        # Adding 0 makes a zero of -0.
+        shift = ", ".join(f"{round(value, 2) + 0.0:+.2f}" for value in view["shift_px"])
         row = ImageRow(
             i, name, view["sensor"], view["n_ties"], shift, _residuals(before), _residuals(after), (bars[0], bars[1])
         )

@@ -126,7 +126,7 @@ def place(found: Survey, crs: CRS) -> tuple[str, str]:
     code = ":".join(authority) if (authority := crs.to_authority()) else "no code"
     lon, lat = Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(x, y)
     where = f"around {abs(lat):.4f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.4f}° {'E' if lon >= 0 else 'W'}"
-    return where, f"{crs.name} ({code})"
+    return where, f"{crs.name}, {code}"
 
 
 def summary(found: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, float]) -> str:
@@ -167,9 +167,9 @@ def what_is_missing(found: Survey) -> str:
 def what_is_doubtful(found: Survey) -> str:
     """How much carries which warning, in a sentence."""
     warnings = Quality.WEAK | Quality.AMBIGUOUS | Quality.DISPUTED
-    counts = [(found.count(flag), f"{flag.name}: {MEANINGS[flag]}") for flag in warnings]
-    told = [f"{meaning} ({percent(n, found.n_asked)})" for n, meaning in sorted(counts, key=lambda e: -e[0]) if n]
-    return f"Heights to check before use carry a warning: {'; '.join(told)}." if told else ""
+    counts = sorted(((found.count(flag), str(flag.name)) for flag in warnings), key=lambda each: -each[0])
+    told = [f"{name} ({percent(n, found.n_asked)} of the cells asked for)" for n, name in counts if n]
+    return f"Heights to check before use carry a warning, explained below: {listed(told)}." if told else ""
 
 
 def against_reference(evaluation: Evaluation, reference: str) -> str:
