@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,10 +73,9 @@ def _of_reasons(found: Survey, kind: str, flags: tuple[Quality, ...], most: int)
 def _middles(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """The cells (row, column) of the thickest patches that are farthest from all that is not in the mask; beyond the
     rim of the grid nothing is."""
-    from scipy.ndimage import distance_transform_edt, label
-
-    inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
-    patches, _ = label(mask)
+    padded = np.pad(mask, 1).astype(np.uint8)
+    inside = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))[1:-1, 1:-1].copy()
+    patches = np.asarray(cv2.connectedComponents(padded, connectivity=4)[1])[1:-1, 1:-1]
     middles: list[tuple[int, int]] = []
     while len(middles) < MOST_PATCHES and inside.any():
         i, j = np.unravel_index(int(np.argmax(inside)), mask.shape)

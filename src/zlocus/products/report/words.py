@@ -175,8 +175,9 @@ def what_is_doubtful(found: Survey) -> str:
 def against_reference(evaluation: Evaluation, reference: str) -> str:
     """How the surface compares with a reference, in a sentence."""
     figures = evaluation.all
+    moved = "" if evaluation.shift is None else ", once the shift between the two is removed"
     return (
-        f"Against the reference {reference}: {100 * figures.completeness:.1f} % of its cells have a height, "
+        f"Against the reference {reference}{moved}: {100 * figures.completeness:.1f} % of its cells have a height, "
         f"{100 * figures.within:.1f} % one that is right to {evaluation.threshold_m:g} m; the errors' median is "
         f"{number(figures.median, 'm', 3)}, their spread (NMAD) {number(figures.nmad, 'm', 3)}."
     )
