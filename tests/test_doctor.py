@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from orientation_scenes import image_of
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, camera, read, rendered, run
 from zlocus.cli import app
-from zlocus.doctor.geometry import geometry_findings, view_geometry
+from zlocus.doctor.geometry import geometry_findings
 from zlocus.doctor.plan import RunPlan, plan_findings
 from zlocus.doctor.quality import MOST_WINDOWS, SIDE_PX, image_quality, sample_windows
 from zlocus.doctor.ties import tie_findings
@@ -28,6 +28,7 @@ from zlocus.io.scene_file import open_scene, open_usable
 from zlocus.options import OrientationOptions
 from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations
+from zlocus.overlap import view_geometry
 from zlocus.scene import View
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera

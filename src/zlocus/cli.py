@@ -24,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
 from zlocus.cli_products import PRODUCTS_HELP, products
+from zlocus.cli_report import report
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
 from zlocus.evaluation.command import evaluate
 from zlocus.progress import progress_for
@@ -203,6 +204,7 @@ def dsm(
     memory: Annotated[float | None, typer.Option(help="Most memory to use, GB.", metavar="GB")] = None,
     maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(DEFAULT_PRODUCTS),
     overwrite: Overwrite = False,
+    report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.")] = True,
     config: ConfigFile = None,
 ) -> None:
     """Make a surface from images."""
@@ -210,7 +212,7 @@ def dsm(
         inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, bounds=bounds, like=like, area=area, mask=mask,
         heights=heights, dem=dem, dem_vertical=dem_vertical, reference=reference, views=views, method=method,
         vertical=vertical, fill=fill, partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
-        products=product_names(maps),
+        products=product_names(maps), report=report,
     )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)
@@ -438,6 +440,9 @@ def import_cameras(
 
 
 app.command()(explained(evaluate))
+
+
+app.command()(explained(report))
 
 
 @app.command()

@@ -46,6 +46,7 @@ from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Stopwatch, inputs_record, now, versions_record, write_record
 from zlocus.progress import Progress
+from zlocus.reporting import Matched, forget_report, try_report, write_shown
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
 from zlocus.surface.reasons import Quality
@@ -93,18 +94,18 @@ class Tally:
         self.evaluations += result.evaluations
         self.all_images += result.all_images
 
+    @property
+    def coverage(self) -> float:
+        """Share of the cells seen by two images or more that have a height."""
+        return self.n_matched / self.n_seen if self.n_seen else 0.0
+
     def as_dict(self) -> dict[str, Any]:
-        """As run.json holds it."""
+        """For run.json."""
         return {
             "evaluations": {"done": self.evaluations, "all_images": self.all_images},
             "coverage": round(self.coverage, 6),
             "left_out_cells": self.n_left_out,
         }
-
-    @property
-    def coverage(self) -> float:
-        """Share of the cells seen by two images or more that have a height."""
-        return self.n_matched / self.n_seen if self.n_seen else 0.0
 
 
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
@@ -151,7 +152,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     remove_maps(out)
     with watch.stage("points"):
-        _write_points(out, orientation, corrected, tally, settled)
+        _write_points(out, orientation, corrected, tally.ranked, settled)
+    _show(request, Matched(corrected, settled, grid, orientation.xyz), config, watch, progress)
     with watch.stage("record"):
         inputs = inputs_record(_files(request, scene, vertical))
     record = {
@@ -168,15 +170,10 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         **tally.as_dict(),
     }
     _write_maps(request, config, watch, record, progress)
+    if request.report:
+        try_report(out, progress)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
-
-
-def _write_points(out: Path, orientation: Orientation, corrected: Scene, tally: Tally, settled: MatchScene) -> None:
-    """ties.gpkg, and ranking.gpkg where ties were ranked."""
-    write_ties(out / "ties.gpkg", orientation, corrected)
-    if tally.ranked:
-        write_ranking(out / "ranking.gpkg", tally.ranked, [view.name for view in settled.views], corrected.crs)
 
 
 def _write_maps(
@@ -304,6 +301,27 @@ def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | Non
     if mask is not None:
         outside |= cells_inside(mask, geobox)
     return surface.without(outside) if outside.any() else surface
+
+
+def _write_points(
+    out: Path, orientation: Orientation, corrected: Scene, ranked: list[RankedPoints], settled: MatchScene
+) -> None:
+    """Ties and ranking; of an earlier run's ranking and report, which are not this one's, nothing stays."""
+    forget_report(out)
+    write_ties(out / "ties.gpkg", orientation, corrected)
+    if ranked:
+        write_ranking(out / "ranking.gpkg", ranked, [view.name for view in settled.views], corrected.crs)
+    else:
+        (out / "ranking.gpkg").unlink(missing_ok=True)
+
+
+def _show(request: DsmRequest, matched: Matched, config: RunConfig, watch: Stopwatch, progress: Progress) -> None:
+    """What the report shows that no other product holds."""
+    if not request.report:
+        return
+    (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
+    with watch.stage("curves"), progress.stage("Match curves"):
+        write_shown(request.out, matched, config, match_s, progress)
 
 
 def _searched_heights(

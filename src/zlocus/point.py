@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.order import Evidence
-from zlocus.matching.point import PointCurves, cell_windows, point_curves, point_order, steps_px
-from zlocus.matching.selection import Ranking, preselected, rank_views
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle
-from zlocus.matching.views import TileViews, pixel_window, read_pixels, tile_views
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import supported
+from zlocus.place import NEAREST_TIES, Place, cell_of, curves_at, height_nearby
 from zlocus.preparing import asked_crs, heights_of_ties, made_folder, oriented, possible_heights, what_was_applied
 from zlocus.products.curves import Locus, PointReport, point_text, write_point
 from zlocus.progress import Progress
@@ -26,23 +23,9 @@ from zlocus.request import CurvesRequest
 from zlocus.scene import Scene, View, check_overlap
 from zlocus.sensors.model import FloatArray
 
-NEAREST_TIES = 5
 ROUNDS, SETTLED_M = 20, 0.01
-# Cells around a point in which tie points order its images where none is nearer.
-FARTHEST = 2048
 # Pixels around a locus that are shown.
 CROP_MARGIN_PX, LEAST_CROP_PX = 12, 48
-
-
-@dataclass(frozen=True)
-class Place:
-    """xyz : (3,) m, the point asked for, at the height about which it is matched; height_from : what tells it; cell :
-    row and column of the finest lattice; middle : (2,) m, of the cell."""
-
-    xyz: FloatArray
-    height_from: str
-    cell: tuple[int, int]
-    middle: FloatArray
 
 
 def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> str:
@@ -71,9 +54,8 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
     )
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     place = located(request, settled, ties)
-    check_shown(request, place.xyz, [view.name for view in settled.views if shows(view, place.xyz)], settled)
     with progress.stage("Match curves"):
-        views, curves, heights_m = curves_at(request, settled, place, config)
+        views, curves, heights_m = curves_at(asked(request), request.reference, settled, place, config)
     report = PointReport(
         asked=asked(request), crs=scene.crs.to_string().splitlines()[0], xyz=place.xyz, height_from=place.height_from,
         middle=place.middle, cell_m=cell_m, names=tuple(view.name for view in views),
@@ -138,12 +120,6 @@ def located(request: CurvesRequest, settled: MatchScene, ties: FloatArray) -> Pl
     return Place(np.array([*xy, z]), source, cell, middle)
 
 
-def cell_of(xy: FloatArray, settled: MatchScene) -> tuple[int, int]:
-    """Row and column of the finest lattice's cell that holds a ground point."""
-    col, row = (xy - settled.anchor) * (1.0, -1.0) / settled.cell_m
-    return math.floor(row), math.floor(col)
-
-
 def pixel_on_ground(request: CurvesRequest, settled: MatchScene, ties: FloatArray) -> tuple[FloatArray, float]:
     """Where a pixel meets the ground, (2,) m and its height: of the ties around the place, which the height moves."""
     assert request.pixel is not None
@@ -161,108 +137,6 @@ def pixel_on_ground(request: CurvesRequest, settled: MatchScene, ties: FloatArra
             return xy, z
         seen.append(z)
         z = height_nearby(xy, ties)
-
-
-def height_nearby(xy: FloatArray, ties: FloatArray) -> float:
-    """Median height of the ties (n, 3) nearest to a place (2,), m."""
-    away = np.hypot(*(ties[:, :2] - xy).T)
-    return float(np.median(ties[np.argsort(away, kind="stable")[:NEAREST_TIES], 2]))
-
-
-def shows(view: View, xyz: FloatArray) -> bool:
-    """Whether a ground point (3,) lies inside an image."""
-    col, row = view.sensor.image_from_ground(xyz[None])[0]
-    rows, cols = view.image.shape
-    return bool(0 <= row <= rows - 1 and 0 <= col <= cols - 1)
-
-
-def check_shown(request: CurvesRequest, xyz: FloatArray, names: Sequence[str], settled: MatchScene) -> None:
-    """Refuse a point that fewer than two views show, or a reference that is not among them."""
-    what = f"{asked(request)} (E {xyz[0]:.1f}, N {xyz[1]:.1f}, height {xyz[2]:.1f} m)"
-    if len(names) < 2:
-        west, north = settled.transform(settled.seen, 0) * (0, 0)
-        east, south = settled.transform(settled.seen, 0) * (settled.seen.cols, settled.seen.rows)
-        fault = (
-            f"is shown, with the window around it, by {names[0]} only, and two images are needed"
-            if names
-            else "lies outside all images"
-        )
-        raise GeometryError(
-            f"{what} {fault}: they share E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m. Check the point "
-            "and --crs."
-        )
-    if request.reference is not None and request.reference not in names:
-        raise GeometryError(f"{what} is not shown by --reference {request.reference}. Choose from {', '.join(names)}.")
-
-
-def curves_at(
-    request: CurvesRequest, settled: MatchScene, place: Place, config: RunConfig
-) -> tuple[tuple[View, ...], PointCurves, FloatArray]:
-    """The views that show the place, its match curves with them, and their heights (h,) m.
-
-    Tie points are looked for farther and farther away, as far as the rules of the order reach.
-    """
-    options, side = config.selection, config.measure.large_window
-    index = (place.xyz[2] - settled.origin_m) / settled.step_m
-    radius, at = options.radius_px, np.array(place.cell[::-1]) + 0.5
-    near = () if options.neighbours == "tin" else ((radius, Evidence.NEIGHBOURS),)
-    for around, enough in (*near, (options.widest * radius, Evidence.NEAREST), (FARTHEST, Evidence.SCENE)):
-        halo = min(math.ceil(around), FARTHEST)
-        window = CellWindow(*place.cell, 1, 1).at_level(0, halo).within(settled.seen)
-        if not (window.rows and window.cols):
-            check_shown(request, place.xyz, [], settled)
-        numbers, views = views_of(settled, window, place, config)
-        windows = cell_windows(views, window, place.cell, index, side, options.reach_steps)
-        kept = np.flatnonzero(~np.isnan(windows[:, options.reach_steps, 0]))
-        check_shown(request, place.xyz, [settled.views[numbers[i]].name for i in kept], settled)
-        ranking = ranked(settled, views, window, config)
-        ranking = replace(ranking, labels=ranking.labels[:, kept][:, :, kept])
-        order = point_order(ranking, references(request, [settled.views[numbers[i]] for i in kept]), at, options)
-        if order.evidence <= enough:
-            break
-    step_px = steps_px(views, int(kept[order.reference]), kept[order.search])
-    along = index + np.arange(-options.reach_steps, options.reach_steps + 1)
-    curves = point_curves(windows[kept], order, step_px, along, options)
-    return tuple(settled.views[numbers[i]] for i in kept), curves, settled.origin_m + along * settled.step_m
-
-
-def references(request: CurvesRequest, views: Sequence[View]) -> FloatArray:
-    """1 for every view that may be the reference, (i,) float64."""
-    return np.array([float(request.reference in (None, view.name)) for view in views])
-
-
-def views_of(settled: MatchScene, window: CellWindow, place: Place, config: RunConfig) -> tuple[list[int], TileViews]:
-    """The views worth comparing at the place, by number, and what they show of a window of cells around it."""
-    reach = config.selection.reach_steps * settled.step_m
-    z = (
-        min(settled.origin_m, place.xyz[2]) - reach,
-        max(settled.origin_m + settled.n_steps * settled.step_m, place.xyz[2]) + reach,
-    )
-    transform = settled.transform(window, 0)
-    across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
-    corners = np.array([transform * (c, r) for c in across for r in down])
-    numbers, found = [], []
-    which = [number for number, view in enumerate(settled.views) if shows(view, place.xyz)]
-    if len(which) > config.selection.candidates + 1:
-        shown = [settled.views[number] for number in which]
-        rows = preselected(shown, place.middle[None], float(place.xyz[2]), config.selection)
-        which = [which[row] for row in rows]
-    for number in which:
-        part = pixel_window(settled.views[number], corners, z, 1)
-        if part is not None:
-            numbers.append(number)
-            found.append(read_pixels(settled.views[number], part, 1, settled.grey[number]))
-    shape, lattice = (window.rows, window.cols), (settled.origin_m, settled.step_m)
-    half = config.measure.large_window // 2
-    return numbers, tile_views(found, 0, transform, shape, config.pyramid.block, lattice, z, half)
-
-
-def ranked(settled: MatchScene, views: TileViews, window: CellWindow, config: RunConfig) -> Ranking:
-    """Labels of all pairs of views at the tie points of a window, on level ground."""
-    xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
-    index = (settled.ties[:, 2] - settled.origin_m) / settled.step_m
-    side, steps_per_cell, flat = config.measure.large_window, settled.cell_m / settled.step_m, np.zeros((len(xy), 2))
-    return rank_views(views, window, xy, index, flat, side, steps_per_cell, config.selection)
 
 
 def loci(views: Sequence[View], report: PointReport) -> list[Locus]:

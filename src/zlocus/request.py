@@ -36,6 +36,7 @@ class DsmRequest:
     vertical : what the heights written are above: one of `VERTICALS`, or the file of a geoid.
     memory_gb : most memory the tiles may take together, GB.
     partial : a surface with too few heights counts as a success. products : maps made of the surface, see `PRODUCTS`.
+    report : whether report.html is made.
 
     Raises
     ------
@@ -66,6 +67,7 @@ class DsmRequest:
     memory_gb: float | None = None
     overwrite: bool = False
     products: tuple[str, ...] = DEFAULT_PRODUCTS
+    report: bool = True
 
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from zlocus.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding, worst
-from zlocus.doctor.geometry import PairGeometry, ViewGeometry
 from zlocus.doctor.plan import ROUGHLY, RunPlan
 from zlocus.doctor.quality import ImageQuality, percent
 from zlocus.doctor.ties import QuickTies
 from zlocus.io.scene_file import Refused
 from zlocus.orientation.blocks import kind_of
 from zlocus.orientation.orient import PairOrientation, ViewOrientation
+from zlocus.overlap import PairGeometry, ViewGeometry
 from zlocus.scene import View
 
 MOST_PAIRS = 30

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from zlocus.doctor.findings import POOR, STOPS, Finding
-from zlocus.doctor.geometry import PairGeometry, ViewGeometry, geometry_findings, pair_geometries, view_geometry
+from zlocus.doctor.geometry import geometry_findings
 from zlocus.doctor.plan import plan_findings, run_plan
 from zlocus.doctor.plane import plane_findings
 from zlocus.doctor.quality import image_quality, quality_findings
@@ -20,6 +20,7 @@ from zlocus.doctor.ties import QuickTies, quick_ties, tie_findings
 from zlocus.errors import ZlocusError, ZlocusWarning
 from zlocus.io.scene_file import Usable, open_usable
 from zlocus.options import RunConfig
+from zlocus.overlap import PairGeometry, ViewGeometry, pair_geometries, view_geometry
 from zlocus.preparing import asked_crs, made_folder, possible_heights
 from zlocus.products.footprints import footprints_picture, write_footprints
 from zlocus.products.record import write_record

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from zlocus.doctor.findings import POOR, Finding, poor
-from zlocus.doctor.geometry import PairGeometry
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.orient import Orientation
+from zlocus.overlap import PairGeometry
 from zlocus.preparing import heights_asked_for, heights_of_ties, oriented
 from zlocus.progress import Progress
 from zlocus.scene import Scene

@@ -7,6 +7,7 @@ match_curves.png: NCC with each search image (figures 3 to 5); selected.png: the
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 COLUMNS = 3
 DPI = 110
+SMALL = (3.7, 3.5)
 # Okabe and Ito's colours, told apart by all eyes; the mean is black.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195")
 DASHES = ("-", "--", ":")
@@ -300,9 +302,12 @@ def match_curves_figure(report: PointReport) -> Figure:
     return figure
 
 
-def mean_figure(report: PointReport, n_images: int) -> Figure:
-    """NCC of the first images, thin, and their mean; where it rests on several, the means on the way to it too."""
-    figure, (axes,) = _panels(1, (7.6, 4.4))
+def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> Figure:
+    """NCC of the first images, thin, and their mean; where it rests on several, the means on the way to it too.
+
+    is_small : as wide as a telephone, without a title.
+    """
+    figure, (axes,) = _panels(1, SMALL if is_small else (7.6, 4.4))
     _frame(axes, report)
     curves = report.curves
     for j, name in enumerate(report.search[:n_images]):
@@ -323,10 +328,26 @@ def mean_figure(report: PointReport, n_images: int) -> Figure:
     figures = f"ρ1 {_number(mean.peaks.rho1[j], 3)}, ratio {_number(mean.peaks.ratio[j], 2)}, peak {height:.2f} m"
     which = "all search images" if n_images == len(report.search) else f"{n_images} of {len(report.search)} images"
     title = f"{report.reference} with {which}: {_signed(label)} {LABELS[label]}, {figures}"
+    if is_small:
+        figure.legend(loc="outside lower center", fontsize=8, frameon=False, ncols=2)
+        axes.set_xlabel("height, m", fontsize=9)  # the figure's own would be under the legend
+        axes.set_ylabel("correlation", fontsize=9)
+        return figure
     axes.set_title(title, fontsize=9, loc="left")
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     _labelled(figure, None)
     return figure
+
+
+def svg_of(figure: Figure) -> str:
+    """A figure as SVG, the same text each time."""
+    import matplotlib
+
+    written = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "zlocus"}):
+        figure.savefig(written, format="svg", metadata={"Date": None})
+    text = written.getvalue()
+    return text[text.index("<svg") :]  # without the address of a document type
 
 
 def loci_figure(loci: Sequence[Locus]) -> Figure:

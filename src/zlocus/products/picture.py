@@ -29,8 +29,8 @@ def picture_beside_truth(dsm: Path, truth: Path, path: Path, side: int = 480) ->
     the error is red where the surface is too high, blue where it is too low, full at 1 m. Cells without a height are
     white.
     """
-    true, cell_m = _read(truth, None, side)
-    found, _ = _read(dsm, truth, side)
+    true, cell_m = read_averaged(truth, None, side)
+    found, _ = read_averaged(dsm, truth, side)
     low, high = np.nanpercentile(true, (2.0, 98.0))
     panels = [
         _captioned(relief(found, cell_m, (low, high)), "surface"),
@@ -78,7 +78,7 @@ def _captioned(panel: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     return np.vstack([strip, panel])
 
 
-def _read(path: Path, like: Path | None, side: int) -> tuple[FloatImage, float]:
+def read_averaged(path: Path, like: Path | None, side: int) -> tuple[FloatImage, float]:
     """Heights of a raster (r, c) with NaN where there is none, `side` rows high, and the cell size, m.
 
     like : raster whose extent is read; None reads the raster's own.

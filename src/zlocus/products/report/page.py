@@ -1,0 +1,272 @@
+"""report.html: what a run made, where, how precise and why not everywhere, as one page that needs no other file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+from zlocus.errors import InputError, ZlocusError
+from zlocus.evaluation.evaluate import Evaluation, evaluate
+from zlocus.io.text import read_text
+from zlocus.products.picture import read_averaged
+from zlocus.products.record import write_whole
+from zlocus.products.report import maps, tables, words
+from zlocus.products.report.survey import Survey, survey
+from zlocus.scene import is_local
+from zlocus.surface.reasons import Quality
+
+REPORT, RECORD, CURVES, FOOTPRINTS, RANKING = (
+    "report.html", "run.json", "curves.json", "footprints.geojson", "ranking.gpkg",
+)  # fmt: skip
+NEEDED = ("config", "versions", "inputs", "stages", "orientation", "grid", "heights", "coverage")
+QUANTILES = (10, 25, 50, 75, 90)
+LABEL_WORDS = {1: "good", 0: "fair", -1: "poor"}
+KIND_WORDS = {"typical": "Typical", "doubtful": "Doubtful", "failed": "No height"}
+FEWEST_RANKED = 7
+MOST_NUMBERED = 40
+DRAWN = 1000.0
+# Of a small figure of match curves.
+SVG_PX = (355, 336)
+# Folded tables are printed too. Nothing else needs it.
+SCRIPT = 'addEventListener("beforeprint",()=>document.querySelectorAll("details").forEach(d=>{d.open=true}));'
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A reference to compare with; classes, is_aligned, margin_m, threshold_m : as `evaluate` takes them."""
+
+    reference: Path
+    classes: Path | None = None
+    is_aligned: bool = False
+    margin_m: float = 10.0
+    threshold_m: float = 1.0
+
+
+def write_report(out: Path, compared: Compared | None = None) -> Path:
+    """Write report.html of the run in a folder, from the files there, whole or not at all; returns its path.
+
+    Raises
+    ------
+    InputError
+        There is no complete run in the folder, or the reference cannot be used.
+    ConfigError
+        See `evaluate`.
+    OutputError
+        Where it cannot be written.
+    """
+    text = rendered(context(out, compared))
+    write_whole(out / REPORT, lambda part: part.write_text(text, encoding="utf-8"))
+    return out / REPORT
+
+
+def rendered(values: Mapping[str, Any]) -> str:
+    """The page of what `context` gives."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("zlocus.products.report", ""), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    digest = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode("ascii")
+    return environment.get_template("page.html.jinja").render(**values, script=SCRIPT, script_hash=digest) + "\n"
+
+
+def context(out: Path, compared: Compared | None) -> dict[str, Any]:
+    """All that the page shows."""
+    run = run_record(out)
+    found, crs = survey(out), CRS.from_user_input(run["grid"]["crs"])
+    sigma = found.sigma[np.isfinite(found.sigma)]
+    quantiles = {q: float(np.percentile(sigma, q)) for q in QUANTILES} if sigma.size else {}
+    where, frame = words.place(found, crs)
+    views = run["orientation"]["views"]
+    reference = None if compared is None else reference_part(out, compared)
+    paragraph = words.summary(found, run, crs, quantiles)
+    if reference is not None:
+        paragraph += " " + reference["sentence"]
+    return {
+        "title": out.resolve().name, "version": run["versions"]["zlocus"], "summary": paragraph, "where": where,
+        "frame": frame, "run": run, "found": found, "n_views": len(views), "coverage": run["coverage"],
+        "footprints": footprints_part(out / FOOTPRINTS, found, crs, list(views)),
+        "heights": maps.height_map(out, found), "sigma": maps.sigma_map(out),
+        "quantiles": [(f"{q} %", words.size(value, "m")) for q, value in quantiles.items()],
+        "used": maps.views_map(found), "reasons": words.reasons(found), "reasons_map": maps.reasons_map(found),
+        "absent": words.listed([str(flag.name) for flag in Quality if not found.count(flag)]),
+        "images": tables.image_rows(views), **pairs_part(out, run), "curves": curves_part(out / CURVES),
+        "reference": reference, "stages": tables.stage_rows(run["stages"]),
+        "request": tables.request_rows(run["config"]["request"]),
+        "options": tables.option_rows(run["config"]["options"]), "size": words.size, "percent": words.percent,
+    }  # fmt: skip
+
+
+def run_record(out: Path) -> dict[str, Any]:
+    """run.json of a surface.
+
+    Raises
+    ------
+    InputError
+        It is missing, damaged, or of something else.
+    """
+    path = out / RECORD
+    if not path.exists():
+        raise InputError(f"There is no {RECORD} in {out}. Give the folder that `zlocus dsm` wrote (-o).")
+    run = read_json(path)
+    missing = [key for key in NEEDED if key not in run]
+    if missing:
+        raise InputError(
+            f"{path} lacks {', '.join(missing)}: it is of no surface, or damaged. Give the folder of a `zlocus dsm`."
+        )
+    return run
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object in a file."""
+    try:
+        found = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON: {error}. Make the surface again.") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path} holds no JSON object. Make the surface again.")
+    return found
+
+
+def footprints_part(path: Path, found: Survey, crs: CRS, names: Sequence[str]) -> dict[str, Any] | None:
+    """Outlines of images and surface for a drawing of `DRAWN` a side, y down; None without footprints."""
+    rings = footprint_rings(path, crs)
+    if not rings or not set(rings) <= set(names):
+        return None
+    rows, cols = found.shape
+    area = np.array([found.transform * corner for corner in ((0, 0), (cols, 0), (cols, rows), (0, rows))])
+    everything = np.concatenate([area, *rings.values()])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    scale = DRAWN / max(*(high - low), 1e-9)
+    width, height = (high - low) * scale
+
+    def drawn(xy: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+        return np.asarray(np.column_stack([xy[:, 0] - low[0], high[1] - xy[:, 1]]) * scale)
+
+    def points(xy: np.typing.NDArray[np.float64]) -> str:
+        return " ".join(f"{x:.1f},{y:.1f}" for x, y in drawn(xy))
+
+    shapes = []
+    for i, name in enumerate(names):
+        if name in rings:
+            # Numbers stand at different places of outlines that are alike.
+            at = drawn(rings[name])[round(i / len(names) * (len(rings[name]) - 1))]
+            shapes.append((i + 1, name, points(rings[name]), f"{at[0]:.1f}", f"{at[1]:.1f}"))
+    return {
+        "shapes": shapes, "area": points(area), "width": f"{width:.1f}", "height": f"{height:.1f}",
+        "is_numbered": len(names) <= MOST_NUMBERED, "span_m": [words.size(float(v), "m") for v in high - low],
+    }  # fmt: skip
+
+
+def footprint_rings(path: Path, crs: CRS) -> dict[str, np.typing.NDArray[np.float64]]:
+    """Outline of each image in the surface's CRS, (n, 2) m, by name; those without one are left out."""
+    rings = {}
+    back = None if is_local(crs) else Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    for feature in features(path, "image"):
+        if feature["geometry"] is not None:
+            ring = np.array(feature["geometry"]["coordinates"][0], float)
+            rings[feature["properties"]["name"]] = ring if back is None else np.column_stack(back.transform(*ring.T))
+    return rings
+
+
+def features(path: Path, kind: str) -> list[dict[str, Any]]:
+    """Those of a kind in footprints.geojson; none without the file."""
+    if not path.exists():
+        return []
+    return [each for each in read_json(path)["features"] if each["properties"]["kind"] == kind]
+
+
+def pairs_part(out: Path, run: Mapping[str, Any]) -> dict[str, Any]:
+    """Matrices of labels and of pairs, and why there is none."""
+    names = list(run["orientation"]["views"])
+    if len(names) > tables.MOST_MATRIX:
+        why = f"There are {len(names)} images, too many for a matrix."
+        return {"labels": None, "no_labels": f"{why} See {RANKING}.", "pairs": None, "no_pairs": why}
+    labels = tables.label_matrix(out / RANKING, names)
+    fewest = run["config"]["options"]["selection"]["fewest_views"]
+    if len(names) < fewest:
+        why = f"This run has {len(names)} images; with fewer than {fewest} all are used, and none is ranked."
+    else:
+        why = f"The run left no ranking of these images ({RANKING})."
+    overlaps = [each["properties"] for each in features(out / FOOTPRINTS, "overlap")]
+    known = [each for each in overlaps if set(each["views"]) <= set(names)]
+    return {
+        "labels": labels, "no_labels": why,
+        "pairs": tables.pair_matrix(names, run["orientation"]["pairs"], known), "no_pairs": "",
+    }  # fmt: skip
+
+
+def curves_part(path: Path) -> dict[str, Any] | None:
+    """Cells with their curves; None without any."""
+    if not path.exists():
+        return None
+    record = read_json(path)
+    return {
+        "rule": record["rule"], "n_left_out": record["n_chosen"] - len(record["cells"]),
+        "cells": [curve_card(cell) for cell in record["cells"]],
+    }  # fmt: skip
+
+
+def curve_card(cell: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said of a cell and its curves."""
+    names = [str(flag.name) for flag in Quality if cell["quality"] & flag]
+    lines = [
+        f"Row {cell['row']}, column {cell['col']} of the grid, at {cell['x']:.1f}, {cell['y']:.1f} m. "
+        f"Reasons: {words.listed(names)}."
+    ]
+    if cell["height_m"] is not None:
+        sigma = words.size(cell["sigma_m"], "m")
+        lines.append(f"The surface has {cell['height_m']:.2f} m, standard deviation {sigma}.")
+    why = cell["why"] if cell["kind"] == "typical" else f"{cell['why']}: {words.MEANINGS[Quality[cell['why']]]}"
+    card = {"heading": f"{KIND_WORDS[cell['kind']]}: {why}", "lines": lines, "error": cell.get("error", "")}
+    if card["error"]:
+        return card
+    point, n = cell["point"], cell["n_shown"]
+    mean = point["means"][n - 1]
+    says = (
+        f"The mean of {n} of {len(point['means'])} search images with {point['reference']} is "
+        f"{LABEL_WORDS[mean['label']]}: largest correlation {words.number(mean['rho1'])}, "
+        f"{words.number(mean['ratio'])} times its rival, at {words.number(mean['peak_m'], 'm')}."
+    )
+    uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
+    alt = f"Correlation against height at this cell. {says}"
+    return card | {"lines": [*lines, says], "picture": maps.Picture(uri, alt, *SVG_PX)}
+
+
+def reference_part(out: Path, compared: Compared) -> dict[str, Any]:
+    """The comparison with a reference."""
+    evaluation: Evaluation = evaluate(
+        out / "dsm.tif", compared.reference, classes=compared.classes, align=compared.is_aligned,
+        margin_m=compared.margin_m, threshold_m=compared.threshold_m,
+    )  # fmt: skip
+    shift, name = evaluation.shift, compared.reference.name
+    removed = "" if shift is None else (
+        f"Removed first, and reported here: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, "
+        f"{shift.up_m:+.3f} m up."
+    )  # fmt: skip
+    return {
+        "sentence": words.against_reference(evaluation, name), "name": name, "removed": removed,
+        "rows": tables.evaluation_rows(evaluation), "threshold": f"{compared.threshold_m:g}",
+        "margin": f"{compared.margin_m:g}", "map": error_part(out / "dsm.tif", compared.reference),
+    }  # fmt: skip
+
+
+def error_part(dsm: Path, reference: Path) -> tuple[maps.Picture, maps.Scale] | None:
+    """The map of errors, as the surfaces lie; None where they cannot be put on the same cells."""
+    from rasterio.errors import RasterioError
+
+    try:
+        found, _ = read_averaged(dsm, None, maps.MAP_PX)
+        true, _ = read_averaged(reference, dsm, maps.MAP_PX)
+    except (ZlocusError, RasterioError):
+        return None
+    return maps.error_picture(found, true)

@@ -1,0 +1,232 @@
+"""Tables of the report: images, pairs, labels, stages, options."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zlocus.errors import InputError
+from zlocus.evaluation.evaluate import Evaluation
+from zlocus.options import RunConfig
+from zlocus.products.report.words import NONE, STAGES, number, percent, seconds
+
+LABEL = "label_"
+# Poor to good, blue and orange being told apart by all eyes.
+POOR_COLOUR, GOOD_COLOUR = np.array([230, 159, 0]), np.array([86, 180, 233])
+MOST_MATRIX = 60
+
+
+@dataclass(frozen=True)
+class ImageRow:
+    """Residuals of an image's ties before and after; before, after : median, rms, 90th percentile; bars : widths of
+    both medians, percent."""
+
+    number: int
+    name: str
+    sensor: str
+    n_ties: int
+    shift: str
+    before: tuple[str, str, str]
+    after: tuple[str, str, str]
+    bars: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a matrix. colour : CSS, "" for none; title : what it says, in words."""
+
+    text: str
+    colour: str = ""
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """A row and a column for every name."""
+
+    names: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """What a stage took; bar : share of the wall time, percent."""
+
+    name: str
+    does: str
+    wall: str
+    cpu: str
+    peak: str
+    bar: float
+
+
+@dataclass(frozen=True)
+class OptionRow:
+    """An option, its value, and its default where it is another."""
+
+    name: str
+    value: str
+    default: str
+    meaning: str
+
+
+def image_rows(views: Mapping[str, Mapping[str, Any]]) -> list[ImageRow]:
+    """Residuals of all images, from run.json."""
+    widest = max(
+        (view[key]["median"] or 0.0 for view in views.values() for key in ("residual_before_px", "residual_after_px")),
+        default=0.0,
+    )
+    rows = []
+    for i, (name, view) in enumerate(views.items(), 1):
+        before, after = view["residual_before_px"], view["residual_after_px"]
+        bars = tuple(100 * (each["median"] or 0.0) / (widest or 1.0) for each in (before, after))
+        # Adding 0 makes a zero of -0.
+        shift = ", ".join(f"{round(value, 2) + 0.0:+.2f}" for value in view["shift_px"])
+        row = ImageRow(
+            i, name, view["sensor"], view["n_ties"], shift, _residuals(before), _residuals(after), (bars[0], bars[1])
+        )
+        rows.append(row)
+    return rows
+
+
+def _residuals(found: Mapping[str, float | None]) -> tuple[str, str, str]:
+    median, rms, percent90 = (number(found[key], "", 3) for key in ("median", "rms", "percent90"))
+    return median, rms, percent90
+
+
+def pair_matrix(
+    names: Sequence[str], pairs: Sequence[Mapping[str, Any]], overlaps: Sequence[Mapping[str, Any]]
+) -> Matrix:
+    """Above the diagonal base-to-height, below it the distance of the ties from the loci after orientation, px.
+
+    pairs : of run.json's orientation; overlaps : of footprints.geojson.
+    """
+    place = {name: i for i, name in enumerate(names)}
+    cells = [[Cell(NONE, title=f"{a} and {b}: nothing known") for b in names] for a in names]
+    for i in range(len(names)):
+        cells[i][i] = Cell("", "#dddddd")
+    for overlap in overlaps:
+        i, j = sorted(place[name] for name in overlap["views"])
+        says = f"{names[i]} and {names[j]}: base-to-height {number(overlap['base_to_height'])}, "
+        says += f"{percent(overlap['overlap'] or 0.0, 1.0)} of the smaller footprint shared"
+        cells[i][j] = Cell(number(overlap["base_to_height"]), title=says)
+    for pair in pairs:
+        i, j = sorted(place[name] for name in pair["views"])
+        before, after = (number(pair[f"across_{when}_px"], "px", 3) for when in ("before", "after"))
+        says = f"{names[i]} and {names[j]}: {pair['n_ties']} ties, off by {before} before and {after} after"
+        cells[j][i] = Cell(number(pair["across_after_px"], "", 3), title=says)
+    return Matrix(tuple(names), tuple(tuple(row) for row in cells))
+
+
+def label_matrix(path: Path, names: Sequence[str]) -> Matrix | None:
+    """For each reference (row) and search image (column) the share of tie points whose match curve is good.
+
+    None where there is no ranking, or one of other images.
+    """
+    if not path.exists():
+        return None
+    import pyogrio.raw  # a quarter of a second
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    try:
+        meta, _, _, columns = pyogrio.raw.read(path, layer="ranking", read_geometry=False)
+    except (DataSourceError, DataLayerError) as error:
+        raise InputError(f"{path} cannot be read: {error}. Make the surface again.") from error
+    held = dict(zip((str(name) for name in meta["fields"]), columns, strict=True))
+    if {LABEL + name for name in names} != {name for name in held if name.startswith(LABEL)}:
+        return None
+    rows = []
+    for reference in names:
+        mine = held["reference"] == reference
+        rows.append(tuple(_label_cell(reference, name, held[LABEL + name][mine]) for name in names))
+    return Matrix(tuple(names), tuple(rows))
+
+
+def _label_cell(reference: str, search: str, column: np.typing.NDArray[Any]) -> Cell:
+    """What the labels of a search image against a reference are. column : (n,) -1, 0, 1 or NaN."""
+    if reference == search:
+        return Cell("", "#dddddd")
+    labels = column[np.isfinite(column)]
+    if not labels.size:
+        return Cell(NONE, title=f"{search} was never compared with {reference}")
+    good, fair, poor = ((labels == value).mean() for value in (1, 0, -1))
+    mean = float(labels.mean())
+    end = GOOD_COLOUR if mean > 0 else POOR_COLOUR
+    colour = np.rint(255 + abs(mean) * (end - 255)).astype(int)
+    says = (
+        f"{search} against {reference}: good at {percent(good, 1)}, fair at {percent(fair, 1)}, poor at "
+        f"{percent(poor, 1)} of {labels.size} tie points"
+    )
+    return Cell(f"{100 * good:.0f}", f"rgb({colour[0]},{colour[1]},{colour[2]})", says)
+
+
+def stage_rows(stages: Sequence[Mapping[str, Any]]) -> list[StageRow]:
+    """What each stage took, and all of them."""
+    total = sum(stage["wall_s"] for stage in stages)
+    rows = [
+        StageRow(
+            stage["name"], STAGES.get(stage["name"], ""), seconds(stage["wall_s"]), seconds(stage["cpu_s"]),
+            f"{stage['peak_mb']:.0f} MB", 100 * stage["wall_s"] / total if total else 0.0,
+        )
+        for stage in stages
+    ]  # fmt: skip
+    cpu, peak = sum(stage["cpu_s"] for stage in stages), max((stage["peak_mb"] for stage in stages), default=0.0)
+    return [*rows, StageRow("all", "", seconds(total), seconds(cpu), f"{peak:.0f} MB", 100.0)]
+
+
+def request_rows(request: Mapping[str, Any]) -> list[OptionRow]:
+    """What was asked for on the command line."""
+    return [OptionRow(name, plain(value), "", "") for name, value in request.items()]
+
+
+def option_rows(options: Mapping[str, Any]) -> list[OptionRow]:
+    """Every option of every stage, with its meaning and, where it was changed, its default."""
+    known = {name: (default, meaning) for name, default, meaning in _known(RunConfig())}
+    rows = []
+    for name, value in _flat(options):
+        default, meaning = known.get(name, (value, ""))
+        rows.append(OptionRow(name, plain(value), "" if default == value else plain(default), meaning))
+    return rows
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def _known(options: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """Name, default and meaning of every option."""
+    for f in fields(options):
+        value = getattr(options, f.name)
+        if is_dataclass(value):
+            yield from _known(value, f"{prefix}{f.name}.")
+        else:
+            unit = f" [{f.metadata['unit']}]" if f.metadata.get("unit") else ""
+            yield prefix + f.name, list(value) if isinstance(value, tuple) else value, f.metadata["doc"] + unit
+
+
+def plain(value: Any) -> str:
+    """A value of an option as it is read."""
+    if value is None:
+        return "not given"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def evaluation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """Name, cells, completeness, within, median, NMAD, RMSE, LE90: of all and per class."""
+    return [
+        (
+            name, str(figures.n), percent(figures.completeness, 1), percent(figures.within, 1),
+            *(number(value, "", 3) for value in (figures.median, figures.nmad, figures.rmse, figures.le90)),
+        )
+        for name, figures in {"all": evaluation.all, **evaluation.classes}.items()
+    ]  # fmt: skip

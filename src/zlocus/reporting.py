@@ -1,0 +1,193 @@
+"""What a run leaves for its report: footprints and pairs of the images, match curves of a few cells, and the page."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyproj import CRS
+
+from zlocus.errors import GeometryError, ZlocusError
+from zlocus.grid import Grid
+from zlocus.matching.setup import MatchScene
+from zlocus.options import RunConfig
+from zlocus.orientation.blocks import kind_of
+from zlocus.overlap import pair_geometries, view_geometry
+from zlocus.place import Place, cell_of, curves_at, height_nearby
+from zlocus.products.curves import PointReport, mean_figure, point_record, svg_of
+from zlocus.products.footprints import write_footprints
+from zlocus.products.record import write_record
+from zlocus.products.report.cells import FAILED, RULE, ChosenCell, chosen_cells
+from zlocus.products.report.page import CURVES, FOOTPRINTS, REPORT, write_report
+from zlocus.products.report.survey import Survey, survey
+from zlocus.progress import Progress
+from zlocus.scene import Scene
+from zlocus.sensors.model import FloatArray
+
+# Pairs grow with the square of their number.
+MOST_VIEWS_PAIRED = 60
+# Curves are not begun after this share of the time that matching took, or this time where that is longer.
+TIME_SHARE, LEAST_TIME_S = 0.02, 10.0
+# Cells around one within which tie points are looked for.
+FARTHEST = 512
+NOT_SHOWN = "Fewer than two images show this cell, and the window around it, at the height looked at."
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What a surface was made of.
+
+    scene : oriented; ties : (n, 3) m; undulation : height of what dsm.tif's heights are above, over the ellipsoid, (n,)
+    m at ground points (n, 2).
+    """
+
+    scene: Scene
+    settled: MatchScene
+    grid: Grid
+    ties: FloatArray
+    undulation: Callable[[FloatArray], FloatArray] = lambda xy: np.zeros(len(xy))
+
+
+def forget_report(out: Path) -> None:
+    """Remove the report of an earlier run, which is not this one's."""
+    for name in (REPORT, CURVES, FOOTPRINTS):
+        (out / name).unlink(missing_ok=True)
+
+
+def write_shown(out: Path, matched: Matched, config: RunConfig, match_s: float, progress: Progress) -> None:
+    """footprints.geojson and curves.json, or a note. match_s : time that matching took, which bounds that of curves."""
+    most_s = max(LEAST_TIME_S, TIME_SHARE * match_s)
+    _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, matched), progress)
+    _tried(CURVES, lambda: write_curves(out / CURVES, out, matched, config, most_s), progress)
+
+
+def try_report(out: Path, progress: Progress) -> None:
+    """report.html, or a note."""
+    with progress.stage("Report"):
+        _tried(REPORT, lambda: write_report(out), progress)
+
+
+def _tried(name: str, write: Callable[[], Any], progress: Progress) -> None:
+    """Write a file, or note why there is none: a surface that is complete does not fail for its report."""
+    try:
+        write()
+    except Exception as error:
+        progress.note(f"{name} was not made: {said(error)} The surface does not depend on it.")
+
+
+def write_views(path: Path, matched: Matched) -> None:
+    """Footprints at the median height of the ties, with what is known of each image and of each pair that overlaps."""
+    views = matched.scene.views
+    z = float(np.median(matched.ties[:, 2])) if len(matched.ties) else middle_height(matched.settled)
+    geometry = [view_geometry(view, z) for view in views]
+    features: list[tuple[Any, dict[str, Any]]] = [
+        (
+            found.outline,
+            {
+                "kind": "image", "name": view.name, "sensor": kind_of(view.sensor), "shape": list(view.image.shape),
+                "ground_px_m": rounded(found.ground_px_m),
+            },
+        )
+        for view, found in zip(views, geometry, strict=True)
+    ]  # fmt: skip
+    if len(views) <= MOST_VIEWS_PAIRED:
+        features += [
+            (
+                pair.shared,
+                {
+                    "kind": "overlap", "views": [views[i].name for i in pair.views], "overlap": rounded(pair.overlap),
+                    "base_to_height": rounded(pair.base_to_height),
+                },
+            )
+            for pair in pair_geometries(views, [each.outline for each in geometry], z)
+        ]  # fmt: skip
+    write_footprints(path, features, matched.scene.crs)
+
+
+def write_curves(path: Path, folder: Path, matched: Matched, config: RunConfig, most_s: float) -> None:
+    """Match curves of chosen cells of the surface in a folder; one that cannot be made leaves a sentence."""
+    found, start, cells = survey(folder), time.perf_counter(), []
+    chosen = chosen_cells(found)
+    for cell in chosen:
+        if time.perf_counter() - start > most_s:
+            break
+        cells.append(shown_cell(cell, found, matched, config))
+    write_record(path, {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells})
+
+
+def shown_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:
+    """What curves.json says of a cell, or of the first of the others that can be shown."""
+    first = tried_cell(cell, found, matched, config)
+    for row, col in cell.others if "error" in first else ():
+        other = tried_cell(replace(cell, row=row, col=col), found, matched, config)
+        if "error" not in other:
+            return other
+    return first
+
+
+def tried_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:
+    """What curves.json says of a cell, with an error where no curve can be made."""
+    x, y = found.transform * (cell.col + 0.5, cell.row + 0.5)
+    i, j = ((at - found.first) // found.stride for at in (cell.row, cell.col))
+    height_m = float(found.height[i, j])
+    record = {
+        "kind": cell.kind, "why": cell.why, "row": cell.row, "col": cell.col, "x": x, "y": y,
+        "height_m": height_m, "sigma_m": float(found.sigma[i, j]),
+        "quality": int(found.quality[i, j]),
+    }  # fmt: skip
+    try:
+        return record | curves_of(cell, np.array([x, y]), height_m, matched, config)
+    except GeometryError:
+        return record | {"error": NOT_SHOWN}
+    except Exception as error:  # a picture less, not a surface
+        return record | {"error": said(error)}
+
+
+def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matched, config: RunConfig) -> dict[str, Any]:
+    """Record and figure of a cell's curves, about its own height, or that of the ties nearby where it has none."""
+    settled = matched.settled
+    if math.isfinite(height_m):
+        z, source = height_m + float(matched.undulation(xy[None])[0]), "that of the surface"
+    elif len(matched.ties):
+        z, source = height_nearby(xy, matched.ties), "that of the nearest tie points"
+    else:
+        z, source = middle_height(settled), "the middle of the heights searched"
+    place = Place(np.array([*xy, z]), source, cell_of(xy, settled), xy)
+    asked = f"The cell at row {cell.row}, column {cell.col}"
+    views, curves, heights_m = curves_at(asked, None, settled, place, config, FARTHEST)
+    report = PointReport(
+        asked=asked, crs=crs_name(matched.scene.crs), xyz=place.xyz, height_from=source, middle=xy,
+        cell_m=settled.cell_m, names=tuple(view.name for view in views),
+        left_out=tuple(view.name for view in settled.views if view not in views), heights_m=heights_m, curves=curves,
+        peak_m=settled.origin_m + curves.peak_index * settled.step_m, step_m=settled.step_m,
+    )  # fmt: skip
+    # Where no height was found all that could help is shown.
+    n_images = len(report.search) if cell.kind == FAILED else curves.n_used
+    figure = mean_figure(report, n_images, is_small=True)
+    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
+
+
+def middle_height(settled: MatchScene) -> float:
+    """The middle of the heights searched, m."""
+    return settled.origin_m + settled.n_steps * settled.step_m / 2
+
+
+def crs_name(crs: CRS) -> str:
+    """A CRS in a line."""
+    return crs.to_string().splitlines()[0]
+
+
+def said(error: Exception) -> str:
+    """An error in a sentence."""
+    words = " ".join(str(error).split())
+    return words if isinstance(error, ZlocusError) else f"{type(error).__name__}: {words}".rstrip(": ") + "."
+
+
+def rounded(value: float) -> float | None:
+    """A number for JSON."""
+    return round(float(value), 4) if math.isfinite(value) else None
