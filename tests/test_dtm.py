@@ -24,7 +24,7 @@ OPTIONS = ProductOptions(ground_window_m=12.0)
 UNDER_A_HOUSE_M = 0.15
 ROWS, COLS = 301, 187
 HOUSE, RIM_HOUSE, HOLE, DARK = np.s_[100:124, 60:84], np.s_[200:220, 170:], np.s_[40:52, 90:101], np.s_[:20, 120:]
-DOUBTED = np.s_[250:253, 40:45]
+DOUBTED, UNSEEN = np.s_[250:253, 40:45], np.s_[270:280, 100:110]
 
 
 def grid(rows=ROWS):
@@ -43,8 +43,9 @@ def town(tmp_path):
     quality[DOUBTED] = Quality.JUMP
     z[HOLE] = np.nan
     quality[HOLE] = Quality.NO_MATCH
-    z[DARK] = np.nan
-    quality[DARK] = Quality.UNSEEN
+    for place in (DARK, UNSEEN):
+        z[place] = np.nan
+        quality[place] = Quality.UNSEEN
     write_cog(tmp_path / "dsm.tif", z, grid(), nodata=np.nan)
     write_cog(tmp_path / "quality.tif", quality, grid())
     return tmp_path, ground, z
@@ -67,8 +68,9 @@ def test_houses_go_and_ground_stays(town):
     # Ground on one side only goes on level.
     assert off[RIM_HOUSE].max() < 1.0
     assert np.isnan(found[DARK]).all()
+    assert np.isnan(found[UNSEEN]).all()
     kept = np.ones(found.shape, bool)
-    for place in (HOUSE, RIM_HOUSE, HOLE, DOUBTED, DARK):
+    for place in (HOUSE, RIM_HOUSE, HOLE, DOUBTED, DARK, UNSEEN):
         kept[place] = False
     np.testing.assert_array_equal(found[kept], z[kept])
 

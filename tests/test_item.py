@@ -99,6 +99,8 @@ def test_bands_say_what_the_file_holds(tmp_path):
     assert band == {"name": "band-1", "description": "height", "data_type": "float32", "nodata": "nan", "unit": "m"}
     assert statistics == {"minimum": 1.0, "maximum": 600.0, "mean": 300.5, "stddev": pytest.approx(z.std()),
                           "valid_percent": 50.0}  # fmt: skip
+    write_cog(tmp_path / "views.tif", np.ones((30, 40), np.uint8), grid(), nodata=0)
+    assert bands_of(tmp_path / "views.tif")[0]["nodata"] == 0
     bands = bands_of(tmp_path / "ortho.tif")
     assert [(b["name"], b["description"], b["data_type"]) for b in bands] == [
         ("band-1", "red", "uint16"), ("band-2", "green", "uint16"), ("band-3", "blue", "uint16"),

@@ -12,6 +12,7 @@ import pytest
 import rasterio
 from affine import Affine
 from odc.geo.geobox import GeoBox
+from pyproj import CRS
 from rio_cogeo.cogeo import cog_validate
 from typer.testing import CliRunner
 
@@ -71,6 +72,25 @@ def test_every_product_opens_and_is_valid(surface):
     assert pyogrio.read_info(surface / "contours.gpkg")["features"] > 10
     with laspy.open(surface / "surface.laz") as laz:
         assert laz.header.point_count == 56 * 80
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32632+5773"])
+def test_products_have_the_crs_of_their_surface(tmp_path, crs):
+    written(tmp_path, GRID)
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        z, profile = file.read(), file.profile
+    for name in ("driver", "blockxsize", "blockysize", "tiled", "interleave"):
+        profile.pop(name, None)
+    with rasterio.open(tmp_path / "dsm.tif", "w", **(profile | {"driver": "COG", "crs": crs})) as file:
+        file.write(z)
+    make_maps(tmp_path, PRODUCTS, ProductOptions(), SilentProgress())
+    for name in ("hillshade.tif", "dtm.tif"):
+        with rasterio.open(tmp_path / name) as file:
+            assert CRS(file.crs.to_wkt()) == CRS(crs)
+    with laspy.open(tmp_path / "surface.laz") as laz:
+        assert laz.header.parse_crs() == CRS(crs)
+    # Lines are flat: theirs is the map's.
+    assert CRS(pyogrio.read_info(tmp_path / "contours.gpkg")["crs"]) == CRS("EPSG:32632")
 
 
 def test_contours_of_the_terrain_need_it(surface):

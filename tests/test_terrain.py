@@ -41,11 +41,13 @@ def test_what_lies_at_the_rim_or_beside_nothing_is_no_wider_than_it_is():
     z = np.zeros((40, 40), np.float32)
     z[15:25, :6] = 9.0
     assert (opened(z, inside(z), 6) == 0).all()
+    # A roof as deep beside nothing, where a membrane would go on at its height.
     nothing = inside(z)
-    nothing[:, 6:12] = True
+    nothing[:, :12] = True
     other = np.zeros((40, 40), np.float32)
-    other[15:25, 12:18] = 9.0
+    other[5:35, :18] = 9.0
     assert (opened(other, nothing, 6)[~nothing] == 0).all()
+    assert (opened(other, inside(z), 6)[5:35, 12:18] == 9).any()
 
 
 def test_a_rise_is_found_by_the_first_window_wider_than_it():

@@ -94,7 +94,7 @@ class _Chain:
 class _Stitcher:
     """Lines of strips become whole ones, level by level."""
 
-    chains: dict[int, list[_Chain]] = field(default_factory=dict)
+    chains: dict[int, dict[_Chain, None]] = field(default_factory=dict)
     heads: dict[Place, _Chain] = field(default_factory=dict)
     tails: dict[Place, _Chain] = field(default_factory=dict)
 
@@ -103,7 +103,7 @@ class _Stitcher:
         before = self.tails.pop(head) if head in self.tails else None
         if before is None:
             chain = _Chain([line], head, tail)
-            self.chains.setdefault(level, []).append(chain)
+            self.chains.setdefault(level, {})[chain] = None
         else:
             chain = before
             chain.pieces.append(line)
@@ -115,7 +115,7 @@ class _Stitcher:
         if after is not None:
             chain.pieces.extend(after.pieces)
             chain.tail = after.tail
-            self.chains[level].remove(after)
+            del self.chains[level][after]
         if chain.head is not None and before is None:
             self.heads[chain.head] = chain
         if chain.tail is not None:
