@@ -43,6 +43,11 @@ class Shift:
     steps: int | None = None
     sigma_m: float | None = None
 
+    @property
+    def enu_m(self) -> tuple[float, float, float]:
+        """East, north and up, m."""
+        return self.east_m, self.north_m, self.up_m
+
 
 @dataclass(frozen=True)
 class ErrorMap:
@@ -116,11 +121,9 @@ def evaluate(
 
     The reference is taken in blocks of about 0.5 m, the surface looked up at their centres (nearest cell, reprojected
     where the CRS differ). A block's true height is its mean; where it holds an edge, either side is right. A cell
-    without height counts as missing, and as not within the threshold. With `align`, the best shift is found and
-    removed first, and heights are then looked up between cells; with `coregister="nuth-kaab"` the same, the shift being
-    that of `coregistration.coregister`.
-
-    geoid : raster added to the heights above a geoid, see `vertical.same_heights`.
+    without height counts as missing, and as not within the threshold. With `align` the best shift, with
+    `coregister="nuth-kaab"` that of slope and aspect, is removed first, and heights are then looked up between cells.
+    geoid : see `vertical.same_heights`.
 
     Raises
     ------
@@ -150,10 +153,7 @@ def evaluate(
         shift=shift,
         threshold_m=threshold_m,
         slopes={name: figures(band) for name, band in slope_bands(truth.slope_deg, slope_edges_deg).items()},
-        mvs3dm=mvs3dm_figures(
-            surface, heights, frame, margin_m=margin_m,
-            shift=None if shift is None else (shift.east_m, shift.north_m, shift.up_m),
-        ),
+        mvs3dm=mvs3dm_figures(surface, heights, frame, margin_m=margin_m, shift=shift.enu_m if shift else None),
         unshifted=None if shift is None else error_statistics(as_it_lies, threshold_m, more_thresholds_m),
         heights=compared.datums,
         assumed=compared.assumed,
