@@ -201,7 +201,7 @@ def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
         assert vertical_datum_of(crs, path, "--dem-vertical").files == datum.files
     assert read_geobox(path) == GRID
     with rasterio.open(path) as file:
-        assert GeoBox.from_rio(file).crs == datum.of_map(GRID).crs or name == "file"
+        assert GeoBox.from_rio(file).crs.proj.name == datum.of_map(GRID).crs.proj.name
 
 
 def test_a_projected_crs_with_ellipsoidal_heights_needs_a_second_file(tmp_path):

@@ -24,9 +24,11 @@ from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.control import read_control
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import vertical_datum
+from zlocus.matching.setup import shared_ground
 from zlocus.options import RunConfig
 from zlocus.orienting import control_points, terrain_heights
 from zlocus.pipeline import run_dsm
+from zlocus.preparing import with_heights
 from zlocus.progress import SilentProgress, progress_for
 from zlocus.request import CloudRequest, DsmRequest, OrientRequest
 from zlocus.synthetic.terrain import analytic_height
@@ -108,6 +110,27 @@ def test_heights_asked_for_are_above_the_same(images, geoid, tmp_path):
     x, y = centres(source)
     truth = analytic_height("sine", x - CENTRE[0], y - CENTRE[1])
     assert np.nanmedian(height + undulation(x, y) - truth) == pytest.approx(0.0, abs=0.03)
+
+
+def test_heights_asked_for_hold_wherever_two_views_see_the_ground(images, geoid):
+    scene, datum = open_scene(images("sine").inputs, UTM), vertical_datum(str(geoid))
+    asked = (HEIGHTS[0] - AT_CENTRE_M, HEIGHTS[1] - AT_CENTRE_M)
+    west, south, east, north = shared_ground(scene, asked)
+    spans = {
+        None: (undulation(west, north), undulation(east, south)),
+        PART: (undulation(PART[0], PART[3]), undulation(PART[2], PART[1])),
+        # Of bounds that reach beyond, what two views see.
+        (west - 500.0, south + 5.0, east + 500.0, north + 400.0): (
+            undulation(west, north), undulation(east, south + 5.0)
+        ),
+    }  # fmt: skip
+    for bounds, (low, high) in spans.items():
+        found = with_heights(scene, asked, datum, bounds).heights
+        assert found == pytest.approx((asked[0] + low, asked[1] + high), abs=1e-6)
+        if bounds == PART:
+            assert with_heights(replace(scene, bounds=PART), asked, datum).heights == found
+    assert with_heights(scene, None, datum) is scene
+    assert with_heights(scene, asked, vertical_datum("ellipsoid")).heights == asked
 
 
 def write_dem(path, geoid_too, crs):
@@ -193,7 +216,12 @@ def test_nothing_is_above_a_geoid_in_a_local_frame(geoid, tmp_path, monkeypatch)
     assert not (tmp_path / "o").exists()
 
 
-def test_a_geoid_of_another_place_is_refused_before_the_first_tile(images, geoid, tmp_path):
+def test_a_geoid_of_another_place_is_refused_before_the_first_tile(images, tmp_path, monkeypatch):
+    def no_tile(*_):
+        raise AssertionError("a tile was begun")
+
+    monkeypatch.setattr("zlocus.pipeline.match_tile", no_tile)
+    monkeypatch.setattr("zlocus.cloud.match_images", no_tile)
     away = write_geoid(tmp_path / "away.tif", np.zeros((4, 4), np.float32), from_origin(5, 44, 0.25, 0.25))
     for asked in (None, HEIGHTS):
         with pytest.raises(InputError, match=r"away\.tif does not cover 46\d+"):

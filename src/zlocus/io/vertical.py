@@ -193,7 +193,7 @@ def vertical_datum_of(crs: CRS, path: Path, option: str) -> VerticalDatum:
     if vertical is None:
         return ELLIPSOIDAL
     for name, known in KNOWN.items():
-        if vertical.to_epsg() == known.epsg or (vertical.datum is not None and vertical.datum.name == known.datum):
+        if vertical.datum is not None and vertical.datum.name == known.datum:
             return _installed(name, f"{path} has {known.title} heights by its CRS, which", f"{option} FILE")
     raise InputError(
         f"{path} has heights above something that zlocus has no geoid of ({vertical.name}, by its CRS). Give its geoid "
