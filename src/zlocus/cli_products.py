@@ -27,9 +27,11 @@ def products(
     from zlocus.io.config import read_config
     from zlocus.io.opening import existing_file
     from zlocus.options import RunConfig
-    from zlocus.products.maps import FILES, make_maps
+    from zlocus.products.maps import FILES, link_all, make_maps
 
     existing_file(out / "dsm.tif", "surface")
     options = (RunConfig() if config is None else read_config(config)).products
-    make_maps(out, chosen, options, progress_for(sys.stderr))
+    progress = progress_for(sys.stderr)
+    make_maps(out, chosen, options, progress)
+    link_all(out, progress)
     print(f"{out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")

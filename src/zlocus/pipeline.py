@@ -40,7 +40,7 @@ from zlocus.preparing import (
     what_was_applied,
     with_heights,
 )
-from zlocus.products.maps import check_maps, make_maps, remove_maps
+from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
@@ -170,8 +170,6 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         **tally.as_dict(),
     }
     _write_maps(request, config, watch, record, progress)
-    if request.report:
-        try_report(out, progress)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
 
@@ -179,11 +177,15 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
 def _write_maps(
     request: DsmRequest, config: RunConfig, watch: Stopwatch, record: dict[str, Any], progress: Progress
 ) -> None:
-    """run.json and the maps: the record first, for maps may fail, and again with the time that they took."""
+    """run.json and the maps: the record first, for maps may fail, and again with the time that they took; then the
+    report, which shows it, and the item, which links them all."""
     write_record(request.out / "run.json", record)
     with watch.stage("products"):
         make_maps(request.out, request.products, config.products, progress)
     write_record(request.out / "run.json", record)
+    if request.report:
+        try_report(request.out, progress)
+    link_all(request.out, progress)
 
 
 def _opened(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:

@@ -21,6 +21,7 @@ from zlocus.scene import is_local
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
+HTML, GEOJSON = "text/html", "application/geo+json"
 # Pieces of each side of the grid, whose straight sides are curves in degrees; a centimetre on the ground.
 PIECES, DEGREE_DIGITS = 16, 7
 STATISTICS = {"MINIMUM": "minimum", "MAXIMUM": "maximum", "MEAN": "mean", "STDDEV": "stddev",
@@ -49,6 +50,9 @@ PRODUCTS = (
     Product("surface.laz", "The surface's cells as coloured points", LAZ, ("data",)),
     Product("ties.gpkg", "Tie points", GEOPACKAGE, ("metadata",)),
     Product("ranking.gpkg", "What tie points say of the images", GEOPACKAGE, ("metadata",)),
+    Product("report.html", "All of it for people, on one page", HTML, ("overview", "metadata")),
+    Product("footprints.geojson", "Outlines and pairs of the images", GEOJSON, ("metadata",)),
+    Product("curves.json", "Match curves of some cells", JSON, ("metadata",)),
     Product("run.json", "What was asked, versions, inputs, times", JSON, ("metadata",)),
 )
 

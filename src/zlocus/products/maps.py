@@ -19,7 +19,7 @@ FILES = {"dtm": "dtm.tif", "hillshade": "hillshade.tif", "contours": "contours.g
 
 
 def make_maps(folder: Path, names: Collection[str], options: ProductOptions, progress: Progress) -> None:
-    """Make products of the rasters in a folder, each whole or not at all, and the item that links all files.
+    """Make products of the rasters in a folder, each whole or not at all.
 
     Raises
     ------
@@ -32,13 +32,21 @@ def make_maps(folder: Path, names: Collection[str], options: ProductOptions, pro
     """
     check_maps(names, options, (folder / FILES["dtm"]).exists())
     wanted = [name for name in FILES if name in names]
-    with progress.stage("Products", len(wanted) + 1) as stage:
+    with progress.stage("Products", len(wanted)) as stage:
         for name in wanted:
             _MAKERS[name](folder, folder / FILES[name], options)
             stage.advance()
-        is_linked = write_item(folder)
-        stage.advance()
-    if not is_linked:
+
+
+def link_all(folder: Path, progress: Progress) -> None:
+    """The item that links all files of a folder, or a note why there is none.
+
+    Raises
+    ------
+    InputError, OutputError
+        As `write_item`.
+    """
+    if not write_item(folder):
         progress.note("No item.json: the frame is local, and STAC is about places on the Earth.")
 
 

@@ -1,0 +1,246 @@
+"""zlocus from Python: a surface as one Dataset, and its stages on arrays.
+
+    >>> import zlocus
+    >>> surface = zlocus.match("img_1.tif", "img_2.tif", "img_3.tif", resolution=0.5)
+    >>> surface.height.rio.to_raster("dsm.tif")
+
+Needs xarray and rioxarray: `pip install zlocus[xarray]`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from zlocus.errors import ConfigError, InputError
+from zlocus.io import scene_file
+from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties
+from zlocus.options import OrientationOptions, RunConfig, SemiGlobalOptions
+from zlocus.orientation.orient import Orientation
+from zlocus.preparing import asked_crs, oriented
+from zlocus.progress import Progress, SilentProgress
+from zlocus.request import DsmRequest
+from zlocus.scene import ImageSource, Scene
+from zlocus.surface.reasons import Quality
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+PathLikes = str | PathLike[str]
+# Names in the Dataset, and what CF calls them.
+VARIABLES = {
+    "height": ("dsm.tif", "height of the surface at the cell's centre"),
+    "sigma": ("sigma.tif", "standard deviation of the height"),
+    "quality": ("quality.tif", "reasons why a height is missing or doubtful"),
+    "views": ("views.tif", "images used"),
+    "ortho": ("ortho.tif", "grey value of the leading image that sees the cell"),
+}
+# Costs of one step of NCC, as the kernels count them, and the largest that they hold.
+COST_UNIT, MOST_COST = 64.0, 255.0
+ALL_VALID = 1e-3  # rounding of weights
+
+
+def open_scene(*inputs: PathLikes, crs: str | CRS | None = None) -> Scene:
+    """Images with their cameras, in one frame.
+
+    inputs : two images or more with RPC, or one `scene.yaml`. crs : of the frame, projected in metres; by default that
+    of the file, else the WGS84 UTM zone of the scene's centre.
+
+    Raises
+    ------
+    InputError, ConfigError
+        See `zlocus.io.scene_file.open_scene`.
+    """
+    asked = crs if crs is None or isinstance(crs, CRS) else asked_crs(crs)
+    return scene_file.open_scene([Path(path) for path in inputs], asked)
+
+
+def orient(
+    scene: Scene,
+    options: OrientationOptions | None = None,
+    *,
+    heights: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+) -> Orientation:
+    """Tie points and corrections of the cameras; `orientation.apply(scene)` is the corrected scene.
+
+    heights : (zmin, zmax) m above the ellipsoid between which ties are looked for; None: all that the cameras allow.
+
+    Raises
+    ------
+    GeometryError
+        Where images share too little ground, or their pointing is worse than can be corrected.
+    """
+    return oriented(scene, options or OrientationOptions(), heights or scene.heights, progress or SilentProgress())
+
+
+def match(
+    *inputs: PathLikes,
+    out: PathLikes | None = None,
+    config: RunConfig | None = None,
+    progress: Progress | None = None,
+    **asked: Any,
+) -> xr.Dataset:
+    """The surface of a scene: what `zlocus dsm` writes, as a Dataset (see `open_surface`).
+
+    inputs : two images or more with RPC, or one `scene.yaml`. out : folder for the products, which are then read from
+    there when they are needed; None: none are kept, and the Dataset is in memory. asked : fields of
+    `zlocus.request.DsmRequest`, such as resolution, bounds, heights, workers; those that name files take paths.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError, CoverageError
+        As `zlocus dsm`. CoverageError: too few cells have a height; what was found lies in `out`.
+    """
+    from zlocus.pipeline import run_dsm
+
+    known = {field for field in DsmRequest.__dataclass_fields__ if field not in ("inputs", "out")}
+    if unknown := sorted(set(asked) - known):
+        raise ConfigError(f"match() does not know {', '.join(unknown)}. Known are {', '.join(sorted(known))}.")
+    for name in ("like", "area", "mask", "dem"):
+        if asked.get(name) is not None:
+            asked[name] = Path(asked[name])
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "surface" if out is None else Path(out)
+        request = DsmRequest(inputs=tuple(Path(path) for path in inputs), out=folder, **asked)
+        run_dsm(request, config or RunConfig(), progress or SilentProgress())
+        surface = open_surface(folder)
+        return surface.load() if out is None else surface
+
+
+def open_surface(folder: PathLikes) -> xr.Dataset:
+    """The result of `zlocus dsm` in a folder: height, sigma (m), quality (bit flags), views and ortho over y and x.
+
+    NaN is a missing height; `zlocus.surface.reasons.Quality` names the flags. Cells are read when they are needed. The
+    CRS is that of the `rio` accessor: `surface.rio.crs`.
+
+    Raises
+    ------
+    InputError
+        Where the folder holds no such result, or xarray and rioxarray are not installed.
+    """
+    try:
+        import rioxarray
+        import xarray as xr
+    except ImportError as error:
+        raise InputError(f"{error.name} is not installed: pip install zlocus[xarray].") from error
+    folder = Path(folder)
+    found = {}
+    for name, (file, long_name) in VARIABLES.items():
+        if not (folder / file).is_file():
+            raise InputError(f"{folder} holds no {file}. Give the folder that a finished `zlocus dsm` wrote.")
+        raster = rioxarray.open_rasterio(folder / file)
+        assert isinstance(raster, xr.DataArray)
+        found[name] = raster.squeeze("band", drop=True)
+        found[name].attrs = {"long_name": long_name, **({"units": "m"} if name in ("height", "sigma") else {})}
+    flags = [flag for flag in Quality if flag.name]
+    found["quality"].attrs |= {
+        "flag_masks": [int(flag) for flag in flags],
+        "flag_meanings": " ".join(str(flag.name) for flag in flags),
+    }
+    return xr.Dataset(found)
+
+
+@dataclass(frozen=True)
+class LocusStack:
+    """What every image shows along the vertical lines of some cells.
+
+    grey : (i, h, r, c) float32, grey value of image i where cell (r, c) would be if it were at height h; NaN where the
+    image does not show it. heights : (h,) m. x, y : (c,), (r,) m, of the cells' centres. names : of the images.
+    """
+
+    grey: NDArray[np.float32]
+    heights: NDArray[np.float64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    names: tuple[str, ...]
+
+
+def locus_stack(
+    scene: Scene, bounds: tuple[float, float, float, float], resolution: float, heights: Sequence[float]
+) -> LocusStack:
+    """Images of a scene resampled (cubic) along the vertical lines of the cells of an area: its vertical line loci.
+
+    For looking at loci and for measures of one's own; the matcher itself never holds so much. bounds : (xmin, ymin,
+    xmax, ymax) m in the scene's frame; resolution : m; heights : (h,) m above the ellipsoid. Source: Ji et al. (2014),
+    section 2 (MVLL).
+
+    Raises
+    ------
+    ConfigError
+        Where there are no cells or no heights.
+    """
+    across, down = (round((bounds[k + 2] - bounds[k]) / resolution) for k in (0, 1))
+    if min(across, down, len(heights)) < 1:
+        raise ConfigError(f"{down} x {across} cells at {len(heights)} heights hold nothing. Give more of each.")
+    x = np.asarray(bounds[0] + (np.arange(across) + 0.5) * resolution, np.float64)
+    y = np.asarray(bounds[3] - (np.arange(down) + 0.5) * resolution, np.float64)
+    column, row = np.meshgrid(x, y)
+    grey = np.full((len(scene.views), len(heights), down, across), np.nan, np.float32)
+    for i, view in enumerate(scene.views):
+        for h, z in enumerate(heights):
+            xyz = np.column_stack([column.ravel(), row.ravel(), np.full(row.size, float(z))])
+            grey[i, h] = _sampled(view.image, view.sensor.image_from_ground(xyz).reshape(down, across, 2))
+    return LocusStack(grey, np.asarray(heights, float), x, y, tuple(view.name for view in scene.views))
+
+
+def _sampled(image: ImageSource, xy: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Cubic values (r, c) of an image at (r, c, 2) px, NaN outside and beside pixels that are not valid."""
+    import cv2
+
+    out = np.full(xy.shape[:2], np.nan, np.float32)
+    rows, cols = image.shape
+    inside: NDArray[np.bool_] = np.all((xy >= 0) & (xy <= (cols - 1, rows - 1)), axis=-1)
+    if not inside.any():
+        return out
+    # Only the part that is needed, with what the weights of cubic interpolation reach.
+    low = np.maximum(np.floor(xy[inside].min(axis=0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(xy[inside].max(axis=0)).astype(int) + 3, (cols, rows))
+    part = image.read(int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0]))
+    at = np.where(inside[..., None], xy - low, 0.0).astype(np.float32)
+    grey = cv2.remap(part.pixels, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    known = cv2.remap(part.valid.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    shown = inside & (known > 1 - ALL_VALID)
+    out[shown] = grey[shown]
+    return out
+
+
+def semiglobal(
+    cost: NDArray[np.floating],
+    *,
+    ortho: NDArray[np.float32] | None = None,
+    options: SemiGlobalOptions | None = None,
+    step_cells: float = 1.0,
+) -> SemiGlobalHeights:
+    """The semi-global constraint on a measure of one's own.
+
+    cost : (r, c, h) in units of 1 - NCC, 0 where all images agree and NaN where nothing is known (there it is 1); the
+    penalties are chosen for those units. ortho : (r, c) grey values, at whose edges heights may jump. step_cells : a
+    height step over the side of a cell. Heights come back as indices into h; `vertex` is the one between steps.
+
+    Raises
+    ------
+    ConfigError
+        Where the arrays do not fit.
+    """
+    if cost.ndim != 3 or min(cost.shape) < 1:
+        raise ConfigError(f"The cost has the shape {cost.shape}. Give one of (rows, columns, heights).")
+    shape = cost.shape[:2]
+    if ortho is not None and ortho.shape != shape:
+        raise ConfigError(f"The ortho-image has {ortho.shape} cells, the cost {shape}. Give both on one grid.")
+    options = options or SemiGlobalOptions()
+    counted = np.rint(np.where(np.isfinite(cost), cost, 1.0) * COST_UNIT).clip(0, MOST_COST).astype(np.uint8)
+    lattice = HeightLattice(
+        0.0, 1.0, shape, max(shape), np.zeros((1, 1), np.int64), np.full((1, 1), cost.shape[2], np.int64)
+    )
+    p2 = penalties(ortho, shape, 0, options)
+    return aggregate(np.ascontiguousarray(counted).ravel(), lattice, p2, step_cells, options)

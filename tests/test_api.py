@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pyproj import CRS
+from scipy.ndimage import uniform_filter
+
+import zlocus
+from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, read, run
+from zlocus.errors import ConfigError, InputError
+from zlocus.options import SemiGlobalOptions
+from zlocus.surface.reasons import Quality
+from zlocus.synthetic.terrain import analytic_height
+
+ASKED = {"crs": "EPSG:32632", "resolution": GSD_M, "heights": HEIGHTS, "bounds": PART}
+# A measure of one's own, without refinement, on noisy images: half a step, and how many may be beyond.
+STEP_M, SHARE = 0.5, 0.97
+
+
+@pytest.fixture(scope="module")
+def written(images, tmp_path_factory):
+    """The part of the sine, through the command's own function."""
+    return run(images("sine"), tmp_path_factory.mktemp("written") / "out", SMALL_TILES, bounds=PART).out
+
+
+def test_a_surface_in_memory_is_what_the_command_writes(images, written):
+    surface = zlocus.match(*map(str, images("sine").inputs), config=SMALL_TILES, **ASKED)
+    for name, file in (("height", "dsm"), ("sigma", "sigma"), ("quality", "quality"), ("views", "views")):
+        expected, source = read(written / f"{file}.tif")
+        np.testing.assert_array_equal(surface[name].values, expected)
+    assert CRS.from_user_input(surface.rio.crs.to_wkt()).to_2d().equals(CRS.from_epsg(32632))
+    assert surface.rio.transform() == source.transform
+    assert (float(surface.x[0]), float(surface.y[0])) == (source.bounds.left + 0.25, source.bounds.top - 0.25)
+    assert surface.height.attrs["units"] == "m"
+    seen = surface.where((surface.quality & int(Quality.JUMP)) == 0).height
+    assert np.isfinite(seen.values).mean() > 0.9
+
+
+def test_flags_are_named(written):
+    surface = zlocus.open_surface(written)
+    flags = dict(zip(surface.quality.flag_meanings.split(), surface.quality.flag_masks, strict=True))
+    assert flags == {flag.name: int(flag) for flag in Quality}
+
+
+def test_products_are_kept_where_they_are_asked_for(images, tmp_path):
+    surface = zlocus.match(*images("sine").inputs, out=str(tmp_path / "kept"), config=SMALL_TILES, **ASKED)
+    assert (tmp_path / "kept" / "run.json").is_file()
+    np.testing.assert_array_equal(surface.height.values, read(tmp_path / "kept" / "dsm.tif")[0])
+
+
+def test_what_is_wrong_is_said(images, tmp_path):
+    with pytest.raises(ConfigError, match=r"does not know resolutoin\. Known are .*resolution"):
+        zlocus.match(*images("sine").inputs, resolutoin=1.0)
+    with pytest.raises(InputError, match=r"holds no dsm\.tif\. Give the folder"):
+        zlocus.open_surface(tmp_path)
+    with pytest.raises(InputError, match="two images or more"):
+        zlocus.open_scene(images("sine").inputs[0])
+    with pytest.raises(ConfigError, match="EPSG:4326"):
+        zlocus.open_scene(*images("sine").inputs, crs="EPSG:4326")
+    scene = zlocus.open_scene(*images("sine").inputs)
+    with pytest.raises(ConfigError, match="0 x 52 cells at 1 heights hold nothing"):
+        zlocus.locus_stack(scene, (PART[0], PART[1], PART[2], PART[1]), GSD_M, [50.0])
+
+
+def test_stages_one_by_one_find_the_true_heights(images):
+    """Open, orient, resample along the loci, a measure of one's own, the semi-global constraint."""
+    scene = zlocus.open_scene(*images("sine").inputs, crs="EPSG:32632")
+    scene = zlocus.orient(scene, heights=HEIGHTS).apply(scene)
+    heights = np.arange(40.0, 60.1, STEP_M)
+    stack = zlocus.locus_stack(scene, PART, GSD_M, heights)
+    assert stack.grey.shape == (3, len(heights), 38, 52)
+    assert stack.names == tuple(view.name for view in scene.views)
+    windows = [(v - uniform_filter(v, (1, 5, 5))) for v in stack.grey.astype(float)]
+    units = [v / np.sqrt(uniform_filter(v * v, (1, 5, 5)) + 1e-6) for v in windows]
+    ncc = np.mean([uniform_filter(units[a] * units[b], (1, 5, 5)) for a, b in ((0, 1), (0, 2), (1, 2))], axis=0)
+    found = zlocus.semiglobal(np.moveaxis(1 - ncc, 0, -1), step_cells=STEP_M / GSD_M)
+    z = heights[0] + STEP_M * found.vertex
+    x, y = np.meshgrid(stack.x, stack.y)
+    error = (z - analytic_height("sine", x - CENTRE[0], y - CENTRE[1]))[4:-4, 4:-4]
+    assert (np.abs(error) < STEP_M).mean() > SHARE
+
+
+def test_the_stack_shows_nothing_outside_an_image(images):
+    scene = zlocus.open_scene(*images("sine").inputs, crs="EPSG:32632")
+    far = (PART[0] - 500.0, PART[1], PART[0] - 490.0, PART[3])
+    assert np.isnan(zlocus.locus_stack(scene, far, GSD_M, [50.0]).grey).all()
+    wide = (PART[0] - 60, PART[1] - 60, PART[2] + 60, PART[3] + 60)
+    edge = zlocus.locus_stack(scene, wide, GSD_M, [50.0])
+    np.testing.assert_allclose(edge.x[[0, -1]], (wide[0] + GSD_M / 2, wide[2] - GSD_M / 2), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(edge.y[[0, -1]], (wide[3] - GSD_M / 2, wide[1] + GSD_M / 2), rtol=0, atol=1e-6)
+    column, row = np.meshgrid(edge.x, edge.y)
+    for view, grey in zip(scene.views, edge.grey[:, 0], strict=True):
+        xy = view.sensor.image_from_ground(np.column_stack([column.ravel(), row.ravel(), np.full(row.size, 50.0)]))
+        inside = ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1).reshape(row.shape)
+        np.testing.assert_array_equal(np.isfinite(grey), inside)
+        assert 0.1 < inside.mean() < 0.9
+
+
+@pytest.mark.parametrize("n_heights", [1, 2, 5, 16, 27])
+@pytest.mark.parametrize("predecessors", [1, 2])
+def test_semiglobal_of_any_number_of_heights(n_heights, predecessors):
+    """A ramp from the first height to the last, with a hole in what is known and false minima of single cells."""
+    rng, shape = np.random.default_rng(n_heights), (23, 31)
+    truth = np.broadcast_to(np.linspace(0, n_heights - 1, shape[1]).round().astype(int), shape)
+    cost = 1.0 - 0.9 * (np.arange(n_heights) == truth[..., None])
+    false = rng.random(shape) < 0.05
+    cost[false] = 1.0 - 0.9 * (np.arange(n_heights) == rng.integers(0, n_heights, shape)[..., None])[false]
+    cost[10:12, 14:16] = np.nan
+    found = zlocus.semiglobal(cost, options=SemiGlobalOptions(predecessors=predecessors))
+    assert (np.abs(found.best - truth) <= 1).mean() > 0.98
+    np.testing.assert_array_equal(np.asfortranarray(cost), cost)
+    again = zlocus.semiglobal(np.asfortranarray(cost), options=SemiGlobalOptions(predecessors=predecessors))
+    np.testing.assert_array_equal(again.best, found.best)
+
+
+def test_semiglobal_jumps_at_edges_of_the_ortho_image():
+    """Where nothing is known beside a jump, it is put where the grey value changes."""
+    truth = np.where(np.arange(30) < 15, 2, 9) * np.ones((20, 1), int)
+    cost = 1.0 - 0.9 * (np.arange(12) == truth[..., None])
+    cost[:, 11:18] = np.nan
+    rng = np.random.default_rng(0)
+    ortho = (np.where(np.arange(30) < 13, 50, 200) + rng.normal(0, 2, (20, 30))).astype(np.float32)
+    found = zlocus.semiglobal(cost, ortho=ortho)
+    assert (found.best[:, :13] == 2).all()
+    assert (found.best[:, 13:] == 9).all()
+
+
+def test_arrays_that_do_not_fit():
+    with pytest.raises(ConfigError, match=r"shape \(4, 5\)\. Give one of \(rows, columns, heights\)"):
+        zlocus.semiglobal(np.zeros((4, 5)))
+    with pytest.raises(ConfigError, match=r"\(5, 4\) cells, the cost \(4, 5\)"):
+        zlocus.semiglobal(np.zeros((4, 5, 6)), ortho=np.zeros((5, 4), np.float32))
+
+
+def test_the_package_is_imported_without_its_kernels():
+    code = "import sys, zlocus; assert not {'numba', 'rasterio', 'xarray'} & set(sys.modules); zlocus.match"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="no attribute 'mtach'"):
+        _ = zlocus.mtach
