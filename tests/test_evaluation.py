@@ -242,6 +242,16 @@ def test_a_slope_has_its_angle_whatever_its_direction(tmp_path):
         np.testing.assert_allclose(truth.slope_deg, np.degrees(np.arctan(0.5)), atol=0.01)
 
 
+def test_heights_between_cells_need_all_four(tmp_path):
+    z = np.array([[1, 2, 3], [4, 5, 6], [7, 8, np.nan]], np.float32)
+    raster = read_heights(write(tmp_path / "z.tif", z, from_origin(0, 3, 1, 1)))
+    # Column and row in cells from the north-west corner: the middle, half a cell in, outside of the centres, by a hole.
+    at = np.array([[1.0, 1.0], [1.25, 1.5], [0.4, 1.0], [1.0, 2.6], [-0.2, 1.0], [2.0, 2.0]])
+    xy = np.column_stack([at[:, 0], 3 - at[:, 1]])
+    np.testing.assert_allclose(raster.between_cells(xy), [3.0, 4.75, *[np.nan] * 4])
+    np.testing.assert_allclose(raster.bilinear(xy), [3.0, 4.75, 4.0, 8.0, np.nan, np.nan])
+
+
 def test_a_case_computed_by_hand(tmp_path):
     # Cells of 1 m under cells of 2 m that start a metre further north-west; a hole in each.
     nan = np.nan
