@@ -48,6 +48,9 @@ def test_what_lies_at_the_rim_or_beside_nothing_is_no_wider_than_it_is():
     other[5:35, :18] = 9.0
     assert (opened(other, nothing, 6)[~nothing] == 0).all()
     assert (opened(other, inside(z), 6)[5:35, 12:18] == 9).any()
+    # A narrow strip of level ground between nothing stays level, whatever a membrane would have beside it.
+    strip = np.where(nothing := np.abs(np.arange(40) - 20) > 2, -50, np.zeros((40, 40))).astype(np.float32)
+    assert (opened(strip, np.tile(nothing, (40, 1)), 6)[:, 18:23] == 0).all()
 
 
 def test_a_rise_is_found_by_the_first_window_wider_than_it():
