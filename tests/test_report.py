@@ -424,7 +424,7 @@ def test_cells_at_regular_distances_over_all_blocks(tmp_path, monkeypatch):
                "blockysize": 256}  # fmt: skip
     values = {
         "dsm": rng.normal(size=(rows, cols)).astype(np.float32), "sigma": rng.random((rows, cols)).astype(np.float32),
-        "quality": rng.choice([0, 1, 2, 16, 272], size=(rows, cols)).astype(np.uint16),
+        "quality": rng.choice([0, 1, 2, 16, 17, 272], size=(rows, cols)).astype(np.uint16),
         "views": rng.integers(0, 9, (rows, cols)).astype(np.uint8),
     }  # fmt: skip
     for name, array in values.items():
@@ -436,8 +436,9 @@ def test_cells_at_regular_distances_over_all_blocks(tmp_path, monkeypatch):
                        ("views", found.views)):  # fmt: skip
         np.testing.assert_array_equal(kept, values[name][found.first :: 11, found.first :: 11])
     counts = Counter(values["quality"].ravel().tolist())
-    assert found.n_asked == rows * cols - counts[1]
-    assert found.n_seen == rows * cols - counts[1] - counts[2]
+    assert found.n_asked == rows * cols - counts[1] - counts[17]
+    assert found.n_seen == found.n_asked - counts[2]
+    assert found.count(Quality.OUTSIDE) == counts[1] + counts[17]
     assert found.count(Quality.NO_MATCH) == counts[16] + counts[272]
     assert found.count(Quality.WEAK) == counts[272]
     np.testing.assert_array_equal(found.n_used[:9], np.bincount(values["views"].ravel()))
@@ -473,7 +474,8 @@ def test_reasons_are_said_as_the_documents_say_them():
 def test_every_reason_has_a_colour_of_its_group():
     group = maps.groups_of(np.array([0, *(int(flag) for flag in Quality)]))
     assert group[0] == len(maps.GROUPS)
-    assert (group[1:] < len(maps.GROUPS)).all()
+    for flag, k in zip(Quality, group[1:], strict=True):
+        assert flag.name in maps.GROUPS[k][0] or flag in (Quality.OUTSIDE, Quality.UNSEEN)
     both = maps.groups_of(np.array([int(Quality.NO_MATCH | Quality.FILLED), int(Quality.FILLED)]))
     assert both[0] == both[1]  # filled, whatever was the matter
     colours = [colour for _, _, colour in maps.GROUPS] + [maps.PLAIN[1]]
