@@ -27,6 +27,7 @@ from pyproj import CRS, Transformer
 
 import terrain_features
 from baselines import baselines
+from double_mapping import double_mapped
 from middlebury import CASES, judge
 from reprojection import Surface, reprojected
 from zlocus.evaluation.evaluate import evaluate
@@ -391,6 +392,19 @@ def new_scene(at: Workplace, kind: str, seed: int, scene: Path) -> list[Figure]:
     return figures
 
 
+def ortho(at: Workplace) -> list[Figure]:
+    """The true ortho-image of the rendered town: cells that show what hides them."""
+    scene = at.scene("rendered-city")
+    images = rendered_images(scene)
+    run([ZLOCUS, "dsm", *images, "-o", at.out, "--resolution", 0.5, "--overwrite"])
+    found = double_mapped(at.out, scene / "truth_dsm.tif", scene / "truth_class.tif", open_scene(images))
+    return [
+        Figure(f"{kind} that shows what hides it{which}", share)
+        for kind, shares in found.items()
+        for which, share in zip(("", ", of right heights"), shares, strict=True)
+    ]
+
+
 def surfaces_of(kind: str, *more: str) -> tuple[str, ...]:
     """Classes of a rendered scene that are judged."""
     return ("all", "ground", *(("building",) if kind == "city" else ()), *more)
@@ -702,7 +716,7 @@ def clone(at: Workplace) -> list[Figure]:
 ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "demo": demo, "mixed": mixed, "calanques": calanques, "city": city, "city-views": city_views, "hills": hills,
     "joint": joint,
-    "new-scenes": new_scenes, "ventoux": ventoux, "datum": datum,
+    "new-scenes": new_scenes, "ventoux": ventoux, "datum": datum, "ortho": ortho,
     "dmc": dmc, "tuniu": tuniu, "herzjesu": herzjesu, "kernels": kernels,
     "selection": selection, "features": features, "middlebury": middlebury, "memory": memory, "speed": speed,
     "clone": clone,
