@@ -239,15 +239,6 @@ def test_missing_parts_are_said_in_words(out):
     assert "None was given" in parsed.text("reference")
 
 
-def test_a_local_frame_has_no_place_on_the_earth(out):
-    local = 'ENGCRS["wall",EDATUM["wall"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
-    changed(out, "run.json", lambda record: record["grid"].update(crs=local))
-    (out / "footprints.geojson").unlink()
-    write_report(out)
-    assert "local frame, which has no place on the Earth" in page_of(out).text("summary")
-    assert "°" not in page_of(out).text("summary")
-
-
 def test_a_surface_without_any_height_has_a_page(out):
     for name, value in (("dsm", np.nan), ("sigma", np.nan), ("views", 0), ("quality", int(Quality.NO_MATCH))):
         with rasterio.open(out / f"{name}.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as file:
