@@ -33,6 +33,7 @@ from zlocus.request import (
     DsmRequest,
     ImportRequest,
     OrientRequest,
+    RankRequest,
     check_output,
 )
 
@@ -326,6 +327,27 @@ def ties(
     from zlocus.orienting import run_orient
 
     print(run_orient(request, run_config, progress_for(sys.stderr)))
+
+
+@app.command()
+@explained
+def rank(
+    inputs: Inputs,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the ranking.")],
+    resolution: Resolution = None,
+    crs: Crs = None,
+    heights: TieHeights = None,
+    workers: Workers = 1,
+    overwrite: Overwrite = False,
+    config: ConfigFile = None,
+) -> None:
+    """Say how well each image matches each other, at the tie points."""
+    request = RankRequest(tuple(inputs), out, resolution, crs, heights, workers, overwrite)
+    check_output(out, overwrite)
+    run_config = _run_config(config)
+    from zlocus.ranking import run_rank
+
+    print(run_rank(request, run_config, progress_for(sys.stderr)))
 
 
 @app.command()

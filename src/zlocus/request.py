@@ -10,7 +10,7 @@ from pathlib import Path
 from zlocus.errors import ConfigError, InputError, OutputError
 
 SCENE_SUFFIXES = (".yaml", ".yml")
-RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "orientation.json", "scene.yaml")
+RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 VERTICALS = ("ellipsoid",)
@@ -201,6 +201,35 @@ class OrientRequest:
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         _check_heights(self.heights)
+
+
+@dataclass(frozen=True)
+class RankRequest:
+    """Images to be ranked. `None` means: not given, to be found.
+
+    inputs, out, resolution, crs, heights, workers, overwrite : as in `DsmRequest`.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    resolution: float | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    workers: int = 1
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_positive("--resolution", self.resolution, "m")
+        _check_heights(self.heights)
+        _check_workers(self.workers)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -18,6 +17,7 @@ from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
 from zlocus.matching.planes import PlanarHeights, texture_unit, with_planes
 from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
+from zlocus.matching.ranking import KnownGround, ranked_at_ties
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
     Coarser,
@@ -29,7 +29,6 @@ from zlocus.matching.selection import (
     images_needed,
     order_views,
     preselected,
-    rank_views,
     sampled_cells,
 )
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
@@ -168,36 +167,19 @@ def _ranking(
     """Labels of the views at the tie points in and around the tile; None where there are too few views to choose."""
     if len(pixels) < config.selection.fewest_views or len(pixels) - 1 <= config.selection.least_images:
         return None
-    around = math.ceil(config.selection.radius_px)
-    window = core.at_level(0, around).within(scene.seen)
-    side = config.measure.large_window
-    reach = config.selection.reach_steps * scene.step_m
-    z = (scene.origin_m - reach, scene.origin_m + scene.n_steps * scene.step_m + reach)
-    transform, shape = scene.transform(window, 0), (window.rows, window.cols)
-    xy = (scene.ties[:, :2] - scene.anchor) * (1.0, -1.0) / scene.cell_m
-    index = (scene.ties[:, 2] - scene.origin_m) / scene.step_m
-    lattice, needed = (scene.origin_m, scene.step_m), _heights_of_ties(scene, xy, window, reach)
-    views = tile_views(pixels, 0, transform, shape, config.pyramid.block, lattice, z, side // 2, needed)
-    steps_per_cell = scene.cell_m / scene.step_m
     if coarsest is None:
-        flat = np.zeros((len(xy), 2))
-        return rank_views(views, window, xy, index, flat, side, steps_per_cell, config.selection)
-    surface = smoothed(coarsest.heights.vertex, config.refine.jump_steps)
-    coarse_cell = np.floor(xy[:, ::-1] / 2**coarsest.level).astype(np.int64)
-    at = tuple(np.clip(coarse_cell - (coarsest.window.row, coarsest.window.col), 1, np.subtract(surface.shape, 2)).T)
-    # Steps per cell are the same at every level.
-    slope = np.stack([(surface[at[0] + i, at[1] + j] - surface[at[0] - i, at[1] - j]) / 2 for i, j in ((1, 0), (0, 1))])
-    return rank_views(views, window, xy, index, slope.T, side, steps_per_cell, config.selection)
+        return ranked_at_ties(scene, pixels, core, None, config)
+    known = KnownGround(coarsest.heights.vertex, coarsest.level, coarsest.window)
+    return ranked_at_ties(scene, pixels, core, known, config)
 
 
-def _heights_of_ties(
-    scene: MatchScene, xy: NDArray[np.float64], window: CellWindow, reach: float
-) -> tuple[float, float] | None:
-    """Heights (m) of the ties within a window, widened by `reach`; None where there are none. xy : (n, 2) cells."""
-    first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
-    z = scene.ties[((xy >= first) & (xy < last)).all(axis=1), 2]
-    z = z[np.isfinite(z)]
-    return (float(z.min()) - reach, float(z.max()) + reach) if len(z) else None
+def rank_tile(scene: MatchScene, core: CellWindow, config: RunConfig) -> tuple[Ranking, list[int]] | None:
+    """The ranking of the views that may see a tile's core, however few, and which of the scene's they are, before
+    anything is matched; None where fewer than two see it."""
+    if not (core.rows and core.cols):
+        return None
+    pixels, which = _read(scene, core, config, True)
+    return (ranked_at_ties(scene, pixels, core, None, config), which) if len(pixels) > 1 else None
 
 
 def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:

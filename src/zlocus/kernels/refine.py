@@ -147,8 +147,7 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
             gather(pixels, layout, index, across, pairs, out[first:end])
 
 
-# (p,) f4, i8, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (j,) f4, i8, (w,) i8, (3,i,r,c) i4, f4, (w,g,j,r,c) f4
-# -> None
+# (p) f4, i8, (i,3) i8, (i,2,2,2,4) f8, (2) f8, (r,c) f4, (j) f4, i8, (w) i8, (3,i,r,c) i4, f4, (w,g,j,r,c) f4 -> None
 @kernel
 def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, windows, seen, floor, out):
     """Mean NCC over all pairs of the views that see the surface, at `surface` + `offsets`; windows follow the surface.

@@ -1,0 +1,140 @@
+"""The order of a ranking that stands alone: scene, ties, labels of every pair of images, files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.execution.local import run_all
+from zlocus.execution.plan import plan_tiles
+from zlocus.grid import grid_from_bounds
+from zlocus.io.config import config_as_dict
+from zlocus.io.scene_file import open_scene
+from zlocus.matching.curve import FAIR, GOOD
+from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
+from zlocus.options import RunConfig
+from zlocus.orienting import check_ties
+from zlocus.preparing import (
+    area_to_match,
+    asked_crs,
+    heights_asked_for,
+    heights_of_ties,
+    made_folder,
+    oriented,
+    possible_heights,
+    what_was_applied,
+)
+from zlocus.products.points import RankedPoints, write_ranking, write_ties
+from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.progress import Progress
+from zlocus.request import RankRequest
+from zlocus.scene import Scene, check_overlap, is_local
+from zlocus.tile import rank_tile
+
+LABELS = ("good", "fair", "poor")
+
+
+def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str:
+    """Label every pair of images at the tie points, as `zlocus dsm` does to choose them, and write ranking.gpkg,
+    ranking.json and ties.gpkg to `request.out`; a table of what came out.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError, OutputError
+        For what cannot be used, before anything is written.
+    """
+    watch = Stopwatch()
+    with watch.stage("open"), progress.stage("Opening images"):
+        scene = open_scene(request.inputs, asked_crs(request.crs))
+        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+        heights = request.heights or scene.heights
+        if not is_local(scene.crs) or heights is not None:
+            check_overlap(scene, possible_heights(scene, heights))
+    with watch.stage("orient"):
+        orientation = oriented(scene, config.orientation, heights, progress)
+        check_ties(orientation, scene)
+        progress.note(what_was_applied(orientation))
+        scene = orientation.apply(scene)
+    with watch.stage("rank"):
+        if heights is None:
+            z_range = heights_of_ties(scene, orientation, config.orientation)
+        else:
+            z_range = heights_asked_for(scene, heights, progress)
+        z = sum(z_range) / 2
+        cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
+        check_resolution(cell, scene, z, "--resolution")
+        grid = grid_from_bounds(area_to_match(scene, orientation, z_range), cell, scene.crs)
+        settled = settle(
+            scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, None, config.pyramid, orientation.measured
+        )
+        tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
+        ranked = []
+        with progress.stage("Ranking", len(tiles)) as stage:
+            for tile, found in run_all(lambda t: rank_tile(settled, t.core, config), tiles, request.workers):
+                if found is not None:
+                    ranked.append(RankedPoints.of(*found, settled.ties, tile.core))
+                stage.advance()
+    names = [view.name for view in settled.views]
+    with watch.stage("write"), made_folder(request.out):
+        write_ties(request.out / "ties.gpkg", orientation, scene)
+        write_ranking(request.out / "ranking.gpkg", ranked, names, scene.crs)
+        counts = label_counts(ranked, len(names))
+        write_record(request.out / "ranking.json", ranking_record(counts, names))
+    write_record(request.out / "run.json", _run_record(request, config, scene, watch))
+    return ranking_table(counts, names)
+
+
+def label_counts(ranked: Sequence[RankedPoints], n_views: int) -> NDArray[np.int64]:
+    """How often each label was given, (3, i, i) int64: good, fair and poor, of the search image (last axis) against the
+    reference; 0 where the two were not compared."""
+    counts = np.zeros((3, n_views, n_views), np.int64)
+    for part in ranked:
+        at = np.ix_(part.views, part.views)
+        for k, is_label in enumerate((part.labels == GOOD, part.labels == FAIR, part.labels < FAIR)):
+            counts[k][at] += is_label.sum(axis=0)
+    counts[:, np.arange(n_views), np.arange(n_views)] = 0
+    return counts
+
+
+def ranking_record(counts: NDArray[np.int64], names: Sequence[str]) -> dict[str, Any]:
+    """For ranking.json: per pair of images that were compared, the points and their labels."""
+    pairs = [
+        {"images": [names[i], names[j]], "points": int(n.sum()), **dict(zip(LABELS, n.tolist(), strict=True))}
+        for i, j in combinations(range(len(names)), 2)
+        if (n := counts[:, i, j]).any()
+    ]
+    return {"images": list(names), "pairs": pairs}
+
+
+def ranking_table(counts: NDArray[np.int64], names: Sequence[str]) -> str:
+    """Percent of the points at which an image (column) is good against a reference (row), the leading image first, and
+    what that says in a line."""
+    total = counts.sum(axis=0)
+    share = np.where(total > 0, 100.0 * counts[0] / np.maximum(total, 1), np.nan)
+    width = max(max(len(name) for name in names), 5) + 2
+    lines = ["Points at which an image (column) alone tells the height against a reference (row), percent:"]
+    lines.append("".join([" " * width, *(f"{name:>{width}}" for name in names)]))
+    for name, row in zip(names, share, strict=True):
+        lines.append("".join([f"{name:<{width}}", *(f"{'-' if np.isnan(v) else f'{v:.0f}':>{width}}" for v in row)]))
+    of_image = [np.nanmean(share[:, j]) if np.isfinite(share[:, j]).any() else 0.0 for j in range(len(names))]
+    order = sorted(range(len(names)), key=lambda j: (-of_image[j], names[j]))
+    lines.append(f"From the most to the least useful: {', '.join(names[j] for j in order)}.")
+    return "\n".join(lines)
+
+
+def _run_record(request: RankRequest, config: RunConfig, scene: Scene, watch: Stopwatch) -> dict[str, Any]:
+    asked = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
+    asked["inputs"] = [str(path) for path in request.inputs]
+    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
+    return {
+        "config": {"request": asked, "options": config_as_dict(config)},
+        "versions": versions_record(),
+        "inputs": inputs_record(dict.fromkeys([*request.inputs, *files])),
+        "stages": watch.stages,
+    }
