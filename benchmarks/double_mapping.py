@@ -1,5 +1,5 @@
-"""Whether an ortho-image shows a place twice: cells of a rendered scene that show a pixel of an image which does not see
-them, by the exact truth.
+"""Whether an ortho-image shows a place twice: cells of a rendered scene that show a pixel of an image that is, by the
+exact truth, hidden from them.
 """
 
 from __future__ import annotations

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
 import rasterio
 from typer.testing import CliRunner
 
-from facade_scene import ALONG, FILE_FROM_WALL, KIND, OUT, photographed
+from facade_scene import ALONG, FILE_FROM_WALL, KIND, OUT, STATIONS, photographed
 from zlocus.cli import app
 from zlocus.errors import ConfigError
 from zlocus.io.scene_file import open_scene, turn_to_axes
@@ -65,6 +66,16 @@ def test_the_wall_is_found(surface):
     assert record["coverage"] > LEAST_COVERAGE
     assert (np.abs(error[found]) < WITHIN_M).mean() > LEAST_WITHIN
     assert abs(np.median(error[found])) < 0.05
+
+
+def test_the_report_says_where_it_cannot_say_where(surface):
+    text = (surface / "report.html").read_text(encoding="utf-8")
+    assert "of a local frame, which has no place on the Earth" in text
+    assert "y is up" in text
+    assert "z of the local frame, m" in text
+    assert not re.search("ellipsoid, m|north is up|°|no footprints|no match curves", text)
+    assert text.count("<polygon") == len(STATIONS) + 1
+    assert len(re.findall(r"<h3>Typical", text)) == 3
 
 
 def test_the_area_is_what_ties_and_two_images_show(surface):

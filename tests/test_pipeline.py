@@ -171,9 +171,8 @@ def test_record(whole, images):
     assert record["schema"] == 1
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in images("sine").inputs]
     assert all(len(entry["sha256"]) == 64 for entry in record["inputs"])
-    assert [stage["name"] for stage in record["stages"]] == [
-        "open", "orient", "settle", "match", "points", "record", "products",
-    ]  # fmt: skip
+    stages = ["open", "orient", "settle", "match", "points", "curves", "record", "products"]
+    assert [stage["name"] for stage in record["stages"]] == stages
     assert all(set(stage) == {"name", "wall_s", "cpu_s", "peak_mb"} for stage in record["stages"])
     assert record["evaluations"]["done"] <= record["evaluations"]["all_images"]
     assert record["evaluations"]["done"] > 1e6

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import typer.main
 from affine import Affine
 from typer.testing import CliRunner
 
@@ -239,15 +240,6 @@ def test_missing_parts_are_said_in_words(out):
     assert "None was given" in parsed.text("reference")
 
 
-def test_a_local_frame_has_no_place_on_the_earth(out):
-    local = 'ENGCRS["wall",EDATUM["wall"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
-    changed(out, "run.json", lambda record: record["grid"].update(crs=local))
-    (out / "footprints.geojson").unlink()
-    write_report(out)
-    assert "local frame, which has no place on the Earth" in page_of(out).text("summary")
-    assert "°" not in page_of(out).text("summary")
-
-
 def test_a_surface_without_any_height_has_a_page(out):
     for name, value in (("dsm", np.nan), ("sigma", np.nan), ("views", 0), ("quality", int(Quality.NO_MATCH))):
         with rasterio.open(out / f"{name}.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as file:
@@ -462,6 +454,13 @@ def test_labels_of_pairs(tmp_path):
     assert "fore against nadir: good at 75.0 %, fair at 0.00 %, poor at 25.0 % of 4 tie points" in titles
     assert tables.label_matrix(tmp_path / "ranking.gpkg", ["aft", "fore"]) is None
     assert tables.label_matrix(tmp_path / "none.gpkg", names) is None
+
+
+def test_the_page_of_the_documents_lists_every_option():
+    text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
+    command = typer.main.get_command(app).commands["report"]
+    options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
+    assert options == set(re.findall(r"^\| `(--[a-z]+)", text, re.MULTILINE))
 
 
 def test_reasons_are_said_as_the_documents_say_them():

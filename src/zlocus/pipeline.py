@@ -153,7 +153,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     remove_maps(out)
     with watch.stage("points"):
         _write_points(out, orientation, corrected, tally.ranked, settled)
-    _show(request, Matched(corrected, settled, grid, orientation.xyz), config, watch, progress)
+    matched = Matched(corrected, settled, grid, orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs))
+    _show(request, matched, config, watch, progress)
     with watch.stage("record"):
         inputs = inputs_record(_files(request, scene, vertical))
     record = {

@@ -75,7 +75,7 @@ class Swatch:
 
 
 def height_map(folder: Path, found: Survey) -> tuple[Picture, Scale]:
-    """Heights as colours, shaded by a sun in the north-west."""
+    """Heights as colours, shaded by a sun in the upper left."""
     height, cell_m = averaged(folder / "dsm.tif", RELIEF_PX)
     # Slopes need a neighbour.
     height = np.pad(height, [(0, int(n < 2)) for n in height.shape], mode="edge")

@@ -6,7 +6,7 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,6 @@ NEEDED = ("config", "versions", "inputs", "stages", "orientation", "grid", "heig
 QUANTILES = (10, 25, 50, 75, 90)
 LABEL_WORDS = {1: "good", 0: "fair", -1: "poor"}
 KIND_WORDS = {"typical": "Typical", "doubtful": "Doubtful", "failed": "No height"}
-FEWEST_RANKED = 7
 MOST_NUMBERED = 40
 DRAWN = 1000.0
 # Of a small figure of match curves.
@@ -83,6 +82,8 @@ def context(out: Path, compared: Compared | None) -> dict[str, Any]:
     """All that the page shows."""
     run = run_record(out)
     found, crs = survey(out), CRS.from_user_input(run["grid"]["crs"])
+    if is_local(crs):
+        found = replace(found, above="z of the local frame")
     sigma = found.sigma[np.isfinite(found.sigma)]
     quantiles = {q: float(np.percentile(sigma, q)) for q in QUANTILES} if sigma.size else {}
     where, frame = words.place(found, crs)
@@ -93,7 +94,7 @@ def context(out: Path, compared: Compared | None) -> dict[str, Any]:
         paragraph += " " + reference["sentence"]
     return {
         "title": out.resolve().name, "version": run["versions"]["zlocus"], "summary": paragraph, "where": where,
-        "frame": frame, "run": run, "found": found, "n_views": len(views), "coverage": run["coverage"],
+        "frame": frame, "is_local": is_local(crs), "run": run, "found": found,
         "footprints": footprints_part(out / FOOTPRINTS, found, crs, list(views)),
         "heights": maps.height_map(out, found), "sigma": maps.sigma_map(out),
         "quantiles": [(f"{q} %", words.size(value, "m")) for q, value in quantiles.items()],
@@ -102,7 +103,7 @@ def context(out: Path, compared: Compared | None) -> dict[str, Any]:
         "images": tables.image_rows(views), **pairs_part(out, run), "curves": curves_part(out / CURVES),
         "reference": reference, "stages": tables.stage_rows(run["stages"]),
         "request": tables.request_rows(run["config"]["request"]),
-        "options": tables.option_rows(run["config"]["options"]), "size": words.size, "percent": words.percent,
+        "options": tables.option_rows(run["config"]["options"]),
     }  # fmt: skip
 
 

@@ -53,6 +53,7 @@ STAGES = {
     "points": "writing tie points and ranking",
     "curves": "footprints and match curves for this page",
     "record": "checksums of the inputs",
+    "products": "hillshade and what else was made of the surface",
 }
 NONE = "–"
 LEAST_SHARE = 0.0001
@@ -135,9 +136,11 @@ def summary(found: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, f
     where, frame = place(found, crs)
     views = run["orientation"]["views"]
     wide, high = cols * found.cell_m, rows * found.cell_m
+    what = "This is a digital surface model: the height of whatever is seen from above, roofs and treetops included."
+    if is_local(crs):
+        what = "This is a surface model: how far whatever the images show stands out along z."
     said = [
-        f"This is a digital surface model: the height of whatever is seen from above, roofs and treetops included. "
-        f"It covers {wide:.0f} m by {high:.0f} m {where} (map: {frame}), with a cell every "
+        f"{what} It covers {wide:.0f} m by {high:.0f} m {where} (map: {frame}), with a cell every "
         f"{found.cell_m:g} m, and was made from {len(views)} images.",
         f"Of the cells that two images or more cover, {100 * run['coverage']:.1f} % have a height.",
     ]
