@@ -9,7 +9,7 @@ ifneq ($(TEST_DATA),)
 export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
 endif
 
-.PHONY: demo test test-minimum lint bench acceptance acceptance-all clean
+.PHONY: demo docs test test-minimum lint bench acceptance acceptance-all clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -20,6 +20,10 @@ $(STAMP): pyproject.toml
 
 demo: $(STAMP)
 	$(BIN)/zlocus demo
+
+# The site, with its notebooks run; opens without a server: build/docs/index.html.
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W --keep-going -E -q -b html -d build/doctrees docs build/docs
 
 test: lint
 	$(BIN)/python -m pytest -n 2

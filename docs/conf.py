@@ -1,0 +1,66 @@
+"""The documentation site: `make docs` builds it into build/docs, without network."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from pygments.lexers.special import TextLexer  # noqa: E402
+
+from reference_pages import command_reference, option_reference, result_pages, unlisted_pages  # noqa: E402
+from zlocus import __version__  # noqa: E402
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+project = "zlocus"
+author = "The zlocus developers"
+copyright = author
+version = release = __version__
+
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
+myst_heading_anchors = 4
+# Equations would need a script from elsewhere: pages say them in words and plain formulae.
+myst_enable_extensions: list[str] = []
+
+# Notebooks are kept without outputs; `make docs` runs them.
+nb_execution_mode = "force"
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+
+html_theme = "furo"
+html_title = f"zlocus {version}"
+html_copy_source = False
+html_show_sourcelink = False
+html_static_path: list[str] = []
+
+# What stands in a page in place of such a line is made from the code.
+GENERATED = {
+    "<!-- generated: commands -->": command_reference,
+    "<!-- generated: options -->": option_reference,
+    "<!-- generated: pages on results -->": lambda: result_pages(HERE),
+    "<!-- generated: other pages -->": lambda: unlisted_pages(HERE),
+}
+
+
+def fill_in(app: Sphinx, page: str, source: list[str]) -> None:
+    """Puts generated parts into a page as it is read."""
+    for marker, make in GENERATED.items():
+        if marker in source[0]:
+            source[0] = source[0].replace(marker, make())
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", fill_in)
+    # Tables in text: Pygments has no lexer for them.
+    app.add_lexer("csv", TextLexer)

@@ -1,0 +1,99 @@
+"""Parts of the documentation that are made from the code, as Markdown: commands, options, and pages of no list."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import Field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import typer.main
+
+from zlocus.cli import app
+from zlocus.options import RunConfig
+
+# Pages on what comes out, in their order, where they are there.
+RESULTS = ("products", "vertical", "evaluate", "report")
+
+
+def command_reference() -> str:
+    """Every command of `zlocus`: what it does, its arguments and options, in the order in which they are defined."""
+    # Typer has its own copy of Click, whose names are private: what is used of it is looked at, not typed.
+    commands: dict[str, Any] = vars(typer.main.get_command(app))["commands"]
+    return "\n\n".join(_command(name, command) for name, command in commands.items())
+
+
+def _command(name: str, command: Any) -> str:
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    needed = [f"{_names(p)} {_metavar(p)}" for p in command.params if p.required and p not in arguments]
+    shown = [f"{p.metavar}{'...' if p.nargs < 0 else ''}" for p in arguments]
+    usage = " ".join(["zlocus", name, *shown, *(each.replace("-o, --out", "-o") for each in needed), "[OPTIONS]"])
+    lines = [f"## zlocus {name}", "", " ".join(command.help.split()), "", f"`{usage}`", "", "| | says | default |"]
+    return "\n".join([*lines, "|---|---|---|", *map(_parameter, command.params)])
+
+
+def _parameter(parameter: Any) -> str:
+    default = "must be given" if parameter.required else _default(parameter.default)
+    name = parameter.metavar if parameter.param_type_name == "argument" else _names(parameter)
+    words = name if name == parameter.metavar else f"{name} {_metavar(parameter)}".rstrip()
+    return f"| `{_cell(words)}` | {_cell(parameter.help)} | {default} |"
+
+
+def _names(parameter: Any) -> str:
+    return ", ".join(parameter.opts)
+
+
+def _metavar(parameter: Any) -> str:
+    return "" if getattr(parameter, "is_flag", False) else parameter.metavar or parameter.name.upper()
+
+
+def _default(value: Any) -> str:
+    return "" if value is None or value is False else f"`{value}`"
+
+
+def option_reference() -> str:
+    """Every option of every stage: name, default, limits and unit, and its sentence."""
+    return "\n".join(_stage(RunConfig(), "", ""))
+
+
+def _stage(options: Any, prefix: str, doc: str) -> Iterator[str]:
+    stages = [f for f in fields(options) if is_dataclass(getattr(options, f.name))]
+    own = [f for f in fields(options) if f not in stages]
+    if own:
+        yield from ("", f"## `[{prefix.rstrip('.')}]`", "", doc, "", "| option | default | allowed | says |")
+        yield "|---|---|---|---|"
+        yield from (_option(f, getattr(options, f.name)) for f in own)
+    for f in stages:
+        yield from _stage(getattr(options, f.name), f"{prefix}{f.name}.", f.metadata["doc"])
+
+
+def _option(f: Field[Any], value: Any) -> str:
+    unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
+    default = "unset" if value is None else f"{value}{unit}"
+    return f"| `{f.name}` | {default} | {_limits(f)}{unit} | {_cell(f.metadata['doc'])} |"
+
+
+def _limits(f: Field[Any]) -> str:
+    low, high, choices = (f.metadata[key] for key in ("low", "high", "choices"))
+    if choices is not None:
+        return ", ".join(map(str, choices))
+    if None not in (low, high):
+        return f"{low:g} to {high:g}"
+    return "" if low is high else f"at least {low:g}" if high is None else f"at most {high:g}"
+
+
+def _cell(text: str) -> str:
+    """Text that may stand in a cell of a table."""
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def result_pages(folder: Path) -> str:
+    """Names of the pages on results that are there, a line each."""
+    return "\n".join(name for name in RESULTS if (folder / f"{name}.md").exists())
+
+
+def unlisted_pages(folder: Path) -> str:
+    """Names of the pages in a folder that its index does not list, a line each: none is without a place."""
+    listed = set(re.findall(r"^([a-z_]+)$", (folder / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
+    return "\n".join(sorted({page.stem for page in folder.glob("*.md")} - listed - {"index", *RESULTS}))
