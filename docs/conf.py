@@ -23,6 +23,8 @@ copyright = author
 version = release = __version__
 
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
+# Quotation marks stand in code and in names of files.
+smartquotes = False
 myst_heading_anchors = 4
 # Equations would need a script from elsewhere: pages say them in words and plain formulae.
 myst_enable_extensions: list[str] = []

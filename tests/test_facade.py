@@ -9,61 +9,21 @@ import pytest
 import rasterio
 from typer.testing import CliRunner
 
-from rendered_scenes import QUIET
+from facade_scene import ALONG, FILE_FROM_WALL, KIND, OUT, photographed
 from zlocus.cli import app
 from zlocus.errors import ConfigError
 from zlocus.io.scene_file import open_scene, turn_to_axes
 from zlocus.options import JointOptions, OrientationOptions
 from zlocus.orientation.orient import orient
 from zlocus.request import ImportRequest
-from zlocus.sensors.frame import FrameModel
-from zlocus.synthetic.files import write_image
-from zlocus.synthetic.render import Sun, expose, render
-from zlocus.synthetic.terrain import analytic_ground, analytic_height
+from zlocus.synthetic.terrain import analytic_height
 
-# The wall stands at z = 50 with waves of 3, x along it and y up it; cameras stand 25 to 34 before it, to one side of
-# what they look at.
-KIND, CELL_M, MIDDLE = "sine", 0.08, (0.0, 0.0)
-SHAPE, FOCAL = (180, 240), 230.0
-STATIONS = ((-16.0, -3.0, 75.0), (-11.5, -2.5, 78.0), (-7.0, -3.2, 81.0), (-2.5, -2.8, 84.0))
-AIMS = ((-5.0, 0.5), (-3.0, 0.2), (-1.0, 0.4), (1.0, 0.0))
-# Out of the wall and up it, in the axes of the camera files, whose y is down as in images.
-OUT, ALONG = np.array([0.6, 0.0, -0.8]), np.array([0.0, -1.0, 0.0])
-FILE_FROM_WALL = np.column_stack([np.cross(ALONG, OUT), ALONG, OUT])
 LEAST_COVERAGE, WITHIN_M, LEAST_WITHIN = 0.9, 0.25, 0.95
-
-
-def facing(station, aim):
-    """A camera that stands upright and looks at a point of the wall."""
-    forwards = np.array([*aim, 50.0]) - station
-    forwards /= np.linalg.norm(forwards)
-    right = np.cross(forwards, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    principal_point = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
-    return FrameModel(tuple(station), np.stack([right, np.cross(forwards, right), forwards]), FOCAL, principal_point)
 
 
 @pytest.fixture(scope="module")
 def facade(tmp_path_factory):
     return photographed(tmp_path_factory.mktemp("facade"), KIND)
-
-
-def photographed(folder, kind):
-    """A folder of images and `.camera` files, as the benchmark of Strecha et al. has them."""
-    ground = analytic_ground(kind, MIDDLE, CELL_M, (1400, 1400), seed=8)
-    (folder / "images").mkdir(parents=True)
-    for number, (station, aim) in enumerate(zip(STATIONS, AIMS, strict=True)):
-        model = facing(np.array(station), aim)
-        grey = expose(render(ground, model, SHAPE, Sun(150.0, 50.0)), QUIET, np.random.default_rng([8, number]))
-        write_image(folder / "images" / f"{number}.tif", grey, None)
-        u, v = model.principal_point
-        rotation = model.camera_from_ground @ FILE_FROM_WALL.T
-        rows = [
-            [FOCAL, 0, u], [0, FOCAL, v], [0, 0, 1], [0, 0, 0], *rotation.T, FILE_FROM_WALL @ np.array(station),
-        ]  # fmt: skip
-        text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
-        (folder / f"{number}.tif.camera").write_text(f"{text}\n{SHAPE[1]} {SHAPE[0]}\n")
-    return folder
 
 
 def command(*arguments):

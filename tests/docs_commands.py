@@ -1,0 +1,107 @@
+"""Commands of the documents: where they stand, and the files that they name."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.transform import from_origin
+
+import camera_files
+from facade_scene import axes_of_wall, photographed
+from rendered_scenes import CENTRE, GSD_M, rendered
+from zlocus.synthetic.terrain import analytic_height
+
+ROOT = Path(__file__).parents[1]
+PROGRAMS = ("zlocus", "python", "make", "printf")
+BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```|((?:^ {4}[^\n]*\n)+)", re.DOTALL | re.MULTILINE)
+INLINE = re.compile(r"`((?:zlocus|python -m zlocus\.synthetic|make) [^`]+)`")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing that a page tells the reader to do. is_python : a block of Python, else a line for the shell."""
+
+    text: str
+    is_python: bool = False
+
+
+def steps_of(page: Path) -> list[Step]:
+    """Commands and Python of a page's blocks, in their order."""
+    found = []
+    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        language, fenced, indented = block.groups()
+        if language == "python":
+            found.append(Step(fenced, is_python=True))
+            continue
+        lines = [line.partition("  #")[0].strip() for line in (indented if fenced is None else fenced).splitlines()]
+        lines = [line for line in lines if line]
+        if language in ("", None) and lines and lines[0].split()[0] in PROGRAMS:
+            found += map(Step, lines)
+    return found
+
+
+def inline_commands(page: Path) -> list[str]:
+    """Commands in the sentences and tables of a page."""
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    return [" ".join(each.split()) for each in INLINE.findall(text.replace("\\|", "|"))]
+
+
+def lay_out_images(folder: Path) -> None:
+    """Three images with RPC, and a reference: what README and others call theirs."""
+    images = rendered(folder / "rendered", "sine")
+    for number, path in enumerate(images.inputs, 1):
+        path.rename(folder / f"img_{number}.tif")
+    half = 40.0
+    n = round(2 * half / GSD_M)
+    along = (np.arange(n) + 0.5) * GSD_M - half
+    heights = analytic_height("sine", *np.meshgrid(along, -along)).astype(np.float32)
+    where = from_origin(CENTRE[0] - half, CENTRE[1] + half, GSD_M, GSD_M)
+    with rasterio.open(
+        folder / "reference.tif", "w", driver="GTiff", width=n, height=n, count=1, dtype="float32", crs="EPSG:32632",
+        transform=where,
+    ) as file:  # fmt: skip
+        file.write(heights, 1)
+
+
+def lay_out_cameras(folder: Path) -> None:
+    """Cameras of every program, by the names of the page on `zlocus import`; a photographed wall."""
+    for write in (camera_files.write_colmap, camera_files.write_opensfm, camera_files.write_bundler):
+        write(folder / "PROJECT")
+    # One folder for three programs: the images of each of them where the others have theirs.
+    for image in (folder / "PROJECT" / "images").glob("*.tif"):
+        shutil.copy(image, folder / "PROJECT")
+    metashape = camera_files.write_metashape(folder / "metashape").folder
+    (metashape / "cameras.xml").rename(folder / "cameras.xml")
+    shutil.move(metashape / "images" if (metashape / "images").is_dir() else metashape, folder / "photos")
+    table = camera_files.write_eo(folder / "eo").folder
+    (table / "eo.csv").rename(folder / "orientations.csv")
+    for image in table.glob("*.tif"):
+        image.rename(folder / image.name)
+    photographed(folder / "herzjesu_p8", "sine", axes_of_wall((-0.733, 0.68, 0.0), (0.0, 0.0, -1.0)))
+
+
+def lay_out_surface(folder: Path) -> None:
+    """A flags raster, for what reads one."""
+    (folder / "surface").mkdir()
+    with rasterio.open(
+        folder / "surface" / "quality.tif", "w", driver="GTiff", width=2, height=1, count=1, dtype="uint16",
+        crs="EPSG:32632", transform=from_origin(*CENTRE, 1.0, 1.0),
+    ) as file:  # fmt: skip
+        file.write(np.array([[[16, 256]]], np.uint16))
+
+
+# What a page's commands find in the folder in which they are run.
+LAID_OUT = {
+    "README.md": lay_out_images,
+    "rpc.md": lay_out_images,
+    "orientation.md": lay_out_images,
+    "doctor.md": lay_out_images,
+    "import.md": lay_out_cameras,
+    "quality.md": lay_out_surface,
+    "tutorial.md": lambda folder: None,
+}
