@@ -36,7 +36,11 @@ nb_execution_raise_on_error = True
 nb_merge_streams = True
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}
 
-autodoc_typehints = "none"
+autodoc_typehints = "signature"
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+# Docstrings set names of the code between single marks.
+default_role = "code"
 autodoc_member_order = "bysource"
 
 html_theme = "furo"

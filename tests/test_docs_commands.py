@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
+from typer.testing import CliRunner
 
 from docs_commands import INLINE, LAID_OUT, ROOT, Step, inline_commands, steps_of
 from zlocus.cli import app
@@ -19,6 +21,8 @@ from zlocus.synthetic.__main__ import _parser
 
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
 COMMANDS = vars(typer.main.get_command(app))["commands"]
+# Per cent, of the figures in the tutorial.
+TOLD_TO = 0.5
 # What stands for the inputs of a run in lines that tell the usage.
 INPUTS = "img_1.tif img_2.tif img_3.tif"
 
@@ -99,6 +103,29 @@ def test_the_commands_of_a_page_work(page, tmp_path):
         # Without a layout a page's files are not there: its command line alone is checked.
         if lay_out:
             run(step, tmp_path)
+    if page.name in TOLD:
+        TOLD[page.name](tmp_path)
+
+
+def check_tutorial(folder: Path) -> None:
+    """The figures that it tells are those of its surface, rounded as there; they change with the code."""
+    words = ["evaluate", "surface/dsm.tif", "scene/truth_dsm.tif", "--classes", "scene/truth_class.tif", "--json"]
+    done = CliRunner().invoke(app, [str(folder / word) if "/" in word else word for word in words])
+    found = json.loads(done.stdout)
+    told = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
+    numbers = re.search(
+        r"truth ([\d.]+) % lie within 1 m .*: ([\d.]+) % of the ground and of the roofs, ([\d.]+) %", told
+    )
+    assert numbers
+    everything, ground, trees = (float(each) for each in numbers.groups())
+    for name, share in (("all", everything), ("ground", ground), ("building", ground), ("tree", trees)):
+        assert abs(100 * found[name]["within"] - share) < TOLD_TO, name
+    coverage = json.loads((folder / "surface" / "run.json").read_text(encoding="utf-8"))["coverage"]
+    assert f"says that {100 * coverage:.0f} % of the cells" in told
+
+
+# After the commands of a page: whether what it says of them is so.
+TOLD = {"tutorial.md": check_tutorial}
 
 
 def test_commands_in_sentences_exist():
