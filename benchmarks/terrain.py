@@ -7,7 +7,7 @@ trees is interpolated linearly (Delaunay) between the cells of ground around the
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -79,4 +79,7 @@ def main(scene, surface=None):
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, metavar="SCENE")
+    parser.add_argument("surface", type=Path, nargs="?", metavar="SURFACE")
+    main(*(path for path in vars(parser.parse_args()).values() if path is not None))

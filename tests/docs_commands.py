@@ -13,6 +13,7 @@ from rasterio.transform import from_origin
 
 import camera_files
 from facade_scene import axes_of_wall, photographed
+from geoids import write_geoid
 from rendered_scenes import CENTRE, GSD_M, rendered
 from zlocus.synthetic.terrain import analytic_height
 
@@ -85,6 +86,37 @@ def lay_out_cameras(folder: Path) -> None:
     photographed(folder / "herzjesu_p8", "sine", axes_of_wall((-0.733, 0.68, 0.0), (0.0, 0.0, -1.0)))
 
 
+def lay_out_products(folder: Path) -> None:
+    """Three images, and a file of options."""
+    lay_out_images(folder)
+    (folder / "options.toml").write_text("[products]\n")
+
+
+def lay_out_comparison(folder: Path) -> None:
+    """Three images, a reference and its classes."""
+    lay_out_images(folder)
+    with rasterio.open(folder / "reference.tif") as reference:
+        profile = reference.profile | {"dtype": "uint8"}
+    with rasterio.open(folder / "classes.tif", "w", **profile) as file:
+        file.write(np.zeros((profile["height"], profile["width"]), np.uint8), 1)
+
+
+def lay_out_surfaces(folder: Path) -> None:
+    """A reference with classes, surfaces that are right and that lie elsewhere, and a geoid under them."""
+    side, shape = 0.5, (400, 400)
+    row, col = np.indices(shape)
+    z = (60 + 20 * np.sin(col / 37) * np.cos(row / 29)).astype(np.float32)
+    surfaces = {"reference": (z, 0.0), "dsm": (z + 0.1, 0.0), "moved": (z, 1.0), "classes": (0 * z, 0.0)}
+    for name, (values, east) in surfaces.items():
+        dtype = "uint8" if name == "classes" else "float32"
+        with rasterio.open(
+            folder / f"{name}.tif", "w", driver="GTiff", width=shape[1], height=shape[0], count=1, dtype=dtype,
+            crs="EPSG:32632", transform=from_origin(CENTRE[0] + east, CENTRE[1], side, side),
+        ) as file:  # fmt: skip
+            file.write(values.astype(dtype), 1)
+    write_geoid(folder / "geoid.tif", np.full((8, 8), 48.0, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
+
+
 def lay_out_surface(folder: Path) -> None:
     """A flags raster, for what reads one."""
     (folder / "surface").mkdir()
@@ -103,5 +135,8 @@ LAID_OUT = {
     "doctor.md": lay_out_images,
     "import.md": lay_out_cameras,
     "quality.md": lay_out_surface,
+    "products.md": lay_out_products,
+    "report.md": lay_out_comparison,
+    "evaluate.md": lay_out_surfaces,
     "tutorial.md": lambda folder: None,
 }

@@ -165,7 +165,7 @@ def test_up_turns_the_cameras(tmp_path):
 def test_the_entry_of_the_documents(tmp_path):
     from pathlib import Path
 
-    page = (Path(__file__).parents[1] / "docs" / "scene.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "frame.md").read_text(encoding="utf-8")
     start = page.index("```\ncamera:") + 4
     entry = yaml.safe_load(page[start : page.index("```", start)])["camera"]
     camera = FrameCamera.model_validate(entry)

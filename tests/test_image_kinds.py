@@ -52,7 +52,8 @@ def test_kinds_of_images(images, tmp_path, variant):
     has_hole = variant in ("float NaN", "float nodata", "int16")
     assert ((views == 2).sum() > 150) == has_hole
     _, ortho = read(out / "ortho.tif")
-    assert ortho.dtypes == (read(paths[0])[1].dtypes[0],)
+    n_bands = 3 if variant == "colours" else 1
+    assert ortho.dtypes == (read(paths[0])[1].dtypes[0],) * n_bands
 
 
 def test_masked_image(images, tmp_path):

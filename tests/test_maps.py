@@ -21,7 +21,7 @@ from zlocus.errors import ConfigError, OutputError
 from zlocus.io.crs import local_frame
 from zlocus.io.raster import write_cog
 from zlocus.options import ProductOptions
-from zlocus.products.maps import FILES, make_maps, remove_maps
+from zlocus.products.maps import FILES, link_all, make_maps, remove_maps
 from zlocus.progress import SilentProgress
 from zlocus.request import DEFAULT_PRODUCTS, PRODUCTS, product_names
 
@@ -54,6 +54,7 @@ def names_in(folder):
 @pytest.mark.parametrize("wanted", [(), *[(name,) for name in PRODUCTS], PRODUCTS])
 def test_what_is_asked_for_is_made_and_linked(surface, wanted):
     make_maps(surface, wanted, ProductOptions(), SilentProgress())
+    link_all(surface, SilentProgress())
     made = {FILES[name] for name in wanted}
     assert names_in(surface) == SURFACE | made | {"item.json"}
     assets = json.loads((surface / "item.json").read_text())["assets"].values()
@@ -113,6 +114,7 @@ def test_in_a_local_frame_a_note_says_why_there_is_no_item(tmp_path, capsys):
     progress = SilentProgress()
     progress.note = said.append
     make_maps(tmp_path, PRODUCTS, ProductOptions(), progress)
+    link_all(tmp_path, progress)
     assert said == ["No item.json: the frame is local, and STAC is about places on the Earth."]
     assert names_in(tmp_path) == SURFACE | set(FILES.values())
 

@@ -38,6 +38,7 @@ from zlocus.progress import progress_for
 from zlocus.request import DsmRequest
 from zlocus.surface.reasons import Quality, is_empty
 
+REPORT_FILES = ("report.html", "footprints.geojson", "curves.json")
 PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
 MAPS = ("hillshade.tif", "dtm.tif")
 ALL_MAPS = ("hillshade", "contours", "dtm", "laz")
@@ -136,7 +137,7 @@ def test_products(whole, images):
         assert valid, (problems, warnings)
         with rasterio.open(whole / name) as file:
             assert "STATISTICS_MEAN" in file.tags(1)
-    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "run.json", "item.json"}
+    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "run.json", "item.json", *REPORT_FILES}
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
@@ -233,7 +234,7 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
     out = run(images("plane"), tmp_path / "out", bounds=PART, products=("dtm", "laz")).out
     assert {"dtm.tif", "surface.laz", "item.json"} <= {path.name for path in out.iterdir()}
     run(images("plane"), out, bounds=PART, products=(), overwrite=True)
-    assert {path.name for path in out.iterdir()} == {*PRODUCTS, "ties.gpkg", "run.json", "item.json"}
+    assert {path.name for path in out.iterdir()} == {*PRODUCTS, *REPORT_FILES, "ties.gpkg", "run.json", "item.json"}
 
 
 def test_contours_of_a_terrain_that_is_not_made_are_refused_at_once(images, tmp_path):

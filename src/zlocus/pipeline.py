@@ -141,13 +141,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         vertical.check_covers(_area_matched(grid, settled), scene.crs)
         _check_polygons(request, grid, settled, polygons[0])
     tally = Tally()
-    out, dtype = request.out, settled.views[0].image.dtype
-    has_colours = settled.has_colours and request.method != "gc3-sgm"
-    with (
-        watch.stage("match"),
-        made_folder(out),
-        SurfaceRasters(out, grid.geobox, dtype, vertical, has_colours) as rasters,
-    ):
+    out = request.out
+    with watch.stage("match"), made_folder(out), _rasters(request, grid, settled, vertical) as rasters:
         match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     remove_maps(out)
@@ -158,11 +153,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     with watch.stage("record"):
         inputs = inputs_record(_files(request, scene, vertical))
     record = {
-        "config": {"request": _request_record(request), "options": config_as_dict(config)},
-        "created": now(),
-        "versions": versions_record(),
+        **_asked_record(request, config, scene),
         "inputs": inputs,
-        "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
         "stages": watch.stages,
         "orientation": orientation.as_dict(),
         "grid": _grid_record(grid, scene.crs),
@@ -173,6 +165,22 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     _write_maps(request, config, watch, record, progress)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
+
+
+def _rasters(request: DsmRequest, grid: Grid, settled: MatchScene, vertical: VerticalDatum) -> SurfaceRasters:
+    """The rasters of the surface; in image space the ortho-image is grey."""
+    has_colours = settled.has_colours and request.method != "gc3-sgm"
+    return SurfaceRasters(request.out, grid.geobox, settled.views[0].image.dtype, vertical, has_colours)
+
+
+def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene) -> dict[str, Any]:
+    """What was asked of which program, when, and when the images were taken."""
+    return {
+        "config": {"request": _request_record(request), "options": config_as_dict(config)},
+        "created": now(),
+        "versions": versions_record(),
+        "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
+    }
 
 
 def _write_maps(
