@@ -230,6 +230,7 @@ def test_demo_keeps_other_runs(zl, pipeline, tmp_path):
 def test_config_is_printed_or_written_once(zl, tmp_path):
     printed = zl("config").stdout
     assert "[orientation]" in printed
+    assert zl("config", "-o", "-").stdout == printed
     assert zl("config", "-o", tmp_path / "all.toml").exit_code == 0
     assert (tmp_path / "all.toml").read_text() == printed
     again = zl("config", "-o", tmp_path / "all.toml")

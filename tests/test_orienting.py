@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyogrio
@@ -143,7 +144,7 @@ def test_a_terrain_model_holds_the_heights(flawed, tmp_path):
     assert result.exit_code == 0, result.output
     found = json.loads((out / "orientation.json").read_text())
     assert abs(found["terrain"]["median_m"]) < 1.0
-    terrain = terrain_heights(tmp_path / "dem.tif", open_scene(flawed.inputs), (25.0, 80.0))
+    terrain = terrain_heights(tmp_path / "dem.tif", replace(open_scene(flawed.inputs), heights=(25.0, 80.0)))
     assert terrain.at(np.array([CENTRE]))[0] == pytest.approx(60.0)
 
 

@@ -152,7 +152,7 @@ def test_a_terrain_model_above_a_geoid(images, geoid, tmp_path):
     above = write_dem(tmp_path / "above.tif", True, UTM.to_wkt())
     scene = open_scene(images("sine").inputs)
     z = [
-        terrain_heights(dem, scene, HEIGHTS, name).z
+        terrain_heights(dem, replace(scene, heights=HEIGHTS), name).z
         for dem, name in ((plain, None), (above, str(geoid)), (above, None))
     ]
     # Bilinear heights of cells of 8 m, of which the plane is exact.

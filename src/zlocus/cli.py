@@ -448,14 +448,14 @@ app.command()(explained(report))
 @app.command()
 @explained
 def config(
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Default: print.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Default, and -: print.")] = None,
 ) -> None:
     """Write a complete commented configuration."""
     from zlocus.io.config import write_config
     from zlocus.options import RunConfig
 
     text = write_config(RunConfig())
-    if out is None:
+    if out is None or str(out) == "-":
         print(text, end="")
         return
     try:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from zlocus.errors import ConfigError
+from zlocus.evaluation.command import Align, Classes, Margin
 
 
 def report(
@@ -15,14 +16,9 @@ def report(
     reference: Annotated[
         Path | None, typer.Option(help="Reference heights on a projected grid, to compare with.", metavar="RASTER")
     ] = None,
-    classes: Annotated[
-        Path | None,
-        typer.Option(help="Classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
-    ] = None,
-    align: Annotated[
-        bool, typer.Option("--align", help="First find and remove the best shift; it is reported.")
-    ] = False,
-    margin: Annotated[float, typer.Option(help="Rim of the reference left out, m.", metavar="M")] = 10.0,
+    classes: Classes = None,
+    align: Align = False,
+    margin: Margin = 10.0,
     threshold: Annotated[float, typer.Option(help="An error below this is within, m.", metavar="M")] = 1.0,
 ) -> None:
     """Make report.html of a surface again, with a reference where one is given."""

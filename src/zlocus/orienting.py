@@ -13,19 +13,18 @@ from zlocus.grid import grid_from_bounds
 from zlocus.io.config import config_as_dict
 from zlocus.io.control import read_control
 from zlocus.io.reference import dem_datum, read_dem
-from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
 from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import Orientation
-from zlocus.preparing import asked_crs, made_folder, oriented, possible_heights, what_was_applied
+from zlocus.preparing import made_folder, opened_alone, oriented, possible_heights, what_was_applied
 from zlocus.products.cameras import SCENE, write_cameras
 from zlocus.products.orientation import orientation_record
 from zlocus.products.points import write_ties
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import OrientRequest
-from zlocus.scene import Scene, check_overlap, footprint, ground_sample_distance, is_local
+from zlocus.scene import Scene, footprint, ground_sample_distance, is_local
 
 # Cells of the terrain model are this many ground pixels, its own resolution being coarser.
 TERRAIN_PX = 16.0
@@ -44,16 +43,12 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     """
     watch = Stopwatch()
     with watch.stage("open"), progress.stage("Opening images"):
-        scene = open_scene(request.inputs, asked_crs(request.crs))
-        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
-        heights = request.heights or scene.heights
-        if not is_local(scene.crs) or heights is not None:
-            check_overlap(scene, possible_heights(scene, heights))
+        scene = opened_alone(request.inputs, request.crs, request.heights)
         control = None if request.control is None else control_points(request, scene)
-        terrain = None if request.dem is None else terrain_heights(request.dem, scene, heights, request.dem_vertical)
+        terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
     with watch.stage("orient"):
         options = alone(config.orientation, request.cameras)
-        found = oriented(scene, options, heights, progress, control, terrain)
+        found = oriented(scene, options, scene.heights, progress, control, terrain)
         check_ties(found, scene)
         progress.note(what_was_applied(found))
     corrected = found.apply(scene)
@@ -111,9 +106,7 @@ def control_points(request: OrientRequest, scene: Scene) -> GroundControl:
     return read_control(request.control, scene.views, vertical, scene.crs)
 
 
-def terrain_heights(
-    dem: Path, scene: Scene, heights: tuple[float, float] | None, vertical: str | None = None
-) -> TerrainHeights:
+def terrain_heights(dem: Path, scene: Scene, vertical: str | None = None) -> TerrainHeights:
     """Ellipsoidal heights of a DEM over all ground that the images may see. vertical : see `dem_datum`.
 
     Raises
@@ -125,7 +118,7 @@ def terrain_heights(
     """
     if is_local(scene.crs):
         raise GeometryError(f"The scene's frame is local, where {dem} has no place. Leave --dem out.")
-    levels = possible_heights(scene, heights)
+    levels = possible_heights(scene, scene.heights)
     outlines = np.concatenate([footprint(view, z) for view in scene.views for z in (levels[0], levels[-1])])
     middle = levels[len(levels) // 2]
     cell = TERRAIN_PX * float(np.nanmedian([ground_sample_distance(view, middle) for view in scene.views]))

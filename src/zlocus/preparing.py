@@ -13,13 +13,14 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, GeometryError, OutputError
 from zlocus.io.crs import checked_crs
+from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.setup import shared_ground
 from zlocus.options import OrientationOptions
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import RANGE_PERCENT, Orientation, height_range, orient, supported
 from zlocus.progress import Progress
-from zlocus.scene import Scene, View, footprint, is_local, is_shared
+from zlocus.scene import Scene, View, check_overlap, footprint, is_local, is_shared
 from zlocus.sensors.model import capped, lowest_station
 
 HEIGHT_SAMPLES = 5
@@ -49,6 +50,23 @@ def asked_crs(given: str | None) -> CRS | None:
         return checked_crs(CRS.from_user_input(given))
     except CRSError as error:
         raise ConfigError(f"--crs {given} is not a known CRS. Give a projected one, such as EPSG:32632.") from error
+
+
+def opened_alone(inputs: Sequence[Path], crs: str | None, heights: tuple[float, float] | None) -> Scene:
+    """The scene of a stage that stands alone: its views by name, its heights (m) those asked for, where some are, and
+    found to overlap, as far as heights are known.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError
+        See `open_scene` and `check_overlap`.
+    """
+    scene = open_scene(inputs, asked_crs(crs))
+    views = tuple(sorted(scene.views, key=lambda view: view.name))
+    scene = replace(scene, views=views, heights=heights or scene.heights)
+    if not is_local(scene.crs) or scene.heights is not None:
+        check_overlap(scene, possible_heights(scene, scene.heights))
+    return scene
 
 
 def possible_heights(scene: Scene, given: tuple[float, float] | None) -> list[float]:

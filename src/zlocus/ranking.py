@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -15,26 +14,24 @@ from zlocus.execution.local import run_all
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
 from zlocus.io.config import config_as_dict
-from zlocus.io.scene_file import open_scene
 from zlocus.matching.curve import FAIR, GOOD
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
 from zlocus.orienting import check_ties
 from zlocus.preparing import (
     area_to_match,
-    asked_crs,
     heights_asked_for,
     heights_of_ties,
     made_folder,
+    opened_alone,
     oriented,
-    possible_heights,
     what_was_applied,
 )
 from zlocus.products.points import RankedPoints, write_ranking, write_ties
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import RankRequest
-from zlocus.scene import Scene, check_overlap, is_local
+from zlocus.scene import Scene
 from zlocus.tile import rank_tile
 
 LABELS = ("good", "fair", "poor")
@@ -51,21 +48,17 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     """
     watch = Stopwatch()
     with watch.stage("open"), progress.stage("Opening images"):
-        scene = open_scene(request.inputs, asked_crs(request.crs))
-        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
-        heights = request.heights or scene.heights
-        if not is_local(scene.crs) or heights is not None:
-            check_overlap(scene, possible_heights(scene, heights))
+        scene = opened_alone(request.inputs, request.crs, request.heights)
     with watch.stage("orient"):
-        orientation = oriented(scene, config.orientation, heights, progress)
+        orientation = oriented(scene, config.orientation, scene.heights, progress)
         check_ties(orientation, scene)
         progress.note(what_was_applied(orientation))
         scene = orientation.apply(scene)
     with watch.stage("rank"):
-        if heights is None:
+        if scene.heights is None:
             z_range = heights_of_ties(scene, orientation, config.orientation)
         else:
-            z_range = heights_asked_for(scene, heights, progress)
+            z_range = heights_asked_for(scene, scene.heights, progress)
         z = sum(z_range) / 2
         cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
         check_resolution(cell, scene, z, "--resolution")

@@ -16,21 +16,24 @@ DEFAULT_THRESHOLD_M = 1.0
 DEFAULT_SLOPES = "5,15,30,45"
 
 
+Classes = Annotated[
+    Path | None,
+    typer.Option(help="Classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
+]
+Align = Annotated[bool, typer.Option("--align", help="First find and remove the best shift; it is reported.")]
+Margin = Annotated[float, typer.Option(help="Rim of the reference left out, m.", metavar="M")]
+
+
 def evaluate(
     dsm: Annotated[Path, typer.Argument(help="Surface to judge.", metavar="DSM")],
     reference: Annotated[Path, typer.Argument(help="Reference heights.", metavar="REFERENCE")],
-    classes: Annotated[
-        Path | None,
-        typer.Option(help="Classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
-    ] = None,
-    align: Annotated[
-        bool, typer.Option("--align", help="First find and remove the best shift; it is reported.")
-    ] = False,
+    classes: Classes = None,
+    align: Align = False,
     coregister: Annotated[
         str | None,
         typer.Option(help="The same by slope and aspect (Nuth and Kääb 2011).", metavar="nuth-kaab"),
     ] = None,
-    margin: Annotated[float, typer.Option(help="Rim of the reference left out, m.", metavar="M")] = 10.0,
+    margin: Margin = 10.0,
     threshold: Annotated[
         list[float] | None,
         typer.Option(help="An error below this is within, m; may be repeated. Default: 1.", metavar="M"),
