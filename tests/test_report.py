@@ -26,10 +26,12 @@ from rendered_scenes import HEIGHTS, SMALL_TILES, read, run, truth_at
 from zlocus.cli import app
 from zlocus.errors import InputError, OutputError
 from zlocus.evaluation.evaluate import evaluate
+from zlocus.evaluation.table import evaluation_rows
 from zlocus.options import RunConfig
 from zlocus.products.points import RankedPoints, write_ranking
 from zlocus.products.report import maps, tables, words
 from zlocus.products.report.cells import DOUBTFUL, FAILED, TYPICAL, chosen_cells
+from zlocus.products.report.comparison import shrunk_means
 from zlocus.products.report.page import write_report
 from zlocus.products.report.survey import Survey, survey
 from zlocus.surface.reasons import Quality
@@ -45,6 +47,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS = (390, 1280)
 # Of numbers with three digits behind the point.
 ROUNDED = 6e-4
+UNDULATION_M = 47.0
 # Rows and columns of small rasters.
 SHAPE = (6, 8)
 
@@ -266,19 +269,55 @@ def test_the_comparison_is_that_of_evaluate(out, tmp_path):
         file.write(truth, 1)
     result = zl("report", out, "--reference", reference, "--margin", 5, "--threshold", 0.5)
     assert result.exit_code == 0, result.output
-    figures = evaluate(out / "dsm.tif", reference, margin_m=5, threshold_m=0.5).all
+    evaluation = evaluate(out / "dsm.tif", reference, margin_m=5, threshold_m=0.5)
+    figures = evaluation.all
     text = page_of(out).text("reference")
-    row = text[text.index("LE90, m") :].split()[2:]
-    assert row[1] == str(figures.n)
-    assert [float(v) for v in (row[2], row[4])] == pytest.approx(
-        [100 * figures.completeness, 100 * figures.within], abs=0.06
-    )
-    assert [float(v) for v in row[6:10]] == pytest.approx(
-        [figures.median, figures.nmad, figures.rmse, figures.le90], abs=ROUNDED
-    )
+    headings, *rows = evaluation_rows(evaluation)
+    assert {"LE90", "LE95"} <= set(headings)
+    assert [row[0] for row in rows] == ["all", "0-5 deg", "5-15 deg", "15-30 deg", "30-45 deg", "45-90 deg"]
+    for row in rows:
+        assert " ".join(" ".join(row).split()) in text
+    assert "Within: share of all cells in error by less than 0.5 m; errors in m." in text
+    assert "MVS3DM (single cells): completeness" in text
     assert "<b>truth.tif" in text
     assert f"{100 * figures.within:.1f} % one that is right to 0.5 m" in page_of(out).text("summary")
-    assert len([each for each in page_of(out).of("img") if each["alt"].startswith("Error of height")]) == 1
+    alts = [each["alt"] for each in page_of(out).of("img")]
+    assert len([alt for alt in alts if alt.startswith("Error of height")]) == 1
+    (histogram,) = (alt for alt in alts if alt.startswith("Histogram of the errors"))
+    assert f"NMAD {figures.nmad:.3f} m" in histogram
+
+
+def test_a_reference_above_a_geoid_is_compared_above_the_ellipsoid(out, tmp_path):
+    _, source = read(out / "dsm.tif")
+    truth, reference, geoid = (
+        truth_at("sine", source).astype(np.float32),
+        tmp_path / "truth.tif",
+        tmp_path / "geoid.tif",
+    )
+    profile = {
+        "driver": "GTiff", "count": 1, "dtype": "float32", "nodata": float("nan"), "crs": source.crs,
+        "transform": source.transform, "width": source.width, "height": source.height,
+    }  # fmt: skip
+    for path, heights in ((reference, truth - UNDULATION_M), (geoid, np.full_like(truth, UNDULATION_M))):
+        with rasterio.open(path, "w", **profile) as file:
+            file.write(heights, 1)
+    result = zl(
+        "report", out, "--reference", reference, "--geoid", geoid, "--coregister", "nuth-kaab", "--slopes", "20"
+    )
+    assert result.exit_code == 0, result.output
+    text = page_of(out).text("reference")
+    assert f"The geoid's heights were added to those of {reference}." in text
+    assert "as it lies" in text
+    assert "20-90 deg" in text
+    median_m = float(text[text.index("errors' median is") :].split()[3])
+    assert abs(median_m) < UNDULATION_M / 10
+    assert "Removed first:" in text
+
+
+def test_means_of_blocks_leave_out_what_is_not_known():
+    values = np.array([[1.0, 3.0, np.nan], [np.nan, 5.0, np.nan], [7.0, np.nan, 2.0]], np.float32)
+    np.testing.assert_array_equal(shrunk_means(values, 2), np.array([[3.0, np.nan], [7.0, 2.0]], np.float32))
+    np.testing.assert_array_equal(shrunk_means(values, 3), values)
 
 
 def test_a_curve_that_fails_fails_no_run(images, tmp_path, monkeypatch):
@@ -331,6 +370,7 @@ def test_a_surface_is_the_same_with_and_without_a_report(images, made, tmp_path)
         (lambda out: (out / "sigma.tif").unlink(), (), "There is no raster"),
         (lambda out: None, ("--classes", "c.tif"), "--classes is about a reference"),
         (lambda out: None, ("--align",), "--align is about a reference"),
+        (lambda out: None, ("--geoid", "g.tif"), "--geoid is about a reference"),
         (lambda out: None, ("--reference", "moon.tif"), "moon.tif"),
     ],
 )

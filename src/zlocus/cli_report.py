@@ -8,24 +8,40 @@ from typing import Annotated
 import typer
 
 from zlocus.errors import ConfigError
-from zlocus.evaluation.command import Align, Classes, Margin
+from zlocus.evaluation.command import (
+    DEFAULT_SLOPES,
+    Align,
+    Classes,
+    Coregister,
+    Geoid,
+    Margin,
+    Slopes,
+    Thresholds,
+    judging,
+)
 
 
 def report(
     out: Annotated[Path, typer.Argument(help="Folder of a surface.", metavar="OUT")],
-    reference: Annotated[
-        Path | None, typer.Option(help="Reference heights on a projected grid, to compare with.", metavar="RASTER")
-    ] = None,
+    reference: Annotated[Path | None, typer.Option(help="Reference heights to compare with.", metavar="RASTER")] = None,
     classes: Classes = None,
     align: Align = False,
+    coregister: Coregister = None,
     margin: Margin = 10.0,
-    threshold: Annotated[float, typer.Option(help="An error below this is within, m.", metavar="M")] = 1.0,
+    threshold: Thresholds = None,
+    slopes: Slopes = DEFAULT_SLOPES,
+    geoid: Geoid = None,
 ) -> None:
     """Make report.html of a surface again, with a reference where one is given."""
-    if reference is None and (classes is not None or align):
-        given = "--classes" if classes is not None else "--align"
-        raise ConfigError(f"{given} is about a reference, and none is given. Add --reference RASTER, or leave it out.")
-    from zlocus.products.report.page import Compared, write_report
+    about = {"--classes": classes, "--align": align, "--coregister": coregister, "--geoid": geoid}
+    given = [name for name, value in about.items() if value]
+    if reference is None and given:
+        raise ConfigError(
+            f"{given[0]} is about a reference, and none is given. Add --reference RASTER, or leave it out."
+        )
+    judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
+    from zlocus.products.report.comparison import Comparison
+    from zlocus.products.report.page import write_report
 
-    compared = None if reference is None else Compared(reference, classes, align, margin, threshold)
-    print(f"{write_report(out, compared)}: open it in a browser.")
+    comparison = None if reference is None else Comparison(reference, **judged_by)
+    print(f"{write_report(out, comparison)}: open it in a browser.")

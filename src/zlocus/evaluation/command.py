@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,7 +21,21 @@ Classes = Annotated[
     typer.Option(help="Classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
 ]
 Align = Annotated[bool, typer.Option("--align", help="First find and remove the best shift; it is reported.")]
+Coregister = Annotated[
+    str | None, typer.Option(help="The same by slope and aspect (Nuth and Kääb 2011).", metavar="nuth-kaab")
+]
 Margin = Annotated[float, typer.Option(help="Rim of the reference left out, m.", metavar="M")]
+Thresholds = Annotated[
+    list[float] | None,
+    typer.Option(help="An error below this is within, m; may be repeated. Default: 1.", metavar="M"),
+]
+Slopes = Annotated[
+    str, typer.Option(help="Limits between bands of slope, degrees; none: no bands.", metavar="DEG,DEG...|none")
+]
+Geoid = Annotated[
+    Path | None,
+    typer.Option(help="Geoid's heights, added to heights above it: by CRS, else the reference's.", metavar="RASTER"),
+]
 
 
 def evaluate(
@@ -29,24 +43,11 @@ def evaluate(
     reference: Annotated[Path, typer.Argument(help="Reference heights.", metavar="REFERENCE")],
     classes: Classes = None,
     align: Align = False,
-    coregister: Annotated[
-        str | None,
-        typer.Option(help="The same by slope and aspect (Nuth and Kääb 2011).", metavar="nuth-kaab"),
-    ] = None,
+    coregister: Coregister = None,
     margin: Margin = 10.0,
-    threshold: Annotated[
-        list[float] | None,
-        typer.Option(help="An error below this is within, m; may be repeated. Default: 1.", metavar="M"),
-    ] = None,
-    slopes: Annotated[
-        str, typer.Option(help="Limits between bands of slope, degrees; none: no bands.", metavar="DEG,DEG...|none")
-    ] = DEFAULT_SLOPES,
-    geoid: Annotated[
-        Path | None,
-        typer.Option(
-            help="Geoid's heights, added to heights above it: by CRS, else the reference's.", metavar="RASTER"
-        ),
-    ] = None,
+    threshold: Thresholds = None,
+    slopes: Slopes = DEFAULT_SLOPES,
+    geoid: Geoid = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="Folder for figures, error map and histogram. Default: print.", metavar="OUT"),
@@ -54,8 +55,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Compare a surface with a reference surface."""
-    edges = _slope_edges(slopes)
-    thresholds = threshold or [DEFAULT_THRESHOLD_M]
+    judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
     if out is not None:
         # It writes no file that a run does.
         check_output(out, overwrite=True)
@@ -65,13 +65,28 @@ def evaluate(
 
     if out is not None:
         check_not_input(out, dsm, reference, classes, geoid)
-    evaluation = compare(
-        dsm, reference, classes=classes, align=align, margin_m=margin, threshold_m=thresholds[0],
-        more_thresholds_m=thresholds[1:], slope_edges_deg=edges, coregister=coregister, geoid=geoid,
-    )  # fmt: skip
+    evaluation = compare(dsm, reference, **judged_by)
     if out is not None:
         write_evaluation(out, evaluation)
     print(json.dumps(evaluation.as_dict(), indent=2) if as_json else evaluation_table(evaluation))
+
+
+def judging(
+    classes: Path | None, align: bool, coregister: str | None, margin: float, threshold: list[float] | None,
+    slopes: str, geoid: Path | None,
+) -> dict[str, Any]:  # fmt: skip
+    """The options as the arguments of `zlocus.evaluation.evaluate.evaluate`.
+
+    Raises
+    ------
+    ConfigError
+        Slopes that are no numbers.
+    """
+    first, *more = threshold or [DEFAULT_THRESHOLD_M]
+    return {
+        "classes": classes, "align": align, "margin_m": margin, "threshold_m": first, "more_thresholds_m": more,
+        "slope_edges_deg": _slope_edges(slopes), "coregister": coregister, "geoid": geoid,
+    }  # fmt: skip
 
 
 def _slope_edges(text: str) -> tuple[float, ...]:

@@ -17,17 +17,18 @@ if TYPE_CHECKING:
 N_BINS = 120
 # What is shown: this many times the 95th percentile of absolute errors, and at least the threshold.
 SHOWN_LE95 = 1.25
+SIZE_INCHES = (7.5, 4.5)
 BAR, CURVE, LINE = "#7A9CC6", "#C03A2B", "#444444"
 
 
-def histogram_figure(evaluation: Evaluation) -> Figure:
+def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = SIZE_INCHES) -> Figure:
     """Share of the heights per bin of error, with the normal curve of the same median and NMAD, and the median."""
     from matplotlib.figure import Figure
 
     assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
     known = np.isfinite(evaluation.error_map.errors)
     errors = evaluation.error_map.errors[known].astype(np.float64)
-    figure = Figure(figsize=(7.5, 4.5), layout="constrained")
+    figure = Figure(figsize=size_inches, layout="constrained")
     axes = figure.subplots()
     axes.set_xlabel("height of the surface less that of the reference, m")
     axes.set_ylabel("share of the heights, %")

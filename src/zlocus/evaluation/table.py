@@ -16,17 +16,25 @@ def evaluation_table(evaluation: Evaluation) -> str:
 
     A shift that was removed is said, with the figures of the surface before.
     """
-    thresholds = [limit for limit, _ in evaluation.all.shares]
+    rows = evaluation_rows(evaluation)
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+    return "\n".join([*lines, *notes(evaluation)])
+
+
+def evaluation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """The table's cells: the headings (the first is empty), then a row for each group of the reference's cells."""
+    thresholds = _thresholds(evaluation)
     within = [f"< {limit:g} m" for limit in thresholds] if len(thresholds) > 1 else ["within"]
     groups = {"all": evaluation.all}
     if evaluation.unshifted is not None:
         groups["as it lies"] = evaluation.unshifted
     groups |= evaluation.classes | {_band_name(name): figures for name, figures in evaluation.slopes.items()}
-    rows = [("", "cells", "complete", *within, *ERROR_COLUMNS)]
-    rows += [_row(name, figures) for name, figures in groups.items()]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
-    return "\n".join([*lines, *_notes(evaluation, thresholds)])
+    return [("", "cells", "complete", *within, *ERROR_COLUMNS), *(_row(*group) for group in groups.items())]
+
+
+def _thresholds(evaluation: Evaluation) -> list[float]:
+    return [limit for limit, _ in evaluation.all.shares]
 
 
 def _row(name: str, figures: ErrorStatistics) -> tuple[str, ...]:
@@ -40,8 +48,9 @@ def _band_name(name: str) -> str:
     return "slope unknown" if name == UNKNOWN else f"{name} deg"
 
 
-def _notes(evaluation: Evaluation, thresholds: list[float]) -> Iterator[str]:
-    if len(thresholds) > 1:
+def notes(evaluation: Evaluation) -> Iterator[str]:
+    """What the table's figures mean, what was assumed and what was removed, a line each."""
+    if len(_thresholds(evaluation)) > 1:
         yield "< M m: share of all cells in error by less; errors in m"
     else:
         yield f"within: share of all cells in error by less than {evaluation.threshold_m:g} m; errors in m"

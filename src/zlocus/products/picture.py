@@ -60,9 +60,12 @@ def relief(height: FloatImage, cell_m: float, span: tuple[float, float]) -> NDAr
     return _empty_white(np.clip(shaded, 0, 255), np.isfinite(height))
 
 
-def error_map(error: FloatImage) -> NDArray[np.uint8]:
-    """Errors (r, c), m, as red (too high), white and blue (too low): (r, c, 3) uint8 in OpenCV's order."""
-    share = np.clip(np.nan_to_num(error) / ERROR_SCALE_M, -1.0, 1.0)
+def error_map(error: FloatImage, full_m: float = ERROR_SCALE_M) -> NDArray[np.uint8]:
+    """Errors (r, c), m, as red (too high), white and blue (too low): (r, c, 3) uint8 in OpenCV's order.
+
+    full_m : size of an error, m, from which its colour is full.
+    """
+    share = np.clip(np.nan_to_num(error) / full_m, -1.0, 1.0)
     blue, green, red = 1.0 - np.maximum(share, 0.0), 1.0 - np.abs(share), 1.0 + np.minimum(share, 0.0)
     # A light grey at no error keeps cells without a height, which are white, apart.
     return _empty_white(225.0 * np.stack([blue, green, red], axis=-1), np.isfinite(error))

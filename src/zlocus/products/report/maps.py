@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
 from zlocus.io.opening import open_raster
-from zlocus.products.picture import ERROR_SCALE_M, error_map, relief
+from zlocus.products.picture import error_map, relief
 from zlocus.products.report.survey import Survey
 from zlocus.products.report.words import percent, size
 from zlocus.surface.reasons import Quality
@@ -138,11 +138,11 @@ def groups_of(code: NDArray[np.int64]) -> NDArray[np.int64]:
     return group
 
 
-def error_picture(found: NDArray[np.float32], true: NDArray[np.float32]) -> tuple[Picture, Scale]:
-    """Heights less those of a reference on the same cells, (r, c) m."""
-    colours = error_map(found - true)
-    line = error_map(np.linspace(-ERROR_SCALE_M, ERROR_SCALE_M, STOPS, dtype=np.float32)[None])[0]
-    ticks = tuple(f"{value:+.1f}" for value in np.linspace(-ERROR_SCALE_M, ERROR_SCALE_M, TICKS))
+def error_picture(errors: NDArray[np.float32], full_m: float) -> tuple[Picture, Scale]:
+    """Errors (r, c) m as colours that are full from `full_m` on."""
+    colours = error_map(errors, full_m)
+    line = error_map(np.linspace(-full_m, full_m, STOPS, dtype=np.float32)[None], full_m)[0]
+    ticks = tuple(f"{value:+g}" if value else "0" for value in np.linspace(-full_m, full_m, TICKS))
     alt = "Error of height: red where the surface is too high, blue where it is too low; white where it cannot be told."
     scale = Scale("surface less reference, m", ", ".join(css(colour) for colour in line), ticks)
     return picture(colours, alt), scale

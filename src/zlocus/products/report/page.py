@@ -6,19 +6,18 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pyproj import CRS, Transformer
 
-from zlocus.errors import InputError, ZlocusError
-from zlocus.evaluation.evaluate import Evaluation, evaluate
+from zlocus.errors import InputError
 from zlocus.io.text import read_text
-from zlocus.products.picture import read_averaged
 from zlocus.products.record import write_whole
 from zlocus.products.report import maps, tables, words
+from zlocus.products.report.comparison import Comparison, comparison_part
 from zlocus.products.report.survey import Survey, survey
 from zlocus.scene import is_local
 from zlocus.surface.reasons import Quality
@@ -38,18 +37,7 @@ SVG_PX = (355, 336)
 SCRIPT = 'addEventListener("beforeprint",()=>document.querySelectorAll("details").forEach(d=>{d.open=true}));'
 
 
-@dataclass(frozen=True)
-class Compared:
-    """A reference to compare with; classes, is_aligned, margin_m, threshold_m : as `evaluate` takes them."""
-
-    reference: Path
-    classes: Path | None = None
-    is_aligned: bool = False
-    margin_m: float = 10.0
-    threshold_m: float = 1.0
-
-
-def write_report(out: Path, compared: Compared | None = None) -> Path:
+def write_report(out: Path, comparison: Comparison | None = None) -> Path:
     """Write report.html of the run in a folder, from the files there, whole or not at all; returns its path.
 
     Raises
@@ -61,7 +49,7 @@ def write_report(out: Path, compared: Compared | None = None) -> Path:
     OutputError
         Where it cannot be written.
     """
-    text = rendered(context(out, compared))
+    text = rendered(context(out, comparison))
     write_whole(out / REPORT, lambda part: part.write_text(text, encoding="utf-8"))
     return out / REPORT
 
@@ -78,7 +66,7 @@ def rendered(values: Mapping[str, Any]) -> str:
     return environment.get_template("page.html.jinja").render(**values, script=SCRIPT, script_hash=digest) + "\n"
 
 
-def context(out: Path, compared: Compared | None) -> dict[str, Any]:
+def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
     """All that the page shows."""
     run = run_record(out)
     found, crs = survey(out), CRS.from_user_input(run["grid"]["crs"])
@@ -88,7 +76,7 @@ def context(out: Path, compared: Compared | None) -> dict[str, Any]:
     quantiles = {q: float(np.percentile(sigma, q)) for q in QUANTILES} if sigma.size else {}
     where, frame = words.place(found, crs)
     views = run["orientation"]["views"]
-    reference = None if compared is None else reference_part(out, compared)
+    reference = None if comparison is None else comparison_part(out, comparison)
     paragraph = words.summary(found, run, crs, quantiles)
     if reference is not None:
         paragraph += " " + reference["sentence"]
@@ -241,33 +229,3 @@ def curve_card(cell: Mapping[str, Any]) -> dict[str, Any]:
     uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
     alt = f"Correlation against height at this cell. {says}"
     return card | {"lines": [*lines, says], "picture": maps.Picture(uri, alt, *SVG_PX)}
-
-
-def reference_part(out: Path, compared: Compared) -> dict[str, Any]:
-    """The comparison with a reference."""
-    evaluation: Evaluation = evaluate(
-        out / "dsm.tif", compared.reference, classes=compared.classes, align=compared.is_aligned,
-        margin_m=compared.margin_m, threshold_m=compared.threshold_m,
-    )  # fmt: skip
-    shift, name = evaluation.shift, compared.reference.name
-    removed = "" if shift is None else (
-        f"Removed first, and reported here: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, "
-        f"{shift.up_m:+.3f} m up."
-    )  # fmt: skip
-    return {
-        "sentence": words.against_reference(evaluation, name), "name": name, "removed": removed,
-        "rows": tables.evaluation_rows(evaluation), "threshold": f"{compared.threshold_m:g}",
-        "margin": f"{compared.margin_m:g}", "map": error_part(out / "dsm.tif", compared.reference),
-    }  # fmt: skip
-
-
-def error_part(dsm: Path, reference: Path) -> tuple[maps.Picture, maps.Scale] | None:
-    """The map of errors, as the surfaces lie; None where they cannot be put on the same cells."""
-    from rasterio.errors import RasterioError
-
-    try:
-        found, _ = read_averaged(dsm, None, maps.MAP_PX)
-        true, _ = read_averaged(reference, dsm, maps.MAP_PX)
-    except (ZlocusError, RasterioError):
-        return None
-    return maps.error_picture(found, true)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from zlocus.errors import InputError
-from zlocus.evaluation.evaluate import Evaluation
 from zlocus.options import RunConfig
 from zlocus.products.report.words import NONE, STAGES, number, percent, seconds
 
@@ -219,14 +218,3 @@ def plain(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def evaluation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
-    """Name, cells, completeness, within, median, NMAD, RMSE, LE90: of all and per class."""
-    return [
-        (
-            name, str(figures.n), percent(figures.completeness, 1), percent(figures.within, 1),
-            *(number(value, "", 3) for value in (figures.median, figures.nmad, figures.rmse, figures.le90)),
-        )
-        for name, figures in {"all": evaluation.all, **evaluation.classes}.items()
-    ]  # fmt: skip
