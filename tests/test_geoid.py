@@ -109,6 +109,11 @@ def test_places_without_undulations(tmp_path):
     assert holed.undulation(np.array([[5.1, 43.9]]), WGS84) == pytest.approx(0.6 * 50.4 + 0.4 * 52.8, abs=EXACT_M)
     with pytest.raises(InputError, match=r"no value \(nodata\) around 5\.3, 43\.9 \(EPSG:4326\)"):
         holed.undulation(np.array([[5.1, 43.9], [5.3, 43.9]]), WGS84)
+    points = np.array([[5.1, 43.9], [5.3, 43.9], [4.99, 43.9], [np.nan, 43.9]])
+    np.testing.assert_allclose(
+        holed.known_undulation(points, WGS84), [0.6 * 50.4 + 0.4 * 52.8, np.nan, np.nan, np.nan], rtol=0, atol=EXACT_M
+    )
+    assert holed.known_undulation(np.zeros((0, 2)), WGS84).shape == (0,)
 
 
 def test_rasters_that_are_no_geoid(tmp_path):

@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import laspy
 import numpy as np
+import pyogrio.raw
 import pytest
 import rasterio
 from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
+from shapely import from_wkb, get_coordinates
 from typer.testing import CliRunner
 
 from geoids import write_geoid
@@ -29,6 +31,7 @@ from zlocus.options import RunConfig
 from zlocus.orienting import control_points, terrain_heights
 from zlocus.pipeline import run_dsm
 from zlocus.preparing import with_heights
+from zlocus.products.points import RankedPoints, write_ranking
 from zlocus.progress import SilentProgress, progress_for
 from zlocus.request import CloudRequest, DsmRequest, OrientRequest
 from zlocus.synthetic.terrain import analytic_height
@@ -36,6 +39,9 @@ from zlocus.synthetic.terrain import analytic_height
 # Steeper than any geoid, so that a cell's neighbour would be seen: 4 mm over a cell, 1 m over the posts.
 AT_CENTRE_M, EAST_SLOPE, NORTH_SLOPE = 48.0, 8e-3, -4e-3
 POST_M = 100.0
+# Three images are ranked too.
+RANKED = replace(SMALL_TILES, selection=replace(SMALL_TILES.selection, fewest_views=3, least_images=1))
+EXACT_M = 1e-9
 # float32 heights, of which an undulation is taken.
 FLOAT_M = 2e-5
 ACCEPTED_M = 0.01
@@ -86,6 +92,38 @@ def test_run_json_says_what_heights_are_above(both, geoid):
     assert above["vertical"] == {"heights_above": "the geoid of slope.tif", "crs": name, "geoid": str(geoid)}
     assert str(geoid) in [entry["path"] for entry in above["inputs"]]
     assert above["heights"] == plain["heights"]
+
+
+@pytest.mark.parametrize("name", ["ties", "ranking"])
+def test_points_are_above_the_same(images, geoid, tmp_path, name):
+    asked = {"heights": None, "bounds": PART}
+    above = {"plain": "ellipsoid", "above": str(geoid)}
+    folders = [run(images("sine"), tmp_path / f, RANKED, vertical=v, **asked).out for f, v in above.items()]
+    (plain, plain_crs), (above, crs) = (points_in(out / f"{name}.gpkg") for out in folders)
+    assert len(plain) > 20
+    np.testing.assert_array_equal(above[:, :2], plain[:, :2])
+    expected = plain[:, 2:] - undulation(*plain[:, :2].T)[:, None]
+    np.testing.assert_allclose(above[:, 2:], expected, rtol=0, atol=EXACT_M)
+    assert not plain_crs.is_compound
+    assert crs.is_compound
+    assert crs.sub_crs_list[1].name == f"height above the geoid of {geoid.name}"
+
+
+def test_points_where_a_geoid_has_no_value_are_left_out(tmp_path, geoid):
+    east, north = CENTRE
+    xyz = np.array([[east, north, 60.0], [east + 900.0, north, 60.0], [east + 5000.0, north, 60.0]])
+    ranked = RankedPoints(xyz, np.ones((3, 2, 2), np.int8), np.arange(2))
+    write_ranking(tmp_path / "ranking.gpkg", [ranked], ["a", "b"], UTM, vertical_datum(str(geoid)))
+    found, _ = points_in(tmp_path / "ranking.gpkg")
+    assert len(found) == 4  # two references each
+    np.testing.assert_allclose(found[::2, 2], 60.0 - undulation(*xyz[:2, :2].T), rtol=0, atol=EXACT_M)
+
+
+def points_in(path):
+    """Points of a GeoPackage (n, 4): x, y, z and the column of heights, and its CRS."""
+    meta, _, wkb, columns = pyogrio.raw.read(path)
+    heights = columns[list(meta["fields"]).index("height_m")]
+    return np.column_stack([get_coordinates(from_wkb(wkb), include_z=True), heights]), CRS.from_user_input(meta["crs"])
 
 
 def test_a_surface_above_a_geoid_is_judged_and_gives_its_grid(both, images, tmp_path):

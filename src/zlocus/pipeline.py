@@ -147,7 +147,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
     remove_maps(out)
     with watch.stage("points"):
-        _write_points(out, orientation, corrected, tally.ranked, settled)
+        _write_points(out, orientation, corrected, tally.ranked, settled, vertical)
     matched = Matched(corrected, settled, grid, orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs))
     _show(request, matched, config, watch, progress)
     with watch.stage("record"):
@@ -315,13 +315,14 @@ def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | Non
 
 
 def _write_points(
-    out: Path, orientation: Orientation, corrected: Scene, ranked: list[RankedPoints], settled: MatchScene
-) -> None:
+    out: Path, orientation: Orientation, corrected: Scene, ranked: list[RankedPoints], settled: MatchScene,
+    vertical: VerticalDatum,
+) -> None:  # fmt: skip
     """Ties and ranking; of an earlier run's ranking and report, which are not this one's, nothing stays."""
     forget_report(out)
-    write_ties(out / "ties.gpkg", orientation, corrected)
+    write_ties(out / "ties.gpkg", orientation, corrected, vertical)
     if ranked:
-        write_ranking(out / "ranking.gpkg", ranked, [view.name for view in settled.views], corrected.crs)
+        write_ranking(out / "ranking.gpkg", ranked, [view.name for view in settled.views], corrected.crs, vertical)
     else:
         (out / "ranking.gpkg").unlink(missing_ok=True)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from affine import Affine
+from numpy.typing import NDArray
 from pyproj import CRS
 from rasterio.windows import Window
 
@@ -71,29 +72,31 @@ class GeoidRaster:
         InputError
             Where a point lies outside the posts or beside one without a value, or values are no undulations.
         """
-        if not len(xy):
-            return np.empty(0)
         cell = self._cells(xy, crs)
-        last = np.array(self.shape) - 1
-        inside = ((cell >= -ROUNDING) & (cell <= last + ROUNDING)).all(axis=1)
-        if self._is_around:  # between the last post and the first
-            inside = (cell[:, 0] >= -ROUNDING) & (cell[:, 0] <= last[0] + ROUNDING)
+        inside = self._inside(cell)
         if not inside.all():
             raise self._not_covered(xy[np.argmin(inside)], crs)
-        cell[:, 0] = np.clip(cell[:, 0], 0, last[0])
-        cell[:, 1] = np.maximum(cell[:, 1], 0) if self._is_around else np.clip(cell[:, 1], 0, last[1])
-        first = np.minimum(np.floor(cell).astype(int), last - (1, 0 if self._is_around else 1))
-        down, right = (cell - first).T
-        row, col = first.T
-        beside = (col + 1) % self.shape[1]
-        at_row, at_col = int(row.min()), int(min(col.min(), beside.min()))
-        posts = self._posts(at_row, at_col, int(row.max()) + 2, int(max(col.max(), beside.max())) + 1)
-        row, col, beside = row - at_row, col - at_col, beside - at_col
-        upper = posts[row, col] * (1.0 - right) + posts[row, beside] * right
-        lower = posts[row + 1, col] * (1.0 - right) + posts[row + 1, beside] * right
-        found = upper * (1.0 - down) + lower * down
-        self._check(found, xy, crs)
-        return np.asarray(found)
+        found = self._between_posts(cell)
+        if not np.isfinite(found).all():
+            x, y = xy[np.argmin(np.isfinite(found))]
+            raise InputError(
+                f"The geoid {self.path} has no value (nodata) around {x:.10g}, {y:.10g} ({named_crs(crs)}). Give one "
+                "that is whole where the heights are."
+            )
+        return found
+
+    def known_undulation(self, xy: FloatArray, crs: CRS) -> FloatArray:
+        """As `undulation`, but NaN where the raster has none.
+
+        Raises
+        ------
+        InputError
+            Where values are no undulations.
+        """
+        cell = self._cells(xy, crs)
+        inside, found = self._inside(cell), np.full(len(xy), np.nan)
+        found[inside] = self._between_posts(cell[inside])
+        return found
 
     def spacing_m(self, xy: FloatArray, crs: CRS) -> float:
         """About how far apart, in units of a projected CRS, the posts lie around a point (2,)."""
@@ -120,6 +123,33 @@ class GeoidRaster:
                 col = np.mod(col + ROUNDING, self.period) - ROUNDING
         return np.column_stack([row, col])
 
+    def _inside(self, cell: FloatArray) -> NDArray[np.bool_]:
+        """Whether (row, col) (n, 2) lie between posts; (n,)."""
+        last = np.array(self.shape) - 1
+        if self._is_around:  # between the last post and the first
+            return np.asarray((cell[:, 0] >= -ROUNDING) & (cell[:, 0] <= last[0] + ROUNDING))
+        return np.asarray(((cell >= -ROUNDING) & (cell <= last + ROUNDING)).all(axis=1))
+
+    def _between_posts(self, cell: FloatArray) -> FloatArray:
+        """Undulations (n,) m at (row, col) (n, 2) inside, NaN beside posts without a value."""
+        if not len(cell):
+            return np.empty(0)
+        last, cell = np.array(self.shape) - 1, cell.copy()
+        cell[:, 0] = np.clip(cell[:, 0], 0, last[0])
+        cell[:, 1] = np.maximum(cell[:, 1], 0) if self._is_around else np.clip(cell[:, 1], 0, last[1])
+        first = np.minimum(np.floor(cell).astype(int), last - (1, 0 if self._is_around else 1))
+        down, right = (cell - first).T
+        row, col = first.T
+        beside = (col + 1) % self.shape[1]
+        at_row, at_col = int(row.min()), int(min(col.min(), beside.min()))
+        posts = self._posts(at_row, at_col, int(row.max()) + 2, int(max(col.max(), beside.max())) + 1)
+        row, col, beside = row - at_row, col - at_col, beside - at_col
+        upper = posts[row, col] * (1.0 - right) + posts[row, beside] * right
+        lower = posts[row + 1, col] * (1.0 - right) + posts[row + 1, beside] * right
+        found = np.asarray(upper * (1.0 - down) + lower * down)
+        self._check(found)
+        return found
+
     def _posts(self, top: int, left: int, bottom: int, right: int) -> FloatArray:
         """Undulations of posts (r, c) m, NaN where there is none."""
         with open_raster(self.path, "geoid") as source:
@@ -127,14 +157,8 @@ class GeoidRaster:
             posts = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
             return np.asarray(posts * source.scales[0] + source.offsets[0])
 
-    def _check(self, found: FloatArray, xy: FloatArray, crs: CRS) -> None:
-        if not np.isfinite(found).all():
-            x, y = xy[np.argmin(np.isfinite(found))]
-            raise InputError(
-                f"The geoid {self.path} has no value (nodata) around {x:.10g}, {y:.10g} ({named_crs(crs)}). Give one "
-                "that is whole where the heights are."
-            )
-        largest = found[np.argmax(np.abs(found))]
+    def _check(self, found: FloatArray) -> None:
+        largest = found[np.argmax(np.abs(np.nan_to_num(found)))]
         if abs(largest) > MOST_UNDULATION_M:
             raise InputError(
                 f"{self.path} is no geoid: it holds {largest:.1f} m, and undulations lie between -107 and 86 m "

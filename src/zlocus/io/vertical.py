@@ -75,6 +75,12 @@ class VerticalDatum:
         """Its height above the ellipsoid, (n,) m, at points (n, 2) of a CRS; see `GeoidRaster.undulation`."""
         return np.zeros(len(xy)) if self.geoid is None else self.geoid.undulation(xy, crs)
 
+    def of_points(self, xyz: FloatArray, crs: CRS) -> FloatArray:
+        """Points (n, 3) m of a CRS, ellipsoidal heights made heights above it; NaN where its raster has no value."""
+        if self.geoid is None:
+            return xyz
+        return np.column_stack([xyz[:, :2], xyz[:, 2] - self.geoid.known_undulation(xyz[:, :2], crs)])
+
     def of_cells(
         self, ellipsoidal: NDArray[np.float32], geobox: GeoBox, row: int = 0, col: int = 0
     ) -> NDArray[np.float32]:

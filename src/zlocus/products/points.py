@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import OutputError
+from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.curve import GOOD
 from zlocus.matching.selection import Ranking
@@ -25,12 +26,12 @@ from zlocus.sensors.model import FloatArray
 NOT_RANKED = -128
 
 
-def write_ties(path: Path, orientation: Orientation, oriented: Scene) -> None:
-    """Layer `ties`: one 3-D point per tie, in the scene's frame.
+def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: VerticalDatum = ELLIPSOIDAL) -> None:
+    """Layer `ties`: one 3-D point per tie, in the scene's frame, its height above `vertical`.
 
     Columns: height_m; sigma_z_m, its standard deviation; n_images; images, their names with commas between;
-    residual_px, the largest distance of an observation from the projected point. Ties whose rays do not meet are left
-    out.
+    residual_px, the largest distance of an observation from the projected point. Ties whose rays do not meet, and those
+    where a geoid's raster has no value, are left out.
     oriented : the scene with the orientation applied.
 
     Raises
@@ -47,13 +48,15 @@ def write_ties(path: Path, orientation: Orientation, oriented: Scene) -> None:
     order = np.lexsort((seen.view, seen.point))
     for point, view in zip(seen.point[order].tolist(), seen.view[order].tolist(), strict=True):
         names[point].append(oriented.views[view].name)
+    xyz = vertical.of_points(xyz, oriented.crs)
     kept = np.isfinite(xyz).all(axis=1)
     images = np.array([",".join(parts) for parts in names], dtype=object)
     columns: dict[str, NDArray[np.generic]] = {
         "height_m": xyz[:, 2], "sigma_z_m": orientation.sigma_z_m, "n_images": n_images, "images": images,
         "residual_px": residual,
     }  # fmt: skip
-    write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, oriented.crs)
+    crs = vertical.compound(oriented.crs)
+    write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, crs)
 
 
 @dataclass(frozen=True)
@@ -85,11 +88,14 @@ class RankedPoints:
         return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), labels.reshape(n * k, n_views)
 
 
-def write_ranking(path: Path, ranked: Sequence[RankedPoints], names: Sequence[str], crs: CRS) -> None:
+def write_ranking(
+    path: Path, ranked: Sequence[RankedPoints], names: Sequence[str], crs: CRS, vertical: VerticalDatum = ELLIPSOIDAL
+) -> None:
     """Layer `ranking`: one 3-D point per ranked tie point and reference, from south-west to north-east.
 
     Columns: reference; height_m; n_good, search images labelled 1 there; label_NAME of every image, NULL where it is
-    the reference or was not compared. names : of the scene's images.
+    the reference or was not compared. names : of the scene's images. vertical : what the heights written are above;
+    points where its raster has no value are left out.
 
     Raises
     ------
@@ -99,7 +105,9 @@ def write_ranking(path: Path, ranked: Sequence[RankedPoints], names: Sequence[st
     parts = [part.rows(len(names)) for part in ranked]
     nothing = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, len(names)), np.int16))
     xyz, reference, labels = (np.concatenate(arrays) for arrays in zip(nothing, *parts, strict=True))
+    xyz = vertical.of_points(xyz, crs)
     order = np.lexsort((reference, xyz[:, 1], xyz[:, 0]))
+    order = order[np.isfinite(xyz[order, 2])]
     xyz, reference, labels = xyz[order], reference[order], labels[order]
     columns: dict[str, NDArray[np.generic]] = {
         "reference": np.array(names, dtype=object)[reference],
@@ -109,7 +117,7 @@ def write_ranking(path: Path, ranked: Sequence[RankedPoints], names: Sequence[st
     nulls = {}
     for i, name in enumerate(column_names(names)):
         columns[name], nulls[name] = labels[:, i].copy(), labels[:, i] == NOT_RANKED
-    write_points(path, "ranking", xyz, columns, crs, nulls)
+    write_points(path, "ranking", xyz, columns, vertical.compound(crs), nulls)
 
 
 def column_names(names: Sequence[str]) -> list[str]:
