@@ -13,13 +13,17 @@ from rasterio.transform import from_origin
 
 import camera_files
 from facade_scene import axes_of_wall, photographed
-from geoids import write_geoid
-from rendered_scenes import CENTRE, GSD_M, rendered
+from geoids import write_geoid, write_proj_grid
+from rendered_scenes import CENTRE, GSD_M, UTM, rendered
+from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import KNOWN
 from zlocus.synthetic.terrain import analytic_height
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = ("zlocus", "python", "make", "printf")
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```|((?:^ {4}[^\n]*\n)+)", re.DOTALL | re.MULTILINE)
+# Where a user's own grids of PROJ lie, below a page's folder.
+PROJ_GRIDS = "proj"
 INLINE = re.compile(r"`((?:zlocus|python -m zlocus\.synthetic|make) [^`]+)`")
 
 
@@ -117,6 +121,32 @@ def lay_out_surfaces(folder: Path) -> None:
     write_geoid(folder / "geoid.tif", np.full((8, 8), 48.0, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
 
 
+def lay_out_datums(folder: Path) -> None:
+    """Three images, a geoid as a file and as PROJ has two, a terrain model and control points above it."""
+    lay_out_images(folder)
+    undulation_m, grid_m, half = 48.0, 2.0, 200.0
+    write_geoid(folder / "geoid.tif", np.full((8, 8), undulation_m, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
+    (folder / PROJ_GRIDS).mkdir()
+    for geoid in KNOWN.values():
+        write_proj_grid(folder / PROJ_GRIDS / geoid.grids[0], np.full((721, 1440), undulation_m, np.float32))
+    n = round(2 * half / grid_m)
+    along = (np.arange(n) + 0.5) * grid_m - half
+    heights = analytic_height("sine", *np.meshgrid(along, -along)) - undulation_m
+    with rasterio.open(
+        folder / "srtm.tif", "w", driver="GTiff", width=n, height=n, count=1, dtype="float32", crs="EPSG:32632",
+        transform=from_origin(CENTRE[0] - half, CENTRE[1] + half, grid_m, grid_m),
+    ) as file:  # fmt: skip
+        file.write(heights.astype(np.float32), 1)
+    views = open_scene([folder / "img_1.tif", folder / "img_2.tif"], UTM).views
+    rows = ["name,x,y,z,image,column,row"]
+    for name, (east, north) in {"p": (-10.0, -8.0), "q": (12.0, 3.0), "r": (0.0, 15.0)}.items():
+        x, y, z = CENTRE[0] + east, CENTRE[1] + north, float(analytic_height("sine", east, north))
+        for view in views:
+            column, row = view.sensor.image_from_ground(np.array([[x, y, z]]))[0]
+            rows.append(f"{name},{x},{y},{z - undulation_m:.4f},{view.name},{column:.3f},{row:.3f}")
+    (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
 def lay_out_surface(folder: Path) -> None:
     """A flags raster, for what reads one."""
     (folder / "surface").mkdir()
@@ -138,5 +168,6 @@ LAID_OUT = {
     "products.md": lay_out_products,
     "report.md": lay_out_comparison,
     "evaluate.md": lay_out_surfaces,
+    "vertical.md": lay_out_datums,
     "tutorial.md": lambda folder: None,
 }

@@ -15,7 +15,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from docs_commands import INLINE, LAID_OUT, ROOT, Step, inline_commands, steps_of
+from docs_commands import INLINE, LAID_OUT, PROJ_GRIDS, ROOT, Step, inline_commands, steps_of
 from zlocus.cli import app
 from zlocus.synthetic.__main__ import _parser
 
@@ -79,6 +79,7 @@ def runnable(text: str) -> str:
 def run(step: Step, folder: Path) -> None:
     """Runs one step in a folder as a reader would; commands that are alternatives to others begin anew."""
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    environment["PROJ_USER_WRITABLE_DIRECTORY"] = str(folder / PROJ_GRIDS)
     command = [sys.executable, "-c", step.text] if step.is_python else ["bash", "-c", runnable(step.text)]
     words = [] if step.is_python else shlex.split(runnable(step.text))
     out = folder / words[words.index("-o") + 1] if "-o" in words else folder / "scene.yaml"
