@@ -104,7 +104,6 @@ def test_like_and_dem_reach_the_pipeline(zl, pipeline, tmp_path):
     result = zl("dsm", "scene.yaml", "-o", tmp_path / "out", "--like", "like.tif", "--dem", "dem.tif")
     assert result.exit_code == 0, result.output
     assert (pipeline.request.like, pipeline.request.dem) == (Path("like.tif"), Path("dem.tif"))
-    assert pipeline.request.is_scene_file
 
 
 def test_dsm_reads_its_configuration(zl, pipeline, tmp_path):

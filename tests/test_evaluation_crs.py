@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from pyproj import Transformer
@@ -16,6 +17,7 @@ from zlocus.evaluation.frame import frame_of, in_metres, points_on
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.table import evaluation_table
 from zlocus.evaluation.truth import truth_blocks
+from zlocus.io.vertical import vertical_datum
 
 N = 240
 # Two ways through PROJ, and the curvature of a map over ten metres.
@@ -108,9 +110,12 @@ def test_web_mercator_is_no_frame(tmp_path):
     assert frame.to_epsg() == 32632
     # Metres of the map are 0.68 of metres on the ground here.
     slope = truth_blocks(surface, 10, None, frame).slope_deg
-    x, y = grid(N)
-    truly = np.degrees(np.arctan(np.hypot(*np.gradient(rolling(x, y), 0.7 * np.cos(np.radians(46.9)))))).ravel()
-    assert np.median(slope) == pytest.approx(np.median(truly), abs=0.3)
+    cell_m = 0.7 * np.cos(np.radians(46.9))
+    truly = np.degrees(np.arctan(np.hypot(*np.gradient(rolling(*grid(N)), cell_m))))
+    rim = round(10 / cell_m)
+    assert np.median(slope) == pytest.approx(np.median(truly[rim:-rim, rim:-rim]), abs=0.05)
+    # And so are those of the rim.
+    assert len(slope) == pytest.approx((N - 2 * rim) ** 2, rel=0.02)
 
 
 def test_points_move_by_metres(tmp_path):
@@ -208,11 +213,56 @@ def test_a_geoid_that_does_not_help_is_refused(tmp_path):
         evaluate(one, third, geoid=up)
     plain = flat(tmp_path / "p.tif", 1)
     small = geoid(tmp_path / "small.tif", reach=0.0004)
-    with pytest.raises(InputError, match=r"small\.tif has no height at \d+ cells of .*p\.tif"):
+    with pytest.raises(InputError, match=r"The geoid .*small\.tif does not cover"):
         evaluate(plain, plain, geoid=small, margin_m=2)
     bare = flat(tmp_path / "bare.tif", 1, None)
     with pytest.raises(InputError, match=r"bare\.tif has no CRS, so no geoid"):
         evaluate(plain, bare, geoid=up, margin_m=2)
+
+
+def test_a_geoid_is_read_as_geoids_are_everywhere(tmp_path):
+    """Whole numbers with a scale, longitudes from 0 to 360, and nothing that is no geoid."""
+    surface, above = flat(tmp_path / "surface.tif", 145.3), flat(tmp_path / "above.tif", 100, EGM96)
+    lon, lat = Transformer.from_crs(CRS, 4326, always_xy=True).transform(WEST, NORTH)
+    at = from_origin(lon + 360 - 0.1, lat + 0.1, 0.025, 0.025)
+    scaled = write(tmp_path / "scaled.tif", np.full((8, 8), 4500, np.int16), at, "EPSG:4326")
+    with rasterio.open(scaled, "r+") as file:
+        file.scales = (0.01,)
+    result = evaluate(surface, above, geoid=scaled, margin_m=2)
+    assert result.all.median == pytest.approx(0.3, abs=HEIGHT_TOLERANCE_M)
+    with pytest.raises(InputError, match=r"surface\.tif is no geoid: it holds 145\.3 m"):
+        evaluate(surface, above, geoid=surface, margin_m=2)
+
+
+def test_a_surface_of_ours_says_that_it_is_ellipsoidal(tmp_path):
+    ours = flat(tmp_path / "ours.tif", 100)
+    with rasterio.open(ours, "r+") as file:
+        file.set_band_description(1, "height above the ellipsoid")
+    with pytest.raises(InputError, match=r"ours\.tif are above the ellipsoid and .* above EGM2008 height"):
+        evaluate(ours, flat(tmp_path / "r.tif", 100, EGM2008))
+    result = evaluate(ours, flat(tmp_path / "plain.tif", 100), margin_m=2)
+    assert result.as_dict()["dsm_heights"] == "ellipsoid"
+    assert "plain.tif does not say what its heights are above: taken to be the ellipsoid" in result.as_dict()["assumed"]
+
+
+def test_a_geoid_of_a_file_is_no_ellipsoid_whatever_its_name(tmp_path):
+    name = geoid(tmp_path / "N_above_ellipsoid.tif")
+    crs = vertical_datum(str(name)).compound(pyproj.CRS(CRS)).to_wkt()
+    with pytest.raises(InputError, match="are above the geoid of N_above_ellipsoid"):
+        evaluate(flat(tmp_path / "d.tif", 100, crs), in_degrees(tmp_path / "r.tif", ELLIPSOIDAL))
+
+
+def test_depths_are_refused(tmp_path):
+    depths = flat(tmp_path / "depths.tif", 1, "EPSG:32632+5715")
+    with pytest.raises(InputError, match=r"depths\.tif go down"):
+        evaluate(depths, depths)
+
+
+def test_heights_may_be_whole_numbers_with_a_scale_and_an_offset(tmp_path):
+    scaled = write(tmp_path / "scaled.tif", np.full((80, 80), 254, np.int16))
+    with rasterio.open(scaled, "r+") as file:
+        file.scales, file.offsets = (0.1,), (10.0,)
+    assert evaluate(scaled, flat(tmp_path / "r.tif", 35), margin_m=2).all.median == pytest.approx(0.4, abs=1e-5)
 
 
 def test_heights_in_feet_are_refused(tmp_path):

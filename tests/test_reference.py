@@ -13,8 +13,8 @@ from rpc_fixtures import write_image
 from zlocus.errors import ConfigError, InputError
 from zlocus.io import vertical
 from zlocus.io.raster import write_cog
-from zlocus.io.reference import dem_datum, read_area, read_dem, read_geobox
-from zlocus.io.vertical import vertical_datum
+from zlocus.io.reference import cells_inside, dem_datum, read_dem, read_geobox, read_polygons
+from zlocus.io.vertical import grid_crs, vertical_datum
 
 GRID = GeoBox.from_bbox((690000, 4790000, 690400, 4790300), crs="EPSG:32631", resolution=2)
 DEGREE_PLANE_M = 0.02
@@ -57,6 +57,13 @@ def write_polygons(path, polygons, crs="EPSG:32631", geometry_type="Polygon", **
 def test_the_grid_of_a_product_is_read_back(tmp_path):
     write_cog(tmp_path / "a.tif", np.zeros(GRID.shape, np.float32), GRID)
     assert read_geobox(tmp_path / "a.tif") == GRID
+
+
+def test_heights_of_a_dem_may_be_scaled(tmp_path):
+    path = write_raster(tmp_path / "dem.tif", np.full(GRID.shape, 254, np.int16), GRID.transform, "EPSG:32631")
+    with rasterio.open(path, "r+") as file:
+        file.scales, file.offsets = (0.1,), (10.0,)
+    np.testing.assert_allclose(read_dem(path, GRID), 35.4, atol=1e-5)
 
 
 def test_rasters_that_are_no_grid(tmp_path):
@@ -166,7 +173,9 @@ def test_area_of_each_format(tmp_path, name: str, driver: str):
     polygon = shapely.transform(shapely.segmentize(ring, 1.0), lambda xy: np.column_stack(transformer.transform(*xy.T)))
     path = write_polygons(tmp_path / name, polygon, crs=crs, driver=driver)
     x, y = cell_centres()
-    np.testing.assert_array_equal(read_area(path, GRID), shapely.contains_xy(ring, x, y))
+    np.testing.assert_array_equal(
+        cells_inside(read_polygons(path, grid_crs(GRID)), GRID), shapely.contains_xy(ring, x, y)
+    )
 
 
 def test_edges_are_straight_in_the_crs_of_their_file(tmp_path):
@@ -177,14 +186,14 @@ def test_edges_are_straight_in_the_crs_of_their_file(tmp_path):
     grid = GeoBox.from_bbox(
         (south[0] - 50, south[1] - 50, south[0] + 50, south[1] + 50), crs="EPSG:32631", resolution=1
     )
-    inside = read_area(path, grid)
+    inside = cells_inside(read_polygons(path, grid_crs(grid)), grid)
     _, lat = Transformer.from_crs(32631, 4326, always_xy=True).transform(*cell_centres(grid))
     assert (inside != (lat > 43.1)).mean() < 0.005
 
 
 def test_area_elsewhere_is_empty(tmp_path):
     path = write_polygons(tmp_path / "a.gpkg", shapely.box(0, 0, 1, 1), driver="GPKG")
-    assert not read_area(path, GRID).any()
+    assert not cells_inside(read_polygons(path, grid_crs(GRID)), GRID).any()
 
 
 def test_vectors_that_are_no_area(tmp_path):
@@ -205,7 +214,7 @@ def test_vectors_that_are_no_area(tmp_path):
         (nowhere, r"n\.shp has no CRS"),
     ):
         with pytest.raises(InputError, match=message):
-            read_area(path, GRID)
+            cells_inside(read_polygons(path, grid_crs(GRID)), GRID)
 
 
 def test_grid_crs_is_kept_as_its_code(tmp_path):

@@ -92,11 +92,6 @@ class DsmRequest:
         _check_workers(self.workers)
         _check_positive("--memory", self.memory_gb, "GB")
 
-    @property
-    def is_scene_file(self) -> bool:
-        """Whether the input is one scene file rather than images."""
-        return len(self.inputs) == 1 and _is_scene_file(self.inputs[0])
-
     def _check_grid(self) -> None:
         _check_positive("--resolution", self.resolution, "m")
         given = {"--resolution": self.resolution, "--crs": self.crs, "--bounds": self.bounds}

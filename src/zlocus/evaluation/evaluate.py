@@ -91,6 +91,7 @@ class Evaluation:
             "shift_sigma": None if shift is None else shift.sigma_m,
             "dsm_heights": self.heights[0],
             "reference_heights": self.heights[1],
+            "assumed": self.assumed,
             "geoid_added_to": None if self.geoid_added_to is None else str(self.geoid_added_to),
             "all": self.all.as_dict(),
             **{name: figures.as_dict() for name, figures in self.classes.items()},

@@ -103,14 +103,16 @@ def converted(given: CRS, wanted: CRS, xy: FloatArray) -> FloatArray:
 
 
 def unit_m(reference: HeightRaster, frame: CRS | None) -> tuple[float, float]:
-    """Metres of the frame in a unit of the reference's x and y, at its centre; (1, 1) for a map in metres."""
+    """Metres of the frame in a unit of the reference's x and y, at its centre; (1, 1) for a map made for measuring."""
     theirs = reference.horizontal
-    if frame is None or theirs is None or in_metres(theirs):
+    if frame is None or theirs is None or theirs == frame:
         return 1.0, 1.0
     x, y = reference.centre
     half = abs(reference.transform.a) / 2
     ends = converted(theirs, frame, np.array([[x - half, y], [x + half, y], [x, y - half], [x, y + half]]))
     width, height = np.hypot(*(ends[1::2] - ends[::2]).T) / (2 * half)
+    if in_metres(theirs) and max(abs(width - 1.0), abs(height - 1.0)) < SCALE_TOLERANCE:
+        return 1.0, 1.0
     return float(width), float(height)
 
 

@@ -24,12 +24,13 @@ OUTSIDE = -10.0
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Heights on a grid. z : (r, c) float64, m, NaN where there is none."""
+    """Heights on a grid. z : (r, c) float64, m, NaN where there is none; description : of the band."""
 
     path: Path
     z: FloatArray
     transform: Affine
     crs: CRS | None
+    description: str = ""
 
     @cached_property
     def spatial(self) -> pyproj.CRS | None:
@@ -107,6 +108,7 @@ def read_heights(path: Path) -> HeightRaster:
     """
     with open_raster(path, "raster of heights") as source:
         stored, nodata, transform, crs = source.read(1), source.nodata, source.transform, source.crs
+        scale, offset, description = source.scales[0], source.offsets[0], source.descriptions[0] or ""
     if stored.dtype.kind == "c":
         raise InputError(f"{path} holds complex numbers, which are no heights. Check the file.")
     with np.errstate(invalid="ignore"):  # some kinds of NaN
@@ -115,5 +117,7 @@ def read_heights(path: Path) -> HeightRaster:
         raise InputError(f"{path} has {z.shape[0]} x {z.shape[1]} cells, too few for a surface. Check the file.")
     if nodata is not None:
         z[z == nodata] = np.nan
+    if (scale, offset) != (1.0, 0.0):
+        z = z * scale + offset
     z[(z < LOWEST_M) | (z > HIGHEST_M)] = np.nan
-    return HeightRaster(path, z, transform, crs)
+    return HeightRaster(path, z, transform, crs, description)

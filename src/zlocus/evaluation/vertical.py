@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from odc.geo.geobox import GeoBox
-from pyproj import CRS
 
 from zlocus.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
-from zlocus.io.reference import read_dem
+from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL, check_heights, vertical_datum, vertical_part
 
-ELLIPSOID = "ellipsoid"
-METRE_TOLERANCE = 1e-9
+# What a surface made here says of its heights in its band's description, its CRS having no room for it.
+OWN_ELLIPSOIDAL = f"height above {ELLIPSOIDAL.surface}"
 
 
 @dataclass(frozen=True)
@@ -66,38 +64,28 @@ def same_heights(surface: HeightRaster, reference: HeightRaster, geoid: Path | N
 
 
 def datum_of(raster: HeightRaster) -> str | None:
-    """What the CRS says that heights are above: `ELLIPSOID`, the name of a vertical CRS, or None for nothing.
+    """What a file says that its heights are above: `ELLIPSOID`, the name of a vertical CRS, or None for nothing.
 
     Raises
     ------
     InputError
-        Heights that are not in metres.
+        Heights that are not in metres, or go down.
     """
     crs = raster.spatial
-    vertical = _vertical_axis(crs)
-    if crs is None or vertical is None:
-        return None
-    name, factor, unit = vertical
-    if abs(factor - 1.0) > METRE_TOLERANCE:
-        raise InputError(f"The heights of {raster.path} are in {unit}. Convert them to metres first.")
-    return ELLIPSOID if ELLIPSOID in name.lower() else name
-
-
-def _vertical_axis(crs: CRS | None) -> tuple[str, float, str] | None:
-    """Name, metres of a unit, and name of the unit of a CRS's heights."""
-    if crs is None:
-        return None
-    for part in crs.sub_crs_list:
-        if part.is_vertical:
-            axis = part.axis_info[0]
-            return part.name, axis.unit_conversion_factor, axis.unit_name
-    if len(crs.axis_info) == 3 and (crs.is_geographic or crs.is_projected):
-        return ELLIPSOID, crs.axis_info[2].unit_conversion_factor, crs.axis_info[2].unit_name
-    return None
+    if crs is not None:
+        check_heights(crs, raster.path)
+        vertical = vertical_part(crs)
+        if vertical is not None:
+            # Geoids of files carry the file's name, whatever that is.
+            is_ellipsoid = ELLIPSOID in vertical.name.lower() and "geoid" not in vertical.name.lower()
+            return ELLIPSOID if is_ellipsoid else vertical.name
+        if len(crs.axis_info) == 3 and (crs.is_geographic or crs.is_projected):
+            return ELLIPSOID
+    return ELLIPSOID if raster.description == OWN_ELLIPSOIDAL else None
 
 
 def _above(datum: str | None) -> str:
-    return f"the {ELLIPSOID}" if datum == ELLIPSOID else str(datum)
+    return f"the {ELLIPSOID}" if datum == ELLIPSOID else str(datum).removeprefix("height above ")
 
 
 def _with_geoid(
@@ -124,10 +112,4 @@ def _raised(raster: HeightRaster, geoid: Path) -> HeightRaster:
     if raster.horizontal is None:
         raise InputError(f"{raster.path} has no CRS, so no geoid can be added to it. Assign one (gdal_edit -a_srs).")
     geobox = GeoBox(raster.z.shape, raster.transform, raster.horizontal.to_wkt())
-    z = raster.z + read_dem(geoid, geobox)
-    n_lost = int(np.count_nonzero(np.isfinite(raster.z) & ~np.isfinite(z)))
-    if n_lost:
-        raise InputError(
-            f"The geoid {geoid} has no height at {n_lost} cells of {raster.path}. Give one that covers all of it."
-        )
-    return replace(raster, z=z)
+    return replace(raster, z=vertical_datum(str(geoid), "--geoid").ellipsoidal_of_cells(raster.z, geobox))

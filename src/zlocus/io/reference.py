@@ -134,17 +134,6 @@ def cells_inside(polygons: NDArray[Any], geobox: GeoBox) -> NDArray[np.bool_]:
     return np.asarray(inside, bool)
 
 
-def read_area(path: Path, geobox: GeoBox) -> NDArray[np.bool_]:
-    """Which cells of a grid have their centre inside the polygons of a vector file; may be none. (r, c) bool.
-
-    Raises
-    ------
-    InputError
-        See `read_polygons`.
-    """
-    return cells_inside(read_polygons(path, grid_crs(geobox)), geobox)
-
-
 def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDArray[np.float32]:
     """The first band on a grid, reading only the part under it. (r, c) float32, NaN where there is nothing.
 
@@ -159,7 +148,8 @@ def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDAr
     if (high <= low).any():
         return out
     window = Window(low[0], low[1], high[0] - low[0], high[1] - low[1])
-    heights = source.read(1, window=window, masked=True, out_dtype=np.float32).filled(np.nan)
+    stored = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
+    heights = (stored * source.scales[0] + source.offsets[0]).astype(np.float32)
     reproject(
         heights, out, src_transform=source.window_transform(window), src_crs=crs.to_wkt(), src_nodata=np.nan,
         dst_transform=geobox.transform, dst_crs=grid_crs(geobox).to_wkt(), dst_nodata=np.nan,

@@ -12,7 +12,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from zlocus.errors import ConfigError, InputError
 from zlocus.io.geoid import GeoidRaster
 from zlocus.sensors.model import FloatArray
 
+Float = TypeVar("Float", np.float32, np.float64)
 ELLIPSOID = "ellipsoid"
 # Points a side at which the posts under an area are looked at.
 LEAST_POINTS, MOST_POINTS = 9, 513
@@ -91,13 +92,11 @@ class VerticalDatum:
         """
         return self._cells(ellipsoidal, geobox, row, col, -1.0)
 
-    def ellipsoidal_of_cells(self, heights: NDArray[np.float32], geobox: GeoBox) -> NDArray[np.float32]:
+    def ellipsoidal_of_cells(self, heights: NDArray[Float], geobox: GeoBox) -> NDArray[Float]:
         """Ellipsoidal heights of cells' centres, whose heights above it are given; (r, c) m, see `of_cells`."""
         return self._cells(heights, geobox, 0, 0, 1.0)
 
-    def _cells(
-        self, heights: NDArray[np.float32], geobox: GeoBox, row: int, col: int, sign: float
-    ) -> NDArray[np.float32]:
+    def _cells(self, heights: NDArray[Float], geobox: GeoBox, row: int, col: int, sign: float) -> NDArray[Float]:
         if self.geoid is None:
             return heights
         known = np.isfinite(heights)
@@ -195,7 +194,7 @@ def vertical_datum_of(crs: CRS, path: Path, option: str) -> VerticalDatum:
     ConfigError
         For a geoid of PROJ whose grid is not installed.
     """
-    vertical = _vertical_part(crs)
+    vertical = vertical_part(crs)
     if vertical is None:
         return ELLIPSOIDAL
     for name, known in KNOWN.items():
@@ -215,7 +214,7 @@ def check_heights(crs: CRS, path: Path) -> None:
     InputError
         For such heights.
     """
-    vertical = _vertical_part(crs)
+    vertical = vertical_part(crs)
     axis = vertical.axis_info[0] if vertical is not None else crs.axis_info[2] if len(crs.axis_info) > 2 else None
     if axis is None:
         return
@@ -225,7 +224,8 @@ def check_heights(crs: CRS, path: Path) -> None:
         raise InputError(f"The heights of {path} go {axis.direction}, by its CRS. Convert them to heights that go up.")
 
 
-def _vertical_part(crs: CRS) -> CRS | None:
+def vertical_part(crs: CRS) -> CRS | None:
+    """The CRS of the heights of a compound one, None of others."""
     return next((part for part in crs.sub_crs_list if part.is_vertical), None)
 
 

@@ -174,9 +174,11 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, folder: Path) -> None:
         "crs": f"EPSG:{spec.epsg}",
         "transform": transform,
     }
-    layers: tuple[tuple[str, NDArray[np.generic]], ...] = (
-        ("truth_dsm.tif", ground.heights[cells]), ("truth_class.tif", ground.classes[cells])
-    )  # fmt: skip
-    for name, values in layers:
+    layers: tuple[tuple[str, NDArray[np.generic], str], ...] = (
+        ("truth_dsm.tif", ground.heights[cells], "height above the ellipsoid"),
+        ("truth_class.tif", ground.classes[cells], "class"),
+    )
+    for name, values, description in layers:
         with rasterio.open(folder / name, "w", dtype=values.dtype, compress="deflate", **profile) as file:
             file.write(np.ascontiguousarray(values), 1)
+            file.set_band_description(1, description)

@@ -1,0 +1,90 @@
+"""The comparison with a reference: what `zlocus evaluate` says of the surface, as tables, histogram and map."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.evaluation.evaluate import Evaluation, evaluate
+from zlocus.evaluation.histogram import histogram_figure
+from zlocus.evaluation.slopes import SLOPE_EDGES_DEG
+from zlocus.evaluation.table import evaluation_rows, notes
+from zlocus.products.curves import svg_of
+from zlocus.products.report import maps, words
+
+HISTOGRAM_INCHES, SVG_DPI = (5.6, 4.2), 72
+# The map's colours are full at this many times the NMAD, and at least at the threshold.
+FULL_AT_NMAD = 3.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A reference to compare with, and all else that `evaluate` takes, by the same names."""
+
+    reference: Path
+    classes: Path | None = None
+    align: bool = False
+    margin_m: float = 10.0
+    threshold_m: float = 1.0
+    more_thresholds_m: Sequence[float] = ()
+    slope_edges_deg: Sequence[float] = SLOPE_EDGES_DEG
+    coregister: str | None = None
+    geoid: Path | None = None
+
+
+def comparison_part(out: Path, comparison: Comparison) -> dict[str, Any]:
+    """What the page shows of the surface in a folder beside a reference.
+
+    Raises
+    ------
+    InputError, ConfigError
+        See `evaluate`.
+    """
+    evaluation = evaluate(out / "dsm.tif", **vars(comparison))
+    headings, *rows = evaluation_rows(evaluation)
+    return {
+        "sentence": words.against_reference(evaluation, comparison.reference.name), "name": comparison.reference.name,
+        "headings": headings, "rows": rows, "notes": [_sentence(note) for note in notes(evaluation)],
+        "margin": f"{comparison.margin_m:g}", "is_shifted": evaluation.shift is not None,
+        "histogram": _histogram(evaluation), "map": _error_map(evaluation),
+    }  # fmt: skip
+
+
+def _sentence(note: str) -> str:
+    return note[0].upper() + note[1:].rstrip(".") + "."
+
+
+def _histogram(evaluation: Evaluation) -> maps.Picture:
+    figure = histogram_figure(evaluation, HISTOGRAM_INCHES)
+    figures = evaluation.all
+    alt = (
+        f"Histogram of the errors about their median {words.number(figures.median, 'm', 3)}, "
+        f"NMAD {words.number(figures.nmad, 'm', 3)}."
+    )
+    width, height = (round(SVG_DPI * side) for side in HISTOGRAM_INCHES)
+    return maps.Picture(maps.data_uri(svg_of(figure).encode(), "image/svg+xml"), alt, width, height)
+
+
+def _error_map(evaluation: Evaluation) -> tuple[maps.Picture, maps.Scale]:
+    assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
+    nmad = np.nan_to_num(evaluation.all.nmad)
+    full_m = float(f"{max(evaluation.threshold_m, FULL_AT_NMAD * nmad):.1g}")
+    return maps.error_picture(shrunk_means(evaluation.error_map.errors, maps.MAP_PX), full_m)
+
+
+def shrunk_means(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Means of square blocks of cells (r, c) so that at most `side` are left a side; NaN where none is known."""
+    step = -(-max(values.shape) // side)
+    rows, cols = (-(-n // step) for n in values.shape)
+    padded = np.full((rows * step, cols * step), np.nan, np.float32)
+    padded[: values.shape[0], : values.shape[1]] = values
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Mean of empty slice", RuntimeWarning)
+        means = np.nanmean(padded.reshape(rows, step, cols, step), axis=(1, 3))
+    return np.asarray(means, np.float32)
