@@ -83,6 +83,21 @@ def rendered(folder: Path, kind: str, errors: dict[str, tuple[float, float]] | N
     return RenderedImages(kind, paths)
 
 
+def rendered_in_colours(folder: Path, dtype: str) -> tuple[Path, ...]:
+    """Three images of a plane with red, green and blue, each band another multiple of the grey value."""
+    ground, paths = analytic_ground("plane", CENTRE, GSD_M / 2, FIELD, seed=5), []
+    for name in ("nadir", "fore", "aft"):
+        radiance = render(ground, camera(name), (SIZE_PX, SIZE_PX), Sun(150.0, 50.0))
+        grey = np.rint(100 * radiance / radiance.mean()).astype(dtype)
+        paths.append(folder / f"{name}.tif")
+        write_image(paths[-1], grey, fit_rpc(camera(name), grey.shape, UTM, (0.0, 120.0)).rpc)
+        with rasterio.open(paths[-1]) as source:
+            profile, rpcs = source.profile, source.rpcs
+        with rasterio.open(paths[-1], "w", **profile | {"count": 3, "photometric": "RGB"}, rpcs=rpcs) as file:
+            file.write(np.stack([grey, grey // 2, 255 - grey]))
+    return tuple(paths)
+
+
 def run(images: RenderedImages | tuple[Path, ...], out: Path, config: RunConfig | None = None, **request) -> DsmResult:
     """A surface of these images at 0.5 m in UTM, with the heights given unless the request says otherwise."""
     inputs = images.inputs if isinstance(images, RenderedImages) else images

@@ -5,11 +5,12 @@ import sys
 
 import numpy as np
 import pytest
+import rasterio
 from pyproj import CRS
 from scipy.ndimage import uniform_filter
 
 import zlocus
-from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, read, run
+from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, read, rendered_in_colours, run
 from zlocus.errors import ConfigError, InputError
 from zlocus.options import SemiGlobalOptions
 from zlocus.surface.reasons import Quality
@@ -37,6 +38,34 @@ def test_a_surface_in_memory_is_what_the_command_writes(images, written):
     assert surface.height.attrs["units"] == "m"
     seen = surface.where((surface.quality & int(Quality.JUMP)) == 0).height
     assert np.isfinite(seen.values).mean() > 0.9
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_surface_of_colour_images(tmp_path):
+    images = rendered_in_colours(tmp_path, "uint8")
+    surface = zlocus.match(*images, out=tmp_path / "out", config=SMALL_TILES, **ASKED)
+    assert list(surface.ortho.band.values) == ["red", "green", "blue"]
+    with rasterio.open(tmp_path / "out" / "ortho.tif") as file:
+        np.testing.assert_array_equal(surface.ortho.values, file.read())
+    assert surface.height.dims == ("y", "x")
+
+
+def test_rasters_written_from_a_surface_know_what_is_missing(written, tmp_path):
+    surface = zlocus.open_surface(written)
+    for name, nodata in (("height", np.nan), ("views", 0)):
+        surface[name].rio.to_raster(tmp_path / f"{name}.tif")
+        with rasterio.open(tmp_path / f"{name}.tif") as file:
+            assert file.nodata is not None
+            assert np.array_equal(file.nodata, nodata, equal_nan=True)
+
+
+def test_nothing_is_made_that_nobody_sees(images, monkeypatch):
+    asked = []
+    monkeypatch.setattr("zlocus.pipeline.run_dsm", lambda request, *_: asked.append(request))
+    for more in ({}, {"products": ("hillshade",)}):
+        with pytest.raises(InputError, match=r"holds no dsm\.tif"):
+            zlocus.match(*images("sine").inputs, **ASKED, **more)
+    assert [(request.products, request.report) for request in asked] == [((), False), (("hillshade",), False)]
 
 
 def test_flags_are_named(written):

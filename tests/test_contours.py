@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 from shapely import from_wkb, get_coordinates, is_closed, is_simple
 
+import zlocus.products.contours as contours_module
 from zlocus.errors import ConfigError
 from zlocus.io.crs import local_frame
 from zlocus.io.raster import write_cog
 from zlocus.options import ProductOptions
-from zlocus.products.contours import contours, nice_interval, write_contours
+from zlocus.products.contours import batched, contours, nice_interval, write_contours
 from zlocus.products.strips import ReadBand
 
 CELL_M, WEST, NORTH = 0.5, 500000.0, 4000000.0
@@ -94,9 +95,32 @@ def test_lines_end_at_holes(tmp_path):
 
 
 def same(one, other):
-    assert one[1] == other[1]
-    for a, b in zip(one[0], other[0], strict=True):
+    assert [level for level, _ in one] == [level for level, _ in other]
+    for (_, a), (_, b) in zip(one, other, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@settings(max_examples=50)
+@given(st.lists(st.integers(2, 9)), st.integers(1, 12))
+def test_batches_hold_all_lines_in_their_order(lengths, most):
+    lines = [(level, np.zeros((n, 2))) for level, n in enumerate(lengths)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contours_module, "BATCH_POINTS", most)
+        found = list(batched(lines))
+    assert found
+    assert [level for levels, _ in found for level in levels] == list(range(len(lengths)))
+    assert all(sum(map(len, held[:-1])) < most for _, held in found)
+
+
+def test_lines_are_written_batch_by_batch(tmp_path, monkeypatch):
+    row, col = np.mgrid[-60:61, -60:61]
+    z = 100.0 - np.hypot(row, col) * CELL_M
+    _, whole, heights = drawn(tmp_path, z, 2.0)
+    monkeypatch.setattr(contours_module, "BATCH_POINTS", 300)
+    _, parts, same_heights = drawn(tmp_path, z, 2.0)
+    assert len(whole) > 10
+    np.testing.assert_array_equal(heights, same_heights)
+    assert [line.wkb for line in whole] == [line.wkb for line in parts]
 
 
 @settings(max_examples=25)
@@ -110,10 +134,10 @@ def test_strips_leave_no_seam(tmp_path_factory, seed, holes, whole_metres):
     z[rng.random(z.shape) < holes] = np.nan
     path = written(tmp_path_factory.mktemp("waves"), z)
     with ReadBand(path) as heights:
-        whole = contours(heights, 1.0, 1000)
-        assert whole[0]
+        whole = list(contours(heights, 1.0, 1000))
+        assert whole
         for rows in (1, 2, 7, 40):
-            same(contours(heights, 1.0, rows), whole)
+            same(list(contours(heights, 1.0, rows)), whole)
 
 
 def test_the_default_interval_suits_the_relief(tmp_path):

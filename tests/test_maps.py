@@ -16,6 +16,8 @@ from pyproj import CRS
 from rio_cogeo.cogeo import cog_validate
 from typer.testing import CliRunner
 
+import zlocus.products.maps as maps
+from las_format import check_laz
 from zlocus.cli import app
 from zlocus.errors import ConfigError, OutputError
 from zlocus.io.crs import local_frame
@@ -85,13 +87,28 @@ def test_products_have_the_crs_of_their_surface(tmp_path, crs):
     with rasterio.open(tmp_path / "dsm.tif", "w", **(profile | {"driver": "COG", "crs": crs})) as file:
         file.write(z)
     make_maps(tmp_path, PRODUCTS, ProductOptions(), SilentProgress())
-    for name in ("hillshade.tif", "dtm.tif"):
-        with rasterio.open(tmp_path / name) as file:
-            assert CRS(file.crs.to_wkt()) == CRS(crs)
+    with rasterio.open(tmp_path / "dtm.tif") as file:
+        assert CRS(file.crs.to_wkt()) == CRS(crs)
+    # A hillshade holds no heights.
+    with rasterio.open(tmp_path / "hillshade.tif") as file:
+        assert CRS(file.crs.to_wkt()) == CRS("EPSG:32632")
+        assert file.units == (None,)
     with laspy.open(tmp_path / "surface.laz") as laz:
         assert laz.header.parse_crs() == CRS(crs)
-    # Lines are flat: theirs is the map's.
-    assert CRS(pyogrio.read_info(tmp_path / "contours.gpkg")["crs"]) == CRS("EPSG:32632")
+    # What elevation_m is above.
+    assert CRS(pyogrio.read_info(tmp_path / "contours.gpkg")["crs"]) == CRS(crs)
+    check_laz(tmp_path / "surface.laz")
+
+
+def test_a_map_that_fails_costs_no_other(surface, monkeypatch):
+    def broken(*_):
+        raise ConfigError("no luck")
+
+    monkeypatch.setitem(maps._MAKERS, "hillshade", broken)
+    with pytest.raises(ConfigError, match="no luck"):
+        make_maps(surface, PRODUCTS, ProductOptions(), SilentProgress())
+    assert {"dtm.tif", "contours.gpkg", "surface.laz"} <= {path.name for path in surface.iterdir()}
+    assert not (surface / "hillshade.tif").exists()
 
 
 def test_contours_of_the_terrain_need_it(surface):

@@ -8,19 +8,24 @@ import rasterio
 from affine import Affine
 from rasterio.enums import ColorInterp
 
-from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, UTM, camera, run
+from rendered_scenes import CENTRE, HEIGHTS, PART, SMALL_TILES, rendered_in_colours, run
 from zlocus.io.images import open_image
 from zlocus.matching.base import BaseSurface
+from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
-from zlocus.matching.ortho import best_view, ortho_image, pixels_per_cell, true_ortho
+from zlocus.matching.ortho import (
+    Around,
+    CoarserHeights,
+    best_view,
+    ortho_image,
+    pixels_per_cell,
+    true_ortho,
+    what_stands_around,
+)
 from zlocus.matching.views import ViewPixels, tile_views
 from zlocus.matching.visibility import coverage
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
-from zlocus.synthetic.files import write_image
-from zlocus.synthetic.render import Sun, render
-from zlocus.synthetic.rpc_fit import fit_rpc
-from zlocus.synthetic.terrain import analytic_ground
 
 CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (40, 60)
 ORIGIN_M, N_STEPS = 40.0, 64
@@ -34,22 +39,22 @@ def sensor(along=0.0, across=0.0, gsd=0.5):
     return SatelliteCamera((*CENTRE, 50.0), (100.0, 100.0), gsd, along, across)
 
 
-def tile(sensors, greys=None, contrast=1.0, mean=0.0):
-    """Views of a grid around the scene's centre, each of one grey value, and what they cover."""
-    transform = Affine(CELL_M, 0, CENTRE[0] - 15.0, 0, -CELL_M, CENTRE[1] + 10.0)
+def tile(sensors, greys=None, contrast=1.0, mean=0.0, shape=SHAPE, col=0):
+    """Views of a grid around the scene's centre, each of one grey value, and what they cover. col : where it begins."""
+    transform = Affine(CELL_M, 0, CENTRE[0] - 15.0 + col * CELL_M, 0, -CELL_M, CENTRE[1] + 10.0)
     greys = range(len(sensors)) if greys is None else greys
     mask = (np.ones((201, 201), bool),)
     pixels = [
         ViewPixels(s, (0, 0), mean, contrast, (np.full((201, 201), g, np.float32),), mask)
         for s, g in zip(sensors, greys, strict=True)
     ]
-    blocks = (-(-SHAPE[0] // BLOCK), -(-SHAPE[1] // BLOCK))
+    blocks = (-(-shape[0] // BLOCK), -(-shape[1] // BLOCK))
     lattice = HeightLattice(
-        ORIGIN_M, STEP_M, SHAPE, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
+        ORIGIN_M, STEP_M, shape, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
     )
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
-    views = tile_views(pixels, 0, transform, SHAPE, BLOCK, (ORIGIN_M, STEP_M), z, 2)
-    return pixels, views, coverage(views, BaseSurface.level(SHAPE, BLOCK), lattice)
+    views = tile_views(pixels, 0, transform, shape, BLOCK, (ORIGIN_M, STEP_M), z, 2)
+    return pixels, views, coverage(views, BaseSurface.level(shape, BLOCK), lattice)
 
 
 def tower() -> np.ndarray:
@@ -81,13 +86,66 @@ def test_what_a_tower_hides_is_shown_by_another_view(across, behind):
     _, views, seen = tile([slanted, opposite])
     best = best_view(views, seen, tower())
     hidden = best == 1
-    side = behind if hidden[behind].any() else np.s_[16:24, 60 - behind[1].stop : 60 - behind[1].start]
-    assert hidden[side].all()
+    assert hidden[behind].all()
+    assert not hidden[16:24, 60 - behind[1].stop : 60 - behind[1].start].any()
     far = np.ones(SHAPE, bool)
     far[TOWER[0].start - 2 : TOWER[0].stop + 2, :] = False
     assert (best[far] == 0).all()
     inner = np.s_[TOWER[0].start + RIM : TOWER[0].stop - RIM, TOWER[1].start + RIM : TOWER[1].stop - RIM]
     assert (best[inner] == 0).all()
+
+
+WIDE, FIRST, HALO = (40, 120), 60, 4
+# 12 m high, west of the tile, with its shadow in it: 13 cells at 30 degrees.
+BESIDE = np.s_[14:26, 44:56]
+
+
+def beside_the_tile(across):
+    """Views of a wide grid and of a tile in it, and a surface with a tower beside the tile."""
+    sensors = [sensor(across=across), sensor(across=-across)]
+    surface = np.full(WIDE, LOW, np.float32)
+    surface[BESIDE] = HIGH
+    _, views, seen = tile(sensors, shape=WIDE, col=-40)
+    _, part, of_part = tile(sensors, col=FIRST - 40)
+    return surface, best_view(views, seen, surface), part, of_part
+
+
+@pytest.mark.parametrize("across", [30.0, -30.0])
+def test_what_stands_beside_a_tile_hides_its_cells(across):
+    surface, whole, views, seen = beside_the_tile(across)
+    mine = surface[:, FIRST : FIRST + SHAPE[1]]
+    shows_its_shadow = (whole[:, FIRST : FIRST + SHAPE[1]] == 1).any()
+    assert shows_its_shadow == (across > 0)
+    found = best_view(views, seen, mine, Around(surface, 0, FIRST))
+    np.testing.assert_array_equal(found, whole[:, FIRST : FIRST + SHAPE[1]])
+    assert (best_view(views, seen, mine) == 0).all()
+
+
+def test_coarser_levels_are_asked_as_far_as_they_matter():
+    """The tower as levels of half and of a quarter of the cells have it, whose halos reach twice and four times as
+    far."""
+    surface, _, views, _ = beside_the_tile(30.0)
+    mine, window = surface[:, FIRST : FIRST + SHAPE[1]], CellWindow(0, FIRST, *SHAPE)
+    coarser = [
+        CoarserHeights(level, CellWindow(0, 0, WIDE[0] // size, WIDE[1] // size), surface[::size, ::size] / size)
+        for level, size in ((1, 2), (2, 4))
+    ]
+    around = what_stands_around(coarser, views, window, mine, HALO)
+    # 13.9 cells from the core's edge, 4 of which are the halo; 12 are within the level's reach.
+    assert (around.row, around.col) == (0, 10)
+    np.testing.assert_array_equal(around.surface[BESIDE[0], 4:6], [[HIGH, HIGH]] * 12)
+    assert (around.surface[BESIDE[0], 6] == LOW).all()
+    # Nothing near is that tall, and a false height of a cell is no tower.
+    level = [CoarserHeights(1, coarser[0].window, np.full_like(coarser[0].surface, LOW / 2))]
+    level[0].surface[8, 20] = HIGH / 2
+    assert what_stands_around(level, views, window, mine, HALO) is None
+    assert what_stands_around([], views, window, mine, HALO) is None
+    # So tall that the coarsest level must do.
+    taller = [
+        CoarserHeights(c.level, c.window, np.where(c.surface > LOW / 2**c.level, 3 * c.surface, c.surface))
+        for c in coarser
+    ]
+    assert what_stands_around(taller, views, window, mine, HALO).col > 12
 
 
 def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
@@ -126,19 +184,7 @@ def test_grey_values_are_those_of_the_image():
 
 @pytest.fixture(scope="module", params=["uint8", "uint16"])
 def coloured(tmp_path_factory, request) -> tuple[Path, ...]:
-    """Three images of a plane with red, green and blue, each band another multiple of the grey value."""
-    folder = tmp_path_factory.mktemp("coloured")
-    ground, paths = analytic_ground("plane", CENTRE, GSD_M / 2, (640, 640), seed=5), []
-    for name in ("nadir", "fore", "aft"):
-        radiance = render(ground, camera(name), (150, 150), Sun(150.0, 50.0))
-        grey = np.rint(100 * radiance / radiance.mean()).astype(request.param)
-        paths.append(folder / f"{name}.tif")
-        write_image(paths[-1], grey, fit_rpc(camera(name), grey.shape, UTM, (0.0, 120.0)).rpc)
-        with rasterio.open(paths[-1]) as source:
-            profile, rpcs = source.profile, source.rpcs
-        with rasterio.open(paths[-1], "w", **profile | {"count": 3, "photometric": "RGB"}, rpcs=rpcs) as file:
-            file.write(np.stack([grey, grey // 2, 255 - grey]))
-    return tuple(paths)
+    return rendered_in_colours(tmp_path_factory.mktemp("coloured"), request.param)
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
+from las_format import check_laz
 from zlocus.errors import OutputError
 from zlocus.io.crs import local_frame
 from zlocus.io.opening import open_raster
@@ -32,6 +33,7 @@ def read_ply(path):
 
 def test_laz_holds_points_colours_source_and_crs(tmp_path):
     cloud = laspy.read(written(tmp_path) / "cloud.laz")
+    check_laz(tmp_path / "cloud.laz")
     np.testing.assert_allclose(np.asarray(cloud.xyz), XYZ, rtol=0, atol=LAZ_STEP_M / 2 + 1e-9)
     np.testing.assert_array_equal(np.column_stack([cloud.red, cloud.green, cloud.blue]), RGB)
     np.testing.assert_array_equal(cloud.point_source_id, [1, 1, 7])

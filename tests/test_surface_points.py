@@ -9,6 +9,7 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
+from las_format import check_laz
 from zlocus.errors import InputError, OutputError
 from zlocus.io.crs import local_frame
 from zlocus.io.raster import write_cog
@@ -49,6 +50,7 @@ def test_a_point_for_every_height(tmp_path):
         np.testing.assert_array_equal(colour, ortho[0][known].astype(np.uint16) * 257)
     assert (laz["sigma_m"].dtype, laz["n_images"].dtype) == (np.float32, np.uint8)
     header = laz.header
+    check_laz(tmp_path / "surface.laz")
     assert (str(header.version), header.point_format.id, header.point_count) == ("1.4", 7, known.sum())
     assert header.parse_crs() == CRS("EPSG:32632")
     np.testing.assert_allclose(header.mins, [laz.x.min(), laz.y.min(), laz.z.min()])
@@ -92,6 +94,7 @@ def test_a_surface_without_heights(tmp_path):
     write_cog(tmp_path / "ortho.tif", np.zeros((4, 5), np.uint16), grid, mask=np.zeros((4, 5), bool))
     assert write_surface_points(tmp_path, tmp_path / "surface.laz") == 0
     assert len(laspy.read(tmp_path / "surface.laz").points) == 0
+    check_laz(tmp_path / "surface.laz")
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):

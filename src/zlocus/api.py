@@ -42,10 +42,11 @@ VARIABLES = {
     "sigma": ("sigma.tif", "standard deviation of the height"),
     "quality": ("quality.tif", "reasons why a height is missing or doubtful"),
     "views": ("views.tif", "images used"),
-    "ortho": ("ortho.tif", "grey value of the leading image that sees the cell"),
+    "ortho": ("ortho.tif", "grey value or colours of the view that shows the cell best"),
 }
 # Costs of one step of NCC, as the kernels count them, and the largest that they hold.
 COST_UNIT, MOST_COST = 64.0, 255.0
+COLOURS = ("red", "green", "blue")
 ALL_VALID = 1e-3  # rounding of weights
 
 
@@ -111,6 +112,8 @@ def match(
             asked[name] = Path(asked[name])
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "surface" if out is None else Path(out)
+        if out is None:  # nobody would see them
+            asked = {"products": (), "report": False} | asked
         request = DsmRequest(inputs=tuple(Path(path) for path in inputs), out=folder, **asked)
         run_dsm(request, config or RunConfig(), progress or SilentProgress())
         surface = open_surface(folder)
@@ -118,7 +121,8 @@ def match(
 
 
 def open_surface(folder: PathLikes) -> xr.Dataset:
-    """The result of `zlocus dsm` in a folder: height, sigma (m), quality (bit flags), views and ortho over y and x.
+    """The result of `zlocus dsm` in a folder: height, sigma (m), quality (bit flags), views and ortho over y and x, the
+    ortho-image of colour images over band (red, green, blue) too.
 
     NaN is a missing height; `zlocus.surface.reasons.Quality` names the flags. Cells are read when they are needed. The
     CRS is that of the `rio` accessor: `surface.rio.crs`.
@@ -140,8 +144,13 @@ def open_surface(folder: PathLikes) -> xr.Dataset:
             raise InputError(f"{folder} holds no {file}. Give the folder that a finished `zlocus dsm` wrote.")
         raster = rioxarray.open_rasterio(folder / file)
         assert isinstance(raster, xr.DataArray)
-        found[name] = raster.squeeze("band", drop=True)
-        found[name].attrs = {"long_name": long_name, **({"units": "m"} if name in ("height", "sigma") else {})}
+        nodata = raster.rio.nodata
+        if raster.sizes["band"] == 1:
+            raster = raster.squeeze("band", drop=True)
+        else:
+            raster = raster.assign_coords(band=list(COLOURS))
+        raster.attrs = {"long_name": long_name, **({"units": "m"} if name in ("height", "sigma") else {})}
+        found[name] = raster if nodata is None else raster.rio.write_nodata(nodata)
     flags = [flag for flag in Quality if flag.name]
     found["quality"].attrs |= {
         "flag_masks": [int(flag) for flag in flags],

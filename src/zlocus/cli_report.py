@@ -40,8 +40,12 @@ def report(
             f"{given[0]} is about a reference, and none is given. Add --reference RASTER, or leave it out."
         )
     judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
+    from zlocus.products.maps import link_all
     from zlocus.products.report.comparison import Comparison
     from zlocus.products.report.page import write_report
+    from zlocus.progress import SilentProgress
 
     comparison = None if reference is None else Comparison(reference, **judged_by)
-    print(f"{write_report(out, comparison)}: open it in a browser.")
+    path = write_report(out, comparison)
+    link_all(out, SilentProgress())
+    print(f"{path}: open it in a browser.")

@@ -187,14 +187,20 @@ def _write_maps(
     request: DsmRequest, config: RunConfig, watch: Stopwatch, record: dict[str, Any], progress: Progress
 ) -> None:
     """run.json and the maps: the record first, for maps may fail, and again with the time that they took; then the
-    report, which shows it, and the item, which links them all."""
+    report, which shows it, and the item, which links them all, with or without the maps."""
     write_record(request.out / "run.json", record)
+    failed: ZlocusError | None = None
     with watch.stage("products"):
-        make_maps(request.out, request.products, config.products, progress)
+        try:
+            make_maps(request.out, request.products, config.products, progress)
+        except ZlocusError as error:
+            failed = error
     write_record(request.out / "run.json", record)
     if request.report:
         try_report(request.out, progress)
     link_all(request.out, progress)
+    if failed is not None:
+        raise failed
 
 
 def _opened(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:

@@ -14,7 +14,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ortho import ortho_image, true_ortho
+from zlocus.matching.ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
 from zlocus.matching.planes import PlanarHeights, texture_unit, with_planes
 from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
 from zlocus.matching.ranking import KnownGround, ranked_at_ties
@@ -123,11 +123,12 @@ def match_tile(
         ranking = _ranking(scene, pixels, core, result, config) if use_visibility else None
         result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
-    worth = _worth_matching(result)
+    worth, coarser = _worth_matching(result), list[LevelResult]()
     for level in range(coarsest - 1, -1, -1):
         window = _level_window(scene, core, level, config).within(worth.finer(coarsest - level))
         if not (window.rows and window.cols):
             return TileResult(Surface.nothing(core), done, every)
+        coarser.append(result)
         guide = Guide(_finer(result, window), *_candidates(scene, result, window, level), result)
         result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
@@ -138,9 +139,11 @@ def match_tile(
     if method != "mvll":
         result = _with_planes(result, config)
     coloured = scene.coloured(which)
-    surface = _finish(scene, pixels, result, config, coloured).precise(config.checks.most_sigma_m)
+    judged, refined = _finish(scene, pixels, result, config)
+    surface = judged.precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
+    surface = replace(surface, ortho=_ortho(pixels, result, coarser, surface, refined, coloured, config.pyramid.halo))
     done += 0 if ranking is None else ranking.evaluations
     return TileResult(surface.part(core, result.window), done, every, None if ranking is None else (ranking, which))
 
@@ -423,9 +426,10 @@ def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
 
 
 def _finish(
-    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig, coloured: list[ColourSource]
-) -> Surface:
-    """Refine the finest level and judge it, halo included."""
+    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig
+) -> tuple[Surface, NDArray[np.float32]]:
+    """Refine the finest level and judge it, halo included: the surface without its ortho-image, and height indices of
+    all cells, (r, c)."""
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
     refined = refine(
         result.views,
@@ -449,7 +453,25 @@ def _finish(
     sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
-    ortho = true_ortho(pixels, result.views, result.seen, refined.height, coloured)
-    ortho[np.isnan(height)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)
-    return Surface(height, sigma, quality, used, ortho)
+    return Surface(height, sigma, quality, used, np.full_like(height, np.nan)), refined.height
+
+
+def _ortho(
+    pixels: list[ViewPixels],
+    result: LevelResult,
+    coarser: list[LevelResult],
+    surface: Surface,
+    index: NDArray[np.float32],
+    coloured: list[ColourSource],
+    halo: int,
+) -> NDArray[np.float32]:
+    """What the views show of a surface, of its filled cells too; NaN where there is no height. index : (r, c) height
+    indices of all cells as matched, which hide others whether they were kept or not."""
+    lattice, is_filled = result.lattice, (surface.quality & np.uint16(Quality.FILLED)) != 0
+    index = np.where(is_filled, (surface.height - np.float32(lattice.origin_m)) / np.float32(lattice.step_m), index)
+    known = [CoarserHeights(each.level, each.window, each.heights.vertex) for each in reversed(coarser)]
+    around = what_stands_around(known, result.views, result.window, index, halo)
+    ortho = true_ortho(pixels, result.views, result.seen, index, coloured, around)
+    ortho[np.isnan(surface.height)] = np.nan
+    return ortho

@@ -42,7 +42,13 @@ def write_evaluation(out: Path, evaluation: Evaluation) -> None:
     except OSError as error:
         raise OutputError(f"{out} cannot be made: {error.strerror}. Choose another folder with -o.") from error
     # They belong together: figures of another evaluation must not stay beside a new map.
-    (out / FIGURES).unlink(missing_ok=True)
+    try:
+        (out / FIGURES).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{out / FIGURES} is of another evaluation and cannot be removed: {error.strerror}. Choose another folder "
+            "with -o."
+        ) from error
     write_cog(
         out / ERROR_MAP, evaluation.error_map.errors, evaluation.error_map.geobox, nodata=float("nan"),
         descriptions=("height of the surface less that of the reference",), units="m",

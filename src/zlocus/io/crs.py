@@ -26,6 +26,12 @@ def local_frame() -> CRS:
     return CRS.from_wkt(LOCAL)
 
 
+def named_crs(crs: CRS) -> str:
+    """A CRS for messages: its code, or else its name."""
+    code = crs.to_2d().to_epsg()
+    return crs.name if code is None else f"EPSG:{code}"
+
+
 def is_on_earth(crs: CRS) -> bool:
     """Whether coordinates in a CRS are places on the Earth: it has its size, and PROJ can convert them."""
     ellipsoid = crs.ellipsoid

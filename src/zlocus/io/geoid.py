@@ -12,7 +12,7 @@ from pyproj import CRS
 from rasterio.windows import Window
 
 from zlocus.errors import InputError
-from zlocus.io.crs import raster_crs
+from zlocus.io.crs import named_crs, raster_crs
 from zlocus.io.opening import check_complete, open_raster
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.space import between
@@ -173,9 +173,3 @@ class GeoidRaster:
             f"between {west:.10g} and {east:.10g}, {south:.10g} and {north:.10g} ({named_crs(self.crs)}). "
             "Give one that covers the area."
         )
-
-
-def named_crs(crs: CRS) -> str:
-    """A CRS for messages: its code, or else its name."""
-    code = crs.to_2d().to_epsg()
-    return crs.name if code is None else f"EPSG:{code}"

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_ortho
+from zlocus.matching.cells import CellWindow
 from zlocus.matching.views import TileViews, ViewPixels
-from zlocus.matching.visibility import hide, sees
+from zlocus.matching.visibility import cells_per_step, hide, sees
 from zlocus.scene import ColourSource
 
 # Steps by which a surface must stand above a ray to hide what lies behind: less is its noise.
@@ -28,17 +29,75 @@ def ortho_image(views: TileViews, surface: NDArray[np.float32], view: int = 0) -
     return out
 
 
+@dataclass(frozen=True)
+class Around:
+    """What stands around a tile. surface : (r, c) float32 height indices of the tile's level, of the tile's cells (not
+    looked at) and of others; row, col : the tile's first cell in it."""
+
+    surface: NDArray[np.float32]
+    row: int
+    col: int
+
+    def with_inside(self, surface: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The surface around a tile with the tile's own in its middle."""
+        whole = self.surface.copy()
+        whole[self.row : self.row + surface.shape[0], self.col : self.col + surface.shape[1]] = surface
+        return whole
+
+
+@dataclass(frozen=True)
+class CoarserHeights:
+    """Height indices (r, c) float32 of a level, in its own steps, on the cells `window`."""
+
+    level: int
+    window: CellWindow
+    surface: NDArray[np.float32]
+
+
+def what_stands_around(
+    coarser: Sequence[CoarserHeights], views: TileViews, window: CellWindow, surface: NDArray[np.float32], halo: int
+) -> Around | None:
+    """What coarser levels know of the ground around a tile, as far as it can stand between the tile and a view; None
+    where the tile's own cells reach that far already.
+
+    coarser : of the next level first; views, window, surface : the finest level's, with a halo of so many cells.
+    """
+    if not coarser:
+        return None
+    speed = max(float(np.hypot(*cells_per_step(views, i))) for i in range(len(views.layout)))
+    ground = float(surface.min())
+    for known in coarser:
+        size = 2**known.level
+        # A false height of a cell or two is no tower.
+        top = size * float(cv2.medianBlur(known.surface, 3).max())
+        # From the cells that matter, those of the core.
+        reach = max(int(np.ceil((top - ground) * speed)) - halo, 0)
+        whole = known.window.finer(known.level)
+        wide = CellWindow(
+            window.row - reach, window.col - reach, window.rows + 2 * reach, window.cols + 2 * reach
+        ).within(whole)
+        # Halos double from level to level.
+        if halo * (size - 1) >= reach:
+            break
+    if wide == window:
+        return None
+    rows = np.clip((np.arange(wide.rows) + wide.row) // size - known.window.row, 0, known.window.rows - 1)
+    cols = np.clip((np.arange(wide.cols) + wide.col) // size - known.window.col, 0, known.window.cols - 1)
+    doubled = np.ascontiguousarray(known.surface[np.ix_(rows, cols)]) * np.float32(size)
+    return Around(doubled, window.row - wide.row, window.col - wide.col)
+
+
 def true_ortho(
     pixels: Sequence[ViewPixels], views: TileViews, seen: NDArray[np.int32], surface: NDArray[np.float32],
-    coloured: Sequence[ColourSource] = (),
+    coloured: Sequence[ColourSource] = (), around: Around | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Grey values (r, c), or colours (r, c, 3), of the best view that sees each cell of a surface; NaN where none does.
 
     surface : (r, c) float32 height indices, no NaN, which also is what hides one cell from a view behind another;
     pixels, views : the finest level's; seen : (3, i, r, c), see `coverage`; coloured : their images, where all have
-    colours.
+    colours; around : what may hide cells too, None where nothing beyond the tile is tall enough.
     """
-    best = best_view(views, seen, surface)
+    best = best_view(views, seen, surface, around)
     out = np.full(surface.shape + ((3,) if coloured else ()), np.nan, np.float32)
     for i, view in enumerate(pixels):
         shown = best == i
@@ -55,18 +114,22 @@ def true_ortho(
     return out
 
 
-def best_view(views: TileViews, seen: NDArray[np.int32], surface: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The view that shows each cell of a surface on most pixels, of those from which the surface itself does not hide
-    it; the leading one unless another is clearly finer; -1 where none sees it. (r, c)
+def best_view(
+    views: TileViews, seen: NDArray[np.int32], surface: NDArray[np.float32], around: Around | None = None
+) -> NDArray[np.int64]:
+    """The view that shows each cell of a surface on most pixels, of those from which the surface itself, or what stands
+    around it, does not hide it; the leading one unless another is clearly finer; -1 where none sees it. (r, c)
 
     Edges lie within a cell or so of where they should: views that see past them by more are asked first.
     """
     size = pixels_per_cell(views)
     size[0] *= FINER
     best = np.full(surface.shape, -1)
-    for obstacle in (cv2.dilate(surface, EDGE), surface):
+    first = (0, 0) if around is None else (around.row, around.col)
+    whole = surface if around is None else around.with_inside(surface)
+    for obstacle in (cv2.dilate(whole, EDGE), whole):
         free = seen.copy()
-        hide(free, views, obstacle, np.zeros_like(surface), STANDS_ABOVE_STEPS)
+        hide(free, views, obstacle, np.zeros_like(surface), STANDS_ABOVE_STEPS, first)
         found = _on_most_pixels(size, free, views.block, surface)
         best = np.where(best < 0, found, best)
         if (best >= 0).all():

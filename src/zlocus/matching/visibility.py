@@ -58,19 +58,23 @@ def hide(
     surface: NDArray[np.float32],
     base: NDArray[np.float32],
     margin_steps: float,
+    first: tuple[int, int] = (0, 0),
 ) -> None:
     """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
 
-    surface : (r, c) float32 height indices of what may stand in the way, a lower bound of it; base : (r, c) float32,
-    the base surface that the indices of `seen` are counted from.
+    surface : float32 height indices of what may stand in the way, a lower bound of it, on the cells of the tile and,
+    where some are known, of those around it; base : (r, c) float32, the base surface that the indices of `seen` are
+    counted from; first : row and column of the tile's first cell in `surface`.
     """
     lowest = np.empty(surface.shape, np.float32)
+    rows, cols = base.shape
+    mine = lowest[first[0] : first[0] + rows, first[1] : first[1] + cols]
     for i in range(len(views.layout)):
         for part in parts_of_one_direction(views, i):
             lowest_visible(surface, *cells_per_step(views, i, part), lowest)
-            lowest -= base + np.float32(margin_steps)
-            np.floor(np.maximum(lowest, NOTHING_HIDDEN, out=lowest), out=lowest)
-            seen[2, i][part] = lowest[part]
+            mine -= base + np.float32(margin_steps)
+            np.floor(np.maximum(mine, NOTHING_HIDDEN, out=mine), out=mine)
+            seen[2, i][part] = mine[part]
 
 
 def spare_pairs(seen: IntVolume) -> None:

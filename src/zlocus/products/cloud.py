@@ -16,6 +16,7 @@ import laspy
 import numpy as np
 from affine import Affine
 from laspy.errors import LaspyException
+from laspy.vlrs.known import WktCoordinateSystemVlr
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
@@ -76,7 +77,7 @@ class PointCloud:
             header.offsets = np.floor(xyz.mean(axis=0) / OFFSET_STEP_M) * OFFSET_STEP_M if len(xyz) else np.zeros(3)
             header.generating_software = f"zlocus {__version__}"
             if self._crs is not None:
-                header.add_crs(self._crs)
+                add_crs(header, self._crs)
             self._laz = laspy.open(self._parts[0], "w", header=header, do_compress=True)
             self._ply = self._parts[1].open("wb")
             self._ply.write(ply_header(self._n_points, self._crs).encode("ascii"))
@@ -107,6 +108,12 @@ class PointCloud:
     def _failed(self, error: Exception) -> OutputError:
         reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
         return OutputError(f"{self._paths[0]} cannot be written: {reason}. Check the folder and the space left.")
+
+
+def add_crs(header: laspy.LasHeader, crs: CRS) -> None:
+    """Put a CRS into a header as LAS 1.4 has it: WKT of OGC 01-009, which is WKT 1 (laspy itself writes WKT 2)."""
+    header.vlrs.append(WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
+    header.global_encoding.wkt = True
 
 
 def ply_header(n_points: int, crs: CRS | None) -> str:

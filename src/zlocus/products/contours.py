@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 from affine import Affine
-from numpy.typing import NDArray
-from pyproj import CRS
 
 from zlocus.errors import ConfigError
 from zlocus.io.crs import local_frame
 from zlocus.options import ProductOptions
-from zlocus.products.points import write_features
+from zlocus.products.points import Batch, write_features
 from zlocus.products.strips import STRIP_ROWS, ReadBand, strips_of
 from zlocus.sensors.model import FloatArray
 
@@ -28,12 +27,14 @@ ABOVE_M = 1.234567e-6
 # Coordinates keep so many digits of a cell; a strip gives the same points to far more.
 DIGITS = 4
 ON_ROW = 1e-9
+BATCH_POINTS, POINT_BYTES = 1_000_000, 16
 # Line ends that wait for their continuation: row, level and the column before it.
 Place = tuple[int, int, int]
 
 
 def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows: int = STRIP_ROWS) -> None:
-    """Layer `contours`: 2-D lines with their `elevation_m`, from low to high, higher ground on their right.
+    """Layer `contours`: 2-D lines with their `elevation_m`, from low to high, higher ground on their right; the CRS
+    says what that is above as far as the raster's does.
 
     Lines are straight between the lines that join cells' centres, where heights are linear; they end at holes and at
     the rim. raster : of heights; strip_rows : rows worked on at a time, which change no line.
@@ -52,12 +53,15 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
     with ReadBand(raster) as heights:
         interval = options.contour_interval_m or nice_interval(heights.statistic("STDDEV") or 0.0)
         _check_number(heights, interval, raster)
-        lines, levels = contours(heights, interval, strip_rows)
         transform, crs = heights.geobox.transform, heights.crs or local_frame()
-    geometries = np.array([linestrings(_on_map(line, transform)) for line in lines], dtype=object)
-    # Counted in steps, then multiplied: a sum of steps would drift.
-    columns: dict[str, NDArray[np.generic]] = {"elevation_m": _rounded(np.array(levels, np.float64) * interval)}
-    write_features(path, "contours", "LineString", geometries, columns, CRS(crs.to_2d()))
+
+        def batches() -> Iterator[Batch]:
+            for levels, lines in batched(contours(heights, interval, strip_rows)):
+                geometries = np.array([linestrings(_on_map(line, transform)) for line in lines], dtype=object)
+                # Counted in steps, then multiplied: a sum of steps would drift.
+                yield geometries, {"elevation_m": _rounded(np.array(levels, np.float64) * interval)}
+
+        write_features(path, "contours", "LineString", batches(), crs)
 
 
 def nice_interval(deviation_m: float) -> float:
@@ -92,9 +96,9 @@ class _Chain:
 
 @dataclass
 class _Stitcher:
-    """Lines of strips become whole ones, level by level."""
+    """Lines of strips become whole ones; those that cannot go on are handed out, with their height in intervals."""
 
-    chains: dict[int, dict[_Chain, None]] = field(default_factory=dict)
+    live: dict[_Chain, int] = field(default_factory=dict)
     heads: dict[Place, _Chain] = field(default_factory=dict)
     tails: dict[Place, _Chain] = field(default_factory=dict)
 
@@ -103,7 +107,7 @@ class _Stitcher:
         before = self.tails.pop(head) if head in self.tails else None
         if before is None:
             chain = _Chain([line], head, tail)
-            self.chains.setdefault(level, {})[chain] = None
+            self.live[chain] = level
         else:
             chain = before
             chain.pieces.append(line)
@@ -115,20 +119,41 @@ class _Stitcher:
         if after is not None:
             chain.pieces.extend(after.pieces)
             chain.tail = after.tail
-            del self.chains[level][after]
+            del self.live[after]
         if chain.head is not None and before is None:
             self.heads[chain.head] = chain
         if chain.tail is not None:
             self.tails[chain.tail] = chain
 
+    def finished(self, row: int) -> Iterator[tuple[int, FloatArray]]:
+        """The lines, (n, 2), that no strip from a row on can lengthen."""
+        for chain in [c for c in self.live if not any(end is not None and end[0] >= row for end in (c.head, c.tail))]:
+            level = self.live.pop(chain)
+            for end, ends in ((chain.head, self.heads), (chain.tail, self.tails)):
+                if end is not None:
+                    ends.pop(end, None)
+            if len(line := chain.points()) > 1:
+                yield level, line
 
-def contours(heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS) -> tuple[list[FloatArray], list[int]]:
-    """Lines (n, 2) as (column, row), (0, 0) the first cell's centre, and their heights in intervals; from low to high,
-    those of one height by their first points, from north to south."""
+
+def contours(heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS) -> Iterator[tuple[int, FloatArray]]:
+    """Heights in intervals, and lines (n, 2) as (column, row), (0, 0) the first cell's centre; from low to high, those
+    of one height by their first points, from north to south.
+
+    Lines wait on disk until all are known: held are those that still grow, and where the others are.
+    """
     stitcher = _Stitcher()
     n_rows, n_cols = heights.geobox.shape
-    if n_cols > 1:
-        for strip in strips_of(n_rows - 1, 0, strip_rows):
+    with TemporaryFile(dir=heights.path.parent) as waiting:
+        # Height, first point's row and column, length, place in the file.
+        index: list[tuple[int, float, float, int, int]] = []
+
+        def keep(row: int) -> None:
+            for level, line in stitcher.finished(row):
+                index.append((level, line[0, 1], line[0, 0], len(line), waiting.tell()))
+                waiting.write(line.tobytes())
+
+        for strip in strips_of(n_rows - 1, 0, strip_rows) if n_cols > 1 else ():
             # And the first row of the next one, which both share.
             z = heights.read_rows(strip.row, strip.rows + 1).astype(np.float64)
             for level, line in _traced(z, interval_m):
@@ -136,11 +161,27 @@ def contours(heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS)
                 is_whole = (line[0] == line[-1]).all()
                 head, tail = (None, None) if is_whole else ends
                 stitcher.add(level, line + np.array([0.0, strip.row]), head, tail)
-    lines = []
-    for level in sorted(stitcher.chains):
-        found = [line for chain in stitcher.chains[level] if len(line := chain.points()) > 1]
-        lines += [(level, line) for line in sorted(found, key=lambda line: (line[0, 1], line[0, 0], len(line)))]
-    return [line for _, line in lines], [level for level, _ in lines]
+            keep(strip.row + strip.rows)
+        keep(n_rows)
+        for level, _, _, n, at in sorted(index):
+            waiting.seek(at)
+            yield level, np.frombuffer(waiting.read(n * POINT_BYTES)).reshape(n, 2)
+
+
+def batched(lines: Iterable[tuple[int, FloatArray]]) -> Iterator[tuple[list[int], list[FloatArray]]]:
+    """The same by as many lines as hold `BATCH_POINTS`; one batch at least."""
+    levels: list[int] = []
+    held: list[FloatArray] = []
+    n_points, is_any = 0, False
+    for level, line in lines:
+        levels.append(level)
+        held.append(line)
+        n_points += len(line)
+        if n_points >= BATCH_POINTS:
+            yield levels, held
+            levels, held, n_points, is_any = [], [], 0, True
+    if levels or not is_any:
+        yield levels, held
 
 
 def _traced(z: FloatArray, interval_m: float) -> Iterator[tuple[int, FloatArray]]:

@@ -59,9 +59,9 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
         mean = np.concatenate([block_mean(ground, side) for _, ground in grounds()])
         filled, reach = membrane(mean), options.ground_window_m / (side * heights.cell_m)
         is_filled = _is_near(mean, reach) & ~outside_of(lowest)
-        with RasterSink(
-            path, heights.geobox, "float32", nodata=float("nan"), descriptions=("height of the ground",), units="m"
-        ) as sink:
+        above = heights.description.partition(" above ")[2]
+        what = f"height of the ground above {above}" if above else "height of the ground"
+        with RasterSink(path, heights.geobox, "float32", nodata=float("nan"), descriptions=(what,), units="m") as sink:
             for strip, ground in grounds():
                 rows, cols = np.arange(strip.row, strip.row + strip.rows) // side, np.arange(shape[1]) // side
                 beyond = (flags.read(strip) & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0

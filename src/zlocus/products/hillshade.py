@@ -31,7 +31,9 @@ def write_hillshade(dsm: Path, path: Path, options: ProductOptions, strip_rows: 
     """
     with (
         ReadBand(dsm) as heights,
-        RasterSink(path, heights.geobox, "uint8", nodata=NO_SHADE, descriptions=("hillshade",), average=True) as sink,
+        RasterSink(
+            path, heights.flat_geobox, "uint8", nodata=NO_SHADE, descriptions=("hillshade",), average=True
+        ) as sink,
     ):
         for strip in strips_of(heights.geobox.shape[0], 1, strip_rows):
             z = heights.read(strip)

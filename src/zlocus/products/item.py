@@ -14,8 +14,9 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 from pyproj import CRS, Transformer
 
+from zlocus.io.crs import named_crs
 from zlocus.io.opening import open_raster
-from zlocus.products.record import write_whole
+from zlocus.products.record import read_record, write_whole
 from zlocus.products.strips import ReadBand
 from zlocus.scene import is_local
 
@@ -61,7 +62,8 @@ def write_item(folder: Path) -> bool:
     """An item that links every product in a folder; False, and no file, where the grid has no place on the Earth.
 
     Its time is that of the images, as far as `run.json` knows their dates, else that of the run, which the description
-    then says. Raster information is that of STAC's core (bands); extensions are not used.
+    then says. Raster information is that of STAC's core (bands); extensions are not used, so the CRS and what heights
+    are above stand in properties of our own.
 
     Raises
     ------
@@ -74,7 +76,7 @@ def write_item(folder: Path) -> bool:
     import pystac
 
     with ReadBand(folder / "dsm.tif") as heights:
-        geobox, crs, cell_m = heights.geobox, heights.crs, heights.cell_m
+        geobox, crs, cell_m, what = heights.geobox, heights.crs, heights.cell_m, heights.description
     if crs is None or is_local(crs):
         return False
     geometry, bbox = footprint_of(geobox, crs)
@@ -88,7 +90,7 @@ def write_item(folder: Path) -> bool:
         end_datetime=taken.last,
         properties={
             "title": "Digital surface model", "description": taken.description, "gsd": cell_m,
-            "created": _text(taken.made),
+            "created": _text(taken.made), "zlocus:crs": named_crs(crs), "zlocus:heights": what,
         },
     )  # fmt: skip
     for product in PRODUCTS:
@@ -163,7 +165,7 @@ def _times(folder: Path) -> _Times:
     """From run.json; of a result without one, the time at which the surface was written."""
     record: dict[str, Any] = {}
     if (path := folder / "run.json").is_file():
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read_record(path)
     if "created" in record:
         made = datetime.fromisoformat(record["created"])
     else:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
 
-from zlocus.errors import ConfigError, OutputError
+from zlocus.errors import ConfigError, OutputError, ZlocusError
 from zlocus.options import ProductOptions
 from zlocus.products.contours import write_contours
 from zlocus.products.dtm import write_dtm
@@ -19,7 +19,7 @@ FILES = {"dtm": "dtm.tif", "hillshade": "hillshade.tif", "contours": "contours.g
 
 
 def make_maps(folder: Path, names: Collection[str], options: ProductOptions, progress: Progress) -> None:
-    """Make products of the rasters in a folder, each whole or not at all.
+    """Make products of the rasters in a folder, each whole or not at all, and the others where one fails.
 
     Raises
     ------
@@ -32,10 +32,16 @@ def make_maps(folder: Path, names: Collection[str], options: ProductOptions, pro
     """
     check_maps(names, options, (folder / FILES["dtm"]).exists())
     wanted = [name for name in FILES if name in names]
+    failures = []
     with progress.stage("Products", len(wanted)) as stage:
         for name in wanted:
-            _MAKERS[name](folder, folder / FILES[name], options)
+            try:
+                _MAKERS[name](folder, folder / FILES[name], options)
+            except ZlocusError as error:
+                failures.append(error)
             stage.advance()
+    if failures:
+        raise failures[0]
 
 
 def link_all(folder: Path, progress: Progress) -> None:

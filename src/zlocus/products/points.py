@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,10 @@ from zlocus.orientation.triangulate import project_points
 from zlocus.scene import Scene, is_local
 from zlocus.sensors.model import FloatArray
 
+# Geometries of shapely's (n,) and their columns, (n,) each.
+Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
+# Columns of labels begin so.
+LABEL = "label_"
 # In place of a label that there is not; becomes NULL.
 NOT_RANKED = -128
 
@@ -124,10 +128,10 @@ def column_names(names: Sequence[str]) -> list[str]:
     """Columns of images, all different in a format that takes A and a for one."""
     found: list[str] = []
     for name in names:
-        column, k = f"label_{name}", 1
+        column, k = LABEL + name, 1
         while column.casefold() in {old.casefold() for old in found}:
             k += 1
-            column = f"label_{name}_{k}"
+            column = f"{LABEL}{name}_{k}"
         found.append(column)
     return found
 
@@ -144,19 +148,19 @@ def write_points(
     where NaN or in `nulls`; a local frame has no CRS."""
     from shapely import points
 
-    write_features(path, layer, "Point Z", points(xyz), columns, crs, nulls)
+    write_features(path, layer, "Point Z", [(points(xyz), columns)], crs, nulls)
 
 
 def write_features(
     path: Path,
     layer: str,
     geometry_type: str,
-    geometries: NDArray[np.object_],
-    columns: dict[str, NDArray[np.generic]],
+    batches: Iterable[Batch],
     crs: CRS,
     nulls: dict[str, NDArray[np.bool_]] | None = None,
 ) -> None:
-    """A GeoPackage of one layer, whole or not at all. geometries : (n,) of shapely's; the rest as in `write_points`.
+    """A GeoPackage of one layer, whole or not at all. batches : one or more; nulls : of a single one; the rest as in
+    `write_points`.
 
     Raises
     ------
@@ -170,15 +174,17 @@ def write_features(
 
     # GDAL minds another ending.
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.gpkg")
-    masks = [(nulls or {}).get(name, np.zeros(len(geometries), bool)) for name in columns]
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="'crs' was not provided")
-            pyogrio.raw.write(
-                part, np.asarray(to_wkb(geometries, output_dimension=3, flavor="iso"), dtype=object),
-                list(columns.values()), np.array(list(columns), dtype=object), field_mask=masks, layer=layer,
-                driver="GPKG", geometry_type=geometry_type, crs=None if is_local(crs) else crs.to_wkt(),
-            )  # fmt: skip
+            for number, (geometries, columns) in enumerate(batches):
+                masks = [(nulls or {}).get(name, np.zeros(len(geometries), bool)) for name in columns]
+                pyogrio.raw.write(
+                    part, np.asarray(to_wkb(geometries, output_dimension=3, flavor="iso"), dtype=object),
+                    list(columns.values()), np.array(list(columns), dtype=object), field_mask=masks, layer=layer,
+                    driver="GPKG", geometry_type=geometry_type, crs=None if is_local(crs) else crs.to_wkt(),
+                    append=number > 0,
+                )  # fmt: skip
         os.replace(part, path)
     except (OSError, DataSourceError, DataLayerError) as error:
         reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")

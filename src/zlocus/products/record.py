@@ -17,7 +17,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from zlocus.errors import OutputError
+from zlocus.errors import InputError, OutputError
+from zlocus.io.text import read_text
 
 SCHEMA = 1
 CHUNK_BYTES = 1 << 20
@@ -88,6 +89,23 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
     """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
     text = json.dumps(_finite({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
     write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """A JSON object in a file of a result.
+
+    Raises
+    ------
+    InputError
+        It is damaged.
+    """
+    try:
+        found = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON: {error}. Make the surface again.") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path} holds no JSON object. Make the surface again.")
+    return found
 
 
 def write_whole(path: Path, write: Callable[[Path], Any]) -> None:

@@ -73,6 +73,17 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         return None if self._file.crs is None else CRS.from_wkt(self._file.crs.to_wkt())
 
     @property
+    def flat_geobox(self) -> GeoBox:
+        """Its grid for what holds no heights: the CRS is that of x and y."""
+        crs = self.crs
+        return self.geobox if crs is None else GeoBox(self._file.shape, self._file.transform, crs.to_2d().to_wkt())
+
+    @property
+    def description(self) -> str:
+        """Of its band, "" for none."""
+        return self._file.descriptions[0] or ""
+
+    @property
     def cell_m(self) -> float:
         """Side of a cell, m."""
         return float(self._file.transform.a)

@@ -9,11 +9,10 @@ import laspy
 import numpy as np
 from laspy.errors import LaspyException
 from numpy.typing import NDArray
-from pyproj import CRS
 
 from zlocus import __version__
 from zlocus.errors import OutputError
-from zlocus.products.cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M
+from zlocus.products.cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, add_crs
 from zlocus.products.strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
 from zlocus.scene import is_local
 from zlocus.sensors.model import FloatArray
@@ -89,7 +88,7 @@ def _header(heights: ReadBand) -> laspy.LasHeader:
     ])  # fmt: skip
     crs = heights.crs
     if crs is not None and not is_local(crs):
-        header.add_crs(CRS(crs))
+        add_crs(header, crs)
     return header
 
 

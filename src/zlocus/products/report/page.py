@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +13,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from zlocus.errors import InputError
-from zlocus.io.text import read_text
-from zlocus.products.record import write_whole
+from zlocus.products.record import read_record, write_whole
 from zlocus.products.report import maps, tables, words
 from zlocus.products.report.comparison import Comparison, comparison_part
 from zlocus.products.report.survey import Survey, survey
@@ -106,24 +104,13 @@ def run_record(out: Path) -> dict[str, Any]:
     path = out / RECORD
     if not path.exists():
         raise InputError(f"There is no {RECORD} in {out}. Give the folder that `zlocus dsm` wrote (-o).")
-    run = read_json(path)
+    run = read_record(path)
     missing = [key for key in NEEDED if key not in run]
     if missing:
         raise InputError(
             f"{path} lacks {', '.join(missing)}: it is of no surface, or damaged. Give the folder of a `zlocus dsm`."
         )
     return run
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object in a file."""
-    try:
-        found = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON: {error}. Make the surface again.") from error
-    if not isinstance(found, dict):
-        raise InputError(f"{path} holds no JSON object. Make the surface again.")
-    return found
 
 
 def footprints_part(path: Path, found: Survey, crs: CRS, names: Sequence[str]) -> dict[str, Any] | None:
@@ -171,7 +158,7 @@ def features(path: Path, kind: str) -> list[dict[str, Any]]:
     """Those of a kind in footprints.geojson; none without the file."""
     if not path.exists():
         return []
-    return [each for each in read_json(path)["features"] if each["properties"]["kind"] == kind]
+    return [each for each in read_record(path)["features"] if each["properties"]["kind"] == kind]
 
 
 def pairs_part(out: Path, run: Mapping[str, Any]) -> dict[str, Any]:
@@ -198,7 +185,7 @@ def curves_part(path: Path) -> dict[str, Any] | None:
     """Cells with their curves; None without any."""
     if not path.exists():
         return None
-    record = read_json(path)
+    record = read_record(path)
     return {
         "rule": record["rule"], "n_left_out": record["n_chosen"] - len(record["cells"]),
         "cells": [curve_card(cell) for cell in record["cells"]],

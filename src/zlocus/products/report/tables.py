@@ -11,9 +11,9 @@ import numpy as np
 
 from zlocus.errors import InputError
 from zlocus.options import RunConfig
+from zlocus.products.points import LABEL, column_names
 from zlocus.products.report.words import NONE, STAGES, number, percent, seconds
 
-LABEL = "label_"
 # Poor to good, blue and orange being told apart by all eyes.
 POOR_COLOUR, GOOD_COLOUR = np.array([230, 159, 0]), np.array([86, 180, 233])
 MOST_MATRIX = 60
@@ -136,12 +136,17 @@ def label_matrix(path: Path, names: Sequence[str]) -> Matrix | None:
     except (DataSourceError, DataLayerError) as error:
         raise InputError(f"{path} cannot be read: {error}. Make the surface again.") from error
     held = dict(zip((str(name) for name in meta["fields"]), columns, strict=True))
-    if {LABEL + name for name in names} != {name for name in held if name.startswith(LABEL)}:
+    columns_of = column_names(names)
+    if set(columns_of) != {name for name in held if name.startswith(LABEL)}:
         return None
     rows = []
     for reference in names:
         mine = held["reference"] == reference
-        rows.append(tuple(_label_cell(reference, name, held[LABEL + name][mine]) for name in names))
+        rows.append(
+            tuple(
+                _label_cell(reference, name, held[column][mine]) for name, column in zip(names, columns_of, strict=True)
+            )
+        )
     return Matrix(tuple(names), tuple(rows))
 
 
