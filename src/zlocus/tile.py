@@ -38,7 +38,6 @@ from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees, spare_pairs
 from zlocus.options import RunConfig
-from zlocus.scene import ColourSource
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
 from zlocus.surface.precision import sigma_steps, signs_of_precision
@@ -126,43 +125,32 @@ def match_tile(
         ranking = _ranking(scene, pixels, core, result, config) if use_visibility else None
         result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
-    ground = _covered_ground(scene, pixels, result, guide)
-    worth, coarser = _worth_matching(result, ground), list[LevelResult]()
+    ground = covered_ground(
+        shown_heights(pixels, result.views, coarsest, result.lattice, -(-scene.n_steps // 2**coarsest)),
+        result.seen, result.heights.vertex, (guide.low, guide.high), scene.cell_m / scene.step_m,
+    )  # fmt: skip
+    worth, levels = _worth_matching(result, ground), [result]
     for level in range(coarsest - 1, -1, -1):
         window = _level_window(scene, core, level, config).within(worth.finer(coarsest - level))
         if not (window.rows and window.cols):
             return TileResult(Surface.nothing(core), done, every)
-        coarser.append(result)
         guide = Guide(_finer(result, window), *_candidates(scene, result, window, level), result)
         result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
+        levels.append(result)
         done, every = done + result.evaluations, every + result.all_views
     for _ in range(1, config.pyramid.finest_rounds if use_visibility else 1):
         guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
         result = _match_level(scene, pixels, window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
-    if method != "mvll":
-        result = _with_planes(result, config)
-    coloured = scene.coloured(which)
-    beyond = ~_on_cells(ground, coarser[0].window, result.window, coarsest)
+    levels[-1] = result = result if method == "mvll" else _with_planes(result, config)
+    beyond = ~_on_cells(ground, levels[0].window, result.window, coarsest)
     judged, refined = _finish(scene, pixels, result, beyond, config)
     surface = judged.precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
-    surface = replace(surface, ortho=_ortho(pixels, result, coarser, surface, refined, coloured, config.pyramid.halo))
+    surface = replace(surface, ortho=_ortho(scene, pixels, which, levels, surface, refined, config))
     done += 0 if ranking is None else ranking.evaluations
     return TileResult(surface.part(core, result.window), done, every, None if ranking is None else (ranking, which))
-
-
-def _covered_ground(
-    scene: MatchScene, pixels: list[ViewPixels], coarsest: LevelResult, guide: Guide
-) -> NDArray[np.bool_]:
-    """Cells of the coarsest level that two views show at the height of the ground around; see `covered_ground`."""
-    lattice, level = coarsest.lattice, coarsest.level
-    n_steps = -(-scene.n_steps // 2**level)
-    whole = replace(lattice, first=np.zeros_like(lattice.first), count=np.full_like(lattice.count, n_steps))
-    shown = shown_heights(pixels, coarsest.views, level, whole)
-    searched = guide.low, guide.high
-    return covered_ground(shown, coarsest.seen, coarsest.heights.vertex, searched, scene.cell_m / scene.step_m)
 
 
 def _worth_matching(coarsest: LevelResult, ground: NDArray[np.bool_]) -> CellWindow:
@@ -477,20 +465,23 @@ def _finish(
 
 
 def _ortho(
+    scene: MatchScene,
     pixels: list[ViewPixels],
-    result: LevelResult,
-    coarser: list[LevelResult],
+    which: list[int],
+    levels: list[LevelResult],
     surface: Surface,
     index: NDArray[np.float32],
-    coloured: list[ColourSource],
-    halo: int,
+    config: RunConfig,
 ) -> NDArray[np.float32]:
-    """What the views show of a surface, of its filled cells too; NaN where there is no height. index : (r, c) height
-    indices of all cells as matched, which hide others whether they were kept or not."""
-    lattice, is_filled = result.lattice, (surface.quality & np.uint16(Quality.FILLED)) != 0
+    """What the views show of a surface, of its filled cells too; NaN where there is no height. which : of the scene's
+    views `pixels` are; levels : the coarsest first; index : (r, c) height indices of all cells as matched, which hide
+    others whether they were kept or not."""
+    *coarser, finest = levels
+    lattice, is_filled = finest.lattice, (surface.quality & np.uint16(Quality.FILLED)) != 0
     index = np.where(is_filled, (surface.height - np.float32(lattice.origin_m)) / np.float32(lattice.step_m), index)
     known = [CoarserHeights(each.level, each.window, each.heights.vertex) for each in reversed(coarser)]
-    around = what_stands_around(known, result.views, result.window, index, halo)
-    ortho = true_ortho(pixels, result.views, result.seen, index, coloured, around)
+    around = what_stands_around(known, finest.views, finest.window, index, config.pyramid.halo)
+    scale = scene.grey[0] if config.products.ortho_levels == "common" else None
+    ortho = true_ortho(pixels, finest.views, finest.seen, index, scene.coloured(which), around, scale)
     ortho[np.isnan(surface.height)] = np.nan
     return ortho

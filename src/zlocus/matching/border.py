@@ -24,15 +24,17 @@ STEEPEST, HALF_STEP, ASKED_STEPS = 0.5, 0.5, 2.0
 
 
 def shown_heights(
-    pixels: Sequence[ViewPixels], views: TileViews, level: int, lattice: HeightLattice
+    pixels: Sequence[ViewPixels], views: TileViews, level: int, lattice: HeightLattice, n_steps: int
 ) -> NDArray[np.int32]:
     """(3, i, r, c) as `coverage`, but up to the last pixel of each image: windows of a coarse level need many pixels
-    around a cell, those of the finest, for which this is asked, a few. views : of `level`."""
+    around a cell, those of the finest, for which this is asked, a few. views : of `level`; n_steps : of the lattice,
+    all of which are asked for."""
     unusable = [~view.valid[level].ravel() for view in pixels]
     bare = replace(
         views, blocked=np.concatenate(unusable), has_blocked=np.array([bool(mask.any()) for mask in unusable])
     )
-    return coverage(bare, BaseSurface.level(lattice.shape, views.block), lattice, 0.0)
+    whole = replace(lattice, first=np.zeros_like(lattice.first), count=np.full_like(lattice.count, n_steps))
+    return coverage(bare, BaseSurface.level(lattice.shape, views.block), whole, 0.0)
 
 
 def covered_ground(
