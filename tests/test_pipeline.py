@@ -13,6 +13,7 @@ import rasterio
 from rasterio.shutil import copy as copy_raster
 from rasterio.transform import from_origin
 
+import zlocus.job
 import zlocus.pipeline
 from rendered_scenes import (
     BLUNDER_M,
@@ -31,7 +32,7 @@ from rendered_scenes import (
     well_seen,
 )  # fmt: skip
 from rpc_fixtures import rpc_txt, write_image
-from zlocus.errors import ConfigError, CoverageError, GeometryError, TileError
+from zlocus.errors import ConfigError, CoverageError, GeometryError
 from zlocus.io.rpc_text import rpc_from_fields
 from zlocus.options import CheckOptions, ProductOptions, PyramidOptions, RunConfig
 from zlocus.progress import progress_for
@@ -137,7 +138,8 @@ def test_products(whole, images):
         assert valid, (problems, warnings)
         with rasterio.open(whole / name) as file:
             assert "STATISTICS_MEAN" in file.tags(1)
-    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "run.json", "item.json", *REPORT_FILES}
+    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "run.json", "item.json", "events.jsonl",
+            *REPORT_FILES}  # fmt: skip
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
@@ -172,7 +174,7 @@ def test_record(whole, images):
     assert record["schema"] == 1
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in images("sine").inputs]
     assert all(len(entry["sha256"]) == 64 for entry in record["inputs"])
-    stages = ["open", "orient", "settle", "match", "points", "curves", "record", "products"]
+    stages = ["open", "orient", "settle", "match", "write", "points", "curves", "record", "products"]
     assert [stage["name"] for stage in record["stages"]] == stages
     assert all(set(stage) == {"name", "wall_s", "cpu_s", "peak_mb"} for stage in record["stages"])
     assert record["evaluations"]["done"] <= record["evaluations"]["all_images"]
@@ -234,7 +236,14 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
     out = run(images("plane"), tmp_path / "out", bounds=PART, products=("dtm", "laz")).out
     assert {"dtm.tif", "surface.laz", "item.json"} <= {path.name for path in out.iterdir()}
     run(images("plane"), out, bounds=PART, products=(), overwrite=True)
-    assert {path.name for path in out.iterdir()} == {*PRODUCTS, *REPORT_FILES, "ties.gpkg", "run.json", "item.json"}
+    assert {path.name for path in out.iterdir()} == {
+        *PRODUCTS,
+        *REPORT_FILES,
+        "ties.gpkg",
+        "run.json",
+        "item.json",
+        "events.jsonl",
+    }
 
 
 def test_contours_of_a_terrain_that_is_not_made_are_refused_at_once(images, tmp_path):
@@ -431,7 +440,7 @@ def test_a_failing_tile_leaves_no_half_products(images, tmp_path, monkeypatch):
     def fail(*_):
         raise GeometryError("no.")
 
-    monkeypatch.setattr(zlocus.pipeline, "match_tile", fail)
+    monkeypatch.setattr(zlocus.job, "match_tile", fail)
     with pytest.raises(GeometryError):
         run(images("sine"), tmp_path / "new" / "out", bounds=PART)
     assert not list(tmp_path.iterdir())
@@ -444,31 +453,6 @@ def test_a_failing_tile_leaves_no_half_products(images, tmp_path, monkeypatch):
     with pytest.raises(GeometryError):
         run(images("sine"), tmp_path / "mine", bounds=PART)
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_fault_names_its_tile(images, tmp_path, monkeypatch, workers):
-    """PART from 462000 - 12 m on: the tile of 64 cells of 0.5 m that holds it starts at a multiple of 32 m."""
-    match, failing = zlocus.pipeline.match_tile, []
-
-    def fail(scene, core, *given):
-        west, north = scene.transform(core, 0) * (0, 0)
-        if west <= CENTRE[0] < west + 32 and north - 32 < CENTRE[1] <= north:
-            failing.append((west, north))
-            raise failure
-        return match(scene, core, *given)
-
-    monkeypatch.setattr(zlocus.pipeline, "match_tile", fail)
-    failure = IndexError("index 7 is out of bounds")
-    with pytest.raises(TileError, match="with IndexError: index 7 is out of bounds") as caught:
-        run(images("sine"), tmp_path / "out", SMALL_TILES, workers=workers)
-    west, north = failing[0]
-    assert f"E {west:.0f} to {west + 32:.0f} m, N {north - 32:.0f} to {north:.0f} m" in str(caught.value)
-    assert caught.value.__cause__ is failure
-    failure = MemoryError()
-    with pytest.raises(TileError, match=r"does not fit into memory\. Use fewer --workers"):
-        run(images("sine"), tmp_path / "out", SMALL_TILES, workers=workers)
-    assert not (tmp_path / "out").exists()
 
 
 def test_tiny_pyramids(images, tmp_path):
@@ -489,4 +473,4 @@ def test_progress_and_defaults(images, tmp_path):
     assert source.transform.a == pytest.approx(0.5, abs=0.02)
     assert (source.bounds.left / source.transform.a) % 1 == pytest.approx(0, abs=1e-6)
     assert "Matching" in log.getvalue()
-    assert replace(request).workers == 1
+    assert replace(request).workers is None

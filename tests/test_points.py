@@ -15,10 +15,11 @@ from rendered_scenes import CENTRE, GSD_M, HEIGHTS, LOOKS, UTM, camera
 from zlocus.errors import OutputError
 from zlocus.io.crs import local_frame
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.selection import Ranking
 from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations, project_points
-from zlocus.products.points import RankedPoints, column_names, write_ranking, write_ties
+from zlocus.products.points import column_names, write_ranking, write_ties
 from zlocus.scene import Scene, View
 
 EXACT_M, EXACT_PX = 1e-6, 1e-6

@@ -39,12 +39,21 @@ def test_lines_tell_the_share_done_and_the_time_left(clock):
     log = io.StringIO()
     run(LineProgress(log), clock, steps=5, seconds=30)
     assert log.getvalue().splitlines() == [
-        "Matching: 20 %, 2 min 0 s left",
-        "Matching: 40 %, 1 min 30 s left",
-        "Matching: 60 %, 1 min 0 s left",
-        "Matching: 80 %, 30.0 s left",
+        "Matching: 1 of 5, 20 %, 2 min 0 s left",
+        "Matching: 2 of 5, 40 %, 1 min 30 s left",
+        "Matching: 3 of 5, 60 %, 1 min 0 s left",
+        "Matching: 4 of 5, 80 %, 30.0 s left",
         "Matching: done in 2 min 30 s",
     ]
+
+
+def test_what_is_told_stands_beside_the_steps(clock):
+    log = io.StringIO()
+    with LineProgress(log).stage("Matching", total=2) as stage:
+        stage.tell("1.5 GB")
+        clock.now += 20
+        stage.advance()
+    assert log.getvalue().splitlines()[0] == "Matching: 1 of 2, 50 %, 20.0 s left, 1.5 GB"
 
 
 def test_lines_are_at_least_ten_seconds_apart(clock):
@@ -72,7 +81,7 @@ def test_a_stage_that_fails_is_not_reported_as_done(clock):
     ],
 )
 def test_durations(seconds, text):
-    assert progress_module._duration(seconds) == text
+    assert progress_module.duration(seconds) == text
 
 
 def test_bars_count_nest_and_end(monkeypatch, clock):

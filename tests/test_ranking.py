@@ -13,8 +13,8 @@ from rasterio.errors import NotGeoreferencedWarning
 from rendered_scenes import GSD_M, HEIGHTS, LOOKS
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.curve import FAIR, GOOD, POOR
+from zlocus.matching.ranking import RankedPoints
 from zlocus.options import RunConfig
-from zlocus.products.points import RankedPoints
 from zlocus.progress import SilentProgress
 from zlocus.ranking import label_counts, ranking_table, run_rank
 from zlocus.request import RankRequest

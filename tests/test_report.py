@@ -27,8 +27,9 @@ from zlocus.cli import app
 from zlocus.errors import InputError, OutputError
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.table import evaluation_rows
+from zlocus.matching.ranking import RankedPoints
 from zlocus.options import RunConfig
-from zlocus.products.points import RankedPoints, write_ranking
+from zlocus.products.points import write_ranking
 from zlocus.products.report import maps, tables, words
 from zlocus.products.report.cells import DOUBTFUL, FAILED, TYPICAL, chosen_cells
 from zlocus.products.report.comparison import shrunk_means

@@ -26,12 +26,13 @@ from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.control import read_control
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import vertical_datum
+from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import shared_ground
 from zlocus.options import RunConfig
 from zlocus.orienting import control_points, terrain_heights
 from zlocus.pipeline import run_dsm
 from zlocus.preparing import with_heights
-from zlocus.products.points import RankedPoints, write_ranking
+from zlocus.products.points import write_ranking
 from zlocus.progress import SilentProgress, progress_for
 from zlocus.request import CloudRequest, DsmRequest, OrientRequest
 from zlocus.synthetic.terrain import analytic_height

@@ -196,12 +196,20 @@ def dsm(
     views: Annotated[str, typer.Option(help="Views used for a cell.", metavar="auto|all")] = "auto",
     method: Annotated[str, typer.Option(help="How heights are found.", metavar="mvll-sgm|mvll|gc3-sgm")] = "mvll-sgm",
     vertical: Vertical = "ellipsoid",
-    fill: Annotated[str, typer.Option(help="What to do with small gaps.", metavar="none|interpolate")] = "none",
+    fill: Annotated[
+        str, typer.Option(help="What to do with gaps: small ones, or all.", metavar="none|interpolate|dem")
+    ] = "none",
     partial: Annotated[
-        bool, typer.Option("--partial", help="Count a surface with too few heights as a success.")
+        bool, typer.Option("--partial", help="Make the surface with too few heights, or without failed tiles, too.")
     ] = False,
-    workers: Workers = 1,
-    memory: Annotated[float | None, typer.Option(help="Most memory to use, GB.", metavar="GB")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Tiles worked on at a time. Default: by cores, memory and work.", metavar="N")
+    ] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Dask cluster that works on them.", metavar="ADDRESS")] = None,
+    memory: Annotated[
+        float | None, typer.Option(help="Most memory to use, GB. Default: 60 % of what is free.", metavar="GB")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Go on where the same run was stopped.")] = True,
     maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(DEFAULT_PRODUCTS),
     overwrite: Overwrite = False,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.")] = True,
@@ -211,8 +219,8 @@ def dsm(
     request = DsmRequest(
         inputs=tuple(inputs), out=out, resolution=resolution, crs=crs, bounds=bounds, like=like, area=area, mask=mask,
         heights=heights, dem=dem, dem_vertical=dem_vertical, reference=reference, views=views, method=method,
-        vertical=vertical, fill=fill, partial=partial, workers=workers, memory_gb=memory, overwrite=overwrite,
-        products=product_names(maps), report=report,
+        vertical=vertical, fill=fill, partial=partial, workers=workers, scheduler=scheduler,
+        memory_gb=memory, overwrite=overwrite, resume=resume, products=product_names(maps), report=report,
     )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)

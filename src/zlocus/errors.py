@@ -39,8 +39,14 @@ class CoverageError(ZlocusError):
     exit_status = 3
 
 
+class StoppedError(ZlocusError):
+    """A run that ended before its surface was whole; what is done is kept."""
+
+    exit_status = 3
+
+
 class TileError(ZlocusError):
-    """A tile that failed for no reason the input explains."""
+    """A part of an image that failed for no reason the input explains."""
 
 
 class ZlocusWarning(UserWarning):

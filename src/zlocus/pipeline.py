@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +13,21 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from zlocus.errors import ConfigError, CoverageError, GeometryError, TileError, ZlocusError
+from zlocus.errors import CoverageError, GeometryError, ZlocusError
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.evaluate import evaluate as compare
-from zlocus.execution.local import run_all
-from zlocus.execution.plan import Tile, plan_tiles, tile_memory_bytes
+from zlocus.execution.events import EventLog
+from zlocus.execution.plan import Tile, plan_tiles
+from zlocus.execution.store import TileStore
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
+from zlocus.identity import digest_of, key_of
 from zlocus.io.config import config_as_dict
 from zlocus.io.reference import cells_inside, dem_datum, read_dem, read_geobox, read_polygons
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, vertical_datum
-from zlocus.matching.cells import CellWindow
+from zlocus.job import Polygons, Terrain, TileJob, TileProduct
+from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import Orientation, supported
@@ -42,16 +45,14 @@ from zlocus.preparing import (
 )
 from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
 from zlocus.products.picture import picture_beside_truth
-from zlocus.products.points import RankedPoints, write_ranking, write_ties
+from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Stopwatch, inputs_record, now, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.reporting import Matched, forget_report, try_report, write_shown
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
-from zlocus.surface.reasons import Quality
-from zlocus.surface.surface import Surface
-from zlocus.tile import TileResult, match_tile
+from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 SUFFICIENT_COVERAGE = 0.5
 DEMO_WORKERS = 2
@@ -73,41 +74,6 @@ class DemoResult:
     evaluations: tuple[Evaluation, ...]
 
 
-@dataclass
-class Tally:
-    """Counts over all tiles, cells inside the area asked for."""
-
-    n_seen: int = 0
-    n_matched: int = 0
-    n_left_out: int = 0
-    evaluations: int = 0
-    all_images: int = 0
-    ranked: list[RankedPoints] = field(default_factory=list)
-
-    def add(self, surface: Surface, result: TileResult) -> None:
-        """Count a tile."""
-        outside = np.uint16(Quality.OUTSIDE | Quality.UNSEEN)
-        self.n_seen += int(((surface.quality & outside) == 0).sum())
-        self.n_matched += int(np.isfinite(surface.height).sum())
-        left_out = (surface.quality & np.uint16(Quality.LEFT_OUT)) != 0
-        self.n_left_out += int((left_out & ((surface.quality & np.uint16(Quality.OUTSIDE)) == 0)).sum())
-        self.evaluations += result.evaluations
-        self.all_images += result.all_images
-
-    @property
-    def coverage(self) -> float:
-        """Share of the cells seen by two images or more that have a height."""
-        return self.n_matched / self.n_seen if self.n_seen else 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """For run.json."""
-        return {
-            "evaluations": {"done": self.evaluations, "all_images": self.all_images},
-            "coverage": round(self.coverage, 6),
-            "left_out_cells": self.n_left_out,
-        }
-
-
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
     """Make a surface and write all products to `request.out`.
 
@@ -121,50 +87,69 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     watch = Stopwatch()
     check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):
-        like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
-        scene = _opened(request, like, vertical)
-        polygons = _area_polygons(request, scene.crs)
+        opened = _opened(request, config)
+        scene, vertical, store = opened.scene, opened.vertical, opened.store
     with watch.stage("orient"):
         orientation = oriented(scene, config.orientation, scene.heights, progress)
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
         corrected = orientation.apply(scene)
         z_range = _searched_heights(request, corrected, orientation, config, progress)
-        grid = _grid(request, like, corrected, orientation, z_range)
-        settled = settle(
-            corrected, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
-            orientation.measured,
-        )  # fmt: skip
-        settled = _with_dem(request, settled, scene.crs, config)
+        grid = _grid(request, opened.like, corrected, orientation, z_range)
+        settled = _settled(request, grid, corrected, orientation, z_range, config)
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
-        workers = _workers(request, settled, config)
+        plan = planned(settled, tiles, config, request.workers, request.memory_gb)
         vertical.check_covers(_area_matched(grid, settled), scene.crs)
-        _check_polygons(request, grid, settled, polygons[0])
-    tally = Tally()
-    out = request.out
-    with watch.stage("match"), made_folder(out), _rasters(request, grid, settled, vertical) as rasters:
-        match = _matcher(request, config, settled, corrected, orientation, z_range, grid, workers, tally, progress)
-        _match(match, settled, grid, tiles, workers, polygons, rasters, tally, progress)
-    remove_maps(out)
+        _check_polygons(request, grid, settled, opened.polygons.inside)
+        progress.note(str(plan))
+    out, tally = request.out, Tally()
+    job = _job(request, settled, grid, config, opened.polygons)
+    matching = Matching(job, tiles, store, EventLog(out))
+    with made_folder(out), store.open(digest_of(settled, orientation)):
+        matching.begin(plan)
+        with watch.stage("match") as elsewhere:
+            make = _maker(request, job, corrected, orientation, z_range, plan, tally, progress)
+            failed = matching.run(workers_for(plan, make, is_here=make is not job), progress, elsewhere)
+        matching.check(failed, request.partial)
+        with watch.stage("write"):
+            _forget(out)
+            with _rasters(request, grid, settled, vertical) as rasters:
+                matching.assemble(failed, rasters, tally, progress)
     with watch.stage("points"):
         _write_points(out, orientation, corrected, tally.ranked, settled, vertical)
     matched = Matched(corrected, settled, grid, orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs))
     _show(request, matched, config, watch, progress)
     with watch.stage("record"):
-        inputs = inputs_record(_files(request, scene, vertical))
+        asked = _asked_record(request, config, scene, opened.files)
     record = {
-        **_asked_record(request, config, scene),
-        "inputs": inputs,
+        **asked,
         "stages": watch.stages,
         "orientation": orientation.as_dict(),
         "grid": _grid_record(grid, scene.crs),
         "vertical": vertical.as_dict(),
-        "heights": {"range_m": [round(v, 3) for v in z_range], **_lattice_record(settled)},
+        "heights": _lattice_record(settled, z_range),
         **tally.as_dict(),
     }
     _write_maps(request, config, watch, record, progress)
+    matching.end(failed, tally)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
+
+
+def _settled(
+    request: DsmRequest,
+    grid: Grid,
+    scene: Scene,
+    orientation: Orientation,
+    z_range: tuple[float, float],
+    config: RunConfig,
+) -> MatchScene:
+    """What is settled before the first tile, with limits of heights from a DEM."""
+    settled = settle(
+        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
+        orientation.measured,
+    )  # fmt: skip
+    return _with_dem(request, settled, scene.crs, config)
 
 
 def _rasters(request: DsmRequest, grid: Grid, settled: MatchScene, vertical: VerticalDatum) -> SurfaceRasters:
@@ -173,12 +158,13 @@ def _rasters(request: DsmRequest, grid: Grid, settled: MatchScene, vertical: Ver
     return SurfaceRasters(request.out, grid.geobox, settled.views[0].image.dtype, vertical, has_colours)
 
 
-def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene) -> dict[str, Any]:
-    """What was asked of which program, when, and when the images were taken."""
+def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: list[Path]) -> dict[str, Any]:
+    """What was asked of which program, when, with which files, and when the images were taken."""
     return {
         "config": {"request": _request_record(request), "options": config_as_dict(config)},
         "created": now(),
         "versions": versions_record(),
+        "inputs": inputs_record(files),
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
     }
 
@@ -203,7 +189,29 @@ def _write_maps(
         raise failed
 
 
-def _opened(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
+@dataclass(frozen=True)
+class Opened:
+    """What a request names. like : grid of --like; files : whose content the result depends on; store : tiles that are
+    there already."""
+
+    scene: Scene
+    vertical: VerticalDatum
+    like: GeoBox | None
+    polygons: Polygons
+    files: list[Path]
+    store: TileStore
+
+
+def _opened(request: DsmRequest, config: RunConfig) -> Opened:
+    """Everything that a request names, open."""
+    like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
+    scene = _scene(request, like, vertical)
+    files = _files(request, scene, vertical)
+    store = TileStore.of(request.out, key_of(request, config, files), request.resume, request.overwrite)
+    return Opened(scene, vertical, like, _area_polygons(request, scene.crs), files, store)
+
+
+def _scene(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
     """The scene, its views by name, so that the order of the inputs changes nothing, with the heights asked for."""
     crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
     scene = open_scene(request.inputs, crs)
@@ -250,87 +258,56 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     return DemoResult(result.out, tuple(evaluations))
 
 
-def _matcher(
+def _job(request: DsmRequest, settled: MatchScene, grid: Grid, config: RunConfig, area: Polygons) -> TileJob:
+    """What makes the tiles of a request."""
+    terrain = None
+    if request.fill == "dem":
+        assert request.dem is not None, "of a request that fills from it"
+        terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
+    use_visibility = request.views == "auto"
+    return TileJob(settled, grid, config, request.method, use_visibility, request.fill, area, terrain)
+
+
+def _maker(
     request: DsmRequest,
-    config: RunConfig,
-    settled: MatchScene,
+    job: TileJob,
     scene: Scene,
     orientation: Orientation,
     z_range: tuple[float, float],
-    grid: Grid,
-    workers: int,
+    plan: Plan,
     tally: Tally,
     progress: Progress,
-) -> Callable[[CellWindow], TileResult]:
-    """What makes the surface of a tile's core: matching on the grid, or what was matched in the images."""
-    use_visibility = request.views == "auto"
+) -> Callable[[Tile], TileProduct]:
+    """What makes a tile: matching on the grid, or what is matched in the images first."""
     if request.method != "gc3-sgm":
-        return lambda core: match_tile(settled, core, config, request.method, use_visibility, request.fill)
+        return job
+    config, settled, grid = job.config, job.settled, job.grid
     xyz = orientation.xyz
     ready = OrientedScene(scene, orientation, xyz, supported(xyz, orientation.sigma_z_m), z_range)
     leading = [view.name for view in settled.views if request.reference in (None, view.name)]
     box, aside = grid.geobox.extent.boundingbox, config.pyramid.halo * grid.cell_m
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
-    matched = match_for_grid(ready, leading, Area(bounds, z_range), config, use_visibility, workers, progress)
+    matched = match_for_grid(ready, leading, Area(bounds, z_range), config, job.use_visibility, plan.slots, progress)
     tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
-    return lambda core: grid_tile(matched, settled, core, config, request.fill)
+    return lambda tile: job.product(tile, grid_tile(matched, settled, tile.core, config, request.fill))
 
 
-def _match(
-    match: Callable[[CellWindow], TileResult],
-    settled: MatchScene,
-    grid: Grid,
-    tiles: list[Tile],
-    workers: int,
-    polygons: tuple[NDArray[Any] | None, NDArray[Any] | None],
-    rasters: SurfaceRasters,
-    tally: Tally,
-    progress: Progress,
-) -> None:
-    """Make every tile and write what was asked for of it."""
-
-    def work(tile: Tile) -> TileResult:
-        try:
-            return match(tile.core)
-        except ZlocusError:
-            raise
-        except Exception as error:
-            raise TileError(_what_failed(settled, tile, error)) from error
-
-    with progress.stage("Matching", len(tiles)) as stage:
-        for tile, result in run_all(work, tiles, workers):
-            row, col = tile.kept.row - grid.window.row, tile.kept.col - grid.window.col
-            geobox = grid.geobox[row : row + tile.kept.rows, col : col + tile.kept.cols]
-            surface = _inside(result.surface.part(tile.kept, tile.core), geobox, polygons)
-            tally.add(surface, result)
-            if result.ranking is not None:
-                tally.ranked.append(RankedPoints.of(*result.ranking, settled.ties, tile.core))
-            rasters.write(row, col, surface)
-            stage.advance()
-
-
-def _inside(surface: Surface, geobox: GeoBox, polygons: tuple[NDArray[Any] | None, NDArray[Any] | None]) -> Surface:
-    """The surface with cells outside the area, or inside the mask, emptied."""
-    area, mask = polygons
-    outside = np.zeros(surface.height.shape, bool)
-    if area is not None:
-        outside |= ~cells_inside(area, geobox)
-    if mask is not None:
-        outside |= cells_inside(mask, geobox)
-    return surface.without(outside) if outside.any() else surface
+def _forget(out: Path) -> None:
+    """Remove what an earlier run left, before its rasters are replaced: nothing of it may stand beside them."""
+    remove_maps(out)
+    forget_report(out)
+    for name in ("run.json", "ties.gpkg"):
+        (out / name).unlink(missing_ok=True)
 
 
 def _write_points(
     out: Path, orientation: Orientation, corrected: Scene, ranked: list[RankedPoints], settled: MatchScene,
     vertical: VerticalDatum,
 ) -> None:  # fmt: skip
-    """Ties and ranking; of an earlier run's ranking and report, which are not this one's, nothing stays."""
-    forget_report(out)
+    """Ties and ranking."""
     write_ties(out / "ties.gpkg", orientation, corrected, vertical)
     if ranked:
         write_ranking(out / "ranking.gpkg", ranked, [view.name for view in settled.views], corrected.crs, vertical)
-    else:
-        (out / "ranking.gpkg").unlink(missing_ok=True)
 
 
 def _show(request: DsmRequest, matched: Matched, config: RunConfig, watch: Stopwatch, progress: Progress) -> None:
@@ -419,39 +396,11 @@ def _check_polygons(request: DsmRequest, grid: Grid, settled: MatchScene, area: 
         )
 
 
-def _area_polygons(request: DsmRequest, crs: CRS) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
     """Polygons of --area and --mask."""
     area = None if request.area is None else read_polygons(request.area, crs)
     mask = None if request.mask is None else read_polygons(request.mask, crs)
-    return area, mask
-
-
-def _workers(request: DsmRequest, settled: MatchScene, config: RunConfig) -> int:
-    """Tiles at a time: as asked, as memory allows."""
-    if request.memory_gb is None:
-        return request.workers
-    need = tile_memory_bytes(settled, config.pyramid)
-    fit = int(request.memory_gb * 1e9 / need)
-    if fit < 1:
-        raise ConfigError(
-            f"--memory {request.memory_gb:g} GB is too little for one tile, which needs about {need / 1e9:.1f} GB. "
-            "Allow more, or set a smaller pyramid.tile in --config."
-        )
-    return min(request.workers, fit)
-
-
-def _what_failed(settled: MatchScene, tile: Tile, error: Exception) -> str:
-    """The tile and its fault, in a sentence."""
-    transform = settled.transform(tile.core, 0)
-    (west, north), (east, south) = transform * (0, 0), transform * (tile.core.cols, tile.core.rows)
-    what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
-    where = f"The tile E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
-    if isinstance(error, MemoryError):
-        return f"{where} does not fit into memory. Use fewer --workers, or set a smaller pyramid.tile in --config."
-    return (
-        f"{where} failed with {what}. This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the "
-        "trace, and report it."
-    )
+    return Polygons(area, mask)
 
 
 def _check_coverage(tally: Tally, out: Path, partial: bool, progress: Progress) -> None:
@@ -475,9 +424,15 @@ def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
     return {"crs": crs.to_string(), "transform": list(geobox.transform)[:6], "shape": list(geobox.shape)}
 
 
-def _lattice_record(settled: MatchScene) -> dict[str, Any]:
-    """The heights' lattice as JSON can hold it."""
-    return {"step_m": settled.step_m, "levels": settled.levels, "leading_view": settled.views[0].name}
+def _lattice_record(settled: MatchScene, z_range: tuple[float, float]) -> dict[str, Any]:
+    """The heights searched, and their lattice, as JSON can hold them."""
+    range_m = [round(z, 3) for z in z_range]
+    return {
+        "range_m": range_m,
+        "step_m": settled.step_m,
+        "levels": settled.levels,
+        "leading_view": settled.views[0].name,
+    }
 
 
 def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[Path]:

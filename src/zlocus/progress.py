@@ -23,6 +23,10 @@ class Stage(Protocol):
         """Count n more steps as done."""
         ...
 
+    def tell(self, text: str) -> None:
+        """Something to stand beside the steps from now on, such as the memory that they take."""
+        ...
+
 
 class Progress(Protocol):
     """What a run reports to.
@@ -56,6 +60,9 @@ class _SilentStage:
     def advance(self, n: float = 1) -> None:
         pass
 
+    def tell(self, text: str) -> None:
+        pass
+
 
 @dataclass
 class LineProgress:
@@ -68,7 +75,7 @@ class LineProgress:
         """See `Progress`."""
         start = time.monotonic()
         yield _LineStage(self, name, total, start, start)
-        self.note(f"{name}: done in {_duration(time.monotonic() - start)}")
+        self.note(f"{name}: done in {duration(time.monotonic() - start)}")
 
     def note(self, sentence: str) -> None:
         """See `Progress`."""
@@ -83,6 +90,10 @@ class _LineStage:
     start: float
     last_line: float
     done: float = 0.0
+    told: str = ""
+
+    def tell(self, text: str) -> None:
+        self.told = text
 
     def advance(self, n: float = 1) -> None:
         self.done += n
@@ -91,7 +102,9 @@ class _LineStage:
             return
         self.last_line = now
         left = (now - self.start) * (self.total - self.done) / self.done
-        self.progress.note(f"{self.name}: {100 * self.done / self.total:.0f} %, {_duration(left)} left")
+        told = f", {self.told}" if self.told else ""
+        steps = f"{self.done:.0f} of {self.total:.0f}, {100 * self.done / self.total:.0f} %"
+        self.progress.note(f"{self.name}: {steps}, {duration(left)} left{told}")
 
 
 @dataclass
@@ -109,7 +122,7 @@ class BarProgress:
             self._bars = bars
             bars.start()
         self._depth += 1
-        task = bars.add_task(name, total=total)
+        task = bars.add_task(name, total=total, told="")
         try:
             yield _BarStage(bars, task)
             done = total if total is not None else 1
@@ -133,23 +146,33 @@ class _BarStage:
     bars: RichBars
     task: TaskID
 
+    def tell(self, text: str) -> None:
+        self.bars.update(self.task, told=text)
+
     def advance(self, n: float = 1) -> None:
         self.bars.advance(self.task, n)
 
 
 def _new_bars() -> RichBars:
     from rich.console import Console
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as RichBars
 
     columns = (
-        TextColumn("{task.description:<14}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.description:<14}"), BarColumn(), TaskProgressColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[told]}"),
     )  # fmt: skip
     return RichBars(*columns, console=Console(stderr=True))
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Seconds as a person says them: 4.2 s, 3 min 5 s, 2 h 10 min."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"

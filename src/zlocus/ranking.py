@@ -15,6 +15,7 @@ from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
 from zlocus.io.config import config_as_dict
 from zlocus.matching.curve import FAIR, GOOD
+from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
 from zlocus.orienting import check_ties
@@ -27,7 +28,7 @@ from zlocus.preparing import (
     oriented,
     what_was_applied,
 )
-from zlocus.products.points import RankedPoints, write_ranking, write_ties
+from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import RankRequest

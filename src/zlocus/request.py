@@ -16,7 +16,7 @@ VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 # Or the file of a geoid.
 VERTICALS = ("ellipsoid", "egm96", "egm2008")
-FILLS = ("none", "interpolate")
+FILLS = ("none", "interpolate", "dem")
 PRODUCTS = ("hillshade", "contours", "dtm", "laz")
 # The first thing anyone looks at, at the cost of a second per million cells; the others take a choice.
 DEFAULT_PRODUCTS = ("hillshade",)
@@ -34,7 +34,9 @@ class DsmRequest:
     what its heights are above, as `vertical`, None is what its CRS says.
     reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
     vertical : what the heights written are above: one of `VERTICALS`, or the file of a geoid.
-    memory_gb : most memory the tiles may take together, GB.
+    workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
+    scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
+    together, GB; None: 60 % of what is free. resume : whether finished tiles of the same run are taken as they are.
     partial : a surface with too few heights counts as a success. products : maps made of the surface, see `PRODUCTS`.
     report : whether report.html is made.
 
@@ -63,9 +65,11 @@ class DsmRequest:
     vertical: str = "ellipsoid"
     fill: str = "none"
     partial: bool = False
-    workers: int = 1
+    workers: int | None = None
+    scheduler: str | None = None
     memory_gb: float | None = None
     overwrite: bool = False
+    resume: bool = True
     products: tuple[str, ...] = DEFAULT_PRODUCTS
     report: bool = True
 
@@ -87,6 +91,8 @@ class DsmRequest:
             ("fill", self.fill, FILLS),
         ):
             _check_choice(name, value, choices)
+        if self.fill == "dem" and self.dem is None:
+            raise ConfigError("--fill dem needs the heights of a terrain model. Add --dem RASTER.")
         _check_vertical("vertical", self.vertical)
         _check_vertical_of("dem", self.dem, self.dem_vertical)
         _check_workers(self.workers)
@@ -136,7 +142,7 @@ class CloudRequest:
     def __post_init__(self) -> None:
         _check_inputs(self.inputs)
         _check_heights(self.heights)
-        _check_choice("fill", self.fill, FILLS)
+        _check_choice("fill", self.fill, FILLS[:2])
         _check_vertical("vertical", self.vertical)
         _check_workers(self.workers)
         for name in self.references:
@@ -395,8 +401,8 @@ def _check_vertical_of(name: str, of: Path | None, value: str | None) -> None:
     _check_vertical(f"{name}-vertical", value)
 
 
-def _check_workers(workers: int) -> None:
-    if workers < 1:
+def _check_workers(workers: int | None) -> None:
+    if workers is not None and workers < 1:
         raise ConfigError(f"--workers {workers} is too few; give 1 or more.")
 
 
@@ -420,7 +426,9 @@ def check_output(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")
     held = [name for name in RUN_FILES if (out / name).exists()]
-    if held and not overwrite:
+    # What failed, or was stopped, may go on; whose it is its manifest says.
+    may_go_on = (out / "tiles" / "manifest.json").exists()
+    if held and not overwrite and not may_go_on:
         raise OutputError(f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite.")
     parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     try:

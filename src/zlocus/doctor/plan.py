@@ -12,7 +12,7 @@ from shapely import box
 from zlocus.doctor.findings import POOR, STOPS, Finding
 from zlocus.doctor.ties import QuickTies
 from zlocus.errors import GeometryError
-from zlocus.execution.plan import plan_tiles, tile_memory_bytes
+from zlocus.execution.plan import VIEW_CELLS_PER_S, plan_tiles, tile_memory_bytes
 from zlocus.grid import grid_from_bounds
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
@@ -20,8 +20,6 @@ from zlocus.preparing import area_to_match
 from zlocus.request import DoctorRequest
 from zlocus.scene import Scene
 
-# Matching of 4.2 M cells with three views took 17.9 s of a core (benchmarks/README.md, "The whole program").
-VIEW_CELLS_PER_S = 4.2e6 * 3 / 17.9
 # Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
 ROUGHLY = 3.0
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.setup import MatchScene
 from zlocus.options import PyramidOptions
 
+# Matching of 4.2 M cells with three views took 17.9 s of a core (benchmarks/README.md, "The whole program").
+VIEW_CELLS_PER_S = 4.2e6 * 3 / 17.9
 STEPS_PER_CELL = 48
 BYTES_PER_CELL = 160
 
@@ -53,3 +56,9 @@ def tile_memory_bytes(scene: MatchScene, options: PyramidOptions) -> int:
     fine = min((height + 2 * options.halo) * (width + 2 * options.halo), everything)
     pixels = min((height + wide) * (width + wide), everything) * len(scene.views) * 16
     return int(fine * (min(STEPS_PER_CELL, scene.n_steps + 16) * 3 + BYTES_PER_CELL) + pixels)
+
+
+def matching_seconds(scene: MatchScene, tiles: Sequence[Tile]) -> float:
+    """About how long one worker matches tiles, as if all views saw all of their cells, s."""
+    cells = sum(tile.core.rows * tile.core.cols for tile in tiles)
+    return cells * len(scene.views) / VIEW_CELLS_PER_S

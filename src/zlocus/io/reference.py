@@ -46,10 +46,13 @@ def read_geobox(path: Path) -> GeoBox:
         return GeoBox(source.shape, transform, checked_crs(crs).to_string())
 
 
-def read_dem(path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None) -> NDArray[np.float32]:
+def read_dem(
+    path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None, may_miss: bool = False
+) -> NDArray[np.float32]:
     """Ellipsoidal heights of a DEM at the cell centres of a grid, bilinear. (r, c) float32 m, NaN where it has none.
 
-    vertical : what the DEM's heights are above, see `dem_datum`; None is what its CRS says.
+    vertical : what the DEM's heights are above, see `dem_datum`; None is what its CRS says. may_miss : whether it may
+    have no height anywhere on the grid.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def read_dem(path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None) 
         crs = raster_crs(source, path)
         check_heights(crs, path)
         heights = _resampled(source, crs.to_2d(), geobox)
-    if not np.isfinite(heights).any():
+    if not (np.isfinite(heights).any() or may_miss):
         raise InputError(
             f"The DEM {path} has no height anywhere on the grid ({_extent(geobox)}). Give one that covers it."
         )

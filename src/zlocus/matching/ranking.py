@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,10 @@ from zlocus.matching.selection import Ranking, rank_views
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import ViewPixels, tile_views
 from zlocus.options import RunConfig
+from zlocus.sensors.model import FloatArray
+
+# In place of a label that there is not; becomes NULL.
+NOT_RANKED = -128
 
 
 @dataclass(frozen=True)
@@ -63,3 +68,32 @@ def _heights_of_ties(
     z = scene.ties[((xy >= first) & (xy < last)).all(axis=1), 2]
     z = z[np.isfinite(z)]
     return (float(z.min()) - reach, float(z.max()) + reach) if len(z) else None
+
+
+@dataclass(frozen=True)
+class RankedPoints:
+    """Tie points of one tile with the labels of its images.
+
+    xyz : (n, 3) m; labels : (n, k, k) int8, of search image (last axis) against reference; views : (k,) int64, which of
+    the scene's images they are.
+    """
+
+    xyz: FloatArray
+    labels: NDArray[np.int8]
+    views: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, ranking: Ranking, views: Sequence[int], ties: FloatArray, kept: CellWindow) -> RankedPoints:
+        """Those in a window of finest cells, so that no point of two tiles counts twice. ties : (n, 3) m, all."""
+        first, size = np.array([kept.col, kept.row]), np.array([kept.cols, kept.rows])
+        inside = ((ranking.xy >= first) & (ranking.xy < first + size)).all(axis=1)
+        return cls(ties[ranking.tie[inside]], ranking.labels[inside], np.array(views, np.int64))
+
+    def rows(self, n_views: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int16]]:
+        """A row per point and reference: its xyz (m, 3) m, reference (m,), labels (m, n_views), `NOT_RANKED` where the
+        image is the reference or was not compared."""
+        n, k = self.labels.shape[:2]
+        labels = np.full((n, k, n_views), NOT_RANKED, np.int16)
+        labels[:, :, self.views] = self.labels
+        labels[:, np.arange(k), self.views] = NOT_RANKED
+        return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), labels.reshape(n * k, n_views)

@@ -54,6 +54,7 @@ PRODUCTS = (
     Product("report.html", "All of it for people, on one page", HTML, ("overview", "metadata")),
     Product("footprints.geojson", "Outlines and pairs of the images", GEOJSON, ("metadata",)),
     Product("curves.json", "Match curves of some cells", JSON, ("metadata",)),
+    Product("events.jsonl", "What happened when", "application/x-ndjson", ("metadata",)),
     Product("run.json", "What was asked, versions, inputs, times", JSON, ("metadata",)),
 )
 

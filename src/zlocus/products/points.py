@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,8 @@ from pyproj import CRS
 
 from zlocus.errors import OutputError
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
-from zlocus.matching.cells import CellWindow
 from zlocus.matching.curve import GOOD
-from zlocus.matching.selection import Ranking
+from zlocus.matching.ranking import NOT_RANKED, RankedPoints
 from zlocus.orientation.orient import Orientation
 from zlocus.orientation.triangulate import project_points
 from zlocus.scene import Scene, is_local
@@ -26,8 +24,6 @@ from zlocus.sensors.model import FloatArray
 Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
 # Columns of labels begin so.
 LABEL = "label_"
-# In place of a label that there is not; becomes NULL.
-NOT_RANKED = -128
 
 
 def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: VerticalDatum = ELLIPSOIDAL) -> None:
@@ -61,35 +57,6 @@ def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: 
     }  # fmt: skip
     crs = vertical.compound(oriented.crs)
     write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, crs)
-
-
-@dataclass(frozen=True)
-class RankedPoints:
-    """Tie points of one tile with the labels of its images.
-
-    xyz : (n, 3) m; labels : (n, k, k) int8, of search image (last axis) against reference; views : (k,) int64, which of
-    the scene's images they are.
-    """
-
-    xyz: FloatArray
-    labels: NDArray[np.int8]
-    views: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, ranking: Ranking, views: Sequence[int], ties: FloatArray, kept: CellWindow) -> RankedPoints:
-        """Those in a window of finest cells, so that no point of two tiles counts twice. ties : (n, 3) m, all."""
-        first, size = np.array([kept.col, kept.row]), np.array([kept.cols, kept.rows])
-        inside = ((ranking.xy >= first) & (ranking.xy < first + size)).all(axis=1)
-        return cls(ties[ranking.tie[inside]], ranking.labels[inside], np.array(views, np.int64))
-
-    def rows(self, n_views: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int16]]:
-        """A row per point and reference: its xyz (m, 3) m, reference (m,), labels (m, n_views), `NOT_RANKED` where the
-        image is the reference or was not compared."""
-        n, k = self.labels.shape[:2]
-        labels = np.full((n, k, n_views), NOT_RANKED, np.int16)
-        labels[:, :, self.views] = self.labels
-        labels[:, np.arange(k), self.views] = NOT_RANKED
-        return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), labels.reshape(n * k, n_views)
 
 
 def write_ranking(

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import os
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from zlocus.errors import InputError, OutputError
+from zlocus.execution.memory import peak_memory_mb
 from zlocus.io.text import read_text
 
 SCHEMA = 1
@@ -37,30 +37,32 @@ LIBRARIES = (
 
 
 @dataclass
+class Elsewhere:
+    """What a stage took in other processes. cpu_s : all of them together; peak_mb : most that one of them held."""
+
+    cpu_s: float = 0.0
+    peak_mb: float = 0.0
+
+
+@dataclass
 class Stopwatch:
     """Wall time, CPU time and peak memory of each stage of a run."""
 
     stages: list[dict[str, Any]] = field(default_factory=list)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time a block."""
-        wall, cpu = time.perf_counter(), time.process_time()
-        yield
+    def stage(self, name: str) -> Iterator[Elsewhere]:
+        """Time a block; what is added to what it yields counts too."""
+        wall, cpu, elsewhere = time.perf_counter(), time.process_time(), Elsewhere()
+        yield elsewhere
         self.stages.append(
             {
                 "name": name,
                 "wall_s": round(time.perf_counter() - wall, 3),
-                "cpu_s": round(time.process_time() - cpu, 3),
-                "peak_mb": round(peak_memory_mb(), 1),
+                "cpu_s": round(time.process_time() - cpu + elsewhere.cpu_s, 3),
+                "peak_mb": round(max(peak_memory_mb(), elsewhere.peak_mb), 1),
             }
         )
-
-
-def peak_memory_mb() -> float:
-    """Most memory this process has held so far, MB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
 def inputs_record(paths: Iterable[Path]) -> list[dict[str, str]]:

@@ -1,0 +1,47 @@
+"""How much memory a run may take."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+from pathlib import Path
+
+# Of what is free.
+SHARE = 0.6
+# What an idle worker holds: Python, libraries, compiled kernels; and what GDAL's cache may grow to.
+WORKER_BYTES = 350e6
+CGROUP = Path("/sys/fs/cgroup")
+
+
+def free_bytes() -> float:
+    """Memory that may still be used: of the machine, or of the container where that is less."""
+    import psutil
+
+    return float(min(psutil.virtual_memory().available, *_left_in_container()))
+
+
+def _left_in_container() -> list[float]:
+    """What limits of control groups (version 2, then 1) leave; empty without any."""
+    found = []
+    for limit, used in (
+        ("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):  # fmt: skip
+        try:
+            found.append(float((CGROUP / limit).read_text()) - float((CGROUP / used).read_text()))
+        except (OSError, ValueError):  # none, or "max"
+            continue
+    return found
+
+
+def peak_memory_mb() -> float:
+    """Most memory this process has held so far, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,152 @@
+"""Local processes, one task at a time each: one that dies costs its task only, and another takes its place."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Any
+
+from zlocus.execution.engine import Cause, Failure, Outcome, attempted
+
+# Kernels use one core each, and so must the libraries below them: else n workers have n times the threads.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
+# Imported once, by the process that workers are forked from.
+PRELOADED = ("zlocus.execution.preload",)
+TIME_TO_STOP_S = 2.0
+
+
+@dataclass
+class _Worker:
+    process: BaseProcess
+    connection: Connection
+    task: Any = None
+
+
+class Processes:
+    """Workers in processes of their own.
+
+    Processes are forked from one that has imported everything and does nothing (started anew where the system cannot
+    do that), never from this one, whose threads and open rasters must not be shared. Leaving the context stops all.
+
+    >>> with Processes(function, 2) as workers:
+    ...     outcomes = run_tasks(workers, tasks)
+
+    function : and what it holds must pickle; it reaches each process once.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], slots: int) -> None:
+        self.slots = slots
+        self._function = pickle.dumps(function)
+        methods = multiprocessing.get_all_start_methods()
+        self._context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+        if "forkserver" in methods:
+            self._context.set_forkserver_preload(list(PRELOADED))
+        self._idle: list[_Worker] = []
+        self._busy: list[_Worker] = []
+        self._number = 0
+
+    def submit(self, task: Any) -> None:
+        """See `Workers`."""
+        worker = self._idle.pop() if self._idle else self._started()
+        worker.task = task
+        self._busy.append(worker)
+        # One that has died meanwhile is found by `wait`.
+        with suppress(OSError):
+            worker.connection.send(task)
+
+    def wait(self) -> list[Outcome]:
+        """See `Workers`."""
+        ready = wait([worker.connection for worker in self._busy])
+        outcomes = []
+        for worker in [worker for worker in self._busy if worker.connection in ready]:
+            self._busy.remove(worker)
+            try:
+                outcome: Outcome = worker.connection.recv()
+                self._idle.append(worker)
+            except (EOFError, OSError, pickle.UnpicklingError):
+                outcome = Outcome(worker.task, failure=_lost(worker.process), worker=worker.process.name)
+                worker.connection.close()
+            outcomes.append(outcome)
+        return outcomes
+
+    def close(self) -> None:
+        """Stop all, whatever they do."""
+        workers = self._idle + self._busy
+        self._idle, self._busy = [], []
+        for worker in workers:
+            worker.connection.close()
+            worker.process.terminate()
+        for worker in workers:
+            worker.process.join(TIME_TO_STOP_S)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+
+    def _started(self) -> _Worker:
+        self._number += 1
+        mine, theirs = self._context.Pipe()
+        name = f"worker {self._number}"
+        process = self._context.Process(target=work, args=(theirs, self._function, name), name=name, daemon=True)
+        kept = {key: os.environ.get(key) for key in ONE_THREAD}
+        os.environ.update(ONE_THREAD)
+        try:
+            process.start()
+        finally:
+            for key, value in kept.items():
+                if value is None:
+                    del os.environ[key]
+                else:
+                    os.environ[key] = value
+        theirs.close()
+        return _Worker(process, mine)
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def work(connection: Connection, function: bytes, name: str) -> None:
+    """What a process does: tasks, until its other end is closed."""
+    # Of Ctrl-C the whole group hears; who waits for the results decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    one_thread()
+    call = pickle.loads(function)
+    cpu_s = 0.0  # what it took to start counts too
+    # The other end may be gone, with its process, at any time.
+    with suppress(EOFError, OSError):
+        while True:
+            outcome = attempted(call, connection.recv(), name, cpu_s)
+            cpu_s += outcome.cpu_s
+            connection.send(outcome)
+
+
+def one_thread() -> None:
+    """Keep libraries of this process to one thread, as far as the environment cannot."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def _lost(process: BaseProcess) -> Failure:
+    """What is known of a process that has gone."""
+    process.join(TIME_TO_STOP_S)
+    status = process.exitcode
+    if status == -signal.SIGKILL:
+        return Failure(
+            Cause.LOST, f"its process was killed (signal {-status}), as the system does when memory runs out"
+        )
+    if status is not None and status < 0:
+        return Failure(Cause.LOST, f"its process ended by signal {-status}")
+    return Failure(Cause.LOST, f"its process ended with status {status}")

@@ -1,0 +1,59 @@
+"""What the tiles of a run depend on: two runs with the same of it have the same tiles."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zlocus.io.config import config_as_dict
+from zlocus.matching.setup import MatchScene
+from zlocus.options import RunConfig
+from zlocus.orientation.orient import Orientation
+from zlocus.products.record import versions_record
+from zlocus.request import DsmRequest
+
+# What changes no tile.
+APART = ("out", "workers", "memory_gb", "scheduler", "partial", "overwrite", "resume", "products", "report", "inputs")
+
+
+def key_of(request: DsmRequest, config: RunConfig, files: Iterable[Path]) -> dict[str, Any]:
+    """Options, versions and inputs (size and time of change), by name.
+
+    The content of images is not read for it, which would take as long as matching; `run.json` has its checksum.
+    """
+    asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in APART}
+    return {
+        "versions": versions_record(),
+        "request": {name: str(value) if isinstance(value, Path) else value for name, value in asked.items()},
+        "options": config_as_dict(config),
+        "inputs": {str(path): _state(path) for path in files},
+    }
+
+
+def digest_of(settled: MatchScene, orientation: Orientation) -> str:
+    """SHA-256 of all that was found before the first tile: corrections, lattice, grey values, tie points."""
+    found = {
+        "orientation": orientation.as_dict(), "names": [view.name for view in settled.views],
+        "lattice": [*settled.anchor, settled.cell_m, settled.origin_m, settled.step_m, settled.n_steps, settled.levels],
+        "seen": vars(settled.seen), "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in settled.grey],
+    }  # fmt: skip
+    digest = hashlib.sha256(json.dumps(found, sort_keys=True).encode())
+    for array in (settled.ties, settled.prior):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _state(path: Path) -> list[int]:
+    """Size, bytes, and time of change, ns; of a file that is not there, nothing."""
+    try:
+        found = path.stat()
+    except OSError:
+        return []
+    return [found.st_size, found.st_mtime_ns]

@@ -1,0 +1,301 @@
+"""The tiles of a run: planned, made by workers, kept on disk, and put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from zlocus.errors import ConfigError, StoppedError
+from zlocus.execution.engine import Failure, Here, Outcome, Workers, run_tasks
+from zlocus.execution.events import NAME, EventLog
+from zlocus.execution.memory import SHARE, WORKER_BYTES, cores, free_bytes
+from zlocus.execution.plan import Tile, matching_seconds, tile_memory_bytes
+from zlocus.execution.processes import Processes
+from zlocus.execution.store import TileStore
+from zlocus.job import TileJob, TileProduct
+from zlocus.matching.cells import CellWindow
+from zlocus.matching.setup import MatchScene
+from zlocus.options import RunConfig
+from zlocus.products.rasters import SurfaceRasters
+from zlocus.products.record import Elsewhere
+from zlocus.progress import Progress, Stage, duration
+from zlocus.surface.reasons import Quality
+from zlocus.surface.surface import Surface
+from zlocus.tile import TileResult
+
+# Processes take about two seconds to start, and so are not worth it for less work than this, s.
+SHORT_S = 15.0
+NAMED = 3  # failed tiles in a message
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How tiles are worked on. slots : at a time; processes : in processes of their own, else here; tile_bytes : that
+    one needs at most; allowed_bytes : all together; seconds : about, of one worker."""
+
+    n_tiles: int
+    slots: int
+    processes: bool
+    tile_bytes: float
+    allowed_bytes: float
+    seconds: float
+
+    def __str__(self) -> str:
+        where = "in processes of their own" if self.processes else "in this process"
+        many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
+        return (
+            f"Plan: {many}, {self.slots} at a time {where}, about {self.slots * self.tile_bytes / 1e9:.2g} GB of "
+            f"memory (of {self.allowed_bytes / 1e9:.2g} GB) and {duration(self.seconds / self.slots)}."
+        )
+
+
+def planned(
+    settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, workers: int | None, memory_gb: float | None
+) -> Plan:
+    """Tiles at a time: as asked, or as many as there are cores and work for; never more than memory allows.
+
+    Raises
+    ------
+    ConfigError
+        One tile needs more memory than it may take.
+    """
+    need = tile_memory_bytes(settled, config.pyramid)
+    allowed = SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
+    if memory_gb is not None and need > allowed:
+        raise ConfigError(
+            f"--memory {memory_gb:g} GB is too little for one tile, which needs about {need / 1e9:.1f} GB. "
+            "Allow more, or set a smaller pyramid.tile in --config."
+        )
+    worked = [tile for tile in tiles if tile.core.rows and tile.core.cols]
+    seconds = matching_seconds(settled, worked)
+    wanted = workers or (cores() if seconds > SHORT_S else 1)
+    slots = max(min(wanted, int(allowed / (need + WORKER_BYTES)), len(worked)), 1)
+    return Plan(len(tiles), slots, slots > 1, need + WORKER_BYTES * (slots > 1), allowed, seconds)
+
+
+@dataclass
+class Tally:
+    """Counts over all tiles, cells inside the area asked for; ranked : tie points with labels, tile by tile."""
+
+    n_seen: int = 0
+    n_matched: int = 0
+    n_left_out: int = 0
+    evaluations: int = 0
+    all_images: int = 0
+    ranked: list[Any] = field(default_factory=list)
+
+    def add(self, product: TileProduct) -> None:
+        """Count a tile."""
+        quality = product.surface.quality
+        asked = (quality & np.uint16(Quality.OUTSIDE)) == 0
+        self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
+        is_matched = np.isfinite(product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
+        self.n_matched += int(is_matched.sum())
+        self.n_left_out += int((asked & ((quality & np.uint16(Quality.LEFT_OUT)) != 0)).sum())
+        self.evaluations += product.evaluations
+        self.all_images += product.all_images
+        if product.ranked is not None:
+            self.ranked.append(product.ranked)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the cells seen by two images or more whose height was matched."""
+        return self.n_matched / self.n_seen if self.n_seen else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """For run.json."""
+        return {
+            "evaluations": {"done": self.evaluations, "all_images": self.all_images},
+            "coverage": round(self.coverage, 6),
+            "left_out_cells": self.n_left_out,
+        }
+
+
+@dataclass(frozen=True)
+class Matching:
+    """What makes and keeps the tiles of a run."""
+
+    job: TileJob
+    tiles: Sequence[Tile]
+    store: TileStore
+    log: EventLog
+
+    def begin(self, plan: Plan) -> None:
+        """Write down what is going to be done; the log of a run that does not go on is a new one."""
+        if not self.store.finished:
+            self.log.remove()
+        self.log.add("began", **vars(plan), tiles_there=len(self.store.finished))
+
+    def check(self, failed: Sequence[Outcome], partial: bool) -> None:
+        """End the run where tiles failed, unless what is there is wanted all the same; nothing never is.
+
+        Raises
+        ------
+        StoppedError
+            Tiles failed; or all of them, for no reason that the input explains.
+        ZlocusError
+            All of them failed, for this reason.
+        """
+        if not failed:
+            return
+        self.log.add("stopped", failed=len(failed))
+        if not self.store.finished:
+            self.store.remove()
+            self.log.remove()
+            first = failed[0].failure
+            if first is not None and first.error is not None:
+                raise first.error
+            raise StoppedError(f"{self._not_all(failed)} Nothing was made.")
+        if not partial:
+            raise StoppedError(
+                f"{self._not_all(failed)} The others are kept in {self.store.folder}: give the same command again to "
+                "try those once more, or add --partial for a surface without them."
+            )
+
+    def end(self, failed: Sequence[Outcome], tally: Tally) -> None:
+        """The end of a run: tiles go where all are in the surface.
+
+        Raises
+        ------
+        StoppedError
+            Some failed, and are empty in it.
+        """
+        self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed))
+        if failed:
+            raise StoppedError(
+                f"{self._not_all(failed)} They are empty in the surface (FAILED in quality.tif): give the same command "
+                "again to try them once more."
+            )
+        self.store.remove()
+
+    def _not_all(self, failed: Sequence[Outcome]) -> str:
+        said = [
+            f"{place_of(self.job.settled, outcome.task.core)}: {_reason(outcome.failure)}" for outcome in failed[:NAMED]
+        ]
+        more = f"; and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
+        return f"{len(failed)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
+
+    def run(self, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: Elsewhere) -> list[Outcome]:
+        """Make every tile that is not there yet; the outcomes of those that failed.
+
+        Raises
+        ------
+        StoppedError
+            Tiles cannot be written.
+        """
+        worked = [tile for tile in self.tiles if tile.core.rows and tile.core.cols]
+        todo = [tile for tile in worked if not self.store.holds(name_of(tile))]
+        failed: list[Outcome] = []
+        with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
+            if len(todo) < len(worked):
+                progress.note(f"{len(worked) - len(todo)} of {len(worked)} tiles are there already.")
+                self.log.add("resumed", tiles_there=len(worked) - len(todo))
+                stage.advance(len(worked) - len(todo))
+            if ready is not None:
+                with self._interruption(progress):
+                    for outcome in run_tasks(ready, todo):
+                        self._took(outcome, stage, elsewhere, is_elsewhere=not isinstance(ready, Here))
+                        if outcome.failure is not None and outcome.is_final:
+                            failed.append(outcome)
+        return failed
+
+    def _took(self, outcome: Outcome, stage: Stage, elsewhere: Elsewhere, is_elsewhere: bool) -> None:
+        tile: Tile = outcome.task
+        record = {
+            "tile": name_of(tile), "worker": outcome.worker, "attempt": outcome.attempt,
+            "wall_s": round(outcome.wall_s, 3), "cpu_s": round(outcome.cpu_s, 3), "peak_mb": round(outcome.peak_mb, 1),
+        }  # fmt: skip
+        if is_elsewhere:
+            elsewhere.cpu_s += outcome.cpu_s
+            elsewhere.peak_mb = max(elsewhere.peak_mb, outcome.peak_mb)
+        if outcome.failure is None:
+            self.store.keep(name_of(tile), outcome.result.arrays())
+            self.log.add("tile", **record)
+        else:
+            again = {} if outcome.is_final else {"again": True}
+            trace = {"trace": outcome.failure.trace} if outcome.failure.trace else {}
+            failure = {"cause": str(outcome.failure.cause), "reason": outcome.failure.reason}
+            self.log.add("tile failed", **record, **failure, **again, **trace)
+        if outcome.is_final:
+            stage.advance()
+        if outcome.peak_mb:
+            stage.tell(f"{outcome.peak_mb / 1e3:.1f} GB")
+
+    @contextmanager
+    def _interruption(self, progress: Progress) -> Iterator[None]:
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.log.add("interrupted", tiles_done=len(self.store.finished))
+            done = f"{len(self.store.finished)} of {len(self.tiles)} tiles"
+            progress.note(f"{done} are finished and kept: the same command goes on from there.")
+            raise
+
+    def assemble(self, failed: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress) -> None:
+        """Write all tiles, those that failed as empty, in their order, so that nothing depends on that of making.
+
+        Raises
+        ------
+        StoppedError
+            A tile that was finished is damaged.
+        """
+        lost = {outcome.task for outcome in failed}
+        with progress.stage("Writing", len(self.tiles)) as stage:
+            for tile in self.tiles:
+                product = self._failed(tile) if tile in lost else self._finished(tile)
+                tally.add(product)
+                window = self.job.grid.window
+                rasters.write(tile.kept.row - window.row, tile.kept.col - window.col, product.surface)
+                stage.advance()
+
+    def _finished(self, tile: Tile) -> TileProduct:
+        if not (tile.core.rows and tile.core.cols):
+            return self.job.product(tile, TileResult(Surface.nothing(tile.core, self._bands)))
+        arrays = self.store.load(name_of(tile))
+        if arrays is None:
+            raise StoppedError(
+                f"{self.store.folder / name_of(tile)}.npz was damaged since it was written. Give the same command "
+                "again: that tile is made anew."
+            )
+        return TileProduct.of(arrays)
+
+    def _failed(self, tile: Tile) -> TileProduct:
+        nothing = Surface.nothing(tile.kept, self._bands)
+        failed = replace(nothing, quality=np.full_like(nothing.quality, Quality.FAILED))
+        return self.job.product(tile, TileResult(failed.part(tile.core, tile.kept)))
+
+    @property
+    def _bands(self) -> tuple[int, ...]:
+        return (3,) if self.job.settled.has_colours else ()
+
+
+def workers_for(
+    plan: Plan, make: Callable[[Tile], TileProduct], is_here: bool = False
+) -> AbstractContextManager[Workers]:
+    """Where the tiles of a plan are made. is_here : in this process, whatever the plan, for `make` holds too much."""
+    if plan.processes and not is_here:
+        return Processes(make, plan.slots)
+    return nullcontext(Here(make))
+
+
+def name_of(tile: Tile) -> str:
+    """A tile's name: row and column of its first kept cell on the scene's lattice."""
+    return f"{tile.kept.row}_{tile.kept.col}"
+
+
+def place_of(settled: MatchScene, core: CellWindow) -> str:
+    """Where a tile lies."""
+    transform = settled.transform(core, 0)
+    (west, north), (east, south) = transform * (0, 0), transform * (core.cols, core.rows)
+    return f"E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
+
+
+def _reason(failure: Failure | None) -> str:
+    assert failure is not None, "of those that failed"
+    if failure.trace:
+        return f"{failure.reason} (a fault of zlocus, not of the input: report it with what {NAME} says of it)"
+    return failure.reason

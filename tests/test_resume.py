@@ -1,0 +1,276 @@
+"""Runs that are killed, interrupted, starved or robbed of their inputs: nothing is lost, and the bytes are the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+import zlocus.job
+from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, read, run
+from zlocus.errors import GeometryError, OutputError, StoppedError
+from zlocus.execution.engine import ATTEMPTS
+from zlocus.execution.store import DONE, FOLDER
+from zlocus.surface.reasons import Quality
+
+RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
+STOPS_WITHIN_S = 5.0
+KILLS = 10
+SEED = 20261122
+
+
+@pytest.fixture(scope="module")
+def straight(images, tmp_path_factory):
+    """The surface of a run that nothing happens to, in tiles of 64 cells."""
+    return run(images("sine"), tmp_path_factory.mktemp("straight") / "out", SMALL_TILES, workers=1, report=False).out
+
+
+def same(out, straight):
+    return all((out / f"{name}.tif").read_bytes() == (straight / f"{name}.tif").read_bytes() for name in RASTERS)
+
+
+def command(images, out, folder, *more):
+    """The same as a command line."""
+    options = folder / "options.toml"
+    options.write_text("[pyramid]\ntile = 64\n")
+    asked = ["--crs", "EPSG:32632", "--resolution", "0.5", "--heights", *map(str, HEIGHTS), "--no-report"]
+    words = ["dsm", *map(str, images.inputs), "-o", str(out), *asked, "--config", str(options), *more]
+    return [sys.executable, "-m", "zlocus", *words]
+
+
+def started(words):
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def below(pid):
+    """All processes that a process has started."""
+    try:
+        return psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+def n_finished(out):
+    done = out / FOLDER / DONE
+    return len(done.read_bytes().splitlines()) if done.exists() else 0
+
+
+def wait_until(condition, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited for too long"
+        time.sleep(0.01)
+
+
+def wait_for_tiles(out, wanted, process):
+    wait_until(lambda: process.poll() is not None or n_finished(out) >= wanted)
+
+
+def test_killed_at_random_moments(images, straight, tmp_path):
+    """SIGKILL, ten times: each time at another moment of the time that is left; what is there then is taken on."""
+    out, rng = tmp_path / "out", random.Random(SEED)
+    for _ in range(KILLS):
+        process = started(command(images("sine"), out, tmp_path, "--workers", "2"))
+        before, wanted = n_finished(out), rng.choice([0, 0, 1, 2])
+        wait_for_tiles(out, before + wanted, process)
+        time.sleep(rng.uniform(0.0, 1.0))
+        children = below(process.pid)
+        process.kill()
+        process.communicate()
+        assert n_finished(out) >= before or (out / "run.json").exists()
+        _, alive = psutil.wait_procs(children, STOPS_WITHIN_S)
+        assert not alive
+        if (out / "run.json").exists() and not (out / FOLDER).exists():
+            break
+    # Done already, or taken on.
+    if (out / FOLDER).exists() or not (out / "run.json").exists():
+        last = subprocess.run(command(images("sine"), out, tmp_path), capture_output=True, text=True, check=False)
+        assert last.returncode == 0, last.stderr
+    assert same(out, straight)
+    assert not (out / FOLDER).exists()
+    assert not [path.name for path in out.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_interrupt_stops_within_seconds_and_is_taken_on(images, straight, tmp_path, workers):
+    out = tmp_path / "out"
+    process = started(command(images("sine"), out, tmp_path, "--workers", str(workers)))
+    wait_for_tiles(out, 2, process)
+    start = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=STOPS_WITHIN_S)
+    assert time.monotonic() - start < STOPS_WITHIN_S
+    assert process.returncode == 130
+    assert "tiles are finished and kept: the same command goes on from there" in stderr
+    n = n_finished(out)
+    again = subprocess.run(command(images("sine"), out, tmp_path), capture_output=True, text=True, check=True)
+    assert f"{n} of " in again.stderr
+    assert "tiles are there already" in again.stderr
+    assert same(out, straight)
+    events = events_of(out)
+    assert [e["event"] for e in events if e["event"] != "tile"] == ["began", "interrupted", "began", "resumed", "ended"]
+    assert len({e["tile"] for e in events if e["event"] == "tile"}) == sum(e["event"] == "tile" for e in events)
+
+
+def events_of(out):
+    return [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+
+
+def failing(monkeypatch, error, where=CENTRE):
+    """Makes the tile that holds a place fail."""
+    match = zlocus.job.match_tile
+
+    def fail(scene, core, *given):
+        west, north = scene.transform(core, 0) * (0, 0)
+        if west <= where[0] < west + core.cols * 0.5 and north - core.rows * 0.5 < where[1] <= north:
+            raise error
+        return match(scene, core, *given)
+
+    monkeypatch.setattr(zlocus.job, "match_tile", fail)
+
+
+@pytest.mark.parametrize(
+    ("error", "says", "attempts"),
+    [
+        (IndexError("index 7 is out of bounds"), "IndexError: index 7 is out of bounds (a fault of zlocus", 1),
+        (MemoryError(), "it does not fit into memory", ATTEMPTS),
+        (OSError(5, "Input/output error"), "Input/output error", ATTEMPTS),
+    ],
+)
+def test_a_tile_that_fails_costs_no_other(images, straight, tmp_path, monkeypatch, error, says, attempts):
+    out = tmp_path / "out"
+    failing(monkeypatch, error)
+    with pytest.raises(StoppedError, match="1 of 9 tiles failed: E 461990 to 462022 m, N 5246984 to 5247016 m") as stop:
+        run(images("sine"), out, SMALL_TILES, workers=1, report=False)
+    assert says in str(stop.value)
+    assert stop.value.exit_status == 3
+    assert not (out / "dsm.tif").exists()
+    assert n_finished(out) == 8
+    # The surface without it.
+    with pytest.raises(StoppedError, match=r"They are empty in the surface \(FAILED in quality\.tif\)"):
+        run(images("sine"), out, SMALL_TILES, workers=1, report=False, partial=True)
+    quality, whole = read(out / "quality.tif")[0], read(straight / "quality.tif")[0]
+    lost = quality == int(Quality.FAILED)
+    assert 1000 < lost.sum() <= 64 * 64
+    np.testing.assert_array_equal(quality[~lost], whole[~lost])
+    assert np.isnan(read(out / "dsm.tif")[0][lost]).all()
+    failed = [
+        e for e in map(json.loads, (out / "events.jsonl").read_text().splitlines()) if e["event"] == "tile failed"
+    ]
+    assert len(failed) == 2 * attempts
+    # And with it, once it can be made.
+    monkeypatch.undo()
+    run(images("sine"), out, SMALL_TILES, workers=1, report=False)
+    assert same(out, straight)
+
+
+def test_where_no_tile_is_made_nothing_is_left(images, tmp_path, monkeypatch):
+    def fail(*_):
+        raise GeometryError("too bent.")
+
+    monkeypatch.setattr(zlocus.job, "match_tile", fail)
+    for partial in (False, True):
+        with pytest.raises(GeometryError, match="too bent"):
+            run(images("sine"), tmp_path / "out", SMALL_TILES, partial=partial)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_tile_is_made_again(images, straight, tmp_path, monkeypatch):
+    out = stopped(images, tmp_path, monkeypatch)
+    tiles = sorted((out / FOLDER).glob("*.npz"))
+    content = bytearray(tiles[0].read_bytes())
+    content[len(content) // 2] ^= 1
+    tiles[0].write_bytes(content)
+    tiles[1].write_bytes(tiles[1].read_bytes()[:-1])
+    tiles[2].unlink()
+    run(images("sine"), out, SMALL_TILES, report=False)
+    assert same(out, straight)
+
+
+def stopped(images, tmp_path, monkeypatch):
+    """A run of which a tile is not there."""
+    failing(monkeypatch, IndexError("planted"))
+    with pytest.raises(StoppedError):
+        run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
+    monkeypatch.undo()
+    return tmp_path / "out"
+
+
+def test_what_was_changed_meanwhile_is_said(images, tmp_path, monkeypatch):
+    scene = images("sine")
+    copied = tuple(Path(shutil.copy(path, tmp_path)) for path in scene.inputs)
+    failing(monkeypatch, IndexError("planted"))
+    with pytest.raises(StoppedError):
+        run(copied, tmp_path / "out", SMALL_TILES, report=False)
+    monkeypatch.undo()
+    n = n_finished(tmp_path / "out")
+    with pytest.raises(OutputError, match=r"holds 8 finished tiles of another run: request\.heights was"):
+        run(copied, tmp_path / "out", SMALL_TILES, heights=(20.0, 80.0))
+    with pytest.raises(OutputError, match=r"options\.pyramid\.tile was 64 there and is"):
+        run(copied, tmp_path / "out")
+    os.utime(copied[1])
+    with pytest.raises(OutputError, match=rf"{copied[1].name} has changed since"):
+        run(copied, tmp_path / "out", SMALL_TILES)
+    assert n_finished(tmp_path / "out") == n
+    # What changes no tile is no other run.
+    run(copied, tmp_path / "out", SMALL_TILES, overwrite=True, products=("hillshade",), report=False)
+    assert not (tmp_path / "out" / FOLDER).exists()
+
+
+def test_an_image_that_disappears(images, tmp_path, monkeypatch):
+    """After the third tile: all others need it, and are named; what is done is kept."""
+    copied = tuple(Path(shutil.copy(path, tmp_path)) for path in images("sine").inputs)
+    match, made = zlocus.job.match_tile, []
+
+    def robbed(*given):
+        made.append(given)
+        if len(made) == 4:
+            copied[0].rename(tmp_path / "elsewhere")
+        return match(*given)
+
+    monkeypatch.setattr(zlocus.job, "match_tile", robbed)
+    with pytest.raises(StoppedError, match=rf"6 of 9 tiles failed: .*There is no image .*{copied[0].name}"):
+        run(copied, tmp_path / "out", SMALL_TILES, report=False)
+    assert n_finished(tmp_path / "out") == 3
+    (tmp_path / "elsewhere").rename(copied[0])
+    run(copied, tmp_path / "out", SMALL_TILES, report=False)
+    assert same(tmp_path / "out", run(copied, tmp_path / "straight", SMALL_TILES, report=False).out)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full or a small tmpfs")
+def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
+    """After some tiles there is no room for the next: those are kept, and the run goes on when there is."""
+    import zlocus.execution.store as store
+
+    write, written = store.write_whole, []
+
+    def until_full(path, content):
+        if path.suffix == ".npz":
+            written.append(path)
+            if len(written) > 4:
+                with Path("/dev/full").open("wb", buffering=0) as full:
+                    full.write(content)
+        write(path, content)
+
+    monkeypatch.setattr(store, "write_whole", until_full)
+    with pytest.raises(StoppedError, match=r"No space left on device\. 4 finished tiles are kept; make room"):
+        run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
+    assert n_finished(tmp_path / "out") == 4
+    monkeypatch.undo()
+    run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
+    assert same(tmp_path / "out", straight)
+
+
+@pytest.mark.parametrize("asked", [{"workers": 2}, {"workers": 3, "memory_gb": 2.0}, {"workers": None}])
+def test_the_same_bytes_however_many_work(images, straight, tmp_path, asked):
+    assert same(run(images("sine"), tmp_path / "out", SMALL_TILES, report=False, **asked).out, straight)
