@@ -142,6 +142,16 @@ def test_degrees_beside_a_file_without_crs_are_refused(tmp_path):
     assert evaluate(bare, bare, margin_m=2).all.rmse == 0
 
 
+def test_coordinates_compared_as_they_are_are_said(tmp_path):
+    bare, placed = (write(tmp_path / f"{n}.tif", rolling(*grid(80)), crs=crs) for n, crs in (("b", None), ("p", CRS)))
+    for pair, says in (((placed, bare), f"{bare} has"), ((bare, placed), f"{bare} has"), ((bare, bare), "have")):
+        result = evaluate(*pair, margin_m=2)
+        line = f"{says} no CRS: coordinates were compared as they are"
+        assert line in evaluation_table(result)
+        assert line in result.as_dict()["places_assumed"]
+    assert evaluate(placed, placed, margin_m=2).as_dict()["places_assumed"] is None
+
+
 def test_a_local_map_beside_one_of_the_earth_is_refused(tmp_path):
     local = 'LOCAL_CS["site",UNIT["metre",1]]'
     site, earth = (write(tmp_path / f"{n}.tif", rolling(*grid(80)), crs=crs) for n, crs in (("s", local), ("e", CRS)))
@@ -269,6 +279,24 @@ def test_heights_in_feet_are_refused(tmp_path):
     feet = flat(tmp_path / "feet.tif", 1, "EPSG:32632+6360")
     with pytest.raises(InputError, match=r"feet\.tif are in US survey foot\. Convert them to metres"):
         evaluate(feet, feet)
+
+
+@pytest.mark.parametrize("unit", ["ft", "feet", "us-ft", "US survey foot", "international foot", "Foot", "cm"])
+def test_heights_whose_unit_is_no_metre_are_refused(tmp_path, unit):
+    feet, metres = flat(tmp_path / "feet.tif", 1), flat(tmp_path / "metres.tif", 1)
+    with rasterio.open(feet, "r+") as file:
+        file.units = (unit,)
+    for pair in ((feet, metres), (metres, feet)):
+        with pytest.raises(InputError, match=rf"feet\.tif are in {unit}\. Convert them to metres"):
+            evaluate(*pair)
+
+
+@pytest.mark.parametrize("unit", ["", "m", "metre", "Meters", "1", "elevation", "m asl"])
+def test_other_units_are_metres(tmp_path, unit):
+    path = flat(tmp_path / "metres.tif", 1)
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    assert evaluate(path, path, margin_m=2).all.rmse == 0
 
 
 def test_real_heights_above_a_geoid_in_degrees(tmp_path, shared_data):

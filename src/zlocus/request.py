@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -409,19 +409,21 @@ def _check_positive(name: str, value: float | None, unit: str) -> None:
         raise ConfigError(f"{name} {value:g} is not a size. Give a number of {unit} above 0.")
 
 
-def check_output(out: Path, overwrite: bool) -> None:
+def check_output(out: Path, overwrite: bool, files: Sequence[str] | None = None, what: str = "run") -> None:
     """Make sure, before any work, that a run may write to `out`; leaves the disk as it was.
+
+    files : that tell of another one, None for those of runs; what : it is, for messages.
 
     Raises
     ------
     OutputError
-        `out` is a file, cannot be written, or holds another run and `overwrite` is False.
+        `out` is a file, cannot be written, or holds another one and `overwrite` is False.
     """
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")
-    held = [name for name in RUN_FILES if (out / name).exists()]
+    held = [name for name in (RUN_FILES if files is None else files) if (out / name).exists()]
     if held and not overwrite:
-        raise OutputError(f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite.")
+        raise OutputError(f"{out} holds another {what} ({', '.join(held)}). Choose another folder, or add --overwrite.")
     parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     try:
         # Only an attempt tells for sure: permission bits say nothing of read-only disks.

@@ -19,6 +19,7 @@ from rasterio.windows import Window
 
 from zlocus.errors import InputError
 from zlocus.io.crs import checked_crs, known_crs, raster_crs
+from zlocus.io.heights import check_unit, is_fill
 from zlocus.io.opening import existing_file, open_raster
 from zlocus.io.vertical import VerticalDatum, check_heights, grid_crs, vertical_datum, vertical_datum_of
 
@@ -62,6 +63,7 @@ def read_dem(path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None) 
     with open_raster(path, "DEM") as source:
         crs = raster_crs(source, path)
         check_heights(crs, path)
+        check_unit(source.units[0], path)
         heights = _resampled(source, crs.to_2d(), geobox)
     if not np.isfinite(heights).any():
         raise InputError(
@@ -149,6 +151,7 @@ def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDAr
         return out
     window = Window(low[0], low[1], high[0] - low[0], high[1] - low[1])
     stored = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
+    stored[is_fill(stored)] = np.nan
     heights = (stored * source.scales[0] + source.offsets[0]).astype(np.float32)
     reproject(
         heights, out, src_transform=source.window_transform(window), src_crs=crs.to_wkt(), src_nodata=np.nan,
