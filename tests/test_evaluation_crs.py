@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyproj
 import pytest
@@ -214,11 +216,21 @@ def test_a_geoid_is_added_to_what_is_above_it(tmp_path):
     assert evaluate(ellipsoidal, plain, geoid=up, margin_m=2).all.median == pytest.approx(0.3, abs=HEIGHT_TOLERANCE_M)
 
 
+def test_a_geoid_may_be_named_in_capitals(tmp_path, monkeypatch):
+    monkeypatch.setattr("zlocus.io.vertical.proj_folders", lambda: [tmp_path])
+    geoid(tmp_path / "us_nga_egm96_15.tif", 45.0)
+    above, ellipsoidal = flat(tmp_path / "above.tif", 100, EGM96), flat(tmp_path / "ellipsoidal.tif", 145.3)
+    result = evaluate(ellipsoidal, above, geoid=Path("EGM96"), margin_m=2)
+    assert result.all.median == pytest.approx(0.3, abs=HEIGHT_TOLERANCE_M)
+
+
 def test_a_geoid_that_does_not_help_is_refused(tmp_path):
     up = geoid(tmp_path / "geoid.tif")
     one, other, third = (flat(tmp_path / f"{n}.tif", 1, crs) for n, crs in (("a", EGM96), ("b", EGM96), ("c", EGM2008)))
     with pytest.raises(ConfigError, match=r"geoid\.tif is not needed: .* both above EGM96 height"):
         evaluate(one, other, geoid=up)
+    with pytest.raises(ConfigError, match="--geoid Ellipsoid is no geoid"):
+        evaluate(flat(tmp_path / "p.tif", 1), one, geoid=Path("Ellipsoid"))
     with pytest.raises(InputError, match="one geoid is not enough"):
         evaluate(one, third, geoid=up)
     plain = flat(tmp_path / "p.tif", 1)

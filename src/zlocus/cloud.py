@@ -13,7 +13,6 @@ from pyproj import CRS
 
 from zlocus.errors import CoverageError
 from zlocus.io.colour import read_colours
-from zlocus.io.config import config_as_dict
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
 from zlocus.matching.confirm import ROWS_AT_ONCE
@@ -30,7 +29,7 @@ from zlocus.per_image import (
 )
 from zlocus.preparing import AREA_MARGIN, asked_crs, made_folder, what_was_applied, with_heights
 from zlocus.products.cloud import PointCloud, file_names, write_map
-from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import CloudRequest
 from zlocus.scene import Scene, View, is_local
@@ -93,10 +92,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     write_record(
         request.out / "run.json",
         {
-            "config": {"request": request_record(request), "options": config_as_dict(options)},
-            "versions": versions_record(),
-            "inputs": inputs_record(dict.fromkeys([*request.inputs, *files, *vertical.files])),
-            "stages": watch.stages,
+            **made_record(request, options, [*files, *vertical.files], watch),
             "orientation": ready.orientation.as_dict(),
             "vertical": vertical.as_dict(),
             "images": {name: image_record(m) for name, m in zip(references, matched, strict=True)},
@@ -193,10 +189,3 @@ def image_record(one: Matched) -> dict[str, Any]:
         span = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
         return record | {"disparities_px": [round(v, 3) for v in span], "disparity_times_depth_px_m": rays.scale}
     return record | {"step_m": scene.step_m * getattr(rays, "unit", 1.0)}
-
-
-def request_record(request: CloudRequest) -> dict[str, Any]:
-    """The request as JSON can hold it."""
-    record = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
-    record["inputs"] = [str(path) for path in request.inputs]
-    return record

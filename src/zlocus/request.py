@@ -33,7 +33,7 @@ class DsmRequest:
     heights : (zmin, zmax), m, above what `vertical` says. dem : raster the heights are searched around; dem_vertical :
     what its heights are above, as `vertical`, None is what its CRS says.
     reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
-    vertical : what the heights written are above: one of `VERTICALS`, or the file of a geoid.
+    vertical : what the heights written are above: one of `VERTICALS`, in capitals too, or the file of a geoid.
     memory_gb : most memory the tiles may take together, GB.
     partial : a surface with too few heights counts as a success. products : maps made of the surface, see `PRODUCTS`.
     report : whether report.html is made.
@@ -380,7 +380,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def _check_vertical(name: str, value: str) -> None:
-    if value not in VERTICALS and not Path(value).is_file():
+    if value.lower() not in VERTICALS and not Path(value).is_file():
         raise ConfigError(
             f"--{name} {value} is neither {', '.join(VERTICALS)} nor the file of a geoid. Check the name."
         )

@@ -21,12 +21,20 @@ from zlocus.errors import InputError
 from zlocus.io.crs import checked_crs, known_crs, raster_crs
 from zlocus.io.heights import check_unit, is_fill
 from zlocus.io.opening import existing_file, open_raster
-from zlocus.io.vertical import VerticalDatum, check_heights, grid_crs, vertical_datum, vertical_datum_of
+from zlocus.io.vertical import (
+    OWN_ELLIPSOIDAL,
+    VerticalDatum,
+    check_heights,
+    grid_crs,
+    vertical_datum,
+    vertical_datum_of,
+    vertical_part,
+)
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200
 # No extent on the Earth, in any unit, is larger.
-FARTHEST = 1e9
+WIDEST_EXTENT = 1e9
 
 
 def read_geobox(path: Path) -> GeoBox:
@@ -86,6 +94,14 @@ def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
         return vertical_datum_of(raster_crs(source, path), path, "--dem-vertical")
 
 
+def says_nothing(path: Path) -> bool:
+    """Whether neither the CRS of a DEM nor its band's description, where it was made here, says what its heights are
+    above."""
+    with open_raster(path, "DEM") as source:
+        crs, description = raster_crs(source, path), source.descriptions[0]
+    return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != OWN_ELLIPSOIDAL
+
+
 def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...) in another CRS. (n,) of shapely's.
 
@@ -121,7 +137,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
     west, south, east, north = shapely.total_bounds(polygons)
     largest = max(east - west, north - south)
-    if not (0 < largest < FARTHEST and np.isfinite(shapely.get_coordinates(polygons)).all()):
+    if not (0 < largest < WIDEST_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
         raise InputError(
             f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
         )
