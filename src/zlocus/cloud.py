@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import CoverageError
@@ -33,6 +34,7 @@ from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import CloudRequest
 from zlocus.scene import Scene, View, is_local
+from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rays import DepthRays
 from zlocus.surface.behind import filled_from_behind
 from zlocus.surface.reasons import Quality
@@ -129,11 +131,24 @@ def write_cloud(out: Path, matched: Sequence[Matched], scene: Scene, vertical: V
             for row, rows in strips(len(height)):
                 known = np.isfinite(height[row : row + rows])
                 if known.any():
-                    xyz = one.image.space.ground(row, height[row : row + rows])[known]
+                    part = slice(row, row + rows)
+                    xyz = one.image.space.ground(row, height[part])[known]
                     xyz[:, 2] -= vertical.undulation(xyz[:, :2], scene.crs)
                     share = np.clip(read_colours(view.path, row, rows)[known] / white, 0.0, 1.0)
-                    cloud.write(number[view.name], xyz, np.rint(share * 65535.0).astype(np.uint16))
+                    rgb = np.rint(share * 65535.0).astype(np.uint16)
+                    sigma_m = precision_m(one, row, known)
+                    cloud.write(number[view.name], xyz, rgb, sigma_m, one.surface.views[part][known])
     return n_points
+
+
+def precision_m(one: Matched, row: int, known: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviations (n,) m of some pixels of the rows from `row` on: of height, or along the rays of cameras that
+    are asked for depths. known : (r, c)."""
+    rows, cols = np.nonzero(known)
+    part = slice(row, row + len(known))
+    z, sigma = one.image.height[part][known], one.surface.sigma[part][known]
+    xy = np.column_stack([cols, rows + row]).astype(float)
+    return np.asarray(sigma * one.image.space.rays.metres_per_unit(xy, z.astype(float)))
 
 
 def strips(n_rows: int) -> Iterator[tuple[int, int]]:
