@@ -54,6 +54,9 @@ CITY_BARS = {
     "two": {"all": 0.925, "building": 0.72, "nmad": 0.25},
 }
 HILLS_NMAD_BAR_M = 0.16
+# Of the ortho-image of a town: share of a class that shows what hides it. Grey values tell which image a cell shows, so
+# they must be the image's own.
+HIDDEN_BARS, OWN_LEVELS = {"ground": 0.005}, '[products]\northo_levels = "own"\n'
 # Two ground pixels of the demo's line scanner, and shares of its surfaces within them.
 TWO_PIXELS_M, DEMO_BARS = 0.42, {"ground": 0.97, "building": 0.85}
 # A town of more than 4 M cells at 0.5 m, and CPU seconds per million cells that it may take.
@@ -396,10 +399,13 @@ def ortho(at: Workplace) -> list[Figure]:
     """The true ortho-image of the rendered town: cells that show what hides them."""
     scene = at.scene("rendered-city")
     images = rendered_images(scene)
-    run([ZLOCUS, "dsm", *images, "-o", at.out, "--resolution", 0.5, "--overwrite"])
+    options = at.out.with_suffix(".toml")
+    options.parent.mkdir(parents=True, exist_ok=True)
+    options.write_text(OWN_LEVELS)
+    run([ZLOCUS, "dsm", *images, "-o", at.out, "--resolution", 0.5, "--config", options, "--overwrite"])
     found = double_mapped(at.out, scene / "truth_dsm.tif", scene / "truth_class.tif", open_scene(images))
     return [
-        Figure(f"{kind} that shows what hides it{which}", share)
+        Figure(f"{kind} that shows what hides it{which}", share, at_most=HIDDEN_BARS.get(kind + which))
         for kind, shares in found.items()
         for which, share in zip(("", ", of right heights"), shares, strict=True)
     ]

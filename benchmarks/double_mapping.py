@@ -23,7 +23,8 @@ KINDS = {"ground": (0, 1), "building": (2,), "tree": (3,)}
 def double_mapped(folder: Path, truth: Path, classes: Path, scene: Scene) -> dict[str, tuple[float, float]]:
     """Share of the cells of a class whose source is hidden from them: of all, and of those with a right height.
 
-    folder : a result of `zlocus dsm`; truth, classes : the rendered scene's; scene : its images.
+    folder : a result of `zlocus dsm` with `products.ortho_levels = "own"`, for grey values tell the source; truth,
+    classes : the rendered scene's; scene : its images.
     """
     with rasterio.open(truth) as file:
         z_true, to_truth = file.read(1).astype(float), ~file.transform

@@ -16,6 +16,7 @@ import typer.main
 import yaml
 from typer.testing import CliRunner
 
+from las_format import check_laz
 from rendered_scenes import CENTRE, FIELD, GSD_M, HEIGHTS, LOOKS, QUIET, camera
 from zlocus import cloud, per_image
 from zlocus.cli import app
@@ -39,6 +40,8 @@ LEAST_WITHIN, LEAST_KEPT = 0.98, 0.9
 MEDIAN_M = 0.05
 LEAST_WITHIN_FRAMES = 0.96
 # The middle camera shares nearly all it sees, the outer ones about half.
+# Standard deviations are calibrated on scenes with more noise than these have.
+LEAST_SPREAD, MOST_SPREAD = 0.15, 1.2
 LEAST_FOUND = {"a": 0.4, "b": 0.85, "c": 0.4}
 RIG_HEIGHT_M, RIG_BASE_M, FOCAL_PX, RIG_SHAPE = 120.0, 30.0, 240.0, (140, 150)
 
@@ -64,7 +67,10 @@ def run(inputs, out, config=None, **asked):
 @pytest.fixture(scope="module")
 def of_step(images, tmp_path_factory):
     out = tmp_path_factory.mktemp("cloud") / "out"
-    return run(images("step").inputs, out, crs="EPSG:32632", heights=HEIGHTS)
+    with pytest.MonkeyPatch.context() as patch:
+        # Several strips.
+        patch.setattr(cloud, "ROWS_AT_ONCE", 40)
+        return run(images("step").inputs, out, crs="EPSG:32632", heights=HEIGHTS)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +137,31 @@ def test_the_cloud_holds_every_height_once(of_step):
     np.testing.assert_array_equal(points.red, points.blue)
 
 
+def spread(points, errors):
+    """NMAD of errors in their own standard deviations."""
+    ratio = errors / np.asarray(points["sigma_m"])
+    return 1.4826 * np.median(np.abs(ratio - np.median(ratio)))
+
+
+def test_points_say_how_precise_they_are_and_how_many_images_saw_them(of_step):
+    check_laz(of_step.out / "cloud.laz")
+    points = laspy.read(of_step.out / "cloud.laz")
+    names = sorted(LOOKS)
+    true = [true_height("step", camera(name), (150 - 3 * list(LOOKS).index(name), 150)) for name in names]
+    found = [np.isfinite(read(of_step.out / f"{name}_height.tif")) for name in names]
+    errors = np.asarray(points.z) - np.concatenate([z[at] for z, at in zip(true, found, strict=True)])
+    sigma_m, n_images = np.asarray(points["sigma_m"]), np.asarray(points["n_images"])
+    assert np.isfinite(sigma_m).all()
+    assert sigma_m.min() > 0
+    assert LEAST_SPREAD < spread(points, errors) < MOST_SPREAD
+    # Where they are said to be ten times less precise, they are worse.
+    poor = sigma_m > 10 * np.median(sigma_m)
+    assert poor.sum() > 500
+    assert np.percentile(np.abs(errors[poor]), 80) > 10 * np.percentile(np.abs(errors[~poor]), 80)
+    assert set(np.unique(n_images)) == {2, 3}
+    assert (n_images == 3).mean() > 0.9
+
+
 def test_points_are_seen_where_their_pixel_is(of_step):
     points = laspy.read(of_step.out / "cloud.laz")
     first = sorted(LOOKS).index("nadir") + 1
@@ -152,13 +183,14 @@ def test_run_json_holds_what_was_done(of_step):
 
 def test_frame_cameras_without_heights_given(rig, of_rig):
     """Depths from the ties, a local frame, colours, and gaps filled."""
-    n_own = 0
+    n_own, errors = 0, []
     for name, model in rig[1].items():
         truth = true_height("step", model, RIG_SHAPE)
         height, quality = (read(of_rig.out / f"{name}_{what}.tif") for what in ("height", "quality"))
         own = np.isfinite(height) & ((quality & Quality.FILLED) == 0) & np.isfinite(truth)
         error = (height - truth)[own]
         n_own += own.sum()
+        errors.append(error)
         assert own.mean() > LEAST_FOUND[name]
         assert (np.abs(error) < WITHIN_M).mean() > LEAST_WITHIN_FRAMES
         depth = read(of_rig.out / f"{name}_depth.tif")
@@ -172,6 +204,9 @@ def test_frame_cameras_without_heights_given(rig, of_rig):
     assert len(points) == of_rig.n_points == n_own
     assert np.median(points.green / points.red) == pytest.approx(0.5, abs=0.02)
     assert np.median(points.blue / points.red) == pytest.approx(0.25, abs=0.02)
+    check_laz(of_rig.out / "cloud.laz")
+    assert LEAST_SPREAD < spread(points, np.concatenate(errors)) < MOST_SPREAD
+    assert set(np.unique(points["n_images"])) == {2, 3}
 
 
 def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypatch):

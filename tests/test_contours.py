@@ -32,9 +32,9 @@ def written(folder, z, crs="EPSG:32632"):
     return folder / "dsm.tif"
 
 
-def drawn(folder, z, interval_m, crs="EPSG:32632"):
+def drawn(folder, z, interval_m, crs="EPSG:32632", **options):
     path = written(folder, z, crs)
-    write_contours(path, folder / "contours.gpkg", ProductOptions(contour_interval_m=interval_m))
+    write_contours(path, folder / "contours.gpkg", ProductOptions(contour_interval_m=interval_m, **options))
     meta, _, wkb, (elevation,) = pyogrio.raw.read(folder / "contours.gpkg", layer="contours")
     assert list(meta["fields"]) == ["elevation_m"]
     return meta, from_wkb(wkb), elevation
@@ -94,6 +94,41 @@ def test_lines_end_at_holes(tmp_path):
     np.testing.assert_allclose(rows, [[9, 0], [39, 20]], atol=PLACE_M)
 
 
+def pyramids(tops):
+    """Flat ground with pyramids one cell wide, on every side, of these heights: about each, lines are squares on their
+    corner, at height z with a side of (1 - z / top) times the root of two."""
+    z = np.zeros((9, 6 * len(tops)))
+    z[4, 3::6] = tops
+    return z
+
+
+def test_short_rings_are_left_out(tmp_path):
+    # Perimeters at 1 m of 4 * 2 ** 0.5 * (1 - 1 / top) cells: 2.83, 4.24, 5.09 and 5.60.
+    z = pyramids([2.0, 4.0, 10.0, 100.0])
+    for least, n in ((0, 4), (2.8, 4), (2.9, 3), (4.3, 2), (5.05, 2), (5.1, 1), (5.7, 0)):
+        _, _, elevation = drawn(tmp_path, z, 1.0, contour_least_cells=least)
+        assert np.sum(np.isclose(elevation, 1.0)) == n, least
+    # By default none of these is drawn, nor a ring about five cells in a row, but one about six.
+    for end, lengths in ((7, []), (8, [2 * 5 + 2 * 2**0.5])):
+        z[2:end, 3] = 2.0
+        _, lines, elevation = drawn(tmp_path, z, 1.0)
+        found = [line.length / CELL_M for line in lines[np.isclose(elevation, 1.0)]]
+        assert found == pytest.approx(lengths, abs=1e-3)
+
+
+def test_short_lines_that_end_at_the_rim_or_a_hole_stay(tmp_path):
+    z = pyramids([4.0])
+    z[4, 4:] = np.nan
+    _, lines, elevation = drawn(tmp_path, z, 2.0)
+    (line,) = lines[np.isclose(elevation, 2.0)]
+    assert not is_closed(line)
+    assert line.length / CELL_M == pytest.approx(2**0.5, abs=1e-3)
+
+
+def is_ring_below(line, least_cells):
+    return (line[0] == line[-1]).all() and np.hypot(*np.diff(line, axis=0).T).sum() < least_cells
+
+
 def same(one, other):
     assert [level for level, _ in one] == [level for level, _ in other]
     for (_, a), (_, b) in zip(one, other, strict=True):
@@ -138,6 +173,7 @@ def test_strips_leave_no_seam(tmp_path_factory, seed, holes, whole_metres):
         assert whole
         for rows in (1, 2, 7, 40):
             same(list(contours(heights, 1.0, rows)), whole)
+            same(list(contours(heights, 1.0, rows, 12.0)), [one for one in whole if not is_ring_below(one[1], 12.0)])
 
 
 def test_the_default_interval_suits_the_relief(tmp_path):

@@ -74,11 +74,21 @@ def test_missing_cells_count_against_completeness_and_within(tmp_path, hills):
     assert result.all.rmse == 0
 
 
-@pytest.mark.parametrize("nodata", [-9999.0, None])
-def test_nodata_is_no_height(tmp_path, hills, nodata):
+@pytest.mark.parametrize(
+    ("empty", "nodata"),
+    [
+        (-9999.0, -9999.0),
+        (-9999.0, None),
+        (-9999.0, -1.0),
+        (-32767.0, None),
+        (-32768.0, None),
+        (np.finfo("f4").min, None),
+    ],
+)
+def test_nodata_is_no_height(tmp_path, hills, empty, nodata):
     truth = hills(*grid(60))
     dsm = truth.copy()
-    dsm[:, 30:] = -9999.0 if nodata else -32767.0
+    dsm[:, 30:] = empty
     result = evaluate(write(tmp_path / "d.tif", dsm, nodata=nodata), write(tmp_path / "t.tif", truth), margin_m=0)
     assert result.all.completeness == pytest.approx(0.5, abs=0.02)
 
@@ -199,10 +209,25 @@ def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
         assert "\n" not in str(caught.value)
 
 
+def test_undeclared_fills_of_whole_numbers_with_a_scale(tmp_path):
+    stored = np.full((80, 80), 350, np.int16)
+    stored[:20] = -32768
+    scaled = write(tmp_path / "scaled.tif", stored)
+    with rasterio.open(scaled, "r+") as file:
+        file.scales = (0.1,)
+    result = evaluate(scaled, write(tmp_path / "r.tif", np.full((80, 80), 35, np.float32)), margin_m=0)
+    assert (result.all.completeness, result.all.rmse) == (0.75, pytest.approx(0, abs=1e-5))
+
+
 def test_an_empty_surface_is_judged_not_refused(tmp_path, hills):
     good = write(tmp_path / "good.tif", hills(*grid(80)))
     empty = write(tmp_path / "empty.tif", np.full((80, 80), np.nan, np.float32))
     result = evaluate(empty, good)
+    lines = evaluation_table(result).splitlines()
+    assert "no error is known: nowhere do surface and reference both have a height" in lines
+    assert "MVS3DM (single cells): completeness 0.00 %, median error -" in lines
+    assert "nan" not in "\n".join(lines[1:])
+    assert "no error is known" not in evaluation_table(evaluate(good, good))
     assert result.all.completeness == 0.0
     assert evaluation_table(result).splitlines()[1].split()[-1] == "-"
     assert (result.mvs3dm.completeness, result.as_dict()["mvs3dm_median_error"]) == (0.0, None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyproj
 import pytest
@@ -142,6 +144,16 @@ def test_degrees_beside_a_file_without_crs_are_refused(tmp_path):
     assert evaluate(bare, bare, margin_m=2).all.rmse == 0
 
 
+def test_coordinates_compared_as_they_are_are_said(tmp_path):
+    bare, placed = (write(tmp_path / f"{n}.tif", rolling(*grid(80)), crs=crs) for n, crs in (("b", None), ("p", CRS)))
+    for pair, says in (((placed, bare), f"{bare} has"), ((bare, placed), f"{bare} has"), ((bare, bare), "have")):
+        result = evaluate(*pair, margin_m=2)
+        line = f"{says} no CRS: coordinates were compared as they are"
+        assert line in evaluation_table(result)
+        assert line in result.as_dict()["places_assumed"]
+    assert evaluate(placed, placed, margin_m=2).as_dict()["places_assumed"] is None
+
+
 def test_a_local_map_beside_one_of_the_earth_is_refused(tmp_path):
     local = 'LOCAL_CS["site",UNIT["metre",1]]'
     site, earth = (write(tmp_path / f"{n}.tif", rolling(*grid(80)), crs=crs) for n, crs in (("s", local), ("e", CRS)))
@@ -204,11 +216,21 @@ def test_a_geoid_is_added_to_what_is_above_it(tmp_path):
     assert evaluate(ellipsoidal, plain, geoid=up, margin_m=2).all.median == pytest.approx(0.3, abs=HEIGHT_TOLERANCE_M)
 
 
+def test_a_geoid_may_be_named_in_capitals(tmp_path, monkeypatch):
+    monkeypatch.setattr("zlocus.io.vertical.proj_folders", lambda: [tmp_path])
+    geoid(tmp_path / "us_nga_egm96_15.tif", 45.0)
+    above, ellipsoidal = flat(tmp_path / "above.tif", 100, EGM96), flat(tmp_path / "ellipsoidal.tif", 145.3)
+    result = evaluate(ellipsoidal, above, geoid=Path("EGM96"), margin_m=2)
+    assert result.all.median == pytest.approx(0.3, abs=HEIGHT_TOLERANCE_M)
+
+
 def test_a_geoid_that_does_not_help_is_refused(tmp_path):
     up = geoid(tmp_path / "geoid.tif")
     one, other, third = (flat(tmp_path / f"{n}.tif", 1, crs) for n, crs in (("a", EGM96), ("b", EGM96), ("c", EGM2008)))
     with pytest.raises(ConfigError, match=r"geoid\.tif is not needed: .* both above EGM96 height"):
         evaluate(one, other, geoid=up)
+    with pytest.raises(ConfigError, match="--geoid Ellipsoid is no geoid"):
+        evaluate(flat(tmp_path / "p.tif", 1), one, geoid=Path("Ellipsoid"))
     with pytest.raises(InputError, match="one geoid is not enough"):
         evaluate(one, third, geoid=up)
     plain = flat(tmp_path / "p.tif", 1)
@@ -269,6 +291,24 @@ def test_heights_in_feet_are_refused(tmp_path):
     feet = flat(tmp_path / "feet.tif", 1, "EPSG:32632+6360")
     with pytest.raises(InputError, match=r"feet\.tif are in US survey foot\. Convert them to metres"):
         evaluate(feet, feet)
+
+
+@pytest.mark.parametrize("unit", ["ft", "feet", "us-ft", "US survey foot", "international foot", "Foot", "cm"])
+def test_heights_whose_unit_is_no_metre_are_refused(tmp_path, unit):
+    feet, metres = flat(tmp_path / "feet.tif", 1), flat(tmp_path / "metres.tif", 1)
+    with rasterio.open(feet, "r+") as file:
+        file.units = (unit,)
+    for pair in ((feet, metres), (metres, feet)):
+        with pytest.raises(InputError, match=rf"feet\.tif are in {unit}\. Convert them to metres"):
+            evaluate(*pair)
+
+
+@pytest.mark.parametrize("unit", ["", "m", "metre", "Meters", "1", "elevation", "m asl"])
+def test_other_units_are_metres(tmp_path, unit):
+    path = flat(tmp_path / "metres.tif", 1)
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    assert evaluate(path, path, margin_m=2).all.rmse == 0
 
 
 def test_real_heights_above_a_geoid_in_degrees(tmp_path, shared_data):

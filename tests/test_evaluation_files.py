@@ -111,11 +111,27 @@ def test_a_failed_write_leaves_no_part(tmp_path, pair, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
-    result = run(*pair, "-o", out)
+    result = run(*pair, "-o", out, "--overwrite")
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
     assert "histogram.png cannot be written: No space left on device" in result.stderr
     # The figures of the evaluation before are gone: they are not those of the new map.
     assert sorted(path.name for path in out.iterdir()) == ["error.tif", "histogram.png"]
+
+
+def test_another_evaluation_is_replaced_only_on_request(tmp_path, pair):
+    out = tmp_path / "out"
+    assert run(*pair, "-o", out).exit_code == 0
+    before = (out / "evaluation.json").read_bytes()
+    result = run(*pair, "-o", out, "--margin", 5)
+    assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
+    assert "out holds another evaluation (evaluation.json, error.tif, histogram.png)" in result.stderr
+    assert (out / "evaluation.json").read_bytes() == before
+    assert run(*pair, "-o", out, "--margin", 5, "--overwrite").exit_code == 0
+    assert (out / "evaluation.json").read_bytes() != before
+    # The folder of a run has room for one beside it.
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").touch()
+    assert run(*pair, "-o", tmp_path / "run").exit_code == 0
 
 
 def test_no_input_is_written_over(tmp_path, pair):

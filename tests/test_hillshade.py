@@ -16,7 +16,7 @@ from rio_cogeo.cogeo import cog_validate
 
 from zlocus.io.raster import write_cog
 from zlocus.options import ProductOptions
-from zlocus.products.hillshade import gradient, hillshade, write_hillshade
+from zlocus.products.hillshade import hillshade, horn_gradient, write_hillshade
 
 CELL_M = 0.5
 SLOPE = 1e-9  # a ratio; rounding of float64 heights of 100 m over half a metre
@@ -72,7 +72,7 @@ def test_a_cone_is_brightest_towards_the_sun():
 def test_planes_keep_their_slope_beside_holes(east, north, seed):
     z = plane(9, 11, east, north)
     holes = np.random.default_rng(seed).random(z.shape) < 0.3
-    found = gradient(np.where(holes, np.nan, z), CELL_M)
+    found = horn_gradient(np.where(holes, np.nan, z), CELL_M)
     known = np.pad(~holes, 1)
     pairs = [
         known[1 + r : 10 + r, 1 + c : 12 + c] | known[1 - r : 10 - r, 1 - c : 12 - c]

@@ -20,9 +20,10 @@ import zlocus.products.maps as maps
 from las_format import check_laz
 from zlocus.cli import app
 from zlocus.errors import ConfigError, OutputError
+from zlocus.io.config import config_as_dict
 from zlocus.io.crs import local_frame
 from zlocus.io.raster import write_cog
-from zlocus.options import ProductOptions
+from zlocus.options import ProductOptions, RunConfig
 from zlocus.products.maps import FILES, link_all, make_maps, remove_maps
 from zlocus.progress import SilentProgress
 from zlocus.request import DEFAULT_PRODUCTS, PRODUCTS, product_names
@@ -171,6 +172,31 @@ def test_the_command(surface, tmp_path_factory):
     assert (surface / "hillshade.tif").read_bytes() != before
     assert names_in(surface) == SURFACE | set(FILES.values()) | {"item.json"}
     assert "no map made" in run(surface, "--products", "none").stdout
+
+
+def test_the_command_takes_the_options_of_the_run(surface, tmp_path_factory):
+    def hillshade(*arguments):
+        done = run(surface, "--products", "hillshade", *arguments)
+        assert done.exit_code == 0, done.stderr
+        return (surface / "hillshade.tif").read_bytes()
+
+    config = tmp_path_factory.mktemp("config") / "c.toml"
+    config.write_text("")
+    options = RunConfig(products=ProductOptions(sun_azimuth_deg=90.0))
+    by_default, record = hillshade(), surface / "run.json"
+    text = json.dumps({"config": {"options": config_as_dict(options)}})
+    record.write_text(text)
+    assert hillshade() != by_default
+    assert record.read_text() == text
+    assert hillshade("--config", config) == by_default
+    # Those of other stages are no matter here, and neither is a record without any.
+    record.write_text('{"config": {"options": {"pyramid": {"of_old": 1}}}}')
+    assert hillshade() == by_default
+    record.write_text('{"config": {"options": {"products": {"of_old": 1}}}}')
+    done = run(surface, "--products", "hillshade")
+    assert (done.exit_code, len(done.stderr.splitlines())) == (2, 1)
+    assert "run.json: products.of_old is not an option" in done.stderr
+    assert done.stderr.endswith("Or give the options with --config.\n")
 
 
 @pytest.mark.parametrize(

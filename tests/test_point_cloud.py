@@ -18,11 +18,13 @@ LAMBERT = CRS("+proj=lcc +lat_1=46 +lat_2=48 +lat_0=47 +lon_0=8 +datum=WGS84 +un
 XYZ = np.array([[462_000.1234, 5_247_000.5678, 431.25], [462_010.0, 5_247_020.0, -3.5], [461_990.5, 5_246_980.0, 0.0]])
 RGB = np.array([[65535, 0, 256], [1000, 2000, 3000], [0, 0, 0]], np.uint16)
 
+SIGMA_M, N_IMAGES = np.array([0.25, 1.5, 0.125]), np.array([2, 5, 3], np.uint8)
+
 
 def written(folder, crs=UTM):
     with PointCloud(folder, 3, crs) as cloud:
-        cloud.write(1, XYZ[:2], RGB[:2])
-        cloud.write(7, XYZ[2:], RGB[2:])
+        cloud.write(1, XYZ[:2], RGB[:2], SIGMA_M[:2], N_IMAGES[:2])
+        cloud.write(7, XYZ[2:], RGB[2:], SIGMA_M[2:], N_IMAGES[2:])
     return folder
 
 
@@ -40,6 +42,15 @@ def test_laz_holds_points_colours_source_and_crs(tmp_path):
     assert cloud.header.are_points_compressed
     assert cloud.header.parse_crs() == UTM
     np.testing.assert_allclose(cloud.header.mins, XYZ.min(axis=0), atol=LAZ_STEP_M)
+
+
+def test_laz_holds_precision_and_number_of_images(tmp_path):
+    cloud = laspy.read(written(tmp_path) / "cloud.laz")
+    np.testing.assert_array_equal(cloud["sigma_m"], SIGMA_M.astype(np.float32))
+    np.testing.assert_array_equal(cloud["n_images"], N_IMAGES)
+    assert (cloud["sigma_m"].dtype, cloud["n_images"].dtype) == (np.float32, np.uint8)
+    about = {dimension.name: dimension.description for dimension in cloud.point_format.extra_dimensions}
+    assert about == {"sigma_m": "standard deviation along ray, m", "n_images": "images used"}
 
 
 def test_ply_holds_the_same(tmp_path):
@@ -75,7 +86,7 @@ def test_no_points_make_an_empty_cloud(tmp_path):
 def test_a_failure_leaves_nothing(tmp_path):
     def interrupted():
         with PointCloud(tmp_path, 3, UTM) as cloud:
-            cloud.write(1, XYZ, RGB)
+            cloud.write(1, XYZ, RGB, SIGMA_M, N_IMAGES)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -88,10 +99,10 @@ def test_what_cannot_be_written_is_said(tmp_path):
         pytest.raises(OutputError, match=r"cloud\.laz cannot be written"),
         PointCloud(tmp_path / "no", 3, UTM) as cloud,
     ):
-        cloud.write(1, XYZ, RGB)
+        cloud.write(1, XYZ, RGB, SIGMA_M, N_IMAGES)
     far = np.add(XYZ, [[0, 0, 0], [0, 0, 0], [0, 5e6, 0]])
     with pytest.raises(OutputError, match="narrower --heights"), PointCloud(tmp_path, 3, UTM) as cloud:
-        cloud.write(1, far, RGB)
+        cloud.write(1, far, RGB, SIGMA_M, N_IMAGES)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -16,6 +16,8 @@ from zlocus.sensors.rpc import RpcModel
 from zlocus.synthetic.rpc_fit import fit_rpc
 
 SAME_PX = 1e-6
+# Metres of UTM against those of the Earth.
+SCALE_OF_MAPS = 1e-3
 XY = np.array([[3.0, 5.0], [60.5, 80.25], [149.0, 140.0]])
 PIXELS = XY * [1.0, -1.0]
 HYPOTHESES = np.array([-3.0, 0.5, 12.0])
@@ -70,6 +72,14 @@ def test_there_and_back(rays, other):
 def test_hypotheses_of_ground_are_those_it_was_made_from(rays, other):
     z = np.abs(HYPOTHESES) + 20.0
     np.testing.assert_allclose(rays.hypothesis(rays.ground(XY, z)), z, rtol=1e-9)
+
+
+@both
+def test_a_unit_is_worth_what_it_moves(rays, other):
+    z, step = np.abs(HYPOTHESES) + 20.0, 0.01
+    way = rays.ground(XY, z + step / 2) - rays.ground(XY, z - step / 2)
+    moved = way[:, 2] if rays is HEIGHTS[0] else np.linalg.norm(way, axis=1)
+    np.testing.assert_allclose(rays.metres_per_unit(XY, z), moved / step, rtol=SCALE_OF_MAPS)
 
 
 def test_disparities_are_linear_and_go_on_beyond_infinity():

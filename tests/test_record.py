@@ -3,12 +3,24 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from zlocus.errors import OutputError
-from zlocus.products.record import Stopwatch, inputs_record, peak_memory_mb, versions_record, write_record
+from zlocus.io.config import config_as_dict
+from zlocus.options import RunConfig
+from zlocus.products.record import (
+    Stopwatch,
+    inputs_record,
+    made_record,
+    peak_memory_mb,
+    request_as_dict,
+    versions_record,
+    write_record,
+)
+from zlocus.request import RankRequest
 
 
 def test_stages_are_timed():
@@ -59,3 +71,25 @@ def test_a_record_is_whole_or_not_there(tmp_path):
     with pytest.raises(OutputError, match=r"taken\.json cannot be written"):
         write_record(tmp_path / "taken.json", {})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.json", "taken.json"]
+
+
+def test_a_request_is_what_json_can_hold():
+    request = RankRequest((Path("a.tif"), Path("b.tif")), Path("out"), heights=(1.0, 2.0))
+    record = request_as_dict(request)
+    assert json.loads(json.dumps(record)) == {
+        "inputs": ["a.tif", "b.tif"], "out": "out", "resolution": None, "crs": None, "heights": [1.0, 2.0],
+        "workers": 1, "overwrite": False,
+    }  # fmt: skip
+
+
+def test_files_are_named_once_with_their_checksums(tmp_path):
+    paths = [tmp_path / name for name in ("a.tif", "b.tif", "camera.txt")]
+    for path in paths:
+        path.write_text(path.name)
+    watch = Stopwatch()
+    with watch.stage("open"):
+        pass
+    record = made_record(RankRequest(tuple(paths[:2]), tmp_path / "out"), RunConfig(), [*paths, paths[2]], watch)
+    assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in paths]
+    assert record["config"]["options"] == config_as_dict(RunConfig())
+    assert (record["stages"], list(record)) == (watch.stages, ["config", "versions", "inputs", "stages"])

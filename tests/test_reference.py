@@ -132,6 +132,22 @@ def test_dem_that_says_its_heights_are_above_a_geoid(tmp_path, monkeypatch):
             read_dem(feet, GRID, datum)
 
 
+def test_dem_in_feet_by_its_band_or_with_fills_that_are_not_declared(tmp_path):
+    plane, cells = degree_plane(tmp_path / "plane.tif")
+    with rasterio.open(plane, "r+") as file:
+        file.units = ("us-ft",)
+    with pytest.raises(InputError, match=r"heights of .*plane\.tif are in us-ft\. Convert them to metres"):
+        read_dem(plane, GRID)
+    whole = read_dem(degree_plane(tmp_path / "whole.tif")[0], GRID)
+    transform = from_origin(5.2, 43.4, 0.001, 0.001)
+    # Without the first column that the grid touches.
+    lon, _ = geographic_centres()
+    cells[:, : int((lon.min() - 5.2) / 0.001) + 1] = -9999
+    empty = read_dem(write_raster(tmp_path / "fills.tif", cells, transform, "EPSG:4326"), GRID)
+    assert 0.5 < np.isfinite(empty).mean() < 1
+    np.testing.assert_allclose(empty[np.isfinite(empty)], whole[np.isfinite(empty)], atol=2.0)
+
+
 def test_national_heights_of_the_aerial_block(shared_data):
     """EGM2008 without a code of its own, in a map without one."""
     dem = shared_data / "aerial_ngi_dmc" / "reference" / "dem_24m_egm2008.tif"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zlocus.options import ProductOptions
-from zlocus.surface.terrain import between, block_least, block_mean, membrane, opened, outside_of, rises, terrain
+from zlocus.surface.terrain import between_blocks, block_least, block_mean, membrane, opened, outside_of, rises, terrain
 
 OPTIONS = ProductOptions(ground_window_m=15.0)
 CELL_M = 1.0
@@ -130,6 +130,6 @@ def test_blocks_by_hand():
 @pytest.mark.parametrize("side", [1, 2, 3, 5])
 def test_between_blocks_lies_the_plane_they_are_means_of(side):
     z = tilted(11 * side, 7 * side)
-    found = between(block_mean(z, side), side, 0, z.shape)
+    found = between_blocks(block_mean(z, side), side, 0, z.shape)
     np.testing.assert_allclose(found[side:-side, side:-side], z[side:-side, side:-side], atol=ROUNDING_M)
-    np.testing.assert_array_equal(between(block_mean(z, side), side, 4, (3, z.shape[1])), found[4:7])
+    np.testing.assert_array_equal(between_blocks(block_mean(z, side), side, 4, (3, z.shape[1])), found[4:7])

@@ -100,6 +100,8 @@ def test_proj_names_the_same_grids(name):
 
 def test_a_grid_that_is_there_is_what_proj_uses(proj_grid):
     datum = vertical_datum("egm96")
+    assert vertical_datum("EGM96") == vertical_datum("Egm96") == datum
+    assert vertical_datum("Ellipsoid") is ELLIPSOIDAL
     xy = centres(GRID)
     lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(*xy.T)
     by_proj = Transformer.from_pipeline(

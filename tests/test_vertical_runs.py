@@ -24,14 +24,15 @@ from zlocus.cloud import run_cloud
 from zlocus.errors import ConfigError, GeometryError, InputError
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.control import read_control
+from zlocus.io.reference import dem_datum
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import vertical_datum
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import shared_ground
 from zlocus.options import RunConfig
-from zlocus.orienting import control_points, terrain_heights
+from zlocus.orienting import control_datum, control_points, run_orient, terrain_heights
 from zlocus.pipeline import run_dsm
-from zlocus.preparing import with_heights
+from zlocus.preparing import note_dem, with_heights
 from zlocus.products.points import write_ranking
 from zlocus.progress import SilentProgress, progress_for
 from zlocus.request import CloudRequest, DsmRequest, OrientRequest
@@ -46,6 +47,16 @@ EXACT_M = 1e-9
 # float32 heights, of which an undulation is taken.
 FLOAT_M = 2e-5
 ACCEPTED_M = 0.01
+
+
+class Notes(SilentProgress):
+    """Keeps what is said."""
+
+    def __init__(self):
+        self.said = []
+
+    def note(self, sentence):
+        self.said.append(sentence)
 
 
 def undulation(x, y):
@@ -204,6 +215,46 @@ def test_a_terrain_model_above_a_geoid(images, geoid, tmp_path):
     x, y = centres(source)
     assert np.nanmax(np.abs(height - analytic_height("sine", x - CENTRE[0], y - CENTRE[1]))) < 0.5
     assert str(geoid) in [entry["path"] for entry in json.loads((out / "run.json").read_text())["inputs"]]
+
+
+def test_what_a_terrain_model_is_taken_to_be_above_is_said(tmp_path):
+    plain, ours, above, deep = (tmp_path / f"{name}.tif" for name in ("plain", "ours", "above", "deep"))
+    for path, crs in ((plain, UTM.to_wkt()), (ours, UTM.to_wkt()), (above, "EPSG:32632+5773"), (deep, "EPSG:4979")):
+        write_dem(path, False, crs)
+    with rasterio.open(ours, "r+") as file:
+        file.set_band_description(1, "height above the ellipsoid")
+    notes = Notes()
+    for dem, given in ((None, None), (plain, "ellipsoid"), (ours, None), (above, None), (deep, None)):
+        note_dem(dem, given, notes)
+    assert notes.said == []
+    note_dem(plain, None, notes)
+    (sentence,) = notes.said
+    assert sentence.startswith(f"{plain} does not say what its heights are above: taken to be ellipsoidal.")
+    assert "--dem-vertical egm96|egm2008|FILE" in sentence
+
+
+def test_runs_say_what_a_terrain_model_is_taken_to_be_above(images, tmp_path):
+    dem = write_dem(tmp_path / "dem.tif", False, UTM.to_wkt())
+    inputs = images("sine").inputs
+    dsm, orient = Notes(), Notes()
+    run_dsm(DsmRequest(inputs, tmp_path / "dsm", crs="EPSG:32632", dem=dem, bounds=PART), SMALL_TILES, dsm)
+    run_orient(OrientRequest(inputs, tmp_path / "oriented", crs="EPSG:32632", dem=dem), RunConfig(), orient)
+    for notes in (dsm, orient):
+        assert sum("does not say what its heights are above" in sentence for sentence in notes.said) == 1
+
+
+def test_geoids_may_be_written_in_capitals(tmp_path, monkeypatch):
+    west, north = 0.0, 90.0
+    monkeypatch.setattr("zlocus.io.vertical.proj_folders", lambda: [tmp_path])
+    write_geoid(tmp_path / "us_nga_egm96_15.tif", np.full((13, 25), 30.0), from_origin(west, north, 15, 15))
+    asked = {"vertical": "EGM96", "dem": tmp_path / "dem.tif", "dem_vertical": "EGM2008"}
+    assert DsmRequest((tmp_path / "a.tif", tmp_path / "b.tif"), tmp_path / "out", **asked).vertical == "EGM96"
+    with pytest.raises(ConfigError, match=r"--dem-vertical EGM2008 needs PROJ's grid us_nga_egm08_25\.tif"):
+        dem_datum(tmp_path / "dem.tif", asked["dem_vertical"])
+    control = OrientRequest(
+        (tmp_path / "a.tif", tmp_path / "b.tif"), tmp_path / "o", control=tmp_path / "c.csv", control_vertical="EGM96"
+    )  # fmt: skip
+    assert control_datum(control).name == "egm96"
 
 
 def test_a_terrain_model_whose_geoid_is_missing_is_refused(images, tmp_path, monkeypatch):

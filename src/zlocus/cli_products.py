@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from zlocus.errors import ConfigError
+from zlocus.options import ProductOptions
 from zlocus.progress import progress_for
 from zlocus.request import PRODUCTS, check_output, product_names
 
@@ -18,7 +20,7 @@ def products(
     out: Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")],
     names: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(PRODUCTS),
     config: Annotated[
-        Path | None, typer.Option(help="Options of every stage; see `zlocus config`.", metavar="FILE")
+        Path | None, typer.Option(help="Options of every stage. Default: those of the run.", metavar="FILE")
     ] = None,
 ) -> None:
     """Make maps of a surface that is there already; those of the same name are replaced."""
@@ -26,12 +28,35 @@ def products(
     check_output(out, overwrite=True)
     from zlocus.io.config import read_config
     from zlocus.io.opening import existing_file
-    from zlocus.options import RunConfig
     from zlocus.products.maps import FILES, link_all, make_maps
 
     existing_file(out / "dsm.tif", "surface")
-    options = (RunConfig() if config is None else read_config(config)).products
+    options = run_options(out / "run.json") if config is None else read_config(config).products
     progress = progress_for(sys.stderr)
     make_maps(out, chosen, options, progress)
     link_all(out, progress)
     print(f"{out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")
+
+
+def run_options(record: Path) -> ProductOptions:
+    """The options of products with which a run was made, by its run.json; where there is none, those by default.
+
+    Raises
+    ------
+    InputError
+        It is damaged.
+    ConfigError
+        It holds options that are none here.
+    """
+    from zlocus.io.config import config_from_dict
+    from zlocus.products.record import read_record
+
+    if not record.exists():
+        return ProductOptions()
+    found: Any = read_record(record)
+    for name in ("config", "options", "products"):
+        found = found.get(name, {}) if isinstance(found, dict) else {}
+    try:
+        return config_from_dict({"products": found}, str(record)).products
+    except ConfigError as error:
+        raise ConfigError(f"{error} Or give the options with --config.") from error

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import CoverageError
 from zlocus.io.colour import read_colours
-from zlocus.io.config import config_as_dict
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
 from zlocus.matching.confirm import ROWS_AT_ONCE
@@ -30,10 +30,11 @@ from zlocus.per_image import (
 )
 from zlocus.preparing import AREA_MARGIN, asked_crs, made_folder, what_was_applied, with_heights
 from zlocus.products.cloud import PointCloud, file_names, write_map
-from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import CloudRequest
 from zlocus.scene import Scene, View, is_local
+from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rays import DepthRays
 from zlocus.surface.behind import filled_from_behind
 from zlocus.surface.reasons import Quality
@@ -93,10 +94,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     write_record(
         request.out / "run.json",
         {
-            "config": {"request": request_record(request), "options": config_as_dict(options)},
-            "versions": versions_record(),
-            "inputs": inputs_record(dict.fromkeys([*request.inputs, *files, *vertical.files])),
-            "stages": watch.stages,
+            **made_record(request, options, [*files, *vertical.files], watch),
             "orientation": ready.orientation.as_dict(),
             "vertical": vertical.as_dict(),
             "images": {name: image_record(m) for name, m in zip(references, matched, strict=True)},
@@ -133,11 +131,24 @@ def write_cloud(out: Path, matched: Sequence[Matched], scene: Scene, vertical: V
             for row, rows in strips(len(height)):
                 known = np.isfinite(height[row : row + rows])
                 if known.any():
-                    xyz = one.image.space.ground(row, height[row : row + rows])[known]
+                    part = slice(row, row + rows)
+                    xyz = one.image.space.ground(row, height[part])[known]
                     xyz[:, 2] -= vertical.undulation(xyz[:, :2], scene.crs)
                     share = np.clip(read_colours(view.path, row, rows)[known] / white, 0.0, 1.0)
-                    cloud.write(number[view.name], xyz, np.rint(share * 65535.0).astype(np.uint16))
+                    rgb = np.rint(share * 65535.0).astype(np.uint16)
+                    sigma_m = precision_m(one, row, known)
+                    cloud.write(number[view.name], xyz, rgb, sigma_m, one.surface.views[part][known])
     return n_points
+
+
+def precision_m(one: Matched, row: int, known: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviations (n,) m of some pixels of the rows from `row` on: of height, or along the rays of cameras that
+    are asked for depths. known : (r, c)."""
+    rows, cols = np.nonzero(known)
+    part = slice(row, row + len(known))
+    z, sigma = one.image.height[part][known], one.surface.sigma[part][known]
+    xy = np.column_stack([cols, rows + row]).astype(float)
+    return np.asarray(sigma * one.image.space.rays.metres_per_unit(xy, z.astype(float)))
 
 
 def strips(n_rows: int) -> Iterator[tuple[int, int]]:
@@ -193,10 +204,3 @@ def image_record(one: Matched) -> dict[str, Any]:
         span = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
         return record | {"disparities_px": [round(v, 3) for v in span], "disparity_times_depth_px_m": rays.scale}
     return record | {"step_m": scene.step_m * getattr(rays, "unit", 1.0)}
-
-
-def request_record(request: CloudRequest) -> dict[str, Any]:
-    """The request as JSON can hold it."""
-    record = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
-    record["inputs"] = [str(path) for path in request.inputs]
-    return record

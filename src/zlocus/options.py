@@ -419,6 +419,10 @@ class ProductOptions(Checked):
         "dsm", "What contours are drawn of: the surface, or the terrain, which then must be among the products.",
         choices=("dsm", "dtm"),
     )  # fmt: skip
+    contour_least_cells: float = option(
+        12.0, "Closed contours whose line is shorter than so many cells are left out; 0 keeps all.",
+        low=0.0, high=1e6, unit="cells",
+    )  # fmt: skip
     ground_cell_m: float = option(
         1.0, "Terrain: side of the cells in which ground is looked for, about.", low=0.01, high=1e3, unit="m"
     )

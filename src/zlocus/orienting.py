@@ -10,18 +10,17 @@ import numpy as np
 
 from zlocus.errors import GeometryError
 from zlocus.grid import grid_from_bounds
-from zlocus.io.config import config_as_dict
 from zlocus.io.control import read_control
 from zlocus.io.reference import dem_datum, read_dem
 from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
 from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import Orientation
-from zlocus.preparing import made_folder, opened_alone, oriented, possible_heights, what_was_applied
+from zlocus.preparing import made_folder, note_dem, opened_alone, oriented, possible_heights, what_was_applied
 from zlocus.products.cameras import SCENE, write_cameras
 from zlocus.products.orientation import orientation_record
 from zlocus.products.points import write_ties
-from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import OrientRequest
 from zlocus.scene import Scene, footprint, ground_sample_distance, is_local
@@ -46,6 +45,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         scene = opened_alone(request.inputs, request.crs, request.heights)
         control = None if request.control is None else control_points(request, scene)
         terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
+    note_dem(request.dem, request.dem_vertical, progress)
     with watch.stage("orient"):
         options = alone(config.orientation, request.cameras)
         found = oriented(scene, options, scene.heights, progress, control, terrain)
@@ -58,7 +58,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         if request.cameras:
             record["cameras"] = write_cameras(request.out, request.inputs, corrected)
         write_record(request.out / "orientation.json", record)
-    write_record(request.out / "run.json", run_record(request, config, scene, watch))
+    write_record(request.out / "run.json", made_record(request, config, files_read(request, scene), watch))
     if not request.cameras:
         return f"{request.out / 'ties.gpkg'}: {len(found.xyz)} tie points."
     return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(found.measured)} tie points."
@@ -129,18 +129,10 @@ def terrain_heights(dem: Path, scene: Scene, vertical: str | None = None) -> Ter
     return TerrainHeights(z, float(first[0]), float(first[1]), cell)
 
 
-def run_record(request: OrientRequest, config: RunConfig, scene: Scene, watch: Stopwatch) -> dict[str, Any]:
-    """What was asked and done, for run.json."""
-    asked = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
-    asked["inputs"] = [str(path) for path in request.inputs]
+def files_read(request: OrientRequest, scene: Scene) -> list[Path]:
+    """Every file beside the inputs whose content the result depends on."""
     extra = [path for path in (request.control, request.dem) if path is not None]
     extra += control_datum(request).files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
-    return {
-        "config": {"request": asked, "options": config_as_dict(config)},
-        "versions": versions_record(),
-        "inputs": inputs_record(dict.fromkeys([*request.inputs, *files, *extra])),
-        "stages": watch.stages,
-    }
+    return [*(path for view in scene.views for path in (view.path, *view.camera_files)), *extra]

@@ -38,6 +38,7 @@ from zlocus.preparing import (
     heights_asked_for,
     heights_of_ties,
     made_folder,
+    note_dem,
     oriented,
     possible_heights,
     what_was_applied,
@@ -47,7 +48,7 @@ from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.record import Stopwatch, inputs_record, now, versions_record, write_record
+from zlocus.products.record import Stopwatch, inputs_record, now, request_as_dict, versions_record, write_record
 from zlocus.progress import Progress
 from zlocus.reporting import Matched, forget_report, try_report, write_shown
 from zlocus.request import DsmRequest
@@ -89,6 +90,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     with watch.stage("open"), progress.stage("Opening images"):
         opened = _opened(request, config)
         scene, vertical, store = opened.scene, opened.vertical, opened.store
+    note_dem(request.dem, request.dem_vertical, progress)
     with watch.stage("orient"):
         orientation = oriented(scene, config.orientation, scene.heights, progress)
         progress.note(what_was_applied(orientation))
@@ -161,7 +163,7 @@ def _rasters(request: DsmRequest, grid: Grid, settled: MatchScene, vertical: Ver
 def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: list[Path]) -> dict[str, Any]:
     """What was asked of which program, when, with which files, and when the images were taken."""
     return {
-        "config": {"request": _request_record(request), "options": config_as_dict(config)},
+        "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         "created": now(),
         "versions": versions_record(),
         "inputs": inputs_record(files),
@@ -443,12 +445,3 @@ def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[P
         extra += dem_datum(request.dem, request.dem_vertical).files
     listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
     return list(dict.fromkeys(listed))
-
-
-def _request_record(request: DsmRequest) -> dict[str, Any]:
-    """The request as JSON can hold it."""
-    record: dict[str, Callable[..., Any] | Any] = {}
-    for name, value in vars(request).items():
-        record[name] = str(value) if isinstance(value, Path) else value
-    record["inputs"] = [str(path) for path in request.inputs]
-    return record

@@ -21,7 +21,7 @@ from zlocus.sensors.model import FloatArray
 
 NEAREST_TIES = 5
 # Cells around a point in which tie points order its images where none is nearer.
-FARTHEST = 2048
+RANKED_WITHIN_CELLS = 2048
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def curves_at(
     settled: MatchScene,
     place: Place,
     config: RunConfig,
-    farthest: int = FARTHEST,
+    farthest: int = RANKED_WITHIN_CELLS,
 ) -> tuple[tuple[View, ...], PointCurves, FloatArray]:
     """The views that show the place, its match curves with them, and their heights (h,) m.
 

@@ -13,6 +13,7 @@ from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, GeometryError, OutputError
 from zlocus.io.crs import checked_crs
+from zlocus.io.reference import says_nothing
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.setup import shared_ground
@@ -211,6 +212,15 @@ def heights_asked_for(
             f"{found[0]:g} to {found[1]:.1f} m are searched."
         )
     return found
+
+
+def note_dem(dem: Path | None, given: str | None, progress: Progress) -> None:
+    """Say what the heights of a DEM are taken to be above where neither the request nor the DEM does."""
+    if dem is not None and given is None and says_nothing(dem):
+        progress.note(
+            f"{dem} does not say what its heights are above: taken to be ellipsoidal. Where they are above a geoid, as "
+            "those of most terrain models, give it with --dem-vertical egm96|egm2008|FILE."
+        )
 
 
 def what_was_applied(orientation: Orientation) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from zlocus.execution.local import run_all
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
-from zlocus.io.config import config_as_dict
 from zlocus.matching.curve import FAIR, GOOD
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
@@ -29,10 +27,9 @@ from zlocus.preparing import (
     what_was_applied,
 )
 from zlocus.products.points import write_ranking, write_ties
-from zlocus.products.record import Stopwatch, inputs_record, versions_record, write_record
+from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import RankRequest
-from zlocus.scene import Scene
 from zlocus.tile import rank_tile
 
 LABELS = ("good", "fair", "poor")
@@ -80,7 +77,8 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
         write_ranking(request.out / "ranking.gpkg", ranked, names, scene.crs)
         counts = label_counts(ranked, len(names))
         write_record(request.out / "ranking.json", ranking_record(counts, names))
-    write_record(request.out / "run.json", _run_record(request, config, scene, watch))
+    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
+    write_record(request.out / "run.json", made_record(request, config, files, watch))
     return ranking_table(counts, names)
 
 
@@ -120,15 +118,3 @@ def ranking_table(counts: NDArray[np.int64], names: Sequence[str]) -> str:
     order = sorted(range(len(names)), key=lambda j: (-of_image[j], names[j]))
     lines.append(f"From the most to the least useful: {', '.join(names[j] for j in order)}.")
     return "\n".join(lines)
-
-
-def _run_record(request: RankRequest, config: RunConfig, scene: Scene, watch: Stopwatch) -> dict[str, Any]:
-    asked = {name: str(v) if isinstance(v, Path) else v for name, v in vars(request).items()}
-    asked["inputs"] = [str(path) for path in request.inputs]
-    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
-    return {
-        "config": {"request": asked, "options": config_as_dict(config)},
-        "versions": versions_record(),
-        "inputs": inputs_record(dict.fromkeys([*request.inputs, *files])),
-        "stages": watch.stages,
-    }

@@ -34,7 +34,7 @@ MOST_VIEWS_PAIRED = 60
 # Curves are not begun after this share of the time that matching took, or this time where that is longer.
 TIME_SHARE, LEAST_TIME_S = 0.02, 10.0
 # Cells around one within which tie points are looked for.
-FARTHEST = 512
+SHOWN_WITHIN_CELLS = 512
 NOT_SHOWN = "Fewer than two images show this cell, and the window around it, at the height looked at."
 
 
@@ -159,7 +159,7 @@ def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matche
         z, source = middle_height(settled), "the middle of the heights searched"
     place = Place(np.array([*xy, z]), source, cell_of(xy, settled), xy)
     asked = f"The cell at row {cell.row}, column {cell.col}"
-    views, curves, heights_m = curves_at(asked, None, settled, place, config, FARTHEST)
+    views, curves, heights_m = curves_at(asked, None, settled, place, config, SHOWN_WITHIN_CELLS)
     report = PointReport(
         asked=asked, crs=crs_name(matched.scene.crs), xyz=place.xyz, height_from=source, middle=xy,
         cell_m=settled.cell_m, names=tuple(view.name for view in views),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +33,7 @@ class DsmRequest:
     heights : (zmin, zmax), m, above what `vertical` says. dem : raster the heights are searched around; dem_vertical :
     what its heights are above, as `vertical`, None is what its CRS says.
     reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
-    vertical : what the heights written are above: one of `VERTICALS`, or the file of a geoid.
+    vertical : what the heights written are above: one of `VERTICALS`, in capitals too, or the file of a geoid.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
     scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
     together, GB; None: 60 % of what is free. resume : whether finished tiles of the same run are taken as they are.
@@ -386,7 +386,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def _check_vertical(name: str, value: str) -> None:
-    if value not in VERTICALS and not Path(value).is_file():
+    if value.lower() not in VERTICALS and not Path(value).is_file():
         raise ConfigError(
             f"--{name} {value} is neither {', '.join(VERTICALS)} nor the file of a geoid. Check the name."
         )
@@ -415,21 +415,23 @@ def _check_positive(name: str, value: float | None, unit: str) -> None:
         raise ConfigError(f"{name} {value:g} is not a size. Give a number of {unit} above 0.")
 
 
-def check_output(out: Path, overwrite: bool) -> None:
+def check_output(out: Path, overwrite: bool, files: Sequence[str] | None = None, what: str = "run") -> None:
     """Make sure, before any work, that a run may write to `out`; leaves the disk as it was.
+
+    files : that tell of another one, None for those of runs; what : it is, for messages.
 
     Raises
     ------
     OutputError
-        `out` is a file, cannot be written, or holds another run and `overwrite` is False.
+        `out` is a file, cannot be written, or holds another one and `overwrite` is False.
     """
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")
-    held = [name for name in RUN_FILES if (out / name).exists()]
+    held = [name for name in (RUN_FILES if files is None else files) if (out / name).exists()]
     # What failed, or was stopped, may go on; whose it is its manifest says.
-    may_go_on = (out / "tiles" / "manifest.json").exists()
+    may_go_on = files is None and (out / "tiles" / "manifest.json").exists()
     if held and not overwrite and not may_go_on:
-        raise OutputError(f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite.")
+        raise OutputError(f"{out} holds another {what} ({', '.join(held)}). Choose another folder, or add --overwrite.")
     parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     try:
         # Only an attempt tells for sure: permission bits say nothing of read-only disks.

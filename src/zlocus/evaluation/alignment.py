@@ -33,7 +33,7 @@ def best_shift(surface: HeightRaster, truth: TruthBlocks, points: Points) -> tup
 
     @functools.cache
     def spread(shift: tuple[float, float]) -> float:
-        difference = surface.bilinear(at.moved(shift)) - height
+        difference = at.heights(surface.bilinear, shift) - height
         difference = difference[np.isfinite(difference)]
         return float(np.median(np.abs(difference - np.median(difference)))) if difference.size else np.inf
 

@@ -14,6 +14,8 @@ from zlocus.request import check_output
 DEFAULT_THRESHOLD_M = 1.0
 # In the module of slopes too, which is slow to import.
 DEFAULT_SLOPES = "5,15,30,45"
+# Beside a run, which has no file of these names, there is room for them.
+EVALUATION_FILES = ("evaluation.json", "error.tif", "histogram.png")
 
 
 Classes = Annotated[
@@ -52,23 +54,37 @@ def evaluate(
         Path | None,
         typer.Option("-o", "--out", help="Folder for figures, error map and histogram. Default: print.", metavar="OUT"),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace another evaluation in the output folder.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Compare a surface with a reference surface."""
     judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
     if out is not None:
-        # It writes no file that a run does.
-        check_output(out, overwrite=True)
+        check_not_input(out, dsm, reference, classes, geoid)
+        check_output(out, overwrite, EVALUATION_FILES, "evaluation")
     from zlocus.evaluation.evaluate import evaluate as compare
-    from zlocus.evaluation.files import check_not_input, write_evaluation
+    from zlocus.evaluation.files import write_evaluation
     from zlocus.evaluation.table import evaluation_table
 
-    if out is not None:
-        check_not_input(out, dsm, reference, classes, geoid)
     evaluation = compare(dsm, reference, **judged_by)
     if out is not None:
         write_evaluation(out, evaluation)
     print(json.dumps(evaluation.as_dict(), indent=2) if as_json else evaluation_table(evaluation))
+
+
+def check_not_input(out: Path, *inputs: Path | None) -> None:
+    """Refuse to write over a raster that is to be read.
+
+    Raises
+    ------
+    ConfigError
+        An input is one of the files that the evaluation writes.
+    """
+    for path in inputs:
+        if path is not None and path.name in EVALUATION_FILES and path.resolve().parent == out.resolve():
+            raise ConfigError(f"{path} would be written over. Choose another folder with -o.")
 
 
 def judging(

@@ -73,7 +73,7 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
     at, height = points.where(usable), height[usable]
     shift, moved = np.zeros(2), np.inf
     for step in range(1, MOST_ITERATIONS + 1):
-        difference = surface.between_cells(at.moved(shift)) - height
+        difference = at.heights(surface.between_cells, shift) - height
         found = np.isfinite(difference)
         n = int(np.count_nonzero(found))
         if step == 1:
@@ -116,7 +116,11 @@ def _robust_fit(design: FloatArray, difference: FloatArray) -> tuple[FloatArray,
 
 def _check_known(surface: HeightRaster, points: Points, sigma_m: float) -> None:
     per_metre = 1.0 if points.per_metre is None else float(np.hypot(*points.per_metre[0, :, 0]))
-    most_m = MOST_SIGMA_CELLS * abs(surface.transform.a) / per_metre
+    cell = abs(surface.transform.a)
+    if points.areas is not None:
+        # Means of larger cells tell as little as those.
+        cell = max(cell, float(np.hypot(*np.moveaxis(points.areas.steps[..., 0], -1, 0)).max()))
+    most_m = MOST_SIGMA_CELLS * cell / per_metre
     if sigma_m > most_m:
         raise InputError(
             f"{surface.path} differs too much from the reference to co-register: the shift would be known to "

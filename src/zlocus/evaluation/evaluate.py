@@ -64,8 +64,10 @@ class Evaluation:
     shift : removed first, None where the surface was judged as it is. threshold_m : limit of `within`.
     slopes : figures by band of slope of the reference, degrees. mvs3dm : figures by the definitions of that benchmark.
     unshifted : figures of all blocks before the shift was removed. heights : what those of surface and reference are
-    above by their files, None where one does not say; assumed : what was taken for granted of that, as a sentence.
-    geoid_added_to : raster that a geoid's heights were added to. error_map : for files.
+    above by their files, None where one does not say; assumed : what was taken for granted of that, as a sentence;
+    places_assumed : of their coordinates. geoid_added_to : raster that a geoid's heights were added to. mean_of : of so
+    many places along the rows and columns of a block the mean was compared, the reference being coarser; None: of one.
+    error_map : for files.
     """
 
     all: ErrorStatistics
@@ -77,7 +79,9 @@ class Evaluation:
     unshifted: ErrorStatistics | None = None
     heights: tuple[str | None, str | None] = (None, None)
     assumed: str | None = None
+    places_assumed: str | None = None
     geoid_added_to: Path | None = None
+    mean_of: tuple[int, int] | None = None
     error_map: ErrorMap | None = field(default=None, repr=False, compare=False)
 
     def as_dict(self) -> dict[str, Any]:
@@ -92,7 +96,9 @@ class Evaluation:
             "dsm_heights": self.heights[0],
             "reference_heights": self.heights[1],
             "assumed": self.assumed,
+            "places_assumed": self.places_assumed,
             "geoid_added_to": None if self.geoid_added_to is None else str(self.geoid_added_to),
+            "mean_of": None if self.mean_of is None else list(self.mean_of),
             "all": self.all.as_dict(),
             **{name: figures.as_dict() for name, figures in self.classes.items()},
             "slopes_deg": {name: figures.as_dict() for name, figures in self.slopes.items()},
@@ -121,7 +127,8 @@ def evaluate(
     """Judge a surface by a reference surface, whose heights decide the area.
 
     The reference is taken in blocks of about 0.5 m, the surface looked up at their centres (nearest cell, reprojected
-    where the CRS differ). A block's true height is its mean; where it holds an edge, either side is right. A cell
+    where the CRS differ); where the reference's cells are twice as large as its own or larger, its mean over the block.
+    A block's true height is its mean; where it holds an edge, either side is right. A cell
     without height counts as missing, and as not within the threshold. With `align` the best shift, with
     `coregister="nuth-kaab"` that of slope and aspect, is removed first, and heights are then looked up between cells.
     geoid : see `vertical.same_heights`.
@@ -140,9 +147,9 @@ def evaluate(
     surface, heights = compared.surface, compared.reference
     frame = frame_of(surface, heights)
     truth = truth_blocks(heights, margin_m, None if classes is None else read_classes(classes, heights), frame)
-    points = points_on(surface, heights, frame, truth.xy)
+    points = points_on(surface, heights, frame, truth.xy, truth.size, truth.is_edge)
     _check_overlap(surface, heights, points)
-    as_it_lies = truth.errors(surface.nearest(points.xy))
+    as_it_lies = truth.errors(points.heights(surface.nearest))
     shift, errors = _aligned(surface, truth, points, align, coregister) or (None, as_it_lies)
 
     def figures(members: NDArray[np.bool_] | slice) -> ErrorStatistics:
@@ -158,7 +165,9 @@ def evaluate(
         unshifted=None if shift is None else error_statistics(as_it_lies, threshold_m, more_thresholds_m),
         heights=compared.datums,
         assumed=compared.assumed,
+        places_assumed=_places_assumed(surface, heights),
         geoid_added_to=compared.converted,
+        mean_of=None if points.areas is None else points.areas.shape,
         error_map=_error_map(truth, heights.horizontal, errors),
     )  # fmt: skip
 
@@ -186,7 +195,7 @@ def _aligned(
         shift = Shift(*best_shift(surface, truth, points), 0.0)
     else:
         return None
-    z = surface.bilinear(points.moved((shift.east_m, shift.north_m)))
+    z = points.heights(surface.bilinear, (shift.east_m, shift.north_m))
     up = float(np.nanmedian(truth.errors(z)))
     return replace(shift, up_m=up), truth.errors(z - up)
 
@@ -204,6 +213,16 @@ def _error_map(truth: TruthBlocks, crs: CRS | None, errors: FloatArray) -> Error
     values = np.full(truth.shape, np.nan, np.float32)
     values[tuple(truth.cells.T)] = errors
     return ErrorMap(GeoBox(truth.shape, truth.transform, None if crs is None else crs.to_wkt()), values)
+
+
+def _places_assumed(surface: HeightRaster, reference: HeightRaster) -> str | None:
+    """What was taken for granted of coordinates, as a sentence."""
+    silent = [str(raster.path) for raster in (surface, reference) if raster.horizontal is None]
+    if not silent:
+        return None
+    return (
+        f"{' and '.join(silent)} {'has' if len(silent) == 1 else 'have'} no CRS: coordinates were compared as they are"
+    )
 
 
 def _name(raster: HeightRaster) -> str:

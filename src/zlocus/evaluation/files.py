@@ -4,28 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zlocus.errors import ConfigError, OutputError
+from zlocus.errors import OutputError
+from zlocus.evaluation.command import EVALUATION_FILES
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.io.raster import write_cog
 from zlocus.products.record import write_record, write_whole
 
-FIGURES, ERROR_MAP, HISTOGRAM = "evaluation.json", "error.tif", "histogram.png"
-NAMES = (FIGURES, ERROR_MAP, HISTOGRAM)
+NAMES = (FIGURES, ERROR_MAP, HISTOGRAM) = EVALUATION_FILES
 DPI = 120
-
-
-def check_not_input(out: Path, *inputs: Path | None) -> None:
-    """Refuse to write over a raster that is to be read.
-
-    Raises
-    ------
-    ConfigError
-        An input is one of the files that the evaluation writes.
-    """
-    for path in inputs:
-        if path is not None and path.name in NAMES and path.resolve().parent == out.resolve():
-            raise ConfigError(f"{path} would be written over. Choose another folder with -o.")
 
 
 def write_evaluation(out: Path, evaluation: Evaluation) -> None:

@@ -13,10 +13,11 @@ from pyproj.exceptions import CRSError
 from rasterio.crs import CRS
 
 from zlocus.errors import InputError
+from zlocus.io.heights import check_unit, is_fill
 from zlocus.io.opening import open_raster
 from zlocus.sensors.model import FloatArray
 
-# What other programs write where they have no height, without declaring it.
+# What lies beyond is no height, whatever it means.
 LOWEST_M, HIGHEST_M = -1e4, 1e5
 # Row and column of a point that a map cannot show.
 OUTSIDE = -10.0
@@ -104,11 +105,12 @@ def read_heights(path: Path) -> HeightRaster:
     Raises
     ------
     InputError
-        The file is missing, cannot be read, or is too small to hold a surface.
+        The file is missing, cannot be read, is too small to hold a surface, or its unit is not the metre.
     """
     with open_raster(path, "raster of heights") as source:
         stored, nodata, transform, crs = source.read(1), source.nodata, source.transform, source.crs
         scale, offset, description = source.scales[0], source.offsets[0], source.descriptions[0] or ""
+        check_unit(source.units[0], path)
     if stored.dtype.kind == "c":
         raise InputError(f"{path} holds complex numbers, which are no heights. Check the file.")
     with np.errstate(invalid="ignore"):  # some kinds of NaN
@@ -117,6 +119,7 @@ def read_heights(path: Path) -> HeightRaster:
         raise InputError(f"{path} has {z.shape[0]} x {z.shape[1]} cells, too few for a surface. Check the file.")
     if nodata is not None:
         z[z == nodata] = np.nan
+    z[is_fill(z)] = np.nan
     if (scale, offset) != (1.0, 0.0):
         z = z * scale + offset
     z[(z < LOWEST_M) | (z > HIGHEST_M)] = np.nan

@@ -39,6 +39,7 @@ def mvs3dm_figures(
     """The benchmark's figures, over single cells of the reference: no blocks, no edges at which both sides are right.
 
     shift : (east, north, up) m to be removed from the surface first, None for the surface as it is (nearest cell).
+    Larger cells are compared with the mean of the surface in them, see `points_on`.
     """
     unit = unit_m(reference, frame)
     rows_at_a_time = max(1, CELLS_AT_A_TIME // reference.z.shape[1])
@@ -64,5 +65,5 @@ def _looked_up(
 ) -> FloatArray:
     points = points_on(surface, reference, frame, xy)
     if shift is None:
-        return surface.nearest(points.xy)
-    return surface.bilinear(points.moved(shift[:2])) - shift[2]
+        return points.heights(surface.nearest)
+    return points.heights(surface.bilinear, shift[:2]) - shift[2]

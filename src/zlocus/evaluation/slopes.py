@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import ConfigError
-from zlocus.evaluation.frame import converted
+from zlocus.evaluation.frame import grid_steps
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.sensors.model import FloatArray
 
@@ -61,18 +61,9 @@ def block_gradient(reference: HeightRaster, size: int, frame: CRS | None, chosen
     per_col = (across[:-2] + 2 * across[1:-1] + across[2:])[chosen] / 8
     per_row = (down[:, :-2] + 2 * down[:, 1:-1] + down[:, 2:])[chosen] / 8
     # The gradient along the grid is the transposed step of the grid times that along the frame.
-    step = _block_steps(reference, size, frame, chosen)
+    t = reference.transform
+    col_row = np.column_stack(np.nonzero(chosen)[::-1]) + 0.5
+    centres = col_row @ (size * np.array([[t.a, t.b], [t.d, t.e]])).T + (t.c, t.f)
+    step = grid_steps(reference, size, frame, centres)
     along_grid = np.column_stack([per_col, per_row])
     return np.asarray(np.linalg.solve(np.swapaxes(step, -1, -2), along_grid[..., None])[..., 0])
-
-
-def _block_steps(reference: HeightRaster, size: int, frame: CRS | None, chosen: NDArray[np.bool_]) -> FloatArray:
-    """(east, north) m of a step of a block along the columns ([..., 0]) and rows ([..., 1]). (2, 2) or (n, 2, 2)."""
-    t, theirs = reference.transform, reference.horizontal
-    step = np.array([[t.a, t.b], [t.d, t.e]]) * size
-    if frame is None or theirs is None or theirs == frame:
-        return step
-    row, col = (np.nonzero(chosen)[axis] + 0.5 for axis in (0, 1))
-    xy = np.column_stack([col, row]) @ step.T + (t.c, t.f)
-    ends = [(converted(theirs, frame, xy + half), converted(theirs, frame, xy - half)) for half in step.T / 2]
-    return np.stack([after - before for after, before in ends], axis=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from zlocus.evaluation.evaluate import Evaluation, Shift
@@ -50,17 +51,27 @@ def _band_name(name: str) -> str:
 
 def notes(evaluation: Evaluation) -> Iterator[str]:
     """What the table's figures mean, what was assumed and what was removed, a line each."""
+    if evaluation.all.n and math.isnan(evaluation.all.median):
+        yield "no error is known: nowhere do surface and reference both have a height"
     if len(_thresholds(evaluation)) > 1:
         yield "< M m: share of all cells in error by less; errors in m"
     else:
         yield f"within: share of all cells in error by less than {evaluation.threshold_m:g} m; errors in m"
     if evaluation.mvs3dm is not None:
+        error_m = evaluation.mvs3dm.median_error_m
         yield (
             f"MVS3DM (single cells): completeness {100 * evaluation.mvs3dm.completeness:.2f} %, "
-            f"median error {evaluation.mvs3dm.median_error_m:.3f} m"
+            f"median error {'-' if math.isnan(error_m) else f'{error_m:.3f} m'}"
         )
-    if evaluation.assumed is not None:
-        yield evaluation.assumed
+    if evaluation.mean_of is not None:
+        down, across = evaluation.mean_of
+        yield (
+            f"the reference is coarser: compared is the mean of the surface at {down} x {across} places in each of its "
+            "cells, where half of them or more have a height"
+        )
+    for sentence in (evaluation.assumed, evaluation.places_assumed):
+        if sentence is not None:
+            yield sentence
     if evaluation.geoid_added_to is not None:
         yield f"the geoid's heights were added to those of {evaluation.geoid_added_to}"
     if evaluation.shift is not None:

@@ -29,7 +29,7 @@ class TruthBlocks:
     xy : (n, 2) float64, centres in the reference's CRS. heights : (n, k) float64, m, the block's cells.
     classes : (n,) uint8 class of the block's first cell, or None. gradient : (n, 2) float64, m per metre east and north
     of the frame, NaN where a neighbour has no height. cells : (n, 2) row and column of the block on the grid of all
-    blocks, which has `shape` and `transform`.
+    blocks, which has `shape` and `transform`. size : cells of the reference along a side of a block.
     """
 
     xy: FloatArray
@@ -39,6 +39,7 @@ class TruthBlocks:
     cells: NDArray[np.int64]
     shape: tuple[int, int]
     transform: Affine
+    size: int = 1
 
     @property
     def mean(self) -> FloatArray:
@@ -98,7 +99,8 @@ def truth_blocks(
     gradient = block_gradient(reference, size, frame, keep.reshape(rows, cols))
     chosen = None if classes is None else classes[row[keep], col[keep]]
     block = np.column_stack([row[keep], col[keep]]) // size
-    return TruthBlocks(xy[keep], heights[keep], chosen, gradient, block, (rows, cols), transform * Affine.scale(size))
+    grid = transform * Affine.scale(size)
+    return TruthBlocks(xy[keep], heights[keep], chosen, gradient, block, (rows, cols), grid, size)
 
 
 def places(transform: Affine, row: FloatArray, col: FloatArray) -> FloatArray:

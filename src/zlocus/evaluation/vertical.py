@@ -9,10 +9,7 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
-from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL, check_heights, vertical_datum, vertical_part
-
-# What a surface made here says of its heights in its band's description, its CRS having no room for it.
-OWN_ELLIPSOIDAL = f"height above {ELLIPSOIDAL.surface}"
+from zlocus.io.vertical import ELLIPSOID, OWN_ELLIPSOIDAL, check_heights, vertical_datum, vertical_part
 
 
 @dataclass(frozen=True)
@@ -111,5 +108,8 @@ def _raised(raster: HeightRaster, geoid: Path) -> HeightRaster:
     """The same heights above the ellipsoid."""
     if raster.horizontal is None:
         raise InputError(f"{raster.path} has no CRS, so no geoid can be added to it. Assign one (gdal_edit -a_srs).")
+    datum = vertical_datum(str(geoid), "--geoid")
+    if datum.geoid is None:
+        raise ConfigError(f"--geoid {geoid} is no geoid. Give egm96, egm2008 or the raster of one, or leave it out.")
     geobox = GeoBox(raster.z.shape, raster.transform, raster.horizontal.to_wkt())
-    return replace(raster, z=vertical_datum(str(geoid), "--geoid").ellipsoidal_of_cells(raster.z, geobox))
+    return replace(raster, z=datum.ellipsoidal_of_cells(raster.z, geobox))

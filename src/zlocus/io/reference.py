@@ -19,13 +19,22 @@ from rasterio.windows import Window
 
 from zlocus.errors import InputError
 from zlocus.io.crs import checked_crs, known_crs, raster_crs
+from zlocus.io.heights import check_unit, is_fill
 from zlocus.io.opening import existing_file, open_raster
-from zlocus.io.vertical import VerticalDatum, check_heights, grid_crs, vertical_datum, vertical_datum_of
+from zlocus.io.vertical import (
+    OWN_ELLIPSOIDAL,
+    VerticalDatum,
+    check_heights,
+    grid_crs,
+    vertical_datum,
+    vertical_datum_of,
+    vertical_part,
+)
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200
 # No extent on the Earth, in any unit, is larger.
-FARTHEST = 1e9
+WIDEST_EXTENT = 1e9
 
 
 def read_geobox(path: Path) -> GeoBox:
@@ -65,6 +74,7 @@ def read_dem(
     with open_raster(path, "DEM") as source:
         crs = raster_crs(source, path)
         check_heights(crs, path)
+        check_unit(source.units[0], path)
         heights = _resampled(source, crs.to_2d(), geobox)
     if not (np.isfinite(heights).any() or may_miss):
         raise InputError(
@@ -85,6 +95,14 @@ def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
         return vertical_datum(given, "--dem-vertical")
     with open_raster(path, "DEM") as source:
         return vertical_datum_of(raster_crs(source, path), path, "--dem-vertical")
+
+
+def says_nothing(path: Path) -> bool:
+    """Whether neither the CRS of a DEM nor its band's description, where it was made here, says what its heights are
+    above."""
+    with open_raster(path, "DEM") as source:
+        crs, description = raster_crs(source, path), source.descriptions[0]
+    return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != OWN_ELLIPSOIDAL
 
 
 def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
@@ -122,7 +140,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
     west, south, east, north = shapely.total_bounds(polygons)
     largest = max(east - west, north - south)
-    if not (0 < largest < FARTHEST and np.isfinite(shapely.get_coordinates(polygons)).all()):
+    if not (0 < largest < WIDEST_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
         raise InputError(
             f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
         )
@@ -152,6 +170,7 @@ def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDAr
         return out
     window = Window(low[0], low[1], high[0] - low[0], high[1] - low[1])
     stored = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
+    stored[is_fill(stored)] = np.nan
     heights = (stored * source.scales[0] + source.offsets[0]).astype(np.float32)
     reproject(
         heights, out, src_transform=source.window_transform(window), src_crs=crs.to_wkt(), src_nodata=np.nan,

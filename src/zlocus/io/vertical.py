@@ -162,10 +162,13 @@ class VerticalDatum:
 
 
 ELLIPSOIDAL = VerticalDatum(ELLIPSOID)
+# What a surface made here says of its heights in its band's description, its CRS having no room for it.
+OWN_ELLIPSOIDAL = f"height above {ELLIPSOIDAL.surface}"
 
 
 def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
-    """What `given` names: ellipsoid, egm96, egm2008, or the file of a geoid. option : for messages.
+    """What `given` names: ellipsoid, egm96, egm2008, in small letters or capitals, or the file of a geoid. option : for
+    messages.
 
     Raises
     ------
@@ -174,10 +177,11 @@ def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
     InputError
         For a file that is no geoid; see `GeoidRaster.open`.
     """
-    if given == ELLIPSOID:
+    name = given.lower()
+    if name == ELLIPSOID:
         return ELLIPSOIDAL
-    if given in KNOWN:
-        return _installed(given, f"{option} {given}", f"{option} FILE")
+    if name in KNOWN:
+        return _installed(name, f"{option} {given}", f"{option} FILE")
     geoid = GeoidRaster.open(Path(given))
     return VerticalDatum(given, geoid, _named(geoid.path))
 

@@ -28,6 +28,8 @@ from zlocus.io.raster import write_cog
 from zlocus.scene import is_local
 
 LAZ_STEP_M = 0.001
+# Dimensions beside those of the format. Descriptions have 32 signs at most.
+SIGMA, VIEWS = "sigma_m", "n_images"
 LAZ_REACH_M = 2**31 * LAZ_STEP_M
 OFFSET_STEP_M = 1000.0
 PLY_POINT = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
@@ -48,8 +50,16 @@ class PointCloud:
         self._ply: BinaryIO | None = None
         self._n_points = n_points
 
-    def write(self, source: int, xyz: NDArray[np.float64], rgb: NDArray[np.uint16]) -> None:
-        """Add points. source : number of the image they come from; xyz : (n, 3) m; rgb : (n, 3), white is 65535."""
+    def write(
+        self,
+        source: int,
+        xyz: NDArray[np.float64],
+        rgb: NDArray[np.uint16],
+        sigma_m: NDArray[np.floating],
+        n_images: NDArray[np.uint8],
+    ) -> None:
+        """Add points. source : number of the image they come from; xyz : (n, 3) m; rgb : (n, 3), white is 65535;
+        sigma_m : (n,) m, standard deviation; n_images : (n,), images used."""
         try:
             laz, ply = self._files(xyz)
             points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=laz.header)
@@ -57,6 +67,7 @@ class PointCloud:
             points.red, points.green, points.blue = rgb.T
             points.return_number[:], points.number_of_returns[:] = 1, 1
             points.point_source_id[:] = source
+            points[SIGMA], points[VIEWS] = sigma_m, n_images
             laz.write_points(points)
             records = np.empty(len(xyz), PLY_POINT)
             records["xyz"], records["rgb"] = xyz, rgb >> 8
@@ -76,6 +87,7 @@ class PointCloud:
             header.scales = np.full(3, LAZ_STEP_M)
             header.offsets = np.floor(xyz.mean(axis=0) / OFFSET_STEP_M) * OFFSET_STEP_M if len(xyz) else np.zeros(3)
             header.generating_software = f"zlocus {__version__}"
+            add_precision(header, "standard deviation along ray, m")
             if self._crs is not None:
                 add_crs(header, self._crs)
             self._laz = laspy.open(self._parts[0], "w", header=header, do_compress=True)
@@ -108,6 +120,14 @@ class PointCloud:
     def _failed(self, error: Exception) -> OutputError:
         reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
         return OutputError(f"{self._paths[0]} cannot be written: {reason}. Check the folder and the space left.")
+
+
+def add_precision(header: laspy.LasHeader, of: str) -> None:
+    """Make room for a standard deviation and a number of images with every point. of : what it is of, 32 signs."""
+    header.add_extra_dims([
+        laspy.ExtraBytesParams(SIGMA, np.float32, of),
+        laspy.ExtraBytesParams(VIEWS, np.uint8, "images used"),
+    ])  # fmt: skip
 
 
 def add_crs(header: laspy.LasHeader, crs: CRS) -> None:

@@ -37,7 +37,8 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
     says what that is above as far as the raster's does.
 
     Lines are straight between the lines that join cells' centres, where heights are linear; they end at holes and at
-    the rim. raster : of heights; strip_rows : rows worked on at a time, which change no line.
+    the rim. Short closed ones, of which noise and trees make thousands, are left out. raster : of heights; strip_rows :
+    rows worked on at a time, which change no line.
 
     Raises
     ------
@@ -56,7 +57,7 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
         transform, crs = heights.geobox.transform, heights.crs or local_frame()
 
         def batches() -> Iterator[Batch]:
-            for levels, lines in batched(contours(heights, interval, strip_rows)):
+            for levels, lines in batched(contours(heights, interval, strip_rows, options.contour_least_cells)):
                 geometries = np.array([linestrings(_on_map(line, transform)) for line in lines], dtype=object)
                 # Counted in steps, then multiplied: a sum of steps would drift.
                 yield geometries, {"elevation_m": _rounded(np.array(levels, np.float64) * interval)}
@@ -136,9 +137,11 @@ class _Stitcher:
                 yield level, line
 
 
-def contours(heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS) -> Iterator[tuple[int, FloatArray]]:
+def contours(
+    heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS, least_cells: float = 0.0
+) -> Iterator[tuple[int, FloatArray]]:
     """Heights in intervals, and lines (n, 2) as (column, row), (0, 0) the first cell's centre; from low to high, those
-    of one height by their first points, from north to south.
+    of one height by their first points, from north to south; without closed ones shorter than `least_cells`.
 
     Lines wait on disk until all are known: held are those that still grow, and where the others are.
     """
@@ -150,6 +153,8 @@ def contours(heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS)
 
         def keep(row: int) -> None:
             for level, line in stitcher.finished(row):
+                if _is_ring_below(line, least_cells):
+                    continue
                 index.append((level, line[0, 1], line[0, 0], len(line), waiting.tell()))
                 waiting.write(line.tobytes())
 
@@ -196,6 +201,11 @@ def _traced(z: FloatArray, interval_m: float) -> Iterator[tuple[int, FloatArray]
     for level in range(math.ceil((low - ABOVE_M) / interval_m), math.floor((high - ABOVE_M) / interval_m) + 1):
         for line in generator.lines(level * interval_m + ABOVE_M):
             yield level, np.asarray(line, np.float64)
+
+
+def _is_ring_below(line: FloatArray, least_cells: float) -> bool:
+    """Whether a line (n, 2) is closed and shorter than so many cells."""
+    return bool((line[0] == line[-1]).all()) and float(np.hypot(*np.diff(line, axis=0).T).sum()) < least_cells
 
 
 def _place(point: FloatArray, row: int, rows: int, level: int) -> Place | None:

@@ -13,7 +13,7 @@ from zlocus.io.raster import RasterSink
 from zlocus.options import ProductOptions
 from zlocus.products.strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
 from zlocus.surface.reasons import Quality
-from zlocus.surface.terrain import between, block_least, block_mean, membrane, outside_of, terrain
+from zlocus.surface.terrain import between_blocks, block_least, block_mean, membrane, outside_of, terrain
 
 FloatImage = NDArray[np.float32]
 # Cells in which ground is looked for; held in memory, some ten arrays of float32 at a time.
@@ -51,8 +51,10 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
             """Heights that are ground, NaN elsewhere, of each strip."""
             for strip in strips_of(shape[0], 0, strip_rows):
                 z = heights.read(strip)
-                allowed = options.ground_tolerance_m + options.ground_scaling * between(slope, side, strip.row, z.shape)
-                off = np.abs(z - between(first, side, strip.row, z.shape))
+                allowed = options.ground_tolerance_m + options.ground_scaling * between_blocks(
+                    slope, side, strip.row, z.shape
+                )
+                off = np.abs(z - between_blocks(first, side, strip.row, z.shape))
                 doubtful = (flags.read(strip) & DOUBTFUL) != 0
                 yield strip, np.where((off <= allowed) & ~doubtful, z, np.float32(np.nan))
 
@@ -66,7 +68,7 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
                 rows, cols = np.arange(strip.row, strip.row + strip.rows) // side, np.arange(shape[1]) // side
                 beyond = (flags.read(strip) & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
                 gap = np.isnan(ground) & ~beyond & is_filled[np.ix_(rows, cols)]
-                sink.write(strip.row, 0, np.where(gap, between(filled, side, strip.row, ground.shape), ground))
+                sink.write(strip.row, 0, np.where(gap, between_blocks(filled, side, strip.row, ground.shape), ground))
 
 
 def _cells_of_a_block(heights: ReadBand, options: ProductOptions) -> int:

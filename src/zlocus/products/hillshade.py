@@ -47,7 +47,7 @@ def hillshade(z: NDArray[np.float32], cell_m: float, azimuth_deg: float, altitud
 
     z : (r, c) m, NaN where empty. Source: Horn (1981), Proc. IEEE 69(1), Lambertian shading of section V.
     """
-    east, north = gradient(z, cell_m)
+    east, north = horn_gradient(z, cell_m)
     azimuth, altitude = math.radians(azimuth_deg), math.radians(altitude_deg)
     sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
     # The normal is (-east, -north, 1), not yet of length 1.
@@ -57,7 +57,7 @@ def hillshade(z: NDArray[np.float32], cell_m: float, azimuth_deg: float, altitud
     return np.where(np.isfinite(z), shade, NO_SHADE).astype(np.uint8)
 
 
-def gradient(z: NDArray[np.floating], cell_m: float) -> tuple[FloatArray, FloatArray]:
+def horn_gradient(z: NDArray[np.floating], cell_m: float) -> tuple[FloatArray, FloatArray]:
     """Slopes to east and to north, (r, c) each, from the eight neighbours; rows go south. NaN where z is.
 
     Source: Horn (1981), the weighted differences of section III (weights 1, 2, 1 over 8 cells). Beside holes and at the

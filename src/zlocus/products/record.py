@@ -18,7 +18,9 @@ from typing import Any
 
 from zlocus.errors import InputError, OutputError
 from zlocus.execution.memory import peak_memory_mb
+from zlocus.io.config import config_as_dict
 from zlocus.io.text import read_text
+from zlocus.options import RunConfig
 
 SCHEMA = 1
 CHUNK_BYTES = 1 << 20
@@ -75,6 +77,23 @@ def inputs_record(paths: Iterable[Path]) -> list[dict[str, str]]:
                 digest.update(chunk)
         records.append({"path": str(path), "sha256": digest.hexdigest()})
     return records
+
+
+def request_as_dict(request: Any) -> dict[str, Any]:
+    """A request, one of `zlocus.request`, as JSON can hold it."""
+    record = {name: str(value) if isinstance(value, Path) else value for name, value in vars(request).items()}
+    return record | {"inputs": [str(path) for path in request.inputs]}
+
+
+def made_record(request: Any, config: RunConfig, files: Iterable[Path], watch: Stopwatch) -> dict[str, Any]:
+    """What was asked, of which versions and inputs, and how long it took, for run.json. files : read beside those that
+    the request names as inputs."""
+    return {
+        "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
+        "versions": versions_record(),
+        "inputs": inputs_record(dict.fromkeys([*request.inputs, *files])),
+        "stages": watch.stages,
+    }
 
 
 def now() -> str:

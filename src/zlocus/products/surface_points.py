@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from zlocus import __version__
 from zlocus.errors import OutputError
-from zlocus.products.cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, add_crs
+from zlocus.products.cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, SIGMA, VIEWS, add_crs, add_precision
 from zlocus.products.strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
 from zlocus.scene import is_local
 from zlocus.sensors.model import FloatArray
 
-# Dimensions beside those of the format. Descriptions have 32 signs at most.
-SIGMA, VIEWS = "sigma_m", "n_images"
 # Grey values from which on points are white, in standard deviations above the mean; of 8 bits: all are shown.
 WHITE_DEVIATIONS = 3.0
 SOURCES = ("dsm.tif", "sigma.tif", "views.tif", "ortho.tif")
@@ -82,10 +80,7 @@ def _header(heights: ReadBand) -> laspy.LasHeader:
     middle = np.array([(box.left + box.right) / 2, (box.bottom + box.top) / 2, heights.statistic("MEAN") or 0.0])
     header.offsets = np.floor(middle / OFFSET_STEP_M) * OFFSET_STEP_M
     header.generating_software = f"zlocus {__version__}"
-    header.add_extra_dims([
-        laspy.ExtraBytesParams(SIGMA, np.float32, "standard deviation of height, m"),
-        laspy.ExtraBytesParams(VIEWS, np.uint8, "images used"),
-    ])  # fmt: skip
+    add_precision(header, "standard deviation of height, m")
     crs = heights.crs
     if crs is not None and not is_local(crs):
         add_crs(header, crs)

@@ -25,6 +25,11 @@ class Rays(Protocol):
         """Hypotheses (n,) of ground points (n, 3) m."""
         ...
 
+    def metres_per_unit(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """What a unit of the hypothesis is worth at pixels (n, 2) and hypotheses (n,), (n,) m: of height, or of the way
+        along the ray."""
+        ...
+
     def to(self, sensor: SensorModel) -> SensorModel:
         """Another view's sensor model over the reference image's pixels and hypotheses."""
         ...
@@ -45,6 +50,10 @@ class HeightRays:
     def hypothesis(self, xyz: FloatArray) -> FloatArray:
         """See `Rays`."""
         return np.asarray((xyz[:, 2] - self.datum) / self.unit)
+
+    def metres_per_unit(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `Rays`: of height."""
+        return np.full(len(xy), self.unit)
 
     def to(self, sensor: SensorModel) -> SensorModel:
         """See `Rays`."""
@@ -93,6 +102,12 @@ class DepthRays:
         """See `Rays`; NaN behind the camera."""
         depth = self.sensor.depth(xyz)
         return np.asarray(np.divide(self.scale, depth, out=np.full(len(depth), np.nan), where=depth > 0))
+
+    def metres_per_unit(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `Rays`: along the ray, on which the depth changes by `scale` / z^2; NaN where `ground` is."""
+        z = np.broadcast_to(np.asarray(z, float), (len(xy),))
+        by_unit = np.divide(self.scale, z * z, out=np.full(len(z), np.nan), where=z > 0)
+        return np.asarray(by_unit * np.linalg.norm(self.sensor.ray_from_image(xy), axis=1))
 
     def to(self, sensor: SensorModel) -> SensorModel:
         """See `Rays`."""

@@ -123,7 +123,7 @@ def _blocks(z: NDArray[np.floating], side: int) -> NDArray[np.floating]:
     return whole.reshape(down, side, across, side)
 
 
-def between(coarse: FloatImage, side: int, row: int, shape: tuple[int, int]) -> FloatImage:
+def between_blocks(coarse: FloatImage, side: int, row: int, shape: tuple[int, int]) -> FloatImage:
     """Values at the centres of the fine cells of rows from `row` on, bilinear between those of blocks of `side` cells;
     beyond the outer centres as there. coarse : (r, c); shape : of the result."""
     upper, lower, down = _places(row, shape[0], side, coarse.shape[0])
