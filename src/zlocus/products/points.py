@@ -6,7 +6,9 @@ import os
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from pyproj import CRS
 from zlocus.errors import OutputError
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.curve import GOOD
+from zlocus.matching.curve import FAIR, GOOD
 from zlocus.matching.selection import Ranking
 from zlocus.orientation.orient import Orientation
 from zlocus.orientation.triangulate import project_points
@@ -24,6 +26,7 @@ from zlocus.sensors.model import FloatArray
 
 # Geometries of shapely's (n,) and their columns, (n,) each.
 Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
+LABELS = ("good", "fair", "poor")
 # Columns of labels begin so.
 LABEL = "label_"
 # In place of a label that there is not; becomes NULL.
@@ -90,6 +93,30 @@ class RankedPoints:
         labels[:, :, self.views] = self.labels
         labels[:, np.arange(k), self.views] = NOT_RANKED
         return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), labels.reshape(n * k, n_views)
+
+
+def label_counts(ranked: Sequence[RankedPoints], n_views: int) -> NDArray[np.int64]:
+    """How often each label was given, (3, i, i) int64: good, fair and poor, of the search image (last axis) against the
+    reference; 0 where the two were not compared."""
+    counts = np.zeros((3, n_views, n_views), np.int64)
+    for part in ranked:
+        at = np.ix_(part.views, part.views)
+        for k, is_label in enumerate((part.labels == GOOD, part.labels == FAIR, part.labels < FAIR)):
+            counts[k][at] += is_label.sum(axis=0)
+    counts[:, np.arange(n_views), np.arange(n_views)] = 0
+    return counts
+
+
+def counted_pairs(counts: NDArray[np.int64], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Per pair of images that were compared, the points and their labels, which are the same either way round.
+
+    counts : of `label_counts`; names : of the scene's images.
+    """
+    return [
+        {"images": [names[i], names[j]], "points": int(n.sum()), **dict(zip(LABELS, n.tolist(), strict=True))}
+        for i, j in combinations(range(len(names)), 2)
+        if (n := counts[:, i, j]).any()
+    ]
 
 
 def write_ranking(
