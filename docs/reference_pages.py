@@ -35,13 +35,16 @@ def _command(name: str, command: Any) -> str:
 
 def _parameter(parameter: Any) -> str:
     default = "must be given" if parameter.required else _default(parameter.default)
+    if parameter.secondary_opts:
+        default = f"`{(parameter.opts if parameter.default else parameter.secondary_opts)[0]}`"
     name = parameter.metavar if parameter.param_type_name == "argument" else _names(parameter)
     words = name if name == parameter.metavar else f"{name} {_metavar(parameter)}".rstrip()
     return f"| `{_cell(words)}` | {_cell(parameter.help)} | {default} |"
 
 
 def _names(parameter: Any) -> str:
-    return ", ".join(parameter.opts)
+    """All forms of an option, those that say the contrary last."""
+    return ", ".join([*parameter.opts, *parameter.secondary_opts])
 
 
 def _metavar(parameter: Any) -> str:

@@ -117,6 +117,8 @@ def test_all_commands_and_options_are_there(site):
             assert letters(parameter.help) in commands, parameter
             shown = parameter.metavar if parameter.param_type_name == "argument" else parameter.opts[-1]
             assert letters(shown) in commands, parameter
+            for contrary in parameter.secondary_opts:
+                assert letters(f"{parameter.opts[-1]} {contrary} {parameter.help}") in commands, parameter
 
     def sentences(options):
         for f in fields(options):
