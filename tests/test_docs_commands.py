@@ -124,9 +124,9 @@ def check_tutorial(folder: Path) -> None:
     coverage = json.loads((folder / "surface" / "run.json").read_text(encoding="utf-8"))["coverage"]
     assert f"says that {100 * coverage:.0f} % of the cells" in told
     # Another run of `zlocus dsm`, to which no products were added.
-    listed = re.search(r"\| file \| holds \|(.*?)Heights are above", told)
-    assert listed
-    first_columns = [row.split(" | ")[0] for row in listed[1].split(" | | ")]
+    page = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    (section,) = re.findall(r"^## 3\..*?(?=^## 4\.)", page, re.DOTALL | re.MULTILINE)
+    first_columns = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
     named = re.findall(r"`([a-z_]+\.[a-z]+)`", " ".join(first_columns))
     assert sorted(named) == sorted(path.name for path in (folder / "again").iterdir())
 

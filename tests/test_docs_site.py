@@ -136,6 +136,34 @@ def test_the_interface_is_described(site):
         assert f'id="zlocus.api.{name}"' in anchors
 
 
+def test_parameters_stand_in_a_list(site):
+    """Those of every function, by name, where its docstring says something of them."""
+    text = (site / "api.html").read_text(encoding="utf-8")
+    listed = set(re.findall(r"<li><p><strong>([\w,]+)</strong>", text.replace("</strong><strong>", "")))
+    for names in ("inputs", "bounds", "step_cells", "reference", "window", "area,mask", "dem_vertical", "x,y"):
+        assert names in listed, names
+    assert "ortho : " not in Loaded(text).text
+    assert "dem_vertical : " not in Loaded(text).text
+
+
+def test_a_docstring_with_parameters_in_its_sentences():
+    sys.path.insert(0, str(DOCS))
+    try:
+        from reference_pages import with_listed_parameters
+    finally:
+        sys.path.remove(str(DOCS))
+    lines = [
+        "What it does.", "", "More words. one : (r, c) m; NaN is", "empty. two, three : of both. Returns (n,) m.", "",
+        "Not one : this.", "", ":raises Fault: What happens; one : stays.", "",
+    ]  # fmt: skip
+    assert with_listed_parameters(lines, ["one", "two", "three"]) == [
+        "What it does.", "", "More words.", "", "Returns (n,) m.", "", "Not one : this.", "",
+        ":param one: (r, c) m; NaN is empty.", ":param two,three: of both.", "",
+        ":raises Fault: What happens; one : stays.", "",
+    ]  # fmt: skip
+    assert with_listed_parameters(["Only words."], []) == ["Only words."]
+
+
 def test_pages_of_later_have_a_place(tmp_path):
     """A page that no list names is listed; a mistake in one is a failure."""
     sys.path.insert(0, str(DOCS))

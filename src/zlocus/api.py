@@ -301,10 +301,11 @@ def true_ortho(
     scene: Scene, height: NDArray[np.floating], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """What the images show of a surface, each cell from the image that shows it on most pixels, of those from which the
-    surface does not hide it: grey values (r, c) float32, NaN where there is no height and where no image sees it.
+    surface does not hide it: grey values (r, c) float32, NaN where there is no height and where no image sees it. What
+    stands beside the area hides nothing.
 
     scene : oriented; height : (r, c) m above the ellipsoid, NaN where there is none; x, y : (c,), (r,) m, of the
-    cells' centres, evenly spaced, y from north to south. What stands beside the area hides nothing.
+    cells' centres, evenly spaced, y from north to south.
 
     Raises
     ------
