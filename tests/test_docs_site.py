@@ -142,8 +142,8 @@ def test_parameters_stand_in_a_list(site):
     listed = set(re.findall(r"<li><p><strong>([\w,]+)</strong>", text.replace("</strong><strong>", "")))
     for names in ("inputs", "bounds", "step_cells", "reference", "window", "area,mask", "dem_vertical", "x,y"):
         assert names in listed, names
-    assert "ortho : " not in Loaded(text).text
-    assert "dem_vertical : " not in Loaded(text).text
+    assert "ortho : (r, c)" not in Loaded(text).text
+    assert "dem_vertical : what" not in Loaded(text).text
 
 
 def test_a_docstring_with_parameters_in_its_sentences():
