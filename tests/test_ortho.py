@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,9 @@ from zlocus.matching.ortho import (
     true_ortho,
     what_stands_around,
 )
+from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.views import ViewPixels, tile_views
-from zlocus.matching.visibility import coverage
+from zlocus.matching.visibility import coverage, hide
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
 
@@ -160,6 +162,9 @@ def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
 
 def test_cells_that_no_view_sees():
     pixels, views, seen = tile([sensor(across=30.0), sensor(across=31.0)])
+    # Where a view that was matched counts as seeing it, that is shown all the same.
+    assert (best_view(views, seen, tower()) >= 0).all()
+    hide(seen, views, tower(), np.zeros(SHAPE, np.float32), 1.0)
     best = best_view(views, seen, tower())
     ortho = true_ortho(pixels, views, seen, tower())
     assert (best < 0).sum() > 80
@@ -179,6 +184,27 @@ def test_grey_values_are_those_of_the_image():
     flat = np.full(SHAPE, LOW, np.float32)
     np.testing.assert_allclose(true_ortho(pixels, views, seen, flat), 510.0, rtol=0, atol=1e-3)
     np.testing.assert_allclose(ortho_image(views, flat, 1), -3.0, rtol=0, atol=1e-6)
+
+
+def test_grey_values_are_levelled_to_those_of_one_image():
+    """0.25 of 40 above 500 is 0.25 of 8 above 100; a trend is taken off."""
+    flat = np.full(SHAPE, LOW, np.float32)
+    pixels, views, seen = tile([sensor()], greys=(0.25,), contrast=40.0, mean=500.0)
+    fallen = [replace(view, trend=np.full((201, 201), 7.0, np.float32)) for view in pixels]
+    for held, scale, expected in (
+        (pixels, None, 510.0), (fallen, None, 517.0),
+        (pixels, GreyScale(100.0, 8.0), 102.0), (fallen, GreyScale(100.0, 8.0), 102.0),
+    ):  # fmt: skip
+        np.testing.assert_allclose(true_ortho(held, views, seen, flat, scale=scale), expected, rtol=0, atol=1e-3)
+    red, green, blue = (np.full((201, 201), v, np.float32) for v in (517.0, 497.0, 547.0))
+
+    class Coloured:
+        def colours(self, row, col, rows, cols):
+            return np.stack([red, green, blue])[:, row : row + rows, col : col + cols]
+
+    found = true_ortho(fallen, views, seen, flat, [Coloured()], scale=GreyScale(100.0, 8.0))
+    np.testing.assert_allclose(found[5, 5], [102.0, 98.0, 108.0], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(true_ortho(fallen, views, seen, flat, [Coloured()])[5, 5], [517, 497, 547], atol=1e-3)
 
 
 @pytest.fixture(scope="module", params=["uint8", "uint16"])

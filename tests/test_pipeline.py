@@ -355,12 +355,13 @@ def test_heights_around_a_dem(images, tmp_path):
 
 def test_ortho_image_where_the_leading_view_sees_nothing(images, tmp_path):
     """The leading image, three times as bright, is cut off in the west: no cell shows another place's grey value, and
-    grey values of another image are its own."""
+    grey values of another image are its own, or as bright as the leading one's."""
     paths = dict(images("plane").paths)
     with rasterio.open(paths["nadir"]) as source:
         pixels, rpc = source.read(1), source.rpcs
     paths["nadir"] = write_image(tmp_path / "nadir.tif", (pixels[:, :75] * 3).astype(np.uint16), None, rpcs=rpc)
-    out = run(tuple(paths.values()), tmp_path / "out", SMALL_TILES).out
+    own = replace(SMALL_TILES, products=ProductOptions(ortho_levels="own"))
+    levelled, out = (run(tuple(paths.values()), tmp_path / n, c).out for n, c in (("a", SMALL_TILES), ("b", own)))
     with rasterio.open(out / "ortho.tif") as source:
         grey, shown = source.read(1).astype(float), source.read_masks(1) > 0
         x, y = source.transform * (np.meshgrid(np.arange(source.width) + 0.5, np.arange(source.height) + 0.5))
@@ -374,6 +375,9 @@ def test_ortho_image_where_the_leading_view_sees_nothing(images, tmp_path):
         known.append(read(paths[name])[0][xy[:, 1], xy[:, 0]].astype(float))
     away = np.min([np.abs(grey.ravel()[there] - values) for values in known], axis=0)
     assert np.median(away) < 20
+    with rasterio.open(levelled / "ortho.tif") as source:
+        brighter = source.read(1).astype(float).ravel()[there] / grey.ravel()[there]
+    assert np.median(brighter) == pytest.approx(3.0, rel=0.03)
 
 
 def test_without_the_semi_global_constraint(images, tmp_path):

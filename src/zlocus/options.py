@@ -401,6 +401,10 @@ class CheckOptions(Checked):
 class ProductOptions(Checked):
     """Maps made of a surface: hillshade, contours, terrain."""
 
+    ortho_levels: str = option(
+        "common", "Ortho-image: grey values and colours levelled to those of the leading image, without the fall-off "
+        "of lenses, or as each image has them.", choices=("common", "own"),
+    )  # fmt: skip
     sun_azimuth_deg: float = option(
         315.0, "Hillshade: direction of the sun, from north over east.", low=0.0, high=360.0, unit="degrees"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from zlocus.kernels.spline import spline_coefficients
 from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.base import BaseSurface
+from zlocus.matching.border import covered_ground, shown_heights
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
@@ -36,13 +38,13 @@ from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees, spare_pairs
 from zlocus.options import RunConfig
-from zlocus.scene import ColourSource
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
 from zlocus.surface.precision import sigma_steps, signs_of_precision
 from zlocus.surface.reasons import Quality, is_empty
 from zlocus.surface.surface import Surface
 
+Value = TypeVar("Value", np.float32, np.bool_)
 RIVALS_KEPT = 128
 SEEN_MARGIN = 4
 PLAIN_IN = 2  # views in which plain segments are looked for, one after the other
@@ -123,34 +125,38 @@ def match_tile(
         ranking = _ranking(scene, pixels, core, result, config) if use_visibility else None
         result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
-    worth, coarser = _worth_matching(result), list[LevelResult]()
+    ground = covered_ground(
+        shown_heights(pixels, result.views, coarsest, result.lattice, -(-scene.n_steps // 2**coarsest)),
+        result.seen, result.heights.vertex, (guide.low, guide.high), scene.cell_m / scene.step_m,
+    )  # fmt: skip
+    worth, levels = _worth_matching(result, ground), [result]
     for level in range(coarsest - 1, -1, -1):
         window = _level_window(scene, core, level, config).within(worth.finer(coarsest - level))
         if not (window.rows and window.cols):
             return TileResult(Surface.nothing(core), done, every)
-        coarser.append(result)
         guide = Guide(_finer(result, window), *_candidates(scene, result, window, level), result)
         result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
+        levels.append(result)
         done, every = done + result.evaluations, every + result.all_views
     for _ in range(1, config.pyramid.finest_rounds if use_visibility else 1):
         guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
         result = _match_level(scene, pixels, window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
-    if method != "mvll":
-        result = _with_planes(result, config)
-    coloured = scene.coloured(which)
-    judged, refined = _finish(scene, pixels, result, config)
+    levels[-1] = result = result if method == "mvll" else _with_planes(result, config)
+    beyond = ~_on_cells(ground, levels[0].window, result.window, coarsest)
+    judged, refined = _finish(scene, pixels, result, beyond, config)
     surface = judged.precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
-    surface = replace(surface, ortho=_ortho(pixels, result, coarser, surface, refined, coloured, config.pyramid.halo))
+    surface = replace(surface, ortho=_ortho(scene, pixels, which, levels, surface, refined, config))
     done += 0 if ranking is None else ranking.evaluations
     return TileResult(surface.part(core, result.window), done, every, None if ranking is None else (ranking, which))
 
 
-def _worth_matching(coarsest: LevelResult) -> CellWindow:
-    """The cells, with a margin, whose ground two views see as far as the coarsest level can tell."""
-    seeing = sees(coarsest.seen, coarsest.heights.vertex[None]).sum(axis=0) >= 2
+def _worth_matching(coarsest: LevelResult, ground: NDArray[np.bool_]) -> CellWindow:
+    """The cells, with a margin, whose ground two views see as far as the coarsest level can tell. ground : (r, c), see
+    `covered_ground`."""
+    seeing = (sees(coarsest.seen, coarsest.heights.vertex[None]).sum(axis=0) >= 2) & ground
     rows, cols = np.flatnonzero(seeing.any(axis=1)), np.flatnonzero(seeing.any(axis=0))
     window = coarsest.window
     if not len(rows):
@@ -359,13 +365,13 @@ def _only(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLat
 
 def _finer(coarser: LevelResult, window: CellWindow) -> NDArray[np.float32]:
     """Height indices of the coarser level on the cells, and in the steps, of the finer."""
-    return 2 * _doubled(coarser.heights.vertex, coarser.window, window)
+    return 2 * _on_cells(coarser.heights.vertex, coarser.window, window)
 
 
-def _doubled(values: NDArray[np.float32], source: CellWindow, target: CellWindow) -> NDArray[np.float32]:
-    """Values of a level on the cells of the next finer one, each coarse cell four times."""
-    rows = np.clip((np.arange(target.rows) + target.row) // 2 - source.row, 0, source.rows - 1)
-    cols = np.clip((np.arange(target.cols) + target.col) // 2 - source.col, 0, source.cols - 1)
+def _on_cells(values: NDArray[Value], source: CellWindow, target: CellWindow, levels: int = 1) -> NDArray[Value]:
+    """Values (r, c) of a level on the cells of one so many levels finer, each of a coarse cell many times."""
+    rows = np.clip(((np.arange(target.rows) + target.row) >> levels) - source.row, 0, source.rows - 1)
+    cols = np.clip(((np.arange(target.cols) + target.col) >> levels) - source.col, 0, source.cols - 1)
     return np.ascontiguousarray(values[np.ix_(rows, cols)])
 
 
@@ -383,7 +389,7 @@ def _candidates(
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
     found = np.stack([heights.best, rival, coarser.lone])
     low, high = _without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
-    low, high = (2 * _doubled(v, coarser.window, window) for v in (low, high))
+    low, high = (2 * _on_cells(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):
         side = scene.cell_m * 2**level
         col = np.floor((scene.ties[:, 0] - scene.anchor[0]) / side).astype(int) - window.col
@@ -426,10 +432,10 @@ def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
 
 
 def _finish(
-    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, config: RunConfig
+    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, beyond: NDArray[np.bool_], config: RunConfig
 ) -> tuple[Surface, NDArray[np.float32]]:
     """Refine the finest level and judge it, halo included: the surface without its ortho-image, and height indices of
-    all cells, (r, c)."""
+    all cells, (r, c). beyond : (r, c) cells whose ground is not covered."""
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
     refined = refine(
         result.views,
@@ -447,6 +453,7 @@ def _finish(
     signs = signs_of_precision(result.heights, refined, seeing)
     quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)
     quality[left_out(result.views, quality.shape)] |= np.uint16(Quality.LEFT_OUT)
+    quality[beyond] |= np.uint16(Quality.UNSEEN)
     if result.is_planar is not None:
         quality[result.is_planar] |= np.uint16(Quality.PLANE)
     height = result.lattice.metres(refined.height)
@@ -458,20 +465,23 @@ def _finish(
 
 
 def _ortho(
+    scene: MatchScene,
     pixels: list[ViewPixels],
-    result: LevelResult,
-    coarser: list[LevelResult],
+    which: list[int],
+    levels: list[LevelResult],
     surface: Surface,
     index: NDArray[np.float32],
-    coloured: list[ColourSource],
-    halo: int,
+    config: RunConfig,
 ) -> NDArray[np.float32]:
-    """What the views show of a surface, of its filled cells too; NaN where there is no height. index : (r, c) height
-    indices of all cells as matched, which hide others whether they were kept or not."""
-    lattice, is_filled = result.lattice, (surface.quality & np.uint16(Quality.FILLED)) != 0
+    """What the views show of a surface, of its filled cells too; NaN where there is no height. which : of the scene's
+    views `pixels` are; levels : the coarsest first; index : (r, c) height indices of all cells as matched, which hide
+    others whether they were kept or not."""
+    *coarser, finest = levels
+    lattice, is_filled = finest.lattice, (surface.quality & np.uint16(Quality.FILLED)) != 0
     index = np.where(is_filled, (surface.height - np.float32(lattice.origin_m)) / np.float32(lattice.step_m), index)
     known = [CoarserHeights(each.level, each.window, each.heights.vertex) for each in reversed(coarser)]
-    around = what_stands_around(known, result.views, result.window, index, halo)
-    ortho = true_ortho(pixels, result.views, result.seen, index, coloured, around)
+    around = what_stands_around(known, finest.views, finest.window, index, config.pyramid.halo)
+    scale = scene.grey[0] if config.products.ortho_levels == "common" else None
+    ortho = true_ortho(pixels, finest.views, finest.seen, index, scene.coloured(which), around, scale)
     ortho[np.isnan(surface.height)] = np.nan
     return ortho

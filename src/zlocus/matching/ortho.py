@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_ortho
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.views import TileViews, ViewPixels
 from zlocus.matching.visibility import cells_per_step, hide, sees
 from zlocus.scene import ColourSource
@@ -89,13 +90,14 @@ def what_stands_around(
 
 def true_ortho(
     pixels: Sequence[ViewPixels], views: TileViews, seen: NDArray[np.int32], surface: NDArray[np.float32],
-    coloured: Sequence[ColourSource] = (), around: Around | None = None,
+    coloured: Sequence[ColourSource] = (), around: Around | None = None, scale: GreyScale | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Grey values (r, c), or colours (r, c, 3), of the best view that sees each cell of a surface; NaN where none does.
 
     surface : (r, c) float32 height indices, no NaN, which also is what hides one cell from a view behind another;
     pixels, views : the finest level's; seen : (3, i, r, c), see `coverage`; coloured : their images, where all have
-    colours; around : what may hide cells too, None where nothing beyond the tile is tall enough.
+    colours; around : what may hide cells too, None where nothing beyond the tile is tall enough; scale : of the image
+    to which all are levelled, trends taken off; None: each keeps its own grey values.
     """
     best = best_view(views, seen, surface, around)
     out = np.full(surface.shape + ((3,) if coloured else ()), np.nan, np.float32)
@@ -103,14 +105,20 @@ def true_ortho(
         shown = best == i
         if not shown.any():
             continue
+        gain, offset = 1.0, 0.0
+        if scale is not None:
+            gain = scale.contrast / view.contrast
+            offset = scale.mean - gain * view.mean
         if coloured:
             (row, col), (rows, cols) = view.origin, view.shape
             for k, channel in enumerate(coloured[i].colours(row, col, rows, cols)):
-                out[shown, k] = _of_one(views, i, channel, surface)[shown]
+                plain = channel if scale is None or view.trend is None else channel - view.trend
+                out[shown, k] = _of_one(views, i, plain, surface)[shown] * np.float32(gain) + np.float32(offset)
             continue
-        out[shown] = ortho_image(views, surface, i)[shown] * np.float32(view.contrast) + np.float32(view.mean)
-        if view.trend is not None:
-            out[shown] += _of_one(views, i, view.trend, surface)[shown]
+        grey = ortho_image(views, surface, i)[shown] * np.float32(view.contrast) + np.float32(view.mean)
+        if scale is None and view.trend is not None:
+            grey += _of_one(views, i, view.trend, surface)[shown]
+        out[shown] = grey if scale is None else grey * np.float32(gain) + np.float32(offset)
     return out
 
 
@@ -120,7 +128,8 @@ def best_view(
     """The view that shows each cell of a surface on most pixels, of those from which the surface itself, or what stands
     around it, does not hide it; the leading one unless another is clearly finer; -1 where none sees it. (r, c)
 
-    Edges lie within a cell or so of where they should: views that see past them by more are asked first.
+    Edges lie within a cell or so of where they should: views that see past them by more are asked first. Where the
+    surface hides a cell from all, those with which it was matched are taken, by `seen`: rough ground hides itself.
     """
     size = pixels_per_cell(views)
     size[0] *= FINER
@@ -133,8 +142,8 @@ def best_view(
         found = _on_most_pixels(size, free, views.block, surface)
         best = np.where(best < 0, found, best)
         if (best >= 0).all():
-            break
-    return best
+            return best
+    return np.where(best < 0, _on_most_pixels(size, seen, views.block, surface), best)
 
 
 def _on_most_pixels(

@@ -24,19 +24,20 @@ PAIR = 2
 TURN, MOST_PARTS = 0.2, 8
 
 
-def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice) -> IntVolume:
+def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice, border_px: float = BORDER_PX) -> IntVolume:
     """(3, i, r, c) int32: lowest and highest height index at which each image covers each cell, and from where on
     nothing hides it (everywhere, for now).
 
     A view takes part over the longest run of heights whose windows lie inside the image and on valid pixels; at other
     heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
-    parallax of the range.) views : whose nodes follow `base`, from which heights are counted.
+    parallax of the range.) views : whose nodes follow `base`, from which heights are counted; border_px : of the images
+    that is not looked at.
     """
     seen = np.empty((3, len(views.layout), *lattice.shape), np.int32)
     seen[2] = NOTHING_HIDDEN
     tile_reach(
         views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, views.limits,
-        lattice.block, BORDER_PX, base.relief, seen[0], seen[1],
+        lattice.block, border_px, base.relief, seen[0], seen[1],
     )  # fmt: skip
     return seen
 

@@ -18,7 +18,7 @@ from zlocus.surface.reasons import EMPTY, Quality
 # As docs/quality.md has them; a test keeps them the same.
 MEANINGS = {
     Quality.OUTSIDE: "not asked for: outside the area, or inside a mask",
-    Quality.UNSEEN: "fewer than two images cover the cell",
+    Quality.UNSEEN: "fewer than two images cover the cell at the height of the ground around it",
     Quality.HIDDEN: "fewer than two images see the surface there, the others are behind it",
     Quality.RANGE_END: "best match at an end of the height range: the true height may lie beyond it",
     Quality.NO_MATCH: "images do not agree at any height",

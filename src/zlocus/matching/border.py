@@ -1,0 +1,88 @@
+"""Cells beside the ground that views share, which two views cover at wrong heights only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from zlocus.matching.base import BaseSurface
+from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.views import TileViews, ViewPixels
+from zlocus.matching.visibility import coverage, covers
+
+AROUND = np.ones((3, 3), np.uint8)
+# Views that show a height.
+PAIR = 2
+# Ground rises by so much of the way to its neighbour at most, to half a step of its height; what views show is asked
+# for within so many steps more.
+STEEPEST, HALF_STEP, ASKED_STEPS = 0.5, 0.5, 2.0
+
+
+def shown_heights(
+    pixels: Sequence[ViewPixels], views: TileViews, level: int, lattice: HeightLattice, n_steps: int
+) -> NDArray[np.int32]:
+    """(3, i, r, c) as `coverage`, but up to the last pixel of each image: windows of a coarse level need many pixels
+    around a cell, those of the finest, for which this is asked, a few. views : of `level`; n_steps : of the lattice,
+    all of which are asked for."""
+    unusable = [~view.valid[level].ravel() for view in pixels]
+    bare = replace(
+        views, blocked=np.concatenate(unusable), has_blocked=np.array([bool(mask.any()) for mask in unusable])
+    )
+    whole = replace(lattice, first=np.zeros_like(lattice.first), count=np.full_like(lattice.count, n_steps))
+    return coverage(bare, BaseSurface.level(lattice.shape, views.block), whole, 0.0)
+
+
+def covered_ground(
+    shown: NDArray[np.int32],
+    matched: NDArray[np.int32],
+    surface: NDArray[np.float32],
+    searched: tuple[NDArray[np.float32], NDArray[np.float32]],
+    cell_steps: float,
+) -> NDArray[np.bool_]:
+    """Cells (r, c) that two views show at the height of the ground around, as far as that is known.
+
+    Beside the ground that views share, rays of two views still meet at heights that the ground does not have: something
+    would be found there. From the cells that two views show at all heights searched, ground is followed outwards as
+    long as two views show it. Cells that no such way leads to, and that are cut off by none, count as shown.
+
+    shown : (3, i, r, c) height indices, see `shown_heights`; matched : the same as far as images could be compared
+    there; surface : (r, c) indices found; searched : lowest and highest index, (r, c) each; cell_steps : side of a cell
+    in steps of height.
+    """
+    at_all = (matched[0] <= searched[0] + 1) & (matched[1] >= searched[1] - 1)
+    known = np.asarray(at_all.sum(axis=0) >= PAIR)
+    covered = np.asarray(covers(shown).sum(axis=0) >= PAIR)
+    if not known.any() or known[covered].all():
+        return covered
+    rise = np.float32(HALF_STEP + STEEPEST * cell_steps)
+    reach = rise + np.float32(ASKED_STEPS)
+    ground = np.where(known, cv2.medianBlur(surface, 3), np.float32(0.0))
+    beyond = np.zeros_like(known)
+    while True:
+        weight = cv2.boxFilter(known.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        ring = (weight > 0.5) & covered & ~known & ~beyond
+        if not ring.any():
+            break
+        total = cv2.boxFilter(ground, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        beside, own = total[ring] / weight[ring], surface[ring]
+        is_shown = _two_show(shown[:, :, ring], beside, reach)
+        # What is no ground, or was looked for elsewhere only, counts as the height beside it.
+        is_ground = (np.abs(own - beside) <= rise) & _two_show(matched[:, :, ring], beside, np.float32(0.0))
+        ground[ring] = np.where(is_shown, np.where(is_ground, own, beside), 0.0)
+        known[ring], beyond[ring] = is_shown, ~is_shown
+    regions, _ = label(covered & ~known, AROUND)
+    found = covered & ~np.isin(regions, np.unique(regions[beyond]))
+    # A cell that is cut off alone is as good as those on both sides of it.
+    closed = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, AROUND, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(covered & (closed > 0))
+
+
+def _two_show(seen: NDArray[np.int32], height: NDArray[np.float32], within: np.float32) -> NDArray[np.bool_]:
+    """Whether two views see cells at some height around a given one. seen : (3, i, n); height : (n,)."""
+    shows = (seen[0] <= height + within) & (seen[1] >= height - within)
+    return np.asarray(shows.sum(axis=0) >= PAIR)

@@ -1,0 +1,101 @@
+"""Ground beside what two views share: shown at wrong heights only, and so not looked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from zlocus.kernels.volume import HIDDEN
+from zlocus.matching.border import covered_ground
+
+ROWS, COLS, LAST = 12, 60, 40
+# Two views whose images end at a column that moves by a cell per two steps of height: further out, only higher ground
+# is shown. Up to EDGE all heights are.
+EDGE, SLANT = 30, 0.5
+GROUND, GHOST = 6.0, 33.0
+CELL_STEPS = 1.0
+# Windows of the coarse level need so many cells around.
+WINDOW = 4
+
+
+def views(edge=EDGE, n=2):
+    """(3, n, r, c): a cell at column c is shown from 2 (c - edge) on."""
+    col = np.arange(COLS)
+    low = np.maximum(np.ceil((col - edge) / SLANT), 0).astype(np.int32)
+    seen = np.empty((3, n, ROWS, COLS), np.int32)
+    seen[0], seen[1], seen[2] = low, LAST, HIDDEN
+    never = np.broadcast_to(low > LAST, (n, ROWS, COLS))
+    seen[0][never], seen[1][never] = HIDDEN, -1
+    return seen
+
+
+def found(surface=None, shown=None, matched=None):
+    searched = np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32)
+    shown = views() if shown is None else shown
+    matched = views(EDGE - WINDOW) if matched is None else matched
+    return covered_ground(shown, matched, ground() if surface is None else surface, searched, CELL_STEPS)
+
+
+def ground():
+    """As a matcher finds it: the ground as far as it is shown, then the lowest height that is."""
+    col = np.arange(COLS)
+    true = np.full(COLS, GROUND)
+    return np.tile(np.maximum(true, (col - EDGE + WINDOW) / SLANT), (ROWS, 1)).astype(np.float32)
+
+
+def test_ground_ends_where_two_views_end_at_its_height():
+    covered = found()
+    # Shown from (c - 30) / 0.5 on: ground at 6 is up to column 33, and up to 34 within the 3 steps that are allowed.
+    assert covered[:, :33].all()
+    assert not covered[:, 35:].any()
+
+
+def test_heights_found_beyond_are_not_followed():
+    """What was matched beside the ground climbs as steeply as the rays do, and is no ground."""
+    surface = ground()
+    surface[:, EDGE - WINDOW + 4 :] = GHOST
+    np.testing.assert_array_equal(found(surface), found())
+
+
+def test_ground_that_rises_is_followed():
+    """A slope of 0.3 cells per cell under rays of 2: the views end later on it."""
+    slope = (GROUND + 0.3 * np.arange(COLS)).astype(np.float32)
+    surface = np.tile(slope, (ROWS, 1))
+    covered = found(surface, matched=views(EDGE))
+    # (c - 30) / 0.5 = 6 + 0.3 c at c = 38.8.
+    assert covered[:, :38].all()
+    assert not covered[:, 41:].any()
+
+
+def test_a_tower_in_the_rim_is_kept_with_the_ground_around_it():
+    surface = ground()
+    surface[3:7, 28:32] = 20.0
+    assert found(surface)[:, :33].all()
+
+
+def test_where_nothing_is_shown_at_all_heights_nothing_is_cut_off():
+    shown = views(-2)
+    np.testing.assert_array_equal(found(shown=shown, matched=shown), shown[1][0] >= shown[0][0])
+
+
+def test_ground_apart_from_all_other_is_kept():
+    """Beyond a gap that no two views cover; what is cut off by ground that is shown at wrong heights is not."""
+    shown = views()
+    shown[1][:, :, 36:] = -1
+    shown[0][:, :, 36:] = HIDDEN
+    shown[:2, :, :, 50:] = np.array([10, LAST], np.int32)[:, None, None, None]
+    covered = found(shown=shown, matched=views(EDGE - WINDOW))
+    assert covered[:, 50:].all()
+    assert not covered[:, 35:50].any()
+    shown = views()
+    shown[:2, :, :, 40:] = np.array([10, LAST], np.int32)[:, None, None, None]
+    assert not found(shown=shown)[:, 36:].any()
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_two_views_it_takes(n):
+    shown, matched = views(n=n), views(EDGE - WINDOW, n)
+    covered = found(shown=shown, matched=matched)
+    assert covered[:, :33].all() == (n > 1)
+    if n == 1:
+        assert not covered.any()
