@@ -302,7 +302,7 @@ def true_ortho(
 ) -> NDArray[np.float32]:
     """What the images show of a surface, each cell from the image that shows it on most pixels, of those from which the
     surface does not hide it: grey values (r, c) float32, NaN where there is no height and where no image sees it. What
-    stands beside the area hides nothing.
+    stands beside the area hides nothing, and every image keeps its own grey values, which a run levels.
 
     scene : oriented; height : (r, c) m above the ellipsoid, NaN where there is none; x, y : (c,), (r,) m, of the
     cells' centres, evenly spaced, y from north to south.
