@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
 from pygments.lexers.special import TextLexer  # noqa: E402
 
-from reference_pages import command_reference, option_reference, result_pages, unlisted_pages  # noqa: E402
+from reference_pages import (  # noqa: E402
+    command_reference,
+    option_reference,
+    result_pages,
+    unlisted_pages,
+    with_listed_parameters,
+)
 from zlocus import __version__  # noqa: E402
 
 if TYPE_CHECKING:
@@ -65,8 +73,17 @@ def fill_in(app: Sphinx, page: str, source: list[str]) -> None:
             source[0] = source[0].replace(marker, make())
 
 
+def list_parameters(app: Sphinx, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
+    """Parameters of functions and classes as a list, whose docstrings have them in sentences."""
+    if what in ("function", "method"):
+        lines[:] = with_listed_parameters(lines, inspect.signature(found).parameters)
+    elif what == "class" and is_dataclass(found):
+        lines[:] = with_listed_parameters(lines, [field.name for field in fields(found)])
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("source-read", fill_in)
+    app.connect("autodoc-process-docstring", list_parameters)
     # Tables in text: Pygments has no lexer for them.
     app.add_lexer("csv", TextLexer)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ import typer.main
 from zlocus.cli import app
 from zlocus.options import RunConfig
 
+# What begins a sentence that is of no single parameter, though it stands behind one.
+OF_ALL = re.compile(r"(?<=\.) (?=(?:Returns|Source:|Heights come back) )")
 # Pages on what comes out, in their order, where they are there.
 RESULTS = ("products", "vertical", "evaluate", "report")
 
@@ -35,13 +37,16 @@ def _command(name: str, command: Any) -> str:
 
 def _parameter(parameter: Any) -> str:
     default = "must be given" if parameter.required else _default(parameter.default)
+    if parameter.secondary_opts:
+        default = f"`{(parameter.opts if parameter.default else parameter.secondary_opts)[0]}`"
     name = parameter.metavar if parameter.param_type_name == "argument" else _names(parameter)
     words = name if name == parameter.metavar else f"{name} {_metavar(parameter)}".rstrip()
     return f"| `{_cell(words)}` | {_cell(parameter.help)} | {default} |"
 
 
 def _names(parameter: Any) -> str:
-    return ", ".join(parameter.opts)
+    """All forms of an option, those that say the contrary last."""
+    return ", ".join([*parameter.opts, *parameter.secondary_opts])
 
 
 def _metavar(parameter: Any) -> str:
@@ -97,3 +102,30 @@ def unlisted_pages(folder: Path) -> str:
     """Names of the pages in a folder that its index does not list, a line each: none is without a place."""
     listed = set(re.findall(r"^([a-z_]+)$", (folder / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
     return "\n".join(sorted({page.stem for page in folder.glob("*.md")} - listed - {"index", *RESULTS}))
+
+
+def with_listed_parameters(lines: list[str], names: Iterable[str]) -> list[str]:
+    """The lines of a docstring with its parameters as a list, behind its sentences and before what it raises.
+
+    Docstrings say `name : what it is`, also of several names with commas between, and of several parameters in a
+    paragraph, set apart by full stops or semicolons: that reads well in the code and runs together on a page. names :
+    of the parameters, or of the fields of a class.
+    """
+    name = "|".join(sorted(map(re.escape, names), key=len, reverse=True))
+    if not name:
+        return lines
+    begin = re.compile(rf"(?:^|(?<=[.;]) )((?:{name})(?:, (?:{name}))*) ?: ")
+    sentences, listed, rest = list[str](), list[str](), list[str]()
+    for paragraph in re.split(r"\n\s*\n", "\n".join(lines).strip("\n")):
+        if rest or paragraph.startswith((":", "..")):
+            rest.append(paragraph)
+            continue
+        first, *parts = begin.split(" ".join(paragraph.split()))
+        sentences.append(first if parts else paragraph)
+        for of, said in zip(parts[::2], parts[1::2], strict=True):
+            text, *others = OF_ALL.split(said, maxsplit=1)
+            # Sphinx takes a word before a name for its type.
+            listed.append(f":param {of.replace(', ', ',')}: {text.removesuffix(';')}")
+            sentences += others
+    parts = [*filter(str.strip, sentences), "\n".join(listed), *rest]
+    return [*"\n\n".join(filter(None, parts)).splitlines(), ""]

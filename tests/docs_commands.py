@@ -160,6 +160,7 @@ def lay_out_surface(folder: Path) -> None:
 # What a page's commands find in the folder in which they are run.
 LAID_OUT = {
     "README.md": lay_out_images,
+    "api.md": lay_out_images,
     "rpc.md": lay_out_images,
     "orientation.md": lay_out_images,
     "doctor.md": lay_out_images,

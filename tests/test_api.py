@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,10 @@ from zlocus.synthetic.terrain import analytic_height
 ASKED = {"crs": "EPSG:32632", "resolution": GSD_M, "heights": HEIGHTS, "bounds": PART}
 # A measure of one's own, without refinement, on noisy images: half a step, and how many may be beyond.
 STEP_M, SHARE = 0.5, 0.97
+# Correlation of two ortho-images, of which one was rounded.
+SAME_ORTHO = 0.99
+# Grey values, of tables over other heights.
+SAME_GREY = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -169,3 +174,124 @@ def test_the_package_is_imported_without_its_kernels():
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="no attribute 'mtach'"):
         _ = zlocus.mtach
+
+
+def test_a_cost_by_hand():
+    """Three images of 3 x 3 cells, one window: NCC 1 with a brighter copy, -1 with a negative."""
+    one = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 10]])
+    grey = np.stack([one, 40 + 3 * one, 9 - one])[:, None]
+    middle = (1, 1, 0)
+    assert zlocus.ncc_cost(grey[:2], window=3)[middle] == pytest.approx(0.0, abs=1e-6)
+    assert zlocus.ncc_cost(grey, window=3)[middle] == pytest.approx((0 + 2 + 2) / 3, abs=1e-6)
+    assert zlocus.ncc_cost(grey, window=3, reference=0)[middle] == pytest.approx((0 + 2) / 2, abs=1e-6)
+    assert zlocus.ncc_cost(grey, window=3, reference=2)[middle] == pytest.approx(2.0, abs=1e-6)
+    rim = zlocus.ncc_cost(grey, window=3)[..., 0]
+    assert np.isnan(rim).sum() == 8  # windows that are not whole
+    grey[0, 0, 2, 2] = np.nan
+    assert zlocus.ncc_cost(grey, window=3)[middle] == pytest.approx(2.0, abs=1e-6)
+    assert np.isnan(zlocus.ncc_cost(grey[:2], window=3)[middle])
+
+
+def test_a_cost_ignores_gain_and_offset_and_knows_no_texture():
+    rng = np.random.default_rng(8)
+    grey = rng.normal(3000.0, 500.0, (2, 3, 9, 8))
+    cost = zlocus.ncc_cost(grey)
+    moved = zlocus.ncc_cost(np.stack([grey[0], 5000.0 - 4000.0 + 0.5 * grey[1]]))
+    np.testing.assert_allclose(cost, moved, atol=1e-5)
+    assert cost.shape == (9, 8, 3)
+    # As NumPy has it, in one window.
+    parts = [grey[i, 1, 2:7, 3:8].ravel() for i in (0, 1)]
+    assert cost[4, 5, 1] == pytest.approx(1 - np.corrcoef(*parts)[0, 1], abs=1e-5)
+    grey[1] = 7.0
+    flat = zlocus.ncc_cost(grey)
+    np.testing.assert_array_equal(flat[np.isfinite(flat)], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "asked"),
+    [((1, 2, 9, 9), {}), ((2, 9, 9), {}), ((2, 2, 9, 9), {"window": 4}), ((2, 2, 9, 9), {"reference": 2})],
+)
+def test_costs_that_make_no_sense_are_refused(shape, asked):
+    with pytest.raises(ConfigError, match="Give"):
+        zlocus.ncc_cost(np.zeros(shape), **asked)
+
+
+def test_loci_costs_and_heights_in_a_row(images):
+    """Stage after stage on arrays: the sine is found."""
+    inputs = images("sine").inputs
+    scene = zlocus.open_scene(*inputs, crs="EPSG:32632")
+    scene = zlocus.orient(scene, heights=HEIGHTS).apply(scene)
+    heights = np.arange(35.0, 70.0, STEP_M)
+    stack = zlocus.locus_stack(scene, PART, GSD_M, heights)
+    found = zlocus.semiglobal(zlocus.ncc_cost(stack.grey), step_cells=STEP_M / GSD_M)
+    height = heights[0] + STEP_M * found.vertex
+    column, row = np.meshgrid(stack.x - CENTRE[0], stack.y - CENTRE[1])
+    truth = analytic_height("sine", column, row)
+    inner = np.s_[4:-4, 4:-4]  # the windows of the rim are not whole
+    assert (np.abs(height - truth)[inner] < STEP_M).mean() > SHARE
+
+
+def test_the_ortho_image_of_a_surface(images, written):
+    """That of the true heights is that of the run, whose heights are near them, but for the noise of the pixels."""
+    inputs = images("sine").inputs
+    scene = zlocus.open_scene(*inputs, crs="EPSG:32632")
+    scene = zlocus.orient(scene, heights=HEIGHTS).apply(scene)
+    surface = zlocus.open_surface(written)
+    height = surface.height.values.astype(float)
+    height[10:14, 5:9] = np.nan
+    ortho = zlocus.true_ortho(scene, height, surface.x.values, surface.y.values)
+    known = np.isfinite(height)
+    np.testing.assert_array_equal(np.isfinite(ortho) & ~known, False)
+    assert np.isfinite(ortho[known]).mean() > SHARE
+    both = np.isfinite(ortho) & known
+    theirs = surface.ortho.values.astype(float)[both]
+    assert np.corrcoef(ortho[both], theirs)[0, 1] > SAME_ORTHO
+    # Another place of the images is another image.
+    wrong = zlocus.true_ortho(scene, height + 15.0, surface.x.values, surface.y.values)
+    both &= np.isfinite(wrong)
+    assert np.corrcoef(wrong[both], ortho[both])[0, 1] < SAME_ORTHO - 0.1
+
+
+def test_a_tower_hides_the_ground_behind_it_from_the_ortho_image(images):
+    """Beside a wall that stands high above all else the views on the far side show the ground, or none does."""
+    inputs = images("sine").inputs
+    scene = zlocus.open_scene(*inputs, crs="EPSG:32632")
+    x = CENTRE[0] + (np.arange(80) - 40) * GSD_M
+    y = CENTRE[1] - (np.arange(80) - 40) * GSD_M
+    ground = np.full((80, 80), 50.0)
+    wall = ground.copy()
+    wall[38:42] = 75.0
+    open_, behind = (zlocus.true_ortho(scene, z, x, y) for z in (ground, wall))
+    with np.errstate(invalid="ignore"):
+        changed = (np.abs(open_ - behind) > SAME_GREY) | (np.isnan(open_) != np.isnan(behind))
+    changed[38:42] = False
+    rows = np.flatnonzero(changed.any(axis=1))
+    assert len(rows)  # something else is shown beside the wall
+    # As far as the flattest rays reach beside it: 25 m, 18 degrees from above.
+    reach = 25.0 * np.tan(np.radians(18.0)) / GSD_M + 2
+    assert rows.min() >= 38 - reach
+    assert rows.max() <= 41 + reach
+
+
+@pytest.mark.parametrize("height", [np.zeros((3, 3)), np.full((4, 5), np.nan)])
+def test_ortho_images_of_nothing_are_refused(height, images):
+    scene = zlocus.open_scene(*images("sine").inputs, crs="EPSG:32632")
+    with pytest.raises(ConfigError, match="show nothing"):
+        zlocus.true_ortho(scene, height, CENTRE[0] + np.arange(5.0), CENTRE[1] - np.arange(4.0))
+
+
+def test_what_is_shown_at_a_prompt_is_a_line(images):
+    scene = zlocus.open_scene(
+        *images("sine").inputs,
+        crs="EPSG:32632",
+    )
+    orientation = zlocus.orient(scene, heights=HEIGHTS)
+    stack = zlocus.locus_stack(scene, PART, GSD_M, [40.0, 45.0])
+    for shown in (scene, scene.views[0], orientation, stack):
+        assert len(repr(shown)) < 200
+        assert "\n" not in repr(shown)
+    assert repr(scene) == "Scene(3 views: nadir, fore, aft; WGS 84 / UTM zone 32N)"
+    assert f"shift, 3 views, {len(orientation.xyz)} ties" in repr(orientation)
+    many = replace(scene, views=scene.views * 5, heights=(1.0, 2.0))
+    assert repr(many).startswith("Scene(15 views: nadir, fore, aft, nadir, fore, aft, nadir, fore, ...; ")
+    assert repr(many).endswith("heights (1.0, 2.0))")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import re
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import typer.main
 
+import zlocus
 from zlocus.cli import app
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
@@ -84,6 +88,45 @@ def test_every_product_is_documented():
     assert sorted(rows) == sorted([*(product.name for product in PRODUCTS), "item.json"])
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in readme for name in rows)
+
+
+STAGES = re.findall(
+    r"^\| [^|]+ \| `(zlocus(?:\.[a-z_]+)+)` \|", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE
+)
+# One or more sizes: (n,), (r, c), (4, r, c).
+SHAPE = re.compile(r"\((?:[a-z]|\d+)(?:,|(?:, (?:[a-z]|\d+))+)\)")
+
+
+def documented(path: str) -> list[str]:
+    """Docstrings of a function and of the classes of arrays that it takes and gives."""
+    if path.count(".") == 1:
+        found = getattr(zlocus, path.partition(".")[2])
+    else:
+        module, _, name = path.rpartition(".")
+        found = getattr(importlib.import_module(module), name)
+    assert callable(found)
+    classes = [each for each in get_type_hints(found).values() if is_dataclass(each)]
+    return [found.__doc__, *(each.__doc__ for each in classes if each.__module__ != "zlocus.options")]
+
+
+def test_stages_are_listed():
+    assert len(STAGES) == len(set(STAGES)) == 18
+    own = {path for path in STAGES if path.count(".") == 1}
+    assert own == {f"zlocus.{name}" for name in zlocus.__all__} - {
+        "zlocus.LocusStack", "zlocus.__version__", "zlocus.match", "zlocus.open_scene", "zlocus.open_surface",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("path", STAGES)
+def test_every_stage_can_be_had_and_says_its_shapes(path):
+    own, *of_classes = documented(path)
+    assert own, f"{path} has no docstring"
+    assert any(SHAPE.search(text) for text in (own, *of_classes)), f"{path} says no shape"
+
+
+def test_a_docstring_without_shapes_is_noticed():
+    assert SHAPE.findall("xyz : (n, 3) m; (4, r, c) uint16; (n,) float64") == ["(n, 3)", "(4, r, c)", "(n,)"]
+    assert not SHAPE.search("heights (m) above the ellipsoid (see `match`), (zmin, zmax) m")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

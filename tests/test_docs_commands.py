@@ -123,6 +123,12 @@ def check_tutorial(folder: Path) -> None:
         assert abs(100 * found[name]["within"] - share) < TOLD_TO, name
     coverage = json.loads((folder / "surface" / "run.json").read_text(encoding="utf-8"))["coverage"]
     assert f"says that {100 * coverage:.0f} % of the cells" in told
+    # Another run of `zlocus dsm`, to which no products were added.
+    page = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    (section,) = re.findall(r"^## 3\..*?(?=^## 4\.)", page, re.DOTALL | re.MULTILINE)
+    first_columns = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    named = re.findall(r"`([a-z_]+\.[a-z]+)`", " ".join(first_columns))
+    assert sorted(named) == sorted(path.name for path in (folder / "again").iterdir())
 
 
 # After the commands of a page: whether what it says of them is so.
@@ -136,6 +142,33 @@ def test_commands_in_sentences_exist():
         program = text.split()[0]
         check = check_make if program == "make" else check_zlocus if program == "zlocus" else check_synthetic
         check(text)
+
+
+def without_a_layout(pages: list[Path]) -> list[str]:
+    """Names of pages that tell a reader to run something for which no layout has the files: nothing would be run."""
+    told = [
+        page.name
+        for page in pages
+        if page.parent == ROOT / "benchmarks" or page.name not in LAID_OUT
+        if any(not step.text.startswith(tuple(ONLY_CHECKED)) for step in steps_of(page))
+    ]
+    return sorted(told)
+
+
+def test_every_page_with_commands_has_a_layout():
+    assert without_a_layout(PAGES) == []
+
+
+def test_a_page_without_a_layout_is_noticed(tmp_path):
+    texts = {
+        "new.md": "```\nzlocus doctor a.tif b.tif\n```\n",
+        "python.md": "```python\nimport zlocus\n```\n",
+        "figures.md": "```\nmake acceptance\n```\n\n    python benchmarks/speed.py --help\n",
+        "words.md": "```yaml\nviews: []\n```\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    assert without_a_layout([tmp_path / name for name in texts]) == ["new.md", "python.md"]
 
 
 def test_every_layout_has_its_page():

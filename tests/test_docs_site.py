@@ -117,6 +117,8 @@ def test_all_commands_and_options_are_there(site):
             assert letters(parameter.help) in commands, parameter
             shown = parameter.metavar if parameter.param_type_name == "argument" else parameter.opts[-1]
             assert letters(shown) in commands, parameter
+            for contrary in parameter.secondary_opts:
+                assert letters(f"{parameter.opts[-1]} {contrary} {parameter.help}") in commands, parameter
 
     def sentences(options):
         for f in fields(options):
@@ -132,6 +134,34 @@ def test_the_interface_is_described(site):
     anchors = (site / "api.html").read_text(encoding="utf-8")
     for name in set(zlocus.__all__) - {"__version__"}:
         assert f'id="zlocus.api.{name}"' in anchors
+
+
+def test_parameters_stand_in_a_list(site):
+    """Those of every function, by name, where its docstring says something of them."""
+    text = (site / "api.html").read_text(encoding="utf-8")
+    listed = set(re.findall(r"<li><p><strong>([\w,]+)</strong>", text.replace("</strong><strong>", "")))
+    for names in ("inputs", "bounds", "step_cells", "reference", "window", "area,mask", "dem_vertical", "x,y"):
+        assert names in listed, names
+    assert "ortho : (r, c)" not in Loaded(text).text
+    assert "dem_vertical : what" not in Loaded(text).text
+
+
+def test_a_docstring_with_parameters_in_its_sentences():
+    sys.path.insert(0, str(DOCS))
+    try:
+        from reference_pages import with_listed_parameters
+    finally:
+        sys.path.remove(str(DOCS))
+    lines = [
+        "What it does.", "", "More words. one : (r, c) m; NaN is", "empty. two, three : of both. Returns (n,) m.", "",
+        "Not one : this.", "", ":raises Fault: What happens; one : stays.", "",
+    ]  # fmt: skip
+    assert with_listed_parameters(lines, ["one", "two", "three"]) == [
+        "What it does.", "", "More words.", "", "Returns (n,) m.", "", "Not one : this.", "",
+        ":param one: (r, c) m; NaN is empty.", ":param two,three: of both.", "",
+        ":raises Fault: What happens; one : stays.", "",
+    ]  # fmt: skip
+    assert with_listed_parameters(["Only words."], []) == ["Only words."]
 
 
 def test_pages_of_later_have_a_place(tmp_path):

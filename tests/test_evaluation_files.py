@@ -96,6 +96,25 @@ def test_the_histogram_shows_the_errors(tmp_path, pair):
     assert axes.get_title(loc="left").startswith("75.0 % of 14400 cells have a height")
 
 
+@pytest.mark.parametrize(("threshold_m", "limits"), [(0.3, [-0.3, 0.3]), (5.0, [])])
+def test_the_histogram_has_limits_where_they_lie_inside(pair, threshold_m, limits):
+    """Errors of 0 and 0.5 m: LE95 is 0.5 m, of which 1.25 times is shown."""
+    axes = histogram_figure(evaluate(*pair, margin_m=0, threshold_m=threshold_m)).axes[0]
+    assert axes.get_xlim() == pytest.approx((-0.625, 0.625), abs=1e-4)
+    upright = {line.get_label(): line.get_xdata()[0] for line in axes.lines if len(set(line.get_xdata())) == 1}
+    assert sorted(x for label, x in upright.items() if not label.startswith("median")) == limits
+    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert ("±0.3 m" in said) == bool(limits)
+
+
+def test_a_surface_that_is_all_but_complete_is_not_100_percent(tmp_path, pair):
+    surface = np.zeros((N, N), np.float32)
+    surface[60, 60] = np.nan
+    nearly = evaluate(write(tmp_path / "nearly.tif", surface), pair[1], margin_m=0)
+    assert 0.9995 < nearly.all.completeness < 1
+    assert histogram_figure(nearly).axes[0].get_title(loc="left").startswith("More than 99.9 % of")
+
+
 def test_a_histogram_of_nothing_says_so(tmp_path, pair):
     empty = write(tmp_path / "empty.tif", np.full((N, N), np.nan, np.float32))
     figure = histogram_figure(evaluate(empty, pair[1]))

@@ -39,7 +39,7 @@ from zlocus.surface.reasons import Quality
 
 ROOT = Path(__file__).parents[1]
 SECTIONS = [
-    "where", "heights", "precision", "used", "reasons", "orientation", "pairs", "curves", "reference", "time",
+    "where", "heights", "ortho", "precision", "used", "reasons", "orientation", "pairs", "curves", "reference", "time",
     "options", "inputs",
 ]  # fmt: skip
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -140,6 +140,7 @@ def test_its_figures_are_those_of_the_record(made):
     parsed, record = page_of(made), json.loads((made / "run.json").read_text())
     assert f"{100 * record['coverage']:.1f} % have a height" in parsed.text("summary")
     assert "made from 3 images" in parsed.text("summary")
+    assert f"Made on {record['created'][:10]} {record['created'][11:16]} UTC" in parsed.text("")
     residuals = parsed.text("orientation")
     assert f"{record['orientation']['n_ties']} tie points" in residuals
     for name, view in record["orientation"]["views"].items():
@@ -176,15 +177,61 @@ def test_the_footprints_hold_the_surface(made):
     assert "3 images" in svg["aria-label"]
     outlines = [np.array([p.split(",") for p in each["points"].split()], float) for each in page_of(made).of("polygon")]
     assert len(outlines) == 4
+    assert [each["fill"] for each in page_of(made).of("text")] == [
+        each["stroke"] for each in page_of(made).of("polygon")
+    ][:3]
     assert all((each >= -0.05).all() and (each <= page.DRAWN + 0.05).all() for each in outlines)
     # What two images share is about what the surface covers.
     middle = [each.mean(axis=0) for each in outlines]
     assert np.ptp(middle, axis=0).max() < 0.2 * page.DRAWN
 
 
-def test_pairs_and_why_there_are_no_labels(made):
+def test_labels_are_a_sample_where_no_images_were_ranked(made):
+    """Good images, compared as `zlocus rank` compares them, at most of the places at which it does."""
+    labels = json.loads((made / "curves.json").read_text())["labels"]
+    n_ties = json.loads((made / "run.json").read_text())["orientation"]["n_ties"]
+    assert labels["points"] <= n_ties  # none counts twice, though places lie close here
+    assert not (made / "ranking.gpkg").exists()
+    pairs = {frozenset(pair["images"]) for pair in labels["pairs"]}
+    assert pairs == {frozenset(two) for two in (("fore", "nadir"), ("aft", "nadir"), ("aft", "fore"))}
+    for pair in labels["pairs"]:
+        assert pair["good"] + pair["fair"] + pair["poor"] == pair["points"] == labels["points"] > 20
+        assert pair["poor"] < 0.1 * pair["points"] < pair["good"]
     text = page_of(made).text("pairs")
-    assert "This run has 3 images; with fewer than 7 all are used" in text
+    assert f"This run ranked no images, so this is a sample for this page: {labels['points']} tie points" in text
+    titles = [each["title"] for each in page_of(made).of("td") if "against" in (each.get("title") or "")]
+    assert len(titles) == 6
+    good = {frozenset(pair["images"]): words.percent(pair["good"], pair["points"]) for pair in labels["pairs"]}
+    assert f"fore against nadir: good at {good[frozenset(('fore', 'nadir'))]}" in " ".join(titles)
+
+
+def test_labels_that_cannot_be_sampled_fail_no_run(images, tmp_path, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no luck")
+
+    monkeypatch.setattr(zlocus.reporting, "rank_tile", broken)
+    out = run(images("sine"), tmp_path / "out", SMALL_TILES).out
+    assert "There are no labels of pairs. None could be made: RuntimeError: no luck." in page_of(out).text("pairs")
+    assert page_of(out).text("curves").count("Typical: ") == 3
+
+
+def test_samples_keep_to_their_time(images, tmp_path, monkeypatch):
+    """The first place is always looked at, the others while there is time."""
+    asked = []
+    monkeypatch.setattr(zlocus.reporting, "TIME_SHARE", 0.0)
+    monkeypatch.setattr(zlocus.reporting, "LEAST_TIME_S", 0.0)
+    rank_tile = zlocus.reporting.rank_tile
+    monkeypatch.setattr(zlocus.reporting, "rank_tile", lambda *these: asked.append(these) or rank_tile(*these))
+    run(images("sine"), tmp_path / "out", SMALL_TILES)
+    assert len(asked) == 1
+
+
+def test_pairs_and_why_there_are_no_labels(out):
+    made = out
+    (made / "curves.json").unlink()
+    write_report(made)
+    text = page_of(made).text("pairs")
+    assert "The run left no ranking of these images (ranking.gpkg), and no sample of one (curves.json)." in text
     record = json.loads((made / "footprints.geojson").read_text())
     pairs = [each["properties"] for each in record["features"] if each["properties"]["kind"] == "overlap"]
     assert len(pairs) == 3
@@ -251,7 +298,7 @@ def test_a_surface_without_any_height_has_a_page(out):
     changed(out, "run.json", lambda record: record.update(coverage=0.0))
     write_report(out)
     parsed = page_of(out)
-    assert "0.0 % have a height" in parsed.text("summary")
+    assert "cover, 0.00 % have a height" in parsed.text("summary")
     assert "100.0 % of the cells asked for have no height, mostly because: images do not agree" in parsed.text(
         "summary"
     )
@@ -530,8 +577,13 @@ def test_sizes_have_two_digits_that_count(value, text):
 
 
 @pytest.mark.parametrize(
-    ("n", "total", "text"), [(0, 5, "0.00 %"), (1, 1e6, "< 0.01 %"), (1, 30, "3.33 %"), (1, 3, "33.3 %"), (1, 0, "–")]
-)
+    ("n", "total", "text"),
+    [
+        (0, 5, "0.00 %"), (1, 1e6, "< 0.01 %"), (1, 30, "3.33 %"), (1, 3, "33.3 %"), (1, 0, "–"),
+        # Only all is all.
+        (9995, 10000, "99.95 %"), (9989, 10000, "99.9 %"), (10**6 - 1, 10**6, "> 99.99 %"), (5, 5, "100.0 %"),
+    ],
+)  # fmt: skip
 def test_shares(n, total, text):
     assert words.percent(n, total) == text
 
@@ -556,6 +608,9 @@ addEventListener("load", () => {{
       asked: frame.contentWindow.performance.getEntriesByType("resource").map(each => each.name)
         .filter(name => !name.startsWith("data:")),
       scripts: page.scripts.length,
+      hints: [...page.querySelectorAll(".hint")].filter(each => each.offsetHeight > 0).length,
+      cut: [...page.querySelectorAll(".wide")].filter(each => each.scrollWidth > each.clientWidth
+        && !(each.previousElementSibling.matches(".hint") && each.previousElementSibling.offsetHeight > 0)).length,
     }};
   }});
   document.title = JSON.stringify(found);
@@ -583,4 +638,7 @@ def test_a_browser_shows_it_at_both_widths_and_asks_for_nothing(out):
         assert each["shown"] == each["images"] > 5
         assert each["asked"] == []
         assert each["scripts"] == 1
+        assert each["cut"] == 0  # tables that scroll say so
+    assert seen[0]["hints"] >= 3
+    assert seen[1]["hints"] == 0
     assert "CONSOLE" not in said.stderr

@@ -6,10 +6,23 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-__all__ = ["LocusStack", "__version__", "locus_stack", "match", "open_scene", "open_surface", "orient", "semiglobal"]
+__all__ = [
+    "LocusStack", "__version__", "locus_stack", "match", "ncc_cost", "open_scene", "open_surface", "orient",
+    "semiglobal", "true_ortho",
+]  # fmt: skip
 
 if TYPE_CHECKING:
-    from zlocus.api import LocusStack, locus_stack, match, open_scene, open_surface, orient, semiglobal
+    from zlocus.api import (
+        LocusStack,
+        locus_stack,
+        match,
+        ncc_cost,
+        open_scene,
+        open_surface,
+        orient,
+        semiglobal,
+        true_ortho,
+    )
 
 
 def __getattr__(name: str) -> Any:

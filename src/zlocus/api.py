@@ -4,7 +4,7 @@
     >>> surface = zlocus.match("img_1.tif", "img_2.tif", "img_3.tif", resolution=0.5)
     >>> surface.height.rio.to_raster("dsm.tif")
 
-Needs xarray and rioxarray: `pip install zlocus[xarray]`.
+Needs xarray and rioxarray: `pip install '.[xarray]'` in the clone.
 """
 
 from __future__ import annotations
@@ -12,19 +12,27 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import ConfigError, InputError
 from zlocus.io import scene_file
+from zlocus.matching import ortho
+from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
+from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties
-from zlocus.options import OrientationOptions, RunConfig, SemiGlobalOptions
+from zlocus.matching.setup import height_step, leading_first
+from zlocus.matching.views import pixel_window, read_pixels, tile_views
+from zlocus.matching.visibility import coverage
+from zlocus.options import OrientationOptions, PyramidOptions, RunConfig, SemiGlobalOptions
 from zlocus.orientation.orient import Orientation
 from zlocus.preparing import asked_crs, oriented
 from zlocus.progress import Progress, SilentProgress
@@ -48,6 +56,8 @@ VARIABLES = {
 COST_UNIT, MOST_COST = 64.0, 255.0
 COLOURS = ("red", "green", "blue")
 ALL_VALID = 1e-3  # rounding of weights
+# Variance of a window, of that of the whole image, below which it has no texture: rounding.
+LEAST_TEXTURE = 1e-9
 
 
 def open_scene(*inputs: PathLikes, crs: str | CRS | None = None) -> Scene:
@@ -72,7 +82,8 @@ def orient(
     heights: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Orientation:
-    """Tie points and corrections of the cameras; `orientation.apply(scene)` is the corrected scene.
+    """Tie points and corrections of the cameras; `orientation.apply(scene)` is the corrected scene, `orientation.xyz`
+    the ties (n, 3) m.
 
     heights : (zmin, zmax) m above the ellipsoid between which ties are looked for; None: all that the cameras allow.
 
@@ -136,7 +147,10 @@ def open_surface(folder: PathLikes) -> xr.Dataset:
         import rioxarray
         import xarray as xr
     except ImportError as error:
-        raise InputError(f"{error.name} is not installed: pip install zlocus[xarray].") from error
+        raise InputError(
+            f"{error.name} is not installed. Install it with pip, or all that is needed with `pip install '.[xarray]'` "
+            "in the clone of zlocus."
+        ) from error
     folder = Path(folder)
     found = {}
     for name, (file, long_name) in VARIABLES.items():
@@ -172,6 +186,13 @@ class LocusStack:
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """In a line, without the arrays."""
+        return (
+            f"LocusStack(grey {self.grey.shape} of images, heights, rows, columns; {self.heights.min():g} to "
+            f"{self.heights.max():g} m; {', '.join(self.names)})"
+        )
 
 
 def locus_stack(
@@ -221,6 +242,107 @@ def _sampled(image: ImageSource, xy: NDArray[np.float64]) -> NDArray[np.float32]
     shown = inside & (known > 1 - ALL_VALID)
     out[shown] = grey[shown]
     return out
+
+
+def ncc_cost(grey: NDArray[np.floating], *, window: int = 5, reference: int | None = None) -> NDArray[np.float32]:
+    """How unlike images are around every cell at every height: 1 - NCC, averaged over pairs of images.
+
+    grey : (i, h, r, c), as of `locus_stack`, NaN where an image does not show a place. window : side of the square of
+    cells that is correlated, odd. reference : number of the image that the others are compared with, whose mean is the
+    SNCC of Ji et al. (2014), section 2.1; None: all pairs are. Returns (r, c, h) float32, in the units of `semiglobal`;
+    NaN where fewer than two images show the whole window. A window without texture is unlike every other: 1.
+
+    The matcher's own cost adds grey differences, and knows which images are hidden: `zlocus.matching.measure`.
+
+    Raises
+    ------
+    ConfigError
+        Where the array or the window do not fit.
+    """
+    if grey.ndim != 4 or len(grey) < 2:
+        raise ConfigError(f"The images are {grey.shape}. Give (images, heights, rows, columns) of two images or more.")
+    if window < 3 or window % 2 == 0 or (reference is not None and not 0 <= reference < len(grey)):
+        raise ConfigError(
+            f"A window of {window} and reference {reference} do not fit {len(grey)} images. Give an odd window of 3 or "
+            f"more, and a reference of 0 to {len(grey) - 1}."
+        )
+    pairs = [pair for pair in combinations(range(len(grey)), 2) if reference is None or reference in pair]
+    costs = [_cost_of_pairs(np.asarray(grey[:, h], np.float64), window, pairs) for h in range(grey.shape[1])]
+    return np.stack(costs, axis=-1)
+
+
+def _cost_of_pairs(images: NDArray[np.float64], window: int, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
+    """Mean of 1 - NCC (r, c) over pairs of images (i, r, c) at a height, NaN where no pair shows the window."""
+    from scipy.ndimage import uniform_filter
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(uniform_filter(values, (0, window, window) if values.ndim == 3 else window, mode="constant"))
+
+    known = np.isfinite(images)
+    # Beyond the rim nothing is known.
+    shown = mean(known.astype(np.float64)) > 1 - ALL_VALID / window**2
+    # About their own mean: squares of large values would cancel.
+    grey = np.where(known, images - np.mean(images, where=known), 0.0) if known.any() else np.zeros_like(images)
+    middle = mean(grey)
+    variance = np.maximum(mean(grey**2) - middle**2, 0.0)
+    least = max(LEAST_TEXTURE * float(np.mean(grey**2)), np.finfo(float).tiny)
+    total, count = np.zeros(images.shape[1:]), np.zeros(images.shape[1:])
+    for a, b in pairs:
+        both = shown[a] & shown[b]
+        has_texture = np.minimum(variance[a], variance[b]) > least
+        scale = np.sqrt(np.where(has_texture, variance[a] * variance[b], 1.0))
+        ncc = np.where(has_texture, (mean(grey[a] * grey[b]) - middle[a] * middle[b]) / scale, 0.0)
+        total += np.where(both, 1.0 - np.clip(ncc, -1.0, 1.0), 0.0)
+        count += both
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def true_ortho(
+    scene: Scene, height: NDArray[np.floating], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """What the images show of a surface, each cell from the image that shows it on most pixels, of those from which the
+    surface does not hide it: grey values (r, c) float32, NaN where there is no height and where no image sees it. What
+    stands beside the area hides nothing, and every image keeps its own grey values, which a run levels.
+
+    scene : oriented; height : (r, c) m above the ellipsoid, NaN where there is none; x, y : (c,), (r,) m, of the
+    cells' centres, evenly spaced, y from north to south.
+
+    Raises
+    ------
+    ConfigError
+        Where the arrays do not fit.
+    GeometryError
+        Where all images look along the same line, or bend too much for the cells.
+    """
+    shape = (len(y), len(x))
+    if height.shape != shape or min(shape) < 2 or not np.isfinite(height).any():
+        raise ConfigError(
+            f"Heights of {height.shape} cells, with {len(x)} x and {len(y)} y, show nothing. Give (rows, columns) of "
+            "two or more each, and some heights."
+        )
+    cell_m, lowest, highest = float(x[1] - x[0]), float(np.nanmin(height)), float(np.nanmax(height))
+    leading = leading_first(scene, (lowest + highest) / 2, None)
+    options = PyramidOptions()
+    step_m = height_step(leading, (lowest + highest) / 2, cell_m, options.max_shift_px)
+    origin_m, n_steps = lowest - step_m, int(np.ceil((highest - lowest) / step_m)) + 3
+    z_range = (origin_m, origin_m + n_steps * step_m)
+    transform = Affine(cell_m, 0, x[0] - cell_m / 2, 0, -cell_m, y[0] + cell_m / 2)
+    across, down = np.linspace(0, shape[1], 5), np.linspace(0, shape[0], 5)
+    corners = np.array([transform * (c, r) for c in across for r in down])
+    parts = [(view, pixel_window(view, corners, z_range, 1)) for view in leading]
+    pixels = [read_pixels(view, part, 1, GreyScale(0.0, 1.0)) for view, part in parts if part is not None]
+    if not pixels:
+        return np.full(shape, np.nan, np.float32)
+    views = tile_views(pixels, 0, transform, shape, options.block, (origin_m, step_m), z_range, 0)
+    blocks = (-(-shape[0] // views.block), -(-shape[1] // views.block))
+    lattice = HeightLattice(
+        origin_m, step_m, shape, views.block, np.zeros(blocks, np.int64), np.full(blocks, n_steps, np.int64)
+    )
+    index = ((np.where(np.isfinite(height), height, lowest) - origin_m) / step_m).astype(np.float32)
+    seen = coverage(views, BaseSurface.level(shape, views.block), lattice)
+    shown = ortho.true_ortho(pixels, views, seen, index)
+    shown[~np.isfinite(height)] = np.nan
+    return shown
 
 
 def semiglobal(

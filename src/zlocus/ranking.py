@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from zlocus.execution.local import run_all
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
-from zlocus.matching.curve import FAIR, GOOD
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
@@ -26,13 +24,11 @@ from zlocus.preparing import (
     oriented,
     what_was_applied,
 )
-from zlocus.products.points import write_ranking, write_ties
+from zlocus.products.points import counted_pairs, label_counts, write_ranking, write_ties
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import RankRequest
 from zlocus.tile import rank_tile
-
-LABELS = ("good", "fair", "poor")
 
 
 def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str:
@@ -82,26 +78,9 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     return ranking_table(counts, names)
 
 
-def label_counts(ranked: Sequence[RankedPoints], n_views: int) -> NDArray[np.int64]:
-    """How often each label was given, (3, i, i) int64: good, fair and poor, of the search image (last axis) against the
-    reference; 0 where the two were not compared."""
-    counts = np.zeros((3, n_views, n_views), np.int64)
-    for part in ranked:
-        at = np.ix_(part.views, part.views)
-        for k, is_label in enumerate((part.labels == GOOD, part.labels == FAIR, part.labels < FAIR)):
-            counts[k][at] += is_label.sum(axis=0)
-    counts[:, np.arange(n_views), np.arange(n_views)] = 0
-    return counts
-
-
 def ranking_record(counts: NDArray[np.int64], names: Sequence[str]) -> dict[str, Any]:
     """For ranking.json: per pair of images that were compared, the points and their labels."""
-    pairs = [
-        {"images": [names[i], names[j]], "points": int(n.sum()), **dict(zip(LABELS, n.tolist(), strict=True))}
-        for i, j in combinations(range(len(names)), 2)
-        if (n := counts[:, i, j]).any()
-    ]
-    return {"images": list(names), "pairs": pairs}
+    return {"images": list(names), "pairs": counted_pairs(counts, names)}
 
 
 def ranking_table(counts: NDArray[np.int64], names: Sequence[str]) -> str:

@@ -14,6 +14,8 @@ from pyproj import CRS
 
 from zlocus.errors import GeometryError, ZlocusError
 from zlocus.grid import Grid
+from zlocus.matching.cells import CellWindow
+from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
 from zlocus.orientation.blocks import kind_of
@@ -21,18 +23,23 @@ from zlocus.overlap import pair_geometries, view_geometry
 from zlocus.place import Place, cell_of, curves_at, height_nearby
 from zlocus.products.curves import PointReport, mean_figure, point_record, svg_of
 from zlocus.products.footprints import write_footprints
+from zlocus.products.points import counted_pairs, label_counts
 from zlocus.products.record import write_record
 from zlocus.products.report.cells import FAILED, RULE, ChosenCell, chosen_cells
-from zlocus.products.report.page import CURVES, FOOTPRINTS, REPORT, write_report
+from zlocus.products.report.page import CURVES, FOOTPRINTS, RANKING, REPORT, write_report
 from zlocus.products.report.survey import Survey, survey
+from zlocus.products.report.tables import MOST_MATRIX
 from zlocus.progress import Progress
 from zlocus.scene import Scene
 from zlocus.sensors.model import FloatArray
+from zlocus.tile import rank_tile
 
 # Pairs grow with the square of their number.
 MOST_VIEWS_PAIRED = 60
 # Curves are not begun after this share of the time that matching took, or this time where that is longer.
 TIME_SHARE, LEAST_TIME_S = 0.02, 10.0
+# Where a run ranked no images they are compared in so many places a side, each of so many blocks a side.
+SAMPLE_PLACES, SAMPLE_BLOCKS = 3, 2
 # Cells around one within which tie points are looked for.
 SHOWN_WITHIN_CELLS = 512
 NOT_SHOWN = "Fewer than two images show this cell, and the window around it, at the height looked at."
@@ -117,7 +124,60 @@ def write_curves(path: Path, folder: Path, matched: Matched, config: RunConfig, 
         if time.perf_counter() - start > most_s:
             break
         cells.append(shown_cell(cell, found, matched, config))
-    write_record(path, {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells})
+    record = {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells}
+    if not (folder / RANKING).exists() and len(matched.settled.views) <= MOST_MATRIX:
+        record["labels"] = tried_labels(matched, config, most_s)
+    write_record(path, record)
+
+
+def tried_labels(matched: Matched, config: RunConfig, most_s: float) -> dict[str, Any]:
+    """What curves.json says of the labels of pairs, with an error where none can be given."""
+    try:
+        return sampled_labels(matched, config, most_s)
+    except Exception as error:  # a table less, not a surface
+        return {"error": said(error)}
+
+
+def sampled_labels(matched: Matched, config: RunConfig, most_s: float) -> dict[str, Any]:
+    """Labels of every pair of images at the tie points in and around a few places, each point once.
+
+    As where images are chosen (`rank_tile`), which takes `selection.fewest_views`: with fewer images nothing else says
+    how well each pair of them matches. No place is begun after `most_s`.
+    """
+    settled, start = matched.settled, time.perf_counter()
+    is_new, parts = np.ones(len(settled.ties), bool), list[RankedPoints]()
+    for core in sample_cores(settled, SAMPLE_BLOCKS * config.pyramid.block):
+        if parts and time.perf_counter() - start > most_s:
+            break
+        found = rank_tile(settled, core, config)
+        if found is None:
+            continue
+        ranking, which = found
+        new = is_new[ranking.tie]
+        is_new[ranking.tie] = False
+        parts.append(RankedPoints(settled.ties[ranking.tie[new]], ranking.labels[new], np.array(which, np.int64)))
+    names = [view.name for view in settled.views]
+    n_points = sum(len(part.xyz) for part in parts)
+    return {"points": n_points, "pairs": counted_pairs(label_counts(parts, len(names)), names)}
+
+
+def sample_cores(settled: MatchScene, side: int) -> list[CellWindow]:
+    """Windows of `side` cells around tie points that are spread over the scene, each far from those before it."""
+    xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
+    first, size = (settled.seen.col, settled.seen.row), (settled.seen.cols, settled.seen.rows)
+    xy = xy[((xy >= first) & (xy < np.add(first, size))).all(axis=1) & np.isfinite(settled.ties[:, 2])]
+    if not len(xy):
+        return []
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    share = (np.arange(SAMPLE_PLACES) + 0.5) / SAMPLE_PLACES
+    places = low + np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * (high - low)
+    nearest = [int(np.hypot(*(xy - place).T).argmin()) for place in places]
+    # Whatever the time allows, the places are spread.
+    order = [nearest[len(nearest) // 2]]
+    while rest := [tie for tie in nearest if tie not in order]:
+        order.append(max(rest, key=lambda tie: min(float(np.hypot(*(xy[tie] - xy[old]))) for old in order)))
+    cells = np.floor(xy[order]).astype(int) - side // 2
+    return [CellWindow(int(row), int(col), side, side).within(settled.seen) for col, row in cells]
 
 
 def shown_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:

@@ -17,6 +17,9 @@ from pyproj import CRS
 from zlocus.errors import GeometryError, ZlocusWarning
 from zlocus.sensors.model import FloatArray, SensorModel
 
+# Views that a scene names at a prompt.
+MOST_NAMED = 8
+
 
 @dataclass(frozen=True)
 class ImageWindow:
@@ -70,6 +73,10 @@ class View:
     camera_files: tuple[Path, ...] = ()
     date: Date | None = None
 
+    def __repr__(self) -> str:
+        rows, cols = self.image.shape
+        return f"View({self.name}, {rows} x {cols} px, {type(self.sensor).__name__})"
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -83,6 +90,13 @@ class Scene:
     crs: CRS
     bounds: tuple[float, float, float, float] | None = None
     heights: tuple[float, float] | None = None
+
+    def __repr__(self) -> str:
+        """In a line: a sensor alone has hundreds of numbers."""
+        names = [view.name for view in self.views[:MOST_NAMED]] + ["..."] * (len(self.views) > MOST_NAMED)
+        frame = "a local frame" if is_local(self.crs) else self.crs.name
+        asked = [f"{name} {value}" for name in ("bounds", "heights") if (value := getattr(self, name)) is not None]
+        return f"Scene({len(self.views)} views: {', '.join(names)}; {'; '.join([frame, *asked])})"
 
 
 def is_local(crs: CRS) -> bool:

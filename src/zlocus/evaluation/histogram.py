@@ -15,14 +15,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 N_BINS = 120
-# What is shown: this many times the 95th percentile of absolute errors, and at least the threshold.
+# What is shown: this many times the 95th percentile of absolute errors.
 SHOWN_LE95 = 1.25
 SIZE_INCHES = (7.5, 4.5)
 BAR, CURVE, LINE = "#7A9CC6", "#C03A2B", "#444444"
 
 
 def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = SIZE_INCHES) -> Figure:
-    """Share of the heights per bin of error, with the normal curve of the same median and NMAD, and the median."""
+    """Share of the heights per bin of error, with the normal curve of the same median and NMAD, the median, and the
+    limits of what counts as within where they lie among what is shown."""
     from matplotlib.figure import Figure
 
     assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
@@ -37,15 +38,18 @@ def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = 
     else:
         axes.text(0.5, 0.5, "no height where the reference has one", ha="center", transform=axes.transAxes)
     shift = "" if evaluation.shift is None else ", shift removed"
+    complete = f"{100 * evaluation.all.completeness:.1f} %"
+    if complete == "100.0 %" and evaluation.all.completeness < 1:
+        complete = "More than 99.9 %"
     axes.set_title(
-        f"{100 * evaluation.all.completeness:.1f} % of {evaluation.all.n} cells have a height{shift}", loc="left",
+        f"{complete} of {evaluation.all.n} cells have a height{shift}", loc="left",
         fontsize=10,
     )  # fmt: skip
     return figure
 
 
 def _draw(axes: Axes, errors: FloatArray, figures: ErrorStatistics, threshold_m: float) -> None:
-    reach = max(SHOWN_LE95 * figures.le95, threshold_m)
+    reach = SHOWN_LE95 * figures.le95 or threshold_m
     edges = np.linspace(-reach, reach, N_BINS + 1)
     share = 100 * np.histogram(errors, edges)[0] / errors.size
     axes.stairs(share, edges, fill=True, color=BAR, label="errors")
@@ -55,7 +59,11 @@ def _draw(axes: Axes, errors: FloatArray, figures: ErrorStatistics, threshold_m:
         label = f"normal, NMAD {figures.nmad:.3f} m"
         axes.plot(at, 100 * bell * (edges[1] - edges[0]), color=CURVE, linewidth=1.3, label=label)
     axes.axvline(figures.median, color=LINE, linewidth=1, linestyle="--", label=f"median {figures.median:+.3f} m")
-    axes.axvspan(-threshold_m, threshold_m, color="#000000", alpha=0.05, linewidth=0, label=f"within {threshold_m:g} m")
+    if threshold_m < reach:
+        for limit in (-threshold_m, threshold_m):
+            axes.axvline(
+                limit, color=LINE, linewidth=1, linestyle=":", label=f"±{threshold_m:g} m" if limit > 0 else None
+            )
     axes.set_xlim(-reach, reach)
     axes.set_ylim(0, 1.08 * max(float(share.max()), 1e-9))
     beyond = 100 * float(np.count_nonzero(np.abs(errors) > reach)) / errors.size

@@ -108,6 +108,17 @@ class Orientation:
     n_measured: int
     joint: JointAdjustment | None = None
 
+    def __repr__(self) -> str:
+        """In a line: ties are thousands."""
+        before, after = (
+            max((m for view in self.views if np.isfinite(m := getattr(view, when).median)), default=np.nan)
+            for when in ("before", "after")
+        )
+        return (
+            f"Orientation({self.model}, {len(self.views)} views, {len(self.xyz)} ties; largest median residual "
+            f"{after:.3f} px, before {before:.3f} px)"
+        )
+
     @property
     def measured(self) -> FloatArray:
         """(k, 3) m, the ties that look the same in the images that see them."""

@@ -12,13 +12,17 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from zlocus.errors import OutputError
+from zlocus.options import ProductOptions
+from zlocus.products.hillshade import BRIGHTEST, DARKEST, hillshade
 
 FloatImage = NDArray[np.float32]
 GAP = 12
 CAPTION = 34
 EMPTY_GREY = 255
-SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 45.0
+# Of the colours' brightness, in shade and facing the sun.
+SHADE, LIT = np.float32(0.35), np.float32(1.1)
 ERROR_SCALE_M = 1.0
+SUN_DEG = (ProductOptions().sun_azimuth_deg, ProductOptions().sun_altitude_deg)
 INK = (40, 40, 40)
 
 
@@ -47,16 +51,18 @@ def picture_beside_truth(dsm: Path, truth: Path, path: Path, side: int = 480) ->
         ) from error
 
 
-def relief(height: FloatImage, cell_m: float, span: tuple[float, float]) -> NDArray[np.uint8]:
-    """Heights (r, c) as colours, shaded by the sun from the north-west: (r, c, 3) uint8 in OpenCV's order."""
-    south, east = np.gradient(height, cell_m)
-    azimuth, elevation = np.deg2rad(SUN_AZIMUTH_DEG), np.deg2rad(SUN_ELEVATION_DEG)
-    to_sun = np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
-    light = (to_sun[2] - east * to_sun[0] + south * to_sun[1]) / np.sqrt(1.0 + east**2 + south**2)
-    # The square root leaves most colours to the ground, which towers would otherwise make one dark plain.
-    share = np.sqrt(np.clip((height - span[0]) / max(span[1] - span[0], 1e-6), 0.0, 1.0))
+def relief(
+    height: FloatImage, cell_m: float, span: tuple[float, float], sun_deg: tuple[float, float] = SUN_DEG
+) -> NDArray[np.uint8]:
+    """Heights (r, c) as colours, shaded as hillshade.tif is: (r, c, 3) uint8 in OpenCV's order.
+
+    span : heights, m, of the first and the last colour, between which colours run evenly; sun_deg : azimuth and
+    altitude.
+    """
+    share = np.clip((height - span[0]) / max(span[1] - span[0], 1e-6), 0.0, 1.0)
     colours = cv2.applyColorMap(np.nan_to_num(255.0 * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-    shaded = colours * (0.35 + 0.75 * np.clip(np.nan_to_num(light), 0.0, 1.0))[..., None]
+    light = (hillshade(height, cell_m, *sun_deg).astype(np.float32) - DARKEST) / (BRIGHTEST - DARKEST)
+    shaded = colours * (SHADE + (LIT - SHADE) * light)[..., None]
     return _empty_white(np.clip(shaded, 0, 255), np.isfinite(height))
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from pyproj import CRS
 
 from zlocus.errors import OutputError
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
-from zlocus.matching.curve import GOOD
+from zlocus.matching.curve import FAIR, GOOD
 from zlocus.matching.ranking import NOT_RANKED, RankedPoints
 from zlocus.orientation.orient import Orientation
 from zlocus.orientation.triangulate import project_points
@@ -22,6 +24,7 @@ from zlocus.sensors.model import FloatArray
 
 # Geometries of shapely's (n,) and their columns, (n,) each.
 Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
+LABELS = ("good", "fair", "poor")
 # Columns of labels begin so.
 LABEL = "label_"
 
@@ -57,6 +60,30 @@ def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: 
     }  # fmt: skip
     crs = vertical.compound(oriented.crs)
     write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, crs)
+
+
+def label_counts(ranked: Sequence[RankedPoints], n_views: int) -> NDArray[np.int64]:
+    """How often each label was given, (3, i, i) int64: good, fair and poor, of the search image (last axis) against the
+    reference; 0 where the two were not compared."""
+    counts = np.zeros((3, n_views, n_views), np.int64)
+    for part in ranked:
+        at = np.ix_(part.views, part.views)
+        for k, is_label in enumerate((part.labels == GOOD, part.labels == FAIR, part.labels < FAIR)):
+            counts[k][at] += is_label.sum(axis=0)
+    counts[:, np.arange(n_views), np.arange(n_views)] = 0
+    return counts
+
+
+def counted_pairs(counts: NDArray[np.int64], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Per pair of images that were compared, the points and their labels, which are the same either way round.
+
+    counts : of `label_counts`; names : of the scene's images.
+    """
+    return [
+        {"images": [names[i], names[j]], "points": int(n.sum()), **dict(zip(LABELS, n.tolist(), strict=True))}
+        for i, j in combinations(range(len(names)), 2)
+        if (n := counts[:, i, j]).any()
+    ]
 
 
 def write_ranking(

@@ -11,7 +11,8 @@ from zlocus.surface.surface import Surface
 
 
 def filled(surface: Surface, reach: int) -> Surface:
-    """The surface with gaps interpolated from the nearest heights in eight directions, at most `reach` cells away.
+    """The surface, (r, c), with gaps interpolated from the nearest heights in eight directions, at most `reach` cells
+    away.
 
     Cells that no two images cover, or that were not asked for, stay empty. Filled cells carry `Quality.FILLED` beside
     the reason why they were empty, use 0 images, and have no sigma.

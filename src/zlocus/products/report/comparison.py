@@ -52,7 +52,7 @@ def comparison_part(out: Path, comparison: Comparison) -> dict[str, Any]:
         "sentence": words.against_reference(evaluation, comparison.reference.name), "name": comparison.reference.name,
         "headings": headings, "rows": rows, "notes": [_sentence(note) for note in notes(evaluation)],
         "margin": f"{comparison.margin_m:g}", "is_shifted": evaluation.shift is not None,
-        "histogram": _histogram(evaluation), "map": _error_map(evaluation),
+        "histogram": _histogram(evaluation), "map": _error_map(evaluation), "bar": _scale_bar(evaluation),
     }  # fmt: skip
 
 
@@ -76,6 +76,15 @@ def _error_map(evaluation: Evaluation) -> tuple[maps.Picture, maps.Scale]:
     nmad = np.nan_to_num(evaluation.all.nmad)
     full_m = float(f"{max(evaluation.threshold_m, FULL_AT_NMAD * nmad):.1g}")
     return maps.error_picture(shrunk_means(evaluation.error_map.errors, maps.MAP_PX), full_m)
+
+
+def _scale_bar(evaluation: Evaluation) -> maps.ScaleBar | None:
+    """None where the reference's cells are in degrees."""
+    assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
+    geobox = evaluation.error_map.geobox
+    if geobox.crs is not None and geobox.crs.geographic:
+        return None
+    return maps.scale_bar(geobox.shape[1] * abs(float(geobox.resolution.x)))
 
 
 def shrunk_means(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:

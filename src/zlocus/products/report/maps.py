@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
     from rasterio import DatasetReader
 
 RELIEF_PX, MAP_PX = 1400, 800
-SPAN_PERCENT = (2.0, 98.0)
+SPAN_PERCENT, STRETCH_PERCENT = (2.0, 98.0), (1.0, 99.0)
+# Of a map's width, at most.
+BAR_SHARE = 0.3
 # Pictures of smooth quantities larger than this are kept as JPEG, which is a tenth as long.
 MOST_PNG_PX, JPEG_QUALITY = 400, 88
 STOPS = 17
@@ -56,6 +59,14 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class ScaleBar:
+    """A length on a map. percent : of the map's width; words : how long it is."""
+
+    percent: float
+    words: str
+
+
+@dataclass(frozen=True)
 class Scale:
     """Colours that run. gradient : CSS colours from the lowest to the highest; ticks : what stands below them, evenly
     spaced; title : quantity and unit."""
@@ -74,18 +85,44 @@ class Swatch:
     share: str
 
 
-def height_map(folder: Path, found: Survey) -> tuple[Picture, Scale]:
-    """Heights as colours, shaded by a sun in the upper left."""
+def height_map(folder: Path, found: Survey, sun_deg: tuple[float, float]) -> tuple[Picture, Scale]:
+    """Heights as colours, shaded by a sun (azimuth and altitude)."""
     height, cell_m = averaged(folder / "dsm.tif", RELIEF_PX)
-    # Slopes need a neighbour.
-    height = np.pad(height, [(0, int(n < 2)) for n in height.shape], mode="edge")
     low, high = span(height)
-    shaded = relief(height, cell_m, (low, high))
-    # As `relief` has it: the square root leaves most colours to the ground.
-    ticks = tuple(f"{low + (high - low) * share**2:.1f}" for share in np.linspace(0, 1, TICKS))
+    shaded = relief(height, cell_m, (low, high), sun_deg)
+    step = (high - low) / (TICKS - 1)
+    # Two digits of the distance between ticks count.
+    digits = max(1, 1 - math.floor(math.log10(step))) if step > 0 else 1
+    ticks = tuple(f"{value:.{digits}f}" for value in np.linspace(low, high, TICKS))
     scale = Scale(f"{found.above}, m", gradient(cv2.COLORMAP_VIRIDIS), ticks)
     alt = f"Shaded relief coloured by height from {low:.1f} to {high:.1f} m; white where there is no height."
     return picture(shaded, alt), scale
+
+
+def ortho_map(folder: Path) -> Picture | None:
+    """The ortho-image, its values stretched; None where there is none."""
+    if not (folder / "ortho.tif").exists():
+        return None
+    with open_raster(folder / "ortho.tif", "raster") as file:
+        shape = shape_within(file, MAP_PX)
+        values = file.read(out_shape=(file.count, *shape), resampling=Resampling.average).astype(np.float32)
+        known = file.dataset_mask(out_shape=shape) > 0
+    shown = values[:, known]
+    low, high = np.percentile(shown, STRETCH_PERCENT) if shown.size else (0.0, 1.0)
+    stretched = np.clip((values - low) / max(high - low, 1e-6), 0.0, 1.0)
+    # A single grey is all three colours, which OpenCV has the other way round.
+    colours = np.rint(255 * np.moveaxis(stretched[::-1] if len(values) == 3 else stretched[[0, 0, 0]], 0, -1))
+    colours[~known] = WHITE
+    alt = "Ortho-image: the ground as it would look from straight above; white where there is no height."
+    return picture(colours.astype(np.uint8), alt)
+
+
+def scale_bar(width_m: float) -> ScaleBar:
+    """The longest round length that takes at most `BAR_SHARE` of a map."""
+    most = BAR_SHARE * width_m
+    power = 10.0 ** math.floor(math.log10(most))
+    length = power * max(k for k in (1, 2, 5) if k * power <= most * (1 + 1e-9))
+    return ScaleBar(100 * length / width_m, f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m")
 
 
 def sigma_map(folder: Path) -> tuple[Picture, Scale]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from zlocus.products.report import maps, tables, words
 from zlocus.products.report.comparison import Comparison, comparison_part
 from zlocus.products.report.survey import Survey, survey
 from zlocus.scene import is_local
+from zlocus.sensors.model import FloatArray
 from zlocus.surface.reasons import Quality
 
 REPORT, RECORD, CURVES, FOOTPRINTS, RANKING = (
@@ -29,10 +30,26 @@ LABEL_WORDS = {1: "good", 0: "fair", -1: "poor"}
 KIND_WORDS = {"typical": "Typical", "doubtful": "Doubtful", "failed": "No height"}
 MOST_NUMBERED = 40
 DRAWN = 1000.0
+# Width and height of a number in the drawing, and places on each side of an outline at which it may stand.
+NUMBER_BOX, PER_SIDE = np.array([56.0, 44.0]), 8
+# Of outlines and their numbers, told apart on white by all eyes.
+COLOURS = ("#0072b2", "#b03a00", "#00704f", "#8f3f71", "#8a6100", "#5b4bb5", "#8b3a2b", "#444444")
 # Of a small figure of match curves.
 SVG_PX = (355, 336)
 # Folded tables are printed too. Nothing else needs it.
 SCRIPT = 'addEventListener("beforeprint",()=>document.querySelectorAll("details").forEach(d=>{d.open=true}));'
+
+
+@dataclass(frozen=True)
+class Outline:
+    """An image on the ground. number : in the table of images; points : of SVG; colour : CSS; at : where its number
+    stands, None where there is no room."""
+
+    number: int
+    name: str
+    points: str
+    colour: str
+    at: tuple[float, float] | None
 
 
 def write_report(out: Path, comparison: Comparison | None = None) -> Path:
@@ -73,6 +90,8 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
     sigma = found.sigma[np.isfinite(found.sigma)]
     quantiles = {q: float(np.percentile(sigma, q)) for q in QUANTILES} if sigma.size else {}
     where, frame = words.place(found, crs)
+    light = run["config"]["options"]["products"]
+    sun_deg = (light["sun_azimuth_deg"], light["sun_altitude_deg"])
     views = run["orientation"]["views"]
     reference = None if comparison is None else comparison_part(out, comparison)
     paragraph = words.summary(found, run, crs, quantiles)
@@ -82,11 +101,14 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
         "title": out.resolve().name, "version": run["versions"]["zlocus"], "summary": paragraph, "where": where,
         "frame": frame, "is_local": is_local(crs), "run": run, "found": found,
         "footprints": footprints_part(out / FOOTPRINTS, found, crs, list(views)),
-        "heights": maps.height_map(out, found), "sigma": maps.sigma_map(out),
+        "heights": maps.height_map(out, found, sun_deg), "sun": words.sun(*sun_deg),
+        "corners": words.corners(found, is_local(crs)), "bar": maps.scale_bar(found.shape[1] * found.cell_m),
+        "ortho": maps.ortho_map(out), "created": words.when(run.get("created")),
+        "sigma": maps.sigma_map(out),
         "quantiles": [(f"{q} %", words.size(value, "m")) for q, value in quantiles.items()],
         "used": maps.views_map(found), "reasons": words.reasons(found), "reasons_map": maps.reasons_map(found),
         "absent": words.listed([str(flag.name) for flag in Quality if not found.count(flag)]),
-        "images": tables.image_rows(views), **pairs_part(out, run), "curves": curves_part(out / CURVES),
+        "images": tables.image_rows(views), **pairs_part(out, run), "curves": curves_part(out / CURVES, run),
         "reference": reference, "stages": tables.stage_rows(run["stages"]),
         "request": tables.request_rows(run["config"]["request"]),
         "options": tables.option_rows(run["config"]["options"]),
@@ -125,25 +147,50 @@ def footprints_part(path: Path, found: Survey, crs: CRS, names: Sequence[str]) -
     scale = DRAWN / max(*(high - low), 1e-9)
     width, height = (high - low) * scale
 
-    def drawn(xy: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+    def drawn(xy: FloatArray) -> FloatArray:
         return np.asarray(np.column_stack([xy[:, 0] - low[0], high[1] - xy[:, 1]]) * scale)
 
-    def points(xy: np.typing.NDArray[np.float64]) -> str:
+    def points(xy: FloatArray) -> str:
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in drawn(xy))
 
-    shapes = []
-    for i, name in enumerate(names):
-        if name in rings:
-            # Numbers stand at different places of outlines that are alike.
-            at = drawn(rings[name])[round(i / len(names) * (len(rings[name]) - 1))]
-            shapes.append((i + 1, name, points(rings[name]), f"{at[0]:.1f}", f"{at[1]:.1f}"))
+    shown = [(i, name) for i, name in enumerate(names) if name in rings]
+    is_numbered = len(shown) <= MOST_NUMBERED
+    places = number_places([drawn(rings[name]) for _, name in shown]) if is_numbered else [None] * len(shown)
+    shapes = [
+        Outline(i + 1, name, points(rings[name]), COLOURS[i % len(COLOURS)], at)
+        for (i, name), at in zip(shown, places, strict=True)
+    ]
     return {
         "shapes": shapes, "area": points(area), "width": f"{width:.1f}", "height": f"{height:.1f}",
-        "is_numbered": len(names) <= MOST_NUMBERED, "span_m": [words.size(float(v), "m") for v in high - low],
+        "span_m": [words.size(float(v), "m") for v in high - low],
     }  # fmt: skip
 
 
-def footprint_rings(path: Path, crs: CRS) -> dict[str, np.typing.NDArray[np.float64]]:
+def number_places(rings: Sequence[FloatArray]) -> list[tuple[float, float] | None]:
+    """Where the number of each outline stands, on the outline and on no other number; None where there is no room.
+
+    rings : outlines (n, 2) in units of the drawing. Each takes the place of its outline that is farthest from the
+    numbers before it.
+    """
+    placed: list[FloatArray] = []
+    found: list[tuple[float, float] | None] = []
+    for ring in rings:
+        steps = np.arange(PER_SIDE) / PER_SIDE
+        closed = np.concatenate([ring, ring[:1]])
+        at = (closed[:-1, None] + steps[:, None] * np.diff(closed, axis=0)[:, None]).reshape(-1, 2)
+        # Of a box that holds two digits: below 1 two of them overlap.
+        apart = [np.abs((at - other) / NUMBER_BOX).max(axis=1) for other in placed]
+        room = np.min(apart, axis=0) if apart else np.full(len(at), np.inf)
+        best = int(room.argmax())
+        if room[best] < 1:
+            found.append(None)
+            continue
+        placed.append(at[best])
+        found.append((round(float(at[best, 0]), 1), round(float(at[best, 1]), 1)))
+    return found
+
+
+def footprint_rings(path: Path, crs: CRS) -> dict[str, FloatArray]:
     """Outline of each image in the surface's CRS, (n, 2) m, by name; those without one are left out."""
     rings = {}
     back = None if is_local(crs) else Transformer.from_crs("EPSG:4326", crs, always_xy=True)
@@ -166,33 +213,41 @@ def pairs_part(out: Path, run: Mapping[str, Any]) -> dict[str, Any]:
     names = list(run["orientation"]["views"])
     if len(names) > tables.MOST_MATRIX:
         why = f"There are {len(names)} images, too many for a matrix."
-        return {"labels": None, "no_labels": f"{why} See {RANKING}.", "pairs": None, "no_pairs": why}
-    labels = tables.label_matrix(out / RANKING, names)
-    fewest = run["config"]["options"]["selection"]["fewest_views"]
-    if len(names) < fewest:
-        why = f"This run has {len(names)} images; with fewer than {fewest} all are used, and none is ranked."
-    else:
-        why = f"The run left no ranking of these images ({RANKING})."
+        return {"labels": None, "n_sampled": 0, "no_labels": f"{why} See {RANKING}.", "pairs": None, "no_pairs": why}
+    labels, n_sampled, why = label_part(out, names)
     overlaps = [each["properties"] for each in features(out / FOOTPRINTS, "overlap")]
     known = [each for each in overlaps if set(each["views"]) <= set(names)]
     return {
-        "labels": labels, "no_labels": why,
+        "labels": labels, "n_sampled": n_sampled, "no_labels": why,
         "pairs": tables.pair_matrix(names, run["orientation"]["pairs"], known), "no_pairs": "",
     }  # fmt: skip
 
 
-def curves_part(path: Path) -> dict[str, Any] | None:
+def label_part(out: Path, names: Sequence[str]) -> tuple[tables.Matrix | None, int, str]:
+    """The matrix of labels, at how many points it is a sample (0 where images were ranked everywhere), and why there is
+    none."""
+    labels = tables.label_matrix(out / RANKING, names)
+    sample = read_record(out / CURVES).get("labels", {}) if (out / CURVES).exists() else {}
+    if labels is not None or not sample:
+        return labels, 0, f"The run left no ranking of these images ({RANKING}), and no sample of one ({CURVES})."
+    if "error" in sample:
+        return None, 0, f"None could be made: {sample['error']}"
+    matrix = tables.sampled_matrix(sample["pairs"], names) if sample["pairs"] else None
+    return matrix, sample["points"], "No tie point lies where two images were compared."
+
+
+def curves_part(path: Path, run: Mapping[str, Any]) -> dict[str, Any] | None:
     """Cells with their curves; None without any."""
     if not path.exists():
         return None
     record = read_record(path)
     return {
         "rule": record["rule"], "n_left_out": record["n_chosen"] - len(record["cells"]),
-        "cells": [curve_card(cell) for cell in record["cells"]],
+        "cells": [curve_card(cell, run) for cell in record["cells"]],
     }  # fmt: skip
 
 
-def curve_card(cell: Mapping[str, Any]) -> dict[str, Any]:
+def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
     """What is said of a cell and its curves."""
     names = [str(flag.name) for flag in Quality if cell["quality"] & flag]
     lines = [
@@ -215,4 +270,7 @@ def curve_card(cell: Mapping[str, Any]) -> dict[str, Any]:
     )
     uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
     alt = f"Correlation against height at this cell. {says}"
-    return card | {"lines": [*lines, says], "picture": maps.Picture(uri, alt, *SVG_PX)}
+    lines.append(says)
+    if cell["kind"] == "failed" and (despite := words.despite_peak(Quality[cell["why"]], mean["rho1"], run)):
+        lines.append(despite)
+    return card | {"lines": lines, "picture": maps.Picture(uri, alt, *SVG_PX)}

@@ -10,13 +10,18 @@ from typing import Any
 import numpy as np
 
 from zlocus.errors import InputError
+from zlocus.matching.curve import FAIR, GOOD, POOR
 from zlocus.options import RunConfig
-from zlocus.products.points import LABEL, column_names
-from zlocus.products.report.words import NONE, STAGES, number, percent, seconds
+from zlocus.products.points import LABEL, LABELS, column_names
+from zlocus.products.report.words import NONE, STAGES, number, percent, seconds, whole_percent
 
 # Poor to good, blue and orange being told apart by all eyes.
 POOR_COLOUR, GOOD_COLOUR = np.array([230, 159, 0]), np.array([86, 180, 233])
 MOST_MATRIX = 60
+# Of a column of a matrix: a letter, what is around them, and the letters of its figures.
+LETTER_PX, PADDING_PX, LEAST_LETTERS = 9, 16, 5
+# Widths of pages at which the style of the page tells tables apart; the last stands for any.
+NARROWEST_PX, PAGES_PX = 360, (400, 600, 700, 1100, 9999)
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,14 @@ class Matrix:
 
     names: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
+
+    @property
+    def wider_than(self) -> int:
+        """Width of the page, px, up to which the matrix is wider than it, about, of `PAGES_PX`; 0 where it always
+        fits."""
+        lengths = [max(len(name), LEAST_LETTERS) for name in self.names]
+        width = LETTER_PX * (sum(lengths) + max(lengths)) + PADDING_PX * (len(lengths) + 2)
+        return 0 if width <= NARROWEST_PX else min(page for page in PAGES_PX if page >= width or page == PAGES_PX[-1])
 
 
 @dataclass(frozen=True)
@@ -144,28 +157,42 @@ def label_matrix(path: Path, names: Sequence[str]) -> Matrix | None:
         mine = held["reference"] == reference
         rows.append(
             tuple(
-                _label_cell(reference, name, held[column][mine]) for name, column in zip(names, columns_of, strict=True)
+                _label_cell(reference, name, [int((held[column][mine] == label).sum()) for label in (GOOD, FAIR, POOR)])
+                for name, column in zip(names, columns_of, strict=True)
             )
         )
     return Matrix(tuple(names), tuple(rows))
 
 
-def _label_cell(reference: str, search: str, column: np.typing.NDArray[Any]) -> Cell:
-    """What the labels of a search image against a reference are. column : (n,) -1, 0, 1 or NaN."""
+def sampled_matrix(pairs: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Matrix | None:
+    """The same of the points at which a run that ranked no images compared them; None where that is of other images.
+
+    pairs : of curves.json, with the labels of each pair, which are the same either way round.
+    """
+    place = {name: i for i, name in enumerate(names)}
+    counts = np.zeros((len(names), len(names), len(LABELS)), int)
+    for pair in pairs:
+        if not set(pair["images"]) <= set(names):
+            return None
+        i, j = (place[name] for name in pair["images"])
+        counts[i, j] = counts[j, i] = [pair[label] for label in LABELS]
+    rows = (tuple(_label_cell(a, b, counts[i, j].tolist()) for j, b in enumerate(names)) for i, a in enumerate(names))
+    return Matrix(tuple(names), tuple(rows))
+
+
+def _label_cell(reference: str, search: str, counts: Sequence[int]) -> Cell:
+    """What the labels of a search image against a reference are. counts : of those that are good, fair and poor."""
     if reference == search:
         return Cell("", "#dddddd")
-    labels = column[np.isfinite(column)]
-    if not labels.size:
+    total = sum(counts)
+    if not total:
         return Cell(NONE, title=f"{search} was never compared with {reference}")
-    good, fair, poor = ((labels == value).mean() for value in (1, 0, -1))
-    mean = float(labels.mean())
+    good, fair, poor = (percent(n, total) for n in counts)
+    mean = (counts[0] - counts[2]) / total
     end = GOOD_COLOUR if mean > 0 else POOR_COLOUR
     colour = np.rint(255 + abs(mean) * (end - 255)).astype(int)
-    says = (
-        f"{search} against {reference}: good at {percent(good, 1)}, fair at {percent(fair, 1)}, poor at "
-        f"{percent(poor, 1)} of {labels.size} tie points"
-    )
-    return Cell(f"{100 * good:.0f}", f"rgb({colour[0]},{colour[1]},{colour[2]})", says)
+    says = f"{search} against {reference}: good at {good}, fair at {fair}, poor at {poor} of {total} tie points"
+    return Cell(whole_percent(counts[0], total), f"rgb({colour[0]},{colour[1]},{colour[2]})", says)
 
 
 def stage_rows(stages: Sequence[Mapping[str, Any]]) -> list[StageRow]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 from pyproj import CRS, Transformer
@@ -33,6 +34,20 @@ MEANINGS = {
     Quality.LEFT_OUT: "an image that may show the cell took no part: it sees it too obliquely for the tables",
     Quality.PLANE: "too plain to be matched alone: height of a plane fitted to all of a plain segment",
 }
+# Why a cell has no height though its match curve, of one place alone, may be high. As `zlocus.surface.checks` decides.
+DESPITE_PEAK = {
+    Quality.NO_MATCH: "the surface lies where the heights around it allow, which need not be at this peak; there, in "
+    "windows that follow its slope, the mean correlation of all pairs of images that see it is below {least_ncc:g} "
+    "(checks.least_ncc)",
+    Quality.RANGE_END: "with the heights around it taken into account the best height is the lowest or the highest of "
+    "those searched ({low:.1f} to {high:.1f} m)",
+    Quality.HIDDEN: "the curve does not know what stands in the way: at the height that the surface has here fewer "
+    "than two images see past what is around it",
+    Quality.UNCONFIRMED: "the curve is of one reference: the height found from an image was not found again from any "
+    "other",
+    Quality.IMPRECISE: "a peak may be high and yet wide or in doubt: its standard deviation is larger than asked for",
+}
+HIGH_PEAK = 0.5
 # What helps, where something does.
 ADVICE = {
     Quality.UNSEEN: "add images, or ask for a smaller area",
@@ -55,6 +70,7 @@ STAGES = {
     "record": "checksums of the inputs",
     "products": "hillshade and what else was made of the surface",
 }
+SIDES = ("top", "upper right", "right", "lower right", "bottom", "lower left", "left", "upper left")
 NONE = "–"
 LEAST_SHARE = 0.0001
 
@@ -91,11 +107,22 @@ def fate(flag: Quality) -> str:
 
 
 def percent(n: float, total: float) -> str:
-    """A share in percent; one that is not 0 never reads as 0."""
+    """A share in percent: one that is not 0 never reads as 0, and one that is not all never as 100."""
     if not total:
         return NONE
     share = n / total
-    return "< 0.01 %" if 0 < share < LEAST_SHARE else f"{100 * share:.2f} %" if share < 0.1 else f"{100 * share:.1f} %"
+    if 0 < share < LEAST_SHARE:
+        return "< 0.01 %"
+    if 1 - LEAST_SHARE < share < 1:
+        return "> 99.99 %"
+    return f"{100 * share:.{2 if share < 0.1 or 0.999 <= share < 1 else 1}f} %"
+
+
+def whole_percent(n: int, total: int) -> str:
+    """A share in whole percent, without its sign; 0 and 100 only where it is none and all."""
+    if n in (0, total):
+        return "100" if n else "0"
+    return str(min(max(round(100 * n / total), 1), 99))
 
 
 def number(value: float | None, unit: str = "", digits: int = 2) -> str:
@@ -117,6 +144,37 @@ def seconds(value: float) -> str:
         return f"{value:.2f} s" if value < 1 else f"{value:.1f} s"
     minutes, rest = divmod(round(value), 60)
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def when(created: str | None) -> str:
+    """A time of run.json, to the minute; "" where it has none."""
+    if not created:
+        return ""
+    return datetime.fromisoformat(created).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def sun(azimuth_deg: float, altitude_deg: float) -> str:
+    """Where the light of a map comes from, its first row being the north."""
+    side = SIDES[round(azimuth_deg / 45) % len(SIDES)]
+    return f"lit from the {side} (azimuth {azimuth_deg:g}°), {altitude_deg:g}° above the horizon"
+
+
+def corners(found: Survey, is_local: bool) -> list[str]:
+    """Coordinates of the map's corners: upper left, upper right, lower left, lower right."""
+    (rows, cols), names = found.shape, ("x", "y") if is_local else ("E", "N")
+    return [
+        ", ".join(f"{name} {value:.1f}" for name, value in zip(names, found.transform * corner, strict=True))
+        for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))
+    ]
+
+
+def despite_peak(why: Quality, rho1: float | None, run: Mapping[str, Any]) -> str:
+    """Why a cell is empty although its mean curve reaches a correlation, as a sentence; "" where it does not."""
+    if rho1 is None or rho1 < HIGH_PEAK or why not in DESPITE_PEAK:
+        return ""
+    low, high = run["heights"]["range_m"]
+    text = DESPITE_PEAK[why].format(least_ncc=run["config"]["options"]["checks"]["least_ncc"], low=low, high=high)
+    return f"No height in spite of the peak: {text}."
 
 
 def place(found: Survey, crs: CRS) -> tuple[str, str]:
@@ -142,7 +200,7 @@ def summary(found: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, f
     said = [
         f"{what} It covers {wide:.0f} m by {high:.0f} m {where} (map: {frame}), with a cell every "
         f"{found.cell_m:g} m, and was made from {len(views)} images.",
-        f"Of the cells that two images or more cover, {100 * run['coverage']:.1f} % have a height.",
+        f"Of the cells that two images or more cover, {percent(found.n_heights, found.n_seen)} have a height.",
     ]
     if found.n_heights:
         said.append(f"Heights run from {found.lowest_m:.1f} to {found.highest_m:.1f} m ({found.above}).")
@@ -180,8 +238,8 @@ def against_reference(evaluation: Evaluation, reference: str) -> str:
     figures = evaluation.all
     moved = "" if evaluation.shift is None else ", once the shift between the two is removed"
     return (
-        f"Against the reference {reference}{moved}: {100 * figures.completeness:.1f} % of its cells have a height, "
-        f"{100 * figures.within:.1f} % one that is right to {evaluation.threshold_m:g} m; the errors' median is "
+        f"Against the reference {reference}{moved}: {percent(figures.completeness, 1)} of its cells have a height, "
+        f"{percent(figures.within, 1)} one that is right to {evaluation.threshold_m:g} m; the errors' median is "
         f"{number(figures.median, 'm', 3)}, their spread (NMAD) {number(figures.nmad, 'm', 3)}."
     )
 
