@@ -98,7 +98,7 @@ def blocks_used(monkeypatch):
                 found[name] = float(np.mean(by_block))
         return used, *others
 
-    monkeypatch.setattr(zlocus.pipeline, "match_tile", matched)
+    monkeypatch.setattr(zlocus.job, "match_tile", matched)
     monkeypatch.setattr(zlocus.tile, "_choose", chosen)
     return found
 

@@ -310,7 +310,7 @@ def test_a_geoid_of_another_place_is_refused_before_the_first_tile(images, tmp_p
     def no_tile(*_):
         raise AssertionError("a tile was begun")
 
-    monkeypatch.setattr("zlocus.pipeline.match_tile", no_tile)
+    monkeypatch.setattr("zlocus.job.match_tile", no_tile)
     monkeypatch.setattr("zlocus.cloud.match_images", no_tile)
     away = write_geoid(tmp_path / "away.tif", np.zeros((4, 4), np.float32), from_origin(5, 44, 0.25, 0.25))
     for asked in (None, HEIGHTS):

@@ -88,9 +88,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     watch = Stopwatch()
     check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):
-        opened = _opened(request, config)
-        scene, vertical, store = opened.scene, opened.vertical, opened.store
-    note_dem(request.dem, request.dem_vertical, progress)
+        opened = _opened(request, config, progress)
+        scene, vertical = opened.scene, opened.vertical
     with watch.stage("orient"):
         orientation = oriented(scene, config.orientation, scene.heights, progress)
         progress.note(what_was_applied(orientation))
@@ -100,18 +99,18 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         grid = _grid(request, opened.like, corrected, orientation, z_range)
         settled = _settled(request, grid, corrected, orientation, z_range, config)
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
-        plan = planned(settled, tiles, config, request.workers, request.memory_gb)
+        plan = planned(settled, tiles, config, request.workers, request.memory_gb, request.scheduler)
         vertical.check_covers(_area_matched(grid, settled), scene.crs)
         _check_polygons(request, grid, settled, opened.polygons.inside)
         progress.note(str(plan))
     out, tally = request.out, Tally()
     job = _job(request, settled, grid, config, opened.polygons)
-    matching = Matching(job, tiles, store, EventLog(out))
-    with made_folder(out), store.open(digest_of(settled, orientation)):
+    matching = Matching(job, tiles, opened.store, EventLog(out))
+    with made_folder(out), opened.store.open(digest_of(settled, orientation)):
         matching.begin(plan)
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, corrected, orientation, z_range, plan, tally, progress)
-            failed = matching.run(workers_for(plan, make, is_here=make is not job), progress, elsewhere)
+            failed = matching.run(workers_for(plan, make, progress, is_here=make is not job), progress, elsewhere)
         matching.check(failed, request.partial)
         with watch.stage("write"):
             _forget(out)
@@ -204,8 +203,9 @@ class Opened:
     store: TileStore
 
 
-def _opened(request: DsmRequest, config: RunConfig) -> Opened:
+def _opened(request: DsmRequest, config: RunConfig, progress: Progress) -> Opened:
     """Everything that a request names, open."""
+    note_dem(request.dem, request.dem_vertical, progress)
     like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
     scene = _scene(request, like, vertical)
     files = _files(request, scene, vertical)

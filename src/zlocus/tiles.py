@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from zlocus.errors import ConfigError, StoppedError
+from zlocus.execution.cluster import Cluster
 from zlocus.execution.engine import Failure, Here, Outcome, Workers, run_tasks
 from zlocus.execution.events import NAME, EventLog
 from zlocus.execution.memory import SHARE, WORKER_BYTES, cores, free_bytes
@@ -35,7 +36,8 @@ NAMED = 3  # failed tiles in a message
 @dataclass(frozen=True)
 class Plan:
     """How tiles are worked on. slots : at a time; processes : in processes of their own, else here; tile_bytes : that
-    one needs at most; allowed_bytes : all together; seconds : about, of one worker."""
+    one needs at most; allowed_bytes : all together; seconds : about, of one worker; scheduler : of a cluster that does
+    it instead."""
 
     n_tiles: int
     slots: int
@@ -43,9 +45,14 @@ class Plan:
     tile_bytes: float
     allowed_bytes: float
     seconds: float
+    scheduler: str | None = None
 
     def __str__(self) -> str:
         where = "in processes of their own" if self.processes else "in this process"
+        if self.scheduler is not None:
+            need = f"{self.tile_bytes / 1e9:.2g} GB of memory for each of its threads"
+            whole = f"{duration(self.seconds)} of one of them"
+            return f"Plan: {self.n_tiles} tiles by the cluster at {self.scheduler}, about {need}, and {whole}."
         many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
         return (
             f"Plan: {many}, {self.slots} at a time {where}, about {self.slots * self.tile_bytes / 1e9:.2g} GB of "
@@ -54,7 +61,12 @@ class Plan:
 
 
 def planned(
-    settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, workers: int | None, memory_gb: float | None
+    settled: MatchScene,
+    tiles: Sequence[Tile],
+    config: RunConfig,
+    workers: int | None,
+    memory_gb: float | None,
+    scheduler: str | None = None,
 ) -> Plan:
     """Tiles at a time: as asked, or as many as there are cores and work for; never more than memory allows.
 
@@ -74,7 +86,7 @@ def planned(
     seconds = matching_seconds(settled, worked)
     wanted = workers or (cores() if seconds > SHORT_S else 1)
     slots = max(min(wanted, int(allowed / (need + WORKER_BYTES)), len(worked)), 1)
-    return Plan(len(tiles), slots, slots > 1, need + WORKER_BYTES * (slots > 1), allowed, seconds)
+    return Plan(len(tiles), slots, slots > 1, need + WORKER_BYTES * (slots > 1), allowed, seconds, scheduler)
 
 
 @dataclass
@@ -274,9 +286,19 @@ class Matching:
 
 
 def workers_for(
-    plan: Plan, make: Callable[[Tile], TileProduct], is_here: bool = False
+    plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress, is_here: bool = False
 ) -> AbstractContextManager[Workers]:
-    """Where the tiles of a plan are made. is_here : in this process, whatever the plan, for `make` holds too much."""
+    """Where the tiles of a plan are made. is_here : in this process, whatever the plan, for `make` holds too much.
+
+    Raises
+    ------
+    ConfigError
+        See `Cluster`.
+    """
+    if plan.scheduler is not None and not is_here:
+        cluster = Cluster(make, plan.scheduler)
+        progress.note(f"Dask cluster at {plan.scheduler}; what it does is shown at {cluster.dashboard}")
+        return cluster
     if plan.processes and not is_here:
         return Processes(make, plan.slots)
     return nullcontext(Here(make))

@@ -29,17 +29,18 @@ class Cause(StrEnum):
 @dataclass(frozen=True)
 class Failure:
     """cause; reason : what happened, as a clause without its full stop; trace : of our own faults; error : where it
-    says all that there is to say."""
+    says all that there is to say; is_given_up : by workers that had tried again themselves."""
 
     cause: Cause
     reason: str
     trace: str = ""
     error: ZlocusError | None = None
+    is_given_up: bool = False
 
     @property
     def may_pass(self) -> bool:
         """Whether another attempt may end otherwise."""
-        return self.cause is not Cause.FAULT
+        return self.cause is not Cause.FAULT and not self.is_given_up
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Workers(Protocol):
 
     @property
     def slots(self) -> int:
-        """Tasks that it takes at a time, 1 or more."""
+        """Tasks that it takes at a time, 1 or more; may change."""
         ...
 
     def submit(self, task: Any) -> None:
@@ -104,15 +105,21 @@ def run_tasks(workers: Workers, tasks: Iterable[Any]) -> Iterator[Outcome]:
             yield replace(outcome, attempt=n, is_final=is_final)
 
 
-def attempted(function: Callable[[Any], Any], task: Any, worker: str, cpu_before_s: float) -> Outcome:
-    """One attempt at a task, in this process. cpu_before_s : from when on its CPU time counts."""
+def attempted(
+    function: Callable[[Any], Any],
+    task: Any,
+    worker: str,
+    cpu_before_s: float,
+    clock: Callable[[], float] = time.process_time,
+) -> Outcome:
+    """One attempt at a task, in this process. cpu_before_s : from when on CPU time counts, by a clock of it."""
     wall = time.perf_counter()
     result, failure = None, None
     try:
         result = function(task)
     except Exception as error:
         failure = failure_of(error)
-    wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu_before_s
+    wall_s, cpu_s = time.perf_counter() - wall, clock() - cpu_before_s
     return Outcome(task, result, failure, wall_s, cpu_s, peak_memory_mb(), worker)
 
 

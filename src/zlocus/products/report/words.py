@@ -156,7 +156,7 @@ def when(created: str | None) -> str:
 def sun(azimuth_deg: float, altitude_deg: float) -> str:
     """Where the light of a map comes from, its first row being the north."""
     side = SIDES[round(azimuth_deg / 45) % len(SIDES)]
-    return f"lit from the {side} (azimuth {azimuth_deg:g}°), {altitude_deg:g}° above the horizon"
+    return f"lit from the {side} (azimuth {azimuth_deg:g} degrees), {altitude_deg:g} degrees above the horizon"
 
 
 def corners(found: Survey, is_local: bool) -> list[str]:
