@@ -167,6 +167,7 @@ LAID_OUT = {
     "import.md": lay_out_cameras,
     "quality.md": lay_out_surface,
     "products.md": lay_out_products,
+    "large.md": lay_out_images,
     "report.md": lay_out_comparison,
     "evaluate.md": lay_out_surfaces,
     "vertical.md": lay_out_datums,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zlocus.surface.fill import filled
+from zlocus.surface.fill import filled, filled_from
 from zlocus.surface.reasons import Quality
 from zlocus.surface.surface import Surface
 
@@ -51,3 +51,19 @@ def test_a_gap_beyond_reach_stays_empty():
     np.testing.assert_allclose(out.height[:, 1 : REACH + 1], 7.0)
     assert np.isnan(out.height[:, REACH + 1 :]).all()
     assert (out.quality[:, REACH + 1 :] == Quality.NO_MATCH).all()
+
+
+def test_other_heights_fill_what_was_asked_for():
+    """Everything empty but what is outside; what has a height keeps it."""
+    height = np.array([[1.0, np.nan, np.nan, np.nan]], np.float32)
+    quality = np.array([[0, Quality.NO_MATCH, Quality.UNSEEN, Quality.OUTSIDE]], np.uint16)
+    none = np.full((1, 4), np.nan, np.float32)
+    surface = Surface(height, none, quality, np.array([[3, 0, 0, 0]], np.uint8), none)
+    found = filled_from(surface, np.array([[9.0, 5.0, 6.0, 7.0]], np.float32))
+    np.testing.assert_array_equal(found.height, [[1.0, 5.0, 6.0, np.nan]])
+    expected = [0, Quality.NO_MATCH | Quality.FILLED, Quality.UNSEEN | Quality.FILLED, Quality.OUTSIDE]
+    np.testing.assert_array_equal(found.quality, [expected])
+    np.testing.assert_array_equal(found.views, surface.views)
+    unknown = filled_from(surface, none)
+    np.testing.assert_array_equal(unknown.height, height)
+    np.testing.assert_array_equal(unknown.quality, quality)

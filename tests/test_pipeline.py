@@ -474,3 +474,31 @@ def test_progress_and_defaults(images, tmp_path):
     assert (source.bounds.left / source.transform.a) % 1 == pytest.approx(0, abs=1e-6)
     assert "Matching" in log.getvalue()
     assert replace(request).workers is None
+
+
+def test_gaps_filled_from_a_terrain_model(images, tmp_path):
+    """A model 7 m above the ground: seen where nothing was matched, and nowhere else; and it counts as no height."""
+    east, north = CENTRE
+    dem = tmp_path / "dem.tif"
+    with rasterio.open(
+        dem, "w", driver="GTiff", width=200, height=200, count=1, dtype="float32", crs="EPSG:32632",
+        transform=from_origin(east - 200.0, north + 200.0, 2.0, 2.0),
+    ) as file:  # fmt: skip
+        file.write(np.full((200, 200), 57.0, np.float32), 1)
+    bounds = (east - 60.0, north - 20.0, east, north + 20.0)
+    asked = {"heights": None, "dem": dem, "dem_vertical": "ellipsoid", "bounds": bounds, "report": False}
+    plain = run(images("plane"), tmp_path / "plain", SMALL_TILES, **asked)
+    result = run(images("plane"), tmp_path / "out", SMALL_TILES, fill="dem", workers=2, **asked)
+    (before, _), (height, _), quality = (
+        read(plain.out / "dsm.tif"),
+        read(result.out / "dsm.tif"),
+        read(result.out / "quality.tif")[0],
+    )
+    empty = np.isnan(before)
+    assert 0.1 < empty.mean() < 0.9
+    np.testing.assert_array_equal(height[~empty], before[~empty])
+    np.testing.assert_allclose(height[empty], 57.0, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal((quality & Quality.FILLED) != 0, empty)
+    assert result.coverage == plain.coverage
+    with pytest.raises(ConfigError, match=r"--fill dem needs the heights of a terrain model\. Add --dem RASTER"):
+        run(images("plane"), tmp_path / "no", fill="dem")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 import warnings
 from collections import OrderedDict
@@ -29,8 +30,19 @@ _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TR
 _quiet = threading.Lock()
 
 
+def is_remote(path: Path) -> bool:
+    """Whether a path is one of GDAL's virtual files: `/vsicurl/https://...`, `/vsis3/bucket/key`."""
+    return str(path).startswith("/vsi")
+
+
+def gdal_name(path: Path) -> str:
+    """A path as GDAL takes it: `Path` makes one of the two slashes of an address within it."""
+    return re.sub(r"^(/vsi\w+/(?:\w+=[^/]*/)?https?:)/(?!/)", r"\1//", str(path))
+
+
 def existing_file(path: Path, what: str) -> Path:
-    """`path` if it is a file. `what` names its role in the message ("image", "DEM").
+    """`path` if it is a file, or one of GDAL's virtual files, of which nothing is known before it is opened. `what`
+    names its role in the message ("image", "DEM").
 
     Raises
     ------
@@ -38,6 +50,8 @@ def existing_file(path: Path, what: str) -> Path:
         When there is no such file, or it is a folder.
     """
     path = Path(path)
+    if is_remote(path):
+        return path
     try:
         is_there, is_folder = path.exists(), path.is_dir()
     except (OSError, ValueError) as error:
@@ -84,7 +98,7 @@ def _opened(path: Path) -> rasterio.DatasetReader:
     try:
         with _quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            return rasterio.open(path)
+            return rasterio.open(gdal_name(path))
     except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
@@ -111,8 +125,10 @@ class _Kept(threading.local):
 
     def dataset(self, path: Path) -> rasterio.DatasetReader:
         """The raster, opened where it is not open yet."""
-        file = os.stat(path)
-        state = (os.getpid(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns)
+        state: tuple[int, ...] = (os.getpid(),)
+        if not is_remote(path):
+            file = os.stat(path)
+            state += (file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns)
         known, dataset = self.datasets.get(path, (None, None))
         if known != state or dataset is None:
             self.forget(path)
@@ -137,13 +153,15 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
     """Compare the offsets and sizes of all TIFF blocks, or of the chunks of a PNG, with the length of the file,
     decoding nothing.
 
-    Other formats pass: GDAL itself finds them truncated, which it does not of a PNG.
+    Other formats pass: GDAL itself finds them truncated, which it does not of a PNG. So do files that are elsewhere.
 
     Raises
     ------
     InputError
         When pixels lie behind the end of the file, or there are too many of them.
     """
+    if is_remote(path):
+        return
     if source.driver == "PNG":
         _check_png(path)
     if source.driver not in ("GTiff", "COG"):

@@ -19,6 +19,7 @@ from typing import Any
 from zlocus.errors import InputError, OutputError
 from zlocus.execution.memory import peak_memory_mb
 from zlocus.io.config import config_as_dict
+from zlocus.io.opening import gdal_name, is_remote
 from zlocus.io.text import read_text
 from zlocus.options import RunConfig
 
@@ -67,10 +68,13 @@ class Stopwatch:
         )
 
 
-def inputs_record(paths: Iterable[Path]) -> list[dict[str, str]]:
-    """Path and SHA-256 of every input file."""
-    records = []
+def inputs_record(paths: Iterable[Path]) -> list[dict[str, str | None]]:
+    """Path and SHA-256 of every input file; None of those that are elsewhere, which are never read whole."""
+    records: list[dict[str, str | None]] = []
     for path in paths:
+        if is_remote(path):
+            records.append({"path": gdal_name(path), "sha256": None})
+            continue
         digest = hashlib.sha256()
         with path.open("rb") as file:
             while chunk := file.read(CHUNK_BYTES):

@@ -1,0 +1,57 @@
+"""Images that are elsewhere: read by window through a server, whole never."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rendered_scenes import PART, SMALL_TILES, read, run
+from zlocus.errors import InputError
+from zlocus.io.images import open_image
+from zlocus.io.opening import gdal_name, is_remote
+
+
+@pytest.fixture
+def served(images):
+    """Address of the folder of the images."""
+    folder = images("sine").inputs[0].parent
+    words = [sys.executable, str(Path(__file__).parent / "range_server.py"), str(folder)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
+        yield f"http://127.0.0.1:{server.stdout.readline().strip()}"
+        server.kill()
+
+
+def test_names_as_gdal_takes_them():
+    for name in (
+        "/vsicurl/https://a.b/c.tif",
+        "/vsis3/bucket/c.tif",
+        "/vsigs/b/http/c.tif",
+        "/vsizip//data/a.zip/c.tif",
+    ):
+        assert is_remote(Path(name))
+    assert gdal_name(Path("/vsicurl/https://a.b/c.tif")) == "/vsicurl/https://a.b/c.tif"
+    assert gdal_name(Path("/vsicurl/http://a.b:80/c//d.tif")) == "/vsicurl/http://a.b:80/c/d.tif"
+    assert gdal_name(Path("/vsis3/bucket/c.tif")) == "/vsis3/bucket/c.tif"
+    assert gdal_name(Path("a/b.tif")) == "a/b.tif"
+    assert not is_remote(Path("vsicurl/a.tif"))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_surface_of_images_elsewhere(images, served, tmp_path, workers):
+    inputs = tuple(Path(f"/vsicurl/{served}/{path.name}") for path in images("sine").inputs)
+    out = run(inputs, tmp_path / "out", SMALL_TILES, bounds=PART, workers=workers).out
+    here = run(images("sine"), tmp_path / "here", SMALL_TILES, bounds=PART, report=False).out
+    np.testing.assert_array_equal(read(out / "dsm.tif")[0], read(here / "dsm.tif")[0])
+    record = json.loads((out / "run.json").read_text())
+    assert [each["path"] for each in record["inputs"]] == [gdal_name(path) for path in inputs]
+    assert {each["sha256"] for each in record["inputs"]} == {None}
+
+
+def test_what_is_not_there_is_said(served):
+    with pytest.raises(InputError, match=r"nothing\.tif cannot be opened as a raster"):
+        open_image(Path(f"/vsicurl/{served}/nothing.tif"))
