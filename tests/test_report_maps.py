@@ -98,7 +98,7 @@ def test_corners_are_those_of_the_grid():
     ("azimuth", "side"), [(0, "top"), (315, "upper left"), (350, "top"), (95, "right"), (225, "lower left")]
 )
 def test_where_the_light_comes_from(azimuth, side):
-    assert words.sun(azimuth, 30) == f"lit from the {side} (azimuth {azimuth}°), 30° above the horizon"
+    assert words.sun(azimuth, 30) == f"lit from the {side} (azimuth {azimuth} degrees), 30 degrees above the horizon"
 
 
 def test_the_ortho_image_is_shown_in_its_colours(tmp_path):

@@ -205,9 +205,9 @@ class Opened:
 
 def _opened(request: DsmRequest, config: RunConfig, progress: Progress) -> Opened:
     """Everything that a request names, open."""
-    note_dem(request.dem, request.dem_vertical, progress)
     like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
     scene = _scene(request, like, vertical)
+    note_dem(request.dem, request.dem_vertical, progress)
     files = _files(request, scene, vertical)
     store = TileStore.of(request.out, key_of(request, config, files), request.resume, request.overwrite)
     return Opened(scene, vertical, like, _area_polygons(request, scene.crs), files, store)

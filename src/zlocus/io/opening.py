@@ -31,7 +31,7 @@ _quiet = threading.Lock()
 
 
 def is_remote(path: Path) -> bool:
-    """Whether a path is one of GDAL's virtual files: `/vsicurl/https://...`, `/vsis3/bucket/key`."""
+    """Whether a path is one of GDAL's virtual files: `/vsicurl/` and an address, `/vsis3/bucket/key`."""
     return str(path).startswith("/vsi")
 
 

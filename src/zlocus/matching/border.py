@@ -20,7 +20,7 @@ AROUND = np.ones((3, 3), np.uint8)
 PAIR = 2
 # Ground rises by so much of the way to its neighbour at most, to half a step of its height; what views show is asked
 # for within so many steps more.
-STEEPEST, HALF_STEP, ASKED_STEPS = 0.5, 0.5, 2.0
+STEEPEST, HALF_STEP, ASKED_STEPS = 1.0, 0.5, 4.0
 
 
 def shown_heights(
