@@ -271,6 +271,26 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
     assert same(tmp_path / "out", straight)
 
 
+def test_a_plain_script_may_use_processes(images, straight, tmp_path):
+    """Without a guard around what it does: workers do not run it again."""
+    script = tmp_path / "mine.py"
+    names = [str(path) for path in images("sine").inputs]
+    script.write_text(
+        f"""
+import zlocus
+from zlocus.options import PyramidOptions, RunConfig
+print("once")
+zlocus.match(*{names}, out={str(tmp_path / "out")!r}, workers=2, crs="EPSG:32632", resolution=0.5,
+             heights={HEIGHTS}, report=False, config=RunConfig(pyramid=PyramidOptions(tile=64)))
+"""
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "once\n"
+    assert same(tmp_path / "out", straight)
+    assert {event["worker"] for event in events_of(tmp_path / "out") if event["event"] == "tile"} >= {"worker 1"}
+
+
 @pytest.mark.parametrize("asked", [{"workers": 2}, {"workers": 3, "memory_gb": 2.0}, {"workers": None}])
 def test_the_same_bytes_however_many_work(images, straight, tmp_path, asked):
     assert same(run(images("sine"), tmp_path / "out", SMALL_TILES, report=False, **asked).out, straight)

@@ -6,12 +6,13 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable
-from contextlib import suppress
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any
 
 from zlocus.execution.engine import Cause, Failure, Outcome, attempted
@@ -95,16 +96,8 @@ class Processes:
         mine, theirs = self._context.Pipe()
         name = f"worker {self._number}"
         process = self._context.Process(target=work, args=(theirs, self._function, name), name=name, daemon=True)
-        kept = {key: os.environ.get(key) for key in ONE_THREAD}
-        os.environ.update(ONE_THREAD)
-        try:
+        with _one_thread_below(), _without_main():
             process.start()
-        finally:
-            for key, value in kept.items():
-                if value is None:
-                    del os.environ[key]
-                else:
-                    os.environ[key] = value
         theirs.close()
         return _Worker(process, mine)
 
@@ -115,6 +108,32 @@ class Processes:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@contextmanager
+def _one_thread_below() -> Iterator[None]:
+    """Processes that are started meanwhile find that libraries shall have one thread."""
+    kept = {key: os.environ.get(key) for key in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for key, value in kept.items():
+            if value is None:
+                del os.environ[key]
+            else:
+                os.environ[key] = value
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Processes that are started meanwhile do not run the script that runs here, which would begin all this again."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def work(connection: Connection, function: bytes, name: str) -> None:
