@@ -1,0 +1,188 @@
+"""How time and memory grow with area, number of images and workers, on a rendered town that is repeated as often as
+needed.
+
+    python benchmarks/scaling.py area --million 4 16 100
+    python benchmarks/scaling.py workers --million 16
+    python benchmarks/scaling.py views --million 1
+
+One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
+the repeated image. CPU is that of all processes, from `run.json`; memory the most that one worker held, from
+`events.jsonl`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from pyproj import CRS
+from rasterio.rpc import RPC
+from rasterio.windows import Window
+
+from zlocus.sensors.rpc import RpcCoefficients
+from zlocus.synthetic.cameras import SatelliteCamera
+from zlocus.synthetic.render import Optics, expose, render
+from zlocus.synthetic.rpc_fit import fit_rpc
+from zlocus.synthetic.scenes import build_ground, city_spec, exposures, steady
+from zlocus.synthetic.terrain import SyntheticGround
+
+PERIOD_PX, GSD_M = 1024, 0.5
+# So far away that rays are parallel over the largest scene, to a thousandth of a pixel.
+FAR_M = 1e9
+UTM = CRS.from_epsg(32632)
+BLOCK = 256
+# Along and across, degrees: in pairs from all sides, the first straight down.
+LOOKS = (1.0, -1.0), (16.0, 2.0), (-16.0, -2.0), (8.0, 12.0), (-8.0, -12.0), (4.0, -18.0)
+
+
+@dataclass(frozen=True)
+class Town:
+    """A period of a town: ground that is repeated around it, and its place."""
+
+    ground: SyntheticGround
+    west_m: float
+    north_m: float
+    z: tuple[float, float]
+
+
+def town() -> Town:
+    """One period of a rendered town, with the same town around it."""
+    spec = replace(steady(city_spec(7)), size=PERIOD_PX, gsd_m=GSD_M)
+    ground = build_ground(spec, exposures(spec))
+    n = round(PERIOD_PX * GSD_M / ground.step)
+    row, col = round((ground.y0 - spec.north_m) / ground.step), round((spec.west_m - ground.x0) / ground.step)
+    one = (slice(row, row + n), slice(col, col + n))
+    whole = SyntheticGround(
+        spec.west_m - n * ground.step, spec.north_m + n * ground.step, ground.step,
+        np.tile(ground.planes[one], (3, 3, 1)), np.tile(ground.material[one], (3, 3)), ground.materials,
+        ground.textures, ground.texel_m,
+    )  # fmt: skip
+    return Town(whole, spec.west_m, spec.north_m, ground.height_range)
+
+
+def looks(n_views: int) -> list[tuple[float, float]]:
+    """View angles (along, across), degrees, of as many images as asked for: those of `LOOKS`, then others between."""
+    rng = np.random.default_rng(3)
+    return [*LOOKS, *((float(a), float(b)) for a, b in rng.uniform(-18.0, 18.0, (max(n_views, 6) - 6, 2)))][:n_views]
+
+
+def write_views(folder: Path, at: Town, n_views: int, periods: int) -> list[Path]:
+    """Images of the town repeated so many times each way."""
+    paths = []
+    for number, (along, across) in enumerate(looks(n_views)):
+        side = PERIOD_PX * periods
+        middle = sum(at.z) / 2
+        target = (at.west_m, at.north_m, middle)
+        # The town's first corner at the same height is the centre of no pixel but a corner of one.
+        one = SatelliteCamera(target, (-0.5, -0.5), GSD_M, along, across, altitude_m=FAR_M)
+        numbers = expose(
+            render(at.ground, one, (PERIOD_PX, PERIOD_PX), exposures(steady(city_spec(7)))[0].view.sun), Optics(),
+            np.random.default_rng([5, number]),
+        )  # fmt: skip
+        fit = fit_rpc(one, (side, side), UTM, (at.z[0] - 20.0, at.z[1] + 20.0))
+        paths.append(folder / f"v{number:02d}.tif")
+        write_repeated(paths[-1], numbers, periods, fit.rpc)
+    return paths
+
+
+def write_repeated(path: Path, numbers: NDArray[np.integer], periods: int, rpc: RpcCoefficients) -> None:
+    """An image (r, c) repeated each way, never whole in memory."""
+    side = PERIOD_PX * periods
+    tags = RPC(
+        height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
+        line_den_coeff=list(rpc.line_den), line_num_coeff=list(rpc.line_num), line_off=rpc.line_off,
+        line_scale=rpc.line_scale, long_off=rpc.lon_off, long_scale=rpc.lon_scale, samp_den_coeff=list(rpc.samp_den),
+        samp_num_coeff=list(rpc.samp_num), samp_off=rpc.samp_off, samp_scale=rpc.samp_scale,
+    )  # fmt: skip
+    with rasterio.open(
+        path, "w", driver="GTiff", height=side, width=side, count=1, dtype=numbers.dtype, nodata=0, tiled=True,
+        blockxsize=BLOCK, blockysize=BLOCK, rpcs=tags, BIGTIFF="IF_SAFER",
+    ) as file:  # fmt: skip
+        for row in range(0, side, PERIOD_PX):
+            for col in range(0, side, PERIOD_PX):
+                file.write(numbers, 1, window=Window(col, row, PERIOD_PX, PERIOD_PX))
+
+
+def measured(images: Sequence[Path], out: Path, at: Town, cells: float, workers: int, memory_gb: float) -> list[str]:
+    """A run over so many cells, in a corner of the images; its figures as a row."""
+    side = round(cells**0.5) * GSD_M
+    # Past what oblique images do not show of the first period.
+    west, north = at.west_m + 60.0, at.north_m - 60.0
+    words = [
+        sys.executable, "-m", "zlocus", "dsm", *map(str, images), "-o", str(out), "--overwrite", "--no-report",
+        "--products", "none", "--crs", "EPSG:32632", "--resolution", str(GSD_M), "--workers", str(workers),
+        "--memory", str(memory_gb), "--heights", f"{at.z[0] - 5:.1f}", f"{at.z[1] + 5:.1f}", "--bounds",
+        str(west), str(north - side), str(west + side), str(north),
+    ]  # fmt: skip
+    start = time.perf_counter()
+    subprocess.run(words, check=True, stdout=sys.stderr)
+    wall = time.perf_counter() - start
+    run = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    events = [json.loads(line) for line in (out / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+    stages = {stage["name"]: stage for stage in run["stages"]}
+    million = run["grid"]["shape"][0] * run["grid"]["shape"][1] / 1e6
+    tiles = [event for event in events if event["event"] == "tile"]
+    cpu = stages["match"]["cpu_s"] + stages["write"]["cpu_s"]
+    return [
+        f"{million:.1f}", str(len(images)), str(workers), str(len(tiles)), f"{wall:.0f}",
+        f"{stages['orient']['wall_s']:.0f}", f"{stages['match']['wall_s']:.1f}", f"{stages['write']['wall_s']:.1f}",
+        f"{cpu / million:.2f}", f"{max(event['peak_mb'] for event in tiles):.0f}",
+        f"{max(stage['peak_mb'] for stage in run['stages'] if stage['name'] != 'match'):.0f}",
+        f"{100 * run['coverage']:.1f}",
+    ]  # fmt: skip
+
+
+HEAD = [
+    "M cells", "images", "workers", "tiles", "wall, s", "orientation, s", "matching, s", "writing, s",
+    "CPU, s / M cells", "worker, MB", "command, MB", "filled, %",
+]  # fmt: skip
+
+
+def plans(asked: argparse.Namespace) -> Iterator[tuple[float, int, int]]:
+    """Cells, images and workers of each run."""
+    for million in asked.million:
+        if asked.what == "area":
+            yield million * 1e6, 6, asked.workers
+        elif asked.what == "workers":
+            yield from ((million * 1e6, 6, n) for n in range(1, asked.workers + 1))
+        else:
+            yield from ((million * 1e6, n, asked.workers) for n in (2, 4, 8, 16, 32, 64))
+
+
+def main() -> None:
+    """Measure what is asked for, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("area", "workers", "views"))
+    parser.add_argument("--million", type=float, nargs="+", default=[4.0], help="cells")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--memory", type=float, default=8.0, help="GB of all workers together")
+    parser.add_argument("--scratch", type=Path, default=Path(tempfile.gettempdir()), help="images and surfaces")
+    asked = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="scaling-", dir=asked.scratch))
+    try:
+        at, made = town(), {}
+        print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD), flush=True)
+        for cells, n_views, workers in plans(asked):
+            periods = int(np.ceil((cells**0.5 + 2 * 60.0 / GSD_M) / PERIOD_PX)) + 1
+            if (n_views, periods) not in made:
+                made[n_views, periods] = write_views(folder, at, n_views, periods)
+            row = measured(made[n_views, periods], folder / "out", at, cells, workers, asked.memory)
+            print("| " + " | ".join(row) + " |", flush=True)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main()
