@@ -136,8 +136,9 @@ def test_a_scheduler_that_goes_keeps_what_is_done(images, straight, tmp_path):
 
 
 def test_failures_on_a_cluster(tmp_path):
-    """A fault at once, a lack of memory after all attempts; a task that kills its workers is given up."""
-    with cluster(tmp_path, 4) as found:
+    """A fault at once, a lack of memory after all attempts; a task that kills its workers is given up, and others that
+    were theirs are not."""
+    with cluster(tmp_path, 6) as found:
         planted = Planted(tmp_path, kill=(2,), exhaust=(4,), break_=(6,))
         with Cluster(planted, found.address) as workers:
             assert workers.slots >= 1

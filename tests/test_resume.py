@@ -294,3 +294,21 @@ zlocus.match(*{names}, out={str(tmp_path / "out")!r}, workers=2, crs="EPSG:32632
 @pytest.mark.parametrize("asked", [{"workers": 2}, {"workers": 3, "memory_gb": 2.0}, {"workers": None}])
 def test_the_same_bytes_however_many_work(images, straight, tmp_path, asked):
     assert same(run(images("sine"), tmp_path / "out", SMALL_TILES, report=False, **asked).out, straight)
+
+
+def test_what_a_killed_run_had_begun_goes(images, straight, tmp_path):
+    """And nothing else: hidden files of others stay."""
+    out = tmp_path / "out"
+    out.mkdir()
+    begun = [
+        ".ties.29684.part.gpkg",
+        ".dsm.tif.7.part.tif",
+        ".dsm.tif.7.cog.tif",
+        ".ortho.tif.7.mask",
+        ".run.json.9.part",
+    ]
+    for name in (*begun, ".mine", ".mine.tif"):
+        (out / name).write_text("x")
+    run(images("sine"), out, SMALL_TILES, report=False)
+    assert sorted(path.name for path in out.iterdir() if path.name.startswith(".")) == [".mine", ".mine.tif"]
+    assert same(out, straight)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -56,6 +57,8 @@ from zlocus.scene import Scene, check_overlap, is_local
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 SUFFICIENT_COVERAGE = 0.5
+# Names that files have until they are complete, with the number of the process that writes them.
+BEGUN = re.compile(r"\..+\.\d+\.(part|cog|cells|mask)(\.\w+)?")
 DEMO_WORKERS = 2
 
 
@@ -300,6 +303,10 @@ def _forget(out: Path) -> None:
     forget_report(out)
     for name in ("run.json", "ties.gpkg"):
         (out / name).unlink(missing_ok=True)
+    # Of runs that were killed; none of this one's is there yet, and no other writes here meanwhile.
+    for path in out.iterdir():
+        if BEGUN.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def _write_points(

@@ -29,7 +29,8 @@ class Cause(StrEnum):
 @dataclass(frozen=True)
 class Failure:
     """cause; reason : what happened, as a clause without its full stop; trace : of our own faults; error : where it
-    says all that there is to say; is_given_up : by workers that had tried again themselves."""
+    says all that there is to say; is_given_up : by workers that had tried again themselves, beside other
+    tasks, one of which may have been the culprit."""
 
     cause: Cause
     reason: str
@@ -40,7 +41,7 @@ class Failure:
     @property
     def may_pass(self) -> bool:
         """Whether another attempt may end otherwise."""
-        return self.cause is not Cause.FAULT and not self.is_given_up
+        return self.cause is not Cause.FAULT
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def run_tasks(workers: Workers, tasks: Iterable[Any]) -> Iterator[Outcome]:
     """Outcomes as they come, of failed attempts too; each task has one final outcome.
 
     A task that failed for a reason that may pass is tried again when all others are done, by itself, so that it has all
-    the memory; `ATTEMPTS` times in all. tasks : hashable.
+    the memory; `ATTEMPTS` times in all, once more where workers had tried it again already. tasks : hashable.
     """
     waiting, again = deque(tasks), deque[Any]()
     attempts: Counter[Any] = Counter()
@@ -98,6 +99,8 @@ def run_tasks(workers: Workers, tasks: Iterable[Any]) -> Iterator[Outcome]:
         for outcome in workers.wait():
             n_running -= 1
             attempts[outcome.task] += 1
+            if outcome.failure is not None and outcome.failure.is_given_up:
+                attempts[outcome.task] = max(attempts[outcome.task], ATTEMPTS - 1)
             n = attempts[outcome.task]
             is_final = outcome.failure is None or not outcome.failure.may_pass or n == ATTEMPTS
             if not is_final:
