@@ -20,7 +20,6 @@ from zlocus.errors import ConfigError, StoppedError
 from zlocus.execution.cluster import Cluster
 from zlocus.execution.engine import Cause, run_tasks
 
-pytest.importorskip("distributed", reason="distributed is not installed")
 pytestmark = pytest.mark.filterwarnings("ignore::Warning:distributed", "ignore::ResourceWarning")
 RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
 
@@ -154,4 +153,6 @@ def test_where_nothing_answers(images, tmp_path):
     for address in ("tcp://127.0.0.1:9", "nonsense"):
         with pytest.raises(ConfigError, match=rf"--scheduler {address} does not answer"):
             run(images("sine"), tmp_path / "out", SMALL_TILES, scheduler=address, report=False)
-    assert not (tmp_path / "out" / "dsm.tif").exists()
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ConfigError, match=r"--method gc3-sgm matches whole images in one process\. Leave --scheduler"):
+        run(images("sine"), tmp_path / "out", SMALL_TILES, scheduler="tcp://127.0.0.1:9", method="gc3-sgm")

@@ -241,6 +241,17 @@ def test_an_ortho_image_has_the_colours_of_the_images(coloured, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_heights_of_image_space_have_a_grey_ortho_image(tmp_path):
+    """Of colour images too; also where tiles lie beyond what the images show."""
+    images, (west, south, east, north) = rendered_in_colours(tmp_path, "uint8"), PART
+    bounds = (west - 80.0, south, east, north)
+    out = run(images, tmp_path / "out", SMALL_TILES, bounds=bounds, heights=HEIGHTS, method="gc3-sgm", workers=2).out
+    with rasterio.open(out / "ortho.tif") as file:
+        assert file.count == 1
+        assert 0.1 < (file.read_masks(1) > 0).mean() < 0.9
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_grey_where_not_all_images_have_colours(coloured, images, tmp_path):
     out = run((*coloured[:2], images("plane").paths["aft"]), tmp_path / "out", SMALL_TILES, bounds=PART).out
     with rasterio.open(out / "ortho.tif") as source:

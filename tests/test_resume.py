@@ -185,6 +185,17 @@ def test_where_no_tile_is_made_nothing_is_left(images, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_where_all_tiles_fail_the_log_says_why(images, tmp_path, monkeypatch):
+    def fail(*_):
+        raise IndexError("index 7 is out of bounds")
+
+    monkeypatch.setattr(zlocus.job, "match_tile", fail)
+    with pytest.raises(StoppedError, match=r"9 of 9 tiles failed: .*; and 6 more\. Nothing was made\."):
+        run(images("sine"), tmp_path / "out", SMALL_TILES, partial=True)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["events.jsonl"]
+    assert all("in fail" in e["trace"] for e in events_of(tmp_path / "out") if e["event"] == "tile failed")
+
+
 def test_a_damaged_tile_is_made_again(images, straight, tmp_path, monkeypatch):
     out = stopped(images, tmp_path, monkeypatch)
     tiles = sorted((out / FOLDER).glob("*.npz"))

@@ -99,8 +99,7 @@ class TileJob:
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        fill = "none" if self.fill == "dem" else self.fill
-        result = match_tile(self.settled, tile.core, self.config, self.method, self.use_visibility, fill)
+        result = match_tile(self.settled, tile.core, self.config, self.method, self.use_visibility, self.fill)
         return self.product(tile, result)
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:

@@ -102,7 +102,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         grid = _grid(request, opened.like, corrected, orientation, z_range)
         settled = _settled(request, grid, corrected, orientation, z_range, config)
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
-        plan = planned(settled, tiles, config, request.workers, request.memory_gb, request.scheduler)
+        plan = planned(settled, tiles, config, request)
         vertical.check_covers(_area_matched(grid, settled), scene.crs)
         _check_polygons(request, grid, settled, opened.polygons.inside)
         progress.note(str(plan))
@@ -110,10 +110,9 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     job = _job(request, settled, grid, config, opened.polygons)
     matching = Matching(job, tiles, opened.store, EventLog(out))
     with made_folder(out), opened.store.open(digest_of(settled, orientation)):
-        matching.begin(plan)
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, corrected, orientation, z_range, plan, tally, progress)
-            failed = matching.run(workers_for(plan, make, progress, is_here=make is not job), progress, elsewhere)
+            failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
         matching.check(failed, request.partial)
         with watch.stage("write"):
             _forget(out)
@@ -269,8 +268,8 @@ def _job(request: DsmRequest, settled: MatchScene, grid: Grid, config: RunConfig
     if request.fill == "dem":
         assert request.dem is not None, "of a request that fills from it"
         terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
-    use_visibility = request.views == "auto"
-    return TileJob(settled, grid, config, request.method, use_visibility, request.fill, area, terrain)
+    use_visibility, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
+    return TileJob(settled, grid, config, request.method, use_visibility, fill, area, terrain)
 
 
 def _maker(
@@ -294,7 +293,7 @@ def _maker(
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
     matched = match_for_grid(ready, leading, Area(bounds, z_range), config, job.use_visibility, plan.slots, progress)
     tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
-    return lambda tile: job.product(tile, grid_tile(matched, settled, tile.core, config, request.fill))
+    return lambda tile: job.product(tile, grid_tile(matched, settled, tile.core, config, job.fill))
 
 
 def _forget(out: Path) -> None:

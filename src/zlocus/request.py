@@ -91,6 +91,10 @@ class DsmRequest:
             ("fill", self.fill, FILLS),
         ):
             _check_choice(name, value, choices)
+        if self.scheduler is not None and self.method == "gc3-sgm":
+            raise ConfigError(
+                "--method gc3-sgm matches whole images in one process. Leave --scheduler out, or use mvll-sgm."
+            )
         if self.fill == "dem" and self.dem is None:
             raise ConfigError("--fill dem needs the heights of a terrain model. Add --dem RASTER.")
         _check_vertical("vertical", self.vertical)

@@ -19,11 +19,13 @@ from zlocus.execution.processes import Processes
 from zlocus.execution.store import TileStore
 from zlocus.job import TileJob, TileProduct
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Elsewhere
 from zlocus.progress import Progress, Stage, duration
+from zlocus.request import DsmRequest
 from zlocus.surface.reasons import Quality
 from zlocus.surface.surface import Surface
 from zlocus.tile import TileResult
@@ -60,22 +62,16 @@ class Plan:
         )
 
 
-def planned(
-    settled: MatchScene,
-    tiles: Sequence[Tile],
-    config: RunConfig,
-    workers: int | None,
-    memory_gb: float | None,
-    scheduler: str | None = None,
-) -> Plan:
-    """Tiles at a time: as asked, or as many as there are cores and work for; never more than memory allows.
+def planned(settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, request: DsmRequest) -> Plan:
+    """Tiles at a time: as asked, or as many as there are cores and work for; never more than memory allows. What was
+    found in image space holds too much for other processes.
 
     Raises
     ------
     ConfigError
         One tile needs more memory than it may take.
     """
-    need = tile_memory_bytes(settled, config.pyramid)
+    need, memory_gb = tile_memory_bytes(settled, config.pyramid), request.memory_gb
     allowed = SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
     if memory_gb is not None and need > allowed:
         raise ConfigError(
@@ -84,9 +80,10 @@ def planned(
         )
     worked = [tile for tile in tiles if tile.core.rows and tile.core.cols]
     seconds = matching_seconds(settled, worked)
-    wanted = workers or (cores() if seconds > SHORT_S else 1)
+    wanted = request.workers or (cores() if seconds > SHORT_S else 1)
     slots = max(min(wanted, int(allowed / (need + WORKER_BYTES)), len(worked)), 1)
-    return Plan(len(tiles), slots, slots > 1, need + WORKER_BYTES * (slots > 1), allowed, seconds, scheduler)
+    processes = slots > 1 and request.method != "gc3-sgm"
+    return Plan(len(tiles), slots, processes, need + WORKER_BYTES * processes, allowed, seconds, request.scheduler)
 
 
 @dataclass
@@ -98,7 +95,7 @@ class Tally:
     n_left_out: int = 0
     evaluations: int = 0
     all_images: int = 0
-    ranked: list[Any] = field(default_factory=list)
+    ranked: list[RankedPoints] = field(default_factory=list)
 
     def add(self, product: TileProduct) -> None:
         """Count a tile."""
@@ -136,12 +133,6 @@ class Matching:
     store: TileStore
     log: EventLog
 
-    def begin(self, plan: Plan) -> None:
-        """Write down what is going to be done; the log of a run that does not go on is a new one."""
-        if not self.store.finished:
-            self.log.remove()
-        self.log.add("began", **vars(plan), tiles_there=len(self.store.finished))
-
     def check(self, failed: Sequence[Outcome], partial: bool) -> None:
         """End the run where tiles failed, unless what is there is wanted all the same; nothing never is.
 
@@ -156,10 +147,9 @@ class Matching:
             return
         self.log.add("stopped", failed=len(failed))
         if not self.store.finished:
-            self.store.remove()
-            self.log.remove()
             first = failed[0].failure
             if first is not None and first.error is not None:
+                self.log.remove()
                 raise first.error
             raise StoppedError(f"{self._not_all(failed)} Nothing was made.")
         if not partial:
@@ -191,8 +181,11 @@ class Matching:
         more = f"; and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
         return f"{len(failed)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
 
-    def run(self, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: Elsewhere) -> list[Outcome]:
-        """Make every tile that is not there yet; the outcomes of those that failed.
+    def run(
+        self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: Elsewhere
+    ) -> list[Outcome]:
+        """Make every tile that is not there yet; the outcomes of those that failed. The log of a run that does not go
+        on is a new one.
 
         Raises
         ------
@@ -203,6 +196,9 @@ class Matching:
         todo = [tile for tile in worked if not self.store.holds(name_of(tile))]
         failed: list[Outcome] = []
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
+            if not self.store.finished:
+                self.log.remove()
+            self.log.add("began", **vars(plan), tiles_there=len(self.store.finished))
             if len(todo) < len(worked):
                 progress.note(f"{len(worked) - len(todo)} of {len(worked)} tiles are there already.")
                 self.log.add("resumed", tiles_there=len(worked) - len(todo))
@@ -266,7 +262,7 @@ class Matching:
 
     def _finished(self, tile: Tile) -> TileProduct:
         if not (tile.core.rows and tile.core.cols):
-            return self.job.product(tile, TileResult(Surface.nothing(tile.core, self._bands)))
+            return self.job.product(tile, TileResult(Surface.nothing(tile.core)))
         arrays = self.store.load(name_of(tile))
         if arrays is None:
             raise StoppedError(
@@ -276,30 +272,24 @@ class Matching:
         return TileProduct.of(arrays)
 
     def _failed(self, tile: Tile) -> TileProduct:
-        nothing = Surface.nothing(tile.kept, self._bands)
+        nothing = Surface.nothing(tile.kept)
         failed = replace(nothing, quality=np.full_like(nothing.quality, Quality.FAILED))
         return self.job.product(tile, TileResult(failed.part(tile.core, tile.kept)))
 
-    @property
-    def _bands(self) -> tuple[int, ...]:
-        return (3,) if self.job.settled.has_colours else ()
 
-
-def workers_for(
-    plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress, is_here: bool = False
-) -> AbstractContextManager[Workers]:
-    """Where the tiles of a plan are made. is_here : in this process, whatever the plan, for `make` holds too much.
+def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress) -> AbstractContextManager[Workers]:
+    """Where the tiles of a plan are made.
 
     Raises
     ------
     ConfigError
         See `Cluster`.
     """
-    if plan.scheduler is not None and not is_here:
+    if plan.scheduler is not None:
         cluster = Cluster(make, plan.scheduler)
         progress.note(f"Dask cluster at {plan.scheduler}; what it does is shown at {cluster.dashboard}")
         return cluster
-    if plan.processes and not is_here:
+    if plan.processes:
         return Processes(make, plan.slots)
     return nullcontext(Here(make))
 

@@ -23,20 +23,15 @@ AHEAD = 1
 _functions: dict[str, Callable[[Any], Any]] = {}
 
 
-class FunctionPlugin:
-    """Brings a run's function to every worker of the cluster, those that join later too."""
+def begin(name: str, function: bytes) -> None:
+    """On a worker, before a run's first task."""
+    one_thread()
+    _functions[name] = pickle.loads(function)
 
-    def __init__(self, name: str, function: bytes) -> None:
-        self.name, self.function = name, function
 
-    def setup(self, worker: Any) -> None:
-        """On a worker, before its first task."""
-        one_thread()
-        _functions[self.name] = pickle.loads(self.function)
-
-    def teardown(self, worker: Any) -> None:
-        """On a worker, at the end of the run."""
-        _functions.pop(self.name, None)
+def end(name: str) -> None:
+    """On a worker, at the end of a run."""
+    _functions.pop(name, None)
 
 
 def at_worker(name: str, task: Any) -> Outcome:
@@ -76,13 +71,16 @@ class Cluster:
         self._futures: dict[Any, Any] = {}
         try:
             self._client.wait_for_workers(1, timeout=WORKERS_S)
-            self._client.register_plugin(_worker_plugin(FunctionPlugin(self._name, pickle.dumps(function))), self._name)
+            self._client.register_plugin(_plugin(self._name, pickle.dumps(function)), self._name)
         except TimeoutError as error:
             self.close()
             raise ConfigError(
                 f"The cluster at {address} has no workers after {WORKERS_S:.0f} s. Start some (dask worker {address})."
             ) from error
-        except BaseException as error:
+        except (KeyboardInterrupt, SystemExit):
+            self.close()
+            raise
+        except Exception as error:
             self.close()
             raise ConfigError(
                 f"The workers of {address} cannot do the run: {' '.join(str(error).split()) or type(error).__name__}. "
@@ -172,15 +170,15 @@ class Cluster:
         self.close()
 
 
-def _worker_plugin(function: FunctionPlugin) -> Any:
-    """A plugin of Dask's that does what ours says, for its class is not at hand without Dask."""
+def _plugin(name: str, function: bytes) -> Any:
+    """Brings a run's function to every worker of the cluster, those that join later too."""
     from distributed import WorkerPlugin
 
     class Plugin(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            function.setup(worker)
+            begin(name, function)
 
         def teardown(self, worker: Any) -> None:
-            function.teardown(worker)
+            end(name)
 
     return Plugin()

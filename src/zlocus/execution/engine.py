@@ -29,8 +29,8 @@ class Cause(StrEnum):
 @dataclass(frozen=True)
 class Failure:
     """cause; reason : what happened, as a clause without its full stop; trace : of our own faults; error : where it
-    says all that there is to say; is_given_up : by workers that had tried again themselves, beside other
-    tasks, one of which may have been the culprit."""
+    says all that there is to say; is_given_up : by workers that had tried again themselves, beside other tasks,
+    one of which may have been the culprit."""
 
     cause: Cause
     reason: str

@@ -37,6 +37,7 @@ class TileStore:
     key: dict[str, Any]
     finished: dict[str, str] = field(default_factory=dict)
     _lock: BinaryIO | None = None
+    _is_ours: bool = False
 
     @classmethod
     def of(cls, out: Path, key: Mapping[str, Any], is_resumed: bool, overwrite: bool) -> TileStore:
@@ -82,10 +83,15 @@ class TileStore:
                 raise OutputError(f"Another run writes to {self.folder.parent}. Wait for it, or choose another folder.")
             self._begin(settled)
             yield self
+        except BaseException:
+            if not self.finished and self._is_ours:
+                self.remove()  # a run that made nothing leaves nothing
+            raise
         finally:
             self._lock.close()
 
     def _begin(self, settled: str) -> None:
+        self._is_ours = True
         manifest = {"schema": SCHEMA, "key": self.key, "settled": settled}
         if self.finished:
             found = _read_object(self.folder / MANIFEST)

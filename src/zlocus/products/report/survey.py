@@ -67,6 +67,11 @@ class Survey:
         """Cells inside the area that two images or more cover."""
         return self.count_without(NOT_SEEN)
 
+    @property
+    def n_matched(self) -> int:
+        """Cells with a height that was not filled in."""
+        return self.n_heights - self.count(Quality.FILLED)
+
     def count(self, flag: Quality) -> int:
         """Cells with a reason, inside the area asked for, or of those outside where that is the reason."""
         which = np.arange(N_CODES)

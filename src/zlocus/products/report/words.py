@@ -200,7 +200,7 @@ def summary(found: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, f
     said = [
         f"{what} It covers {wide:.0f} m by {high:.0f} m {where} (map: {frame}), with a cell every "
         f"{found.cell_m:g} m, and was made from {len(views)} images.",
-        f"Of the cells that two images or more cover, {percent(found.n_heights, found.n_seen)} have a height.",
+        f"Of the cells that two images or more cover, {percent(found.n_matched, found.n_seen)} have a height.",
     ]
     if found.n_heights:
         said.append(f"Heights run from {found.lowest_m:.1f} to {found.highest_m:.1f} m ({found.above}).")
