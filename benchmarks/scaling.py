@@ -4,6 +4,7 @@ needed.
     python benchmarks/scaling.py area --million 4 16 100
     python benchmarks/scaling.py workers --million 16
     python benchmarks/scaling.py views --million 1
+    python benchmarks/scaling.py block --side 4 8 16
 
 One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
 the repeated image. CPU is that of all processes, from `run.json`; memory the most that one worker held, from
@@ -22,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -78,28 +80,50 @@ def looks(n_views: int) -> list[tuple[float, float]]:
     return [*LOOKS, *((float(a), float(b)) for a, b in rng.uniform(-18.0, 18.0, (max(n_views, 6) - 6, 2)))][:n_views]
 
 
-def write_views(folder: Path, at: Town, n_views: int, periods: int) -> list[Path]:
-    """Images of the town repeated so many times each way."""
+def write_views(folder: Path, at: Town, n_views: int, side: int) -> list[Path]:
+    """Images of the repeated town, so many pixels each way, all of the same ground."""
     paths = []
-    for number, (along, across) in enumerate(looks(n_views)):
-        side = PERIOD_PX * periods
-        middle = sum(at.z) / 2
-        target = (at.west_m, at.north_m, middle)
-        # The town's first corner at the same height is the centre of no pixel but a corner of one.
-        one = SatelliteCamera(target, (-0.5, -0.5), GSD_M, along, across, altitude_m=FAR_M)
-        numbers = expose(
-            render(at.ground, one, (PERIOD_PX, PERIOD_PX), exposures(steady(city_spec(7)))[0].view.sun), Optics(),
-            np.random.default_rng([5, number]),
-        )  # fmt: skip
-        fit = fit_rpc(one, (side, side), UTM, (at.z[0] - 20.0, at.z[1] + 20.0))
+    for number, look in enumerate(looks(n_views)):
         paths.append(folder / f"v{number:02d}.tif")
-        write_repeated(paths[-1], numbers, periods, fit.rpc)
+        write_repeated(paths[-1], pixels(at, look, number), side, rpc_of(at, look, (0, 0), side))
     return paths
 
 
-def write_repeated(path: Path, numbers: NDArray[np.integer], periods: int, rpc: RpcCoefficients) -> None:
-    """An image (r, c) repeated each way, never whole in memory."""
-    side = PERIOD_PX * periods
+def write_block(folder: Path, at: Town, side: int) -> list[Path]:
+    """A square block of side x side images of `PERIOD_PX`, each half over the next."""
+    step, paths = PERIOD_PX // 2, []
+    made = [pixels(at, look, number) for number, look in enumerate(LOOKS)]
+    for row, col in product(range(side), range(side)):
+        # So that neighbours on all sides look elsewhere.
+        number = (row * 2 + col) % len(LOOKS)
+        numbers = np.roll(made[number], (-step * (row % 2), -step * (col % 2)), (0, 1))
+        paths.append(folder / f"b{row:02d}_{col:02d}.tif")
+        write_repeated(paths[-1], numbers, PERIOD_PX, rpc_of(at, LOOKS[number], (row * step, col * step), PERIOD_PX))
+    return paths
+
+
+def camera(at: Town, look: tuple[float, float], first: tuple[int, int]) -> SatelliteCamera:
+    """The camera whose pixel (row, col) = first of the repeated town is its first."""
+    # The town's first corner at the same height is the centre of no pixel but a corner of one.
+    centre = (-0.5 - first[1], -0.5 - first[0])
+    return SatelliteCamera((at.west_m, at.north_m, sum(at.z) / 2), centre, GSD_M, *look, altitude_m=FAR_M)
+
+
+def pixels(at: Town, look: tuple[float, float], number: int) -> NDArray[np.integer]:
+    """One period of the image of the repeated town (`PERIOD_PX`, `PERIOD_PX`)."""
+    seen = render(
+        at.ground, camera(at, look, (0, 0)), (PERIOD_PX, PERIOD_PX), exposures(steady(city_spec(7)))[0].view.sun
+    )
+    return expose(seen, Optics(), np.random.default_rng([5, number]))
+
+
+def rpc_of(at: Town, look: tuple[float, float], first: tuple[int, int], side: int) -> RpcCoefficients:
+    """The RPC of an image of `side` pixels each way."""
+    return fit_rpc(camera(at, look, first), (side, side), UTM, (at.z[0] - 20.0, at.z[1] + 20.0)).rpc
+
+
+def write_repeated(path: Path, numbers: NDArray[np.integer], side: int, rpc: RpcCoefficients) -> None:
+    """An image (r, c), repeated to so many pixels each way, never whole in memory."""
     tags = RPC(
         height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
         line_den_coeff=list(rpc.line_den), line_num_coeff=list(rpc.line_num), line_off=rpc.line_off,
@@ -112,19 +136,15 @@ def write_repeated(path: Path, numbers: NDArray[np.integer], periods: int, rpc: 
     ) as file:  # fmt: skip
         for row in range(0, side, PERIOD_PX):
             for col in range(0, side, PERIOD_PX):
-                file.write(numbers, 1, window=Window(col, row, PERIOD_PX, PERIOD_PX))
+                part = numbers[: side - row, : side - col]
+                file.write(part, 1, window=Window(col, row, part.shape[1], part.shape[0]))
 
 
-def measured(images: Sequence[Path], out: Path, at: Town, cells: float, workers: int, memory_gb: float) -> list[str]:
-    """A run over so many cells, in a corner of the images; its figures as a row."""
-    side = round(cells**0.5) * GSD_M
-    # Past what oblique images do not show of the first period.
-    west, north = at.west_m + 60.0, at.north_m - 60.0
+def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) -> list[str]:
+    """A run over all that the images show, with everything by default; its figures as a row."""
     words = [
-        sys.executable, "-m", "zlocus", "dsm", *map(str, images), "-o", str(out), "--overwrite", "--no-report",
-        "--products", "none", "--crs", "EPSG:32632", "--resolution", str(GSD_M), "--workers", str(workers),
-        "--memory", str(memory_gb), "--heights", f"{at.z[0] - 5:.1f}", f"{at.z[1] + 5:.1f}", "--bounds",
-        str(west), str(north - side), str(west + side), str(north),
+        sys.executable, "-m", "zlocus", "dsm", *map(str, images), "-o", str(out), "--overwrite", "--crs", "EPSG:32632",
+        "--resolution", str(GSD_M), "--workers", str(workers), "--memory", str(memory_gb),
     ]  # fmt: skip
     start = time.perf_counter()
     subprocess.run(words, check=True, stdout=sys.stderr)
@@ -134,38 +154,46 @@ def measured(images: Sequence[Path], out: Path, at: Town, cells: float, workers:
     stages = {stage["name"]: stage for stage in run["stages"]}
     million = run["grid"]["shape"][0] * run["grid"]["shape"][1] / 1e6
     tiles = [event for event in events if event["event"] == "tile"]
-    cpu = stages["match"]["cpu_s"] + stages["write"]["cpu_s"]
+    # Of all processes, those of workers too.
+    cpu = sum(stage["cpu_s"] for stage in run["stages"])
+    after = sum(stages[name]["wall_s"] for name in stages if name not in ("open", "orient", "settle", "match"))
     return [
         f"{million:.1f}", str(len(images)), str(workers), str(len(tiles)), f"{wall:.0f}",
-        f"{stages['orient']['wall_s']:.0f}", f"{stages['match']['wall_s']:.1f}", f"{stages['write']['wall_s']:.1f}",
-        f"{cpu / million:.2f}", f"{max(event['peak_mb'] for event in tiles):.0f}",
+        f"{stages['orient']['wall_s']:.0f}", f"{stages['match']['wall_s']:.1f}", f"{after:.1f}",
+        f"{stages['match']['cpu_s'] / million:.2f}", f"{cpu / million:.2f}",
+        f"{max(event['peak_mb'] for event in tiles):.0f}",
         f"{max(stage['peak_mb'] for stage in run['stages'] if stage['name'] != 'match'):.0f}",
         f"{100 * run['coverage']:.1f}",
     ]  # fmt: skip
 
 
 HEAD = [
-    "M cells", "images", "workers", "tiles", "wall, s", "orientation, s", "matching, s", "writing, s",
-    "CPU, s / M cells", "worker, MB", "command, MB", "filled, %",
+    "M cells", "images", "workers", "tiles", "wall, s", "orientation, s", "matching, s", "products, s",
+    "matching, CPU s / M cells", "all, CPU s / M cells", "worker, MB", "command, MB", "filled, %",
 ]  # fmt: skip
 
 
-def plans(asked: argparse.Namespace) -> Iterator[tuple[float, int, int]]:
-    """Cells, images and workers of each run."""
+def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
+    """Pixels along each image, images and workers of each run; of a block, images along each side."""
+    if asked.what == "block":
+        yield from ((PERIOD_PX, side, asked.workers) for side in asked.side)
+        return
     for million in asked.million:
+        side = round((million * 1e6) ** 0.5)
         if asked.what == "area":
-            yield million * 1e6, 6, asked.workers
+            yield side, 6, asked.workers
         elif asked.what == "workers":
-            yield from ((million * 1e6, 6, n) for n in range(1, asked.workers + 1))
+            yield from ((side, 6, n) for n in range(1, asked.workers + 1))
         else:
-            yield from ((million * 1e6, n, asked.workers) for n in (2, 4, 8, 16, 32, 64))
+            yield from ((side, n, asked.workers) for n in (2, 4, 8, 16, 32, 64))
 
 
 def main() -> None:
     """Measure what is asked for, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("area", "workers", "views"))
+    parser.add_argument("what", choices=("area", "workers", "views", "block"))
     parser.add_argument("--million", type=float, nargs="+", default=[4.0], help="cells")
+    parser.add_argument("--side", type=int, nargs="+", default=[4, 8], help="images along each side of a block")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--memory", type=float, default=8.0, help="GB of all workers together")
     parser.add_argument("--scratch", type=Path, default=Path(tempfile.gettempdir()), help="images and surfaces")
@@ -174,11 +202,12 @@ def main() -> None:
     try:
         at, made = town(), {}
         print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD), flush=True)
-        for cells, n_views, workers in plans(asked):
-            periods = int(np.ceil((cells**0.5 + 2 * 60.0 / GSD_M) / PERIOD_PX)) + 1
-            if (n_views, periods) not in made:
-                made[n_views, periods] = write_views(folder, at, n_views, periods)
-            row = measured(made[n_views, periods], folder / "out", at, cells, workers, asked.memory)
+        for side, n, workers in plans(asked):
+            if (side, n) not in made:
+                made[side, n] = (
+                    write_block(folder, at, n) if asked.what == "block" else write_views(folder, at, n, side)
+                )
+            row = measured(made[side, n], folder / "out", workers, asked.memory)
             print("| " + " | ".join(row) + " |", flush=True)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

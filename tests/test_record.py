@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -42,6 +44,14 @@ def test_peak_memory_grows_by_what_is_held():
     held = np.ones(60_000_000, np.uint8)
     assert peak_memory_mb() >= before
     assert peak_memory_mb() > held.nbytes / 1e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc, which Linux has")
+def test_peak_memory_is_not_that_of_who_started_the_process():
+    held = np.ones(600_000_000, np.uint8)
+    words = [sys.executable, "-c", "from zlocus.execution.memory import peak_memory_mb; print(peak_memory_mb())"]
+    found = float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
+    assert 5.0 < found < held.nbytes / 1e6 / 2
 
 
 def test_inputs_are_known_by_their_content(tmp_path):

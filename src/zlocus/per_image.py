@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.errors import ConfigError, TileError, ZlocusError
-from zlocus.execution.local import run_all
 from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.confirm import Confirmation, MatchedImage, confirm
@@ -37,6 +36,7 @@ from zlocus.surface.fill import filled
 from zlocus.surface.gridded import Cells, PixelHeights, gridded
 from zlocus.surface.reasons import Quality
 from zlocus.surface.surface import Surface
+from zlocus.threads import run_all
 from zlocus.tile import TileResult, match_tile
 
 AGREE_PX = 1.0

@@ -94,7 +94,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         opened = _opened(request, config, progress)
         scene, vertical = opened.scene, opened.vertical
     with watch.stage("orient"):
-        orientation = oriented(scene, config.orientation, scene.heights, progress)
+        orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers)
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
         corrected = orientation.apply(scene)

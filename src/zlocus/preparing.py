@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.errors import ConfigError, GeometryError, OutputError
+from zlocus.execution.memory import cores
 from zlocus.io.crs import checked_crs
 from zlocus.io.reference import says_nothing
 from zlocus.io.scene_file import open_scene
@@ -25,6 +28,9 @@ from zlocus.scene import Scene, View, check_overlap, footprint, is_local, is_sha
 from zlocus.sensors.model import capped, lowest_station
 
 HEIGHT_SAMPLES = 5
+# Of the time that ties take, about: where it begins, and how much it is.
+SHARES = {"features": (0.0, 0.4), "matches": (0.4, 0.35)}
+MOST_NAMED = 12  # images in a message
 # Ground lies between these on Earth.
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 # Depths below the lowest camera at which footprints are looked at, in equal ratios.
@@ -158,19 +164,34 @@ def oriented(
     progress: Progress,
     control: GroundControl | None = None,
     terrain: TerrainHeights | None = None,
+    threads: int | None = None,
 ) -> Orientation:
-    """Tie points and corrections, with progress. control, terrain : see `orient`."""
+    """Tie points and corrections, with progress. control, terrain : see `orient`; threads : as many as there are cores
+    unless told otherwise."""
     if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
         heights = heights_below(scene)
     with progress.stage("Tie points", 1.0) as stage:
         done = 0.0
 
-        def report(_: str, share: float) -> None:
+        def report(what: str, share: float) -> None:
             nonlocal done
-            stage.advance(share - done)
-            done = share
+            first, part = SHARES[what]
+            stage.advance(first + part * share - done)
+            done = first + part * share
 
-        return orient(scene, options, heights, report, control, terrain)
+        with one_thread_below():
+            return orient(scene, options, heights, report, control, terrain, threads or cores())
+
+
+@contextmanager
+def one_thread_below() -> Iterator[None]:
+    """OpenCV uses one thread meanwhile: what calls it runs in several."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def heights_of_ties(scene: Scene, orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
@@ -225,9 +246,7 @@ def note_dem(dem: Path | None, given: str | None, progress: Progress) -> None:
 
 def what_was_applied(orientation: Orientation) -> str:
     """The corrections, in a sentence."""
-    moved = [
-        f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in orientation.views if v.shift_px != (0.0, 0.0)
-    ]
+    moved = [v for v in orientation.views if v.shift_px != (0.0, 0.0)]
     if orientation.joint is not None and orientation.joint.solution.is_held.all():
         return (
             f"Cameras left as delivered: {len(orientation.measured)} tie points show no errors beyond their noise, "
@@ -235,13 +254,18 @@ def what_was_applied(orientation: Orientation) -> str:
         )
     if not moved:
         return "Pointing: no correction applied."
+    if len(moved) <= MOST_NAMED:
+        named = ", ".join(f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in moved)
+        by = f"px (column, row): {named}."
+    else:
+        farthest = max(moved, key=lambda v: math.hypot(*v.shift_px))
+        by = f"up to {math.hypot(*farthest.shift_px):.2f} px ({farthest.name})."
     if orientation.joint is not None:
         return (
             f"Cameras corrected jointly from {len(orientation.measured)} tie points, to "
-            f"{orientation.joint.solution.sigma0_px:.2f} px; their images moved by, px (column, row): "
-            f"{', '.join(moved)}."
+            f"{orientation.joint.solution.sigma0_px:.2f} px; their images moved by, {by}"
         )
-    return f"Pointing corrected from {len(orientation.xyz)} tie points, px (column, row): {', '.join(moved)}."
+    return f"Pointing corrected from {len(orientation.xyz)} tie points, {by}"
 
 
 @contextmanager

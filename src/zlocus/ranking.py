@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.execution.local import run_all
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
 from zlocus.matching.ranking import RankedPoints
@@ -28,6 +27,7 @@ from zlocus.products.points import counted_pairs, label_counts, write_ranking, w
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import RankRequest
+from zlocus.threads import run_all
 from zlocus.tile import rank_tile
 
 

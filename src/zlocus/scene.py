@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date as Date
-from itertools import combinations
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -19,6 +18,9 @@ from zlocus.sensors.model import FloatArray, SensorModel
 
 # Views that a scene names at a prompt.
 MOST_NAMED = 8
+# Along each side of an image, for the box around its footprint; and by how much of it that is widened, for sides are
+# curved in between.
+BOX_POINTS, BOX_ASIDE = 8, 0.02
 
 
 @dataclass(frozen=True)
@@ -104,19 +106,34 @@ def is_local(crs: CRS) -> bool:
     return bool(crs.is_engineering)
 
 
-def footprint(view: View, z: float, per_side: int = 8) -> FloatArray:
+def footprint(view: View, z: float, per_side: int = 8, margin_px: float = 0.0) -> FloatArray:
     """The image's outline on the ground at height z (m, ellipsoidal), counter-clockwise or clockwise, not closed.
 
-    Runs along the outer edges of the border pixels, `per_side` points a side, because the sides of a line scanner's
-    image are curves. Returns (4 * per_side, 2) m; points the sensor cannot map are left out.
+    Runs along the outer edges of the border pixels, or `margin_px` outside of them, `per_side` points a side, because
+    the sides of a line scanner's image are curves. Returns (4 * per_side, 2) m; points the sensor cannot map are left
+    out.
     """
     rows, cols = view.image.shape
     t = np.arange(per_side) / per_side
     zero, one = np.zeros(per_side), np.ones(per_side)
-    column = np.concatenate([t, one, 1 - t, zero]) * cols - 0.5
-    row = np.concatenate([zero, t, one, 1 - t]) * rows - 0.5
+    column = np.concatenate([t, one, 1 - t, zero]) * (cols + 2 * margin_px) - 0.5 - margin_px
+    row = np.concatenate([zero, t, one, 1 - t]) * (rows + 2 * margin_px) - 0.5 - margin_px
     xyz = view.sensor.ground_from_image(np.column_stack([column, row]), np.full(len(column), float(z)))
     return np.asarray(xyz[np.isfinite(xyz).all(axis=1), :2])
+
+
+def ground_box(view: View, z_range: tuple[float, float], margin_px: float = 0.0) -> FloatArray:
+    """Least and greatest east and north (2, 2) m that an image may see between two heights (m), if it may lie
+    `margin_px` away from where its sensor model puts it; infinite where some ray at its border meets no ground.
+
+    Rays are straight: at heights in between they stay in the box of both ends.
+    """
+    outlines = [footprint(view, z, BOX_POINTS, margin_px) for z in z_range]
+    if any(len(outline) < 4 * BOX_POINTS for outline in outlines):
+        return np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+    xy = np.concatenate(outlines)
+    aside = BOX_ASIDE * np.ptp(xy, axis=0)
+    return np.stack([xy.min(axis=0) - aside, xy.max(axis=0) + aside])
 
 
 def is_shared(scene: Scene, z: float) -> bool:
@@ -154,15 +171,15 @@ def check_overlap(scene: Scene, heights: float | Sequence[float]) -> None:
         When no two footprints overlap; names the views and where they lie.
     """
     # shapely costs 0.1 s to import, and only this check needs it.
-    from shapely import MultiPoint
+    from shapely import MultiPoint, STRtree
 
     levels = np.atleast_1d(np.asarray(heights, float))
     n_views = len(scene.views)
     overlap = np.zeros(n_views, bool)
     for z in levels:
         hulls = [MultiPoint(footprint(view, z)).convex_hull for view in scene.views]
-        for i, j in combinations(range(n_views), 2):
-            if hulls[i].intersection(hulls[j]).area > 0:
+        for i, j in zip(*STRtree(hulls).query(hulls, predicate="intersects"), strict=True):
+            if i < j and hulls[i].intersection(hulls[j]).area > 0:
                 overlap[[i, j]] = True
     at = f"at heights of {levels.min():g} to {levels.max():g} m" if len(levels) > 1 else f"at {levels[0]:g} m"
     if not overlap.any():

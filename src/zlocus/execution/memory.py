@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 # Of what is free.
@@ -12,6 +13,7 @@ SHARE = 0.6
 # What an idle worker holds: Python, libraries, compiled kernels; and what GDAL's cache may grow to.
 WORKER_BYTES = 350e6
 CGROUP = Path("/sys/fs/cgroup")
+STATUS = Path("/proc/self/status")
 
 
 def free_bytes() -> float:
@@ -36,8 +38,13 @@ def _left_in_container() -> list[float]:
 
 def peak_memory_mb() -> float:
     """Most memory this process has held so far, MB."""
+    with suppress(OSError):  # where there is no /proc
+        # The kernel's own count for `getrusage` begins with what the process held that started this one.
+        for line in STATUS.read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return float(line.split()[1]) * 1.024e-3
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1.024e-3
 
 
 def cores() -> int:

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.errors import OutputError
 from zlocus.options import OrientationOptions
 from zlocus.scene import ImageSource, ImageWindow
 from zlocus.sensors.model import FloatArray
+from zlocus.threads import run_all
 
 PART_PX = 1024
 HALO_PX = 16  # of the reduced image
 STRETCH_PERCENT = (0.5, 99.5)
 CONTRAST_THRESHOLD = 0.02
 DESCRIPTOR_LENGTH = 128
+# Descriptors held in memory, all images together.
+HELD_BYTES = 500e6
 WHOLLY = 0.999  # valid share of what a reduced pixel covers
 
 
@@ -37,32 +42,94 @@ class Features:
         return Features(self.xy[rows], self.descriptors[rows])
 
 
+NOTHING = Features(np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), np.float32))
+
+
 def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOptions) -> Features:
     """SIFT features of the wanted parts of an image, the strongest of each part.
 
     wanted : (r, c) bool, one entry per part, as `part_grid` numbers them. Large images are reduced first, see
     `reduction`.
     """
+    return detect_all([image], [wanted], options)[0]
+
+
+def detect_all(
+    images: Sequence[ImageSource],
+    wanted: Sequence[NDArray[np.bool_]],
+    options: OrientationOptions,
+    threads: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> list[Features]:
+    """Features of several images, see `detect`, parts of all of them in threads. progress : is told the share done."""
+    work = [(i, core) for i, image in enumerate(images) for part, core in parts(image.shape) if wanted[i][part]]
+    left = np.bincount([i for i, _ in work], minlength=len(images))
+    waiting: list[dict[int, Features]] = [{} for _ in images]
+    found, held_bytes = [NOTHING for _ in images], 0
+
+    def detect_one(number: int) -> Features:
+        i, core = work[number]
+        return detect_part(images[i], core, options)
+
+    for done, (number, part) in enumerate(run_all(detect_one, range(len(work)), threads)):
+        i = work[number][0]
+        waiting[i][number] = part
+        left[i] -= 1
+        if not left[i]:
+            found[i] = joined([waiting[i][number] for number in sorted(waiting[i])], held_bytes)
+            held_bytes += found[i].descriptors.nbytes
+            waiting[i] = {}
+        if progress is not None:
+            progress((done + 1) / len(work))
+    return found
+
+
+def joined(several: Sequence[Features], held_bytes: int) -> Features:
+    """Features as one. held_bytes : of descriptors that are in memory already; beyond `HELD_BYTES` those of thousands
+    of images lie in unnamed files, from which the system takes them into memory as they are needed."""
+    xy = np.concatenate([part.xy for part in several])
+    descriptors = np.concatenate([part.descriptors for part in several])
+    if held_bytes + descriptors.nbytes > HELD_BYTES and descriptors.size:
+        descriptors = on_disk(descriptors)
+    return Features(xy, descriptors)
+
+
+def on_disk(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same, in an unnamed file.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    try:
+        with tempfile.TemporaryFile() as file:
+            descriptors.tofile(file)
+            file.flush()
+            return np.asarray(np.memmap(file, np.float32, "r", shape=descriptors.shape))
+    except OSError as error:
+        raise OutputError(
+            f"Features of the images cannot be written to {tempfile.gettempdir()}: {error.strerror or error}. Make "
+            "room there, or set TMPDIR to another folder."
+        ) from error
+
+
+def detect_part(image: ImageSource, core: tuple[int, int, int, int], options: OrientationOptions) -> Features:
+    """Features of a part of an image: of rows and columns from the first two to before the last two of `core`."""
     rows, cols = image.shape
     area_mpx = rows * cols / 1e6
     factor = reduction(image.shape, options)
     halo = math.ceil(HALO_PX * factor)
     per_mpx = min(options.features_per_mpx * math.sqrt(area_mpx), options.features_per_image) / area_mpx
-    xys, descriptors = [np.empty((0, 2))], [np.empty((0, DESCRIPTOR_LENGTH), np.float32)]
-    for part, core in parts(image.shape):
-        if not wanted[part]:
-            continue
-        row, col = max(core[0] - halo, 0), max(core[1] - halo, 0)
-        window = image.read(row, col, min(core[2] + halo, rows) - row, min(core[3] + halo, cols) - col)
-        limit = int(np.ceil(per_mpx * window.valid.size / 1e6))
-        xy, descriptor = detect_window(window, limit, factor)
-        xy = xy + np.array([col, row])
-        inside = (xy >= np.array([core[1], core[0]]) - 0.5) & (xy < np.array([core[3], core[2]]) - 0.5)
-        kept = np.flatnonzero(inside.all(axis=1))
-        kept = kept[: math.ceil(per_mpx * (core[2] - core[0]) * (core[3] - core[1]) / 1e6)]
-        xys.append(xy[kept])
-        descriptors.append(descriptor[kept])
-    return Features(np.concatenate(xys), np.concatenate(descriptors))
+    row, col = max(core[0] - halo, 0), max(core[1] - halo, 0)
+    window = image.read(row, col, min(core[2] + halo, rows) - row, min(core[3] + halo, cols) - col)
+    limit = int(np.ceil(per_mpx * window.valid.size / 1e6))
+    xy, descriptors = detect_window(window, limit, factor)
+    xy = xy + np.array([col, row])
+    inside = (xy >= np.array([core[1], core[0]]) - 0.5) & (xy < np.array([core[3], core[2]]) - 0.5)
+    kept = np.flatnonzero(inside.all(axis=1))
+    kept = kept[: math.ceil(per_mpx * (core[2] - core[0]) * (core[3] - core[1]) / 1e6)]
+    return Features(xy[kept], descriptors[kept])
 
 
 def reduction(shape: tuple[int, int], options: OrientationOptions) -> float:

@@ -68,6 +68,10 @@ class Loci:
         """(n,) px between the two heights."""
         return np.asarray(np.hypot(*(self.high - self.low).T))
 
+    def part(self, rows: slice) -> Loci:
+        """Some of them."""
+        return Loci(self.low[rows], self.high[rows], self.z_low, self.z_high)
+
     def moved(self, shift_px: FloatArray) -> Loci:
         """The loci of a second image whose points are moved by (2,) px."""
         return Loci(self.low + shift_px, self.high + shift_px, self.z_low, self.z_high)

@@ -18,7 +18,7 @@ from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.locus import Sightlines, locate
 from zlocus.orientation.sharpen import sharpened
 from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
-from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, triangulate
+from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, rows_of_views, triangulate
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.model import FloatArray, SensorModel
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 CLOSE_BY = 0.15
 FEWEST_FOR_RANGE = 20
+POINTS_AT_ONCE = 4096
 ENOUGH_FOR_MEDIAN = 200  # ties of a pair whose distances are reported, about: up to twice as many
 NEIGHBOURS = 8
 SUPPORTERS = 3
@@ -191,23 +192,25 @@ def orient(
     progress: Progress | None = None,
     control: GroundControl | None = None,
     terrain: TerrainHeights | None = None,
+    threads: int = 1,
 ) -> Orientation:
     """Tie points, measured again by correlation, then one shift per image, or all cameras, solved with the heights of
     the ties.
 
     z_range_hint: heights in m that hold the ground, where they are known; else the scene's. control, terrain : used
     where cameras are corrected jointly. Cameras of a local frame come from an adjustment of their own, and nothing but
-    ties would hold them in place: `model` "auto" leaves them as they are.
+    ties would hold them in place: `model` "auto" leaves them as they are. The result does not depend on the number of
+    threads.
     """
     has_poses = needs_joint(scene.views)
     if options.model == "auto" and has_poses and is_local(scene.crs):
         options = replace(options, model="none")
     is_joint = options.model == "joint" or (options.model == "auto" and has_poses)
     loosely = replace(options, inlier_px=options.inlier_px * POSE_LOOSENESS) if is_joint and has_poses else options
-    ties = find_ties(scene, loosely, z_range_hint, progress)
+    ties = find_ties(scene, loosely, z_range_hint, progress, threads)
     sensors = [view.sensor for view in scene.views]
     xyz = first_ground(scene, ties)
-    seen = sharpened(scene.views, ties.seen, ground_jacobian(sensors, ties.seen, xyz), options)
+    seen = sharpened(scene.views, ties.seen, ground_jacobian(sensors, ties.seen, xyz), options, threads)
     strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
     joint, corrected = None, sensors
     if is_joint:
@@ -306,22 +309,31 @@ def pair_orientations(
     """Each pair's distances from the loci, over ties that both its images see. corrected : the sensors, but for their
     shifts."""
     seen, found = adjusted.seen, []
-    row_of = np.full((len(scene.views), len(adjusted.points.xyz)), -1)
-    row_of[seen.view, seen.point] = np.arange(len(seen))
-    for a in range(len(scene.views)):
-        for b in range(a + 1, len(scene.views)):
-            both = np.flatnonzero((row_of[a] >= 0) & (row_of[b] >= 0))
-            if not len(both):
-                continue  # such a pair has nothing to report
-            few = both[:: max(len(both) // ENOUGH_FOR_MEDIAN, 1)]
-            in_a, in_b = seen.xy[row_of[a][few]], seen.xy[row_of[b][few]]
-            first = Sightlines.of(scene.views[a].sensor, in_a, z_range)
-            before = locate(first, scene.views[b].sensor, in_b, z_range).across_px
-            first = Sightlines.of(corrected[a], in_a - adjusted.shift_px[a], z_range)
-            after = locate(first, corrected[b], in_b - adjusted.shift_px[b], z_range).across_px
-            names = (scene.views[a].name, scene.views[b].name)
-            found.append(PairOrientation(names, len(both), median_distance(before), median_distance(after)))
+    of_view = rows_of_views(seen, len(scene.views))
+    for a, b in linked_pairs(seen, len(scene.views), len(adjusted.points.xyz)):
+        _, in_a, in_b = np.intersect1d(
+            seen.point[of_view[a]], seen.point[of_view[b]], assume_unique=True, return_indices=True
+        )
+        few = slice(None, None, max(len(in_a) // ENOUGH_FOR_MEDIAN, 1))
+        xy_a, xy_b = seen.xy[of_view[a][in_a[few]]], seen.xy[of_view[b][in_b[few]]]
+        first = Sightlines.of(scene.views[a].sensor, xy_a, z_range)
+        before = locate(first, scene.views[b].sensor, xy_b, z_range).across_px
+        first = Sightlines.of(corrected[a], xy_a - adjusted.shift_px[a], z_range)
+        after = locate(first, corrected[b], xy_b - adjusted.shift_px[b], z_range).across_px
+        names = (scene.views[a].name, scene.views[b].name)
+        found.append(PairOrientation(names, len(in_a), median_distance(before), median_distance(after)))
     return tuple(found)
+
+
+def linked_pairs(seen: Observations, n_views: int, n_points: int) -> NDArray[np.int64]:
+    """Numbers (k, 2) of the views, the smaller first, that see some point together."""
+    together = np.zeros((n_views, n_views), np.float32)
+    for first in range(0, n_points, POINTS_AT_ONCE):
+        here = (seen.point >= first) & (seen.point < first + POINTS_AT_ONCE)
+        sees = np.zeros((n_views, POINTS_AT_ONCE), np.float32)
+        sees[seen.view[here], seen.point[here] - first] = 1.0
+        together += sees @ sees.T
+    return np.argwhere(np.triu(together > 0, 1))
 
 
 def median_distance(across_px: FloatArray) -> float:

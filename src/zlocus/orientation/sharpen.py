@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from zlocus.orientation.features import parts, reduction
 from zlocus.orientation.triangulate import Observations
 from zlocus.scene import View
 from zlocus.sensors.model import FloatArray
+from zlocus.threads import run_all
 
 # A view with fewer observations that could be measured keeps them all as SIFT found them: another season, haze.
 ENOUGH = 50
@@ -34,7 +36,7 @@ class Squares:
 
 
 def sharpened(
-    views: Sequence[View], seen: Observations, by_ground: FloatArray, options: OrientationOptions
+    views: Sequence[View], seen: Observations, by_ground: FloatArray, options: OrientationOptions, threads: int = 1
 ) -> Observations:
     """The observations, each put where its image correlates best with that of the tie's reference.
 
@@ -47,7 +49,7 @@ def sharpened(
     reference = reference_rows(seen, by_ground, len(views))
     other = np.flatnonzero(reference != np.arange(len(seen)))
     whole = np.rint(seen.xy).astype(np.int64)
-    patches, usable = reference_patches(views, seen.view, whole, np.unique(reference), options)
+    patches, usable = reference_patches(views, seen.view, whole, np.unique(reference), options, threads)
     warp = np.zeros((len(seen), 2, 2))
     warp[other] = warps(by_ground[reference[other]], by_ground[other])
     # Where the whole pixel of the reference is expected.
@@ -55,14 +57,18 @@ def sharpened(
     found = np.zeros((len(seen), 3))
     reach = math.ceil(max(reduction(view.image.shape, options) for view in views) / 2.0)
     half = 2 * (options.patch_px // 2) + reach + BORDER_PX
-    for i, view in enumerate(views):
-        for squares in squares_around(view, whole, other[seen.view[other] == i], half):
+
+    def measure(i: int) -> None:
+        """Observations of one view."""
+        for squares in squares_around(views[i], whole, other[seen.view[other] == i], half):
             rows, of = squares.rows, reference[squares.rows]
             out = np.empty((len(rows), 3))
             centres = expected[rows] - whole[rows] + half
             patch_shifts(patches[of], squares.pixels, warp[rows], centres, reach, out)
             out[:, 2] *= squares.valid & usable[of]
             found[rows] = out
+
+    deque(run_all(measure, range(len(views)), threads), maxlen=0)
     is_good = found[:, 2] >= options.least_ncc
     n_good = np.bincount(seen.view[is_good], minlength=len(views))
     as_found = (n_good < ENOUGH)[seen.view]
@@ -108,13 +114,17 @@ def reference_patches(
     whole: NDArray[np.int64],
     rows: NDArray[np.int64],
     options: OrientationOptions,
+    threads: int = 1,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Patches around some of the observations, (m, p, p) float32 with a border for slopes, and which are valid (m,)."""
     half = options.patch_px // 2 + 1
     patches, usable = np.zeros((len(view), 2 * half + 1, 2 * half + 1), np.float32), np.zeros(len(view), bool)
-    for i, one in enumerate(views):
-        for squares in squares_around(one, whole, rows[view[rows] == i], half):
+
+    def read(i: int) -> None:
+        for squares in squares_around(views[i], whole, rows[view[rows] == i], half):
             patches[squares.rows], usable[squares.rows] = squares.pixels, squares.valid
+
+    deque(run_all(read, range(len(views)), threads), maxlen=0)
     return patches, usable
 
 

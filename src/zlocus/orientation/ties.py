@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from zlocus.errors import GeometryError
 from zlocus.kernels.descriptors import nearest_descriptors
 from zlocus.options import OrientationOptions
-from zlocus.orientation.features import Features, detect, part_grid, parts, reduction
+from zlocus.orientation.features import Features, detect_all, part_grid, parts, reduction
 from zlocus.orientation.locus import Loci, Sightlines, locate, trace
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.triangulate import Observations
-from zlocus.scene import Scene, View
+from zlocus.scene import Scene, View, ground_box
 from zlocus.sensors.model import FloatArray, lowest_station
+from zlocus.threads import run_all
 
 Progress = Callable[[str, float], None]
 
+PART_POINTS = 5  # along each side of a part, whose loci are looked at
 SAMPLE = 1000  # features of a pair's first search
 # Loci of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
 DEPTH_RATIO = 1.5
@@ -64,8 +66,9 @@ def find_ties(
     options: OrientationOptions,
     z_range_hint: tuple[float, float] | None = None,
     progress: Progress | None = None,
+    threads: int = 1,
 ) -> Ties:
-    """Tie points between all images that overlap.
+    """Tie points between all images that overlap, the same whatever the number of threads.
 
     Heights are looked for within `z_range_hint` (m) where given, else within the scene's heights, else wherever the
     sensor models are made for. A pair with fewer than `min_ties` agreeing matches is dropped.
@@ -73,25 +76,30 @@ def find_ties(
     z_range = z_range_hint or scene.heights or widest_range(scene.views)
     report = progress or (lambda _stage, _share: None)
     z_ranges = slabs(scene.views, z_range)
-    wanted = shared_parts(scene.views, z_ranges, options.max_pointing_px)
-    features = []
-    for i, view in enumerate(scene.views):
-        features.append(detect(view.image, wanted[i], options))
-        report("features", (i + 1) / len(scene.views))
-    lines = [
-        [Sightlines.of(view.sensor, found.xy, z_range) for z_range in z_ranges]
-        for view, found in zip(scene.views, features, strict=True)
-    ]
-    pairs = []
-    candidates = list(combinations(range(len(scene.views)), 2))
-    for done, (a, b) in enumerate(candidates):
-        matches = match_pair(scene.views, features, (a, b), lines[a], options)
-        if len(matches):
-            pairs.append(matches)
-        report("matches", (done + 1) / len(candidates))
-    if len(z_ranges) > 1 and pairs:
-        z_range = likely_range(np.concatenate([pair.z for pair in pairs]))
-    return join_tracks(features, tuple(pairs), z_range)
+    near = neighbours(scene.views, z_range, options.max_pointing_px)
+    wanted = shared_parts(scene.views, z_ranges, options.max_pointing_px, near)
+    images = [view.image for view in scene.views]
+    features = detect_all(images, wanted, options, threads, lambda share: report("features", share))
+    pairs: dict[int, list[PairMatches]] = {}
+
+    def match_all(a: int) -> list[PairMatches]:
+        """With all images after it: its sightlines are needed for these only."""
+        others = np.flatnonzero(near[a, a + 1 :]) + a + 1
+        if not len(others):
+            return []
+        lines = [Sightlines.of(scene.views[a].sensor, features[a].xy, z_range) for z_range in z_ranges]
+        found = (match_pair(scene.views, features, (a, int(b)), lines, options) for b in others)
+        return [matches for matches in found if len(matches)]
+
+    n_pairs, done = int(near.sum()) // 2, 0
+    for a, found in run_all(match_all, range(len(scene.views)), threads):
+        pairs[a] = found
+        done += int(near[a, a + 1 :].sum())
+        report("matches", done / n_pairs if n_pairs else 1.0)
+    every = tuple(pair for a in sorted(pairs) for pair in pairs[a])
+    if len(z_ranges) > 1 and every:
+        z_range = likely_range(np.concatenate([pair.z for pair in every]))
+    return join_tracks(features, every, z_range)
 
 
 def slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tuple[float, float]]:
@@ -118,21 +126,40 @@ def widest_range(views: Sequence[View]) -> tuple[float, float]:
     return min(low for low, _ in bounds), max(high for _, high in bounds)
 
 
+def neighbours(views: Sequence[View], z_range: tuple[float, float], margin_px: float) -> NDArray[np.bool_]:
+    """(i, i) whether two images may see the same ground between two heights (m), if each may lie `margin_px` away from
+    where its sensor model puts it; never an image itself.
+
+    Told by the boxes around footprints, so some that see no common ground are among them.
+    """
+    low, high = np.moveaxis(np.array([ground_box(view, z_range, margin_px) for view in views]), 1, 0)
+    may = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
+    np.fill_diagonal(may, False)
+    return np.asarray(may)
+
+
 def shared_parts(
-    views: Sequence[View], z_ranges: Sequence[tuple[float, float]], margin_px: float
+    views: Sequence[View],
+    z_ranges: Sequence[tuple[float, float]],
+    margin_px: float,
+    near: NDArray[np.bool_],
 ) -> list[NDArray[np.bool_]]:
-    """For each view the grid of its parts (see `features.parts`) that some other view may see too."""
+    """For each view the grid of its parts (see `features.parts`) that some other view may see too. near : see
+    `neighbours`."""
     wanted = [np.zeros(part_grid(view.image.shape), bool) for view in views]
+    edge = np.linspace(0.0, 1.0, PART_POINTS)
     for i, view in enumerate(views):
-        for part, (row, col, row_end, col_end) in parts(view.image.shape):
-            edge = np.linspace(0.0, 1.0, 5)
-            xy = np.stack(np.meshgrid(col + edge * (col_end - col), row + edge * (row_end - row)), axis=-1).reshape(
-                -1, 2
-            )
-            lines = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges]
-            for other, line in product((v for v in views if v is not view), lines):
-                loci = trace(line, other.sensor, line.z_range)
-                wanted[i][part] |= may_fall_inside(loci, other.image.shape, margin_px)
+        numbers, places = zip(*parts(view.image.shape), strict=True)
+        row, col, row_end, col_end = np.array(places).T[:, :, None]
+        y, x = np.broadcast_arrays((row + edge * (row_end - row))[:, :, None], (col + edge * (col_end - col))[:, None])
+        xy = np.stack([x, y], axis=-1).reshape(-1, 2)
+        lines = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges]
+        for other, line in product((views[j] for j in np.flatnonzero(near[i]).tolist()), lines):
+            loci = trace(line, other.sensor, line.z_range)
+            for number, part in enumerate(numbers):
+                if not wanted[i][part]:
+                    at = slice(number * PART_POINTS**2, (number + 1) * PART_POINTS**2)
+                    wanted[i][part] = may_fall_inside(loci.part(at), other.image.shape, margin_px)
     return wanted
 
 

@@ -84,10 +84,16 @@ def triangulate(
 def project_points(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:
     """Image positions (m, 2) px at which each observation's ground point is expected."""
     xy = np.full((len(seen), 2), np.nan)
-    for i in np.unique(seen.view):
-        rows = np.flatnonzero(seen.view == i)
-        xy[rows] = sensors[i].image_from_ground(xyz[seen.point[rows]])
+    for i, rows in enumerate(rows_of_views(seen, len(sensors))):
+        if len(rows):
+            xy[rows] = sensors[i].image_from_ground(xyz[seen.point[rows]])
     return xy
+
+
+def rows_of_views(seen: Observations, n_views: int) -> list[NDArray[np.intp]]:
+    """The observations of each view, in their order."""
+    order = np.argsort(seen.view, kind="stable")
+    return np.split(order, np.searchsorted(seen.view, np.arange(1, n_views), sorter=order))
 
 
 def ground_jacobian(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Runs a function over tiles in threads of this process; kernels release the interpreter lock."""
+"""Runs a function over tasks in threads of this process; kernels, GDAL and OpenCV release the interpreter lock."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from zlocus.execution.local import run_all
+from zlocus.threads import run_all
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
