@@ -27,6 +27,7 @@ from zlocus.kernels.visibility import lowest_visible
 from zlocus.kernels.volume import flat_cells, tile_costs
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.refine import smoothed
+from zlocus.products.hillshade import hillshade
 
 SIDE, BLOCK, ROUNDS = 320, 32, 5
 SGM_SIDE = 576
@@ -313,6 +314,13 @@ def test_smooth(benchmark):
 
 def test_visibility(benchmark):
     timed(benchmark, visibility_case())
+
+
+def test_shade(benchmark):
+    """Shaded as hillshade.tif is, a cell in a hundred empty."""
+    surface = rolling()
+    surface[np.random.default_rng(1).random(surface.shape) < 0.01] = np.nan
+    timed(benchmark, Case(lambda: hillshade(surface, 0.5, 315.0, 45.0), surface.size, "cell"))
 
 
 def test_reach(benchmark):

@@ -15,12 +15,67 @@ from odc.geo.geobox import GeoBox
 from rio_cogeo.cogeo import cog_validate
 
 from zlocus.io.raster import write_cog
+from zlocus.kernels.shade import horn_slopes
 from zlocus.options import ProductOptions
-from zlocus.products.hillshade import hillshade, horn_gradient, write_hillshade
+from zlocus.products.hillshade import hillshade, write_hillshade
 
 CELL_M = 0.5
 SLOPE = 1e-9  # a ratio; rounding of float64 heights of 100 m over half a metre
 RNG = np.random.default_rng(7)
+
+
+def horn_twin(z, cell_m):
+    """Slopes to east and to north (r, c), plainly: what `horn_slopes` does cell by cell."""
+    ringed = np.pad(np.asarray(z, float), 1, constant_values=np.nan)
+    rows, cols = z.shape
+
+    def across(row, col):
+        one = ringed[1 + row : 1 + row + rows, 1 + col : 1 + col + cols]
+        other = ringed[1 - row : 1 - row + rows, 1 - col : 1 - col + cols]
+        mirrored = np.where(np.isnan(one), 2.0 * z - other, one), np.where(np.isnan(other), 2.0 * z - one, other)
+        return mirrored[0] - mirrored[1]
+
+    def known(*values):
+        return np.select([~np.isnan(value) for value in values], values, np.nan)
+
+    e, n, ne, se = across(0, 1), across(-1, 0), across(-1, 1), across(1, 1)
+    e, n = known(e, (ne + se) / 2, ne - n, se + n), known(n, (ne - se) / 2, ne - e, e - se)
+    ne, se = known(ne, e + n), known(se, e - n)
+    e, n, ne, se = (np.where(np.isnan(d), 0.0, d) for d in (e, n, ne, se))
+    return (ne + 2 * e + se) / (8 * cell_m), (ne + 2 * n - se) / (8 * cell_m)
+
+
+def horn_gradient(z, cell_m):
+    """The kernel's slopes, NaN without height."""
+    ringed = np.pad(np.asarray(z, float), 1, constant_values=np.nan)
+    found = np.full((2, *z.shape), np.nan)
+    slopes = np.empty(2)
+    for r, c in np.argwhere(~np.isnan(z)):
+        horn_slopes(ringed, r + 1, c + 1, slopes)
+        found[:, r, c] = slopes
+    return found / (8 * cell_m)
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.floats(0, 0.9), st.integers(0, 2**32 - 1))
+def test_slopes_of_the_kernel_are_those_of_its_twin(rows, cols, holes, seed):
+    rng = np.random.default_rng(seed)
+    z = rng.normal(100, 1, (rows, cols))
+    z[rng.random(z.shape) < holes] = np.nan
+    for one, other in zip(horn_gradient(z, CELL_M), horn_twin(z, CELL_M), strict=True):
+        np.testing.assert_allclose(one, np.where(np.isnan(z), np.nan, other), rtol=0, atol=SLOPE)
+
+
+@given(st.floats(0, 360), st.floats(1, 90), st.integers(0, 2**32 - 1))
+def test_shade_is_that_of_its_twin(azimuth, altitude, seed):
+    z = np.random.default_rng(seed).normal(100, 0.4, (12, 15))
+    z[3:5, 2:9] = np.nan
+    east, north = horn_twin(z, CELL_M)
+    a, h = np.radians([azimuth, altitude])
+    cosine = np.sin(h) - np.cos(h) * (east * np.sin(a) + north * np.cos(a))
+    shade = 1 + 254 * np.maximum(cosine / np.sqrt(1 + east**2 + north**2), 0)
+    found = hillshade(z, CELL_M, azimuth, altitude)
+    assert (found[np.isnan(z)] == 0).all()
+    assert np.nanmax(np.abs(found - shade)[~np.isnan(z)]) <= 0.5 + 1e-9
 
 
 def plane(rows, cols, east, north):

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zlocus.execution.plan import core_size, plan_tiles, tile_memory_bytes
+from orientation_scenes import hill_scene
+from zlocus.execution.plan import CELL_S, VIEW_CELL_S, TileNeeds, core_size, plan_tiles, tile_needs
 from zlocus.matching.cells import CellWindow
-from zlocus.options import PyramidOptions
+from zlocus.matching.setup import settle
+from zlocus.options import PyramidOptions, RunConfig
+from zlocus.sensors.correction import ShiftedModel
 
 OPTIONS = PyramidOptions(tile=64, halo=8)
 SEEN = CellWindow(-100, 30, 300, 250)
@@ -53,13 +57,44 @@ def test_cores_are_about_as_large_as_asked(rows, cols, tile):
     assert sum(t.core.rows * t.core.cols for t in plan_tiles(seen, seen, options)) == rows * cols
 
 
-def test_memory_grows_with_tiles_views_and_levels():
-    def need(tile=1024, views=3, levels=4, seen=4000):
-        scene = SimpleNamespace(views=[None] * views, levels=levels, n_steps=500, seen=CellWindow(0, 0, seen, seen))
-        return tile_memory_bytes(scene, PyramidOptions(tile=tile))
+def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):
+    """Images of the same ground, looking elsewhere, and one of ground far away."""
+    looks = [(0.05 * k, 0.0) for k in range(n_views - 1)]
+    scene = hill_scene([(0.0, 0.0)] * (n_views - 1), looks, size, [0.0] * (n_views - 1))
+    away = replace(scene.views[0], name="away", sensor=ShiftedModel(scene.views[0].sensor, 9000.0, 0.0))
+    return settle(
+        replace(scene, views=(*scene.views, away)), cell_m, (0.0, 0.0), z, np.empty((0, 3)), "view0", PyramidOptions()
+    )
 
-    assert need(tile=512) < need() < need(tile=2048)
-    assert need(views=2) < need() < need(views=8)
-    assert need(levels=3) < need(levels=5)
-    assert need(seen=100) < need(seen=500)
-    assert 0.1e9 < need() < 2e9
+
+def needs_of(scene, tile=1024, candidates=12):
+    config = RunConfig(
+        pyramid=PyramidOptions(tile=tile), selection=replace(RunConfig().selection, candidates=candidates)
+    )
+    return tile_needs(scene, plan_tiles(scene.seen, scene.seen, config.pyramid), config)
+
+
+def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
+    plain = needs_of(scene_of(4)).n_bytes
+    assert needs_of(scene_of(4), tile=64).n_bytes < plain < needs_of(scene_of(4, size=500)).n_bytes
+    assert needs_of(scene_of(3)).n_bytes < plain < needs_of(scene_of(6)).n_bytes
+    assert needs_of(scene_of(4, z=(109.0, 111.0))).n_bytes < plain
+    # Images of other ground are none of its views, and of many of the same only some are compared.
+    assert needs_of(scene_of(4), candidates=2).n_bytes == plain
+    assert needs_of(scene_of(6), candidates=2).n_bytes < 0.9 * needs_of(scene_of(6)).n_bytes
+    # Coarse cells hold many pixels.
+    fine, coarse = scene_of(4), scene_of(4, cell_m=2.0)
+    per_cell = [needs_of(scene).n_bytes / (scene.seen.rows * scene.seen.cols) for scene in (fine, coarse)]
+    assert per_cell[1] > 2 * per_cell[0]
+
+
+def test_time_is_that_of_cells_and_views():
+    plain = needs_of(scene_of(4))
+    cells = scene_of(4).seen.rows * scene_of(4).seen.cols
+    assert plain.seconds == pytest.approx(cells * (CELL_S + 3 * VIEW_CELL_S))
+    assert needs_of(scene_of(4), tile=64).seconds == pytest.approx(plain.seconds, rel=0.05)
+    assert needs_of(scene_of(6)).seconds > 1.3 * plain.seconds
+
+
+def test_needs_of_no_tile():
+    assert tile_needs(scene_of(3), [], RunConfig()) == TileNeeds(0, 0.0)

@@ -20,7 +20,7 @@ from rio_cogeo.cogeo import cog_validate
 
 from zlocus.errors import OutputError
 from zlocus.io.cells import WaitingCells
-from zlocus.io.raster import RasterSink, write_cog
+from zlocus.io.raster import RasterSink, compressing, write_cog
 
 RNG = np.random.default_rng(5)
 GRID = GeoBox.from_bbox((500000, 4500000, 500350.5, 4500400), crs="EPSG:32631", resolution=0.5)
@@ -95,6 +95,19 @@ def test_blocks_from_threads(tmp_path):
             thread.join()
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(1), HEIGHTS)
+
+
+@pytest.mark.parametrize("threads", [2, 7])
+def test_threads_that_compress_change_no_byte(tmp_path, threads):
+    """More blocks and overviews than threads, some blocks of noise and some of one value, which take other times."""
+    grid = GeoBox.from_bbox((500000, 4500000, 502000, 4501500), crs="EPSG:32631", resolution=0.5)
+    cells = RNG.normal(100, 9, grid.shape).astype(np.float32)
+    cells[:1200, 700:2500] = 7.0
+    write_cog(tmp_path / "one.tif", cells, grid, nodata=np.nan)
+    for time in range(3):
+        with compressing(threads):
+            write_cog(tmp_path / f"{time}.tif", cells, grid, nodata=np.nan)
+        assert (tmp_path / f"{time}.tif").read_bytes() == (tmp_path / "one.tif").read_bytes()
 
 
 def test_gdal_sees_no_cell_before_the_end(tmp_path, monkeypatch):
@@ -230,13 +243,14 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 from pathlib import Path
 from zlocus.errors import OutputError
-from zlocus.io.raster import write_cog
+from zlocus.io.raster import compressing, write_cog
 grid = GeoBox.from_bbox((0, 0, 1024, 1024), crs="EPSG:32631", resolution=1)
 cells = np.random.default_rng(0).normal(size=(1024, 1024)).astype(np.float32)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 try:
-    write_cog(Path(sys.argv[1]) / "a.tif", cells, grid)
+    with compressing(int(sys.argv[3])):
+        write_cog(Path(sys.argv[1]) / "a.tif", cells, grid)
 except OutputError as error:
     print(error)
 """
@@ -244,11 +258,12 @@ except OutputError as error:
 
 # The waiting file of 1024 x 1024 float32 has 4 195 000 bytes, the COG of noise more: each step runs out of space once.
 @pytest.mark.skipif(sys.platform == "win32", reason="no file size limit")
-@pytest.mark.parametrize("limit", [100, 1_000_000, 4_000_000, 4_300_000])
-def test_full_disk(tmp_path, limit: int):
-    run = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(tmp_path), str(limit)], capture_output=True, text=True, check=False
-    )
+@pytest.mark.parametrize(
+    ("limit", "threads"), [(100, 1), (1_000_000, 1), (4_000_000, 1), (4_300_000, 1), (4_300_000, 3)]
+)
+def test_full_disk(tmp_path, limit: int, threads: int):
+    words = [sys.executable, "-c", FULL_DISK, str(tmp_path), str(limit), str(threads)]
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
     assert "a.tif cannot be written" in run.stdout, run.stderr
     assert os.listdir(tmp_path) == []
 

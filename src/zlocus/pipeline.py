@@ -18,12 +18,14 @@ from zlocus.errors import CoverageError, GeometryError, ZlocusError
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.events import EventLog
+from zlocus.execution.memory import cores
 from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.execution.store import TileStore
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.identity import digest_of, key_of
 from zlocus.io.config import config_as_dict
+from zlocus.io.raster import compressing
 from zlocus.io.reference import cells_inside, dem_datum, read_dem, read_geobox, read_polygons
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, vertical_datum
@@ -88,6 +90,11 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     CoverageError
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
+    with compressing(request.workers or cores()):
+        return _run_dsm(request, config, progress)
+
+
+def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
     watch = Stopwatch()
     check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):

@@ -202,23 +202,26 @@ def _read(scene: MatchScene, core: CellWindow, config: RunConfig, choose: bool) 
 
     choose : whether those beyond the most promising ones are left out.
     """
+    corners, windows = windows_of(scene, core, config)
+    which = list(windows)
+    if choose and len(which) > config.selection.candidates + 1:
+        middle = sum(scene.z_range) / 2
+        which = [which[row] for row in preselected([scene.views[n] for n in which], corners, middle, config.selection)]
+    return [read_pixels(scene.views[n], windows[n], scene.levels, scene.grey[n]) for n in which], which
+
+
+def windows_of(
+    scene: MatchScene, core: CellWindow, config: RunConfig
+) -> tuple[NDArray[np.float64], dict[int, tuple[int, int, int, int]]]:
+    """Points (n, 2) m all over a tile with its halo, and the window (row, col, rows, cols) px of each view that may see
+    it, by its number in the scene."""
     coarsest = scene.levels - 1
     window = _level_window(scene, core, coarsest, config)
-    z = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
     transform = scene.transform(window, coarsest)
     across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
     corners = np.array([transform * (c, r) for c in across for r in down])
-    parts = [pixel_window(view, corners, z, 2**coarsest) for view in scene.views]
-    which = [number for number, part in enumerate(parts) if part is not None]
-    if choose and len(which) > config.selection.candidates + 1:
-        rows = preselected([scene.views[number] for number in which], corners, sum(z) / 2, config.selection)
-        which = [which[row] for row in rows]
-    found = []
-    for number in which:
-        part = parts[number]
-        assert part is not None
-        found.append(read_pixels(scene.views[number], part, scene.levels, scene.grey[number]))
-    return found, which
+    found = {n: pixel_window(scene.views[n], corners, scene.z_range, 2**coarsest) for n in scene.views_near(corners)}
+    return corners, {number: part for number, part in found.items() if part is not None}
 
 
 @dataclass(frozen=True)

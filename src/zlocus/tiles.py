@@ -13,8 +13,8 @@ from zlocus.errors import ConfigError, StoppedError
 from zlocus.execution.cluster import Cluster
 from zlocus.execution.engine import Failure, Here, Outcome, Workers, run_tasks
 from zlocus.execution.events import NAME, EventLog
-from zlocus.execution.memory import SHARE, WORKER_BYTES, cores, free_bytes
-from zlocus.execution.plan import Tile, matching_seconds, tile_memory_bytes
+from zlocus.execution.memory import SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
+from zlocus.execution.plan import Tile, tile_needs
 from zlocus.execution.processes import Processes
 from zlocus.execution.store import TileStore
 from zlocus.job import TileJob, TileProduct
@@ -38,16 +38,22 @@ NAMED = 3  # failed tiles in a message
 @dataclass(frozen=True)
 class Plan:
     """How tiles are worked on. slots : at a time; processes : in processes of their own, else here; tile_bytes : that
-    one needs at most; allowed_bytes : all together; seconds : about, of one worker; scheduler : of a cluster that does
-    it instead."""
+    one needs at most, with its process; own_bytes : that the command needs itself; allowed_bytes : all together;
+    seconds : about, of one worker; scheduler : of a cluster that does it instead."""
 
     n_tiles: int
     slots: int
     processes: bool
     tile_bytes: float
+    own_bytes: float
     allowed_bytes: float
     seconds: float
     scheduler: str | None = None
+
+    @property
+    def n_bytes(self) -> float:
+        """Of all together."""
+        return self.own_bytes + self.slots * self.tile_bytes
 
     def __str__(self) -> str:
         where = "in processes of their own" if self.processes else "in this process"
@@ -57,8 +63,8 @@ class Plan:
             return f"Plan: {self.n_tiles} tiles by the cluster at {self.scheduler}, about {need}, and {whole}."
         many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
         return (
-            f"Plan: {many}, {self.slots} at a time {where}, about {self.slots * self.tile_bytes / 1e9:.2g} GB of "
-            f"memory (of {self.allowed_bytes / 1e9:.2g} GB) and {duration(self.seconds / self.slots)}."
+            f"Plan: {many}, {self.slots} at a time {where}, about {self.n_bytes / 1e9:.2g} GB of memory (of "
+            f"{self.allowed_bytes / 1e9:.2g} GB) and {duration(self.seconds / self.slots)}."
         )
 
 
@@ -71,19 +77,21 @@ def planned(settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, reque
     ConfigError
         One tile needs more memory than it may take.
     """
-    need, memory_gb = tile_memory_bytes(settled, config.pyramid), request.memory_gb
-    allowed = SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
-    if memory_gb is not None and need > allowed:
+    needs, own, memory_gb = tile_needs(settled, tiles, config), held_bytes(), request.memory_gb
+    allowed = own + SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
+    here = needs.n_bytes + TILE_CODE_BYTES
+    if memory_gb is not None and own + here > allowed:
         raise ConfigError(
-            f"--memory {memory_gb:g} GB is too little for one tile, which needs about {need / 1e9:.1f} GB. "
-            "Allow more, or set a smaller pyramid.tile in --config."
+            f"--memory {memory_gb:g} GB is too little for one tile, which needs about {here / 1e9:.2g} GB beside the "
+            f"{own / 1e9:.2g} GB of the command itself. Allow more, or set a smaller pyramid.tile in --config."
         )
-    worked = [tile for tile in tiles if tile.core.rows and tile.core.cols]
-    seconds = matching_seconds(settled, worked)
-    wanted = request.workers or (cores() if seconds > SHORT_S else 1)
-    slots = max(min(wanted, int(allowed / (need + WORKER_BYTES)), len(worked)), 1)
+    n_worked = sum(1 for tile in tiles if tile.core.rows and tile.core.cols)
+    wanted = request.workers or (cores() if needs.seconds > SHORT_S else 1)
+    there = needs.n_bytes + WORKER_BYTES
+    slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
     processes = slots > 1 and request.method != "gc3-sgm"
-    return Plan(len(tiles), slots, processes, need + WORKER_BYTES * processes, allowed, seconds, request.scheduler)
+    each = there if processes or request.scheduler else here
+    return Plan(len(tiles), slots, processes, each, own, allowed, needs.seconds, request.scheduler)
 
 
 @dataclass

@@ -12,7 +12,8 @@ from shapely import box
 from zlocus.doctor.findings import POOR, STOPS, Finding
 from zlocus.doctor.ties import QuickTies
 from zlocus.errors import GeometryError
-from zlocus.execution.plan import VIEW_CELLS_PER_S, plan_tiles, tile_memory_bytes
+from zlocus.execution.memory import WORKER_BYTES
+from zlocus.execution.plan import plan_tiles, tile_needs
 from zlocus.grid import grid_from_bounds
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
@@ -67,7 +68,8 @@ def run_plan(
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
     tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
-    tile_bytes = tile_memory_bytes(settled, config.pyramid)
+    needs = tile_needs(settled, tiles, config)
+    tile_bytes = int(needs.n_bytes + WORKER_BYTES)
     fit = request.workers if request.memory_gb is None else int(request.memory_gb * 1e9 / tile_bytes)
     workers = max(min(request.workers, fit, len(tiles)), 1)
     area = box(*bounds)
@@ -83,7 +85,7 @@ def run_plan(
         workers=workers,
         machine_bytes=machine_memory_bytes(),
         view_cells=view_cells,
-        seconds=view_cells / VIEW_CELLS_PER_S / min(workers, os.cpu_count() or 1),
+        seconds=needs.seconds / min(workers, os.cpu_count() or 1),
     )
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 # Of what is free.
 SHARE = 0.6
-# What an idle worker holds: Python, libraries, compiled kernels; and what GDAL's cache may grow to.
-WORKER_BYTES = 350e6
+# What the first tile brings into a process, beside its own: compiled kernels, GDAL's cache of blocks; and that with
+# what a worker holds before, Python and libraries.
+TILE_CODE_BYTES, WORKER_BYTES = 160e6, 280e6
 CGROUP = Path("/sys/fs/cgroup")
 STATUS = Path("/proc/self/status")
 
@@ -21,6 +22,13 @@ def free_bytes() -> float:
     import psutil
 
     return float(min(psutil.virtual_memory().available, *_left_in_container()))
+
+
+def held_bytes() -> float:
+    """Memory that this process holds."""
+    import psutil
+
+    return float(psutil.Process().memory_info().rss)
 
 
 def _left_in_container() -> list[float]:

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.setup import MatchScene
-from zlocus.options import PyramidOptions
+from zlocus.options import PyramidOptions, RunConfig
+from zlocus.tile import windows_of
 
-# Matching of 4.2 M cells with three views took 17.9 s of a core (benchmarks/README.md, "The whole program").
-VIEW_CELLS_PER_S = 4.2e6 * 3 / 17.9
+# Of a core, per cell, and more for each view that is compared (benchmarks/README.md, "Growth").
+CELL_S, VIEW_CELL_S = 1.5e-6, 0.45e-6
+# Of a tile at its largest: per cell; per cell and step of heights; per cell and view that is compared; per pixel of
+# those views' windows.
+CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 170, 3, 42, 22
 STEPS_PER_CELL = 48
-BYTES_PER_CELL = 160
+# Tiles that are looked at for what they need, spread over all.
+MOST_LOOKED_AT = 64
 
 
 @dataclass(frozen=True)
@@ -49,16 +54,24 @@ def core_size(seen: CellWindow, options: PyramidOptions) -> tuple[int, int]:
     return height, width
 
 
-def tile_memory_bytes(scene: MatchScene, options: PyramidOptions) -> int:
-    """About what one tile needs at its largest: cost volume, path sums, pixels of all views, planes and results."""
-    height, width = core_size(scene.seen, options)
-    wide, everything = 2 * options.halo * 2 ** (scene.levels - 1), scene.seen.rows * scene.seen.cols
-    fine = min((height + 2 * options.halo) * (width + 2 * options.halo), everything)
-    pixels = min((height + wide) * (width + wide), everything) * len(scene.views) * 16
-    return int(fine * (min(STEPS_PER_CELL, scene.n_steps + 16) * 3 + BYTES_PER_CELL) + pixels)
+@dataclass(frozen=True)
+class TileNeeds:
+    """n_bytes : about what the largest of some tiles needs; seconds : about how long one worker takes for all."""
+
+    n_bytes: int
+    seconds: float
 
 
-def matching_seconds(scene: MatchScene, tiles: Sequence[Tile]) -> float:
-    """About how long one worker matches tiles, as if all views saw all of their cells, s."""
-    cells = sum(tile.core.rows * tile.core.cols for tile in tiles)
-    return cells * len(scene.views) / VIEW_CELLS_PER_S
+def tile_needs(scene: MatchScene, tiles: Sequence[Tile], config: RunConfig) -> TileNeeds:
+    """What tiles need, from the cells, and the views and pixels, that some of them are to be matched with."""
+    worked = [tile for tile in tiles if tile.core.rows and tile.core.cols]
+    most, seconds, looked = 0, 0.0, worked[:: -(-len(worked) // MOST_LOOKED_AT) or 1]
+    for tile in looked:
+        fine = tile.core.at_level(0, config.pyramid.halo).within(scene.seen)
+        cells, steps = fine.rows * fine.cols, min(STEPS_PER_CELL, scene.n_steps + 16)
+        pixels = sorted(rows * cols for _, _, rows, cols in windows_of(scene, tile.core, config)[1].values())
+        pixels = pixels[-config.selection.candidates - 1 :]
+        per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * len(pixels)
+        most = max(most, cells * per_cell + sum(pixels) * PIXEL_BYTES)
+        seconds += tile.core.rows * tile.core.cols * (CELL_S + VIEW_CELL_S * len(pixels))
+    return TileNeeds(most, seconds * len(worked) / max(len(looked), 1))

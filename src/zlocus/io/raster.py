@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,9 +27,20 @@ from zlocus.io.statistics import BandStatistics, is_data
 
 BLOCK_SIZE = 512
 # Deflate is read everywhere. Heights, sigmas and grey values shrink by 1 % more at level 6, in nearly twice the time.
-# One thread: the same bytes each time.
-COG_OPTIONS = {"BLOCKSIZE": BLOCK_SIZE, "COMPRESS": "DEFLATE", "LEVEL": 1, "BIGTIFF": "IF_SAFER", "NUM_THREADS": 1}
+COG_OPTIONS = {"BLOCKSIZE": BLOCK_SIZE, "COMPRESS": "DEFLATE", "LEVEL": 1, "BIGTIFF": "IF_SAFER"}
+_threads = ContextVar("_threads", default=1)
 FLOAT_PREDICTOR, INTEGER_PREDICTOR = "FLOATING_POINT", "STANDARD"
+
+
+@contextmanager
+def compressing(threads: int) -> Iterator[None]:
+    """Rasters that this thread closes meanwhile are compressed by so many; blocks are written in their order all the
+    same, and so the same bytes."""
+    token = _threads.set(threads)
+    try:
+        yield
+    finally:
+        _threads.reset(token)
 
 
 class RasterSink:
@@ -102,6 +114,7 @@ class RasterSink:
         options = COG_OPTIONS | {
             "PREDICTOR": FLOAT_PREDICTOR if self.dtype.kind == "f" else INTEGER_PREDICTOR,
             "OVERVIEW_RESAMPLING": "AVERAGE" if self._average else "NEAREST",
+            "NUM_THREADS": _threads.get(),
         }
         with self._guard():
             self._gather()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import GreyScale, grey_scales
+from zlocus.matching.views import MARGIN_PX
 from zlocus.options import PyramidOptions
-from zlocus.scene import ColourSource, Scene, View, footprint, ground_sample_distance
+from zlocus.scene import ColourSource, Scene, View, footprint, ground_box, ground_sample_distance
 from zlocus.sensors.model import Scanning, bare
 
 FINEST_CELL = 0.1
@@ -46,6 +48,23 @@ class MatchScene:
     grey: tuple[GreyScale, ...]
     ties: NDArray[np.float64] = field(repr=False)
     prior: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    @property
+    def z_range(self) -> tuple[float, float]:
+        """Heights searched, m."""
+        return self.origin_m, self.origin_m + self.n_steps * self.step_m
+
+    def views_near(self, xy: NDArray[np.float64]) -> list[int]:
+        """Numbers of the views that may see ground in the box around points (n, 2) m."""
+        low, high = self._boxes[:, 0], self._boxes[:, 1]
+        near = ((low <= xy.max(axis=0)) & (xy.min(axis=0) <= high)).all(axis=1)
+        return [int(number) for number in np.flatnonzero(near)]
+
+    @cached_property
+    def _boxes(self) -> NDArray[np.float64]:
+        """Box of the ground that each view sees, (i, 2, 2) m, with the margin that its windows have."""
+        margin_px = float(MARGIN_PX * 2**self.levels)
+        return np.array([ground_box(view, self.z_range, margin_px) for view in self.views])
 
     @property
     def has_colours(self) -> bool:

@@ -12,8 +12,9 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from zlocus.errors import OutputError
+from zlocus.kernels.shade import BRIGHTEST, DARKEST
 from zlocus.options import ProductOptions
-from zlocus.products.hillshade import BRIGHTEST, DARKEST, hillshade
+from zlocus.products.hillshade import hillshade
 
 FloatImage = NDArray[np.float32]
 GAP = 12
