@@ -5,15 +5,18 @@ needed.
     python benchmarks/scaling.py workers --million 16
     python benchmarks/scaling.py views --million 1
     python benchmarks/scaling.py block --side 4 8 16
+    python benchmarks/scaling.py draw
 
 One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
 the repeated image. CPU is that of all processes, from `run.json`; memory the most that one worker held, from
-`events.jsonl`.
+`events.jsonl`. Measured rows are kept in `growth.csv`, in place of those of the same kind; `draw` shows them as
+docs/growth.png.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import shutil
@@ -22,9 +25,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -40,6 +44,8 @@ from zlocus.synthetic.rpc_fit import fit_rpc
 from zlocus.synthetic.scenes import build_ground, city_spec, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
 
+ROOT = Path(__file__).parents[1]
+KEPT = ROOT / "benchmarks" / "growth.csv"
 PERIOD_PX, GSD_M = 1024, 0.5
 # So far away that rays are parallel over the largest scene, to a thousandth of a pixel.
 FAR_M = 1e9
@@ -140,8 +146,49 @@ def write_repeated(path: Path, numbers: NDArray[np.integer], side: int, rpc: Rpc
                 file.write(part, 1, window=Window(col, row, part.shape[1], part.shape[0]))
 
 
-def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) -> list[str]:
-    """A run over all that the images show, with everything by default; its figures as a row."""
+@dataclass(frozen=True)
+class Growth:
+    """What a run took. wall_s : all of it, and of stages; cpu_s : of all processes; worker_mb, command_mb : the most
+    that one worker, and the command itself, held."""
+
+    million: float
+    n_views: int
+    workers: int
+    n_tiles: int
+    wall_s: float
+    orient_s: float
+    match_s: float
+    products_s: float
+    match_cpu_s: float
+    cpu_s: float
+    worker_mb: float
+    command_mb: float
+    filled: float
+
+    @property
+    def cpu_s_per_million(self) -> float:
+        """Of the whole run, per million cells."""
+        return self.cpu_s / self.million
+
+    def row(self) -> str:
+        """Below `HEAD`."""
+        cells = (
+            f"{self.million:.1f}", self.n_views, self.workers, self.n_tiles, f"{self.wall_s:.0f}",
+            f"{self.orient_s:.1f}", f"{self.match_s:.1f}", f"{self.products_s:.1f}",
+            f"{self.match_cpu_s / self.million:.2f}", f"{self.cpu_s_per_million:.2f}", f"{self.worker_mb:.0f}",
+            f"{self.command_mb:.0f}", f"{100 * self.filled:.1f}",
+        )  # fmt: skip
+        return "| " + " | ".join(map(str, cells)) + " |"
+
+
+HEAD = (
+    "| M cells | images | workers | tiles | wall, s | orientation, s | matching, s | products, s | "
+    "matching, CPU s / M cells | all, CPU s / M cells | worker, MB | command, MB | filled, % |\n" + "|---" * 13 + "|"
+)
+
+
+def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) -> Growth:
+    """A run over all that the images show, with everything by default."""
     words = [
         sys.executable, "-m", "zlocus", "dsm", *map(str, images), "-o", str(out), "--overwrite", "--crs", "EPSG:32632",
         "--resolution", str(GSD_M), "--workers", str(workers), "--memory", str(memory_gb),
@@ -149,28 +196,101 @@ def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) 
     start = time.perf_counter()
     subprocess.run(words, check=True, stdout=sys.stderr)
     wall = time.perf_counter() - start
-    run = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    run = record_of(out)
     events = [json.loads(line) for line in (out / "events.jsonl").read_text(encoding="utf-8").splitlines()]
     stages = {stage["name"]: stage for stage in run["stages"]}
-    million = run["grid"]["shape"][0] * run["grid"]["shape"][1] / 1e6
     tiles = [event for event in events if event["event"] == "tile"]
-    # Of all processes, those of workers too.
-    cpu = sum(stage["cpu_s"] for stage in run["stages"])
-    after = sum(stages[name]["wall_s"] for name in stages if name not in ("open", "orient", "settle", "match"))
-    return [
-        f"{million:.1f}", str(len(images)), str(workers), str(len(tiles)), f"{wall:.0f}",
-        f"{stages['orient']['wall_s']:.0f}", f"{stages['match']['wall_s']:.1f}", f"{after:.1f}",
-        f"{stages['match']['cpu_s'] / million:.2f}", f"{cpu / million:.2f}",
-        f"{max(event['peak_mb'] for event in tiles):.0f}",
-        f"{max(stage['peak_mb'] for stage in run['stages'] if stage['name'] != 'match'):.0f}",
-        f"{100 * run['coverage']:.1f}",
-    ]  # fmt: skip
+    return Growth(
+        million=run["grid"]["shape"][0] * run["grid"]["shape"][1] / 1e6,
+        n_views=len(images),
+        workers=workers,
+        n_tiles=len(tiles),
+        wall_s=wall,
+        orient_s=stages["orient"]["wall_s"],
+        match_s=stages["match"]["wall_s"],
+        products_s=sum(
+            stage["wall_s"] for name, stage in stages.items() if name not in ("open", "orient", "settle", "match")
+        ),
+        match_cpu_s=stages["match"]["cpu_s"],
+        # Of all processes, those of workers too.
+        cpu_s=sum(stage["cpu_s"] for stage in run["stages"]),
+        worker_mb=max(event["peak_mb"] for event in tiles),
+        command_mb=max(stage["peak_mb"] for name, stage in stages.items() if name != "match"),
+        filled=run["coverage"],
+    )
 
 
-HEAD = [
-    "M cells", "images", "workers", "tiles", "wall, s", "orientation, s", "matching, s", "products, s",
-    "matching, CPU s / M cells", "all, CPU s / M cells", "worker, MB", "command, MB", "filled, %",
-]  # fmt: skip
+def kept(what: str, found: Sequence[Growth]) -> None:
+    """Put rows of a kind into `KEPT`, in place of those that are there."""
+    rows = [] if not KEPT.exists() else [row for row in read_kept() if row["what"] != what]
+    rows += [{"what": what, **{name: f"{value:.6g}" for name, value in asdict(one).items()}} for one in found]
+    with KEPT.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, ["what", *(f.name for f in fields(Growth))], lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+def read_kept() -> list[dict[str, str]]:
+    """All rows of `KEPT`."""
+    with KEPT.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def draw(path: Path) -> None:
+    """Curves of what is kept: against area, workers, images of the same ground, and images of a growing block."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    def lines(what: str, **only: float) -> dict[str, np.ndarray]:
+        chosen = [
+            row for row in read_kept() if row["what"] == what and all(float(row[k]) == v for k, v in only.items())
+        ]
+        found = {name: np.array([float(row[name]) for row in chosen]) for name in chosen[0] if name != "what"}
+        order = np.lexsort((found["workers"], found["n_views"], found["million"]))
+        return {name: values[order] for name, values in found.items()}
+
+    ink, accent, second = "#222222", "#c0392b", "#1f618d"
+    style = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": ink}
+    with mpl.rc_context(style):
+        figure, axes = plt.subplots(2, 2, figsize=(8.0, 5.6), layout="constrained")
+        area = lines("workers", workers=2)
+        for values, colour, label in ((area["cpu_s"], accent, "all"), (area["match_cpu_s"], second, "matching")):
+            axes[0, 0].semilogx(area["million"], values / area["million"], "o-", color=colour, label=label)
+        axes[0, 0].set(xlabel="million cells, six images", ylabel="CPU, s per million cells", ylim=(0, None))
+        axes[0, 1].semilogx(area["million"], area["worker_mb"] / 1e3, "o-", color=accent, label="a worker")
+        axes[0, 1].semilogx(area["million"], area["command_mb"] / 1e3, "o-", color=second, label="the command")
+        axes[0, 1].set(xlabel="million cells, six images", ylabel="most memory, GB", ylim=(0, None))
+        views = lines("views")
+        for values, colour, label in (
+            (views["match_cpu_s"] / views["million"], second, "matching, CPU s per million cells"),
+            (views["orient_s"], accent, "orientation, s"),
+        ):
+            axes[1, 0].loglog(views["n_views"], values, "o-", color=colour, label=label)
+        axes[1, 0].set(xlabel="images of the same million cells", xticks=views["n_views"])
+        block = lines("block")
+        axes[1, 1].semilogx(
+            block["n_views"], block["orient_s"] / block["n_views"], "o-", color=accent, label="orientation, s per image"
+        )
+        axes[1, 1].semilogx(
+            block["n_views"],
+            block["match_cpu_s"] / block["million"],
+            "o-",
+            color=second,
+            label="matching, CPU s per million cells",
+        )
+        axes[1, 1].set(xlabel="images of a growing block", ylim=(0, None), xticks=block["n_views"])
+        for axis in axes.flat:
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.minorticks_off()
+            axis.legend(frameon=False)
+        figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
+def record_of(out: Path) -> dict[str, Any]:
+    """What a run says of itself."""
+    return dict(json.loads((out / "run.json").read_text(encoding="utf-8")))
 
 
 def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
@@ -191,24 +311,28 @@ def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
 def main() -> None:
     """Measure what is asked for, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("area", "workers", "views", "block"))
+    parser.add_argument("what", choices=("area", "workers", "views", "block", "draw"))
     parser.add_argument("--million", type=float, nargs="+", default=[4.0], help="cells")
     parser.add_argument("--side", type=int, nargs="+", default=[4, 8], help="images along each side of a block")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--memory", type=float, default=8.0, help="GB of all workers together")
     parser.add_argument("--scratch", type=Path, default=Path(tempfile.gettempdir()), help="images and surfaces")
     asked = parser.parse_args()
+    if asked.what == "draw":
+        draw(ROOT / "docs" / "growth.png")
+        return
     folder = Path(tempfile.mkdtemp(prefix="scaling-", dir=asked.scratch))
     try:
-        at, made = town(), {}
-        print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD), flush=True)
+        at, made, found = town(), {}, []
+        print(HEAD, flush=True)
         for side, n, workers in plans(asked):
             if (side, n) not in made:
                 made[side, n] = (
                     write_block(folder, at, n) if asked.what == "block" else write_views(folder, at, n, side)
                 )
-            row = measured(made[side, n], folder / "out", workers, asked.memory)
-            print("| " + " | ".join(row) + " |", flush=True)
+            found.append(measured(made[side, n], folder / "out", workers, asked.memory))
+            print(found[-1].row(), flush=True)
+        kept(asked.what, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

@@ -6,36 +6,44 @@ import functools
 import json
 import math
 import re
+import struct
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 import shapely
 import yaml
 from odc.geo.geobox import GeoBox
 from pydantic import BaseModel
+from pyproj import CRS
 from rasterio.transform import from_origin
 
 import camera_files as files
+from geoids import write_geoid
 from joint_scenes import views_of
 from rpc_fixtures import dimap_dim, dimap_rpc, rpb, rpc_txt, satellite_rpc, write_image
 from test_csm import state
 from test_linescan import FOCAL_MM, INTERVAL_S
 from test_reference import write_polygons, write_raster
 from zlocus.evaluation.heights import read_heights
+from zlocus.evaluation.truth import read_classes
 from zlocus.io.cameras import read_rpc
 from zlocus.io.config import config_as_dict, read_config, write_config
 from zlocus.io.control import read_control
 from zlocus.io.csm import MODEL, read_csm
+from zlocus.io.geoid import GeoidRaster
 from zlocus.io.images import open_image
 from zlocus.io.importers.scene import import_scene
 from zlocus.io.linescan_files import read_calibration, read_times, read_trajectory
 from zlocus.io.reference import read_dem, read_geobox, read_polygons
 from zlocus.io.scene_file import open_scene, read_scene_file
 from zlocus.options import RunConfig
+from zlocus.products.record import read_record
 from zlocus.request import ImportRequest
 
 RPC = satellite_rpc()
@@ -295,6 +303,59 @@ def _read_surface(path: Path) -> Leaves:
     return {("z",): found.z.tobytes(), ("transform",): tuple(found.transform), ("crs",): str(found.crs)}
 
 
+def _write_posts(folder: Path) -> Path:
+    posts = np.linspace(40.0, 50.0, 13 * 9, dtype=np.float32).reshape(13, 9)
+    return write_geoid(folder / "geoid.tif", posts, from_origin(4.5, 44.5, 0.25, 0.25), compress="deflate")
+
+
+def _write_gtx(folder: Path) -> Path:
+    """Posts of a GTX file, the first in the south-west. Source: NOAA, "VDatum GTX file format"."""
+    posts = np.linspace(40.0, 50.0, 13 * 9, dtype=">f4").reshape(13, 9)
+    path = folder / "geoid.gtx"
+    path.write_bytes(struct.pack(">4d2i", 41.5, 4.5, 0.25, 0.25, *posts.shape) + posts.tobytes())
+    return path
+
+
+def _read_geoid(path: Path) -> Leaves:
+    at = np.array([[5.0, 43.0], [5.3, 42.2], [6.1, 43.9]])
+    return leaves(GeoidRaster.open(path).undulation(at, CRS.from_epsg(4326)))
+
+
+def _write_classes(folder: Path) -> Path:
+    _write_dem(folder)
+    classes = np.random.default_rng(4).integers(0, 4, (60, 70)).astype(np.uint8)
+    return write_raster(folder / "classes.tif", classes, from_origin(699900, 4790500, 10.0, 10.0), "EPSG:32631")
+
+
+def _read_classes(path: Path) -> Leaves:
+    return {("classes",): read_classes(path, read_heights(path.with_name("dem.tif"))).tobytes()}
+
+
+def _write_colours(folder: Path) -> Path:
+    pixels = np.random.default_rng(3).integers(0, 255, (3, 40, 50)).astype(np.uint8)
+    with warnings.catch_warnings(action="ignore"), rasterio.open(
+        folder / "colours.tif", "w", driver="GTiff", height=40, width=50, count=3, dtype="uint8", photometric="RGB",
+        compress="lzw",
+    ) as file:  # fmt: skip
+        file.write(pixels)
+    return folder / "colours.tif"
+
+
+def _read_colours(path: Path) -> Leaves:
+    image = open_image(path)
+    size = [min(n, 200) for n in image.shape]
+    bands = image.colours(0, 0, *size).tobytes() if image.has_colours else b""
+    return {("bands",): bands, **_read_image(path)}
+
+
+RECORD = {"schema": 1, "grid": {"crs": "EPSG:32631", "shape": [12, 13]}, "stages": [{"name": "open", "wall_s": 0.25}]}
+
+
+def _write_record(folder: Path) -> Path:
+    (folder / "run.json").write_text(json.dumps(RECORD, indent=2) + "\n")
+    return folder / "run.json"
+
+
 def _vector(name: str, **options: Any) -> Case:
     def write(folder: Path) -> Path:
         rings = [shapely.box(700010, 4790210, 700110, 4790310), shapely.box(700150, 4790250, 700250, 4790390)]
@@ -343,10 +404,16 @@ CASES: dict[str, Case] = {
     "strecha": _import("strecha", files.write_strecha, "b.tif.camera"),
     "image-tiff": _picture(".tif", tiled=True, blockxsize=32, blockysize=32),
     "image-deflate": _picture(".tif", compress="deflate", blockysize=16),
+    "image-envi": _picture(".img", driver="ENVI"),
     "image-png": _picture(".png", driver="PNG"),
     "image-jpeg": _picture(".jpg", driver="JPEG"),
     "dem": Case(_write_dem, lambda path: {("z",): read_dem(path, GRID).tobytes()}, text=False),
     "like": Case(_write_dem, lambda path: {("grid",): str(read_geobox(path))}, text=False),
+    "geoid-tif": Case(_write_posts, _read_geoid, text=False),
+    "geoid-gtx": Case(_write_gtx, _read_geoid, text=False),
+    "classes": Case(_write_classes, _read_classes, text=False),
+    "image-colours": Case(_write_colours, _read_colours, text=False),
+    "record": Case(_write_record, lambda path: leaves(read_record(path)), exact=True),
     "surface": Case(_write_dem, _read_surface, text=False),
     "area-geojson": _vector("area.geojson", driver="GeoJSON"),
     "area-gpkg": _vector("area.gpkg", driver="GPKG"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.enums import ColorInterp
+from rasterio.transform import from_origin
 
 from rpc_fixtures import write_image
 from zlocus.errors import InputError
@@ -117,6 +118,28 @@ def test_truncated_at_any_length(tmp_path, profile):
         cut.write_bytes(data[:length])
         with pytest.raises(InputError, match=r"cut\.tif"):
             open_image(cut)
+
+
+@pytest.mark.parametrize(
+    ("driver", "name"), [("ENVI", "a.img"), ("EHdr", "a.bil"), ("PNM", "a.pgm"), ("SAGA", "a.sdat")]
+)
+def test_truncated_pixels_as_they_are(tmp_path, driver, name):
+    """GDAL reads those behind the end as 0."""
+    place = from_origin(500000, 4500000, 1, 1)
+    grey = GREY.astype(np.float32 if driver == "SAGA" else np.uint8)
+    with warnings.catch_warnings(action="ignore"), rasterio.open(
+        tmp_path / name, "w", driver=driver, height=grey.shape[0], width=grey.shape[1], count=1, dtype=grey.dtype,
+        transform=place,
+    ) as file:  # fmt: skip
+        file.write(grey, 1)
+    path = tmp_path / name
+    np.testing.assert_array_equal(whole(open_image(path)).pixels, grey)
+    content = path.read_bytes()
+    # The header of a PNM is not counted.
+    for lost in (64 if driver == "PNM" else 1, len(content) // 3):
+        path.write_bytes(content[:-lost])
+        with pytest.raises(InputError, match="truncated"):
+            open_image(path)
 
 
 def test_truncated_mask(tmp_path):

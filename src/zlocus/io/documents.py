@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any, NoReturn
@@ -41,6 +42,9 @@ def read_json(path: Path, start: str | None = None) -> Any:
     def refuse(constant: str) -> NoReturn:
         raise ValueError(f"it holds {constant}, which is no number")
 
+    def number(text: str) -> float:
+        return float(text) if math.isfinite(float(text)) else refuse(text)
+
     def table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found = dict(pairs)
         if len(found) < len(pairs):
@@ -52,7 +56,7 @@ def read_json(path: Path, start: str | None = None) -> Any:
     if start is not None:
         text = text[max(text.find(start), 0) :]
     try:
-        return json.loads(text, parse_constant=refuse, object_pairs_hook=table)
+        return json.loads(text, parse_constant=refuse, parse_float=number, object_pairs_hook=table)
     except (ValueError, RecursionError) as error:
         what = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise InputError(f"{path} cannot be read as JSON: {what}. {AGAIN}") from error

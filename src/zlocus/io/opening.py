@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import threading
@@ -12,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import rasterio
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import Interleaving
@@ -26,6 +28,17 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEAST_BLOCK_BYTES = 4
 KEPT_OPEN = 32  # rasters of a thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
+# GDAL's virtual files that are read: those of servers, as they are. None within an archive.
+REMOTE = ("vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsihdfs", "vsiwebhdfs")
+ARCHIVES = {b"PK\x03\x04": "ZIP", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7-Zip", b"Rar!": "RAR", b"BZh": "bzip2"}
+# Rasters that are lists of other files or ask services, whatever their file is called. A virtual raster is read where
+# its name says that it is one.
+ELSEWHERE = frozenset((
+    "DERIVED", "ECRGTOC", "EEDA", "EEDAI", "ESRIC", "GTI", "HTTP", "KMLSUPEROVERLAY", "MRF", "PLMOSAIC", "RPFTOC",
+    "STACIT", "STACTA", "VRT", "WCS", "WMS", "WMTS",
+))  # fmt: skip
+# Formats whose pixels lie in a file as they are.
+PLAIN = frozenset(("BT", "EHdr", "ENVI", "ERS", "GTX", "ISCE", "KRO", "LAN", "PAux", "PNM", "ROI_PAC", "SAGA"))
 # `warnings.catch_warnings` swaps a global list, so two threads must not be inside it at once.
 _quiet = threading.Lock()
 
@@ -47,10 +60,15 @@ def existing_file(path: Path, what: str) -> Path:
     Raises
     ------
     InputError
-        When there is no such file, or it is a folder.
+        When there is no such file, it is a folder, or lies in an archive.
     """
     path = Path(path)
     if is_remote(path):
+        if path.parts[1] not in REMOTE:
+            raise InputError(
+                f"{shown(str(path))} names a file in an archive or a stream, which is not followed. Unpack it, and "
+                f"give the {what} itself, or one on a server ({', '.join(f'/{name}/' for name in REMOTE[:3])}...)."
+            )
         return path
     try:
         is_there, is_folder = path.exists(), path.is_dir()
@@ -73,6 +91,8 @@ def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetRea
     """
     path = existing_file(path, what)
     with rasterio.Env(**_GDAL), _opened(path) as dataset, _read_errors(path):
+        if dataset.driver in PLAIN and not is_remote(path):
+            _check_plain(dataset, path)
         yield dataset
 
 
@@ -98,12 +118,31 @@ def _opened(path: Path) -> rasterio.DatasetReader:
     try:
         with _quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            return rasterio.open(gdal_name(path))
+            # `rasterio.open` takes one format only.
+            return rasterio.DatasetReader(gdal_name(path), driver=_drivers(path.suffix.lower() == ".vrt"))
     except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
+        if not is_remote(path) and first_bytes(path).lstrip().startswith(b"<VRTDataset"):
+            raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
         raise InputError(
             f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
             "GeoTIFF (or another format of GDAL)."
         ) from error
+
+
+@functools.cache
+def _drivers(virtual: bool) -> list[str]:
+    """GDAL's formats that are read. virtual : lists of other files too."""
+    with rasterio.Env() as gdal:
+        return [name for name in gdal.drivers() if name not in ELSEWHERE or (virtual and name == "VRT")]
+
+
+def first_bytes(path: Path) -> bytes:
+    """How a file begins; nothing where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64)
+    except OSError:
+        return b""
 
 
 @contextmanager
@@ -153,7 +192,7 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
     """Compare the offsets and sizes of all TIFF blocks, or of the chunks of a PNG, with the length of the file,
     decoding nothing.
 
-    Other formats pass: GDAL itself finds them truncated, which it does not of a PNG. So do files that are elsewhere.
+    Other formats pass: GDAL itself finds them truncated, or `open_raster` does. So do files that are elsewhere.
 
     Raises
     ------
@@ -184,6 +223,21 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
                         f"{path} is truncated: it has {length} bytes, and pixels of row {y * block_rows} on lie behind "
                         "its end. Copy it again from its source."
                     )
+
+
+def _check_plain(source: rasterio.DatasetReader, path: Path) -> None:
+    """Of pixels as they are, GDAL reads those behind the end of the file as 0."""
+    sizes = {name: os.path.getsize(name) for name in source.files if os.path.isfile(name)}
+    largest = max(sizes, key=lambda name: sizes[name], default=None)
+    if largest is None or first_bytes(Path(largest)).startswith(tuple(ARCHIVES)):
+        return
+    item_bits = int(source.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", 8 * np.dtype(source.dtypes[0]).itemsize))
+    needed = source.count * source.height * source.width * item_bits // 8
+    if sizes[largest] < needed:
+        raise InputError(
+            f"{path} is truncated: {Path(largest).name} has {sizes[largest]} bytes, and its pixels take {needed}. Copy "
+            "it again from its source."
+        )
 
 
 def _check_png(path: Path) -> None:

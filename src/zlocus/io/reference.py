@@ -20,7 +20,7 @@ from rasterio.windows import Window
 from zlocus.errors import InputError
 from zlocus.io.crs import checked_crs, known_crs, raster_crs
 from zlocus.io.heights import check_unit, is_fill
-from zlocus.io.opening import existing_file, open_raster
+from zlocus.io.opening import ARCHIVES, existing_file, first_bytes, is_remote, open_raster
 from zlocus.io.vertical import (
     OWN_ELLIPSOIDAL,
     VerticalDatum,
@@ -33,6 +33,9 @@ from zlocus.io.vertical import (
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200
+# Formats of vector files that hold their polygons themselves.
+VECTORS = ("ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
+           "OpenFileGDB", "SQLite", "TopoJSON")  # fmt: skip
 # No extent on the Earth, in any unit, is larger.
 WIDEST_EXTENT = 1e9
 
@@ -111,18 +114,24 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     Raises
     ------
     InputError
-        For a file that is no vector file, has several layers, no CRS, or anything but polygons.
+        For a file that is no vector file or names other files, an archive, several layers, no CRS, or anything but
+        polygons.
     """
     # pyogrio brings pandas, a third of a second that only runs with polygons need.
     import pyogrio.raw
 
     path = existing_file(path, "vector file")
+    begins = b"" if is_remote(path) else first_bytes(path)
+    if archive := next((name for start, name in ARCHIVES.items() if begins.startswith(start)), None):
+        raise InputError(f"The vector file {path} is an archive ({archive}), which is not followed. Unpack it.")
     try:
         layers = pyogrio.list_layers(path)[:, 0]
         if len(layers) != 1:
             raise InputError(
                 f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
             )
+        if (kind := pyogrio.read_info(path)["driver"]) not in VECTORS:
+            raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
         with warnings.catch_warnings():
             # What they warn of, rings that are not closed or numbers that are not finite, is refused.
             warnings.simplefilter("ignore", RuntimeWarning)

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import datetime
 import os
+import unicodedata
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,7 +26,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, field_validator, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
@@ -95,6 +97,13 @@ class ViewEntry(StrictModel):
     camera: SerializeAsAny[Camera]
     date: datetime.date | None = None
 
+    @field_validator("name")
+    @classmethod
+    def _shows(cls, name: str) -> str:
+        if any(unicodedata.category(sign) == "Cc" for sign in name):
+            raise ValueError("a name has no control characters, which change what a terminal shows")
+        return name
+
 
 class SceneFile(StrictModel):
     """A `scene.yaml`, schema 1."""
@@ -109,9 +118,8 @@ class SceneFile(StrictModel):
     def _consistent(self) -> SceneFile:
         if self.heights is not None and not self.heights[0] < self.heights[1]:
             raise ValueError("heights are zmin, zmax with zmin < zmax")
-        names = [view.name for view in self.views]
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(view.name for view in self.views).items():
+            if count > 1:
                 raise ValueError(f"the view name {name!r} is used twice")
         if self.area is not None and self.frame is None:
             raise ValueError("area needs frame: {crs: EPSG:n}, whose coordinates its bounds are")

@@ -19,8 +19,8 @@ from typing import Any
 from zlocus.errors import InputError, OutputError
 from zlocus.execution.memory import peak_memory_mb
 from zlocus.io.config import config_as_dict
+from zlocus.io.documents import read_json
 from zlocus.io.opening import gdal_name, is_remote
-from zlocus.io.text import read_text
 from zlocus.options import RunConfig
 
 SCHEMA = 1
@@ -124,10 +124,7 @@ def read_record(path: Path) -> dict[str, Any]:
     InputError
         It is damaged.
     """
-    try:
-        found = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON: {error}. Make the surface again.") from error
+    found = read_json(path)
     if not isinstance(found, dict):
         raise InputError(f"{path} holds no JSON object. Make the surface again.")
     return found
