@@ -22,6 +22,7 @@ SEEDS = Path(__file__).parent / "fuzz_seeds"
 TIMEOUT_S, MOST_MB = 20, 3000
 # Of a format, and of a seed.
 MOST_SEEDS, LARGEST_SEED = 40, 20_000
+MOST_TOKENS = 200
 FAILED = "fail-"
 
 
@@ -30,6 +31,7 @@ def fuzz_one(name: str, corpus: Path, artifacts: Path, seconds: int) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["zlocus"]):
+        from damage import TOKEN, WORDS
         from damage_cases import CASES
         from test_damage import check_sentence
         from zlocus.errors import ZlocusError
@@ -48,8 +50,14 @@ def fuzz_one(name: str, corpus: Path, artifacts: Path, seconds: int) -> None:
         except ZlocusError as error:
             check_sentence(str(error), path)
 
-    words = [sys.argv[0], str(corpus), f"-artifact_prefix={artifacts}/", f"-max_total_time={seconds}",
-             f"-timeout={TIMEOUT_S}", f"-rss_limit_mb={MOST_MB}", f"-max_len={LARGEST_SEED}"]  # fmt: skip
+    # What the file is made of, and what could stand in its place.
+    tokens = {m.group() for m in TOKEN.finditer(path.read_bytes())} if case.text else set()
+    listed = sorted(tokens)[:MOST_TOKENS] + [word.encode() for word in WORDS if 0 < len(word) < 40]
+    dictionary = corpus.parent / "words.dict"
+    dictionary.write_text("".join('"' + "".join(f"\\x{byte:02x}" for byte in word) + '"\n' for word in listed))
+    limits = {"max_total_time": seconds, "timeout": TIMEOUT_S, "rss_limit_mb": MOST_MB, "max_len": LARGEST_SEED}
+    options = {"dict": dictionary, "artifact_prefix": f"{artifacts}/", **limits}
+    words = [sys.argv[0], str(corpus), *(f"-{name}={value}" for name, value in options.items())]
     atheris.Setup(words, read)
     atheris.Fuzz()
 

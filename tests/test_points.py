@@ -15,11 +15,12 @@ from rendered_scenes import CENTRE, GSD_M, HEIGHTS, LOOKS, UTM, camera
 from zlocus.errors import OutputError
 from zlocus.io.crs import local_frame
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.ranking import RankedPoints
+from zlocus.matching.ranking import NOT_RANKED, RankedPoints
 from zlocus.matching.selection import Ranking
 from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations, project_points
-from zlocus.products.points import column_names, write_ranking, write_ties
+from zlocus.products import points
+from zlocus.products.points import column_names, labels_in, write_ranking, write_ties
 from zlocus.scene import Scene, View
 
 EXACT_M, EXACT_PX = 1e-6, 1e-6
@@ -90,6 +91,26 @@ def test_ranking_has_a_row_per_point_and_reference(tmp_path):
     np.testing.assert_array_equal(columns["label_b"], [1, none, -1, none, none])
     np.testing.assert_array_equal(columns["label_A_2"], [0, -1, none, 1, none])
     np.testing.assert_allclose(at, xyz[[1, 1, 1, 0, 0]], atol=EXACT_M)
+
+
+def test_labels_of_very_many_images_are_one_text(tmp_path, monkeypatch):
+    monkeypatch.setattr(points, "MOST_COLUMNS", 2)
+    names, xyz = ["a", "b,c", "A=1"], np.array([[CENTRE[0] + GSD_M, CENTRE[1], 51.0], [*CENTRE, 50.0]])
+    all_three = np.array([[[-1, 1, 0], [1, -1, NOT_RANKED], [0, -1, -1]]], np.int8)
+    ranked = [
+        RankedPoints(xyz[:1], np.array([[[-1, 1], [1, -1]]], np.int8), np.array([2, 0])),
+        RankedPoints(xyz[1:], all_three, np.arange(3)),
+    ]
+    write_ranking(tmp_path / "ranking.gpkg", ranked, names, UTM)
+    columns, at = columns_of(tmp_path / "ranking.gpkg", "ranking")
+    assert list(columns) == ["reference", "height_m", "n_good", "labels"]
+    assert columns["reference"].tolist() == ["a", "b,c", "A=1", "a", "A=1"]
+    assert columns["n_good"].tolist() == [1, 1, 0, 1, 1]
+    assert columns["labels"].tolist() == ["b c=1,A=1=0", "a=1", "a=0,b c=-1", "A=1=1", "a=1"]
+    assert labels_in("b c=1,A=1=0") == {"b c": 1, "A=1": 0}
+    np.testing.assert_allclose(at, xyz[[1, 1, 1, 0, 0]], atol=EXACT_M)
+    write_ranking(tmp_path / "nothing.gpkg", [], names, UTM)
+    assert pyogrio.read_info(tmp_path / "nothing.gpkg")["features"] == 0
 
 
 def test_a_tile_keeps_the_points_of_its_own_cells():

@@ -412,7 +412,7 @@ def test_a_surface_is_the_same_with_and_without_a_report(images, made, tmp_path)
     ("prepare", "arguments", "says"),
     [
         (lambda out: (out / "run.json").unlink(), (), "There is no run.json in"),
-        (lambda out: (out / "run.json").write_text("{"), (), "is not valid JSON"),
+        (lambda out: (out / "run.json").write_text("{"), (), "(char 1). Make the surface again."),
         (lambda out: (out / "run.json").write_text("[]"), (), "holds no JSON object"),
         (lambda out: (out / "run.json").write_text('{"schema": 1}'), (), "lacks config, versions"),
         (lambda out: (out / "sigma.tif").unlink(), (), "There is no raster"),
@@ -524,9 +524,12 @@ def test_cells_at_regular_distances_over_all_blocks(tmp_path, monkeypatch):
     np.testing.assert_array_equal(found.n_used[:9], np.bincount(values["views"].ravel()))
 
 
-def test_labels_of_pairs(tmp_path):
+@pytest.mark.parametrize("most_columns", [100, 2])
+def test_labels_of_pairs(tmp_path, monkeypatch, most_columns):
+    """Whether images have a column each, or are too many for that."""
     from pyproj import CRS
 
+    monkeypatch.setattr("zlocus.products.points.MOST_COLUMNS", most_columns)
     names = ["nadir", "fore", "aft"]
     labels = np.zeros((4, 3, 3), np.int8)
     labels[:, 0, 1] = [1, 1, 1, -1]

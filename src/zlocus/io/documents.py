@@ -30,8 +30,9 @@ PLAIN: dict[str, tuple[str, str]] = {
 }
 
 
-def read_json(path: Path, start: str | None = None) -> Any:
-    """A JSON document, with finite numbers and different keys. start : letter before which anything may stand.
+def read_json(path: Path, start: str | None = None, again: str = AGAIN) -> Any:
+    """A JSON document, with finite numbers and different keys. start : letter before which anything may stand; again :
+    what to do where it is none.
 
     Raises
     ------
@@ -59,7 +60,7 @@ def read_json(path: Path, start: str | None = None) -> Any:
         return json.loads(text, parse_constant=refuse, parse_float=number, object_pairs_hook=table)
     except (ValueError, RecursionError) as error:
         what = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise InputError(f"{path} cannot be read as JSON: {what}. {AGAIN}") from error
+        raise InputError(f"{path} cannot be read as JSON: {what}. {again}") from error
 
 
 def read_xml(path: Path) -> Element:

@@ -29,7 +29,7 @@ LEAST_TREND = 0.04
 # Grey values are never more precise than this, in contrasts: the prior keeps some weight.
 LEAST_NOISE = 1e-3
 N_TERMS = 5
-PRECISION = 1e-10  # of what is solved by rounds, relative
+PRECISION = 1e-7  # of what is solved by rounds, relative
 
 
 @dataclass(frozen=True)
@@ -199,9 +199,9 @@ def trends_between(found: Greys, terms: FloatArray, n_views: int) -> FloatArray 
     if len(found.grey) < FEWEST_POINTS:
         return None
     terms = np.column_stack([terms, np.ones(len(terms))])
-    weight, noise = np.ones(len(terms)), 1.0
+    weight, noise, trends = np.ones(len(terms)), 1.0, np.zeros((n_views, terms.shape[1]))
     for _ in range(TREND_ROUNDS):
-        trends = _fitted(found, terms, weight, max(noise, LEAST_NOISE**2), n_views)
+        trends = _fitted(found, terms, weight, max(noise, LEAST_NOISE**2), trends)
         differs = found.grey - found.common(found.grey, weight)
         fitted = np.einsum("mk,mk->m", terms, trends[found.view])
         left, used = differs - (fitted - found.common(fitted, weight)), weight > 0
@@ -215,12 +215,12 @@ def trends_between(found: Greys, terms: FloatArray, n_views: int) -> FloatArray 
     return trends[:, :N_TERMS] if explained >= max(LEAST_EXPLAINED * before, LEAST_TREND**2) else None
 
 
-def _fitted(found: Greys, terms: FloatArray, weight: FloatArray, noise: float, n_views: int) -> FloatArray:
+def _fitted(found: Greys, terms: FloatArray, weight: FloatArray, noise: float, first: FloatArray) -> FloatArray:
     """Trends and constants (i, 6) of least squares with a prior. terms : (m, 6); weight : (m,); noise : variance of
-    grey values. Solved by conjugate gradients, so that no matrix of all views is needed."""
+    grey values; first : what to start from. Solved by conjugate gradients, so that no matrix of all views is needed."""
     from scipy.sparse.linalg import LinearOperator, cg
 
-    shape, prior = (n_views, terms.shape[1]), noise / TREND_SIGMA**2
+    shape, n_views, prior = first.shape, len(first), noise / TREND_SIGMA**2
     weighted = terms * weight[:, None]
 
     def summed(values: FloatArray) -> FloatArray:
@@ -237,7 +237,7 @@ def _fitted(found: Greys, terms: FloatArray, weight: FloatArray, noise: float, n
     size = n_views * shape[1]
     right = summed(weighted * (found.grey - found.common(found.grey, weight))[:, None]).ravel()
     trends, _ = cg(
-        LinearOperator((size, size), matvec=normal, dtype=float), right, rtol=PRECISION,
+        LinearOperator((size, size), matvec=normal, dtype=float), right, first.ravel(), rtol=PRECISION,
         M=LinearOperator(
             (size, size), matvec=lambda v: np.einsum("ikl,il->ik", inverse, v.reshape(shape)).ravel(), dtype=float
         ),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.curve import GOOD
 from zlocus.matching.refine import smoothed
 from zlocus.matching.selection import Ranking, rank_views
 from zlocus.matching.setup import MatchScene
@@ -89,11 +90,35 @@ class RankedPoints:
         inside = ((ranking.xy >= first) & (ranking.xy < first + size)).all(axis=1)
         return cls(ties[ranking.tie[inside]], ranking.labels[inside], np.array(views, np.int64))
 
-    def rows(self, n_views: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int16]]:
-        """A row per point and reference: its xyz (m, 3) m, reference (m,), labels (m, n_views), `NOT_RANKED` where the
-        image is the reference or was not compared."""
+    def rows(self, n_views: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int32], NDArray[np.int16]]:
+        """A row per point and reference: its xyz (m, 3) m, reference (m,), how many labels are good (m,), labels
+        (m, n_views), `NOT_RANKED` where the image is the reference or was not compared."""
         n, k = self.labels.shape[:2]
         labels = np.full((n, k, n_views), NOT_RANKED, np.int16)
-        labels[:, :, self.views] = self.labels
-        labels[:, np.arange(k), self.views] = NOT_RANKED
-        return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), labels.reshape(n * k, n_views)
+        labels[:, :, self.views] = self._of_others()
+        return *self._references(), labels.reshape(n * k, n_views)
+
+    def texts(
+        self, names: Sequence[str]
+    ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int32], NDArray[np.object_]]:
+        """The same for scenes of very many images: labels as NAME=LABEL of those that were compared, with commas
+        between, (m,). names : of the scene's images; a comma in one becomes a blank."""
+        mine = [names[number].replace(",", " ") for number in self.views]
+        rows = self._of_others().reshape(-1, len(mine)).tolist()
+        texts = [
+            ",".join(f"{name}={label}" for name, label in zip(mine, row, strict=True) if label != NOT_RANKED)
+            for row in rows
+        ]
+        return *self._references(), np.array(texts, dtype=object)
+
+    def _of_others(self) -> NDArray[np.int8]:
+        """Labels (n, k, k), none of an image against itself."""
+        labels, itself = self.labels.copy(), np.arange(len(self.views))
+        labels[:, itself, itself] = NOT_RANKED
+        return labels
+
+    def _references(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int32]]:
+        """Of every point and reference its xyz, the reference, and how many labels are good."""
+        n, k = self.labels.shape[:2]
+        n_good = (self._of_others() == GOOD).sum(axis=2).astype(np.int32)
+        return np.repeat(self.xyz, k, axis=0), np.tile(self.views, n), n_good.reshape(n * k)

@@ -26,7 +26,9 @@ from zlocus.sensors.model import FloatArray
 Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
 LABELS = ("good", "fair", "poor")
 # Columns of labels begin so.
-LABEL = "label_"
+LABEL, TEXT = "label_", "labels"
+# Images that have a column each; the labels of more are one text: SQLite has no more than 2000 columns.
+MOST_COLUMNS = 100
 
 
 def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: VerticalDatum = ELLIPSOIDAL) -> None:
@@ -92,30 +94,39 @@ def write_ranking(
     """Layer `ranking`: one 3-D point per ranked tie point and reference, from south-west to north-east.
 
     Columns: reference; height_m; n_good, search images labelled 1 there; label_NAME of every image, NULL where it is
-    the reference or was not compared. names : of the scene's images. vertical : what the heights written are above;
-    points where its raster has no value are left out.
+    the reference or was not compared; of more than `MOST_COLUMNS` images instead labels, NAME=LABEL of those that were
+    compared, with commas between. names : of the scene's images. vertical : what the heights written are above; points
+    where its raster has no value are left out.
 
     Raises
     ------
     OutputError
         Where the file cannot be written.
     """
-    parts = [part.rows(len(names)) for part in ranked]
-    nothing = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, len(names)), np.int16))
-    xyz, reference, labels = (np.concatenate(arrays) for arrays in zip(nothing, *parts, strict=True))
+    is_wide = len(names) <= MOST_COLUMNS
+    parts = [part.rows(len(names)) if is_wide else part.texts(names) for part in ranked]
+    labels_of_none = np.zeros((0, len(names)), np.int16) if is_wide else np.zeros(0, object)
+    nothing = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int32), labels_of_none)
+    xyz, reference, n_good, labels = (np.concatenate(arrays) for arrays in zip(nothing, *parts, strict=True))
     xyz = vertical.of_points(xyz, crs)
     order = np.lexsort((reference, xyz[:, 1], xyz[:, 0]))
     order = order[np.isfinite(xyz[order, 2])]
-    xyz, reference, labels = xyz[order], reference[order], labels[order]
+    xyz, reference, n_good, labels = xyz[order], reference[order], n_good[order], labels[order]
     columns: dict[str, NDArray[np.generic]] = {
-        "reference": np.array(names, dtype=object)[reference],
-        "height_m": xyz[:, 2],
-        "n_good": (labels == GOOD).sum(axis=1).astype(np.int32),
-    }
+        "reference": np.array(names, dtype=object)[reference], "height_m": xyz[:, 2], "n_good": n_good,
+    }  # fmt: skip
     nulls = {}
-    for i, name in enumerate(column_names(names)):
-        columns[name], nulls[name] = labels[:, i].copy(), labels[:, i] == NOT_RANKED
+    if is_wide:
+        for i, name in enumerate(column_names(names)):
+            columns[name], nulls[name] = labels[:, i].copy(), labels[:, i] == NOT_RANKED
+    else:
+        columns[TEXT] = labels
     write_points(path, "ranking", xyz, columns, vertical.compound(crs), nulls)
+
+
+def labels_in(text: str) -> dict[str, int]:
+    """Labels by the names of images, of the column `TEXT`."""
+    return {name: int(label) for name, _, label in (part.rpartition("=") for part in text.split(",") if part)}
 
 
 def column_names(names: Sequence[str]) -> list[str]:

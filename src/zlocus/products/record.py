@@ -124,7 +124,7 @@ def read_record(path: Path) -> dict[str, Any]:
     InputError
         It is damaged.
     """
-    found = read_json(path)
+    found = read_json(path, again="Make the surface again.")
     if not isinstance(found, dict):
         raise InputError(f"{path} holds no JSON object. Make the surface again.")
     return found

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.errors import InputError
 from zlocus.matching.curve import FAIR, GOOD, POOR
 from zlocus.options import RunConfig
-from zlocus.products.points import LABEL, LABELS, column_names
+from zlocus.products.points import LABEL, LABELS, TEXT, column_names, labels_in
 from zlocus.products.report.words import NONE, STAGES, number, percent, seconds, whole_percent
 
 # Poor to good, blue and orange being told apart by all eyes.
@@ -149,19 +150,37 @@ def label_matrix(path: Path, names: Sequence[str]) -> Matrix | None:
     except (DataSourceError, DataLayerError) as error:
         raise InputError(f"{path} cannot be read: {error}. Make the surface again.") from error
     held = dict(zip((str(name) for name in meta["fields"]), columns, strict=True))
-    columns_of = column_names(names)
-    if set(columns_of) != {name for name in held if name.startswith(LABEL)}:
+    counts = _counts_of_texts(held, names) if TEXT in held else _counts_of_columns(held, names)
+    if counts is None:
         return None
-    rows = []
-    for reference in names:
-        mine = held["reference"] == reference
-        rows.append(
-            tuple(
-                _label_cell(reference, name, [int((held[column][mine] == label).sum()) for label in (GOOD, FAIR, POOR)])
-                for name, column in zip(names, columns_of, strict=True)
-            )
-        )
+    rows = (tuple(_label_cell(a, b, counts[i, j].tolist()) for j, b in enumerate(names)) for i, a in enumerate(names))
     return Matrix(tuple(names), tuple(rows))
+
+
+def _counts_of_columns(held: Mapping[str, Any], names: Sequence[str]) -> NDArray[np.int64] | None:
+    """How often each label was given (i, i, 3), of search image (second) against reference; None of other images."""
+    columns = column_names(names)
+    if set(columns) != {name for name in held if name.startswith(LABEL)}:
+        return None
+    counts = np.zeros((len(names), len(names), len(LABELS)), np.int64)
+    for i, reference in enumerate(names):
+        mine = held["reference"] == reference
+        for j, column in enumerate(columns):
+            counts[i, j] = [(held[column][mine] == label).sum() for label in (GOOD, FAIR, POOR)]
+    return counts
+
+
+def _counts_of_texts(held: Mapping[str, Any], names: Sequence[str]) -> NDArray[np.int64] | None:
+    """The same where labels are texts."""
+    place = {name.replace(",", " "): i for i, name in enumerate(names)}
+    counts = np.zeros((len(names), len(names), len(LABELS)), np.int64)
+    for reference, text in zip(held["reference"], held[TEXT], strict=True):
+        for name, label in labels_in(text).items():
+            i, j = place.get(reference.replace(",", " ")), place.get(name)
+            if i is None or j is None or label not in (GOOD, FAIR, POOR):
+                return None
+            counts[i, j, (GOOD, FAIR, POOR).index(label)] += 1
+    return counts
 
 
 def sampled_matrix(pairs: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Matrix | None:
