@@ -237,7 +237,7 @@ def read_kept() -> list[dict[str, str]]:
 
 
 def draw(path: Path) -> None:
-    """Curves of what is kept: against area, workers, images of the same ground, and images of a growing block."""
+    """Curves of what is kept: against area, and against the images of a growing block."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -254,34 +254,27 @@ def draw(path: Path) -> None:
     ink, accent, second = "#222222", "#c0392b", "#1f618d"
     style = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": ink}
     with mpl.rc_context(style):
-        figure, axes = plt.subplots(2, 2, figsize=(8.0, 5.6), layout="constrained")
+        figure, axes = plt.subplots(1, 3, figsize=(10.0, 3.0), layout="constrained")
         area = lines("workers", workers=2)
         for values, colour, label in ((area["cpu_s"], accent, "all"), (area["match_cpu_s"], second, "matching")):
-            axes[0, 0].semilogx(area["million"], values / area["million"], "o-", color=colour, label=label)
-        axes[0, 0].set(xlabel="million cells, six images", ylabel="CPU, s per million cells", ylim=(0, None))
-        axes[0, 1].semilogx(area["million"], area["worker_mb"] / 1e3, "o-", color=accent, label="a worker")
-        axes[0, 1].semilogx(area["million"], area["command_mb"] / 1e3, "o-", color=second, label="the command")
-        axes[0, 1].set(xlabel="million cells, six images", ylabel="most memory, GB", ylim=(0, None))
-        views = lines("views")
-        for values, colour, label in (
-            (views["match_cpu_s"] / views["million"], second, "matching, CPU s per million cells"),
-            (views["orient_s"], accent, "orientation, s"),
-        ):
-            axes[1, 0].loglog(views["n_views"], values, "o-", color=colour, label=label)
-        axes[1, 0].set(xlabel="images of the same million cells", xticks=views["n_views"])
+            axes[0].semilogx(area["million"], values / area["million"], "o-", color=colour, label=label)
+        axes[0].set(xlabel="million cells, six images", ylabel="CPU, s per million cells", ylim=(0, None))
+        axes[1].semilogx(area["million"], area["worker_mb"] / 1e3, "o-", color=accent, label="a worker")
+        axes[1].semilogx(area["million"], area["command_mb"] / 1e3, "o-", color=second, label="the command")
+        axes[1].set(xlabel="million cells, six images", ylabel="most memory, GB", ylim=(0, None))
         block = lines("block")
-        axes[1, 1].semilogx(
+        axes[2].semilogx(
             block["n_views"], block["orient_s"] / block["n_views"], "o-", color=accent, label="orientation, s per image"
         )
-        axes[1, 1].semilogx(
+        axes[2].semilogx(
             block["n_views"],
             block["match_cpu_s"] / block["million"],
             "o-",
             color=second,
             label="matching, CPU s per million cells",
         )
-        axes[1, 1].set(xlabel="images of a growing block", ylim=(0, None), xticks=block["n_views"])
-        for axis in axes.flat:
+        axes[2].set(xlabel="images of a growing block", ylim=(0, None), xticks=block["n_views"])
+        for axis in axes:
             axis.xaxis.set_major_formatter("{x:g}")
             axis.minorticks_off()
             axis.legend(frameon=False)

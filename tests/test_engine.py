@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 import pytest
 
-from worker_tasks import Planted, Sleeping
+from worker_tasks import Hungry, Planted, Sleeping
 from zlocus.errors import GeometryError, InputError
 from zlocus.execution.engine import ATTEMPTS, Cause, Here, Outcome, failure_of, run_tasks
 from zlocus.execution.processes import ONE_THREAD, Processes
@@ -63,6 +64,15 @@ def test_a_task_that_passes_at_last(tmp_path):
     outcomes = run(Planted(tmp_path, kill=(2,), exhaust=(4,), passes_after=ATTEMPTS - 1), range(6), 2)
     assert {n: o.result[0] for n, o in final(outcomes).items()} == {n: n * n for n in range(6)}
     assert sum(o.failure is not None for o in outcomes) == 2 * (ATTEMPTS - 1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc and limits of memory, which Linux has")
+def test_a_worker_that_runs_out_of_memory_works_on(tmp_path):
+    ends = final(run(Hungry(3), range(8), 2))
+    assert {n for n, o in ends.items() if o.failure} == {3}
+    assert ends[3].failure.cause is Cause.MEMORY
+    assert ends[3].attempt == ATTEMPTS
+    assert {n: o.result for n, o in ends.items() if n != 3} == {n: n for n in range(8) if n != 3}
 
 
 def test_a_worker_that_is_killed_costs_its_task_only(tmp_path):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -280,6 +282,45 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
     monkeypatch.undo()
     run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
     assert same(tmp_path / "out", straight)
+
+
+SMALL_DISK = """
+mount -t tmpfs -o size={small} tmpfs {disk} || exit 99
+{command}
+echo "exit status $?"
+ls {disk}/out/tiles | grep -c npz
+mount -o remount,size=64m {disk} || exit 99
+{command}
+echo "exit status $?"
+cp {disk}/out/*.tif {kept}
+ls -A {disk}/out {disk}
+"""
+
+
+@pytest.mark.parametrize(("small", "said"), [("450k", "tiles cannot be written"), ("900k", "cannot be written")])
+def test_a_small_disk_that_fills_and_grows(images, straight, tmp_path, small, said):
+    """A file system in memory, first too small for the tiles, or for the rasters beside them."""
+    disk, kept = tmp_path / "disk", tmp_path / "kept"
+    disk.mkdir()
+    kept.mkdir()
+    words = shlex.join(command(images("sine"), disk / "out", tmp_path, "--workers", "1"))
+    script = SMALL_DISK.format(small=small, disk=disk, command=words, kept=kept)
+    alone = shutil.which("unshare")
+    if alone is None:
+        pytest.skip("needs unshare, to mount a file system of its own")
+    done = subprocess.run([alone, "--map-root-user", "--mount", "sh", "-c", script], capture_output=True, text=True,
+                          check=False)  # fmt: skip
+    if done.returncode == 99 or "unshare" in done.stderr:
+        pytest.skip(f"no file system can be mounted here: {done.stderr.strip()[-200:]}")
+    assert re.findall(r"exit status (\d+)", done.stdout) == ["3", "0"], done.stderr
+    assert said in done.stderr
+    assert "No space left on device" in done.stderr
+    assert int(done.stdout.split("exit status 3\n")[1].split()[0]) > 2
+    assert "are there already" in done.stderr
+    assert same(kept, straight)
+    assert not [
+        name for name in done.stdout.split("exit status 0")[1].split() if name.startswith(".") or name == "tiles"
+    ]
 
 
 def test_a_plain_script_may_use_processes(images, straight, tmp_path):

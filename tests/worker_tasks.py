@@ -8,6 +8,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from zlocus.errors import InputError
 
 
@@ -49,6 +51,25 @@ class Planted:
         """How often a number was tried."""
         counted = self.folder / str(number)
         return counted.stat().st_size if counted.exists() else 0
+
+
+@dataclass(frozen=True)
+class Hungry:
+    """Takes more memory than its process may have, for one number."""
+
+    number: int
+    more_mb: int = 300
+
+    def __call__(self, number: int) -> int:
+        """The number."""
+        import resource
+
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (held + self.more_mb * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        try:
+            return int(np.ones((self.more_mb + 100 if number == self.number else 1) * 2**20, np.uint8)[0]) * number
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
 @dataclass(frozen=True)

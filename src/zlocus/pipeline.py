@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from zlocus.errors import CoverageError, GeometryError, ZlocusError
+from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.events import EventLog
@@ -87,14 +87,25 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     ------
     InputError, ConfigError, GeometryError, OutputError
         Before the first tile, for what cannot be used.
+    StoppedError
+        Afterwards, where tiles fail or what was found cannot be written; finished tiles are kept.
     CoverageError
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
-    with compressing(request.workers or cores()):
-        return _run_dsm(request, config, progress)
+    kept: list[TileStore] = []
+    try:
+        with compressing(request.workers or cores()):
+            return _run_dsm(request, config, progress, kept)
+    except OutputError as error:
+        if not any(store.finished for store in kept):
+            raise
+        raise StoppedError(
+            f"{error} The {len(kept[0].finished)} finished tiles are kept: give the same command again to go on."
+        ) from error
 
 
-def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
+def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: list[TileStore]) -> DsmResult:
+    """See `run_dsm`. kept : becomes where the tiles are, once they are made."""
     watch = Stopwatch()
     check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):
@@ -120,6 +131,7 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmR
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, corrected, orientation, z_range, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
+        kept.append(opened.store)
         matching.check(failed, request.partial)
         with watch.stage("write"):
             _forget(out)
