@@ -6,7 +6,7 @@
 
 Formats are those of `damage_cases.CASES`. What a reader must do is what `test_damage` asks for: an answer or a
 `ZlocusError` of one sentence, in time and memory. Inputs that reach code of their own are kept, the smallest first, in
-`tests/fuzz_seeds/FORMAT`; those that fail too, as `fail-...`. `test_fuzz_seeds` reads them all again.
+`tests/fuzz_seeds/FORMAT`; those that fail too, as `fail-...`.
 """
 
 from __future__ import annotations

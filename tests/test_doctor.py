@@ -147,7 +147,7 @@ def test_the_plan_is_what_a_run_does(good, tmp_path):
     assert plan["step_m"] == pytest.approx(done["heights"]["step_m"], abs=1e-3)
     # Three images of about 150 x 147 pixels of 0.5 m.
     assert plan["view_cells"] == pytest.approx(3 * 150 * 147, rel=0.05)
-    assert plan["seconds"] == pytest.approx(CELL_S * 150 * 147 + VIEW_CELL_S * plan["view_cells"], rel=0.2)
+    assert plan["seconds"] == pytest.approx(CELL_S * 150 * 147 + VIEW_CELL_S * plan["view_cells"], rel=0.5)
     assert f"{plan['shape'][0]} x {plan['shape'][1]} cells" in text
     assert "rough estimate" in text
 
