@@ -24,7 +24,6 @@ from zlocus.doctor.plan import RunPlan, plan_findings
 from zlocus.doctor.quality import MOST_WINDOWS, SIDE_PX, image_quality, sample_windows
 from zlocus.doctor.ties import tie_findings
 from zlocus.errors import InputError
-from zlocus.execution.plan import CELL_S, VIEW_CELL_S
 from zlocus.io.scene_file import open_scene, open_usable
 from zlocus.options import OrientationOptions
 from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
@@ -139,7 +138,9 @@ def test_the_plan_is_what_a_run_does(good, tmp_path):
     status, text, report = doctor(
         tmp_path / "doctor", *good.values(), "--resolution", GSD_M, "--heights", *heights, "--crs", "EPSG:32632",
     )  # fmt: skip
-    done = json.loads((run(tuple(good.values()), tmp_path / "dsm", heights=heights).out / "run.json").read_text())
+    out = run(tuple(good.values()), tmp_path / "dsm", heights=heights).out
+    done = json.loads((out / "run.json").read_text())
+    began = json.loads((out / "events.jsonl").read_text().splitlines()[0])
     plan = report["plan"]
     assert status == 0
     assert plan["shape"] == done["grid"]["shape"]
@@ -147,7 +148,9 @@ def test_the_plan_is_what_a_run_does(good, tmp_path):
     assert plan["step_m"] == pytest.approx(done["heights"]["step_m"], abs=1e-3)
     # Three images of about 150 x 147 pixels of 0.5 m.
     assert plan["view_cells"] == pytest.approx(3 * 150 * 147, rel=0.05)
-    assert plan["seconds"] == pytest.approx(CELL_S * 150 * 147 + VIEW_CELL_S * plan["view_cells"], rel=0.5)
+    assert began["event"] == "began"
+    assert plan["seconds"] == pytest.approx(began["seconds"], rel=1e-3)
+    assert plan["n_tiles"] == began["n_tiles"]
     assert f"{plan['shape'][0]} x {plan['shape'][1]} cells" in text
     assert "rough estimate" in text
 

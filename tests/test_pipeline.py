@@ -425,7 +425,9 @@ def test_memory_limits_the_tiles_at_a_time(images, tmp_path):
     assert not (tmp_path / "out").exists()
     # This process and a tile, not two workers.
     enough = held_bytes() / 1e9 + 0.4
-    assert run(images("sine"), tmp_path / "out", workers=2, memory_gb=enough, bounds=PART).coverage > 0.99
+    out = tmp_path / "out"
+    assert run(images("sine"), out, SMALL_TILES, workers=2, memory_gb=enough, bounds=PART).coverage > 0.99
+    assert json.loads((out / "events.jsonl").read_text().splitlines()[0])["slots"] == 1
 
 
 def test_too_little_matched_keeps_the_products(images, tmp_path):
