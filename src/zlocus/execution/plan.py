@@ -10,7 +10,7 @@ from zlocus.matching.setup import MatchScene
 from zlocus.options import PyramidOptions, RunConfig
 from zlocus.tile import windows_of
 
-# Of a core, per cell, and more for each view that is compared (benchmarks/README.md, "Growth").
+# Of a core, per cell, and more for each view that is compared (docs/large.md, "Growth").
 CELL_S, VIEW_CELL_S = 1.5e-6, 0.45e-6
 # Of a tile at its largest: per cell; per cell and step of heights; per cell and view that is compared; per pixel of
 # those views' windows.
