@@ -9,7 +9,7 @@ ifneq ($(TEST_DATA),)
 export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
 endif
 
-.PHONY: demo docs test test-minimum lint bench acceptance acceptance-all clean
+.PHONY: demo docs test test-minimum audit lint bench acceptance acceptance-all clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -35,6 +35,10 @@ test-minimum: $(STAMP)
 	    print(*(d.split(",")[0].replace(">=", "==") for d in project["dependencies"]), sep="\n")' > $(MINIMUM)/versions.txt
 	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[dev]'
 	$(MINIMUM)/bin/python -m pytest -n 2
+
+# Known vulnerabilities of what is installed, from the package registry.
+audit: $(STAMP)
+	$(BIN)/python benchmarks/audit.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ import rasterio
 import scaling
 from workplace import ZLOCUS, Figure, Workplace, rendered_images, run
 
-# Tiles of a quarter of the usual side, so that a town has many, and halos of which each is wider than the usual one.
-HALO_TILE, HALOS = 256, {"usual": 32, "twice": 64, "four times": 128}
+# Halos, in cells; a town of nine tiles; and tiles of a quarter of the usual side, so that a small town has many seams.
+USUAL_HALO, WIDER = 32, {"twice": 64, "four times": 128}
+HALO_TOWN_PX, SMALL_TILE = 3500, 256
 # Cells that a wider halo may change by more than half a height step.
 CHANGED = 1e-3
 # Cells asked for, in millions: a run of the usual size, and a large one.
@@ -22,20 +24,31 @@ GROWTH, WORKER_GB, SPEED_UP = 1.15, 4.0, 1.8
 
 def halo(at: Workplace) -> list[Figure]:
     """Share of the cells of a town that wider halos change."""
-    scene, steps, heights = at.scene("rendered-city"), {}, {}
-    for name, cells in HALOS.items():
-        out, options = at.out / name, at.out / f"{cells}.toml"
+    small = at.scene("rendered-city")
+    with tempfile.TemporaryDirectory(dir=at.out.parent) as scratch:
+        town = scaling.write_views(Path(scratch), scaling.town(), 6, HALO_TOWN_PX)
+        options = ["--crs", "EPSG:32632", *map(str, town)]
+        return [
+            *changes(at, options, None, {"twice": WIDER["twice"]}),
+            *changes(at, rendered_images(small), SMALL_TILE, WIDER),
+        ]
+
+
+def changes(at: Workplace, images: Sequence[str | Path], tile: int | None, wider: dict[str, int]) -> list[Figure]:
+    """What halos do to a town. tile : cells a side, None for the usual size."""
+    heights, step_m = {}, 0.0
+    for cells in (USUAL_HALO, *wider.values()):
+        out, options = at.out / f"halo{cells}", at.out / f"{cells}.toml"
         options.parent.mkdir(parents=True, exist_ok=True)
-        options.write_text(f"[pyramid]\ntile = {HALO_TILE}\nhalo = {cells}\n")
-        run(
-            [ZLOCUS, "dsm", *rendered_images(scene), "-o", out, "--resolution", 0.5, "--config", options, "--overwrite"]
-        )
-        heights[name], steps[name] = heights_of(out), scaling.record_of(out)["heights"]["step_m"]
-    usual = heights.pop("usual")
+        options.write_text(f"[pyramid]\nhalo = {cells}\n" + (f"tile = {tile}\n" if tile else ""))
+        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--config", options, "--overwrite"])
+        heights[cells], step_m = heights_of(out), scaling.record_of(out)["heights"]["step_m"]
+    of = f"tiles of {tile}" if tile else "usual tiles"
     return [
-        Figure(f"changed by a halo {name} as wide", changed(usual, wide, steps["usual"]), at_most=CHANGED)
-        for name, wide in heights.items()
-    ]
+        Figure(f"{of}, changed by a halo {name} as wide", changed(heights[USUAL_HALO], heights[cells], step_m),
+               at_most=CHANGED)
+        for name, cells in wider.items()
+    ]  # fmt: skip
 
 
 def changed(one: np.ndarray, other: np.ndarray, step_m: float) -> float:

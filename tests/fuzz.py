@@ -16,12 +16,13 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from itertools import accumulate
 from pathlib import Path
 
 SEEDS = Path(__file__).parent / "fuzz_seeds"
 TIMEOUT_S, MOST_MB = 20, 3000
-# Of a format, and of a seed.
-MOST_SEEDS, LARGEST_SEED = 40, 20_000
+# Of a format, of a seed, and of all seeds of a format.
+MOST_SEEDS, LARGEST_SEED, MOST_BYTES = 40, 20_000, 24_000
 MOST_TOKENS = 200
 FAILED = "fail-"
 
@@ -55,7 +56,8 @@ def fuzz_one(name: str, corpus: Path, artifacts: Path, seconds: int) -> None:
     listed = sorted(tokens)[:MOST_TOKENS] + [word.encode() for word in WORDS if 0 < len(word) < 40]
     dictionary = corpus.parent / "words.dict"
     dictionary.write_text("".join('"' + "".join(f"\\x{byte:02x}" for byte in word) + '"\n' for word in listed))
-    limits = {"max_total_time": seconds, "timeout": TIMEOUT_S, "rss_limit_mb": MOST_MB, "max_len": LARGEST_SEED}
+    limits = {"max_total_time": seconds, "timeout": TIMEOUT_S, "rss_limit_mb": MOST_MB}
+    limits["max_len"] = max(LARGEST_SEED, 2 * path.stat().st_size)
     options = {"dict": dictionary, "artifact_prefix": f"{artifacts}/", **limits}
     words = [sys.argv[0], str(corpus), *(f"-{name}={value}" for name, value in options.items())]
     atheris.Setup(words, read)
@@ -87,7 +89,8 @@ def fuzz(name: str, seconds: float) -> int:
         chosen = sorted(
             (p for p in corpus.iterdir() if p.stat().st_size <= LARGEST_SEED), key=lambda p: p.stat().st_size
         )
-        for seed in chosen[:MOST_SEEDS]:
+        sizes = accumulate(seed.stat().st_size for seed in chosen[:MOST_SEEDS])
+        for seed in (seed for seed, size in zip(chosen, sizes, strict=False) if size <= MOST_BYTES):
             (kept / seed.name).write_bytes(seed.read_bytes())
         for artifact in artifacts.iterdir():
             (kept / f"{FAILED}{artifact.name[:40]}").write_bytes(artifact.read_bytes())

@@ -20,7 +20,8 @@ from zlocus.kernels.planes import (
     segment_loci,
     solve_damped,
 )
-from zlocus.matching.planes import PlanarHeights, deviation, plain_segments, with_planes
+from zlocus.matching.contrast import deviation
+from zlocus.matching.planes import PlanarHeights, plain_segments, with_planes
 from zlocus.matching.views import TileViews
 from zlocus.options import PlaneOptions
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.ranges import LANES, ranges_nearby
+from zlocus.matching.ranges import LANES, ranges_nearby, without_spikes
 from zlocus.options import PyramidOptions
-from zlocus.tile import RIVALS_KEPT, _candidates, _without_spikes
+from zlocus.tile import RIVALS_KEPT, _candidates
 
 OPTIONS = PyramidOptions(block=16, margin_steps=6, reach=2)
 
@@ -131,7 +131,7 @@ def test_spikes_beside_cells_that_nobody_saw():
     known[:, 6:] = False
     low, high = np.full((12, 12), 40, np.float32), np.full((12, 12), 40, np.float32)
     high[2:5, 3:6], high[8, 5] = 90, 90
-    found_low, found_high = _without_spikes(low, high, known)
+    found_low, found_high = without_spikes(low, high, known)
     assert np.isnan(found_high[~known]).all()
     assert np.isnan(found_low[~known]).all()
     expected = np.full((12, 6), 40.0)

@@ -21,9 +21,9 @@ def levels_matched(monkeypatch):
     """(level, whether views may be hidden, cells by which obstacles are narrowed) of every level that is matched."""
     calls, one = [], tile._match_level
 
-    def counted(scene, pixels, window, level, guide, config, method, use_visibility, ranking):
+    def counted(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking):
         calls.append((level, use_visibility, len(guide.obstacle) // 2))
-        return one(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
+        return one(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
 
     monkeypatch.setattr(tile, "_match_level", counted)
     return calls

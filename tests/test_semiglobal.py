@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from kernel_scene import even_lattice
+from zlocus.matching.contrast import edge_unit
 from zlocus.matching.semiglobal import BEHIND, SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.options import SemiGlobalOptions
 
@@ -25,7 +26,7 @@ def test_without_an_ortho_image_penalties_are_even():
 def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
     ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
     p2 = penalties(ortho, (12, 15), 0, OPTIONS)
-    unit = 2.0 * np.median(np.abs(np.diff(ortho, axis=1)))
+    unit = 2.0 * edge_unit(ortho)
     for path, (dr, dc) in enumerate(BEHIND):
         for r in range(1, 11):
             for c in range(1, 14):

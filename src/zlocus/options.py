@@ -220,8 +220,12 @@ class SemiGlobalOptions(Checked):
         low=0.1, high=1.0,
     )  # fmt: skip
     edge_contrast: float = option(
-        0.75,
-        "Grey difference that halves the penalty of a jump, in median differences of the scene.",
+        1.2, "Grey difference that halves the penalty of a jump, in median differences of the tile.",
+        low=0.01, high=1e3,
+    )  # fmt: skip
+    edge_contrast_two: float = option(
+        4.0,
+        "The same where only two views see a cell: one pair is alike by chance at many heights.",
         low=0.01,
         high=1e3,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -11,14 +10,15 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.spline import spline_coefficients
 from zlocus.kernels.volume import HIDDEN
-from zlocus.matching.base import BaseSurface
-from zlocus.matching.border import covered_ground, shown_heights
-from zlocus.matching.cells import CellWindow
+from zlocus.matching.base import BaseSurface, CoarserBase
+from zlocus.matching.border import covered_ground, shown_heights, worth_matching
+from zlocus.matching.cells import CellWindow, on_cells
+from zlocus.matching.contrast import texture_unit
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
-from zlocus.matching.planes import PlanarHeights, texture_unit, with_planes
-from zlocus.matching.ranges import LANES, UNKNOWN, by_block, ranges_nearby
+from zlocus.matching.ortho import CoarserHeights, leading_ortho, ortho_image, true_ortho, what_stands_around
+from zlocus.matching.planes import PlanarHeights, with_planes
+from zlocus.matching.ranges import LANES, by_block, ranges_nearby, without_spikes
 from zlocus.matching.ranking import KnownGround, ranked_at_ties
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
@@ -36,7 +36,17 @@ from zlocus.matching.selection import (
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import NOTHING_HIDDEN, above_base, coverage, covers, hide, left_out, sees, spare_pairs
+from zlocus.matching.visibility import (
+    NOTHING_HIDDEN,
+    PAIR,
+    above_base,
+    coverage,
+    covers,
+    hide,
+    left_out,
+    sees,
+    spare_pairs,
+)
 from zlocus.options import RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
@@ -44,9 +54,7 @@ from zlocus.surface.precision import sigma_steps, signs_of_precision
 from zlocus.surface.reasons import Quality, is_empty
 from zlocus.surface.surface import Surface
 
-Value = TypeVar("Value", np.float32, np.bool_)
 RIVALS_KEPT = 128
-SEEN_MARGIN = 4
 PLAIN_IN = 2  # views in which plain segments are looked for, one after the other
 # Texture of the second sharpest view (the sharpest may be noise) over that of one that is sharp, at most.
 SHARP = 1.5
@@ -55,14 +63,14 @@ FEWEST_STEPS = 4  # to both sides of a surface, over which a match curve is look
 # What hides a cell is taken this much narrower than the guide shows it, for its edges are a coarser level's; less where
 # they are the level's own.
 OBSTACLE, OWN_OBSTACLE = np.ones((5, 5), np.uint8), np.ones((3, 3), np.uint8)
-SPIKE = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
 class LevelResult:
     """What one level hands to the next: its window, heights, and between which heights views cover and see each cell.
 
-    seen, heights and lone are in height indices of the level's lattice, whatever base surface they were found along.
+    base : what heights were searched along; of the coarsest level, what its heights give. seen, heights and lone are in
+    height indices of the level's lattice, whatever base they were found along.
     lone : (r, c) int32, heights of the least costs, each cell by itself; None at the finest level.
     evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
     is_planar : (r, c) cells whose heights are those of planes through plain segments.
@@ -71,6 +79,7 @@ class LevelResult:
     level: int
     window: CellWindow
     views: TileViews
+    base: BaseSurface
     lattice: HeightLattice
     seen: NDArray[np.int32]
     heights: SemiGlobalHeights
@@ -115,35 +124,28 @@ def match_tile(
     # is left that could tell.
     use_visibility = use_visibility and len(pixels) > 2
     coarsest = scene.levels - 1
-    window = _level_window(scene, core, coarsest, config)
-    guide = _coarsest_guide(scene, window, None)
-    ranking = _ranking(scene, pixels, core, None, config) if use_visibility else None
-    result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
+    result, guide, ranking = _match_coarsest(scene, pixels, core, config, method, use_visibility)
     done, every = result.evaluations, result.all_views
-    if BaseSurface.along(smoothed(result.heights.vertex, config.refine.jump_steps), config.pyramid.block).is_steep:
-        guide = _coarsest_guide(scene, window, result.heights.vertex)
-        ranking = _ranking(scene, pixels, core, result, config) if use_visibility else None
-        result = _match_level(scene, pixels, window, coarsest, guide, config, method, use_visibility, ranking)
-        done, every = done + result.evaluations, every + result.all_views
     ground = covered_ground(
         shown_heights(pixels, result.views, coarsest, result.lattice, -(-scene.n_steps // 2**coarsest)),
         result.seen, result.heights.vertex, (guide.low, guide.high), scene.cell_m / scene.step_m,
     )  # fmt: skip
-    worth, levels = _worth_matching(result, ground), [result]
+    worth, levels = worth_matching(result.seen, result.heights.vertex, ground, result.window), [result]
+    if not core.at_level(coarsest, 0).meets(worth):
+        return TileResult(Surface.nothing(core), done, every)
     for level in range(coarsest - 1, -1, -1):
-        window = _level_window(scene, core, level, config).within(worth.finer(coarsest - level))
-        if not (window.rows and window.cols):
-            return TileResult(Surface.nothing(core), done, every)
-        guide = Guide(_finer(result, window), *_candidates(scene, result, window, level), result)
-        result = _match_level(scene, pixels, window, level, guide, config, method, use_visibility, ranking)
+        window = _level_window(scene, core, level, config, worth.finer(coarsest - level))
+        above = 2 * on_cells(result.heights.vertex, result.window, window)
+        guide = Guide(above, *_candidates(scene, result, window, level), result)
+        result = _match_level(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
         levels.append(result)
         done, every = done + result.evaluations, every + result.all_views
     for _ in range(1, config.pyramid.finest_rounds if use_visibility else 1):
         guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
-        result = _match_level(scene, pixels, window, 0, guide, config, method, use_visibility, ranking)
+        result = _match_level(scene, pixels, core, window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
-    levels[-1] = result = result if method == "mvll" else _with_planes(result, config)
-    beyond = ~_on_cells(ground, levels[0].window, result.window, coarsest)
+    levels[-1] = result = result if method == "mvll" else _with_planes(result, core, config)
+    beyond = ~on_cells(ground, levels[0].window, result.window, coarsest)
     judged, refined = _finish(scene, pixels, result, beyond, config)
     surface = judged.precise(config.checks.most_sigma_m)
     if fill == "interpolate":
@@ -153,17 +155,24 @@ def match_tile(
     return TileResult(surface.part(core, result.window), done, every, None if ranking is None else (ranking, which))
 
 
-def _worth_matching(coarsest: LevelResult, ground: NDArray[np.bool_]) -> CellWindow:
-    """The cells, with a margin, whose ground two views see as far as the coarsest level can tell. ground : (r, c), see
-    `covered_ground`."""
-    seeing = (sees(coarsest.seen, coarsest.heights.vertex[None]).sum(axis=0) >= 2) & ground
-    rows, cols = np.flatnonzero(seeing.any(axis=1)), np.flatnonzero(seeing.any(axis=0))
-    window = coarsest.window
-    if not len(rows):
-        return CellWindow(window.row, window.col, 0, 0)
-    row, col = window.row + int(rows[0]) - SEEN_MARGIN, window.col + int(cols[0]) - SEEN_MARGIN
-    size = (int(rows[-1] - rows[0]) + 1 + 2 * SEEN_MARGIN, int(cols[-1] - cols[0]) + 1 + 2 * SEEN_MARGIN)
-    return CellWindow(row, col, *size)
+def _match_coarsest(
+    scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, config: RunConfig, method: str, use_visibility: bool
+) -> tuple[LevelResult, Guide, Ranking | None]:
+    """The coarsest level, a second time along what it found where that is steep; what guided it, and the ranking."""
+    level = scene.levels - 1
+    window = _level_window(scene, core, level, config)
+    done = every = 0
+    known: LevelResult | None = None
+    while True:
+        guide = _coarsest_guide(scene, window, None if known is None else known.heights.vertex)
+        ranking = _ranking(scene, pixels, core, known, config) if use_visibility else None
+        result = _match_level(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
+        done, every = done + result.evaluations, every + result.all_views
+        smooth = smoothed(result.heights.vertex, config.refine.jump_steps)
+        base = BaseSurface.along(smooth, config.pyramid.block)
+        if known is not None or not base.is_steep(_own_cells(core, window, level)):
+            return replace(result, base=base, evaluations=done, all_views=every), guide, ranking
+        known = result
 
 
 def _evaluations(seen: NDArray[np.int32], lattice: HeightLattice) -> int:
@@ -193,8 +202,23 @@ def rank_tile(scene: MatchScene, core: CellWindow, config: RunConfig) -> tuple[R
     return (ranked_at_ties(scene, pixels, core, None, config), which) if len(pixels) > 1 else None
 
 
-def _level_window(scene: MatchScene, core: CellWindow, level: int, config: RunConfig) -> CellWindow:
-    return core.at_level(level, config.pyramid.halo).within(scene.seen.at_level(level, 0))
+def _level_window(
+    scene: MatchScene, core: CellWindow, level: int, config: RunConfig, seen: CellWindow | None = None
+) -> CellWindow:
+    """A tile's cells at a level with their halo, where the scene or the part `seen` of it lies; from the same blocks on
+    whatever the halo, so that it may begin before that part."""
+    window = core.at_level(level, config.pyramid.halo).within(scene.seen.at_level(level, 0) if seen is None else seen)
+    row, col = (
+        first - (first - own) % config.pyramid.block
+        for first, own in ((window.row, core.row >> level), (window.col, core.col >> level))
+    )
+    return CellWindow(row, col, window.rows + window.row - row, window.cols + window.col - col)
+
+
+def _own_cells(core: CellWindow, window: CellWindow, level: int) -> tuple[slice, slice]:
+    """Rows and columns of a window that are the core's. What decides for a whole tile is asked of them alone: it does
+    not change with the halo then."""
+    return core.at_level(level, 0).within(window).slices_in(window)
 
 
 def _read(scene: MatchScene, core: CellWindow, config: RunConfig, choose: bool) -> tuple[list[ViewPixels], list[int]]:
@@ -239,6 +263,13 @@ class Guide:
     coarser: LevelResult | None = None
     obstacle: NDArray[np.uint8] = field(default_factory=lambda: OBSTACLE)
 
+    def base(self, window: CellWindow) -> CoarserBase | None:
+        """The base surface of the coarser level, beneath the cells of a window."""
+        if self.coarser is None:
+            return None
+        above = self.coarser.window
+        return CoarserBase(self.coarser.base, above.row - window.row / 2, above.col - window.col / 2)
+
 
 def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.float32] | None) -> Guide:
     """The whole range, or what a DEM leaves of it."""
@@ -246,7 +277,8 @@ def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.f
     low = np.zeros((window.rows, window.cols), np.float32)
     high = np.full((window.rows, window.cols), n_steps - 1, np.float32)
     if scene.prior is not None:
-        part = scene.prior[(slice(None), *window.slices_in(scene.seen.at_level(scene.levels - 1, 0)))]
+        seen = scene.seen.at_level(scene.levels - 1, 0)
+        part = np.stack([on_cells(bound, seen, window, 0) for bound in scene.prior])
         step = np.float32(scene.step_m * 2 ** (scene.levels - 1))
         from_dem = (part - np.float32(scene.origin_m)) / step
         low, high = (
@@ -259,6 +291,7 @@ def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.f
 def _match_level(
     scene: MatchScene,
     pixels: list[ViewPixels],
+    core: CellWindow,
     window: CellWindow,
     level: int,
     guide: Guide,
@@ -278,11 +311,12 @@ def _match_level(
     )  # fmt: skip
     block = views.block
     smooth = None if guide.surface is None else smoothed(guide.surface, config.refine.jump_steps)
-    base = BaseSurface.level(shape, block) if smooth is None else BaseSurface.along(smooth, block)
+    base = BaseSurface.level(shape, block) if smooth is None else BaseSurface.along(smooth, block, guide.base(window))
     low, high = guide.low - base.cells, guide.high - base.cells
     lattice = ranges_nearby(low, high, scene.origin_m, step, shape, config.pyramid, block)
     along_base = base.shear(views)
     seen = coverage(along_base, base, lattice)
+    covered = covers(seen)
     if guide.surface is not None and use_visibility:
         obstacle = cv2.erode(guide.surface, guide.obstacle)
         hide(seen, views, obstacle, base.cells, config.measure.hidden_margin_steps)
@@ -292,16 +326,17 @@ def _match_level(
         ground = None if guide.surface is None else guide.surface - base.cells
         used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
     done = _evaluations(used, lattice) + added
-    ortho = None if smooth is None else ortho_image(views, smooth)
+    own = _own_cells(core, window, level)
+    ortho = None if smooth is None else leading_ortho(views, smooth, covered, own)
     cost = cost_volume(along_base, base, lattice, used, config.measure)
     if method == "mvll":
         heights = alone(cost, lattice)
     else:
-        p2, step_cells = penalties(ortho, shape, level, config.semiglobal), scene.step_m / scene.cell_m
-        heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal)
+        p2 = penalties(ortho, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
+        heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal)
     lone = alone(cost, lattice).above(base.cells).best if level else None
     worth = above_base(worth, base.cells)
-    return LevelResult(level, window, views, lattice, worth, heights.above(base.cells), lone, done, all_views)
+    return LevelResult(level, window, views, base, lattice, worth, heights.above(base.cells), lone, done, all_views)
 
 
 def _needed_heights(
@@ -366,18 +401,6 @@ def _only(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLat
     return kept
 
 
-def _finer(coarser: LevelResult, window: CellWindow) -> NDArray[np.float32]:
-    """Height indices of the coarser level on the cells, and in the steps, of the finer."""
-    return 2 * _on_cells(coarser.heights.vertex, coarser.window, window)
-
-
-def _on_cells(values: NDArray[Value], source: CellWindow, target: CellWindow, levels: int = 1) -> NDArray[Value]:
-    """Values (r, c) of a level on the cells of one so many levels finer, each of a coarse cell many times."""
-    rows = np.clip(((np.arange(target.rows) + target.row) >> levels) - source.row, 0, source.rows - 1)
-    cols = np.clip(((np.arange(target.cols) + target.col) >> levels) - source.col, 0, source.cols - 1)
-    return np.ascontiguousarray(values[np.ix_(rows, cols)])
-
-
 def _candidates(
     scene: MatchScene, coarser: LevelResult, window: CellWindow, level: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -391,8 +414,8 @@ def _candidates(
     known = covers(coarser.seen).sum(axis=0) >= 2
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
     found = np.stack([heights.best, rival, coarser.lone])
-    low, high = _without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
-    low, high = (2 * _on_cells(v, coarser.window, window) for v in (low, high))
+    low, high = without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
+    low, high = (2 * on_cells(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):
         side = scene.cell_m * 2**level
         col = np.floor((scene.ties[:, 0] - scene.anchor[0]) / side).astype(int) - window.col
@@ -404,33 +427,17 @@ def _candidates(
     return low, high
 
 
-def _without_spikes(
-    low: NDArray[np.float32], high: NDArray[np.float32], known: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest candidates that 3 x 3 cells share (a closing and an opening), NaN where not `known`.
-
-    A false height of a cell or two would widen the range of a whole block; a tower has more cells, and tie points are
-    added later.
-    """
-    far = UNKNOWN
-    top = cv2.erode(np.where(known, high, far), SPIKE)
-    top = cv2.dilate(np.where(known, top, -far), SPIKE)
-    floor = cv2.dilate(np.where(known, low, -far), SPIKE)
-    floor = cv2.erode(np.where(known, floor, far), SPIKE)
-    nothing = np.float32(np.nan)
-    return np.where(known, np.minimum(floor, top), nothing), np.where(known, np.maximum(floor, top), nothing)
-
-
-def _with_planes(result: LevelResult, config: RunConfig) -> LevelResult:
+def _with_planes(result: LevelResult, core: CellWindow, config: RunConfig) -> LevelResult:
     """The finest level with planes where the leading views show plain segments, of those that are sharp enough to
     tell a plain roof from a blurred one."""
     heights = result.heights
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
-    units = [texture_unit(ortho_image(result.views, planar.height, view)) for view in range(len(result.views.layout))]
+    own, n_views = _own_cells(core, result.window, 0), len(result.views.layout)
+    units = [texture_unit(ortho_image(result.views, planar.height, view), own) for view in range(n_views)]
     sharp = [view for view, unit in enumerate(units) if unit * SHARP > sorted(units)[-2]]
     for view in sharp[:PLAIN_IN]:
         ortho = ortho_image(result.views, planar.height, view)
-        planar = with_planes(result.views, ortho, planar, result.seen, config.planes)
+        planar = with_planes(result.views, ortho, planar, result.seen, config.planes, own)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
 
 

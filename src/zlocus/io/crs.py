@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
 from zlocus.errors import ConfigError, InputError
-from zlocus.io.text import shown
+from zlocus.io.text import AGAIN, LARGEST, shown
 from zlocus.sensors.space import WGS84, between
 
 LOCAL = (
@@ -19,6 +20,7 @@ LOCAL = (
 )
 # Semi-major axis, and by how much those of ellipsoids and spheres in use differ.
 EARTH_M, EARTHS_DIFFER_M = 6378137.0, 3e4
+LONGEST_NAME = 80
 
 
 def local_frame() -> CRS:
@@ -54,11 +56,12 @@ def checked_crs(crs: CRS) -> CRS:
     """
     flat = crs.to_2d()
     advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
+    named = f"The CRS {shown(crs.to_string())} ({crs.name[:LONGEST_NAME]})"
     if not flat.is_projected:
         kind = "geographic (degrees)" if flat.is_geographic else "not projected"
-        raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is {kind}. {advice}, or leave --crs out.")
+        raise ConfigError(f"{named} is {kind}. {advice}, or leave --crs out.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
-        raise ConfigError(f"The CRS {crs.to_string()} ({crs.name}) is in {flat.axis_info[0].unit_name}. {advice}.")
+        raise ConfigError(f"{named} is in {flat.axis_info[0].unit_name}. {advice}.")
     if not is_on_earth(flat):
         raise ConfigError(f"The CRS {shown(crs.to_string())} cannot be converted to places on the Earth. {advice}.")
     return flat
@@ -71,13 +74,17 @@ def utm_zone(lon: float, lat: float) -> CRS:
 
 
 def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:
-    """The CRS of an open raster.
+    """The CRS of an open raster, whose cells lie somewhere in it.
 
     Raises
     ------
     InputError
-        Where it has none, or one that is no place on the Earth.
+        Where it has none, or one that is no place on the Earth, or cells have no place or no size.
     """
+    transform = source.transform
+    steps = (*transform[:6], *(~transform)[:6]) if transform.determinant else (math.nan,)
+    if not all(abs(step) <= LARGEST for step in steps):
+        raise InputError(f"The cells of {path} lie nowhere: its transform is {tuple(transform)[:6]}. {AGAIN}")
     if source.crs is None:
         raise InputError(f"{path} has no CRS, so its place on the ground is unknown. Assign one (gdal_edit -a_srs).")
     return known_crs(source.crs, path)

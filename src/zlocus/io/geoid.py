@@ -14,7 +14,6 @@ from rasterio.windows import Window
 from zlocus.errors import InputError
 from zlocus.io.crs import named_crs, raster_crs
 from zlocus.io.opening import check_complete, open_raster
-from zlocus.io.text import AGAIN
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.space import between
 
@@ -59,8 +58,6 @@ class GeoidRaster:
             if (unit := (source.units[0] or "").lower()) not in METRES:
                 raise InputError(f"The undulations of {path} are in {unit}. Convert them to metres.")
             transform, shape = source.transform, (source.height, source.width)
-            if not (np.isfinite(transform[:6]).all() and transform.determinant):
-                raise InputError(f"The posts of {path} lie nowhere: its transform is {tuple(transform)[:6]}. {AGAIN}")
         turns = crs.is_geographic and transform.b == transform.d == 0
         around = 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor
         return cls(Path(path), crs, transform, shape, around / abs(transform.a) if turns else None)

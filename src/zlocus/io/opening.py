@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import re
 import threading
@@ -26,6 +27,8 @@ BLOCK_CACHE_BYTES = 128 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Its place in a TIFF alone.
 LEAST_BLOCK_BYTES = 4
+# Of a block, that is read whatever stands for it; beyond, as many times what the file holds.
+LARGE_BLOCK_BYTES, DENSEST = 256 << 20, 10_000
 KEPT_OPEN = 32  # rasters of a thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
 # GDAL's virtual files that are read: those of servers, as they are. None within an archive.
@@ -119,7 +122,7 @@ def _opened(path: Path) -> rasterio.DatasetReader:
         with _quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             # `rasterio.open` takes one format only.
-            return rasterio.DatasetReader(gdal_name(path), driver=_drivers(path.suffix.lower() == ".vrt"))
+            dataset = rasterio.DatasetReader(gdal_name(path), driver=_drivers(path.suffix.lower() == ".vrt"))
     except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
         if not is_remote(path) and first_bytes(path).lstrip().startswith(b"<VRTDataset"):
             raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
@@ -127,6 +130,22 @@ def _opened(path: Path) -> rasterio.DatasetReader:
             f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
             "GeoTIFF (or another format of GDAL)."
         ) from error
+    if not is_remote(path):
+        _check_block(dataset, path)
+    return dataset
+
+
+def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
+    """A block of pixels is read as one, in memory, however few bytes stand for it."""
+    bands = source.count if source.interleaving == Interleaving.pixel else 1
+    n_bytes = math.prod(source.block_shapes[0]) * bands * np.dtype(source.dtypes[0]).itemsize if source.count else 0
+    length = os.path.getsize(path)
+    if source.driver in ("GTiff", "COG") and n_bytes > max(LARGE_BLOCK_BYTES, DENSEST * length):
+        source.close()
+        raise InputError(
+            f"{path} is damaged: it says that it has blocks of {n_bytes / 1e9:.1f} GB of pixels, in {length} bytes. "
+            "Copy it again from its source."
+        )
 
 
 @functools.cache

@@ -17,7 +17,7 @@ from rasterio.features import rasterize
 from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
 
-from zlocus.errors import InputError
+from zlocus.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, known_crs, raster_crs
 from zlocus.io.heights import check_unit, is_fill
 from zlocus.io.opening import ARCHIVES, existing_file, first_bytes, is_remote, open_raster
@@ -33,6 +33,7 @@ from zlocus.io.vertical import (
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200
+LONGEST = 300  # of what a library says, characters
 # Formats of vector files that hold their polygons themselves.
 VECTORS = ("ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
            "OpenFileGDB", "SQLite", "TopoJSON")  # fmt: skip
@@ -55,7 +56,10 @@ def read_geobox(path: Path) -> GeoBox:
         transform = source.transform
         if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
             raise InputError(f"{path} is rotated or not north-up, so it cannot be the grid. Warp it first (gdalwarp).")
-        return GeoBox(source.shape, transform, checked_crs(crs).to_string())
+        try:
+            return GeoBox(source.shape, transform, checked_crs(crs).to_string())
+        except ConfigError as error:
+            raise ConfigError(f"No surface lies on the grid of {path}. {error}") from error
 
 
 def read_dem(
@@ -138,9 +142,13 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
             meta, _, wkb, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
             polygons = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # pyogrio's own are of these kinds
-        why = "some text in it is not UTF-8" if isinstance(error, UnicodeError) else " ".join(str(error).split())
+        why = (
+            "some text in it is not UTF-8"
+            if isinstance(error, UnicodeError)
+            else " ".join(str(error).split())[:LONGEST]
+        )
         raise InputError(
-            f"{path} cannot be read as vector file: {why}. Give GeoJSON, GeoPackage or Shapefile."
+            f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
         ) from error
     polygons = polygons[~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)]
     if not len(polygons) or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
@@ -171,6 +179,8 @@ def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDAr
     """
     out = np.full(tuple(geobox.shape), np.nan, np.float32)
     bounds = transform_bounds(grid_crs(geobox).to_wkt(), crs.to_wkt(), *geobox.boundingbox.bbox)
+    if not np.isfinite(bounds).all():
+        return out
     corners = [~source.transform * (x, y) for x in bounds[::2] for y in bounds[1::2]]
     # Two cells more on each side, for the bilinear neighbours.
     low = np.clip(np.floor(np.min(corners, axis=0)).astype(int) - 2, 0, (source.width, source.height))

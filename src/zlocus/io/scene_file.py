@@ -431,6 +431,6 @@ def _camera(value: Any, path: Path, where: str) -> Any:
     if not isinstance(value, dict):
         return value
     kind = value.get("kind")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(f"{path}: {where}.kind is {kind!r}. Allowed: {', '.join(KINDS)}.")
     return validated(KINDS[kind], value, path, where)

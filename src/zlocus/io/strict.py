@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from zlocus.errors import InputError
-from zlocus.io.text import LARGEST, is_decimal
+from zlocus.io.text import LARGEST, is_decimal, shown
 
 
 def _plain(value: Any) -> Any:
@@ -33,7 +33,7 @@ class StrictModel(BaseModel):
     def _refuse_unknown_keys(cls, value: Any) -> Any:
         allowed = {name: field.alias or name for name, field in cls.model_fields.items()}
         if isinstance(value, dict):
-            unknown = [str(key) for key in value if key not in allowed and key not in allowed.values()]
+            unknown = [_key(key) for key in value if key not in allowed and key not in allowed.values()]
             if unknown:
                 raise ValueError(f"unknown key {', '.join(unknown)[:80]}; allowed here: {', '.join(allowed.values())}")
         return value
@@ -64,7 +64,7 @@ def validated(model: type[Document], document: Any, path: Path, where: str = "")
         first = error.errors()[0]
         key = where
         for part in first["loc"]:
-            key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+            key += f"[{part}]" if isinstance(part, int) else f".{_key(part)}" if key else _key(part)
         if first["type"] == "missing":
             raise InputError(f"{path}: the key {key} is missing. Add it.") from error
         message = first["msg"].removeprefix("Value error, ")
@@ -78,8 +78,14 @@ def _empty_key(document: Any) -> str | None:
         return None
     for key, value in document.items():
         if value is None:
-            return str(key)
+            return _key(key)
         inside = _empty_key(value)
         if inside is not None:
-            return f"{key}.{inside}"
+            return f"{_key(key)}.{inside}"
     return None
+
+
+def _key(key: Any) -> str:
+    """A key as a message shows it: in one line, and only the beginning of a long one."""
+    text = str(key)
+    return text if text.isprintable() and len(text) <= SHORT.maxstring else shown(text)

@@ -4,6 +4,10 @@ Level windows see a slope as a step per cell, and the semi-global constraint mak
 the slopes of the coarser level's surface (medians over patches, which jumps do not touch) and none of its jumps; height
 index k then means k steps above the base. It is continuous and bilinear between the corners of patches, so neighbours
 are still compared by height. It follows no building: where slopes are small it is nearly level.
+
+It must not depend on how the ground is cut into tiles either, for where it lies decides at which heights views are
+compared. So a level takes the base of the level above and mends it with the patches nearby alone, and corners lie whole
+steps high: what differs a little in two tiles makes no difference then.
 """
 
 from __future__ import annotations
@@ -20,8 +24,28 @@ from zlocus.matching.views import TileViews
 
 PATCH = 8
 SLOPE_REACH = 4
-ANCHOR = 1e-3
+ROUNDS, DAMPING = 6, 0.8
+# Patches to every side of a corner whose heights say how high it lies at the coarsest level.
+LEVELLED = 3
 STEEP_STEPS = 8.0
+
+
+@dataclass(frozen=True)
+class CoarserBase:
+    """The base of the level above, in its own cells and steps. row, col : of its window's first cell, less half of the
+    finer one's."""
+
+    base: BaseSurface
+    row: float
+    col: float
+
+    def corners(self, n_patches: tuple[int, int], patch: int) -> NDArray[np.float64]:
+        """Height indices of the finer level at the corners of its patches, (p + 1, q + 1)."""
+        rows, cols = (
+            (np.arange(n + 1) * patch + 0.5) / 2 - 0.5 - first
+            for n, first in zip(n_patches, (self.row, self.col), strict=True)
+        )
+        return 2 * self.base.at(rows, cols)
 
 
 @dataclass(frozen=True)
@@ -43,30 +67,38 @@ class BaseSurface:
         return cls(np.zeros((-(-shape[0] // block) + 1, -(-shape[1] // block) + 1)), block, shape, block)
 
     @classmethod
-    def along(cls, surface: NDArray[np.float32], block: int) -> BaseSurface:
+    def along(cls, surface: NDArray[np.float32], block: int, coarser: CoarserBase | None = None) -> BaseSurface:
         """With the slopes of a smooth surface, (r, c) float32 height indices.
 
+        coarser : the base of the level above, whose slopes are kept where they are longer than a few patches; None at
+        the coarsest, where those of the surface are (none, if it is hardly wider than what a slope is taken over).
         Patches are no smaller in small blocks, whose medians would follow noise: they are divided afterwards.
         """
         if block < PATCH and PATCH % block == 0:
             every = PATCH // block
-            corners = divided(cls.along(surface, PATCH).patches, every)
+            corners = divided(cls.along(surface, PATCH, coarser).patches, every)
             return cls(
                 corners[: -(-surface.shape[0] // block) + 1, : -(-surface.shape[1] // block) + 1],
                 block,
                 surface.shape,
                 block,
             )
+        if coarser is None and min(surface.shape) <= 2 * SLOPE_REACH:
+            return cls.level(surface.shape, block)
         patch = PATCH if block % PATCH == 0 else block
         rows, cols = surface.shape
         whole = ((0, -rows % block), (0, -cols % block))
-        by_row, by_col = known_slopes(surface)
-        down, across, heights = (
-            np.pad(patch_medians(values, patch), [(0, (n + more) // patch - -(-n // patch)) for n, (_, more) in
-                   zip(surface.shape, whole, strict=True)], mode="edge")
-            for values in (by_row, by_col, surface)
-        )  # fmt: skip
-        return cls(integrated(down, across, patch, heights), patch, surface.shape, block)
+        n_patches = [(n + more) // patch for n, (_, more) in zip(surface.shape, whole, strict=True)]
+        down, across = (
+            np.pad(medians, [(0, m - n) for m, n in zip(n_patches, medians.shape, strict=True)], mode="edge")
+            for medians in (patch_medians(values, patch) for values in known_slopes(surface))
+        )
+        if coarser is None:
+            medians = patch_medians(np.pad(surface, whole, mode="reflect", reflect_type="odd"), patch)
+            start = levelled(medians, down, across, patch)
+        else:
+            start = coarser.corners(down.shape, patch)
+        return cls(np.rint(relaxed(start, down, across, patch)), patch, surface.shape, block)
 
     @cached_property
     def nodes(self) -> NDArray[np.float64]:
@@ -90,16 +122,26 @@ class BaseSurface:
         cells += along[b]
         return cells
 
+    def at(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(r, c), at fractional rows and columns of cells; the outermost patches go on."""
+        (b, fr), (d, fc) = (
+            (low := np.clip(k // self.patch, 0, n - 2).astype(int), k / self.patch - low)
+            for k, n in zip((rows, cols), self.patches.shape, strict=True)
+        )
+        along = self.patches[:, d] * (1 - fc) + self.patches[:, d + 1] * fc
+        return np.asarray(along[b] * (1 - fr[:, None]) + along[b + 1] * fr[:, None])
+
     @cached_property
     def relief(self) -> NDArray[np.float32]:
         """(r, c) float32: the cells less the bilinear surface through the corners of their blocks."""
         blocks = BaseSurface(self.nodes, self.block, self.shape, self.block)
         return np.asarray(self.cells - blocks.cells)
 
-    @property
-    def is_steep(self) -> bool:
-        """Whether it rises anywhere by so much from a block's corner to the next that level windows would suffer."""
-        return bool(max(np.abs(np.diff(self.nodes, axis=axis)).max(initial=0.0) for axis in (0, 1)) > STEEP_STEPS)
+    def is_steep(self, part: tuple[slice, slice]) -> bool:
+        """Whether it rises anywhere among some cells by so much from a block's corner to the next that level windows
+        would suffer. part : their rows and columns."""
+        nodes = self.nodes[tuple(slice(s.start // self.block, -(-s.stop // self.block) + 1) for s in part)]
+        return bool(max(np.abs(np.diff(nodes, axis=axis)).max(initial=0.0) for axis in (0, 1)) > STEEP_STEPS)
 
     def shear(self, views: TileViews) -> TileViews:
         """The views with nodes that project height index k of the base instead of the lattice.
@@ -160,34 +202,48 @@ def _spans(n: int, patch: int) -> list[slice]:
     return [part for part in (slice(0, whole), slice(whole, n)) if part.stop > part.start]
 
 
-def integrated(
-    by_row: NDArray[np.float64], by_col: NDArray[np.float64], patch: int, heights: NDArray[np.float64]
+def relaxed(
+    corners: NDArray[np.float64], by_row: NDArray[np.float64], by_col: NDArray[np.float64], patch: int
 ) -> NDArray[np.float64]:
-    """Heights of the corners of patches whose differences come closest to the slopes of the patches. (p + 1, q + 1).
+    """Heights of the corners of patches, drawn towards the slopes of the patches. (p + 1, q + 1).
 
-    Least squares over all edges, each as steep as the patches beside it; a weak pull towards the patches' heights
-    fixes the rest. The normal equations are a screened Poisson equation with free borders, which the cosine transform
-    solves exactly (Simchony et al. 1990, section 3).
+    A few damped Jacobi steps of the least squares over all edges, each as steep as the patches beside it. They settle
+    what a coarser level is blind to and leave what it knows, as in nested iteration (Brandt 1977, section 1); a corner
+    hears of no patch that is more than `ROUNDS` away, so heights do not depend on how the ground is cut into tiles.
     """
     rise_down, rise_across = patch * _beside(by_row, 1), patch * _beside(by_col, 0)
-    around = _beside(_beside(heights, 0), 1)
-    right = ANCHOR * around
-    right[1:] += rise_down
-    right[:-1] -= rise_down
-    right[:, 1:] += rise_across
-    right[:, :-1] -= rise_across
-    (waves_down, p), (waves_across, q) = (cosine_transform(n) for n in right.shape)
-    spectrum = waves_down @ right @ waves_across.T / (p[:, None] + q[None, :] + ANCHOR)
-    return np.asarray(waves_down.T @ spectrum @ waves_across, np.float64)
+    n = np.full(corners.shape, 4.0)
+    n[[0, -1]] -= 1
+    n[:, [0, -1]] -= 1
+    for _ in range(ROUNDS):
+        down, across = np.diff(corners, axis=0) - rise_down, np.diff(corners, axis=1) - rise_across
+        away = np.zeros_like(corners)
+        away[:-1] += down
+        away[1:] -= down
+        away[:, :-1] += across
+        away[:, 1:] -= across
+        corners = corners + DAMPING * away / n
+    return corners
 
 
-def cosine_transform(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Orthonormal cosine transform (n, n), a wave a row, and what second differences with free ends make of each wave:
-    (n,) factors. (As a matrix: n is a few hundred at most, and importing a library's takes longer than all of them.)"""
-    k = np.arange(n)
-    waves = np.sqrt(2.0 / n) * np.cos(np.pi * k[:, None] * (k + 0.5) / n)
-    waves[0] /= np.sqrt(2.0)
-    return waves, 2.0 - 2.0 * np.cos(np.pi * k / n)
+def levelled(
+    heights: NDArray[np.float64], by_row: NDArray[np.float64], by_col: NDArray[np.float64], patch: int
+) -> NDArray[np.float64]:
+    """Heights (p + 1, q + 1) of the corners of patches (p, q) without what stands on the ground: medians of what the
+    patches around each corner say, continued to it by the mean of their slopes and its own."""
+    n, m = np.add(heights.shape, 1)
+    known = np.pad(heights, LEVELLED, constant_values=np.nan)
+    slopes_there = [np.pad(slope, LEVELLED, mode="edge") for slope in (by_row, by_col)]
+    slopes_here = [_beside(_beside(slope, 0), 1) for slope in (by_row, by_col)]
+    said = []
+    for i, j in np.ndindex(2 * LEVELLED, 2 * LEVELLED):
+        part = slice(i, i + n), slice(j, j + m)
+        rise = sum(
+            patch * (LEVELLED - 0.5 - at) * (there[part] + here) / 2
+            for at, there, here in zip((i, j), slopes_there, slopes_here, strict=True)
+        )
+        said.append(known[part] + rise)
+    return np.asarray(np.nanmedian(said, axis=0), np.float64)
 
 
 def _beside(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:

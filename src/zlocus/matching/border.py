@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from zlocus.matching.base import BaseSurface
+from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews, ViewPixels
-from zlocus.matching.visibility import coverage, covers
+from zlocus.matching.visibility import coverage, covers, sees
 
 AROUND = np.ones((3, 3), np.uint8)
-# Views that show a height.
-PAIR = 2
+# Views that show a height; cells around those that are worth matching.
+PAIR, MARGIN = 2, 4
 # Ground rises by so much of the way to its neighbour at most, to half a step of its height; what views show is asked
 # for within so many steps more.
 STEEPEST, HALF_STEP, ASKED_STEPS = 1.0, 0.5, 4.0
@@ -86,3 +87,18 @@ def _two_show(seen: NDArray[np.int32], height: NDArray[np.float32], within: np.f
     """Whether two views see cells at some height around a given one. seen : (3, i, n); height : (n,)."""
     shows = (seen[0] <= height + within) & (seen[1] >= height - within)
     return np.asarray(shows.sum(axis=0) >= PAIR)
+
+
+def worth_matching(
+    seen: NDArray[np.int32], surface: NDArray[np.float32], ground: NDArray[np.bool_], window: CellWindow
+) -> CellWindow:
+    """The cells of a window, with a margin, whose ground two views see as far as its level can tell.
+
+    seen : (3, i, r, c), see `coverage`; surface : (r, c) height indices; ground : (r, c), see `covered_ground`.
+    """
+    seeing = (sees(seen, surface[None]).sum(axis=0) >= PAIR) & ground
+    rows, cols = np.flatnonzero(seeing.any(axis=1)), np.flatnonzero(seeing.any(axis=0))
+    if not len(rows):
+        return CellWindow(window.row, window.col, 0, 0)
+    row, col = window.row + int(rows[0]) - MARGIN, window.col + int(cols[0]) - MARGIN
+    return CellWindow(row, col, int(rows[-1] - rows[0]) + 1 + 2 * MARGIN, int(cols[-1] - cols[0]) + 1 + 2 * MARGIN)

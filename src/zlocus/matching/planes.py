@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.planes import SPAN, fit_segments
+from zlocus.matching.contrast import ALL, Part, deviation, texture_unit
 from zlocus.matching.views import TileViews
 from zlocus.matching.visibility import sees
 from zlocus.options import PlaneOptions
 
 TEXTURE, RIM, INNER = (3, 3), np.ones((3, 3), np.uint8), np.ones((3, 3), np.uint8)
-# Deviations are compared with those of windows of this side, at the median of the tile.
-AROUND = (5, 5)
 # By how much less the views may agree on a plane than on the heights before, as a share of what a plain core may have.
 MOST_WORSE = 0.25
 
@@ -58,16 +57,18 @@ def with_planes(
     known: PlanarHeights,
     seen: NDArray[np.int32],
     options: PlaneOptions,
+    core: Part = ALL,
 ) -> PlanarHeights:
     """Heights with planes in place of those of plain segments, where the views agree on a plane.
 
     ortho : (r, c) grey values at the known heights, which are (r, c) height indices; cells that are planar stay; seen :
-    (3, i, r, c), see `coverage`. A plane is taken where most cells were matched near it, or the views agree better on
-    it, and where they agree on its core to the noise, not much less than on the heights before: outlines may not.
+    (3, i, r, c), see `coverage`; core : the cells whose texture is the unit. A plane is taken where most cells were
+    matched near it, or the views agree better on it, and where they agree on its core to the noise, not much less than
+    on the heights before: outlines may not.
     """
     height, shown = known.height, np.isfinite(ortho)
     grey = np.where(shown, ortho, np.float32(0.0))
-    unit = texture_unit(ortho)
+    unit = texture_unit(ortho, core)
     noise, is_plain = options.noise * unit, deviation(grey, TEXTURE) < options.texture * unit
     found = plain_segments(is_plain & shown & ~known.is_planar, options)
     n_segments, cells = len(found.start) - 1, (found.row, found.col)
@@ -91,18 +92,6 @@ def with_planes(
     result.height[found.row[kept], found.col[kept]] = after[kept]
     result.is_planar[found.row[kept], found.col[kept]] = True
     return result
-
-
-def texture_unit(ortho: NDArray[np.float32]) -> float:
-    """Median standard deviation of grey values (r, c) in small windows; 0 where nothing is shown."""
-    shown = np.isfinite(ortho)
-    return float(np.median(deviation(np.where(shown, ortho, np.float32(0.0)), AROUND)[shown])) if shown.any() else 0.0
-
-
-def deviation(grey: NDArray[np.float32], window: tuple[int, int]) -> NDArray[np.float32]:
-    """Standard deviation of grey values in a window around each cell, (r, c)."""
-    mean, squares = cv2.blur(grey, window), cv2.blur(grey * grey, window)
-    return np.asarray(np.sqrt(np.maximum(squares - mean * mean, 0)), np.float32)
 
 
 def plain_segments(is_plain: NDArray[np.bool_], options: PlaneOptions) -> Segments:

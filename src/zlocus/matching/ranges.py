@@ -14,6 +14,7 @@ from zlocus.options import PyramidOptions
 # Heights of a block come in multiples of this many, for the sake of vector loops.
 LANES = 4
 UNKNOWN = np.float32(1e9)
+SPIKE = np.ones((3, 3), np.uint8)
 
 
 def ranges_nearby(
@@ -47,3 +48,20 @@ def by_block(values: NDArray[Any], block: int, reduce: np.ufunc) -> NDArray[Any]
     rows = np.arange(0, values.shape[0], block)
     cols = np.arange(0, values.shape[1], block)
     return np.asarray(reduce.reduceat(reduce.reduceat(values, rows, axis=0), cols, axis=1))
+
+
+def without_spikes(
+    low: NDArray[np.float32], high: NDArray[np.float32], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Lowest and highest candidates that 3 x 3 cells share (a closing and an opening), NaN where not `known`.
+
+    A false height of a cell or two would widen the range of a whole block; a tower has more cells, and tie points are
+    added later.
+    """
+    far = UNKNOWN
+    top = cv2.erode(np.where(known, high, far), SPIKE)
+    top = cv2.dilate(np.where(known, top, -far), SPIKE)
+    floor = cv2.dilate(np.where(known, low, -far), SPIKE)
+    floor = cv2.erode(np.where(known, floor, far), SPIKE)
+    nothing = np.float32(np.nan)
+    return np.where(known, np.minimum(floor, top), nothing), np.where(known, np.maximum(floor, top), nothing)

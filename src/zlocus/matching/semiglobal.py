@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.sgm import sweep, winners
+from zlocus.matching.contrast import ALL, Part, edge_unit
 from zlocus.matching.lattice import NARROW_BASE, HeightLattice
 from zlocus.options import SemiGlobalOptions
 
@@ -36,13 +37,20 @@ class SemiGlobalHeights:
 
 
 def penalties(
-    ortho: NDArray[np.float32] | None, shape: tuple[int, int], level: int, options: SemiGlobalOptions
+    ortho: NDArray[np.float32] | None,
+    shape: tuple[int, int],
+    level: int,
+    options: SemiGlobalOptions,
+    by_two: NDArray[np.bool_] | None = None,
+    core: Part = ALL,
 ) -> NDArray[np.uint16]:
     """P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
 
     P2 shrinks with the grey difference g of the two cells in the ortho-image, p2 / (1 + g / (edge_contrast median g)),
-    but not below p2_edge (Hirschmueller 2008, section 2.3, with the scene's own contrast as the unit). Both are eased
-    at coarser levels: the same roof has half the cells to pay for its jumps, and a roof lost there stays lost.
+    but not below p2_edge (Hirschmueller 2008, section 2.3, with the contrast of the cells of `core` as the unit). Both
+    are eased at coarser levels: the same roof has half the cells to pay for its jumps, and a roof lost there stays
+    lost. ortho : (r, c), NaN where nothing is known of edges; by_two : (r, c) cells that two views cover, no more, to
+    which `edge_contrast_two` applies.
     """
     easing = options.level_easing**level
     p2, p2_edge = options.p2 * easing, min(options.p2_edge, options.p2) * easing
@@ -51,10 +59,13 @@ def penalties(
         return steps
     padded = np.pad(ortho, 1, mode="edge")
     rows, cols = shape
-    unit = options.edge_contrast * max(float(np.median(np.abs(np.diff(ortho, axis=1)))), 1e-6)
+    unit = np.float32(max(edge_unit(ortho, core), 1e-6))
+    contrast: np.float32 | NDArray[np.float32] = np.float32(options.edge_contrast)
+    if by_two is not None:
+        contrast = np.where(by_two, np.float32(options.edge_contrast_two), contrast)
     for path, (dr, dc) in enumerate(BEHIND):
-        away = np.abs(ortho - padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols])
-        steps[path] = np.maximum(p2 / (1.0 + away / unit), p2_edge).astype(np.uint16)
+        away = np.nan_to_num(np.abs(ortho - padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols]))
+        steps[path] = np.maximum(p2 / (1.0 + away / (contrast * unit)), p2_edge).astype(np.uint16)
     return steps
 
 

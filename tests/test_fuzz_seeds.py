@@ -1,0 +1,22 @@
+"""What coverage-guided fuzzing kept of every format (`fuzz.py`): bytes that reach code of their own, and old faults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from damage_cases import CASES
+from test_damage import Good, outcome
+
+SEEDS = Path(__file__).parent / "fuzz_seeds"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_was_found_is_read_or_refused(name, tmp_path):
+    case, seeds = CASES[name], sorted((SEEDS / name).iterdir())
+    assert seeds, "python tests/fuzz.py finds some"
+    path = case.write(tmp_path)
+    good = Good(case, path, path.read_bytes(), {})
+    for seed in seeds:
+        outcome(good, seed.read_bytes())
