@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zlocus.matching.cells import CellWindow
+from zlocus.matching.cells import CellWindow, on_cells
 
 SIDES = st.integers(0, 60)
 STARTS = st.integers(-100, 100)
@@ -38,3 +38,21 @@ def test_a_coarser_level_covers_the_same_ground(window, level, halo):
     assert bare.row * size > window.row - size
     assert (bare.row + bare.rows) * size < window.row + window.rows + size
     assert coarse == CellWindow(bare.row - halo, bare.col - halo, bare.rows + 2 * halo, bare.cols + 2 * halo)
+
+
+@given(WINDOWS, WINDOWS)
+def test_what_holds_two_windows(one, other):
+    both = one.around(other)
+    assert cells(one) | cells(other) <= cells(both)
+    assert one.meets(other) == bool(cells(one) & cells(other)) == other.meets(one)
+
+
+@given(WINDOWS.filter(lambda w: w.rows and w.cols), st.integers(0, 3))
+def test_a_coarse_cell_has_its_value_on_all_finer_ones(window, levels):
+    values = np.arange(window.rows * window.cols, dtype=np.float32).reshape(window.rows, window.cols)
+    finer = window.finer(levels)
+    np.testing.assert_array_equal(
+        on_cells(values, window, finer, levels), values.repeat(2**levels, axis=0).repeat(2**levels, axis=1)
+    )
+    beside = CellWindow(finer.row - 3, finer.col, 2, finer.cols)
+    np.testing.assert_array_equal(on_cells(values, window, beside, levels), values[[0, 0]].repeat(2**levels, axis=1))

@@ -49,6 +49,24 @@ def test_a_penalty_of_edges_above_p2_does_not_raise_it():
     assert penalties(ortho, (6, 6), 0, SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
 
 
+def test_edges_count_less_where_two_views_see_a_cell():
+    ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
+    options, by_two = replace(OPTIONS, edge_contrast_two=6.0), np.zeros((9, 10), bool)
+    by_two[:, 5:] = True
+    p2 = penalties(ortho, (9, 10), 0, options, by_two)
+    few, many = (penalties(ortho, (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (6.0, 2.0))
+    np.testing.assert_array_equal(p2, np.where(by_two, few, many))
+    assert (few[few > 60] > many[few > 60]).mean() > 0.9
+
+
+def test_no_edge_counts_where_nothing_is_shown():
+    ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
+    ortho[:, 6:] = np.nan
+    p2 = penalties(ortho, (9, 10), 0, OPTIONS)
+    assert (p2[:, :, 6:] == 240).all()
+    assert (p2[:, 1:-1, 1:5] < 240).all()
+
+
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_penalties_ease_from_level_to_level(level):
     """Those of even ground and those of edges alike."""
