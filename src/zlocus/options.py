@@ -220,7 +220,7 @@ class SemiGlobalOptions(Checked):
         low=0.1, high=1.0,
     )  # fmt: skip
     edge_contrast: float = option(
-        1.2, "Grey difference that halves the penalty of a jump, in median differences of the tile.",
+        1.0, "Grey difference that halves the penalty of a jump, in median differences of the tile.",
         low=0.01, high=1e3,
     )  # fmt: skip
     edge_contrast_two: float = option(
