@@ -155,7 +155,8 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
     if meta["crs"] is None:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
-    west, south, east, north = shapely.total_bounds(polygons)
+    with np.errstate(invalid="ignore"):  # of coordinates that are no numbers, which are refused below
+        west, south, east, north = shapely.total_bounds(polygons)
     largest = max(east - west, north - south)
     if not (0 < largest < WIDEST_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
         raise InputError(
