@@ -171,7 +171,7 @@ def hillside(wavelength=64.0, height=8.0):
 
 
 def test_patches_follow_a_rough_hillside():
-    """Windows see what slope the base leaves: along the patches it is less than half of that along whole blocks."""
+    """Windows see what slope the base leaves: along the patches it is two fifths of that along whole blocks at most."""
     surface = hillside()
     base = BaseSurface.along(surface, 32)
 
@@ -181,7 +181,7 @@ def test_patches_follow_a_rough_hillside():
 
     by_patches, by_blocks = left_over(base.cells), left_over(base.cells - base.relief)
     assert by_blocks > 0.3
-    assert by_patches < 0.45 * by_blocks
+    assert by_patches < 0.4 * by_blocks
 
 
 def test_relief_is_what_lies_above_the_corners_of_blocks():
@@ -221,11 +221,12 @@ def level_above(by_col=0.0):
     return CoarserBase(BaseSurface(corners_of(0.0, by_col, n_patches), PATCH, shape, PATCH), 0.0, 0.0)
 
 
-def test_a_building_on_level_ground_leaves_the_base_nearly_level():
+@pytest.mark.parametrize("above", ["level", None])
+def test_a_building_on_level_ground_leaves_the_base_nearly_level(above):
     surface = np.full(SHAPE, 40.0, np.float32)
     surface[20:43, 30:61] = 130.0
     surface[50:53, 5:100] = 70.0
-    base = BaseSurface.along(surface, BLOCK, level_above())
+    base = BaseSurface.along(surface, BLOCK, level_above() if above else None)
     assert max(np.abs(np.diff(base.nodes, axis=axis)).max() for axis in (0, 1)) < 0.5
     assert np.abs(base.relief).max() < 0.5
     assert not base.is_steep(ALL)
