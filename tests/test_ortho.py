@@ -20,7 +20,6 @@ from zlocus.matching.ortho import (
     Around,
     CoarserHeights,
     best_view,
-    leading_ortho,
     ortho_image,
     pixels_per_cell,
     true_ortho,
@@ -92,21 +91,6 @@ def test_pixels_of_a_cell():
     size = pixels_per_cell(views)
     for found, expected in zip(size, (1.0, 0.25, 1.0, np.cos(o) ** 3), strict=True):
         np.testing.assert_allclose(found, expected, rtol=0.05, atol=0)
-
-
-def test_the_leading_view_is_one_that_shows_the_tile():
-    """The first, unless another shows more than twice as much of the core; nothing is known beyond it."""
-    _, views, _ = tile([sensor(), sensor(), sensor()], greys=(10.0, 20.0, 30.0))
-    surface, core = np.full(SHAPE, LOW, np.float32), (slice(4, 34), slice(10, 50))
-    covering = np.ones((3, *SHAPE), bool)
-    covering[0, :, 35:] = False
-    found = leading_ortho(views, surface, covering, core)
-    assert (found[:, :35] == ortho_image(views, surface)[:, :35]).all()
-    assert np.isnan(found[:, 35:]).all()
-    covering[0, :, 20:] = False
-    covering[1, 30:] = False
-    found = leading_ortho(views, surface, covering, core)
-    np.testing.assert_array_equal(found, ortho_image(views, surface, 2))
 
 
 @pytest.mark.parametrize(("across", "behind"), [(30.0, np.s_[16:24, 37:48]), (-30.0, np.s_[16:24, 12:23])])

@@ -255,6 +255,17 @@ def test_blocks_have_the_order_of_the_points_around_them():
     assert found.is_worth.tolist() == [[True, False], [True, False]]
 
 
+def test_far_from_all_points_the_whole_scene_says_which_view_misleads():
+    """The first two agree with none in most of the scene; near the one point where they do, they lead."""
+    labels = np.stack([agreeing(4, 0, 1), agreeing(4, 0, 1), agreeing(4, 0, 1), agreeing(4)])
+    xy = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [5000.0, 0.0]])
+    at = np.array([[2500.0, 2500.0], [5000.0, 5.0]])
+    found = order_views(ranking_of(xy, labels), np.ones((4, 2)), at, OPTIONS)
+    assert found.reference.tolist() == [2, 0]
+    assert found.search[0].tolist() == [3, 0, 1]
+    assert found.is_worth.tolist() == [[True, False, False], [True, True, True]]
+
+
 @pytest.mark.parametrize("xy", [np.zeros((0, 2)), np.full((3, 2), 1e5)], ids=["no point at all", "far points"])
 def test_cells_of_plain_roofs_and_roads_that_no_feature_point_covers_still_get_an_order(xy):
     """A reference that shows them and every other view once, in the order of the scene."""
@@ -266,6 +277,7 @@ def test_cells_of_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a
         assert sorted([int(found.reference[b]), *found.search[b].tolist()]) == [0, 1, 2]
     if len(xy):
         assert found.search[0].tolist() == [2, 1], "by the whole scene"
+        assert found.is_worth[0].tolist() == [True, False]
     else:
         assert found.is_worth.all(), "nothing is known against any"
 

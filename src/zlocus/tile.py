@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.spline import spline_coefficients
-from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.base import BaseSurface, CoarserBase
 from zlocus.matching.border import covered_ground, shown_heights, worth_matching
 from zlocus.matching.cells import CellWindow, on_cells
 from zlocus.matching.contrast import texture_unit
+from zlocus.matching.edges import agreement, edge_images
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
-from zlocus.matching.ortho import CoarserHeights, leading_ortho, ortho_image, true_ortho, what_stands_around
+from zlocus.matching.ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
 from zlocus.matching.planes import PlanarHeights, with_planes
 from zlocus.matching.ranges import LANES, by_block, ranges_nearby, without_spikes
 from zlocus.matching.ranking import KnownGround, ranked_at_ties
@@ -29,6 +29,7 @@ from zlocus.matching.selection import (
     block_shares,
     chosen_views,
     images_needed,
+    only_chosen,
     order_views,
     preselected,
     sampled_cells,
@@ -37,7 +38,6 @@ from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, pena
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import (
-    NOTHING_HIDDEN,
     PAIR,
     above_base,
     coverage,
@@ -73,6 +73,7 @@ class LevelResult:
     height indices of the level's lattice, whatever base they were found along.
     lone : (r, c) int32, heights of the least costs, each cell by itself; None at the finest level.
     evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
+    agrees : (i,) how alike each view is to the others, see `agreement`; None where no surface was known yet.
     is_planar : (r, c) cells whose heights are those of planes through plain segments.
     """
 
@@ -86,6 +87,7 @@ class LevelResult:
     lone: NDArray[np.int32] | None
     evaluations: int
     all_views: int
+    agrees: NDArray[np.float64] | None
     is_planar: NDArray[np.bool_] | None = None
 
 
@@ -326,17 +328,22 @@ def _match_level(
         ground = None if guide.surface is None else guide.surface - base.cells
         used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
     done = _evaluations(used, lattice) + added
-    own = _own_cells(core, window, level)
-    ortho = None if smooth is None else leading_ortho(views, smooth, covered, own)
     cost = cost_volume(along_base, base, lattice, used, config.measure)
+    agrees = None if guide.coarser is None else guide.coarser.agrees
     if method == "mvll":
         heights = alone(cost, lattice)
     else:
-        p2 = penalties(ortho, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
+        own, images = _own_cells(core, window, level), []
+        if smooth is not None:
+            agrees = agreement(views, smooth, covered, own) if agrees is None else agrees
+            images = edge_images(views, smooth, covered, own, agrees)
+        p2 = penalties(images, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
         heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal)
     lone = alone(cost, lattice).above(base.cells).best if level else None
     worth = above_base(worth, base.cells)
-    return LevelResult(level, window, views, base, lattice, worth, heights.above(base.cells), lone, done, all_views)
+    return LevelResult(
+        level, window, views, base, lattice, worth, heights.above(base.cells), lone, done, all_views, agrees
+    )
 
 
 def _needed_heights(
@@ -387,18 +394,8 @@ def _choose(
     covered = covers(few) if ground is None else sees(few, ground[::STRIDE, ::STRIDE])
     covered = covered.reshape(seen.shape[1], -1)
     of_cell = block_of_cells(lattice, STRIDE).ravel()
-    used = _only(seen, chosen_views(order, needed, covered, of_cell, options), lattice)
-    return used, _only(seen, chosen_views(order, every, covered, of_cell, options), lattice), evaluations
-
-
-def _only(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLattice) -> NDArray[np.int32]:
-    """`seen` without the views that a block does not take. chosen : (i, b) bool."""
-    by_block = chosen.reshape(len(chosen), *lattice.count.shape)
-    rows, cols = lattice.shape
-    left_out = ~by_block.repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
-    kept = seen.copy()
-    kept[0][left_out], kept[1][left_out] = HIDDEN, NOTHING_HIDDEN
-    return kept
+    used = only_chosen(seen, chosen_views(order, needed, covered, of_cell, options), lattice)
+    return used, only_chosen(seen, chosen_views(order, every, covered, of_cell, options), lattice), evaluations
 
 
 def _candidates(

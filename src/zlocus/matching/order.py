@@ -100,7 +100,12 @@ def scene_order(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray
 
     labels : (n, i) int8; n may be 0.
     """
-    return np.argsort(-_weights(labels, options).sum(axis=0), kind="stable").astype(np.int64)
+    return np.argsort(-scene_labels(labels, options), kind="stable").astype(np.int64)
+
+
+def scene_labels(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray:
+    """Labels of the search images accumulated over all feature points, (i,) int64. labels : (n, i) int8; n may be 0."""
+    return np.asarray(_weights(labels, options).sum(axis=0))
 
 
 def _weights(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_ortho
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.contrast import Part
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.views import TileViews, ViewPixels
 from zlocus.matching.visibility import cells_per_step, hide, sees
@@ -29,19 +28,6 @@ def ortho_image(views: TileViews, surface: NDArray[np.float32], view: int = 0) -
     out = np.empty(surface.shape, np.float32)
     tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, view, views.block, out)
     return out
-
-
-def leading_ortho(
-    views: TileViews, surface: NDArray[np.float32], covering: NDArray[np.bool_], core: Part
-) -> NDArray[np.float32]:
-    """The leading view of a tile on a surface (r, c), NaN where it does not cover it.
-
-    That is the first view, unless it shows less than half as much of the core as another: then the one that shows most.
-    covering : (i, r, c) bool.
-    """
-    shown = covering[:, *core].sum(axis=(1, 2))
-    view = 0 if shown[0] >= shown.max() / 2 else int(shown.argmax())
-    return np.where(covering[view], ortho_image(views, surface, view), np.float32(np.nan))
 
 
 @dataclass(frozen=True)

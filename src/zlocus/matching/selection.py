@@ -15,14 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.curves import line_windows
+from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.curve import POOR, curve_labels
 from zlocus.matching.lattice import HeightLattice
-from zlocus.matching.order import FeaturePoints, SearchGeometry, candidate_images, closeness, image_order
+from zlocus.matching.order import (
+    Evidence,
+    FeaturePoints,
+    SearchGeometry,
+    candidate_images,
+    closeness,
+    image_order,
+    scene_labels,
+)
 from zlocus.matching.progressive import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.setup import nadir_offset
 from zlocus.matching.views import TileViews
-from zlocus.matching.visibility import cells_per_step, covers
+from zlocus.matching.visibility import NOTHING_HIDDEN, cells_per_step, covers
 from zlocus.options import SelectionOptions
 from zlocus.scene import View
 
@@ -174,9 +183,10 @@ def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
 
     share : (i, b) float64, of each block that each view covers, the views in the order in which they may be the
     reference; at : (b, 2) float64, the blocks' middles, as `Ranking.xy`. The reference is the first view that shows the
-    whole block and has a label above zero with another view around it. A view whose accumulated label is below
-    `least_worth` of the best one's misleads more than it helps. Those that help come in the order of their angles, see
-    `closeness`: labels are a matter of tens of points, and neighbouring blocks should not differ by the luck of one.
+    whole block and has a label above zero with another view around it; far from all tie points, at those of the whole
+    tile. A view whose accumulated label is below `least_worth` of the best one's misleads more than it helps. Those
+    that help come in the order of their angles, see `closeness`: labels are a matter of tens of points, and
+    neighbouring blocks should not differ by the luck of one.
     """
     n_views, n_blocks = share.shape
     reference = share.argmax(axis=0)
@@ -188,8 +198,11 @@ def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
             if not len(rows):
                 continue
             others = np.delete(np.arange(n_views), view)
-            order = image_order(FeaturePoints(ranking.xy, ranking.labels[:, view][:, others]), at[rows], options)
+            labels = ranking.labels[:, view][:, others]
+            order = image_order(FeaturePoints(ranking.xy, labels), at[rows], options)
             value = np.take_along_axis(order.accumulated, order.images, axis=1)
+            is_lonely = order.evidence == Evidence.SCENE
+            value[is_lonely] = scene_labels(labels, options)[order.images[is_lonely]]
             fits = last_resort | (value[:, 0] > 0) | (len(ranking.xy) == 0)
             rows, images, value = rows[fits], others[order.images[fits]], value[fits]
             helps = value >= options.least_worth * np.maximum(value[:, :1], 0)
@@ -222,6 +235,16 @@ def chosen_views(
         chosen[view[is_taken], np.flatnonzero(is_taken)] = True
         count += gains & is_taken[of_cell]
     return chosen
+
+
+def only_chosen(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLattice) -> NDArray[np.int32]:
+    """`seen` without the views that a block does not take. chosen : (i, b) bool."""
+    by_block = chosen.reshape(len(chosen), *lattice.count.shape)
+    rows, cols = lattice.shape
+    left_out = ~by_block.repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
+    kept = seen.copy()
+    kept[0][left_out], kept[1][left_out] = HIDDEN, NOTHING_HIDDEN
+    return kept
 
 
 def sampled_cells(lattice: HeightLattice) -> tuple[IntArray, IntArray]:

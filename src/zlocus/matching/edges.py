@@ -1,0 +1,79 @@
+"""Images at whose edges heights may jump: of the views of a tile, those that show what others show too."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.matching.contrast import ALL, Part
+from zlocus.matching.ortho import ortho_image
+from zlocus.matching.views import TileViews
+
+# Agreement with the other views, as a share of the best one's, that a view needs to lead: noise, clouds and the shadows
+# of another hour have edges where nothing stands.
+AGREES = 0.8
+# Cells that two views must share for their agreement to mean anything.
+FEWEST_SHARED = 64
+
+
+def agreement(
+    views: TileViews, surface: NDArray[np.float32], showing: NDArray[np.bool_], core: Part
+) -> NDArray[np.float64]:
+    """How alike each view is to the others: the median of its correlations with them over the core, (i,).
+
+    surface : (r, c) height indices on which they are compared; showing : (i, r, c) bool, which views show which cells.
+    NaN for a view that shares too little with any.
+    """
+    shown = showing[:, *core].reshape(len(showing), -1)
+    grey = np.stack([ortho_image(views, surface, view)[core].ravel() for view in range(len(showing))])
+    count = shown.astype(np.float32)
+    grey = np.where(shown, grey, np.float32(0.0))
+    n = np.maximum((count @ count.T).astype(np.float64), 1.0)
+    mean = (grey @ count.T) / n
+    variance = (grey**2 @ count.T) / n - mean**2
+    covariance = (grey @ grey.T) / n - mean * mean.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alike = covariance / np.sqrt(variance * variance.T)
+    alike[n < FEWEST_SHARED] = np.nan
+    np.fill_diagonal(alike, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of views that share nothing
+        return np.asarray(np.nanmedian(alike, axis=1))
+
+
+def edge_images(
+    views: TileViews,
+    surface: NDArray[np.float32],
+    showing: NDArray[np.bool_],
+    core: Part,
+    agrees: NDArray[np.float64],
+) -> list[NDArray[np.float32]]:
+    """Views of a tile on a surface (r, c), each NaN where it does not show it, the leading one first.
+
+    Leading is the first that agrees with the others and shows half as much of the core, or more, as any that does.
+    Others follow as long as they show cells of the core, or else of the tile, that none before does: those that agree,
+    then the rest. showing : (i, r, c) bool, which views show which cells; agrees : (i,), see `agreement`.
+    """
+    best = np.nanmax(agrees, initial=-1.0)
+    trusted = ~(agrees < AGREES * best)
+    shown = np.where(trusted, showing[:, *core].sum(axis=(1, 2)), 0)
+    view: int | None = int(np.flatnonzero(trusted & (shown >= shown.max() / 2))[0])
+    images, missing = [], np.ones(surface.shape, np.bool_)
+    while view is not None:
+        images.append(np.where(showing[view], ortho_image(views, surface, view), np.float32(np.nan)))
+        missing &= ~showing[view]
+        view = _next(showing, missing, core, trusted)
+    return images
+
+
+def _next(showing: NDArray[np.bool_], missing: NDArray[np.bool_], core: Part, trusted: NDArray[np.bool_]) -> int | None:
+    """The view that shows most of the missing cells, of those of the core where some are; None where no view does."""
+    for part in (core, ALL):
+        if missing[part].any():
+            shown = (showing[:, *part] & missing[part]).sum(axis=(1, 2))
+            for some in (np.where(trusted, shown, 0), shown):
+                if some.max() > 0:
+                    return int(some.argmax())
+    return None
