@@ -86,7 +86,7 @@ def test_the_leading_view_is_the_first_that_shows_half_of_what_another_shows(sho
 
 def test_a_view_that_does_not_agree_with_the_others_does_not_lead(showing):
     views = views_of(*plain(3))
-    for agrees, leads in (([1.2 * AGREES - 0.2, 1.0, 1.0], 1), ([AGREES, 1.0, 0.9], 0), ([np.nan] * 3, 0)):
+    for agrees, leads in (([1.2 * AGREES - 0.2, 1.0, 1.0], 1), ([AGREES, 1.0, 0.9], 0), ([np.nan] * 3, 0), ([-0.2, -0.1, np.nan], 0)):
         (image,) = edge_images(views, SURFACE, showing, CORE, np.array(agrees))
         np.testing.assert_array_equal(image, ortho_image(views, SURFACE, leads))
 

@@ -56,8 +56,8 @@ def edge_images(
     Others follow as long as they show cells of the core, or else of the tile, that none before does: those that agree,
     then the rest. showing : (i, r, c) bool, which views show which cells; agrees : (i,), see `agreement`.
     """
-    best = np.nanmax(agrees, initial=-1.0)
-    trusted = ~(agrees < AGREES * best)
+    best = np.nanmax(agrees, initial=0.0)
+    trusted = ~(agrees < AGREES * best) if best > 0 else np.ones(len(agrees), np.bool_)
     shown = np.where(trusted, showing[:, *core].sum(axis=(1, 2)), 0)
     view: int | None = int(np.flatnonzero(trusted & (shown >= shown.max() / 2))[0])
     images, missing = [], np.ones(surface.shape, np.bool_)
