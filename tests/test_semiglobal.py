@@ -17,7 +17,7 @@ OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, level_
 
 
 def test_without_an_ortho_image_penalties_are_even():
-    p2 = penalties([], (5, 7), 0, OPTIONS)
+    p2 = penalties(None, (5, 7), 0, OPTIONS)
     assert p2.dtype == np.uint16
     assert p2.shape == (4, 5, 7)
     assert (p2 == 240).all()
@@ -25,7 +25,7 @@ def test_without_an_ortho_image_penalties_are_even():
 
 def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
     ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
-    p2 = penalties([ortho], (12, 15), 0, OPTIONS)
+    p2 = penalties(ortho, (12, 15), 0, OPTIONS)
     unit = 2.0 * edge_unit(ortho)
     for path, (dr, dc) in enumerate(BEHIND):
         for r in range(1, 11):
@@ -39,22 +39,22 @@ def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
 def test_a_strong_edge_is_cheap_to_cross_only_where_it_is():
     ortho = np.zeros((8, 12), np.float32) + np.random.default_rng(1).normal(0, 0.01, (8, 12)).astype(np.float32)
     ortho[:, 6:] += 5
-    p2 = penalties([ortho], (8, 12), 0, OPTIONS)
+    p2 = penalties(ortho, (8, 12), 0, OPTIONS)
     assert (p2[0, :, 6] == 60).all()
     assert (p2[2, 1:, 6] > 60).all()
 
 
 def test_a_penalty_of_edges_above_p2_does_not_raise_it():
     ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
-    assert penalties([ortho], (6, 6), 0, SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
+    assert penalties(ortho, (6, 6), 0, SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
 
 
 def test_edges_count_less_where_two_views_see_a_cell():
     ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
     options, by_two = replace(OPTIONS, edge_contrast_two=6.0), np.zeros((9, 10), bool)
     by_two[:, 5:] = True
-    p2 = penalties([ortho], (9, 10), 0, options, by_two)
-    few, many = (penalties([ortho], (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (6.0, 2.0))
+    p2 = penalties(ortho, (9, 10), 0, options, by_two)
+    few, many = (penalties(ortho, (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (6.0, 2.0))
     np.testing.assert_array_equal(p2, np.where(by_two, few, many))
     assert (few[few > 60] > many[few > 60]).mean() > 0.9
 
@@ -62,36 +62,9 @@ def test_edges_count_less_where_two_views_see_a_cell():
 def test_no_edge_counts_where_nothing_is_shown():
     ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
     ortho[:, 6:] = np.nan
-    p2 = penalties([ortho], (9, 10), 0, OPTIONS)
+    p2 = penalties(ortho, (9, 10), 0, OPTIONS)
     assert (p2[:, :, 6:] == 240).all()
     assert (p2[:, 1:-1, 1:5] < 240).all()
-
-
-def test_edges_come_from_the_first_image_that_shows_both_cells():
-    """Each in units of its own contrast."""
-    rng = np.random.default_rng(0)
-    first, second = (rng.normal(size=(9, 10)).astype(np.float32) for _ in range(2))
-    alone = penalties([first], (9, 10), 0, OPTIONS), penalties([second], (9, 10), 0, OPTIONS)
-    np.testing.assert_array_equal(penalties([first, 8 * second], (9, 10), 0, OPTIONS), alone[0])
-    part = first.copy()
-    part[:, 6:] = np.nan
-    core = (slice(None), slice(0, 6))
-    p2 = penalties([part, 8 * second], (9, 10), 0, OPTIONS, None, core)
-    of_part, of_second = (penalties([image], (9, 10), 0, OPTIONS, None, core) for image in (part, second))
-    shows = np.isfinite(np.abs(part - np.roll(part, 1, axis=1)))
-    shows[:, 0] = True
-    np.testing.assert_array_equal(p2[0], np.where(shows, of_part[0], of_second[0]))
-    assert (p2[0][~shows] < 240).mean() > 0.9
-    assert (of_part[0][~shows] == 240).all()
-
-
-def test_an_image_that_shows_nothing_of_the_core_has_its_own_unit():
-    image = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
-    image[:, :4] = np.nan
-    core = (slice(None), slice(0, 3))
-    p2 = penalties([image], (9, 10), 0, OPTIONS, None, core)
-    np.testing.assert_array_equal(p2, penalties([image], (9, 10), 0, OPTIONS))
-    assert (p2[0, :, 5:] > 60).any()
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -99,9 +72,9 @@ def test_penalties_ease_from_level_to_level(level):
     """Those of even ground and those of edges alike."""
     ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
     ortho[:, 6:] += 5
-    even, finest = penalties([], (12, 15), level, OPTIONS), penalties([ortho], (12, 15), 0, OPTIONS)
+    even, finest = penalties(None, (12, 15), level, OPTIONS), penalties(ortho, (12, 15), 0, OPTIONS)
     assert (even == 240 // 2**level).all()
-    eased = penalties([ortho], (12, 15), level, OPTIONS)
+    eased = penalties(ortho, (12, 15), level, OPTIONS)
     assert (finest == 60).any()
     assert (eased[finest == 60] == 60 // 2**level).all()
     assert np.abs(eased - finest / 2**level).max() <= 1
@@ -110,7 +83,7 @@ def test_penalties_ease_from_level_to_level(level):
 def test_penalties_without_easing_are_the_same_at_every_level():
     ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
     kept = replace(OPTIONS, level_easing=1.0)
-    np.testing.assert_array_equal(penalties([ortho], (6, 6), 3, kept), penalties([ortho], (6, 6), 0, kept))
+    np.testing.assert_array_equal(penalties(ortho, (6, 6), 3, kept), penalties(ortho, (6, 6), 0, kept))
 
 
 @pytest.mark.parametrize("predecessors", [1, 2])
@@ -119,7 +92,7 @@ def test_aggregation_joins_what_picking_alone_does_not(predecessors):
     rng = np.random.default_rng(3)
     cost = rng.integers(30, 90, (20, 24, 16)).astype(np.uint8)
     cost[..., 7] -= 25
-    p2 = penalties([], lattice.shape, 0, OPTIONS)
+    p2 = penalties(None, lattice.shape, 0, OPTIONS)
     joined = aggregate(cost.ravel(), lattice, p2, 1.0, replace(OPTIONS, predecessors=predecessors))
     single = alone(cost.ravel(), lattice)
     assert (np.abs(joined.best - 7) <= 1).mean() > 0.97
@@ -143,7 +116,7 @@ def test_one_and_two_predecessors_give_margins_of_the_same_size():
     """The chosen kernel is the one that the option names: the sums differ, their size does not."""
     lattice = even_lattice(16, (20, 24), 16)
     cost = np.random.default_rng(3).integers(30, 90, lattice.size).astype(np.uint8)
-    p2 = penalties([], lattice.shape, 0, OPTIONS)
+    p2 = penalties(None, lattice.shape, 0, OPTIONS)
     one, two = (aggregate(cost, lattice, p2, 1.0, replace(OPTIONS, predecessors=n)).margin for n in (1, 2))
     assert (one != two).any()
     assert np.median(two) == pytest.approx(np.median(one), rel=0.5)

@@ -373,5 +373,5 @@ def semiglobal(
     lattice = HeightLattice(
         0.0, 1.0, shape, max(shape), np.zeros((1, 1), np.int64), np.full((1, 1), cost.shape[2], np.int64)
     )
-    p2 = penalties([] if ortho is None else [ortho], shape, 0, options)
+    p2 = penalties(ortho, shape, 0, options)
     return aggregate(np.ascontiguousarray(counted).ravel(), lattice, p2, step_cells, options)

@@ -13,7 +13,7 @@ from zlocus.matching.base import BaseSurface, CoarserBase
 from zlocus.matching.border import covered_ground, shown_heights, worth_matching
 from zlocus.matching.cells import CellWindow, on_cells
 from zlocus.matching.contrast import texture_unit
-from zlocus.matching.edges import agreement, edge_images
+from zlocus.matching.edges import agreement, edge_image
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
 from zlocus.matching.ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
@@ -333,11 +333,11 @@ def _match_level(
     if method == "mvll":
         heights = alone(cost, lattice)
     else:
-        own, images = _own_cells(core, window, level), []
+        own, ortho = _own_cells(core, window, level), None
         if smooth is not None:
             agrees = agreement(views, smooth, covered, own) if agrees is None else agrees
-            images = edge_images(views, smooth, covered, own, agrees)
-        p2 = penalties(images, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
+            ortho = edge_image(views, smooth, covered, own, agrees)
+        p2 = penalties(ortho, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
         heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal)
     lone = alone(cost, lattice).above(base.cells).best if level else None
     worth = above_base(worth, base.cells)

@@ -1,4 +1,4 @@
-"""Images at whose edges heights may jump: of the views of a tile, those that show what others show too."""
+"""The image at whose edges heights may jump: of the views of a tile, the first that shows what the others show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.matching.contrast import ALL, Part
+from zlocus.matching.contrast import Part
 from zlocus.matching.ortho import ortho_image
 from zlocus.matching.views import TileViews
 
@@ -43,37 +43,20 @@ def agreement(
         return np.asarray(np.nanmedian(alike, axis=1))
 
 
-def edge_images(
+def edge_image(
     views: TileViews,
     surface: NDArray[np.float32],
     showing: NDArray[np.bool_],
     core: Part,
     agrees: NDArray[np.float64],
-) -> list[NDArray[np.float32]]:
-    """Views of a tile on a surface (r, c), each NaN where it does not show it, the leading one first.
+) -> NDArray[np.float32]:
+    """The leading view of a tile on a surface (r, c), NaN where it does not show it.
 
-    Leading is the first that agrees with the others and shows half as much of the core, or more, as any that does.
-    Others follow as long as they show cells of the core, or else of the tile, that none before does: those that agree,
-    then the rest. showing : (i, r, c) bool, which views show which cells; agrees : (i,), see `agreement`.
+    That is the first that agrees with the others and shows half as much of the core, or more, as any that does.
+    showing : (i, r, c) bool, which views show which cells; agrees : (i,), see `agreement`.
     """
     best = np.nanmax(agrees, initial=0.0)
     trusted = ~(agrees < AGREES * best) if best > 0 else np.ones(len(agrees), np.bool_)
-    shown = np.where(trusted, showing[:, *core].sum(axis=(1, 2)), 0)
-    view: int | None = int(np.flatnonzero(trusted & (shown >= shown.max() / 2))[0])
-    images, missing = [], np.ones(surface.shape, np.bool_)
-    while view is not None:
-        images.append(np.where(showing[view], ortho_image(views, surface, view), np.float32(np.nan)))
-        missing &= ~showing[view]
-        view = _next(showing, missing, core, trusted)
-    return images
-
-
-def _next(showing: NDArray[np.bool_], missing: NDArray[np.bool_], core: Part, trusted: NDArray[np.bool_]) -> int | None:
-    """The view that shows most of the missing cells, of those of the core where some are; None where no view does."""
-    for part in (core, ALL):
-        if missing[part].any():
-            shown = (showing[:, *part] & missing[part]).sum(axis=(1, 2))
-            for some in (np.where(trusted, shown, 0), shown):
-                if some.max() > 0:
-                    return int(some.argmax())
-    return None
+    shown = showing[:, *core].sum(axis=(1, 2))
+    view = int(np.flatnonzero(trusted & (shown >= shown[trusted].max() / 2))[0])
+    return np.where(showing[view], ortho_image(views, surface, view), np.float32(np.nan))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +37,7 @@ class SemiGlobalHeights:
 
 
 def penalties(
-    images: Sequence[NDArray[np.float32]],
+    ortho: NDArray[np.float32] | None,
     shape: tuple[int, int],
     level: int,
     options: SemiGlobalOptions,
@@ -47,41 +46,27 @@ def penalties(
 ) -> NDArray[np.uint16]:
     """P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
 
-    P2 shrinks with the grey difference g of the two cells in an ortho-image, p2 / (1 + g / (edge_contrast median g)),
+    P2 shrinks with the grey difference g of the two cells in the ortho-image, p2 / (1 + g / (edge_contrast median g)),
     but not below p2_edge (Hirschmueller 2008, section 2.3, with the contrast of the cells of `core` as the unit). Both
     are eased at coarser levels: the same roof has half the cells to pay for its jumps, and a roof lost there stays
-    lost. images : (r, c) each, NaN where one shows nothing; the first that shows both cells counts, and without any
-    there is no edge. by_two : (r, c) cells that two views cover, no more, to which `edge_contrast_two` applies.
+    lost. ortho : (r, c), NaN where nothing is known of edges; by_two : (r, c) cells that two views cover, no more, to
+    which `edge_contrast_two` applies.
     """
     easing = options.level_easing**level
     p2, p2_edge = options.p2 * easing, min(options.p2_edge, options.p2) * easing
     steps = np.full((4, *shape), p2, np.uint16)
-    if not images:
+    if ortho is None:
         return steps
-    units = [max(edge_unit(image, core) or edge_unit(image), 1e-6) for image in images]
-    padded = [np.pad(image / np.float32(unit), 1, mode="edge") for image, unit in zip(images, units, strict=True)]
+    padded = np.pad(ortho, 1, mode="edge")
+    rows, cols = shape
+    unit = np.float32(max(edge_unit(ortho, core), 1e-6))
     contrast: np.float32 | NDArray[np.float32] = np.float32(options.edge_contrast)
     if by_two is not None:
         contrast = np.where(by_two, np.float32(options.edge_contrast_two), contrast)
     for path, (dr, dc) in enumerate(BEHIND):
-        away = _first_known([_differences(image, dr, dc) for image in padded])
-        steps[path] = np.maximum(p2 / (1.0 + np.nan_to_num(away) / contrast), p2_edge).astype(np.uint16)
+        away = np.nan_to_num(np.abs(ortho - padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols]))
+        steps[path] = np.maximum(p2 / (1.0 + away / (contrast * unit)), p2_edge).astype(np.uint16)
     return steps
-
-
-def _differences(padded: NDArray[np.float32], dr: int, dc: int) -> NDArray[np.float32]:
-    """Of the cells (r, c) of an image with a border of one, from their neighbours so many rows and columns away."""
-    rows, cols = np.subtract(padded.shape, 2)
-    behind = padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols]
-    return np.asarray(np.abs(padded[1:-1, 1:-1] - behind))
-
-
-def _first_known(values: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Of several (r, c), the first that is not NaN."""
-    known = values[0]
-    for more in values[1:]:
-        known = np.where(np.isnan(known), more, known)
-    return known
 
 
 def aggregate(
