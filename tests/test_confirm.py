@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pyproj import CRS
 
-from zlocus.matching.confirm import MatchedImage, confirm
+from zlocus.matching.confirm import Confirmation, MatchedImage, confirm
 from zlocus.matching.gc3 import image_space
 from zlocus.scene import ImageWindow, Scene, View
 from zlocus.sensors.frame import FrameModel
@@ -43,9 +43,21 @@ def images(*places: float) -> list[MatchedImage]:
     return found
 
 
+def whole(mine, others):
+    """Counts of all rows, which come some after others."""
+    rows, parts = zip(*confirm(mine, others, 1.0), strict=True)
+    assert np.concatenate([np.arange(len(mine.height))[r] for r in rows]).tolist() == list(range(len(mine.height)))
+    return Confirmation(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Confirmation)))
+
+
+@pytest.fixture(autouse=True)
+def few_rows_at_once(monkeypatch):
+    monkeypatch.setattr("zlocus.matching.confirm.ROWS_AT_ONCE", 16)
+
+
 def test_equal_heights_agree_where_both_see():
     left, right = images(0.0, 1.0)
-    result = confirm(left, [right], 1.0)
+    result = whole(left, [right])
     np.testing.assert_array_equal(result.agreeing[:, 6:], 1)
     np.testing.assert_array_equal(result.agreeing[:, :6], 0)  # left of the right image
     np.testing.assert_array_equal(result.is_confirmed, result.agreeing == 1)
@@ -57,7 +69,7 @@ def test_equal_heights_agree_where_both_see():
 def test_the_tolerance_is_in_pixels(by_px, agrees):
     left, right = images(0.0, 1.0)
     left.height[PATCH] += by_px
-    result = confirm(left, [right], 1.0)
+    result = whole(left, [right])
     assert (result.agreeing[PATCH] == agrees).all()
     # What is too near is looked through, what is too far is hidden.
     assert ((result.farther if by_px > 0 else result.nearer)[PATCH] == (not agrees)).all()
@@ -66,7 +78,7 @@ def test_the_tolerance_is_in_pixels(by_px, agrees):
 def test_a_wrong_patch_is_not_confirmed():
     left, right = images(0.0, 1.0)
     left.height[PATCH] += 8.0
-    confirmed = confirm(left, [right], 1.0).is_confirmed
+    confirmed = whole(left, [right]).is_confirmed
     assert not confirmed[PATCH].any()
     confirmed[PATCH] = True
     assert confirmed[:, 6:].all()
@@ -77,17 +89,17 @@ def test_more_must_agree_than_look_through():
     for other in others[:1]:
         other.height[:] -= 2.0 * other.px_per_unit(first.space.reference.name) ** -1
     inside = (slice(None), slice(14, 50))
-    result = confirm(first, others, 1.0)
+    result = whole(first, others)
     assert (result.farther[inside] == 1).all()
     assert (result.agreeing[inside] == 2).all()
     assert result.is_confirmed[inside].all()
-    assert not confirm(first, others[:2], 1.0).is_confirmed[inside].any()
+    assert not whole(first, others[:2]).is_confirmed[inside].any()
 
 
 def test_empty_pixels_have_no_say():
     left, right = images(0.0, 1.0)
     left.height[0], right.height[5] = np.nan, np.nan
-    result = confirm(left, [right], 1.0)
+    result = whole(left, [right])
     for counts in (result.agreeing, result.nearer, result.farther):
         assert not counts[[0, 5]].any()
 

@@ -13,6 +13,7 @@ from reference.mesh import agreed_heights_reference
 from rendered_scenes import HEIGHTS, PART, SMALL_TILES, camera, errors_of, read, run
 from zlocus.cli import app
 from zlocus.errors import ConfigError
+from zlocus.execution.scratch import Scratch
 from zlocus.kernels.mesh import agreed_heights, draw_image
 from zlocus.matching.confirm import MatchedImage
 from zlocus.matching.gc3 import ImageSpace
@@ -209,6 +210,22 @@ def test_heights_are_true(images, tmp_path, kind):
     record = json.loads((result.out / "run.json").read_text())
     assert record["config"]["request"]["method"] == "gc3-sgm"
     assert 0 < record["evaluations"]["done"] <= record["evaluations"]["all_images"]
+
+
+def test_without_room_in_memory_the_bytes_are_the_same(images, tmp_path, monkeypatch):
+    whole = run(images("step"), tmp_path / "whole", SMALL_TILES, method="gc3-sgm").out
+    made = []
+
+    def no_room(beside, room_bytes):
+        made.append(Scratch(beside, 0.0))
+        assert room_bytes > 0
+        return made[0]
+
+    monkeypatch.setattr("zlocus.pipeline.Scratch", no_room)
+    out = run(images("step"), tmp_path / "out", SMALL_TILES, method="gc3-sgm", workers=2).out
+    assert made[0].file_bytes > 0
+    for name in ("dsm", "sigma", "quality", "views", "ortho"):
+        assert (out / f"{name}.tif").read_bytes() == (whole / f"{name}.tif").read_bytes(), name
 
 
 def test_area_and_workers_change_nothing(images, tmp_path):

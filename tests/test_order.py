@@ -17,7 +17,7 @@ from zlocus.matching.order import (
     SearchGeometry,
     candidate_images,
     image_order,
-    scene_order,
+    scene_labels,
     triangulated,
 )
 from zlocus.options import SelectionOptions
@@ -124,8 +124,8 @@ def test_far_from_all_features_the_order_of_the_scene_holds():
     points = features([[0, 0], [5, 0], [10, 0]], [[1, 1, 0], [-1, 1, 1], [0, 1, -1]])
     found = order_of(points, (10, 40.1), (10, 39.9))
     assert found.evidence.tolist() == [Evidence.SCENE, Evidence.NEAREST]
-    assert found.images[0].tolist() == scene_order(points.labels, OPTIONS).tolist() == [1, 0, 2]
-    assert found.accumulated[0].tolist() == [0, 0, 0]
+    assert found.images[0].tolist() == [1, 0, 2]
+    assert found.accumulated[0].tolist() == scene_labels(points.labels, OPTIONS).tolist() == [0, 3, 0]
 
 
 @pytest.mark.parametrize("options", [OPTIONS, TIN], ids=["radius", "tin"])
@@ -138,8 +138,11 @@ def test_a_scene_without_features_keeps_the_given_order(options):
 @pytest.mark.parametrize("accumulate", ["sum", "count"])
 def test_the_order_of_the_scene(accumulate):
     labels = np.array([[1, 1, 0], [-1, 0, 1], [1, 1, 1], [-1, 0, 0]], np.int8)
-    order = {"sum": [1, 2, 0], "count": [0, 1, 2]}[accumulate]
-    assert scene_order(labels, SelectionOptions(accumulate=accumulate)).tolist() == order
+    options = SelectionOptions(accumulate=accumulate)
+    sums = {"sum": [0, 2, 2], "count": [2, 2, 2]}[accumulate]
+    assert scene_labels(labels, options).tolist() == sums
+    far = order_of(FeaturePoints(np.arange(8.0).reshape(4, 2), labels), (1e5, 0), options=options)
+    assert far.images.tolist() == [{"sum": [1, 2, 0], "count": [0, 1, 2]}[accumulate]]
 
 
 # --- TIN ---

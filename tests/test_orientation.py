@@ -14,7 +14,7 @@ from pyproj import CRS
 from orientation_scenes import hill, hill_scene, image_of, observe, rendered, texture, without_translation
 from zlocus.errors import GeometryError
 from zlocus.options import JointOptions, OrientationOptions
-from zlocus.orientation.orient import Orientation, height_range, orient
+from zlocus.orientation.orient import MeasuredTies, Orientation, height_range, orient
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.scene import Scene, View
 from zlocus.sensors.correction import ShiftedModel
@@ -46,6 +46,40 @@ def test_planted_pointing_errors_are_taken_back(scene, oriented):
         assert view.after.median < view.before.median
     for pair in oriented.pairs:
         assert pair.across_after_px < 0.3 < pair.across_before_px
+
+
+def test_ties_that_are_known_make_the_same_orientation(scene, oriented, monkeypatch):
+    def looked_for(*_):
+        raise AssertionError("ties are looked for again")
+
+    for name in ("find_ties", "sharpened"):
+        monkeypatch.setattr(f"zlocus.orientation.orient.{name}", looked_for)
+    known = MeasuredTies.of(oriented.ties.arrays(), len(scene.views))
+    again = orient(scene, OPTIONS, known=known)
+    assert again.as_dict() == oriented.as_dict()
+    assert again.z_bounds == oriented.z_bounds
+    np.testing.assert_array_equal(again.xyz, oriented.xyz)
+    np.testing.assert_array_equal(again.seen.xy, oriented.seen.xy)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda kept: kept.pop("rough_xy"),
+        lambda kept: kept.update(z_range=np.zeros(3)),
+        lambda kept: kept.update(precise_view=kept["precise_view"] + 1),
+        lambda kept: kept.update(precise_point=kept["precise_point"][:-1]),
+        lambda kept: kept.update(rough_point=-1 - kept["rough_point"]),
+        lambda kept: kept.update(rough_xy=kept["rough_xy"][:, :1]),
+        lambda kept: kept.update(z=kept["z"][:-1]),
+        lambda kept: kept.update(rough_view=kept["rough_view"].astype(float)),
+    ],
+)
+def test_arrays_that_are_no_ties_of_the_scene_are_none(scene, oriented, change):
+    kept = oriented.ties.arrays()
+    assert MeasuredTies.of(kept, len(scene.views)) is not None
+    change(kept)
+    assert MeasuredTies.of(kept, len(scene.views)) is None
 
 
 def test_applied_shifts_are_the_reported_ones(scene, oriented):

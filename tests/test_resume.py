@@ -22,7 +22,7 @@ import zlocus.job
 from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, read, run
 from zlocus.errors import GeometryError, OutputError, StoppedError
 from zlocus.execution.engine import ATTEMPTS
-from zlocus.execution.store import DONE, FOLDER
+from zlocus.execution.store import BEFORE, DONE, FOLDER
 from zlocus.surface.reasons import Quality
 
 RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
@@ -202,6 +202,27 @@ def test_where_all_tiles_fail_the_log_says_why(images, tmp_path, monkeypatch):
     assert all("in fail" in e["trace"] for e in events_of(tmp_path / "out") if e["event"] == "tile failed")
 
 
+def test_ties_are_not_looked_for_again(images, straight, tmp_path, monkeypatch):
+    out = stopped(images, tmp_path, monkeypatch)
+
+    def looked_for(*_):
+        raise AssertionError("ties are looked for again")
+
+    for name in ("find_ties", "sharpened"):
+        monkeypatch.setattr(f"zlocus.orientation.orient.{name}", looked_for)
+    run(images("sine"), out, SMALL_TILES, workers=1, report=False)
+    assert same(out, straight)
+    assert (out / "ties.gpkg").stat().st_size > 0
+    assert not (out / FOLDER).exists()
+
+
+def test_ties_that_are_damaged_are_found_anew(images, straight, tmp_path, monkeypatch):
+    out = stopped(images, tmp_path, monkeypatch)
+    (out / FOLDER / BEFORE).write_bytes(b"PK nothing")
+    run(images("sine"), out, SMALL_TILES, workers=1, report=False)
+    assert same(out, straight)
+
+
 def test_a_damaged_tile_is_made_again(images, straight, tmp_path, monkeypatch):
     out = stopped(images, tmp_path, monkeypatch)
     tiles = sorted((out / FOLDER).glob("*.npz"))
@@ -272,7 +293,7 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
     write, written = store.write_whole, []
 
     def until_full(path, content):
-        if path.suffix == ".npz":
+        if path.suffix == ".npz" and path.name != BEFORE:
             written.append(path)
             if len(written) > 4:
                 with Path("/dev/full").open("wb", buffering=0) as full:

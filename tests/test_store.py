@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import zlocus.execution.store as store_module
 from zlocus.errors import OutputError, StoppedError
-from zlocus.execution.store import DONE, FOLDER, MANIFEST, TileStore, difference
+from zlocus.execution.store import BEFORE, DONE, FOLDER, MANIFEST, TileStore, difference
 
 KEY = {"versions": {"zlocus": "1"}, "request": {"crs": None}, "options": {"a": {"b": 1}}, "inputs": {"i.tif": [5, 6]}}
 ARRAYS = {"height": np.arange(6, dtype=np.float32).reshape(2, 3), "views": np.ones((2, 3), np.uint8)}
@@ -24,7 +24,7 @@ def store(out, key=None, **how):
 
 def filled(out, names=("0_0", "0_64"), settled="s", key=None):
     held = store(out, key)
-    with held.open(settled):
+    with held.open(settled, ARRAYS):
         for name in names:
             held.keep(name, ARRAYS)
     return held
@@ -44,6 +44,38 @@ def test_tiles_are_there_for_the_same_run(tmp_path):
     assert set(store(tmp_path).finished) == {"0_0", "0_64", "64_0"}
     again.remove()
     assert not list(tmp_path.iterdir())
+
+
+def test_what_was_found_before_the_first_tile_is_there_for_the_same_run(tmp_path):
+    """Whether or not a tile was finished; not for another run, nor for one that is not to take it on."""
+    with store(tmp_path).open("s", ARRAYS) as held:
+        held.keep("0_0", ARRAYS)
+    for again in (store(tmp_path), store(tmp_path)):
+        found = again.found_before()
+        assert set(found) == set(ARRAYS)
+        for name, array in ARRAYS.items():
+            np.testing.assert_array_equal(found[name], array)
+        with again.open("s", {"height": np.zeros(3)}):
+            assert again.holds("0_0")
+    assert store(tmp_path, overwrite=True).found_before() is None
+    assert store(tmp_path, is_resumed=False).found_before() is None
+    (tmp_path / FOLDER / DONE).unlink()
+    assert set(store(tmp_path).found_before()) == set(ARRAYS)
+    assert store(tmp_path, KEY | {"inputs": {}}).found_before() is None
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "changed"])
+def test_what_was_found_before_is_whole_or_not_there(tmp_path, damage):
+    filled(tmp_path)
+    path = tmp_path / FOLDER / BEFORE
+    content = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(content[:-1] if damage == "cut" else bytes([content[0] ^ 1]) + content[1:])
+    held = store(tmp_path)
+    assert held.found_before() is None
+    assert held.holds("0_0")
 
 
 @pytest.mark.parametrize(

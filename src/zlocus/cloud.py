@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import CoverageError
+from zlocus.execution.memory import SHARE, free_bytes
+from zlocus.execution.scratch import Scratch
 from zlocus.io.colour import read_colours
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
@@ -80,9 +82,10 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         settled, options = settle_all(ready, references, options)
         check_geoid(vertical, ready)
     with watch.stage("match"):
-        matched = match_images(settled, options, True, request.workers, progress)
+        scratch = Scratch(request.out, SHARE * free_bytes())
+        matched = match_images(settled, options, True, request.workers, progress, scratch)
     with watch.stage("match back"):
-        matched = confirmed_images(matched, progress)
+        matched = confirmed_images(matched, progress, scratch)
     with watch.stage("write"), made_folder(request.out), progress.stage("Writing", len(matched)) as stage:
         n_points = write_cloud(request.out, matched, scene, vertical)
         for one, name in zip(matched, file_names(references), strict=True):

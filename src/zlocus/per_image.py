@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from zlocus.errors import ConfigError, TileError, ZlocusError
 from zlocus.execution.plan import Tile, plan_tiles
+from zlocus.execution.scratch import Scratch
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.confirm import Confirmation, MatchedImage, confirm
+from zlocus.matching.confirm import ROWS_AT_ONCE, MatchedImage, confirm
 from zlocus.matching.gc3 import (
     ImageSpace,
     beyond_range,
@@ -97,12 +98,16 @@ class Matched:
         """(r, c), see `Quality`."""
         return self.surface.quality
 
-    def without(self, cells: NDArray[np.bool_], reason: Quality) -> Matched:
-        """The image without the heights of some pixels (r, c), which get a reason."""
-        quality = np.where(cells, self.quality | np.uint16(reason), self.quality)
-        height = np.where(cells, np.float32(np.nan), self.image.height)
+    def copied(self, scratch: Scratch) -> Matched:
+        """The image with heights and reasons of its own."""
+        height, quality = scratch.copied(self.image.height), scratch.copied(self.quality)
         surface = replace(self.surface, height=height, quality=quality)
         return replace(self, image=replace(self.image, height=height), surface=surface)
+
+    def leave_out(self, rows: slice, cells: NDArray[np.bool_], reason: Quality) -> None:
+        """Take the heights of some pixels of some rows away, which get a reason; changes the arrays. cells : (r, c)."""
+        self.image.height[rows][cells] = np.nan
+        self.quality[rows][cells] |= np.uint16(reason)
 
 
 @dataclass(frozen=True)
@@ -192,13 +197,14 @@ def match_images(
     use_visibility: bool,
     workers: int,
     progress: Progress,
+    scratch: Scratch,
     area: Area | None = None,
 ) -> list[Matched]:
     """Every tile of every reference image, or those that may show an area; of any precision, for there it is not in
-    metres."""
+    metres. scratch : makes the arrays of all pixels."""
     options = replace(options, checks=replace(options.checks, most_sigma_m=None))
     images = [CellWindow(0, 0, *space.reference.image.shape) for space, _ in settled]
-    surfaces = [Surface.nothing(window) for window in images]
+    surfaces = [Surface.nothing(window, full=scratch.full) for window in images]
     tasks = [
         (number, tile)
         for number, (_, scene) in enumerate(settled)
@@ -224,6 +230,7 @@ def match_images(
             to, part = tile.kept.slices_in(images[number]), result.surface.part(tile.kept, tile.core)
             for mine, theirs in zip(surfaces[number].arrays, part.arrays, strict=True):
                 mine[to] = theirs
+            scratch.rest()
             tallies[number] += result.evaluations, result.all_images
             stage.advance()
     found = [matched_image(*one, surface) for one, surface in zip(settled, surfaces, strict=True)]
@@ -233,10 +240,14 @@ def match_images(
 def matched_image(space: ImageSpace, scene: MatchScene, surface: Surface) -> Matched:
     """What the tiles of an image found, without heights beyond the range that was asked for."""
     image = MatchedImage(space, surface.height, scene.origin_m + scene.n_steps * scene.step_m / 2)
-    return Matched(image, scene, surface).without(beyond_range(scene, surface.height), Quality.RANGE_END)
+    found = Matched(image, scene, surface)
+    for row in range(0, len(surface.height), ROWS_AT_ONCE):
+        rows = slice(row, row + ROWS_AT_ONCE)
+        found.leave_out(rows, beyond_range(scene, surface.height[rows]), Quality.RANGE_END)
+    return found
 
 
-def confirmed_images(matched: Sequence[Matched], progress: Progress) -> list[Matched]:
+def confirmed_images(matched: Sequence[Matched], progress: Progress, scratch: Scratch) -> list[Matched]:
     """The images without the heights that no other one confirms; as they are where only one was matched."""
     if len(matched) < 2:
         progress.note("Only one image was matched, so no other one could confirm its heights: all are kept.")
@@ -244,15 +255,14 @@ def confirmed_images(matched: Sequence[Matched], progress: Progress) -> list[Mat
     images, found = [m.image for m in matched], []
     with progress.stage("Matching back", len(images)) as stage:
         for k, one in enumerate(matched):
-            result = confirm(one.image, images[:k] + images[k + 1 :], AGREE_PX)
-            found.append(without_unconfirmed(one, result))
+            kept = one.copied(scratch)
+            for rows, result in confirm(one.image, images[:k] + images[k + 1 :], AGREE_PX):
+                unsure = np.isfinite(one.image.height[rows]) & ~result.is_confirmed
+                kept.leave_out(rows, unsure, Quality.UNCONFIRMED)
+                scratch.rest()
+            found.append(kept)
             stage.advance()
     return found
-
-
-def without_unconfirmed(one: Matched, result: Confirmation) -> Matched:
-    """The image without the heights that are not confirmed, which are marked."""
-    return one.without(np.isfinite(one.image.height) & ~result.is_confirmed, Quality.UNCONFIRMED)
 
 
 def match_for_grid(
@@ -263,13 +273,14 @@ def match_for_grid(
     use_visibility: bool,
     workers: int,
     progress: Progress,
+    scratch: Scratch,
 ) -> GridImages:
     """All views matched in their own spaces and confirmed by each other, for a surface. leading : names of those whose
     heights it takes, in the order in which they give grey values."""
     options = depth_options(config) if is_by_depth(ready.scene) else config
     settled, options = settle_all(ready, [view.name for view in ready.scene.views], options)
-    before = match_images(settled, options, use_visibility, workers, progress, area)
-    after = confirmed_images(before, progress)
+    before = match_images(settled, options, use_visibility, workers, progress, scratch, area)
+    after = confirmed_images(before, progress, scratch)
     z = sum(area.z_range) / 2
     images = {one.image.space.reference.name: pixel_heights(one, b, z) for one, b in zip(after, before, strict=True)}
     evaluations = sum(one.evaluations for one in before), sum(one.all_images for one in before)

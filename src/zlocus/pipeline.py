@@ -20,6 +20,7 @@ from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.events import EventLog
 from zlocus.execution.memory import cores
 from zlocus.execution.plan import Tile, plan_tiles
+from zlocus.execution.scratch import Scratch
 from zlocus.execution.store import TileStore
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
@@ -33,7 +34,7 @@ from zlocus.job import Polygons, Terrain, TileJob, TileProduct
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import Orientation, supported
+from zlocus.orientation.orient import MeasuredTies, Orientation, supported
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
 from zlocus.preparing import (
     area_to_match,
@@ -112,7 +113,8 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
         opened = _opened(request, config, progress)
         scene, vertical = opened.scene, opened.vertical
     with watch.stage("orient"):
-        orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers)
+        known = _known_ties(opened.store, scene, progress)
+        orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
         corrected = orientation.apply(scene)
@@ -127,7 +129,8 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     out, tally = request.out, Tally()
     job = _job(request, settled, grid, config, opened.polygons)
     matching = Matching(job, tiles, opened.store, EventLog(out))
-    with made_folder(out), opened.store.open(digest_of(settled, orientation)):
+    ties = {} if orientation.ties is None else orientation.ties.arrays()
+    with made_folder(out), opened.store.open(digest_of(settled, orientation), ties):
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, corrected, orientation, z_range, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
@@ -156,6 +159,15 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     matching.end(failed, tally)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
+
+
+def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredTies | None:
+    """Tie points of the same run, where it was begun before."""
+    arrays = store.found_before()
+    known = None if arrays is None else MeasuredTies.of(arrays, len(scene.views))
+    if known is not None:
+        progress.note("Tie points are those of the run that is taken on.")
+    return known
 
 
 def _settled(
@@ -310,9 +322,22 @@ def _maker(
     leading = [view.name for view in settled.views if request.reference in (None, view.name)]
     box, aside = grid.geobox.extent.boundingbox, config.pyramid.halo * grid.cell_m
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
-    matched = match_for_grid(ready, leading, Area(bounds, z_range), config, job.use_visibility, plan.slots, progress)
+    scratch = Scratch(request.out, plan.allowed_bytes - plan.n_bytes)
+    area = Area(bounds, z_range)
+    matched = match_for_grid(ready, leading, area, config, job.use_visibility, plan.slots, progress, scratch)
     tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
-    return lambda tile: job.product(tile, grid_tile(matched, settled, tile.core, config, job.fill))
+    if scratch.file_bytes:
+        progress.note(
+            f"What was found for the pixels of the images lies on disk, for memory has no room for it: "
+            f"{scratch.file_bytes / 1e9:.2g} GB."
+        )
+
+    def make(tile: Tile) -> TileProduct:
+        product = job.product(tile, grid_tile(matched, settled, tile.core, config, job.fill))
+        scratch.rest()
+        return product
+
+    return make
 
 
 def _forget(out: Path) -> None:

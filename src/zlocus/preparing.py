@@ -22,7 +22,7 @@ from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.setup import shared_ground
 from zlocus.options import OrientationOptions
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.orient import RANGE_PERCENT, Orientation, height_range, orient, supported
+from zlocus.orientation.orient import RANGE_PERCENT, MeasuredTies, Orientation, height_range, orient, supported
 from zlocus.progress import Progress
 from zlocus.scene import Scene, View, check_overlap, footprint, is_local, is_shared
 from zlocus.sensors.model import capped, lowest_station
@@ -165,9 +165,10 @@ def oriented(
     control: GroundControl | None = None,
     terrain: TerrainHeights | None = None,
     threads: int | None = None,
+    known: MeasuredTies | None = None,
 ) -> Orientation:
-    """Tie points and corrections, with progress. control, terrain : see `orient`; threads : as many as there are cores
-    unless told otherwise."""
+    """Tie points and corrections, with progress. control, terrain, known : see `orient`; threads : as many as there are
+    cores unless told otherwise."""
     if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
         heights = heights_below(scene)
     with progress.stage("Tie points", 1.0) as stage:
@@ -180,7 +181,7 @@ def oriented(
             done = first + part * share
 
         with one_thread_below():
-            return orient(scene, options, heights, report, control, terrain, threads or cores())
+            return orient(scene, options, heights, report, control, terrain, threads or cores(), known)
 
 
 @contextmanager

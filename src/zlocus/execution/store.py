@@ -21,21 +21,25 @@ from zlocus.errors import OutputError, StoppedError
 Arrays = Mapping[str, NDArray[Any]]
 # Below the folder of a run.
 FOLDER, MANIFEST, DONE, LOCK = "tiles", "manifest.json", "done.jsonl", "lock"
-SCHEMA = 1
+# What was found before the first tile.
+BEFORE = "before.npz"
+SCHEMA = 2
 
 
 @dataclass
 class TileStore:
-    """Tiles of one run below its folder: a manifest of what they depend on, a line for every finished tile, and a file
-    of each.
+    """Tiles of one run below its folder: a manifest of what they depend on, what was found before the first of them, a
+    line for every finished tile, and a file of each.
 
-    folder : holds them, made by `begin`; key : all that the tiles depend on, by name; finished : SHA-256 of each tile
-    that is there, by its name.
+    folder : holds them, made by `open`; key : all that the tiles depend on, by name; finished : SHA-256 of each tile
+    that is there, by its name; before : SHA-256 of what an earlier run of the same found before its first tile, "" of
+    nothing.
     """
 
     folder: Path
     key: dict[str, Any]
     finished: dict[str, str] = field(default_factory=dict)
+    before: str = ""
     _lock: BinaryIO | None = None
     _is_ours: bool = False
 
@@ -62,12 +66,20 @@ class TileStore:
                 f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give what that run was "
                 "given, or add --overwrite to start anew."
             )
-        store.finished = {} if differs else listed
+        if not differs:
+            store.finished, store.before = listed, str(found.get("before", ""))
         return store
 
+    def found_before(self) -> dict[str, NDArray[Any]] | None:
+        """What an earlier run of the same found before its first tile; None where it is missing, or not what was
+        written."""
+        return _arrays(self.folder / BEFORE, self.before)
+
     @contextmanager
-    def open(self, settled: str) -> Iterator[TileStore]:
-        """The store, begun, and locked against other runs. settled : digest of what was found before the first tile.
+    def open(self, settled: str, before: Arrays | None = None) -> Iterator[TileStore]:
+        """The store, begun, and locked against other runs.
+
+        settled : digest of what was found before the first tile; before : the part of it that is to be kept.
 
         Raises
         ------
@@ -81,7 +93,7 @@ class TileStore:
         try:
             if not _locked(self._lock):
                 raise OutputError(f"Another run writes to {self.folder.parent}. Wait for it, or choose another folder.")
-            self._begin(settled)
+            self._begin(settled, before or {})
             yield self
         except BaseException:
             if not self.finished and self._is_ours:
@@ -90,9 +102,8 @@ class TileStore:
         finally:
             self._lock.close()
 
-    def _begin(self, settled: str) -> None:
+    def _begin(self, settled: str, before: Arrays) -> None:
         self._is_ours = True
-        manifest = {"schema": SCHEMA, "key": self.key, "settled": settled}
         if self.finished:
             found = _read_object(self.folder / MANIFEST)
             # Another run may have written here since the store was looked at.
@@ -107,6 +118,9 @@ class TileStore:
                 for path in self.folder.iterdir():
                     if path.name != LOCK:
                         path.unlink()
+                content, digest = _packed(before)
+                write_whole(self.folder / BEFORE, content)
+                manifest = {"schema": SCHEMA, "key": self.key, "settled": settled, "before": digest}
                 write_whole(self.folder / MANIFEST, json.dumps(manifest, indent=1).encode())
 
     def keep(self, name: str, arrays: Arrays) -> None:
@@ -117,11 +131,9 @@ class TileStore:
         StoppedError
             It cannot be written: what was kept before stays.
         """
-        content = io.BytesIO()
-        np.savez(content, **arrays)  # type: ignore[arg-type]
-        digest = hashlib.sha256(content.getbuffer()).hexdigest()
+        content, digest = _packed(arrays)
         try:
-            write_whole(self._path(name), content.getbuffer())
+            write_whole(self._path(name), content)
             with (self.folder / DONE).open("ab") as done:
                 done.write(json.dumps({"tile": name, "sha256": digest}).encode() + b"\n")
                 done.flush()
@@ -135,14 +147,7 @@ class TileStore:
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
         """The arrays of a finished tile; None where its file is missing, or not what was written."""
-        try:
-            content = self._path(name).read_bytes()
-            if hashlib.sha256(content).hexdigest() != self.finished[name]:
-                return None
-            with np.load(io.BytesIO(content), allow_pickle=False) as file:
-                return dict(file)
-        except (OSError, KeyError, ValueError):
-            return None
+        return _arrays(self._path(name), self.finished.get(name, ""))
 
     def holds(self, name: str) -> bool:
         """Whether a finished tile is there, with the bytes that were written."""
@@ -154,6 +159,25 @@ class TileStore:
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npz"
+
+
+def _packed(arrays: Arrays) -> tuple[memoryview, str]:
+    """The bytes of a file of arrays, and their SHA-256."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # type: ignore[arg-type]
+    return content.getbuffer(), hashlib.sha256(content.getbuffer()).hexdigest()
+
+
+def _arrays(path: Path, digest: str) -> dict[str, NDArray[Any]] | None:
+    """The arrays of a file; None where it is missing, or its SHA-256 is another."""
+    try:
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != digest:
+            return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            return dict(file)
+    except (OSError, ValueError):
+        return None
 
 
 def difference(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,28 +46,29 @@ class Confirmation:
         return np.asarray(self.agreeing > self.farther)
 
 
-def confirm(mine: MatchedImage, others: Sequence[MatchedImage], tolerance_px: float) -> Confirmation:
-    """Compare every height of an image with those of the others, where they show the same ground.
+def confirm(
+    mine: MatchedImage, others: Sequence[MatchedImage], tolerance_px: float
+) -> Iterator[tuple[slice, Confirmation]]:
+    """Compare every height of an image with those of the others, where they show the same ground; some rows of the
+    image after others.
 
     A height becomes a ground point, which is at a pixel (the nearest) and at a hypothesis of each other image; that
     image's own hypothesis there agrees when it differs by no more than `tolerance_px` of equivalent disparity of the
     two. Pixels without a height have no say.
     """
     sharing = [(other, rate) for other in others if np.isfinite(rate := other.px_per_unit(mine.space.reference.name))]
-    counts = np.zeros((3, *mine.height.shape), np.uint8)
     for row in range(0, len(mine.height), ROWS_AT_ONCE):
-        part = mine.height[row : row + ROWS_AT_ONCE]
-        known = np.isfinite(part)
+        rows = slice(row, min(row + ROWS_AT_ONCE, len(mine.height)))
+        part = mine.height[rows]
+        counts, known = np.zeros((3, *part.shape), np.uint8), np.isfinite(part)
         ground = mine.space.ground(row, part)[known]
         for other, px_per_unit in sharing:
             differs = difference(other, ground) * px_per_unit
             for count, where in zip(
-                counts[:, row : row + ROWS_AT_ONCE],
-                (np.abs(differs) <= tolerance_px, differs < -tolerance_px, differs > tolerance_px),
-                strict=True,
+                counts, (np.abs(differs) <= tolerance_px, differs < -tolerance_px, differs > tolerance_px), strict=True
             ):
                 count[known] += where
-    return Confirmation(counts[0], counts[1], counts[2])
+        yield rows, Confirmation(counts[0], counts[1], counts[2])
 
 
 def difference(image: MatchedImage, ground: NDArray[np.float64]) -> NDArray[np.float64]:

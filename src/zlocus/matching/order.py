@@ -55,7 +55,7 @@ class ImageOrder:
     """Search images of every cell, best first.
 
     images : (c, i) int64, indices of search images; accumulated : (c, i) int64, labels accumulated over the cell's
-    feature points, in the order of the labels (0 where the order is the scene's); evidence : (c,) uint8 `Evidence`.
+    feature points, in the order of the labels; evidence : (c,) uint8 `Evidence`, where SCENE says that these are all.
     """
 
     images: IntArray
@@ -85,7 +85,7 @@ def image_order(features: FeaturePoints, at: FloatArray, options: SelectionOptio
     sums them with their signs: an option.
     """
     search = NeighbourSearch(features.xy, options)
-    scene = scene_order(features.labels, options)
+    scene = scene_labels(features.labels, options)
     parts = [
         _ordered(search.of(at[first : first + CHUNK]), features.labels, scene, options)
         for first in range(0, max(len(at), 1), CHUNK)
@@ -93,14 +93,6 @@ def image_order(features: FeaturePoints, at: FloatArray, options: SelectionOptio
     return ImageOrder(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in ("images", "accumulated", "evidence"))
     )
-
-
-def scene_order(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray:
-    """Search images by the labels accumulated over all feature points, best first; equals as they stand. (i,) int64.
-
-    labels : (n, i) int8; n may be 0.
-    """
-    return np.argsort(-scene_labels(labels, options), kind="stable").astype(np.int64)
 
 
 def scene_labels(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray:
@@ -114,7 +106,7 @@ def _weights(labels: NDArray[np.int8], options: SelectionOptions) -> IntArray:
 
 
 def _ordered(near: Neighbours, labels: NDArray[np.int8], scene: IntArray, options: SelectionOptions) -> ImageOrder:
-    """Order of the images at cells with these neighbours. scene : (i,) int64, the order of last resort."""
+    """Order of the images at cells with these neighbours. scene : (i,) int64, labels accumulated over all points."""
     # SciPy costs a third of a second, which scenes whose views are all used need not spend.
     from scipy.sparse import csr_array
 
@@ -129,7 +121,8 @@ def _ordered(near: Neighbours, labels: NDArray[np.int8], scene: IntArray, option
             (digit, labels.astype(np.int64)),
         )
     )
-    last = np.broadcast_to(np.argsort(scene), accumulated.shape)
+    accumulated[near.evidence == Evidence.SCENE] = scene
+    last = np.broadcast_to(-scene, accumulated.shape)
     images = np.lexsort((last, -tie, -accumulated), axis=-1)
     return ImageOrder(images.astype(np.int64), accumulated, near.evidence)
 

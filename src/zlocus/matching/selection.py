@@ -19,15 +19,7 @@ from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.curve import POOR, curve_labels
 from zlocus.matching.lattice import HeightLattice
-from zlocus.matching.order import (
-    Evidence,
-    FeaturePoints,
-    SearchGeometry,
-    candidate_images,
-    closeness,
-    image_order,
-    scene_labels,
-)
+from zlocus.matching.order import FeaturePoints, SearchGeometry, candidate_images, closeness, image_order
 from zlocus.matching.progressive import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.setup import nadir_offset
 from zlocus.matching.views import TileViews
@@ -198,11 +190,8 @@ def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
             if not len(rows):
                 continue
             others = np.delete(np.arange(n_views), view)
-            labels = ranking.labels[:, view][:, others]
-            order = image_order(FeaturePoints(ranking.xy, labels), at[rows], options)
+            order = image_order(FeaturePoints(ranking.xy, ranking.labels[:, view][:, others]), at[rows], options)
             value = np.take_along_axis(order.accumulated, order.images, axis=1)
-            is_lonely = order.evidence == Evidence.SCENE
-            value[is_lonely] = scene_labels(labels, options)[order.images[is_lonely]]
             fits = last_resort | (value[:, 0] > 0) | (len(ranking.xy) == 0)
             rows, images, value = rows[fits], others[order.images[fits]], value[fits]
             helps = value >= options.least_worth * np.maximum(value[:, :1], 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +39,8 @@ RANGE_PERCENT = (0.5, 99.5)
 MEASURED_SHARE = 0.5
 # How much farther from one common shift of a pair its ties may lie where more than shifts is corrected.
 POSE_LOOSENESS = 3.0
+# What is kept of ties.
+TIES, OBSERVED = ("rough", "precise"), ("view", "point", "xy")
 KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex), which is not a random one
 
 
@@ -88,6 +90,41 @@ class PairOrientation:
 
 
 @dataclass(frozen=True)
+class MeasuredTies:
+    """What an orientation takes from the images, and most of its time: rough ties as they were found, and their
+    observations measured again by correlation."""
+
+    rough: Ties
+    precise: Observations
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """By name, to be kept; the matches of the pairs are not."""
+        both = zip(TIES, (self.rough.seen, self.precise), strict=True)
+        columns = {f"{name}_{part}": getattr(seen, part) for name, seen in both for part in OBSERVED}
+        return {**columns, "z": self.rough.z, "z_range": np.array(self.rough.z_range)}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]], n_views: int) -> MeasuredTies | None:
+        """What `arrays` gave; None of arrays that are not ties of so many views."""
+        try:
+            rough, precise = (Observations(*(arrays[f"{name}_{part}"] for part in OBSERVED)) for name in TIES)
+            z, (low, high) = arrays["z"], arrays["z_range"]
+        except (KeyError, ValueError):
+            return None
+        if not all(_fits(seen, n_views, len(z)) for seen in (rough, precise)):
+            return None
+        return cls(Ties(rough, z, (), (float(low), float(high))), precise)
+
+
+def _fits(seen: Observations, n_views: int, n_points: int) -> bool:
+    """Whether observations are of so many views and points."""
+    if seen.view.ndim != 1 or seen.point.shape != seen.view.shape or seen.xy.shape != (len(seen), 2):
+        return False
+    numbers = ((seen.view, n_views), (seen.point, n_points))
+    return all(v.dtype == np.int64 and v.min(initial=0) >= 0 and v.max(initial=-1) < n for v, n in numbers)
+
+
+@dataclass(frozen=True)
 class Orientation:
     """Pointing corrections and the ties they rest on.
 
@@ -95,7 +132,7 @@ class Orientation:
     seen: their observations; model: the kind of correction; n_seen: how many of the shifts' 2 i components the ties
     could show; z_bounds: the heights (m) within which ties were looked for; n_measured: the first so many ties were
     measured again and agree, the others look different from everywhere, see `with_rough_ties`; joint: where all cameras
-    were corrected jointly.
+    were corrected jointly; ties: what was measured in the images.
     """
 
     views: tuple[ViewOrientation, ...]
@@ -108,6 +145,7 @@ class Orientation:
     z_bounds: tuple[float, float]
     n_measured: int
     joint: JointAdjustment | None = None
+    ties: MeasuredTies | None = None
 
     def __repr__(self) -> str:
         """In a line: ties are thousands."""
@@ -193,6 +231,7 @@ def orient(
     control: GroundControl | None = None,
     terrain: TerrainHeights | None = None,
     threads: int = 1,
+    known: MeasuredTies | None = None,
 ) -> Orientation:
     """Tie points, measured again by correlation, then one shift per image, or all cameras, solved with the heights of
     the ties.
@@ -200,17 +239,20 @@ def orient(
     z_range_hint: heights in m that hold the ground, where they are known; else the scene's. control, terrain : used
     where cameras are corrected jointly. Cameras of a local frame come from an adjustment of their own, and nothing but
     ties would hold them in place: `model` "auto" leaves them as they are. The result does not depend on the number of
-    threads.
+    threads. known : of an earlier orientation of the same; images are not read then.
     """
     has_poses = needs_joint(scene.views)
     if options.model == "auto" and has_poses and is_local(scene.crs):
         options = replace(options, model="none")
     is_joint = options.model == "joint" or (options.model == "auto" and has_poses)
     loosely = replace(options, inlier_px=options.inlier_px * POSE_LOOSENESS) if is_joint and has_poses else options
-    ties = find_ties(scene, loosely, z_range_hint, progress, threads)
+    ties = find_ties(scene, loosely, z_range_hint, progress, threads) if known is None else known.rough
     sensors = [view.sensor for view in scene.views]
     xyz = first_ground(scene, ties)
-    seen = sharpened(scene.views, ties.seen, ground_jacobian(sensors, ties.seen, xyz), options, threads)
+    if known is None:
+        jacobian = ground_jacobian(sensors, ties.seen, xyz)
+        known = MeasuredTies(ties, sharpened(scene.views, ties.seen, jacobian, options, threads))
+    seen = known.precise
     strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
     joint, corrected = None, sensors
     if is_joint:
@@ -234,6 +276,7 @@ def orient(
         z_bounds=ties.z_range,
         n_measured=len(adjusted.points.xyz),
         joint=joint,
+        ties=known,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,13 +62,15 @@ class Surface:
         return self.height, self.sigma, self.quality, self.views, self.ortho
 
     @classmethod
-    def nothing(cls, window: CellWindow, bands: tuple[int, ...] = ()) -> Surface:
-        """Cells that no two views cover. bands : () or (3,), of the ortho-image."""
+    def nothing(
+        cls, window: CellWindow, bands: tuple[int, ...] = (), full: Callable[..., NDArray[Any]] = np.full
+    ) -> Surface:
+        """Cells that no two views cover. bands : () or (3,), of the ortho-image; full : makes the arrays."""
         shape = (window.rows, window.cols)
         return cls(
-            np.full(shape, np.nan, np.float32),
-            np.full(shape, np.nan, np.float32),
-            np.full(shape, Quality.UNSEEN, np.uint16),
-            np.zeros(shape, np.uint8),
-            np.full(shape + bands, np.nan, np.float32),
+            full(shape, np.nan, np.float32),
+            full(shape, np.nan, np.float32),
+            full(shape, Quality.UNSEEN, np.uint16),
+            full(shape, 0, np.uint8),
+            full(shape + bands, np.nan, np.float32),
         )
