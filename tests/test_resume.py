@@ -19,6 +19,8 @@ import psutil
 import pytest
 
 import zlocus.job
+import zlocus.per_image
+import zlocus.tile
 from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, read, run
 from zlocus.errors import GeometryError, OutputError, StoppedError
 from zlocus.execution.engine import ATTEMPTS
@@ -221,6 +223,46 @@ def test_ties_that_are_damaged_are_found_anew(images, straight, tmp_path, monkey
     (out / FOLDER / BEFORE).write_bytes(b"PK nothing")
     run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     assert same(out, straight)
+
+
+def test_image_space_goes_on_with_the_tiles_of_its_images(images, tmp_path, monkeypatch):
+    """Some are there, one of them damaged; the others are matched."""
+    asked = {"method": "gc3-sgm", "report": False, "workers": 1}
+    straight = run(images("sine"), tmp_path / "straight", SMALL_TILES, **asked).out
+    match, matched = zlocus.per_image.match_tile, []
+
+    def until_stopped(scene, core, *rest, **given):
+        matched.append((core.row, core.col))
+        if len(matched) == 5:
+            raise KeyboardInterrupt
+        return match(scene, core, *rest, **given)
+
+    monkeypatch.setattr("zlocus.per_image.match_tile", until_stopped)
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run(images("sine"), out, SMALL_TILES, **asked)
+    kept = sorted((out / FOLDER).glob("image*.npz"))
+    assert len(kept) == 4
+    kept[1].write_bytes(kept[1].read_bytes()[:-1])
+    before, everything = matched[:5], len(list_of_tiles(images, tmp_path, asked))
+    run(images("sine"), out, SMALL_TILES, **asked)
+    assert len(matched) - len(before) == everything - 3
+    assert same(out, straight)
+    assert not (out / FOLDER).exists()
+
+
+def list_of_tiles(images, tmp_path, asked):
+    """The tiles of images that a run matches."""
+    with pytest.MonkeyPatch.context() as patch:
+        found, match = [], zlocus.tile.match_tile
+
+        def counted(scene, core, *rest, **given):
+            found.append(core)
+            return match(scene, core, *rest, **given)
+
+        patch.setattr("zlocus.per_image.match_tile", counted)
+        run(images("sine"), tmp_path / "counted", SMALL_TILES, **asked)
+    return found
 
 
 def test_a_damaged_tile_is_made_again(images, straight, tmp_path, monkeypatch):

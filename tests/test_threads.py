@@ -5,7 +5,9 @@ import time
 
 import pytest
 
-from zlocus.threads import run_all
+from zlocus.threads import is_busy, run_all
+
+SOON_S = 5.0
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -59,6 +61,9 @@ def test_an_exception_ends_the_run(workers, error):
     with pytest.raises(error):
         list(run_all(work, range(100), workers))
     assert len(begun) < 10
+    end = time.monotonic() + (SOON_S if error is KeyboardInterrupt else 0.0)
+    while threading.active_count() > before and time.monotonic() < end:
+        time.sleep(0.01)
     assert threading.active_count() == before
 
 
@@ -69,3 +74,25 @@ def test_an_interrupt_of_the_consumer_ends_the_run():
     with pytest.raises(KeyboardInterrupt):
         results.throw(KeyboardInterrupt())
     assert len(begun) <= 4
+
+
+def test_an_interrupt_does_not_wait_for_what_runs():
+    """Of two tasks one waits for minutes; the command may ask whether it still does."""
+    go_on = threading.Event()
+
+    def work(x):
+        if x == 0:
+            go_on.wait(300.0)
+        else:
+            raise KeyboardInterrupt
+
+    assert not is_busy()
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        list(run_all(work, range(9), 2))
+    assert time.monotonic() - start < SOON_S
+    assert is_busy()
+    go_on.set()
+    while is_busy():
+        assert time.monotonic() - start < SOON_S
+        time.sleep(0.01)

@@ -40,6 +40,7 @@ from zlocus.request import (
     check_output,
     product_names,
 )
+from zlocus.threads import is_busy
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
@@ -96,7 +97,13 @@ def explained(command: Callable[P, R]) -> Callable[P, R]:
         except ZlocusError as error:
             raise _failed(str(error), error.exit_status) from error
         except KeyboardInterrupt as error:
-            raise _failed("Interrupted.", EXIT_INTERRUPTED) from error
+            failed = _failed("Interrupted.", EXIT_INTERRUPTED)
+            if is_busy():
+                # Nothing is half-written: threads only compute.
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(EXIT_INTERRUPTED)
+            raise failed from error
         except (typer.Exit, BrokenPipeError):
             raise
         except Exception as error:

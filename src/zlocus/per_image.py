@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from zlocus.errors import ConfigError, TileError, ZlocusError
 from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.execution.scratch import Scratch
+from zlocus.execution.store import TileStore
+from zlocus.job import TileProduct
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.confirm import ROWS_AT_ONCE, MatchedImage, confirm
 from zlocus.matching.gc3 import (
@@ -199,9 +201,10 @@ def match_images(
     progress: Progress,
     scratch: Scratch,
     area: Area | None = None,
+    store: TileStore | None = None,
 ) -> list[Matched]:
     """Every tile of every reference image, or those that may show an area; of any precision, for there it is not in
-    metres. scratch : makes the arrays of all pixels."""
+    metres. scratch : makes the arrays of all pixels; store : keeps tiles, and has those of a run that is taken on."""
     options = replace(options, checks=replace(options.checks, most_sigma_m=None))
     images = [CellWindow(0, 0, *space.reference.image.shape) for space, _ in settled]
     surfaces = [Surface.nothing(window, full=scratch.full) for window in images]
@@ -213,28 +216,40 @@ def match_images(
     ]
     tallies = np.zeros((len(settled), 2), np.int64)
 
-    def work(task: tuple[int, Tile]) -> TileResult:
+    def work(task: tuple[int, Tile]) -> tuple[TileProduct, bool]:
+        """What was found for a tile, and whether it was found anew."""
         space, scene = settled[task[0]]
         core = task[1].core
+        known = None if store is None else store.load(tile_name(*task))
+        if known is not None:
+            return TileProduct.of(known), False
         try:
-            return match_tile(scene, core, options, use_visibility=use_visibility)
+            result = match_tile(scene, core, options, use_visibility=use_visibility)
         except ZlocusError:
             raise
         except Exception as error:
             where = f"The pixels from row {core.row}, column {core.col} on of {space.reference.name}"
             what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
             raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
+        return TileProduct(result.surface.part(task[1].kept, core), result.evaluations, result.all_images), True
 
     with progress.stage("Matching", len(tasks)) as stage:
-        for (number, tile), result in run_all(work, tasks, workers):
-            to, part = tile.kept.slices_in(images[number]), result.surface.part(tile.kept, tile.core)
-            for mine, theirs in zip(surfaces[number].arrays, part.arrays, strict=True):
+        for (number, tile), (product, is_new) in run_all(work, tasks, workers):
+            if store is not None and is_new:
+                store.keep(tile_name(number, tile), product.arrays())
+            to = tile.kept.slices_in(images[number])
+            for mine, theirs in zip(surfaces[number].arrays, product.surface.arrays, strict=True):
                 mine[to] = theirs
             scratch.rest()
-            tallies[number] += result.evaluations, result.all_images
+            tallies[number] += product.evaluations, product.all_images
             stage.advance()
     found = [matched_image(*one, surface) for one, surface in zip(settled, surfaces, strict=True)]
     return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(found, tallies, strict=True)]
+
+
+def tile_name(number: int, tile: Tile) -> str:
+    """Of a tile of an image, where it is kept."""
+    return f"image{number}_{tile.core.row}_{tile.core.col}"
 
 
 def matched_image(space: ImageSpace, scene: MatchScene, surface: Surface) -> Matched:
@@ -274,12 +289,13 @@ def match_for_grid(
     workers: int,
     progress: Progress,
     scratch: Scratch,
+    store: TileStore,
 ) -> GridImages:
     """All views matched in their own spaces and confirmed by each other, for a surface. leading : names of those whose
-    heights it takes, in the order in which they give grey values."""
+    heights it takes, in the order in which they give grey values; scratch, store : see `match_images`."""
     options = depth_options(config) if is_by_depth(ready.scene) else config
     settled, options = settle_all(ready, [view.name for view in ready.scene.views], options)
-    before = match_images(settled, options, use_visibility, workers, progress, scratch, area)
+    before = match_images(settled, options, use_visibility, workers, progress, scratch, area, store)
     after = confirmed_images(before, progress, scratch)
     z = sum(area.z_range) / 2
     images = {one.image.space.reference.name: pixel_heights(one, b, z) for one, b in zip(after, before, strict=True)}

@@ -132,7 +132,7 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     ties = {} if orientation.ties is None else orientation.ties.arrays()
     with made_folder(out), opened.store.open(digest_of(settled, orientation), ties):
         with watch.stage("match") as elsewhere:
-            make = _maker(request, job, corrected, orientation, z_range, plan, tally, progress)
+            make = _maker(request, job, opened.store, corrected, orientation, z_range, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
         kept.append(opened.store)
         matching.check(failed, request.partial)
@@ -306,6 +306,7 @@ def _job(request: DsmRequest, settled: MatchScene, grid: Grid, config: RunConfig
 def _maker(
     request: DsmRequest,
     job: TileJob,
+    store: TileStore,
     scene: Scene,
     orientation: Orientation,
     z_range: tuple[float, float],
@@ -324,7 +325,7 @@ def _maker(
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
     scratch = Scratch(request.out, plan.allowed_bytes - plan.n_bytes)
     area = Area(bounds, z_range)
-    matched = match_for_grid(ready, leading, area, config, job.use_visibility, plan.slots, progress, scratch)
+    matched = match_for_grid(ready, leading, area, config, job.use_visibility, plan.slots, progress, scratch, store)
     tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
     if scratch.file_bytes:
         progress.note(

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+_left: list[Future[Any]] = []
 
 
 def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[tuple[Task, Result]]:
     """Results as they come, at most `workers` tasks at a time and no result waiting while tasks pile up.
 
-    An exception in a task, or an interrupt, ends the run: tasks not begun are dropped.
+    An exception in a task, or an interrupt, ends the run: tasks not begun are dropped; after an interrupt those that
+    run are not waited for, see `is_busy`.
     """
     remaining = iter(tasks)
     if workers == 1:
@@ -32,5 +34,16 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
                 result = future.result()
                 running.update({pool.submit(function, following): following for following in islice(remaining, 1)})
                 yield task, result
-    finally:
+    except (KeyboardInterrupt, GeneratorExit):
+        _left.extend(running)
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    except BaseException:
         pool.shutdown(wait=True, cancel_futures=True)
+        raise
+    pool.shutdown()
+
+
+def is_busy() -> bool:
+    """Whether tasks that an interrupt left behind are still running: the process would wait for them at its end."""
+    return any(future.running() for future in _left)

@@ -141,6 +141,11 @@ class Matching:
     store: TileStore
     log: EventLog
 
+    @property
+    def n_there(self) -> int:
+        """Tiles that are finished; the store may keep others, of images."""
+        return sum(name_of(tile) in self.store.finished for tile in self.tiles)
+
     def check(self, failed: Sequence[Outcome], partial: bool) -> None:
         """End the run where tiles failed, unless what is there is wanted all the same; nothing never is.
 
@@ -154,7 +159,7 @@ class Matching:
         if not failed:
             return
         self.log.add("stopped", failed=len(failed))
-        if not self.store.finished:
+        if not self.n_there:
             first = failed[0].failure
             if first is not None and first.error is not None:
                 self.log.remove()
@@ -206,7 +211,7 @@ class Matching:
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
             if not self.store.finished:
                 self.log.remove()
-            self.log.add("began", **vars(plan), tiles_there=len(self.store.finished))
+            self.log.add("began", **vars(plan), tiles_there=self.n_there)
             if len(todo) < len(worked):
                 progress.note(f"{len(worked) - len(todo)} of {len(worked)} tiles are there already.")
                 self.log.add("resumed", tiles_there=len(worked) - len(todo))
@@ -246,8 +251,8 @@ class Matching:
         try:
             yield
         except KeyboardInterrupt:
-            self.log.add("interrupted", tiles_done=len(self.store.finished))
-            done = f"{len(self.store.finished)} of {len(self.tiles)} tiles"
+            self.log.add("interrupted", tiles_done=self.n_there)
+            done = f"{self.n_there} of {len(self.tiles)} tiles"
             progress.note(f"{done} are finished and kept: the same command goes on from there.")
             raise
 
