@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
@@ -25,6 +26,7 @@ from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, read, run
 from zlocus.errors import GeometryError, OutputError, StoppedError
 from zlocus.execution.engine import ATTEMPTS
 from zlocus.execution.store import BEFORE, DONE, FOLDER
+from zlocus.progress import progress_for
 from zlocus.surface.reasons import Quality
 
 RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
@@ -237,10 +239,13 @@ def test_image_space_goes_on_with_the_tiles_of_its_images(images, tmp_path, monk
             raise KeyboardInterrupt
         return match(scene, core, *rest, **given)
 
+    said = io.StringIO()
     monkeypatch.setattr("zlocus.per_image.match_tile", until_stopped)
+    monkeypatch.setattr("rendered_scenes.progress_for", lambda _: progress_for(said))
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         run(images("sine"), out, SMALL_TILES, **asked)
+    assert re.search(r"\n4 of \d+ tiles of images are finished and kept", said.getvalue())
     kept = sorted((out / FOLDER).glob("image*.npz"))
     assert len(kept) == 4
     kept[1].write_bytes(kept[1].read_bytes()[:-1])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -233,7 +234,7 @@ def match_images(
             raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
         return TileProduct(result.surface.part(task[1].kept, core), result.evaluations, result.all_images), True
 
-    with progress.stage("Matching", len(tasks)) as stage:
+    with progress.stage("Matching", len(tasks)) as stage, _interruption(store, len(tasks), progress):
         for (number, tile), (product, is_new) in run_all(work, tasks, workers):
             if store is not None and is_new:
                 store.keep(tile_name(number, tile), product.arrays())
@@ -245,6 +246,18 @@ def match_images(
             stage.advance()
     found = [matched_image(*one, surface) for one, surface in zip(settled, surfaces, strict=True)]
     return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(found, tallies, strict=True)]
+
+
+@contextmanager
+def _interruption(store: TileStore | None, n_tasks: int, progress: Progress) -> Iterator[None]:
+    """Says what is kept after an interrupt."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if store is not None:
+            done = f"{len(store.finished)} of {n_tasks} tiles of images"
+            progress.note(f"{done} are finished and kept: the same command goes on from there.")
+        raise
 
 
 def tile_name(number: int, tile: Tile) -> str:

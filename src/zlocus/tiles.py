@@ -91,7 +91,9 @@ def planned(settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, reque
     slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
     processes = slots > 1 and request.method != "gc3-sgm"
     each = there if processes or request.scheduler else here
-    return Plan(len(tiles), slots, processes, each, own, allowed, needs.seconds, request.scheduler)
+    # In image space the pixels of every image are matched before.
+    seconds = needs.seconds * (len(settled.views) if request.method == "gc3-sgm" else 1)
+    return Plan(len(tiles), slots, processes, each, own, allowed, seconds, request.scheduler)
 
 
 @dataclass
