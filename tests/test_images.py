@@ -168,6 +168,30 @@ def test_damage_inside_a_block_is_found_by_reading(tmp_path):
         whole(image)
 
 
+def pairs_of_integers(path):
+    """An image of a kind that NumPy does not have."""
+    with warnings.catch_warnings(action="ignore"), rasterio.open(
+        path, "w", driver="GTiff", height=4, width=5, count=1, dtype="complex_int16"
+    ) as file:  # fmt: skip
+        file.write(np.ones((4, 5), np.complex64), 1)
+    return path
+
+
+def test_a_block_that_no_file_so_small_can_hold_is_not_read(tmp_path):
+    """One gigabyte of pixels that are not there."""
+    path, side = tmp_path / "block.tif", 32768
+    with warnings.catch_warnings(action="ignore"), rasterio.open(
+        path, "w", driver="GTiff", height=side, width=side, count=1, dtype="uint8", sparse_ok=True,
+        tiled=True, blockxsize=side, blockysize=side, compress="deflate",
+    ):  # fmt: skip
+        pass
+    assert path.stat().st_size < 10_000
+    with pytest.raises(
+        InputError, match=r"block\.tif is damaged: it says that it has blocks of 1\.1 GB of pixels, in \d+ "
+    ):
+        open_image(path)
+
+
 def test_files_that_are_no_images(tmp_path):
     text = tmp_path / "notes.tif"
     text.write_text("not an image")
@@ -176,6 +200,7 @@ def test_files_that_are_no_images(tmp_path):
         (tmp_path, "is a folder"),
         (text, r"notes\.tif cannot be opened as a raster"),
         (write_image(tmp_path / "c.tif", GREY.astype(np.complex64)), "complex numbers"),
+        (pairs_of_integers(tmp_path / "slc.tif"), r"slc\.tif holds complex numbers\. Convert it to intensity first"),
     ):
         with pytest.raises(InputError, match=message):
             open_image(path)

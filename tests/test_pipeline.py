@@ -460,9 +460,10 @@ def test_a_failing_tile_leaves_no_half_products(images, tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
 
 
-def test_tiny_pyramids(images, tmp_path):
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_tiny_pyramids(images, tmp_path, rounds):
     """One level and blocks of 8 cells, the least that the options allow."""
-    config = RunConfig(pyramid=PyramidOptions(max_levels=1, block=8, halo=8, tile=64))
+    config = RunConfig(pyramid=PyramidOptions(max_levels=1, block=8, halo=8, tile=64, finest_rounds=rounds))
     out = run(images("plane"), tmp_path / "out", config, bounds=PART).out
     error, seen = errors_of(out, "plane")
     assert (np.abs(error[seen]) < BLUNDER_M).mean() > 0.95

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 import rasterio
 import shapely
+from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyogrio.raw import write as write_vector
 from pyproj import CRS, Transformer
@@ -83,6 +87,17 @@ def test_rasters_that_are_no_grid(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             read_geobox(path)
+
+
+@pytest.mark.parametrize("row", [(np.nan, 0.0), (np.inf, 0.0), (1e300, 0.0), (2.0, -2.0)])
+def test_a_dem_whose_cells_have_no_place(tmp_path, row):
+    """Nor, where rows and columns run the same way, a size."""
+    with warnings.catch_warnings(action="ignore"):
+        path = write_raster(tmp_path / "dem.tif", np.zeros((4, 5)), Affine(*row, 5.0, 1.0, -1.0, 43.0), "EPSG:4326")
+        with pytest.raises(
+            InputError, match=re.escape(f"The cells of {path} lie nowhere: its transform is ({row[0]}, ")
+        ):
+            read_dem(path, GRID, dem_datum(path, None))
 
 
 def test_dem_is_bilinear_at_the_cell_centres(tmp_path):

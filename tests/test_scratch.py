@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,6 +45,17 @@ def test_memory_is_used_while_there_is_room(tmp_path):
     assert scratch.full((0, 5), 0, np.float32).shape == (0, 5)
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="no list of open files")
+def test_many_arrays_share_a_file(tmp_path):
+    """A process may have few files open."""
+    scratch, before = Scratch(tmp_path, 0.0), len(list(Path("/proc/self/fd").iterdir()))
+    arrays = [scratch.full((1000, k + 1), k, np.uint16) for k in range(50)]
+    assert len(list(Path("/proc/self/fd").iterdir())) - before <= 1
+    for k, array in enumerate(arrays):
+        assert array.shape == (1000, k + 1)
+        assert (array == k).all()
+
+
 def test_files_do_not_count_as_memory_once_at_rest(tmp_path):
     side = 12_000
     assert 2 * side * side > 4 * PART_BYTES
@@ -61,7 +73,5 @@ def test_a_disk_without_room_is_said(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "posix_fallocate", full)
     scratch = Scratch(tmp_path / "out", 10.0)
-    with pytest.raises(
-        OutputError, match=rf"{tmp_path} cannot hold the 0\.002 GB .*: No space left on device\. Choose"
-    ):
+    with pytest.raises(OutputError, match=rf"{tmp_path} cannot hold the 1\.1 GB .*: No space left on device\. Choose"):
         scratch.full((1000, 1000), 0, np.uint16)

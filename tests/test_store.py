@@ -50,7 +50,8 @@ def test_what_was_found_before_the_first_tile_is_there_for_the_same_run(tmp_path
     """Whether or not a tile was finished; not for another run, nor for one that is not to take it on."""
     with store(tmp_path).open("s", ARRAYS) as held:
         held.keep("0_0", ARRAYS)
-    for again in (store(tmp_path), store(tmp_path)):
+    for _ in range(2):
+        again = store(tmp_path)
         found = again.found_before()
         assert set(found) == set(ARRAYS)
         for name, array in ARRAYS.items():
@@ -76,6 +77,10 @@ def test_what_was_found_before_is_whole_or_not_there(tmp_path, damage):
     held = store(tmp_path)
     assert held.found_before() is None
     assert held.holds("0_0")
+    with held.open("s", ARRAYS):
+        assert held.holds("0_0")
+    assert set(store(tmp_path).found_before()) == set(ARRAYS)
+    assert store(tmp_path).holds("0_0")
 
 
 @pytest.mark.parametrize(

@@ -234,7 +234,7 @@ def match_images(
             raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
         return TileProduct(result.surface.part(task[1].kept, core), result.evaluations, result.all_images), True
 
-    with progress.stage("Matching", len(tasks)) as stage, _interruption(store, len(tasks), progress):
+    with progress.stage("Matching", len(tasks)) as stage, _interruption(store, tasks, progress):
         for (number, tile), (product, is_new) in run_all(work, tasks, workers):
             if store is not None and is_new:
                 store.keep(tile_name(number, tile), product.arrays())
@@ -249,14 +249,16 @@ def match_images(
 
 
 @contextmanager
-def _interruption(store: TileStore | None, n_tasks: int, progress: Progress) -> Iterator[None]:
+def _interruption(store: TileStore | None, tasks: Sequence[tuple[int, Tile]], progress: Progress) -> Iterator[None]:
     """Says what is kept after an interrupt."""
     try:
         yield
     except KeyboardInterrupt:
         if store is not None:
-            done = f"{len(store.finished)} of {n_tasks} tiles of images"
-            progress.note(f"{done} are finished and kept: the same command goes on from there.")
+            done = sum(tile_name(*task) in store.finished for task in tasks)
+            progress.note(
+                f"{done} of {len(tasks)} tiles of images are finished and kept: the same command goes on from there."
+            )
         raise
 
 

@@ -131,10 +131,10 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     matching = Matching(job, tiles, opened.store, EventLog(out))
     ties = {} if orientation.ties is None else orientation.ties.arrays()
     with made_folder(out), opened.store.open(digest_of(settled, orientation), ties):
+        kept.append(opened.store)
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, opened.store, corrected, orientation, z_range, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
-        kept.append(opened.store)
         matching.check(failed, request.partial)
         with watch.stage("write"):
             _forget(out)

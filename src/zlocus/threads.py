@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-_left: list[Future[Any]] = []
+# What threads are working on.
+_running: set[Future[Any]] = set()
 
 
 def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[tuple[Task, Result]]:
@@ -25,17 +26,25 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
         return
     pool = ThreadPoolExecutor(workers)
     running: dict[Future[Result], Task] = {}
+
+    def begin(task: Task) -> None:
+        future = pool.submit(function, task)
+        running[future] = task
+        _running.add(future)
+        future.add_done_callback(_running.discard)
+
     try:
-        running.update({pool.submit(function, task): task for task in islice(remaining, workers)})
+        for task in islice(remaining, workers):
+            begin(task)
         while running:
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 task = running.pop(future)
                 result = future.result()
-                running.update({pool.submit(function, following): following for following in islice(remaining, 1)})
+                for following in islice(remaining, 1):
+                    begin(following)
                 yield task, result
-    except (KeyboardInterrupt, GeneratorExit):
-        _left.extend(running)
+    except KeyboardInterrupt:
         pool.shutdown(wait=False, cancel_futures=True)
         raise
     except BaseException:
@@ -45,5 +54,5 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
 
 
 def is_busy() -> bool:
-    """Whether tasks that an interrupt left behind are still running: the process would wait for them at its end."""
-    return any(future.running() for future in _left)
+    """Whether threads are at work, as after an interrupt: the process would wait for them at its end."""
+    return bool(_running)

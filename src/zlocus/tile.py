@@ -144,7 +144,7 @@ def match_tile(
         done, every = done + result.evaluations, every + result.all_views
     for _ in range(1, config.pyramid.finest_rounds if use_visibility else 1):
         guide = replace(guide, surface=result.heights.vertex, obstacle=OWN_OBSTACLE)
-        result = _match_level(scene, pixels, core, window, 0, guide, config, method, use_visibility, ranking)
+        result = _match_level(scene, pixels, core, result.window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
     levels[-1] = result = result if method == "mvll" else _with_planes(result, core, config)
     beyond = ~on_cells(ground, levels[0].window, result.window, coarsest)
@@ -408,7 +408,7 @@ def _candidates(
     """
     heights = coarser.heights
     assert coarser.lone is not None
-    known = covers(coarser.seen).sum(axis=0) >= 2
+    known = covers(coarser.seen).sum(axis=0) >= PAIR
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
     found = np.stack([heights.best, rival, coarser.lone])
     low, high = without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)

@@ -211,7 +211,7 @@ class Matching:
         todo = [tile for tile in worked if not self.store.holds(name_of(tile))]
         failed: list[Outcome] = []
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
-            if not self.store.finished:
+            if not self.n_there:
                 self.log.remove()
             self.log.add("began", **vars(plan), tiles_there=self.n_there)
             if len(todo) < len(worked):

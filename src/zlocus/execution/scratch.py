@@ -14,8 +14,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from zlocus.errors import OutputError
 
-# Written to a file at a time.
-PART_BYTES = 64_000_000
+# Written to a file at a time; and of a file at least, for each takes a descriptor of which there are few.
+PART_BYTES, FILE_BYTES = 64_000_000, 1 << 30
+ALIGNED = 64
 
 
 class Scratch:
@@ -30,6 +31,7 @@ class Scratch:
         self.room_bytes = room_bytes
         self.file_bytes = 0
         self._maps: list[mmap.mmap] = []
+        self._used = 0
 
     def full(self, shape: tuple[int, ...], value: Any, dtype: DTypeLike) -> NDArray[Any]:
         """As `numpy.full`.
@@ -56,28 +58,35 @@ class Scratch:
         if n_bytes <= self.room_bytes or not n_bytes:
             self.room_bytes -= n_bytes
             return np.array(values)
-        held = self._mapped(n_bytes)
-        out = np.frombuffer(held, values.dtype).reshape(values.shape)
+        held, first = self._mapped(n_bytes)
+        out = np.frombuffer(held, values.dtype, values.size, first).reshape(values.shape)
         rows = max(PART_BYTES * len(out) // n_bytes, 1)
         for row in range(0, len(out), rows):
             out[row : row + rows] = values[row : row + rows]
             self.rest()
         return out
 
-    def _mapped(self, n_bytes: int) -> mmap.mmap:
-        """So many bytes of a file, which the disk has: a file that grows later ends the process where it cannot."""
+    def _mapped(self, n_bytes: int) -> tuple[mmap.mmap, int]:
+        """A file with room for so many bytes, and the first of them. The disk has that room: a file that grows when it
+        is written ends the process where it cannot."""
+        self.file_bytes += n_bytes
+        first = -(-self._used // ALIGNED) * ALIGNED
+        if self._maps and first + n_bytes <= len(self._maps[-1]):
+            self._used = first + n_bytes
+            return self._maps[-1], first
+        size = max(n_bytes, FILE_BYTES)
         try:
             with tempfile.TemporaryFile(dir=self.folder) as file:
                 if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(file.fileno(), 0, n_bytes)
+                    os.posix_fallocate(file.fileno(), 0, size)
                 else:
-                    file.truncate(n_bytes)
-                held = mmap.mmap(file.fileno(), n_bytes)
+                    file.truncate(size)
+                held = mmap.mmap(file.fileno(), size)
         except OSError as error:
             raise OutputError(
-                f"{self.folder} cannot hold the {n_bytes / 1e9:.2g} GB that memory has no room for: "
-                f"{error.strerror or error}. Choose a folder on a larger disk with -o, or allow more memory."
+                f"{self.folder} cannot hold the {size / 1e9:.2g} GB that memory has no room for: "
+                f"{error.strerror or error}. Choose a folder on a larger disk with -o, or a machine with more memory."
             ) from error
-        self.file_bytes += n_bytes
         self._maps.append(held)
-        return held
+        self._used = n_bytes
+        return held, 0

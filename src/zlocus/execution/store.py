@@ -113,10 +113,10 @@ class TileStore:
                     f"{self.folder} holds {len(self.finished)} finished tiles for which cameras and heights came out "
                     "otherwise, as they may on another machine. Add --overwrite to start anew, or go on where it began."
                 )
-        if not self.finished:
+        if not self.finished or self.found_before() is None:
             with _written(self.folder):
                 for path in self.folder.iterdir():
-                    if path.name != LOCK:
+                    if not self.finished and path.name != LOCK:
                         path.unlink()
                 content, digest = _packed(before)
                 write_whole(self.folder / BEFORE, content)

@@ -29,6 +29,8 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEAST_BLOCK_BYTES = 4
 # Of a block, that is read whatever stands for it; beyond, as many times what the file holds.
 LARGE_BLOCK_BYTES, DENSEST = 256 << 20, 10_000
+# Of kinds that only GDAL has.
+PIXEL_BYTES = {"complex_int16": 4}
 KEPT_OPEN = 32  # rasters of a thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
 # GDAL's virtual files that are read: those of servers, as they are. None within an archive.
@@ -137,10 +139,13 @@ def _opened(path: Path) -> rasterio.DatasetReader:
 
 def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
     """A block of pixels is read as one, in memory, however few bytes stand for it."""
+    if source.driver not in ("GTiff", "COG") or not source.count:
+        return
     bands = source.count if source.interleaving == Interleaving.pixel else 1
-    n_bytes = math.prod(source.block_shapes[0]) * bands * np.dtype(source.dtypes[0]).itemsize if source.count else 0
-    length = os.path.getsize(path)
-    if source.driver in ("GTiff", "COG") and n_bytes > max(LARGE_BLOCK_BYTES, DENSEST * length):
+    kind = source.dtypes[0]
+    pixel = PIXEL_BYTES[kind] if kind in PIXEL_BYTES else np.dtype(kind).itemsize
+    n_bytes, length = math.prod(source.block_shapes[0]) * bands * pixel, os.path.getsize(path)
+    if n_bytes > max(LARGE_BLOCK_BYTES, DENSEST * length):
         source.close()
         raise InputError(
             f"{path} is damaged: it says that it has blocks of {n_bytes / 1e9:.1f} GB of pixels, in {length} bytes. "

@@ -14,11 +14,11 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews, ViewPixels
-from zlocus.matching.visibility import coverage, covers, sees
+from zlocus.matching.visibility import PAIR, coverage, covers, sees
 
 AROUND = np.ones((3, 3), np.uint8)
-# Views that show a height; cells around those that are worth matching.
-PAIR, MARGIN = 2, 4
+# Cells around those that are worth matching.
+MARGIN = 4
 # Ground rises by so much of the way to its neighbour at most, to half a step of its height; what views show is asked
 # for within so many steps more.
 STEEPEST, HALF_STEP, ASKED_STEPS = 1.0, 0.5, 4.0

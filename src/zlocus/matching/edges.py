@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,9 +26,8 @@ def agreement(
     """
     shown = showing[:, *core].reshape(len(showing), -1)
     grey = np.stack([ortho_image(views, surface, view)[core].ravel() for view in range(len(showing))])
-    count = shown.astype(np.float32)
-    grey = np.where(shown, grey, np.float32(0.0))
-    n = np.maximum((count @ count.T).astype(np.float64), 1.0)
+    grey, count = np.where(shown, grey, np.float32(0.0)).astype(np.float64), shown.astype(np.float64)
+    n = np.maximum(count @ count.T, 1.0)
     mean = (grey @ count.T) / n
     variance = (grey**2 @ count.T) / n - mean**2
     covariance = (grey @ grey.T) / n - mean * mean.T
@@ -38,9 +35,9 @@ def agreement(
         alike = covariance / np.sqrt(variance * variance.T)
     alike[n < FEWEST_SHARED] = np.nan
     np.fill_diagonal(alike, np.nan)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of views that share nothing
-        return np.asarray(np.nanmedian(alike, axis=1))
+    found, known = np.full(len(alike), np.nan), np.isfinite(alike).any(axis=1)
+    found[known] = np.nanmedian(alike[known], axis=1)
+    return found
 
 
 def edge_image(

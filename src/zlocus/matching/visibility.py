@@ -19,6 +19,7 @@ from zlocus.matching.views import TileViews
 IntVolume = NDArray[np.int32]
 BORDER_PX = 3.0
 NOTHING_HIDDEN = -(2**29)
+# Views that a height takes.
 PAIR = 2
 # Cells per height step by which directions differ within a part of a tile, and parts along a side at most.
 TURN, MOST_PARTS = 0.2, 8

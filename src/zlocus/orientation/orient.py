@@ -251,7 +251,8 @@ def orient(
     xyz = first_ground(scene, ties)
     if known is None:
         jacobian = ground_jacobian(sensors, ties.seen, xyz)
-        known = MeasuredTies(ties, sharpened(scene.views, ties.seen, jacobian, options, threads))
+        precise = sharpened(scene.views, ties.seen, jacobian, options, threads)
+        known = MeasuredTies(replace(ties, pairs=()), precise)
     seen = known.precise
     strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
     joint, corrected = None, sensors
