@@ -5,7 +5,7 @@ the slopes of the coarser level's surface (medians over patches, which jumps do 
 index k then means k steps above the base. It is continuous and bilinear between the corners of patches, so neighbours
 are still compared by height. It follows no building: where slopes are small it is nearly level.
 
-It must not depend on how the ground is cut into tiles either, for where it lies decides at which heights views are
+It must not depend on how far a tile's halo reaches either, for where it lies decides at which heights views are
 compared. So a level takes the base of the level above and mends it with the patches nearby alone, and corners lie whole
 steps high: what differs a little in two tiles makes no difference then.
 """
@@ -209,7 +209,7 @@ def relaxed(
 
     A few damped Jacobi steps of the least squares over all edges, each as steep as the patches beside it. They settle
     what a coarser level is blind to and leave what it knows, as in nested iteration (Brandt 1977, section 1); a corner
-    hears of no patch that is more than `ROUNDS` away, so heights do not depend on how the ground is cut into tiles.
+    hears of no patch that is more than `ROUNDS` away, so heights do not depend on what is far away in a halo.
     """
     rise_down, rise_across = patch * _beside(by_row, 1), patch * _beside(by_col, 0)
     n = np.full(corners.shape, 4.0)

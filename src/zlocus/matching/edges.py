@@ -17,15 +17,15 @@ FEWEST_SHARED = 64
 
 
 def agreement(
-    views: TileViews, surface: NDArray[np.float32], showing: NDArray[np.bool_], core: Part
+    views: TileViews, surface: NDArray[np.float32], covering: NDArray[np.bool_], core: Part
 ) -> NDArray[np.float64]:
     """How alike each view is to the others: the median of its correlations with them over the core, (i,).
 
-    surface : (r, c) height indices on which they are compared; showing : (i, r, c) bool, which views show which cells.
-    NaN for a view that shares too little with any.
+    surface : (r, c) height indices on which they are compared; covering : (i, r, c) bool, which views cover which cells
+    at some of the heights searched. NaN for a view that shares too little with any.
     """
-    shown = showing[:, *core].reshape(len(showing), -1)
-    grey = np.stack([ortho_image(views, surface, view)[core].ravel() for view in range(len(showing))])
+    shown = covering[:, *core].reshape(len(covering), -1)
+    grey = np.stack([ortho_image(views, surface, view)[core].ravel() for view in range(len(covering))])
     grey, count = np.where(shown, grey, np.float32(0.0)).astype(np.float64), shown.astype(np.float64)
     n = np.maximum(count @ count.T, 1.0)
     mean = (grey @ count.T) / n
@@ -43,17 +43,17 @@ def agreement(
 def edge_image(
     views: TileViews,
     surface: NDArray[np.float32],
-    showing: NDArray[np.bool_],
+    covering: NDArray[np.bool_],
     core: Part,
     agrees: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """The leading view of a tile on a surface (r, c), NaN where it does not show it.
+    """The leading view of a tile on a surface (r, c), NaN where it covers nothing.
 
-    That is the first that agrees with the others and shows half as much of the core, or more, as any that does.
-    showing : (i, r, c) bool, which views show which cells; agrees : (i,), see `agreement`.
+    That is the first that agrees with the others and covers half as much of the core, or more, as any that does.
+    covering : (i, r, c) bool, as for `agreement`, which gives `agrees` (i,).
     """
     best = np.nanmax(agrees, initial=0.0)
     trusted = ~(agrees < AGREES * best) if best > 0 else np.ones(len(agrees), np.bool_)
-    shown = showing[:, *core].sum(axis=(1, 2))
+    shown = covering[:, *core].sum(axis=(1, 2))
     view = int(np.flatnonzero(trusted & (shown >= shown[trusted].max() / 2))[0])
-    return np.where(showing[view], ortho_image(views, surface, view), np.float32(np.nan))
+    return np.where(covering[view], ortho_image(views, surface, view), np.float32(np.nan))

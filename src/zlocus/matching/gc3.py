@@ -36,7 +36,14 @@ DISPARITY_MARGIN_PX = 8.0
 LEAST_DISPARITY_PX = 0.5
 BY_DEPTH: dict[str, dict[str, Any]] = {
     "measure": {"large_window": 3, "hidden_excused": 1.0, "hidden_margin_steps": 24.0, "grey_weight_two": 1.0},
-    "semiglobal": {"predecessors": 1, "p1": 20, "p2": 240, "p2_edge": 100, "edge_contrast": 2.0},
+    "semiglobal": {
+        "predecessors": 1,
+        "p1": 20,
+        "p2": 240,
+        "p2_edge": 100,
+        "edge_contrast": 2.0,
+        "edge_contrast_two": 2.0,
+    },
 }
 SMALLEST_BLOCK = 8
 DISPARITY_SAMPLES = 64
