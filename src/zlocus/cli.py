@@ -40,7 +40,7 @@ from zlocus.request import (
     check_output,
     product_names,
 )
-from zlocus.threads import is_busy
+from zlocus.threads import leave_if_busy
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
@@ -98,11 +98,7 @@ def explained(command: Callable[P, R]) -> Callable[P, R]:
             raise _failed(str(error), error.exit_status) from error
         except KeyboardInterrupt as error:
             failed = _failed("Interrupted.", EXIT_INTERRUPTED)
-            if is_busy():
-                # Nothing is half-written: threads only compute.
-                sys.stdout.flush()
-                sys.stderr.flush()
-                os._exit(EXIT_INTERRUPTED)
+            leave_if_busy(EXIT_INTERRUPTED)
             raise failed from error
         except (typer.Exit, BrokenPipeError):
             raise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import islice
@@ -56,3 +58,11 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
 def is_busy() -> bool:
     """Whether threads are at work, as after an interrupt: the process would wait for them at its end."""
     return bool(_running)
+
+
+def leave_if_busy(status: int) -> None:
+    """End the process where threads are at work. Nothing is half-written then, for they only compute."""
+    if is_busy():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
