@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -361,3 +363,14 @@ def test_what_is_written_reads_back_equal(tmp_path):
     assert table.labels == {"word": ("a", "b") * 25}
     with pytest.raises(OutputError, match="cannot be written"):
         write_numbers(tmp_path / "none" / "t.csv", columns, "")
+
+
+def test_what_is_asked_for_stays_asked_for_whatever_is_read_first():
+    """Up to 2.11 pydantic lends the defaults of one model to another, in the order in which they are imported."""
+    code = (
+        "import zlocus.io.scene_file\n"
+        "from zlocus.io.linescan import LineScanCamera\n"
+        "print([n for n, f in LineScanCamera.model_fields.items() if f.is_required()])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert found.strip() == "['calibration', 'focal_mm', 'trajectory', 'times']"
