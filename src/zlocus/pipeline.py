@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
 from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
@@ -23,32 +21,21 @@ from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.execution.scratch import Scratch
 from zlocus.execution.store import TileStore
 from zlocus.execution.warm import kernels_compiling
-from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
+from zlocus.grid import Grid
 from zlocus.identity import digest_of, key_of
 from zlocus.io.config import config_as_dict
 from zlocus.io.raster import compressing
-from zlocus.io.reference import cells_inside, dem_datum, read_dem, read_geobox, read_polygons
-from zlocus.io.scene_file import open_scene
-from zlocus.io.vertical import VerticalDatum, vertical_datum
+from zlocus.io.reference import cells_inside, dem_datum, read_polygons
+from zlocus.io.vertical import VerticalDatum
 from zlocus.job import Polygons, Terrain, TileJob, TileProduct
 from zlocus.matching.ranking import RankedPoints
-from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
+from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import MeasuredTies, Orientation, supported
+from zlocus.orientation.orient import MeasuredTies, supported
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
-from zlocus.preparing import (
-    area_to_match,
-    asked_crs,
-    heights_asked_for,
-    heights_of_ties,
-    made_folder,
-    note_dem,
-    oriented,
-    possible_heights,
-    what_was_applied,
-    with_heights,
-)
+from zlocus.preparing import made_folder, oriented, what_was_applied
 from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
+from zlocus.products.observations import OBSERVATIONS, write_observations
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
@@ -56,7 +43,8 @@ from zlocus.products.record import Stopwatch, inputs_record, now, request_as_dic
 from zlocus.progress import Progress
 from zlocus.reporting import Matched, forget_report, try_report, write_shown
 from zlocus.request import DsmRequest
-from zlocus.scene import Scene, check_overlap, is_local
+from zlocus.scene import Scene
+from zlocus.settling import Settled, opened, settled_run
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 SUFFICIENT_COVERAGE = 0.5
@@ -110,49 +98,51 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     watch = Stopwatch()
     check_maps(request.products, config.products)
     with watch.stage("open"), progress.stage("Opening images"):
-        opened = _opened(request, config, progress)
-        scene, vertical = opened.scene, opened.vertical
+        found = opened(request, progress)
+        scene, vertical = found.scene, found.vertical
+        store = TileStore.of(request.out, key_of(request, config, found.files), request.resume, request.overwrite)
+        polygons = _area_polygons(request, scene.crs)
     with watch.stage("orient"):
-        known = _known_ties(opened.store, scene, progress)
+        known = _known_ties(store, scene, progress)
         orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
-        corrected = orientation.apply(scene)
-        z_range = _searched_heights(request, corrected, orientation, config, progress)
-        grid = _grid(request, opened.like, corrected, orientation, z_range)
-        settled = _settled(request, grid, corrected, orientation, z_range, config)
-        tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
-        plan = planned(settled, tiles, config, request)
-        vertical.check_covers(_area_matched(grid, settled), scene.crs)
-        _check_polygons(request, grid, settled, opened.polygons.inside)
+        settled = settled_run(request, found, orientation, config, progress)
+        tiles = plan_tiles(settled.grid.window, settled.matching.seen, config.pyramid)
+        plan = planned(settled.matching, tiles, config, request)
+        vertical.check_covers(_area_matched(settled.grid, settled.matching), scene.crs)
+        _check_polygons(request, settled, polygons.inside)
         progress.note(str(plan))
     out, tally = request.out, Tally()
-    job = _job(request, settled, grid, config, opened.polygons)
-    matching = Matching(job, tiles, opened.store, EventLog(out))
+    job, digest = _job(request, settled, config, polygons), digest_of(settled.matching, orientation)
+    matching = Matching(job, tiles, store, EventLog(out))
     ties = {} if orientation.ties is None else orientation.ties.arrays()
-    with made_folder(out), opened.store.open(digest_of(settled, orientation), ties):
-        kept.append(opened.store)
+    with made_folder(out), store.open(digest, ties):
+        kept.append(store)
         with watch.stage("match") as elsewhere:
-            make = _maker(request, job, opened.store, corrected, orientation, z_range, plan, tally, progress)
+            make = _maker(request, job, store, settled, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
         matching.check(failed, request.partial)
         with watch.stage("write"):
             _forget(out)
-            with _rasters(request, grid, settled, vertical) as rasters:
+            with _rasters(request, settled, vertical) as rasters:
                 matching.assemble(failed, rasters, tally, progress)
     with watch.stage("points"):
-        _write_points(out, orientation, corrected, tally.ranked, settled, vertical)
-    matched = Matched(corrected, settled, grid, orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs))
+        _write_points(out, settled, tally.ranked, vertical)
+    matched = Matched(
+        settled.scene, settled.matching, settled.grid, orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs)
+    )
     _show(request, matched, config, watch, progress)
     with watch.stage("record"):
-        asked = _asked_record(request, config, scene, opened.files)
+        asked = _asked_record(request, config, scene, found.files)
     record = {
         **asked,
         "stages": watch.stages,
         "orientation": orientation.as_dict(),
-        "grid": _grid_record(grid, scene.crs),
+        "grid": _grid_record(settled.grid, scene.crs),
         "vertical": vertical.as_dict(),
-        "heights": _lattice_record(settled, z_range),
+        "heights": _lattice_record(settled),
+        "settled_sha256": digest,
         **tally.as_dict(),
     }
     _write_maps(request, config, watch, record, progress)
@@ -170,26 +160,11 @@ def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredT
     return known
 
 
-def _settled(
-    request: DsmRequest,
-    grid: Grid,
-    scene: Scene,
-    orientation: Orientation,
-    z_range: tuple[float, float],
-    config: RunConfig,
-) -> MatchScene:
-    """What is settled before the first tile, with limits of heights from a DEM."""
-    settled = settle(
-        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
-        orientation.measured,
-    )  # fmt: skip
-    return _with_dem(request, settled, scene.crs, config)
-
-
-def _rasters(request: DsmRequest, grid: Grid, settled: MatchScene, vertical: VerticalDatum) -> SurfaceRasters:
+def _rasters(request: DsmRequest, settled: Settled, vertical: VerticalDatum) -> SurfaceRasters:
     """The rasters of the surface; in image space the ortho-image is grey."""
-    has_colours = settled.has_colours and request.method != "gc3-sgm"
-    return SurfaceRasters(request.out, grid.geobox, settled.views[0].image.dtype, vertical, has_colours)
+    matching = settled.matching
+    has_colours = matching.has_colours and request.method != "gc3-sgm"
+    return SurfaceRasters(request.out, settled.grid.geobox, matching.views[0].image.dtype, vertical, has_colours)
 
 
 def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: list[Path]) -> dict[str, Any]:
@@ -197,6 +172,7 @@ def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: l
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         "created": now(),
+        "started_in": str(Path.cwd()),
         "versions": versions_record(),
         "inputs": inputs_record(files),
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
@@ -221,51 +197,6 @@ def _write_maps(
     link_all(request.out, progress)
     if failed is not None:
         raise failed
-
-
-@dataclass(frozen=True)
-class Opened:
-    """What a request names. like : grid of --like; files : whose content the result depends on; store : tiles that are
-    there already."""
-
-    scene: Scene
-    vertical: VerticalDatum
-    like: GeoBox | None
-    polygons: Polygons
-    files: list[Path]
-    store: TileStore
-
-
-def _opened(request: DsmRequest, config: RunConfig, progress: Progress) -> Opened:
-    """Everything that a request names, open."""
-    like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
-    scene = _scene(request, like, vertical)
-    note_dem(request.dem, request.dem_vertical, progress)
-    files = _files(request, scene, vertical)
-    store = TileStore.of(request.out, key_of(request, config, files), request.resume, request.overwrite)
-    return Opened(scene, vertical, like, _area_polygons(request, scene.crs), files, store)
-
-
-def _scene(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
-    """The scene, its views by name, so that the order of the inputs changes nothing, with the heights asked for."""
-    crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
-    scene = open_scene(request.inputs, crs)
-    if is_local(scene.crs):
-        _check_local(request)
-    bounds = request.bounds if like is None else like.boundingbox.bbox
-    scene = with_heights(scene, request.heights, vertical, bounds)
-    check_overlap(scene, possible_heights(scene, scene.heights))
-    return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
-
-
-def _check_local(request: DsmRequest) -> None:
-    """Refuse what has a place on the Earth, in a local frame."""
-    for name in ("dem", "area", "mask"):
-        if path := getattr(request, name):
-            raise GeometryError(
-                f"The scene's frame is local, where {path} has no place. Leave --{name} out; --bounds and --heights "
-                "are in that frame."
-            )
 
 
 def run_demo(out: Path, progress: Progress) -> DemoResult:
@@ -293,23 +224,21 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     return DemoResult(result.out, tuple(evaluations))
 
 
-def _job(request: DsmRequest, settled: MatchScene, grid: Grid, config: RunConfig, area: Polygons) -> TileJob:
+def _job(request: DsmRequest, settled: Settled, config: RunConfig, area: Polygons) -> TileJob:
     """What makes the tiles of a request."""
     terrain = None
     if request.fill == "dem":
         assert request.dem is not None, "of a request that fills from it"
         terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
     use_visibility, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
-    return TileJob(settled, grid, config, request.method, use_visibility, fill, area, terrain)
+    return TileJob(settled.matching, settled.grid, config, request.method, use_visibility, fill, area, terrain)
 
 
 def _maker(
     request: DsmRequest,
     job: TileJob,
     store: TileStore,
-    scene: Scene,
-    orientation: Orientation,
-    z_range: tuple[float, float],
+    found: Settled,
     plan: Plan,
     tally: Tally,
     progress: Progress,
@@ -317,14 +246,14 @@ def _maker(
     """What makes a tile: matching on the grid, or what is matched in the images first."""
     if request.method != "gc3-sgm":
         return job
-    config, settled, grid = job.config, job.settled, job.grid
-    xyz = orientation.xyz
-    ready = OrientedScene(scene, orientation, xyz, supported(xyz, orientation.sigma_z_m), z_range)
+    config, settled, grid, orientation = job.config, job.settled, job.grid, found.orientation
+    is_supported = supported(orientation.xyz, orientation.sigma_z_m)
+    ready = OrientedScene(found.scene, orientation, orientation.xyz, is_supported, found.z_range)
     leading = [view.name for view in settled.views if request.reference in (None, view.name)]
     box, aside = grid.geobox.extent.boundingbox, config.pyramid.halo * grid.cell_m
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)
     scratch = Scratch(request.out, plan.allowed_bytes - plan.n_bytes)
-    area = Area(bounds, z_range)
+    area = Area(bounds, found.z_range)
     matched = match_for_grid(ready, leading, area, config, job.use_visibility, plan.slots, progress, scratch, store)
     tally.evaluations, tally.all_images = matched.evaluations, matched.all_images
     if scratch.file_bytes:
@@ -345,7 +274,7 @@ def _forget(out: Path) -> None:
     """Remove what an earlier run left, before its rasters are replaced: nothing of it may stand beside them."""
     remove_maps(out)
     forget_report(out)
-    for name in ("run.json", "ties.gpkg"):
+    for name in ("run.json", "ties.gpkg", OBSERVATIONS):
         (out / name).unlink(missing_ok=True)
     # Of runs that were killed; none of this one's is there yet, and no other writes here meanwhile.
     for path in out.iterdir():
@@ -353,14 +282,15 @@ def _forget(out: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _write_points(
-    out: Path, orientation: Orientation, corrected: Scene, ranked: list[RankedPoints], settled: MatchScene,
-    vertical: VerticalDatum,
-) -> None:  # fmt: skip
-    """Ties and ranking."""
-    write_ties(out / "ties.gpkg", orientation, corrected, vertical)
+def _write_points(out: Path, settled: Settled, ranked: list[RankedPoints], vertical: VerticalDatum) -> None:
+    """Ties, also as they were measured, and ranking."""
+    orientation, scene = settled.orientation, settled.scene
+    write_ties(out / "ties.gpkg", orientation, scene, vertical)
+    if orientation.ties is not None:
+        write_observations(out, orientation.ties)
     if ranked:
-        write_ranking(out / "ranking.gpkg", ranked, [view.name for view in settled.views], corrected.crs, vertical)
+        names = [view.name for view in settled.matching.views]
+        write_ranking(out / "ranking.gpkg", ranked, names, scene.crs, vertical)
 
 
 def _show(request: DsmRequest, matched: Matched, config: RunConfig, watch: Stopwatch, progress: Progress) -> None:
@@ -370,53 +300,6 @@ def _show(request: DsmRequest, matched: Matched, config: RunConfig, watch: Stopw
     (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
     with watch.stage("curves"), progress.stage("Match curves"):
         write_shown(request.out, matched, config, match_s, progress)
-
-
-def _searched_heights(
-    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
-) -> tuple[float, float]:
-    """Height range of the search: as asked for, else from the DEM, else from the ties."""
-    if scene.heights:
-        return heights_asked_for(scene, scene.heights, progress)
-    if request.dem is None:
-        return heights_of_ties(scene, orientation, config.orientation)
-    z = possible_heights(scene, None)
-    bounds = shared_ground(scene, (z[0], z[-1]))
-    cell = median_ground_pixel(scene, sum(z) / len(z)) * 16
-    geobox = grid_from_bounds(bounds, cell, scene.crs).geobox
-    heights = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
-    if not np.isfinite(heights).any():
-        raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
-    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
-    low, high = low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
-    return heights_asked_for(scene, (low, high), progress, f"The heights around {request.dem}")
-
-
-def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
-    """Limits from the DEM for the coarsest level."""
-    if request.dem is None:
-        return settled
-    level = settled.levels - 1
-    window = settled.seen.at_level(level, 0)
-    geobox = GeoBox((window.rows, window.cols), settled.transform(window, level), crs)
-    dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
-    limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
-    return replace(settled, prior=limits)
-
-
-def _grid(
-    request: DsmRequest, like: GeoBox | None, scene: Scene, orientation: Orientation, z_range: tuple[float, float]
-) -> Grid:
-    """The grid asked for: another raster's, or the area at a resolution, both with defaults."""
-    z = (z_range[0] + z_range[1]) / 2
-    if like is not None:
-        grid = grid_from_geobox(like, str(request.like))
-        check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
-        return grid
-    cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
-    check_resolution(cell, scene, z, "--resolution")
-    bounds = request.bounds or area_to_match(scene, orientation, z_range)
-    return grid_from_bounds(bounds, cell, scene.crs)
 
 
 def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:
@@ -437,11 +320,12 @@ def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float,
     )
 
 
-def _check_polygons(request: DsmRequest, grid: Grid, settled: MatchScene, area: NDArray[Any] | None) -> None:
+def _check_polygons(request: DsmRequest, settled: Settled, area: NDArray[Any] | None) -> None:
     """Refuse polygons of an area that hold no cell to be matched."""
     if area is None:
         return
-    shared = grid.window.within(settled.seen)
+    grid = settled.grid
+    shared = grid.window.within(settled.matching.seen)
     row, col = shared.row - grid.window.row, shared.col - grid.window.col
     if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
         raise GeometryError(
@@ -477,22 +361,11 @@ def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
     return {"crs": crs.to_string(), "transform": list(geobox.transform)[:6], "shape": list(geobox.shape)}
 
 
-def _lattice_record(settled: MatchScene, z_range: tuple[float, float]) -> dict[str, Any]:
+def _lattice_record(settled: Settled) -> dict[str, Any]:
     """The heights searched, and their lattice, as JSON can hold them."""
-    range_m = [round(z, 3) for z in z_range]
     return {
-        "range_m": range_m,
-        "step_m": settled.step_m,
-        "levels": settled.levels,
-        "leading_view": settled.views[0].name,
+        "range_m": [round(z, 3) for z in settled.z_range],
+        "step_m": settled.matching.step_m,
+        "levels": settled.matching.levels,
+        "leading_view": settled.matching.views[0].name,
     }
-
-
-def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[Path]:
-    """Every file whose content the result depends on."""
-    extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
-    extra += vertical.files
-    if request.dem is not None:
-        extra += dem_datum(request.dem, request.dem_vertical).files
-    listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
-    return list(dict.fromkeys(listed))

@@ -50,6 +50,7 @@ PRODUCTS = (
     Product("contours.gpkg", "Contours", GEOPACKAGE, ("data",)),
     Product("surface.laz", "The surface's cells as coloured points", LAZ, ("data",)),
     Product("ties.gpkg", "Tie points", GEOPACKAGE, ("metadata",)),
+    Product("observations.npz", "Where tie points were seen in the images", "application/zip", ("metadata",)),
     Product("ranking.gpkg", "What tie points say of the images", GEOPACKAGE, ("metadata",)),
     Product("report.html", "All of it for people, on one page", HTML, ("overview", "metadata")),
     Product("footprints.geojson", "Outlines and pairs of the images", GEOJSON, ("metadata",)),

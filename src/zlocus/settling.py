@@ -1,0 +1,157 @@
+"""What is settled before the first tile of a surface: scene, cameras, heights, grid and lattice.
+
+A run does it once; who looks at its surface afterwards does the same again with the ties that the run kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from odc.geo.geobox import GeoBox
+from pyproj import CRS
+
+from zlocus.errors import GeometryError
+from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
+from zlocus.io.reference import dem_datum, read_dem, read_geobox
+from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import VerticalDatum, vertical_datum
+from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
+from zlocus.options import RunConfig
+from zlocus.orientation.orient import Orientation
+from zlocus.preparing import (
+    area_to_match,
+    asked_crs,
+    heights_asked_for,
+    heights_of_ties,
+    note_dem,
+    possible_heights,
+    with_heights,
+)
+from zlocus.progress import Progress
+from zlocus.request import DsmRequest
+from zlocus.scene import Scene, check_overlap, is_local
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What a request names. like : grid of --like; files : whose content the result depends on."""
+
+    scene: Scene
+    vertical: VerticalDatum
+    like: GeoBox | None
+    files: list[Path]
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What all tiles share. scene : with corrected cameras; z_range : heights searched, m; matching : what a tile is
+    matched with."""
+
+    scene: Scene
+    orientation: Orientation
+    z_range: tuple[float, float]
+    grid: Grid
+    matching: MatchScene
+
+
+def opened(request: DsmRequest, progress: Progress) -> Opened:
+    """Everything that a request names, open, but for its polygons."""
+    like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
+    scene = _scene(request, like, vertical)
+    note_dem(request.dem, request.dem_vertical, progress)
+    return Opened(scene, vertical, like, _files(request, scene, vertical))
+
+
+def settled_run(
+    request: DsmRequest, found: Opened, orientation: Orientation, config: RunConfig, progress: Progress
+) -> Settled:
+    """Heights, grid and lattice of a scene whose orientation is known."""
+    scene = orientation.apply(found.scene)
+    z_range = _searched_heights(request, scene, orientation, config, progress)
+    grid = _grid(request, found.like, scene, orientation, z_range)
+    matching = settle(
+        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
+        orientation.measured,
+    )  # fmt: skip
+    return Settled(scene, orientation, z_range, grid, _with_dem(request, matching, scene.crs, config))
+
+
+def _scene(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
+    """The scene, its views by name, so that the order of the inputs changes nothing, with the heights asked for."""
+    crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
+    scene = open_scene(request.inputs, crs)
+    if is_local(scene.crs):
+        _check_local(request)
+    bounds = request.bounds if like is None else like.boundingbox.bbox
+    scene = with_heights(scene, request.heights, vertical, bounds)
+    check_overlap(scene, possible_heights(scene, scene.heights))
+    return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+
+
+def _check_local(request: DsmRequest) -> None:
+    """Refuse what has a place on the Earth, in a local frame."""
+    for name in ("dem", "area", "mask"):
+        if path := getattr(request, name):
+            raise GeometryError(
+                f"The scene's frame is local, where {path} has no place. Leave --{name} out; --bounds and --heights "
+                "are in that frame."
+            )
+
+
+def _searched_heights(
+    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
+) -> tuple[float, float]:
+    """Height range of the search: as asked for, else from the DEM, else from the ties."""
+    if scene.heights:
+        return heights_asked_for(scene, scene.heights, progress)
+    if request.dem is None:
+        return heights_of_ties(scene, orientation, config.orientation)
+    z = possible_heights(scene, None)
+    bounds = shared_ground(scene, (z[0], z[-1]))
+    cell = median_ground_pixel(scene, sum(z) / len(z)) * 16
+    geobox = grid_from_bounds(bounds, cell, scene.crs).geobox
+    heights = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
+    if not np.isfinite(heights).any():
+        raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
+    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
+    low, high = low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
+    return heights_asked_for(scene, (low, high), progress, f"The heights around {request.dem}")
+
+
+def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
+    """Limits from the DEM for the coarsest level."""
+    if request.dem is None:
+        return settled
+    level = settled.levels - 1
+    window = settled.seen.at_level(level, 0)
+    geobox = GeoBox((window.rows, window.cols), settled.transform(window, level), crs)
+    dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
+    limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
+    return replace(settled, prior=limits)
+
+
+def _grid(
+    request: DsmRequest, like: GeoBox | None, scene: Scene, orientation: Orientation, z_range: tuple[float, float]
+) -> Grid:
+    """The grid asked for: another raster's, or the area at a resolution, both with defaults."""
+    z = (z_range[0] + z_range[1]) / 2
+    if like is not None:
+        grid = grid_from_geobox(like, str(request.like))
+        check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
+        return grid
+    cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
+    check_resolution(cell, scene, z, "--resolution")
+    bounds = request.bounds or area_to_match(scene, orientation, z_range)
+    return grid_from_bounds(bounds, cell, scene.crs)
+
+
+def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[Path]:
+    """Every file whose content the result depends on."""
+    extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
+    extra += vertical.files
+    if request.dem is not None:
+        extra += dem_datum(request.dem, request.dem_vertical).files
+    listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
+    return list(dict.fromkeys(listed))
