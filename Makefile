@@ -32,7 +32,7 @@ test: lint
 test-minimum: $(STAMP)
 	$(PYTHON) -m venv $(MINIMUM)
 	$(BIN)/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-	    extra = project["optional-dependencies"]; needed = project["dependencies"] + extra["cluster"] + extra["xarray"]; \
+	    extra = project["optional-dependencies"]; needed = project["dependencies"] + extra["cluster"] + extra["inspect"] + extra["xarray"]; \
 	    print(*(d.split(",")[0].replace(">=", "==") for d in needed), sep="\n")' > $(MINIMUM)/versions.txt
 	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[dev]'
 	$(MINIMUM)/bin/python -m pytest -n 2

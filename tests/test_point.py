@@ -188,8 +188,8 @@ def windows_of(ncc: np.ndarray) -> np.ndarray:
 def order_of(n: int, worth: list[bool]) -> PointOrder:
     nothing = np.zeros(0, np.int64)
     return PointOrder(
-        0, np.arange(1, n + 1), np.zeros(n, np.int64), np.array(worth), Evidence.SCENE, nothing, np.zeros(0),
-        np.zeros((0, n), np.int8),
+        0, np.arange(1, n + 1), np.zeros(n, np.int64), np.array(worth), Evidence.SCENE, nothing, np.zeros((0, 2)),
+        np.zeros(0), np.zeros((0, n), np.int8),
     )  # fmt: skip
 
 

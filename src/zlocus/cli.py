@@ -23,6 +23,7 @@ import typer
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
+from zlocus.cli_inspect import inspect
 from zlocus.cli_products import PRODUCTS_HELP, products
 from zlocus.cli_report import report
 from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
@@ -450,10 +451,8 @@ def import_cameras(
     print(f"{out}: {len(scene.views)} views.")
 
 
-app.command()(explained(evaluate))
-
-
-app.command()(explained(report))
+for command in (evaluate, report, inspect):
+    app.command()(explained(command))
 
 
 @app.command()

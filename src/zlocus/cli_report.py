@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -33,12 +33,7 @@ def report(
     geoid: Geoid = None,
 ) -> None:
     """Make report.html of a surface again, with a reference where one is given."""
-    about = {"--classes": classes, "--align": align, "--coregister": coregister, "--geoid": geoid}
-    given = [name for name, value in about.items() if value]
-    if reference is None and given:
-        raise ConfigError(
-            f"{given[0]} is about a reference, and none is given. Add --reference RASTER, or leave it out."
-        )
+    check_about(reference, {"--classes": classes, "--align": align, "--coregister": coregister, "--geoid": geoid})
     judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
     from zlocus.products.maps import link_all
     from zlocus.products.report.comparison import Comparison
@@ -49,3 +44,18 @@ def report(
     path = write_report(out, comparison)
     link_all(out, SilentProgress())
     print(f"{path}: open it in a browser.")
+
+
+def check_about(reference: Path | None, about: dict[str, Any]) -> None:
+    """Refuse what says how to compare with a reference where there is none. about : values by option.
+
+    Raises
+    ------
+    ConfigError
+        One is given without a reference.
+    """
+    given = [name for name, value in about.items() if value]
+    if reference is None and given:
+        raise ConfigError(
+            f"{given[0]} is about a reference, and none is given. Add --reference RASTER, or leave it out."
+        )

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.order import Evidence
-from zlocus.matching.point import PointCurves, cell_windows, point_curves, point_order, steps_px
+from zlocus.matching.point import IntArray, PointCurves, cell_windows, point_curves, point_order, steps_px
 from zlocus.matching.selection import Ranking, preselected, rank_views
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, pixel_window, read_pixels, tile_views
@@ -33,6 +34,33 @@ class Place:
     height_from: str
     cell: tuple[int, int]
     middle: FloatArray
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """A place and its match curves.
+
+    views : that show it and were compared; curves : numbers of views in it are of these; index : height index of the
+    place, in the middle of those sampled; heights_m : (h,) m; sampled : what all views show around it, of the cells
+    `window`; kept : (i,) int64, which of them `views` are.
+    """
+
+    place: Place
+    views: tuple[View, ...]
+    curves: PointCurves
+    index: float
+    heights_m: FloatArray
+    sampled: TileViews
+    window: CellWindow
+    kept: IntArray
+
+    def patches(self, side: int) -> NDArray[np.float32]:
+        """Windows of `side` cells around the place, (i, h, k) float32, of every view at every height.
+
+        Normalised as those that are compared; NaN where a view does not show one whole.
+        """
+        reach = len(self.heights_m) // 2
+        return cell_windows(self.sampled, self.window, self.place.cell, self.index, side, reach)[self.kept]
 
 
 def cell_of(xy: FloatArray, settled: MatchScene) -> tuple[int, int]:
@@ -83,8 +111,8 @@ def curves_at(
     place: Place,
     config: RunConfig,
     farthest: int = RANKED_WITHIN_CELLS,
-) -> tuple[tuple[View, ...], PointCurves, FloatArray]:
-    """The views that show the place, its match curves with them, and their heights (h,) m.
+) -> LookedAt:
+    """Match curves of a place with the views that show it.
 
     Tie points are looked for farther and farther away, as far as the rules of the order reach, and `farthest` cells at
     most. asked : the point as it was asked for, for messages; reference : name of the view to be it, None for the best.
@@ -108,16 +136,18 @@ def curves_at(
         numbers, views = views_of(settled, window, place, config)
         windows = cell_windows(views, window, place.cell, index, side, options.reach_steps)
         kept = np.flatnonzero(~np.isnan(windows[:, options.reach_steps, 0]))
-        check_shown(asked, reference, place.xyz, [settled.views[numbers[i]].name for i in kept], settled)
+        compared = tuple(settled.views[numbers[i]] for i in kept)
+        check_shown(asked, reference, place.xyz, [view.name for view in compared], settled)
         ranking = ranked(settled, views, window, config)
         ranking = replace(ranking, labels=ranking.labels[:, kept][:, :, kept])
-        order = point_order(ranking, references(reference, [settled.views[numbers[i]] for i in kept]), at, options)
+        order = point_order(ranking, references(reference, compared), at, options)
         if order.evidence <= enough:
             break
     step_px = steps_px(views, int(kept[order.reference]), kept[order.search])
     along = index + np.arange(-options.reach_steps, options.reach_steps + 1)
     curves = point_curves(windows[kept], order, step_px, along, options)
-    return tuple(settled.views[numbers[i]] for i in kept), curves, settled.origin_m + along * settled.step_m
+    heights_m = settled.origin_m + along * settled.step_m
+    return LookedAt(place, compared, curves, index, heights_m, views, window, kept)
 
 
 def references(reference: str | None, views: Sequence[View]) -> FloatArray:

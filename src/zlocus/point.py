@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.io.scene_file import open_scene
@@ -17,15 +14,13 @@ from zlocus.options import RunConfig
 from zlocus.orientation.orient import supported
 from zlocus.place import NEAREST_TIES, Place, cell_of, curves_at, height_nearby
 from zlocus.preparing import asked_crs, heights_of_ties, made_folder, oriented, possible_heights, what_was_applied
-from zlocus.products.curves import Locus, PointReport, point_text, write_point
+from zlocus.products.curves import PointReport, loci, point_text, write_point
 from zlocus.progress import Progress
 from zlocus.request import CurvesRequest
-from zlocus.scene import Scene, View, check_overlap
+from zlocus.scene import Scene, check_overlap
 from zlocus.sensors.model import FloatArray
 
 ROUNDS, SETTLED_M = 20, 0.01
-# Pixels around a locus that are shown.
-CROP_MARGIN_PX, LEAST_CROP_PX = 12, 48
 
 
 def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> str:
@@ -55,15 +50,10 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     place = located(request, settled, ties)
     with progress.stage("Match curves"):
-        views, curves, heights_m = curves_at(asked(request), request.reference, settled, place, config)
-    report = PointReport(
-        asked=asked(request), crs=scene.crs.to_string().splitlines()[0], xyz=place.xyz, height_from=place.height_from,
-        middle=place.middle, cell_m=cell_m, names=tuple(view.name for view in views),
-        left_out=tuple(v.name for v in settled.views if v not in views), heights_m=heights_m, curves=curves,
-        peak_m=settled.origin_m + curves.peak_index * settled.step_m, step_m=settled.step_m,
-    )  # fmt: skip
+        looked = curves_at(asked(request), request.reference, settled, place, config)
+    report = PointReport.of(asked(request), looked, settled, scene.crs)
     with made_folder(request.out), progress.stage("Drawing"):
-        write_point(request.out, report, loci(views, report), config.selection)
+        write_point(request.out, report, loci(looked.views, report), config.selection)
     return point_text(report, config.selection)
 
 
@@ -137,27 +127,3 @@ def pixel_on_ground(request: CurvesRequest, settled: MatchScene, ties: FloatArra
             return xy, z
         seen.append(z)
         z = height_nearby(xy, ties)
-
-
-def loci(views: Sequence[View], report: PointReport) -> list[Locus]:
-    """The vertical line in every image, the reference first, then the others in their order."""
-    order, found = report.curves.order, []
-    peak_m = report.peak_m if math.isfinite(report.peak_m) else float(report.xyz[2])
-    heights = np.concatenate([report.heights_m, [report.xyz[2], peak_m]])
-    xyz = np.column_stack([np.broadcast_to(report.middle, (len(heights), 2)), heights])
-    for i in (order.reference, *order.search.tolist()):
-        xy = views[i].sensor.image_from_ground(xyz)
-        row, col, pixels, valid = crop(views[i], xy[np.isfinite(xy).all(axis=1)])
-        grey = np.where(valid, pixels, np.float32(np.nan))
-        found.append(Locus(views[i].name, (row, col), grey, xy[:-2], xy[-2], xy[-1]))
-    return found
-
-
-def crop(view: View, xy: FloatArray) -> tuple[int, int, NDArray[np.float32], NDArray[np.bool_]]:
-    """The square around image points (n, 2) px: its first row and column, pixels and which of them are valid."""
-    shape, centre = np.array(view.image.shape), (xy.min(axis=0) + xy.max(axis=0))[::-1] / 2
-    side = max(float(np.ptp(xy, axis=0).max()) + 2 * CROP_MARGIN_PX, LEAST_CROP_PX)
-    first = np.clip(np.floor(centre - side / 2), 0, shape - 1).astype(int)
-    last = np.clip(np.ceil(centre + side / 2), first + 1, shape).astype(int)
-    read = view.image.read(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
-    return int(first[0]), int(first[1]), read.pixels, read.valid

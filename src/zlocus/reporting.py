@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyproj import CRS
 
 from zlocus.errors import GeometryError, ZlocusError
 from zlocus.grid import Grid
@@ -209,7 +208,19 @@ def tried_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunCon
 
 
 def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matched, config: RunConfig) -> dict[str, Any]:
-    """Record and figure of a cell's curves, about its own height, or that of the ties nearby where it has none."""
+    """Record and figure of a cell's curves."""
+    settled = matched.settled
+    asked = f"The cell at row {cell.row}, column {cell.col}"
+    looked = curves_at(asked, None, settled, place_of_cell(xy, height_m, matched), config, SHOWN_WITHIN_CELLS)
+    report = PointReport.of(asked, looked, settled, matched.scene.crs)
+    # Where no height was found all that could help is shown.
+    n_images = len(report.search) if cell.kind == FAILED else report.curves.n_used
+    figure = mean_figure(report, n_images, is_small=True)
+    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
+
+
+def place_of_cell(xy: FloatArray, height_m: float, matched: Matched) -> Place:
+    """A cell with middle (2,) m at its height in dsm.tif, or at that of the ties nearby where it has none."""
     settled = matched.settled
     if math.isfinite(height_m):
         z, source = height_m + float(matched.undulation(xy[None])[0]), "that of the surface"
@@ -217,29 +228,12 @@ def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matche
         z, source = height_nearby(xy, matched.ties), "that of the nearest tie points"
     else:
         z, source = middle_height(settled), "the middle of the heights searched"
-    place = Place(np.array([*xy, z]), source, cell_of(xy, settled), xy)
-    asked = f"The cell at row {cell.row}, column {cell.col}"
-    views, curves, heights_m = curves_at(asked, None, settled, place, config, SHOWN_WITHIN_CELLS)
-    report = PointReport(
-        asked=asked, crs=crs_name(matched.scene.crs), xyz=place.xyz, height_from=source, middle=xy,
-        cell_m=settled.cell_m, names=tuple(view.name for view in views),
-        left_out=tuple(view.name for view in settled.views if view not in views), heights_m=heights_m, curves=curves,
-        peak_m=settled.origin_m + curves.peak_index * settled.step_m, step_m=settled.step_m,
-    )  # fmt: skip
-    # Where no height was found all that could help is shown.
-    n_images = len(report.search) if cell.kind == FAILED else curves.n_used
-    figure = mean_figure(report, n_images, is_small=True)
-    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
+    return Place(np.array([*xy, z]), source, cell_of(xy, settled), xy)
 
 
 def middle_height(settled: MatchScene) -> float:
     """The middle of the heights searched, m."""
     return settled.origin_m + settled.n_steps * settled.step_m / 2
-
-
-def crs_name(crs: CRS) -> str:
-    """A CRS in a line."""
-    return crs.to_string().splitlines()[0]
 
 
 def said(error: Exception) -> str:

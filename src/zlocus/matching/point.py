@@ -29,7 +29,8 @@ class PointOrder:
 
     reference : view; search : (j,) int64 views; accumulated : (j,) int64, their labels summed over the feature points
     around; is_worth : (j,) bool, whether they help; evidence : what the order rests on; features : (f,) int64 feature
-    points, the nearest first; distance : (f,) float64 cells; labels : (f, j) int8, of the search views there.
+    points, the nearest first; xy : (f, 2) float64, where they are, as `Ranking.xy`; distance : (f,) float64 cells;
+    labels : (f, j) int8, of the search views there.
     """
 
     reference: int
@@ -38,6 +39,7 @@ class PointOrder:
     is_worth: NDArray[np.bool_]
     evidence: Evidence
     features: IntArray
+    xy: FloatArray
     distance: FloatArray
     labels: NDArray[np.int8]
 
@@ -113,6 +115,7 @@ def point_order(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
         is_worth=found.is_worth[0],
         evidence=Evidence(int(order.evidence[0])),
         features=features,
+        xy=ranking.xy[features],
         distance=np.hypot(*(ranking.xy[features] - at).T),
         labels=labels[features][:, search],
     )

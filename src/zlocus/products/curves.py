@@ -17,11 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from zlocus.matching.order import Evidence
 from zlocus.matching.point import JudgedCurves, PointCurves
+from zlocus.matching.setup import MatchScene
 from zlocus.options import SelectionOptions
+from zlocus.place import LookedAt
 from zlocus.products.record import write_record, write_whole
+from zlocus.scene import View
 from zlocus.sensors.model import FloatArray
 
 if TYPE_CHECKING:
@@ -37,6 +41,8 @@ DASHES = ("-", "--", ":")
 LABELS = {1: "good", 0: "fair", -1: "poor"}
 LABEL_COLOURS = {1: "#00704F", 0: "#8A6100", -1: "#B03A00"}
 STRETCH_PERCENT = (1.0, 99.0)
+# Pixels around a locus that are shown.
+CROP_MARGIN_PX, LEAST_CROP_PX = 12, 48
 MOST_FEATURES = 8
 # From here on a stop rests on the label alone.
 LABEL_ALONE_STEPS = 1000.0
@@ -80,6 +86,18 @@ class PointReport:
     curves: PointCurves
     peak_m: float
 
+    @classmethod
+    def of(cls, asked: str, looked: LookedAt, settled: MatchScene, crs: CRS) -> PointReport:
+        """Of a place whose curves are known. settled, crs : of the scene."""
+        place, curves = looked.place, looked.curves
+        return cls(
+            asked=asked, crs=crs.to_string().splitlines()[0], xyz=place.xyz, height_from=place.height_from,
+            middle=place.middle, cell_m=settled.cell_m, names=tuple(view.name for view in looked.views),
+            left_out=tuple(view.name for view in settled.views if view not in looked.views),
+            heights_m=looked.heights_m, curves=curves, peak_m=settled.origin_m + curves.peak_index * settled.step_m,
+            step_m=settled.step_m,
+        )  # fmt: skip
+
     @property
     def reference(self) -> str:
         """Name of the reference."""
@@ -89,6 +107,33 @@ class PointReport:
     def search(self) -> list[str]:
         """Names of the search images, in their order."""
         return [self.names[i] for i in self.curves.order.search]
+
+
+def loci(views: Sequence[View], report: PointReport) -> list[Locus]:
+    """The vertical line in every image of a report, the reference first, then the others in their order.
+
+    views : that were compared.
+    """
+    order, found = report.curves.order, []
+    peak_m = report.peak_m if math.isfinite(report.peak_m) else float(report.xyz[2])
+    heights = np.concatenate([report.heights_m, [report.xyz[2], peak_m]])
+    xyz = np.column_stack([np.broadcast_to(report.middle, (len(heights), 2)), heights])
+    for i in (order.reference, *order.search.tolist()):
+        xy = views[i].sensor.image_from_ground(xyz)
+        row, col, pixels, valid = crop(views[i], xy[np.isfinite(xy).all(axis=1)])
+        grey = np.where(valid, pixels, np.float32(np.nan))
+        found.append(Locus(views[i].name, (row, col), grey, xy[:-2], xy[-2], xy[-1]))
+    return found
+
+
+def crop(view: View, xy: FloatArray) -> tuple[int, int, NDArray[np.float32], NDArray[np.bool_]]:
+    """The square around image points (n, 2) px: its first row and column, pixels and which of them are valid."""
+    shape, centre = np.array(view.image.shape), (xy.min(axis=0) + xy.max(axis=0))[::-1] / 2
+    side = max(float(np.ptp(xy, axis=0).max()) + 2 * CROP_MARGIN_PX, LEAST_CROP_PX)
+    first = np.clip(np.floor(centre - side / 2), 0, shape - 1).astype(int)
+    last = np.clip(np.ceil(centre + side / 2), first + 1, shape).astype(int)
+    read = view.image.read(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
+    return int(first[0]), int(first[1]), read.pixels, read.valid
 
 
 def point_text(report: PointReport, options: SelectionOptions) -> str:

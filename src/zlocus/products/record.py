@@ -112,7 +112,7 @@ def versions_record() -> dict[str, str]:
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
-    text = json.dumps(_finite({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(finite_only({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
     write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
@@ -149,10 +149,10 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
         part.unlink(missing_ok=True)
 
 
-def _finite(value: Any) -> Any:
+def finite_only(value: Any) -> Any:
     """The same value with None for every number in it that is not finite."""
     if isinstance(value, dict):
-        return {key: _finite(part) for key, part in value.items()}
+        return {key: finite_only(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
+        return [finite_only(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -73,9 +73,13 @@ def _histogram(evaluation: Evaluation) -> maps.Picture:
 
 def _error_map(evaluation: Evaluation) -> tuple[maps.Picture, maps.Scale]:
     assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
+    return maps.error_picture(shrunk_means(evaluation.error_map.errors, maps.MAP_PX), full_colour_m(evaluation))
+
+
+def full_colour_m(evaluation: Evaluation) -> float:
+    """Size of an error from which a map's colours are full, m."""
     nmad = np.nan_to_num(evaluation.all.nmad)
-    full_m = float(f"{max(evaluation.threshold_m, FULL_AT_NMAD * nmad):.1g}")
-    return maps.error_picture(shrunk_means(evaluation.error_map.errors, maps.MAP_PX), full_m)
+    return float(f"{max(evaluation.threshold_m, FULL_AT_NMAD * nmad):.1g}")
 
 
 def _scale_bar(evaluation: Evaluation) -> maps.ScaleBar | None:

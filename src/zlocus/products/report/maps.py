@@ -90,11 +90,7 @@ def height_map(folder: Path, found: Survey, sun_deg: tuple[float, float]) -> tup
     height, cell_m = averaged(folder / "dsm.tif", RELIEF_PX)
     low, high = span(height)
     shaded = relief(height, cell_m, (low, high), sun_deg)
-    step = (high - low) / (TICKS - 1)
-    # Two digits of the distance between ticks count.
-    digits = max(1, 1 - math.floor(math.log10(step))) if step > 0 else 1
-    ticks = tuple(f"{value:.{digits}f}" for value in np.linspace(low, high, TICKS))
-    scale = Scale(f"{found.above}, m", gradient(cv2.COLORMAP_VIRIDIS), ticks)
+    scale = Scale(f"{found.above}, m", gradient(cv2.COLORMAP_VIRIDIS), even_ticks(low, high))
     alt = f"Shaded relief coloured by height from {low:.1f} to {high:.1f} m; white where there is no height."
     return picture(shaded, alt), scale
 
@@ -129,14 +125,31 @@ def sigma_map(folder: Path) -> tuple[Picture, Scale]:
     """Standard deviations as colours."""
     sigma, _ = averaged(folder / "sigma.tif", MAP_PX)
     top = span(sigma)[1]
+    colours = sigma_colours(sigma, top)
+    colours[~np.isfinite(sigma)] = WHITE
+    ticks = sigma_ticks(top)
+    alt = f"Standard deviation of height, dark at 0 m to bright at {size(top, 'm')}; white where there is no height."
+    return picture(colours, alt), Scale("standard deviation, m", gradient(cv2.COLORMAP_CIVIDIS), ticks)
+
+
+def sigma_colours(sigma: NDArray[np.float32], top: float) -> NDArray[np.uint8]:
+    """Colours (r, c, 3) of standard deviations, m, the last one from `top` on."""
     # The square root keeps the many small ones apart.
     share = np.sqrt(np.clip(np.nan_to_num(sigma) / max(top, 1e-6), 0.0, 1.0))
-    colours = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
-    colours[~np.isfinite(sigma)] = WHITE
+    return np.asarray(cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS), np.uint8)
+
+
+def sigma_ticks(top: float) -> tuple[str, ...]:
+    """What stands below the colours of standard deviations."""
     ticks = tuple(size(top * share**2, "m") for share in np.linspace(0, 1, TICKS))
-    ticks = (*ticks[:-1], f"{ticks[-1]} or more")
-    alt = f"Standard deviation of height, dark at 0 m to bright at {size(top, 'm')}; white where there is no height."
-    return picture(np.asarray(colours), alt), Scale("standard deviation, m", gradient(cv2.COLORMAP_CIVIDIS), ticks)
+    return (*ticks[:-1], f"{ticks[-1]} or more")
+
+
+def even_ticks(low: float, high: float) -> tuple[str, ...]:
+    """Evenly spaced numbers; two digits of the distance between them count."""
+    step = (high - low) / (TICKS - 1)
+    digits = max(1, 1 - math.floor(math.log10(step))) if step > 0 else 1
+    return tuple(f"{value:.{digits}f}" for value in np.linspace(low, high, TICKS))
 
 
 def views_map(found: Survey) -> tuple[Picture, list[Swatch]]:

@@ -1,0 +1,1 @@
+"""The page that explains a surface, cell by cell: map, match curves, profile and relief."""

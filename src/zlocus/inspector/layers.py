@@ -1,0 +1,193 @@
+"""Layers of the map: what each shows, its colours and legend, and a patch of it as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.inspector.folder import Cells, Patch, SurfaceFolder, read_patch
+from zlocus.inspector.reference import Difference
+from zlocus.products.hillshade import hillshade
+from zlocus.products.picture import error_map
+from zlocus.products.report import maps, words
+
+Rgba = NDArray[np.uint8]
+# Cells a side that tell the range of colours.
+SAMPLED = 800
+MOST_CLASSES = 12
+OPAQUE = 255
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer. legend : as the page draws it, None where there is nothing to say; draw : a patch of the grid as
+    (r, c, 4) uint8: red, green, blue and opacity."""
+
+    name: str
+    title: str
+    legend: dict[str, Any] | None
+    draw: Callable[[Patch], Rgba]
+
+
+def layers_of(folder: SurfaceFolder) -> dict[str, Layer]:
+    """The layers that a surface has, by name, from the lowest to the highest."""
+    found = [_hillshade(folder)]
+    found += [_ortho(folder)] if folder.has("ortho") else []
+    found += [_height(folder), _sigma(folder), _views(folder), _quality(folder)]
+    return {layer.name: layer for layer in found}
+
+
+def difference_layer(folder: SurfaceFolder, difference: Difference) -> Layer:
+    """Surface less reference."""
+    full_m = difference.full_m
+
+    def draw(patch: Patch) -> Rgba:
+        cells = read_patch(difference.path, patch, True, folder)
+        return with_opacity(error_map(cells.values[0].astype(np.float32), full_m), cells.known)
+
+    line = error_map(np.linspace(-full_m, full_m, maps.STOPS, dtype=np.float32)[None], full_m)[0]
+    ticks = [f"{value:+g}" if value else "0" for value in np.linspace(-full_m, full_m, maps.TICKS)]
+    legend = scale(f"surface less {difference.name}, m", ", ".join(maps.css(colour) for colour in line), ticks)
+    return Layer("difference", "Difference to the reference", legend, draw)
+
+
+def composed(layers: Sequence[tuple[Layer, float]], patch: Patch) -> Rgba:
+    """Layers over each other, the first below, each with an opacity of 0 to 1, as the map shows them."""
+    colours, opacity = np.zeros((patch.height, patch.width, 3)), np.zeros((patch.height, patch.width, 1))
+    for layer, share in layers:
+        drawn = layer.draw(patch).astype(float)
+        above = share * drawn[..., 3:] / OPAQUE
+        total = above + opacity * (1 - above)
+        mixed = drawn[..., :3] * above + colours * opacity * (1 - above)
+        colours, opacity = mixed / np.maximum(total, 1e-9), total
+    return np.asarray(np.rint(np.concatenate([colours, OPAQUE * opacity], axis=-1)), np.uint8)
+
+
+def png_of(picture: Rgba) -> bytes:
+    """A picture as PNG, written fast."""
+    swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
+    return bytes(cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+
+
+def with_opacity(colours: NDArray[Any], known: NDArray[np.bool_]) -> Rgba:
+    """Colours (r, c, 3) in OpenCV's order as a picture that is clear where nothing is known."""
+    return np.dstack([colours[..., ::-1], np.where(known, OPAQUE, 0)]).astype(np.uint8)
+
+
+def scale(title: str, gradient: str, ticks: Sequence[str]) -> dict[str, Any]:
+    """The legend of colours that run."""
+    return {"kind": "scale", "title": title, "gradient": gradient, "ticks": list(ticks)}
+
+
+def classes(title: str, items: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    """The legend of colours (CSS) that each mean something."""
+    return {"kind": "classes", "title": title, "items": [{"colour": c, "meaning": m} for c, m in items]}
+
+
+def sampled(folder: SurfaceFolder, name: str, average: bool = True) -> Cells:
+    """All of a raster, made small."""
+    rows, cols = folder.shape
+    share = min(SAMPLED / max(rows, cols), 1.0)
+    size = (max(round(rows * share), 1), max(round(cols * share), 1))
+    return read_patch(folder.path(name), Patch(0, 0, rows, cols, *size), average)
+
+
+def _hillshade(folder: SurfaceFolder) -> Layer:
+    light = folder.run["config"]["options"]["products"]
+    sun_deg = light["sun_azimuth_deg"], light["sun_altitude_deg"]
+
+    def draw(patch: Patch) -> Rgba:
+        if folder.has("hillshade"):
+            cells = read_patch(folder.path("hillshade"), patch, True)
+            return with_opacity(np.dstack([cells.values[0]] * 3), cells.known)
+        wide = read_patch(folder.path("dsm"), patch.widened(1), True).values[0].astype(np.float32)
+        shaded = hillshade(wide, folder.cell_m * patch.cols / patch.width, *sun_deg)[1:-1, 1:-1]
+        return with_opacity(np.dstack([shaded] * 3), np.isfinite(wide[1:-1, 1:-1]))
+
+    return Layer("hillshade", "Hillshade", None, draw)
+
+
+def _ortho(folder: SurfaceFolder) -> Layer:
+    cells = sampled(folder, "ortho")
+    shown = cells.values[:, cells.known].astype(np.float32)
+    low, high = np.percentile(shown, maps.STRETCH_PERCENT) if shown.size else (0.0, 1.0)
+
+    def draw(patch: Patch) -> Rgba:
+        cells = read_patch(folder.path("ortho"), patch, True)
+        grey = np.clip((cells.values.astype(np.float32) - low) / max(high - low, 1e-6), 0.0, 1.0)
+        bands = grey[[2, 1, 0]] if len(grey) >= 3 else grey[[0, 0, 0]]
+        return with_opacity(np.rint(OPAQUE * np.moveaxis(np.nan_to_num(bands), 0, -1)), cells.known)
+
+    return Layer("ortho", "Ortho-image", None, draw)
+
+
+def _height(folder: SurfaceFolder) -> Layer:
+    low, high = maps.span(sampled(folder, "dsm").values[0])
+
+    def draw(patch: Patch) -> Rgba:
+        cells = read_patch(folder.path("dsm"), patch, True)
+        share = np.clip((np.nan_to_num(cells.values[0]) - low) / max(high - low, 1e-6), 0.0, 1.0)
+        return with_opacity(cv2.applyColorMap((OPAQUE * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS), cells.known)
+
+    legend = scale(f"{folder.above}, m", maps.gradient(cv2.COLORMAP_VIRIDIS), maps.even_ticks(low, high))
+    return Layer("height", "Height", legend, draw)
+
+
+def _sigma(folder: SurfaceFolder) -> Layer:
+    top = maps.span(sampled(folder, "sigma").values[0])[1]
+
+    def draw(patch: Patch) -> Rgba:
+        cells = read_patch(folder.path("sigma"), patch, True)
+        return with_opacity(maps.sigma_colours(cells.values[0], top), cells.known)
+
+    legend = scale("standard deviation, m", maps.gradient(cv2.COLORMAP_CIVIDIS), maps.sigma_ticks(top))
+    return Layer("sigma", "Standard deviation", legend, draw)
+
+
+def _views(folder: SurfaceFolder) -> Layer:
+    used = np.unique(sampled(folder, "views", average=False).values[0])
+    used = used[used > 0]
+    top = int(used.max()) if used.size else 1
+    table = maps.ramp(cv2.COLORMAP_VIRIDIS, top)
+    colours = np.vstack([[maps.WHITE], table]).astype(np.uint8)
+
+    def draw(patch: Patch) -> Rgba:
+        cells = read_patch(folder.path("views"), patch, False)
+        return with_opacity(colours[np.minimum(cells.values[0], top)], cells.known)
+
+    title = "images a height rests on"
+    if used.size > MOST_CLASSES:
+        ticks = [f"{n:.0f}" for n in np.linspace(1, top, maps.TICKS)]
+        return Layer("views", "Number of images", scale(title, maps.gradient(cv2.COLORMAP_VIRIDIS), ticks), draw)
+    items = [(maps.css(table[n - 1]), str(n)) for n in used.tolist()]
+    return Layer("views", "Number of images", classes(title, items), draw)
+
+
+def _quality(folder: SurfaceFolder) -> Layer:
+    """Reasons; clear where nothing is to be said, so that what lies below is seen."""
+    colours = np.array([*(colour for *_, colour in maps.GROUPS), maps.PLAIN[1]], np.uint8)[:, ::-1]
+    groups = maps.groups_of(np.arange(1 << 16))
+    present = np.unique(groups[sampled(folder, "quality", average=False).values[0]])
+
+    def draw(patch: Patch) -> Rgba:
+        cells = read_patch(folder.path("quality"), patch, False)
+        group = groups[cells.values[0]]
+        return with_opacity(colours[group], cells.known & (group < len(maps.GROUPS)))
+
+    items = [(maps.css(colours[k]), maps.GROUPS[k][0]) for k in present.tolist() if k < len(maps.GROUPS)]
+    return Layer("quality", "Reasons", classes("why there is no height, or one to be checked", items), draw)
+
+
+def reasons_of(code: int) -> list[Mapping[str, str]]:
+    """What a value of quality.tif says, as the report has it."""
+    return [
+        {"name": str(flag.name), "meaning": words.MEANINGS[flag], "fate": words.fate(flag),
+         "advice": words.ADVICE.get(flag, "")}
+        for flag in words.MEANINGS
+        if code & flag
+    ]  # fmt: skip

@@ -1,0 +1,91 @@
+"""Heights along a line, cell by cell, and of an area for the view in three dimensions."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio import DatasetReader
+from rasterio.enums import Resampling
+from rasterio.vrt import WarpedVRT
+from rasterio.windows import Window
+
+from zlocus.inspector.folder import SurfaceFolder
+from zlocus.inspector.reference import Difference
+from zlocus.io.opening import kept_raster
+from zlocus.sensors.model import FloatArray
+
+MOST_PLACES = 2000
+# Cells a side that are read at a time.
+PIECE = 512
+
+
+def profile(
+    folder: SurfaceFolder, difference: Difference | None, start: tuple[float, float], end: tuple[float, float]
+) -> dict[str, Any]:
+    """Heights and what is known of them at cells along a line, a cell or more apart, `MOST_PLACES` at most.
+
+    start, end : m. Keys: distance_m (n,), height_m, sigma_m, reference_m (None without a reference), each None where
+    nothing is known; spacing_m; length_m.
+    """
+    length = math.dist(start, end)
+    n = int(np.clip(math.ceil(length / folder.cell_m) + 1, 2, MOST_PLACES))
+    share = np.linspace(0.0, 1.0, n)[:, None]
+    xy = (1 - share) * start + share * end
+    cells = cells_of(folder, xy)
+    height, sigma = (values_at(folder, name, cells) for name in ("dsm", "sigma"))
+    reference = None if difference is None else height - differences_at(folder, difference, cells)
+    return {
+        "distance_m": (share[:, 0] * length).round(3).tolist(), "height_m": listed(height), "sigma_m": listed(sigma),
+        "reference_m": None if reference is None else listed(reference), "spacing_m": length / (n - 1),
+        "length_m": length,
+    }  # fmt: skip
+
+
+def cells_of(folder: SurfaceFolder, xy: FloatArray) -> NDArray[np.int64]:
+    """Row and column (n, 2) of the cells that hold ground points (n, 2) m; some may lie outside the grid."""
+    a, b, c, d, e, f = (~folder.transform)[:6]
+    col, row = a * xy[:, 0] + b * xy[:, 1] + c, d * xy[:, 0] + e * xy[:, 1] + f
+    cells: NDArray[np.int64] = np.floor(np.column_stack([row, col])).astype(np.int64)
+    return cells
+
+
+def values_at(folder: SurfaceFolder, name: str, cells: NDArray[np.int64]) -> FloatArray:
+    """A raster's values at cells (n, 2), NaN outside the grid."""
+    with kept_raster(folder.path(name)) as file:
+        return picked(file, cells)
+
+
+def differences_at(folder: SurfaceFolder, difference: Difference, cells: NDArray[np.int64]) -> FloatArray:
+    """Surface less reference at cells (n, 2), NaN where it is not known."""
+    with ExitStack() as stack:
+        file = stack.enter_context(kept_raster(difference.path))
+        view = stack.enter_context(
+            WarpedVRT(
+                file, src_crs=file.crs or folder.crs.to_wkt(), crs=folder.crs.to_wkt(), transform=folder.transform,
+                height=folder.shape[0], width=folder.shape[1], resampling=Resampling.nearest, nodata=float("nan"),
+            )
+        )  # fmt: skip
+        return picked(view, cells)
+
+
+def picked(file: DatasetReader, cells: NDArray[np.int64]) -> FloatArray:
+    """Values at cells (n, 2) of a raster, read piece by piece where the cells are."""
+    found = np.full(len(cells), np.nan)
+    inside = ((cells >= 0) & (cells < (file.height, file.width))).all(axis=1)
+    pieces, which = np.unique(cells[inside] // PIECE, axis=0, return_inverse=True)
+    members = np.flatnonzero(inside)
+    for k in range(len(pieces)):
+        chosen = members[which.ravel() == k]
+        (row, col), (last_row, last_col) = cells[chosen].min(axis=0), cells[chosen].max(axis=0)
+        values = file.read(1, window=Window(col, row, last_col - col + 1, last_row - row + 1))
+        found[chosen] = values[cells[chosen, 0] - row, cells[chosen, 1] - col]
+    return found
+
+
+def listed(values: FloatArray) -> list[float | None]:
+    """Numbers for JSON."""
+    return [round(float(value), 4) if math.isfinite(value) else None for value in values]

@@ -1,0 +1,88 @@
+"""`zlocus inspect`, from the folder to a page that answers until it is interrupted."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import uvicorn
+
+from zlocus.errors import ConfigError, OutputError
+from zlocus.inspector.inspection import Inspection
+from zlocus.inspector.server import application, new_token
+from zlocus.products.report.comparison import Comparison
+
+Announce = Callable[[str, bool], None]
+
+
+def inspect_surface(
+    out: Path, comparison: Comparison | None, host: str, port: int, view: str, announce: Announce
+) -> None:
+    """Serve the page of a surface until interrupted.
+
+    host, port : where; port 0 is any that is free. view : link of a view, or what stands behind its #, to begin with.
+    announce : is given the address, and whether others than this machine can reach it.
+
+    Raises
+    ------
+    InputError, ConfigError
+        There is no surface in the folder, or the address cannot be used.
+    OutputError
+        The port is taken.
+    """
+    address = checked_address(host)
+    fragment = fragment_of(view)
+    with listening(address, port) as listener, Inspection(out, comparison) as inspection:
+        port, token = listener.getsockname()[1], new_token()
+        names = [f"[{address}]" if address.version == 6 else str(address)]
+        names += ["localhost"] if address.is_loopback else []
+        app = application(inspection, token, frozenset(f"{name}:{port}" for name in names))
+        announce(f"http://{names[0]}:{port}/{token}/{fragment}", not address.is_loopback)
+        config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, ws="none")
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """An address of this machine that a browser can be given.
+
+    Raises
+    ------
+    ConfigError
+        It is a name, or stands for all addresses.
+    """
+    try:
+        address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
+    except ValueError as error:
+        raise ConfigError(f"--host {host} is no address. Give one of this machine, such as 127.0.0.1.") from error
+    if address.is_unspecified:
+        raise ConfigError(f"--host {host} stands for all addresses. Give the one under which the page is asked for.")
+    return address
+
+
+def fragment_of(view: str) -> str:
+    """What stands behind the # of a link, with it; "" of nothing."""
+    text = urlsplit(view).fragment if "#" in view else view
+    return f"#{text}" if text else ""
+
+
+def listening(address: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int) -> socket.socket:
+    """A socket that listens.
+
+    Raises
+    ------
+    OutputError
+        The address is not this machine's, or the port is taken.
+    """
+    listener = socket.socket(socket.AF_INET6 if address.version == 6 else socket.AF_INET)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((str(address), port))
+    except OSError as error:
+        listener.close()
+        raise OutputError(
+            f"No page can be served at {address} port {port}: {error.strerror}. Choose another --port, or none."
+        ) from error
+    return listener

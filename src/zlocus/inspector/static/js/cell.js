@@ -1,0 +1,324 @@
+// The panel of one cell: what the surface says of it, how it was matched, and what would be otherwise.
+
+import { asked, Refused } from "./api.js";
+import * as curves from "./curves.js";
+import { $, colour, element, metres, notice, signed } from "./dom.js";
+import { exportable } from "./figures.js";
+import * as map from "./map.js";
+import * as state from "./state.js";
+import * as windows from "./windows.js";
+
+const LABELS = { 1: "good", 0: "fair", "-1": "poor" };
+const WAIT_MS = 700;
+// Options that a cell's curves depend on most; the others are behind them.
+const FIRST = [
+  "rho1_high", "ratio_high", "rho1_middle", "ratio_middle", "rho1_low", "ratio_low", "rho1_fair", "ratio_fair", "sigma_steps",
+  "neighbours", "radius_px", "order", "least_worth", "most_images",
+];
+let surface, leaflet, drawn, shown = null, asRun = null, busy = null, unpacked = [];
+const charts = {};
+
+export function make(about, theMap) {
+  [surface, leaflet] = [about, theMap];
+  drawn = L.layerGroup().addTo(leaflet);
+  $("height").addEventListener("input", () => moved(true));
+  $("reset").addEventListener("click", () => asInRun());
+  $("options").addEventListener("change", () => changed());
+  $("options").addEventListener("submit", (event) => event.preventDefault());
+  makeOptions();
+  const name = (what) => () => `${surface.title}_${what}_${state.get("cell")?.replace(",", "_")}`;
+  for (const [id, what] of [["ncc", "correlation"], ["sncc", "mean"], ["windows", "windows"], ["loci", "lines"]]) {
+    exportable($(`${id}-figure`), name(what)(), () => charts[id]);
+  }
+}
+
+// Look at the cell at a ground point.
+export function look(x, y) {
+  state.set({ cell: `${x.toFixed(3)},${y.toFixed(3)}`, height: null });
+  return open();
+}
+
+// Look at the neighbour of the cell.
+export function step(down, across) {
+  if (!shown) return;
+  const [a, , , , e] = surface.transform;
+  look(shown.x + across * a, shown.y + down * e);
+}
+
+// The cell that the address names, or none.
+export async function open() {
+  const at = state.numbers("cell", 2);
+  $("cell-empty").hidden = Boolean(at);
+  $("cell-content").hidden = !at;
+  busy?.abort();
+  drawn.clearLayers();
+  if (!at) {
+    shown = null;
+    return;
+  }
+  busy = new AbortController();
+  const { signal } = busy;
+  $("match").setAttribute("aria-busy", "true");
+  fillOptions();
+  try {
+    await load(at, signal);
+  } catch (error) {
+    if (error.name === "AbortError") return;
+    fail(error instanceof Refused ? error.message : "The server does not answer. Is `zlocus inspect` still running?");
+  }
+}
+
+async function load([x, y], signal) {
+  const changes = whatIf();
+  let record = await asked("cell", { x, y, ...changes }, signal);
+  facts(record);
+  while (record.is_pending) {
+    $("cell-error").hidden = false;
+    $("cell-error").textContent = "The images are being opened; curves follow.";
+    await new Promise((done) => setTimeout(done, WAIT_MS));
+    if (signal.aborted) return;
+    record = await asked("cell", { x, y, ...changes }, signal);
+  }
+  const isChanged = Object.keys(changes).length > 0;
+  if (!isChanged) asRun = record;
+  else if (asRun?.row !== record.row || asRun?.col !== record.col) asRun = await asked("cell", { x, y }, signal);
+  shown = record;
+  facts(record);
+  $("changed").hidden = !isChanged;
+  $("cell-error").hidden = !record.error;
+  $("cell-error").textContent = record.error ?? "";
+  $("match").hidden = !record.match && !isChanged;
+  $("match").setAttribute("aria-busy", "false");
+  mark(record);
+  if (record.match) match(record.match, isChanged ? asRun.match : null);
+  else imageTable(null);
+  document.dispatchEvent(new CustomEvent("looked", { detail: record }));
+}
+
+function fail(text) {
+  $("cell-error").hidden = false;
+  $("cell-error").textContent = text;
+  $("match").setAttribute("aria-busy", "false");
+}
+
+function facts(record) {
+  $("cell-title").textContent = `Cell at row ${record.row}, column ${record.col}`;
+  const rows = [
+    ["Place", map.words(record.x, record.y, 2)],
+    ["Height", record.height_m === null ? "none" : `${metres(record.height_m)} (${surface.above})`],
+    ["Standard deviation", metres(record.sigma_m, 3)],
+    ["Images used", record.height_m === null ? "–" : String(record.n_images)],
+  ];
+  if (record.difference_m !== null) rows.push(["Less the reference", `${signed(Number(record.difference_m.toFixed(2)))} m`]);
+  const ids = { Height: "cell-height", "Standard deviation": "cell-sigma", "Images used": "cell-images", "Less the reference": "cell-difference" };
+  $("cell-facts").replaceChildren(
+    ...rows.flatMap(([name, text]) => [element("dt", {}, name), element("dd", { id: ids[name] ?? null }, text)]),
+  );
+  $("cell-reasons").replaceChildren(...record.reasons.map(reason));
+}
+
+function reason({ name, meaning, fate, advice }) {
+  const said = `: ${meaning}${fate === "none" ? ", so there is no height" : ""}. ${advice ?? ""}`;
+  return element("li", {}, element("b", {}, name), said);
+}
+
+// The cell, and the tie points that order its images, on the map.
+function mark(record) {
+  drawn.clearLayers();
+  const [a] = surface.transform;
+  const half = a / 2, at = [record.y, record.x], ink = "#e6007a";
+  L.rectangle([[record.y - half, record.x - half], [record.y + half, record.x + half]], { color: ink, weight: 2, fill: false, interactive: false }).addTo(drawn);
+  L.circleMarker(at, { radius: 11, color: ink, weight: 2, fill: false, interactive: false }).addTo(drawn);
+  const around = record.match?.neighbours;
+  if (!around) return;
+  if (around.by === "tin" && around.points.length === 3) {
+    L.polygon(around.points.map((p) => [p.y, p.x]), { color: ink, weight: 1.5, fill: false, interactive: false }).addTo(drawn);
+  } else if (around.by === "radius") {
+    L.circle(at, { radius: around.radius_m, color: ink, weight: 1.5, dashArray: "5 5", fill: false, interactive: false }).addTo(drawn);
+  }
+  for (const point of around.points) {
+    const sum = point.labels.reduce((one, other) => one + other, 0);
+    L.circleMarker([point.y, point.x], { radius: 5, weight: 1.5, color: "#fff", fillColor: windows.inkOf(Math.sign(sum)), fillOpacity: 1 })
+      .bindTooltip(`Tie point ${point.distance_m.toFixed(1)} m away: ${point.labels.map(signed).join(", ")}`).addTo(drawn);
+  }
+}
+
+function match(found, before) {
+  unpacked = windows.unpack(found);
+  $("match-stop").textContent = `${found.says.stop} ${peak(found)}`;
+  $("match-run").textContent = ofRun();
+  $("match-order").textContent = `Order, from ${found.says.order}. A line is drawn below the last image that is used.`;
+  draw("ncc", curves.single(found), key(found));
+  draw("sncc", curves.means(found, before), before ? element("p", { class: "aside" }, "dashed in colour: the mean that the run's options end with") : null);
+  const columns = Math.max(2, Math.floor(($("windows-figure").clientWidth || 500) / 118));
+  draw("windows", windows.windows(found, unpacked, columns));
+  draw("loci", windows.loci(found, Math.max(2, Math.floor(($("loci-figure").clientWidth || 500) / 200))));
+  imageTable(found);
+  tieTable(found);
+  $("height").max = found.heights_m.length - 1;
+  const asked = state.numbers("height", 1);
+  $("height").value = asked ? nearest(found, asked[0]) : windows.middle(found);
+  moved(false);
+}
+
+function peak(found) {
+  if (found.peak_m === null) return "There is no peak.";
+  const sigma = found.sigma_m[found.stop.images - 1];
+  return `The peak lies at ${metres(found.peak_m, 3)}, predicted to ${sigma === null ? "no precision" : metres(sigma, 3)}.`;
+}
+
+// What the run did otherwise than a cell alone would.
+function ofRun() {
+  const n = surface.images.length;
+  if (surface.views === "all") return "The run was told to use every image in every cell (--views all).";
+  if (n < surface.fewest_views) {
+    return `With fewer than ${surface.fewest_views} images the run uses all of them where nothing hides the cell; order and stop ` +
+      "are what the rule says of this cell.";
+  }
+  return "The run decides for blocks of cells, one level up, by the same rule; neighbours then settle the height together.";
+}
+
+function nearest(found, height) {
+  return found.heights_m.reduce((best, value, k, all) => (Math.abs(value - height) < Math.abs(all[best] - height) ? k : best), 0);
+}
+
+function draw(id, svg, ...below) {
+  charts[id] = svg;
+  $(`${id}-figure`).querySelector(".drawing").replaceChildren(svg, ...below.filter(Boolean));
+}
+
+function key(found) {
+  return element("div", { class: "key" }, ...found.curves.map(({ image }, j) =>
+    element("span", {}, element("i", { style: `border-color: ${curves.lineColour(j)}; border-top-style: ${curves.dashes(j) ? "dashed" : "solid"}` }), `${j + 1}. ${image}`),
+  ));
+}
+
+// The height under the slider, wherever it is shown.
+function moved(isAsked) {
+  const found = shown?.match;
+  if (!found) return;
+  const k = Number($("height").value), height = found.heights_m[k];
+  $("height-value").textContent = metres(height);
+  $("height").setAttribute("aria-valuetext", metres(height));
+  curves.mark(charts.ncc, found, k);
+  curves.mark(charts.sncc, found, k);
+  windows.show(charts.windows, found, unpacked, "moving", k);
+  windows.moveLoci(charts.loci, k);
+  if (isAsked) state.set({ height: height.toFixed(3) });
+}
+
+export function slide(by) {
+  $("height").value = Number($("height").value) + by;
+  moved(true);
+}
+
+function imageTable(found) {
+  const heads = ["image", "label", "ρ1", "ratio", "peak m", "labels around", "mean", "σ m", "use"];
+  const rows = [element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))];
+  const order = found?.curves.map((curve) => curve.image) ?? [];
+  if (found) rows.push(imageRow(found.reference, ["reference", "", "", "", "", "", ""]));
+  order.forEach((name, j) => {
+    const [one, mean] = [found.curves[j], found.means[j]];
+    const cells = [
+      label(one.label, name, "label"), text(one.rho1, 4, "rho1"), text(one.ratio, 3, "ratio"), text(one.peak_m, 2, "peak"),
+      signed(found.order.images[j].accumulated), label(mean.label, name, "mean"), text(found.sigma_m[j], 3, "sigma"),
+    ];
+    rows.push(imageRow(`${j + 1}. ${name}`, cells, name, j + 1 === found.stop.images ? "last" : j + 1 > found.stop.images ? "off" : ""));
+  });
+  const rest = surface.images.filter((name) => name !== found?.reference && !order.includes(name));
+  const off = new Set(state.all("without"));
+  rest.forEach((name) => rows.push(imageRow(name, [off.has(name) ? "switched off" : "not compared", "", "", "", "", "", ""], name, "off")));
+  $("images").replaceChildren(...rows);
+}
+
+function imageRow(heading, cells, name = heading, kind = "") {
+  const isOff = state.all("without").includes(name);
+  const box = element("input", { type: "checkbox", "aria-label": `Use ${name}`, onchange: () => switchImage(name, box.checked) });
+  box.checked = !isOff;
+  return element("tr", { class: kind, "data-image": name }, element("td", {}, heading), ...cells.map((cell) =>
+    cell instanceof Node ? cell : element("td", {}, cell)), element("td", {}, box));
+}
+
+function text(value, digits, what) {
+  return element("td", { "data-value": what }, value === null ? (what === "ratio" ? "∞" : "none") : value.toFixed(digits));
+}
+
+function label(value, name, what) {
+  return element("td", { class: `label-${value}`, "data-value": what }, `${signed(value)} ${LABELS[value]}`);
+}
+
+function tieTable(found) {
+  const { points } = found.neighbours;
+  const heads = ["distance", ...found.curves.map(({ image }) => image)];
+  const rows = points.slice(0, 12).map((point) => element("tr", {}, element("td", {}, `${point.distance_m.toFixed(1)} m`),
+    ...point.labels.map((value) => element("td", { class: `label-${value}` }, signed(value)))));
+  if (!points.length) rows.push(element("tr", {}, element("td", {}, "none near enough")));
+  $("ties").replaceChildren(element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);
+}
+
+function switchImage(name, isOn) {
+  const off = state.all("without").filter((each) => each !== name);
+  state.set({ without: isOn ? off : [...off, name] });
+  open();
+}
+
+// What is looked at otherwise than in the run, as the server takes it.
+function whatIf() {
+  const found = Object.fromEntries(state.entries("if."));
+  const without = state.all("without");
+  return without.length ? { ...found, without } : found;
+}
+
+function asInRun() {
+  state.set({ without: null, ...Object.fromEntries(state.entries("if.").map(([name]) => [`if.${name}`, null])) });
+  open();
+}
+
+function makeOptions() {
+  const known = Object.fromEntries(surface.options.map((each) => [each.name, each]));
+  const others = surface.options.map(({ name }) => name).filter((name) => !FIRST.includes(name));
+  const window = { name: "window", value: surface.window.value, choices: surface.window.choices, doc: "Side of the window that is compared.", unit: "cells" };
+  const reference = { name: "reference", value: "", choices: ["", ...surface.images], doc: "Image that the others are compared with.", unit: "" };
+  $("options").append(...[window, reference, ...FIRST.map((name) => known[name])].map(optionRow));
+  $("options").append(element("details", { style: "grid-column: 1 / -1" }, element("summary", {}, "More"), ...others.map((name) => optionRow(known[name]))));
+}
+
+function optionRow({ name, value, choices, low, high, is_whole, doc, unit }) {
+  const input = choices
+    ? element("select", { name }, ...choices.map((each) => element("option", { value: each }, each === "" ? "the best" : String(each))))
+    : element("input", { type: "number", name, min: low, max: high, step: is_whole ? 1 : "any" });
+  input.value = value;
+  input.dataset.asRun = String(value);
+  return element("label", { title: `${doc}${unit ? ` [${unit}]` : ""}` }, element("span", {}, name), input);
+}
+
+function inputs() {
+  return [...$("options").querySelectorAll("input, select")];
+}
+
+function fillOptions() {
+  const asked = Object.fromEntries(state.entries("if."));
+  for (const input of inputs()) {
+    input.value = asked[input.name] ?? input.dataset.asRun;
+    input.parentElement.classList.toggle("is-changed", input.name in asked);
+  }
+}
+
+function changed() {
+  const bad = inputs().find((input) => !input.checkValidity());
+  if (bad) {
+    bad.reportValidity();
+    return;
+  }
+  state.set(Object.fromEntries(inputs().map((input) => [`if.${input.name}`, input.value === input.dataset.asRun ? null : input.value])));
+  open();
+}
+
+// After colours changed.
+export function redraw() {
+  if (shown?.match) match(shown.match, $("changed").hidden ? null : asRun?.match);
+}
+
+export function current() {
+  return shown;
+}

@@ -1,0 +1,91 @@
+// Match curves: correlation against height, with the heights that matter marked.
+
+import { colour } from "./dom.js";
+
+// Okabe and Ito's colours, as in the figures of `zlocus curves`, the dark ones lighter on dark paper.
+const LIGHT = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195"];
+const DARK = ["#4aa8e0", "#ff8a4a", "#33cfa3", "#e39ac6", "#f0b73a", "#8fd0f5", "#c08a58", "#ad85c9"];
+const DASHES = ["", "7 4", "2 3"];
+const SIZE = { width: 520, height: 260, marginLeft: 42, marginBottom: 38, marginTop: 16, marginRight: 12 };
+
+export function isDark() {
+  return document.documentElement.dataset.theme === "dark" ||
+    (document.documentElement.dataset.theme !== "light" && matchMedia("(prefers-color-scheme: dark)").matches);
+}
+
+export function lineColour(j) {
+  const colours = isDark() ? DARK : LIGHT;
+  return colours[j % colours.length];
+}
+
+export function dashes(j) {
+  return DASHES[Math.floor(j / LIGHT.length) % DASHES.length];
+}
+
+function points(heights, values, name) {
+  return heights.map((height, k) => ({ height, value: values[k], name }));
+}
+
+function frame(match, marks, label) {
+  const heights = match.heights_m;
+  return Plot.plot({
+    ...SIZE, ariaLabel: label, style: { fontSize: "12px", background: "transparent" },
+    x: { domain: [heights[0], heights.at(-1)], label: "height, m", labelAnchor: "center", labelArrow: "none" },
+    y: { domain: [-1, 1.05], label: "correlation", ticks: [-1, -0.5, 0, 0.5, 1], labelArrow: "none" },
+    marks: [
+      Plot.ruleY([0], { stroke: "currentColor", strokeOpacity: 0.3 }),
+      Plot.ruleX([match.xyz[2]], { stroke: "currentColor", strokeOpacity: 0.45, strokeDasharray: "5 4" }),
+      ...marks,
+    ],
+  });
+}
+
+// NCC with each search image, their peaks, and the values at the pointer.
+export function single(match) {
+  const drawn = match.curves.map((curve, j) => ({ ...curve, j, points: points(match.heights_m, match.ncc[j], curve.image) }));
+  const marks = drawn.map((each) =>
+    Plot.line(each.points, { x: "height", y: "value", stroke: lineColour(each.j), strokeWidth: 1.5, strokeDasharray: dashes(each.j) }),
+  );
+  const peaks = drawn.filter((each) => each.rho1 !== null);
+  return frame(match, [
+    ...marks,
+    Plot.dot(peaks, { x: "peak_m", y: "rho1", symbol: "times", stroke: (d) => lineColour(d.j), strokeWidth: 2, r: 5 }),
+    tips(drawn.flatMap((each) => each.points)),
+  ], "Correlation with each search image against height");
+}
+
+// The mean of the first 1, 2, ... images, from pale to dark, that at which the match ends thick.
+export function means(match, before) {
+  const used = match.stop.images;
+  const steps = match.sncc.map((values, m) => ({ m: m + 1, points: points(match.heights_m, values, `mean of ${m + 1}`) }));
+  const marks = steps.map((each) => {
+    const isEnd = each.m === used;
+    const shade = each.m > used ? { strokeOpacity: 0.5, strokeDasharray: "2 4" } : { strokeOpacity: isEnd ? 1 : 0.25 + (0.5 * each.m) / used };
+    return Plot.line(each.points, { x: "height", y: "value", stroke: "currentColor", strokeWidth: isEnd ? 2.6 : 1.3, ...shade });
+  });
+  if (before) {
+    const old = points(before.heights_m, before.sncc[before.stop.images - 1], "as in the run");
+    marks.push(Plot.line(old, { x: "height", y: "value", stroke: colour("warn"), strokeWidth: 1.8, strokeDasharray: "6 4" }));
+  }
+  const end = match.means[used - 1];
+  const peak = end && end.rho1 !== null ? [Plot.dot([end], { x: "peak_m", y: "rho1", symbol: "times", stroke: "currentColor", strokeWidth: 2.5, r: 7 })] : [];
+  return frame(match, [...marks, ...peak, tips(steps.flatMap((each) => each.points))], "Mean correlation against height");
+}
+
+function tips(all) {
+  const known = all.filter((each) => each.value !== null);
+  return Plot.tip(known, Plot.pointer({
+    x: "height", y: "value", maxRadius: 30, fill: colour("raised"), stroke: colour("line"),
+    title: (d) => `${d.name}\n${d.value.toFixed(3)} at ${d.height.toFixed(2)} m`,
+  }));
+}
+
+// The height that is looked at, as a line on a chart that is there.
+export function mark(svg, match, k) {
+  const scale = svg.scale("x");
+  const [low, high] = scale.domain, [left, right] = scale.range;
+  const x = left + ((match.heights_m[k] - low) / (high - low)) * (right - left);
+  const line = d3.select(svg).selectAll("line.looked-at").data([x]).join("line");
+  line.attr("class", "looked-at").attr("x1", x).attr("x2", x).attr("y1", SIZE.marginTop).attr("y2", SIZE.height - SIZE.marginBottom)
+    .attr("stroke", colour("accent")).attr("stroke-width", 2).attr("pointer-events", "none");
+}

@@ -1,0 +1,36 @@
+// Small helpers for the page's elements.
+
+export const $ = (id) => document.getElementById(id);
+
+export function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value === false || value === null || value === undefined) continue;
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else made.setAttribute(key, value === true ? "" : value);
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+// Why something is not there, or "" to say nothing.
+export function notice(text) {
+  $("notice").textContent = text;
+  $("notice").hidden = !text;
+}
+
+export function colour(name) {
+  const probe = element("i", { style: `color: var(--${name})` });
+  document.body.append(probe);
+  const found = getComputedStyle(probe).color;
+  probe.remove();
+  return found;
+}
+
+export function metres(value, digits = 2) {
+  return value === null || value === undefined ? "none" : `${value.toFixed(digits)} m`;
+}
+
+export function signed(value) {
+  return value > 0 ? `+${value}` : String(value).replace("-", "−");
+}

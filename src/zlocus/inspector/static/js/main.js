@@ -1,0 +1,213 @@
+// The page: what was asked for by its address, and what keys and buttons do.
+
+import { asked } from "./api.js";
+import * as cell from "./cell.js";
+import { $, element, notice } from "./dom.js";
+import { saveCanvas } from "./figures.js";
+import * as map from "./map.js";
+import * as profile from "./profile.js";
+import * as state from "./state.js";
+
+const TABS = ["cell", "profile", "relief"];
+const KEYS = [
+  ["1 to 7", "layers, on and off"],
+  ["Arrows, + and −", "move the map and zoom, while it has the focus"],
+  ["Enter", "look at the cell in the middle of the map"],
+  ["Shift and arrows", "the neighbouring cell"],
+  ["[ and ]", "the height looked at, down and up"],
+  ["P", "one end of a profile, then the other, in the middle of the map"],
+  ["Esc", "end drawing"],
+  ["C, F, V", "cell, profile, 3-D"],
+  ["L", "copy the link of this view"],
+  ["D", "light or dark"],
+  ["?", "these keys"],
+];
+const WAIT_MS = 1000;
+let leaflet, relief = null;
+
+async function start() {
+  theme(state.get("theme"));
+  const surface = await asked("surface");
+  document.title = `${surface.title} – zlocus inspect`;
+  $("title").textContent = surface.title;
+  const [rows, cols] = surface.shape;
+  $("subtitle").textContent = `${rows} × ${cols} cells of ${surface.transform[0]} m, ${surface.images.length} images, ${surface.crs}`;
+  leaflet = map.make(surface);
+  cell.make(surface, leaflet);
+  profile.make(surface, leaflet);
+  makeGo(surface);
+  makeKeys();
+  leaflet.on("click", ({ latlng }) => clicked(latlng));
+  TABS.forEach((name) => $(`tab-${name}`).addEventListener("click", () => open(name)));
+  $("tab-cell").parentElement.addEventListener("keydown", moveTab);
+  $("link").addEventListener("click", copyLink);
+  $("theme").addEventListener("click", changeTheme);
+  $("help").addEventListener("click", () => $("keys").showModal());
+  $("export-map").addEventListener("click", async () => {
+    const canvas = await map.exportMap();
+    if (canvas) saveCanvas(canvas, `${surface.title}_map`);
+  });
+  addEventListener("keydown", key);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  state.onOpened(reopen);
+  await reopen();
+  document.body.dataset.ready = "true";
+  watch(surface);
+}
+
+async function reopen() {
+  theme(state.get("theme"));
+  map.openView();
+  const tab = state.get("tab");
+  await Promise.all([cell.open(), profile.open()]);
+  await open(TABS.includes(tab) ? tab : "cell", false);
+}
+
+// Until everything that is made in the background is there.
+async function watch(surface) {
+  for (;;) {
+    let found;
+    try {
+      found = await asked("state");
+    } catch {
+      notice("The server does not answer. Is `zlocus inspect` still running?");
+      return;
+    }
+    const failed = ["scene", "reference"].filter((what) => found[what]?.is === "failed").map((what) => found[what].why);
+    const waiting = found.scene.is === "opening" ? ["The images are being opened."] : [];
+    if (found.reference?.is === "opening") waiting.push("The reference is being compared.");
+    notice([...failed, ...waiting, ...found.notes].join(" "));
+    if (found.difference && !map.has("difference")) {
+      map.addLate(found.difference);
+      await Promise.all([cell.open(), profile.open()]);
+    }
+    document.body.dataset.scene = found.scene.is;
+    if (!waiting.length) return;
+    await new Promise((done) => setTimeout(done, WAIT_MS));
+  }
+}
+
+function clicked(latlng) {
+  if (profile.isDrawing()) profile.point(latlng);
+  else inspect(latlng);
+}
+
+function inspect({ lat, lng }) {
+  if ($("cell").hidden && $("profile").hidden === false) return;
+  open("cell");
+  cell.look(lng, lat);
+}
+
+async function open(name, isAsked = true) {
+  for (const each of TABS) {
+    $(each).hidden = each !== name;
+    $(`tab-${each}`).setAttribute("aria-selected", String(each === name));
+    $(`tab-${each}`).tabIndex = each === name ? 0 : -1;
+  }
+  if (isAsked) state.set({ tab: name });
+  if (name !== "profile") profile.cancel();
+  if (name === "profile" && !state.get("line")) profile.begin();
+  if (name === "relief") {
+    // Three dimensions are loaded when somebody wants them.
+    if (!relief) {
+      relief = await import("./relief.js");
+      relief.make(await asked("surface"));
+    }
+    await relief.show();
+  }
+}
+
+function moveTab(event) {
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+  if (!step) return;
+  const at = TABS.findIndex((name) => $(`tab-${name}`).getAttribute("aria-selected") === "true");
+  const next = TABS[(at + step + TABS.length) % TABS.length];
+  open(next);
+  $(`tab-${next}`).focus();
+}
+
+function makeGo(surface) {
+  for (const { x, y, what } of surface.cells) $("go").append(element("option", { value: `${x},${y}` }, what));
+  $("go").addEventListener("change", () => {
+    if (!$("go").value) return;
+    const [x, y] = $("go").value.split(",").map(Number);
+    leaflet.setView([y, x], Math.max(leaflet.getZoom(), 1));
+    open("cell");
+    cell.look(x, y);
+  });
+  $("go").parentElement.hidden = !surface.cells.length;
+}
+
+function makeKeys() {
+  const rows = KEYS.map(([keys, what]) => element("tr", {}, element("td", {}, element("kbd", {}, keys)), element("td", {}, what)));
+  $("keys").querySelector("tbody").append(...rows);
+}
+
+function key(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
+  const isTyping = event.target.matches("input, select, textarea");
+  const arrows = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+  if (event.shiftKey && arrows[event.key] && !isTyping) cell.step(...arrows[event.key]);
+  else if (isTyping) return;
+  else if (/^[1-9]$/.test(event.key)) map.toggle(Number(event.key));
+  else if (event.key === "Enter" && event.target === $("map")) centre();
+  else if (event.key === "[" || event.key === "]") cell.slide(event.key === "]" ? 1 : -1);
+  else if (event.key === "Escape") profile.cancel();
+  else if (event.key === "?") $("keys").showModal();
+  else {
+    const action = { c: () => open("cell"), f: () => open("profile"), v: () => open("relief"), l: copyLink, d: changeTheme, p: profilePoint }[event.key.toLowerCase()];
+    if (!action) return;
+    action();
+  }
+  event.preventDefault();
+  event.stopPropagation();
+}
+
+function centre() {
+  if (profile.isDrawing()) profile.point(leaflet.getCenter());
+  else {
+    open("cell");
+    cell.look(leaflet.getCenter().lng, leaflet.getCenter().lat);
+  }
+}
+
+function profilePoint() {
+  if ($("profile").hidden) open("profile");
+  profile.point(leaflet.getCenter());
+}
+
+async function copyLink() {
+  try {
+    await navigator.clipboard.writeText(location.href);
+    flash("Copied.");
+  } catch {
+    prompt("The link of this view:", location.href);
+  }
+}
+
+function flash(text) {
+  const before = $("link").textContent;
+  $("link").textContent = text;
+  setTimeout(() => ($("link").textContent = before), 1200);
+}
+
+function theme(name) {
+  if (name === "light" || name === "dark") document.documentElement.dataset.theme = name;
+  else delete document.documentElement.dataset.theme;
+}
+
+function changeTheme() {
+  const isDark = getComputedStyle(document.documentElement).getPropertyValue("color-scheme") === "dark" ||
+    (!document.documentElement.dataset.theme && matchMedia("(prefers-color-scheme: dark)").matches);
+  state.set({ theme: isDark ? "light" : "dark" });
+  theme(state.get("theme"));
+  redraw();
+}
+
+function redraw() {
+  cell.redraw();
+  profile.redraw();
+  relief?.draw();
+}
+
+start().catch((error) => notice(`The page could not be opened: ${error.message}`));

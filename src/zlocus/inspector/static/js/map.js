@@ -1,0 +1,227 @@
+// The map: layers of tiles on the surface's own grid, a pixel being a cell at zoom 0.
+
+import { address } from "./api.js";
+import { $, element, notice } from "./dom.js";
+import * as state from "./state.js";
+
+const TILE_PX = 256;
+const CLOSEST = 6;
+const DEFAULT_LAYERS = { hillshade: 1, height: 0.55 };
+let surface, map, crs;
+const layers = new Map();
+
+const Tiles = L.TileLayer.extend({
+  getTileUrl({ x, y }) {
+    return `tiles/${this.options.name}/${-this._tileZoom_()}/${x}/${y}.png`;
+  },
+  _tileZoom_() {
+    return this._clampZoom(this._tileZoom);
+  },
+});
+
+export function make(about) {
+  surface = about;
+  const [a, , c, , e, f] = about.transform;
+  crs = L.extend({}, L.CRS.Simple, { transformation: new L.Transformation(1 / a, -c / a, 1 / e, -f / e) });
+  map = L.map("map", {
+    crs, minZoom: -about.levels - 1, maxZoom: CLOSEST, zoomSnap: 0.5, zoomDelta: 1, attributionControl: false,
+    wheelPxPerZoomLevel: 90, keyboardPanDelta: 120,
+  });
+  L.control.scale({ imperial: false, maxWidth: 160 }).addTo(map);
+  about.layers.forEach(addLayer);
+  openView();
+  map.on("moveend", () => {
+    const { lat, lng } = map.getCenter();
+    state.set({ at: [lng.toFixed(2), lat.toFixed(2), map.getZoom()].join(",") });
+  });
+  map.on("mousemove", ({ latlng }) => ($("pointer").textContent = words(latlng.lng, latlng.lat)));
+  map.on("mouseout", () => ($("pointer").textContent = ""));
+  new ResizeObserver(() => map.invalidateSize()).observe($("map"));
+  if (matchMedia("(max-width: 860px)").matches) $("layers").open = false;
+  return map;
+}
+
+export function words(x, y, digits = 1) {
+  const [first, second] = surface.axes;
+  return `${first} ${x.toFixed(digits)}, ${second} ${y.toFixed(digits)} m`;
+}
+
+// The place and the layers that the address asks for.
+export function openView() {
+  const at = state.numbers("at", 3);
+  if (at) map.setView([at[1], at[0]], at[2], { animate: false });
+  else map.fitBounds(bounds(), { animate: false });
+  const asked = state.get("layers");
+  const shown = asked === undefined || asked === null ? DEFAULT_LAYERS : parsed(asked);
+  for (const layer of layers.values()) show(layer, shown[layer.name]);
+}
+
+function parsed(text) {
+  return Object.fromEntries(
+    text.split(",").filter(Boolean).map((each) => each.split(":")).map(([name, share]) => [name, clamp(Number(share ?? 1))]),
+  );
+}
+
+function clamp(share) {
+  return Number.isFinite(share) ? Math.min(Math.max(share, 0), 1) : 1;
+}
+
+export function bounds() {
+  const [rows, cols] = surface.shape;
+  const [a, , c, , e, f] = surface.transform;
+  return L.latLngBounds([f + rows * e, c], [f, c + cols * a]);
+}
+
+export function addLayer(about) {
+  const tiles = new Tiles("", {
+    name: about.name, tileSize: TILE_PX, minZoom: -surface.levels - 1, maxZoom: CLOSEST, minNativeZoom: -surface.levels,
+    maxNativeZoom: 0, bounds: bounds(), noWrap: true, keepBuffer: 3, zIndex: layers.size + 1, className: `layer-${about.name}`,
+  });
+  const number = layers.size + 1;
+  const box = element("input", { type: "checkbox", id: `layer-${about.name}`, onchange: () => changed(layer) });
+  const share = element("input", {
+    type: "range", min: 0, max: 1, step: 0.05, value: 1, "aria-label": `Opacity of ${about.title}`, oninput: () => changed(layer),
+  });
+  const legend = legendOf(about);
+  const layer = { ...about, tiles, box, share, legend, number };
+  layers.set(about.name, layer);
+  // The highest stands at the top.
+  $("layer-rows").prepend(
+    element("div", { class: "layer" }, element("label", { title: `Key ${number}` }, box, about.title), share),
+  );
+  $("legends").prepend(legend);
+  show(layer, undefined);
+}
+
+export function has(name) {
+  return layers.has(name);
+}
+
+// A layer that came later, as the address asks for it.
+export function addLate(about) {
+  addLayer(about);
+  const share = parsed(state.get("layers") ?? "")[about.name];
+  if (share !== undefined) show(layers.get(about.name), share);
+}
+
+function show(layer, share) {
+  layer.box.checked = share !== undefined;
+  if (share !== undefined) layer.share.value = share;
+  layer.share.disabled = !layer.box.checked;
+  layer.legend.hidden = !layer.box.checked;
+  layer.tiles.setOpacity(Number(layer.share.value));
+  if (layer.box.checked) layer.tiles.addTo(map);
+  else layer.tiles.remove();
+}
+
+function changed(layer) {
+  show(layer, layer.box.checked ? Number(layer.share.value) : undefined);
+  state.set({ layers: shown().map(([name, share]) => `${name}:${share}`).join(",") });
+}
+
+export function toggle(number) {
+  for (const layer of layers.values()) {
+    if (layer.number === number) {
+      layer.box.checked = !layer.box.checked;
+      changed(layer);
+    }
+  }
+}
+
+// Names and opacities of the layers that are shown, the lowest first.
+export function shown() {
+  return [...layers.values()].filter((layer) => layer.box.checked).map((layer) => [layer.name, Number(layer.share.value)]);
+}
+
+export function titles() {
+  return [...layers.values()].map(({ name, title }) => ({ name, title }));
+}
+
+function legendOf({ legend }) {
+  if (!legend) return element("div", {});
+  const box = element("div", { class: "legend" }, element("b", {}, legend.title));
+  if (legend.kind === "scale") {
+    box.append(element("div", { class: "bar", style: `background: linear-gradient(to right, ${legend.gradient})` }));
+    box.append(element("div", { class: "ticks" }, ...legend.ticks.map((tick) => element("span", {}, tick))));
+  } else {
+    const items = legend.items.map(({ colour, meaning }) =>
+      element("li", {}, element("span", { class: "swatch", style: `background: ${colour}` }), meaning),
+    );
+    box.append(element("ul", {}, ...(items.length ? items : ["none here"])));
+  }
+  return box;
+}
+
+// The part of the grid that the map shows, as the server takes it, in a picture of at most `side` pixels a side.
+export function patch(side, isInside = false) {
+  const view = map.getBounds();
+  const [a, , c, , e, f] = surface.transform;
+  let [left, right] = [view.getWest(), view.getEast()].map((x) => (x - c) / a);
+  let [top, bottom] = [view.getNorth(), view.getSouth()].map((y) => (y - f) / e);
+  if (isInside) {
+    [left, right] = [Math.max(left, 0), Math.min(right, surface.shape[1])];
+    [top, bottom] = [Math.max(top, 0), Math.min(bottom, surface.shape[0])];
+    if (right - left < 2 || bottom - top < 2) return null;
+  }
+  const [rows, cols] = [bottom - top, right - left];
+  const scale = Math.min(side / Math.max(rows, cols), isInside ? 1 : Infinity);
+  return {
+    row: top, col: left, rows, cols, height: Math.max(Math.round(rows * scale), 2), width: Math.max(Math.round(cols * scale), 2),
+  };
+}
+
+export function pictureAddress(part, names) {
+  return address("picture.png", { ...part, layer: names });
+}
+
+// The map as a picture: what is shown, and what is drawn on it.
+export async function exportMap() {
+  const size = map.getSize();
+  const part = { ...patch(1), height: Math.round(size.y), width: Math.round(size.x) };
+  const names = shown().map(([name, share]) => `${name}:${share}`);
+  const picture = new Image();
+  picture.src = pictureAddress(part, names);
+  try {
+    await picture.decode();
+  } catch {
+    notice("The map could not be drawn.");
+    return null;
+  }
+  const canvas = element("canvas", { width: size.x, height: size.y });
+  const context = canvas.getContext("2d");
+  context.fillStyle = "white";
+  context.fillRect(0, 0, size.x, size.y);
+  context.drawImage(picture, 0, 0);
+  const drawn = document.querySelector("#map .leaflet-overlay-pane svg");
+  if (drawn) await overlay(context, drawn);
+  scaleBar(context, size);
+  return canvas;
+}
+
+async function overlay(context, drawn) {
+  const [frame, place] = [$("map").getBoundingClientRect(), drawn.getBoundingClientRect()];
+  const image = new Image();
+  const copy = drawn.cloneNode(true);
+  copy.removeAttribute("style");
+  copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
+  image.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(new XMLSerializer().serializeToString(copy))}`;
+  await image.decode();
+  context.drawImage(image, place.left - frame.left, place.top - frame.top, place.width, place.height);
+}
+
+function scaleBar(context, size) {
+  const line = document.querySelector("#map .leaflet-control-scale-line");
+  const width = line.offsetWidth;
+  context.fillStyle = "rgb(255 255 255 / 80%)";
+  context.fillRect(10, size.y - 34, width + 8, 26);
+  context.fillStyle = context.strokeStyle = "black";
+  context.lineWidth = 2;
+  context.beginPath();
+  context.moveTo(14, size.y - 18);
+  context.lineTo(14, size.y - 12);
+  context.lineTo(14 + width, size.y - 12);
+  context.lineTo(14 + width, size.y - 18);
+  context.stroke();
+  context.font = "13px system-ui, sans-serif";
+  context.fillText(line.textContent, 18, size.y - 19);
+}

@@ -1,0 +1,118 @@
+// Heights along a line drawn on the map, with their standard deviation, and the reference where there is one.
+
+import { asked } from "./api.js";
+import { colour, $ } from "./dom.js";
+import { exportable } from "./figures.js";
+import * as map from "./map.js";
+import * as state from "./state.js";
+
+let surface, leaflet, line, dot, first = null, chart = null, last = null;
+
+export function make(about, theMap) {
+  [surface, leaflet] = [about, theMap];
+  line = L.layerGroup().addTo(leaflet);
+  $("draw").addEventListener("click", begin);
+  exportable($("profile-figure"), `${surface.title}_profile`, () => chart);
+}
+
+export function isDrawing() {
+  return $("map").classList.contains("drawing");
+}
+
+export function begin() {
+  first = null;
+  $("map").classList.add("drawing");
+  $("draw").setAttribute("aria-pressed", "true");
+}
+
+export function cancel() {
+  first = null;
+  $("map").classList.remove("drawing");
+  $("draw").setAttribute("aria-pressed", "false");
+}
+
+// One end of the line, then the other.
+export function point({ lat, lng }) {
+  if (!isDrawing()) begin();
+  if (!first) {
+    first = { lat, lng };
+    line.clearLayers();
+    L.circleMarker(first, { radius: 5, color: "#e6007a", interactive: false }).addTo(line);
+    return;
+  }
+  state.set({ line: [first.lng, first.lat, lng, lat].map((value) => value.toFixed(2)).join(",") });
+  cancel();
+  open();
+}
+
+// The line that the address names, or none.
+export async function open() {
+  const ends = state.numbers("line", 4);
+  line.clearLayers();
+  $("profile-figure").hidden = !ends;
+  $("profile-text").textContent = "";
+  if (!ends) return;
+  const [x0, y0, x1, y1] = ends;
+  L.polyline([[y0, x0], [y1, x1]], { color: "#e6007a", weight: 3, interactive: false }).addTo(line);
+  dot = L.circleMarker([y0, x0], { radius: 6, color: "#e6007a", fillOpacity: 1, interactive: false });
+  try {
+    last = await asked("profile", { x0, y0, x1, y1 });
+  } catch (error) {
+    $("profile-figure").hidden = true;
+    $("profile-text").textContent = error.message;
+    return;
+  }
+  draw(ends);
+}
+
+export function redraw() {
+  const ends = state.numbers("line", 4);
+  if (ends && last) draw(ends);
+}
+
+function draw([x0, y0, x1, y1]) {
+  const points = last.distance_m.map((distance, i) => ({
+    distance, height: last.height_m[i], sigma: last.sigma_m[i], reference: last.reference_m?.[i] ?? null,
+  }));
+  const known = points.filter((each) => each.height !== null);
+  const hasReference = points.some((each) => each.reference !== null);
+  chart = Plot.plot({
+    width: 520, height: 300, marginLeft: 52, marginBottom: 38, ariaLabel: "Height along the line",
+    style: { fontSize: "12px", background: "transparent" },
+    x: { label: "distance, m", labelAnchor: "center", labelArrow: "none" },
+    y: { label: "height, m", labelArrow: "none", nice: true, zero: false },
+    marks: [
+      // Where a height is missing there is a gap.
+      Plot.areaY(points, { x: "distance", y1: (d) => low(d), y2: (d) => high(d), fill: colour("accent"), fillOpacity: 0.3 }),
+      ...(hasReference ? [Plot.line(points, { x: "distance", y: (d) => d.reference ?? NaN, stroke: colour("warn"), strokeWidth: 1.4 })] : []),
+      Plot.line(points, { x: "distance", y: (d) => d.height ?? NaN, stroke: colour("accent"), strokeWidth: 1.6 }),
+      Plot.ruleX(known, Plot.pointerX({ x: "distance", stroke: "currentColor", strokeOpacity: 0.4 })),
+      Plot.tip(known, Plot.pointerX({ x: "distance", y: "height", fill: colour("raised"), stroke: colour("line"), title: words })),
+    ],
+  });
+  chart.addEventListener("input", () => {
+    if (!chart.value) return dot.remove();
+    const share = chart.value.distance / Math.max(last.length_m, 1e-9);
+    return dot.setLatLng([y0 + share * (y1 - y0), x0 + share * (x1 - x0)]).addTo(line);
+  });
+  $("profile-figure").querySelector(".drawing").replaceChildren(chart);
+  const reference = hasReference ? ", and the reference in orange" : "";
+  $("profile-text").textContent =
+    `${last.length_m.toFixed(1)} m from ${map.words(x0, y0)} to ${map.words(x1, y1)}: ${known.length} of ${points.length} places, ` +
+    `${last.spacing_m.toFixed(2)} m apart, have a height. The band is one standard deviation to either side${reference}.`;
+}
+
+function low({ height, sigma }) {
+  return height === null ? NaN : height - (sigma ?? 0);
+}
+
+function high({ height, sigma }) {
+  return height === null ? NaN : height + (sigma ?? 0);
+}
+
+function words({ distance, height, sigma, reference }) {
+  const lines = [`${distance.toFixed(1)} m along`, `height ${height.toFixed(2)} m`];
+  if (sigma !== null) lines.push(`σ ${sigma.toFixed(3)} m`);
+  if (reference !== null) lines.push(`reference ${reference.toFixed(2)} m`);
+  return lines.join("\n");
+}

@@ -1,0 +1,172 @@
+// The surface in three dimensions with a layer on it.
+
+import * as THREE from "three";
+import { ask } from "./api.js";
+import { $, colour, element } from "./dom.js";
+import { saveCanvas } from "./figures.js";
+import * as map from "./map.js";
+import * as state from "./state.js";
+import { OrbitControls } from "../vendor/three/OrbitControls.js";
+
+const MOST_SIDE = 512, PICTURE_SIDE = 2048;
+let surface, renderer, scene, camera, controls, mesh = null, span = 0;
+
+export function make(about) {
+  surface = about;
+  const choices = [["map", "what the map shows"], ...map.titles().map(({ name, title }) => [name, title])];
+  $("drape").replaceChildren(...choices.map(([value, text]) => element("option", { value }, text)));
+  $("drape").value = about.layers.some(({ name }) => name === "ortho") ? "ortho" : "map";
+  $("drape").addEventListener("change", () => {
+    state.set({ drape: $("drape").value });
+    show();
+  });
+  $("relief-here").addEventListener("click", show);
+  $("exaggeration").addEventListener("input", () => {
+    exaggerate();
+    state.set({ exaggeration: $("exaggeration").value });
+  });
+  $("export-relief").addEventListener("click", () => {
+    draw();
+    saveCanvas(renderer.domElement, `${surface.title}_3d`);
+  });
+}
+
+export function isReady() {
+  return mesh !== null;
+}
+
+function begin() {
+  if (renderer) return true;
+  try {
+    renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+  } catch {
+    $("relief-text").textContent = "This browser shows nothing in three dimensions: it has no WebGL.";
+    return false;
+  }
+  renderer.setPixelRatio(devicePixelRatio);
+  scene = new THREE.Scene();
+  camera = new THREE.PerspectiveCamera(45, 1, 0.01, 100);
+  controls = new OrbitControls(camera, renderer.domElement);
+  controls.listenToKeyEvents($("relief-view"));
+  controls.maxPolarAngle = Math.PI / 2;
+  controls.addEventListener("change", draw);
+  controls.addEventListener("end", keepPlace);
+  $("relief-view").replaceChildren(renderer.domElement);
+  new ResizeObserver(fit).observe($("relief-view"));
+  return true;
+}
+
+// The part of the surface that the map shows.
+export async function show() {
+  if (!begin()) return;
+  $("drape").value = state.get("drape") ?? $("drape").value;
+  $("exaggeration").value = state.get("exaggeration") ?? $("exaggeration").value;
+  const part = map.patch(MOST_SIDE, true);
+  if (!part) {
+    $("relief-text").textContent = "The map shows nothing of the surface. Move it there.";
+    return;
+  }
+  const names = $("drape").value === "map" ? map.shown().map(([name, share]) => `${name}:${share}`) : [$("drape").value];
+  const scale = PICTURE_SIDE / Math.max(part.rows, part.cols);
+  const size = { height: Math.max(Math.min(Math.round(part.rows * scale), PICTURE_SIDE), 2), width: Math.max(Math.min(Math.round(part.cols * scale), PICTURE_SIDE), 2) };
+  try {
+    const [answer, texture] = await Promise.all([ask("heights", part), load(map.pictureAddress({ ...part, ...size }, names))]);
+    build(part, new Float32Array(await answer.arrayBuffer()), texture);
+  } catch (error) {
+    $("relief-text").textContent = error.message || "The surface could not be shown.";
+  }
+}
+
+function load(address) {
+  return new THREE.TextureLoader().loadAsync(address).then((texture) => {
+    texture.colorSpace = THREE.SRGBColorSpace;
+    texture.anisotropy = renderer.capabilities.getMaxAnisotropy();
+    return texture;
+  });
+}
+
+// Longer side of the part: 1; heights to the same scale.
+function build(part, heights, texture) {
+  const { height: rows, width: cols } = part;
+  const known = heights.filter(Number.isFinite);
+  if (!known.length) {
+    $("relief-text").textContent = "No cell of what the map shows has a height.";
+    return;
+  }
+  const sorted = known.slice().sort();
+  const middle = sorted[Math.floor(sorted.length / 2)];
+  const step = (part.rows / rows) * surface.transform[0];
+  span = Math.max(rows, cols) * step;
+  const places = new Float32Array(3 * rows * cols), uv = new Float32Array(2 * rows * cols);
+  for (let i = 0; i < rows * cols; i++) {
+    const row = Math.floor(i / cols), col = i % cols, z = heights[i];
+    places.set([((col + 0.5 - cols / 2) * step) / span, (Number.isFinite(z) ? z - middle : 0) / span, ((row + 0.5 - rows / 2) * step) / span], 3 * i);
+    uv.set([(col + 0.5) / cols, 1 - (row + 0.5) / rows], 2 * i);
+  }
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
+  geometry.setAttribute("uv", new THREE.BufferAttribute(uv, 2));
+  geometry.setIndex(new THREE.BufferAttribute(triangles(heights, rows, cols), 1));
+  const material = new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide });
+  if (mesh) {
+    scene.remove(mesh);
+    mesh.geometry.dispose();
+    mesh.material.map.dispose();
+    mesh.material.dispose();
+  }
+  mesh = new THREE.Mesh(geometry, material);
+  scene.add(mesh);
+  place();
+  exaggerate();
+  fit();
+  const shape = `${rows} x ${cols} places, ${step.toFixed(2)} m apart`;
+  $("relief-text").textContent = `${shape}, ${sorted[0].toFixed(1)} to ${sorted.at(-1).toFixed(1)} m. Drag to turn, wheel or pinch to come closer; holes are holes.`;
+  $("relief-view").dataset.places = String(known.length);
+}
+
+// Two per square of places that all have a height.
+function triangles(heights, rows, cols) {
+  const found = [];
+  for (let row = 0; row + 1 < rows; row++) {
+    for (let col = 0; col + 1 < cols; col++) {
+      const a = row * cols + col, b = a + 1, c = a + cols, d = c + 1;
+      if ([a, b, c, d].every((i) => Number.isFinite(heights[i]))) found.push(a, c, b, b, c, d);
+    }
+  }
+  return new Uint32Array(found);
+}
+
+function place() {
+  const kept = state.numbers("eye", 6) ?? [0, 0.75, 0.95, 0, 0, 0];
+  camera.position.set(...kept.slice(0, 3));
+  controls.target.set(...kept.slice(3));
+  controls.update();
+}
+
+function keepPlace() {
+  const all = [...camera.position.toArray(), ...controls.target.toArray()];
+  state.set({ eye: all.map((value) => value.toFixed(3)).join(",") });
+}
+
+function exaggerate() {
+  $("exaggeration-value").textContent = $("exaggeration").value;
+  if (!mesh) return;
+  mesh.scale.y = Number($("exaggeration").value);
+  draw();
+}
+
+function fit() {
+  if (!renderer) return;
+  const { clientWidth, clientHeight } = $("relief-view");
+  if (!clientWidth || !clientHeight) return;
+  renderer.setSize(clientWidth, clientHeight);
+  camera.aspect = clientWidth / clientHeight;
+  camera.updateProjectionMatrix();
+  draw();
+}
+
+export function draw() {
+  if (!renderer || !mesh) return;
+  scene.background = new THREE.Color(colour("raised"));
+  renderer.render(scene, camera);
+}

@@ -1,0 +1,44 @@
+// The view, kept behind the # of the address: whoever opens the link sees the same.
+
+const listeners = [];
+let values = read();
+
+export function get(name) {
+  return values.get(name);
+}
+
+export function all(name) {
+  return values.getAll(name);
+}
+
+export function entries(prefix) {
+  return [...values].filter(([name]) => name.startsWith(prefix)).map(([name, value]) => [name.slice(prefix.length), value]);
+}
+
+// Set some values; null removes one, a list sets several of the same name.
+export function set(changes) {
+  for (const [name, value] of Object.entries(changes)) {
+    values.delete(name);
+    for (const each of [value].flat()) if (each !== null && each !== undefined) values.append(name, each);
+  }
+  const text = values.toString();
+  history.replaceState(null, "", text ? `#${text}` : "#");
+}
+
+export function onOpened(listener) {
+  listeners.push(listener);
+}
+
+export function numbers(name, count) {
+  const found = (values.get(name) ?? "").split(",").map(Number);
+  return found.length === count && found.every(Number.isFinite) && values.get(name) !== "" ? found : null;
+}
+
+addEventListener("hashchange", () => {
+  values = read();
+  listeners.forEach((listener) => listener());
+});
+
+function read() {
+  return new URLSearchParams(location.hash.slice(1));
+}
