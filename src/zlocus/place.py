@@ -16,7 +16,7 @@ from zlocus.matching.point import IntArray, PointCurves, cell_windows, point_cur
 from zlocus.matching.selection import Ranking, preselected, rank_views
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, pixel_window, read_pixels, tile_views
-from zlocus.options import RunConfig
+from zlocus.options import RunConfig, SelectionOptions
 from zlocus.scene import View
 from zlocus.sensors.model import FloatArray
 
@@ -157,11 +157,7 @@ def references(reference: str | None, views: Sequence[View]) -> FloatArray:
 
 def views_of(settled: MatchScene, window: CellWindow, place: Place, config: RunConfig) -> tuple[list[int], TileViews]:
     """The views worth comparing at the place, by number, and what they show of a window of cells around it."""
-    reach = config.selection.reach_steps * settled.step_m
-    z = (
-        min(settled.origin_m, place.xyz[2]) - reach,
-        max(settled.origin_m + settled.n_steps * settled.step_m, place.xyz[2]) + reach,
-    )
+    z = heights_around(settled, window, place, config.selection)
     transform = settled.transform(window, 0)
     across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
     corners = np.array([transform * (c, r) for c in across for r in down])
@@ -181,9 +177,27 @@ def views_of(settled: MatchScene, window: CellWindow, place: Place, config: RunC
     return numbers, tile_views(found, 0, transform, shape, config.pyramid.block, lattice, z, half)
 
 
+def heights_around(
+    settled: MatchScene, window: CellWindow, place: Place, options: SelectionOptions
+) -> tuple[float, float]:
+    """Between which heights, m, curves of the place and of the tie points in a window are looked at: of a scene's whole
+    range projections would be tabulated several times as long."""
+    xy = ties_on_cells(settled)
+    first, size = np.array([window.col, window.row]), np.array([window.cols, window.rows])
+    inside = ((xy >= first) & (xy < first + size)).all(axis=1) & np.isfinite(settled.ties[:, 2])
+    heights = np.append(settled.ties[inside, 2], place.xyz[2])
+    reach = (options.reach_steps + 1) * settled.step_m
+    return float(heights.min()) - reach, float(heights.max()) + reach
+
+
+def ties_on_cells(settled: MatchScene) -> FloatArray:
+    """Columns and rows of the finest lattice where the tie points lie, (n, 2)."""
+    return np.asarray((settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m)
+
+
 def ranked(settled: MatchScene, views: TileViews, window: CellWindow, config: RunConfig) -> Ranking:
     """Labels of all pairs of views at the tie points of a window, on level ground."""
-    xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
+    xy = ties_on_cells(settled)
     index = (settled.ties[:, 2] - settled.origin_m) / settled.step_m
     side, steps_per_cell, flat = config.measure.large_window, settled.cell_m / settled.step_m, np.zeros((len(xy), 2))
     return rank_views(views, window, xy, index, flat, side, steps_per_cell, config.selection)

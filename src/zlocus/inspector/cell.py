@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.inspector.folder import SurfaceFolder
 from zlocus.inspector.layers import reasons_of
-from zlocus.inspector.profile import differences_at
-from zlocus.inspector.reference import Difference
+from zlocus.inspector.profile import reference_at
+from zlocus.inspector.reference import Reference
 from zlocus.inspector.restore import Restored
 from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
@@ -77,7 +77,7 @@ class WhatIf:
         return replace(settled, views=tuple(settled.views[i] for i in kept), grey=tuple(settled.grey[i] for i in kept))
 
 
-def cell_record(folder: SurfaceFolder, difference: Difference | None, row: int, col: int) -> dict[str, Any]:
+def cell_record(folder: SurfaceFolder, reference: Reference | None, row: int, col: int) -> dict[str, Any]:
     """What the rasters say of a cell; heights are NaN where there is none."""
     cell = folder.cell(row, col)
     x, y = folder.middle_of(row, col)
@@ -86,8 +86,8 @@ def cell_record(folder: SurfaceFolder, difference: Difference | None, row: int, 
         "sigma_m": cell["sigma"], "n_images": cell["views"], "quality": cell["quality"],
         "reasons": reasons_of(cell["quality"]), "difference_m": None,
     }  # fmt: skip
-    if difference is not None:
-        record["difference_m"] = float(differences_at(folder, difference, np.array([[row, col]]))[0])
+    if reference is not None:
+        record["difference_m"] = cell["dsm"] - float(reference_at(folder, reference, np.array([[row, col]]))[0])
     return record
 
 

@@ -16,7 +16,7 @@ from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
 from zlocus.inspector.queries import KINDS, WINDOWS
-from zlocus.inspector.reference import Difference, difference_to
+from zlocus.inspector.reference import Reference, reference_for
 from zlocus.inspector.restore import Restored, config_of, restored
 from zlocus.options import SelectionOptions
 from zlocus.products.record import read_record
@@ -50,9 +50,9 @@ class Inspection:
         self._scratch = TemporaryDirectory(prefix="zlocus-inspect-")
         self._threads = ThreadPoolExecutor(2, "inspect")
         self._scene: Future[Restored] = self._threads.submit(self._open)
-        self._difference: Future[Difference] | None = None
+        self._reference: Future[Reference] | None = None
         if comparison is not None:
-            self._difference = self._threads.submit(self._compare, comparison)
+            self._reference = self._threads.submit(self._compare, comparison)
         # One match at a time: each takes all that the machine has.
         self._matching = threading.Lock()
 
@@ -78,32 +78,32 @@ class Inspection:
         except ZlocusError:
             return  # what is shown there does not matter
 
-    def _compare(self, comparison: Comparison) -> Difference:
-        return difference_to(self.folder.path("dsm"), comparison, Path(self._scratch.name))
+    def _compare(self, comparison: Comparison) -> Reference:
+        return reference_for(self.folder.path("dsm"), comparison, Path(self._scratch.name))
 
     @property
-    def difference(self) -> Difference | None:
-        """Surface less reference, once it is known."""
-        return _done(self._difference)
+    def reference(self) -> Reference | None:
+        """What the surface is compared with, once it is ready."""
+        return _done(self._reference)
 
     def layer(self, name: str) -> Layer | None:
         """A layer by its name, None of one that is not there, or not yet."""
-        if name == "difference" and (difference := self.difference) is not None:
-            return difference_layer(self.folder, difference)
+        if name == "difference" and (reference := self.reference) is not None:
+            return difference_layer(self.folder, reference)
         return self.layers.get(name)
 
     def state(self) -> dict[str, Any]:
         """How far what is made in the background is: of scene and reference "opening", "ready" or "failed", with the
         reason; notes : what is to be known of them."""
         state: dict[str, Any] = {"scene": _progress(self._scene), "notes": []}
-        if self._difference is not None:
-            state["reference"] = _progress(self._difference)
-        scene, difference = _done(self._scene), self.difference
+        if self._reference is not None:
+            state["reference"] = _progress(self._reference)
+        scene, reference = _done(self._scene), self.reference
         if scene is not None and not scene.is_same:
             state["notes"].append(NOT_THE_SAME)
-        if difference is not None:
-            layer = difference_layer(self.folder, difference)
-            state["notes"].append(difference.sentence)
+        if reference is not None:
+            layer = difference_layer(self.folder, reference)
+            state["comparison"] = reference.sentence
             state["difference"] = {"name": layer.name, "title": layer.title, "legend": layer.legend}
         return state
 
@@ -120,7 +120,7 @@ class Inspection:
         at = self.folder.cell_of(x, y)
         if at is None:
             raise GeometryError("The point lies outside the surface.")
-        record = cell_record(self.folder, self.difference, *at)
+        record = cell_record(self.folder, self.reference, *at)
         if not self._scene.done():
             return record | {"is_pending": True}
         if (error := _failure(self._scene)) is not None:

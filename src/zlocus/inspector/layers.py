@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.inspector.folder import Cells, Patch, SurfaceFolder, read_patch
-from zlocus.inspector.reference import Difference
+from zlocus.inspector.reference import Reference
 from zlocus.products.hillshade import hillshade
 from zlocus.products.picture import error_map
 from zlocus.products.report import maps, words
@@ -42,17 +42,18 @@ def layers_of(folder: SurfaceFolder) -> dict[str, Layer]:
     return {layer.name: layer for layer in found}
 
 
-def difference_layer(folder: SurfaceFolder, difference: Difference) -> Layer:
+def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
     """Surface less reference."""
-    full_m = difference.full_m
+    full_m = reference.full_m
 
     def draw(patch: Patch) -> Rgba:
-        cells = read_patch(difference.path, patch, True, folder)
-        return with_opacity(error_map(cells.values[0].astype(np.float32), full_m), cells.known)
+        # One cell of each: means of cells would differ at every edge.
+        found, true = read_patch(folder.path("dsm"), patch, False), read_patch(reference.path, patch, False, folder)
+        return with_opacity(error_map(found.values[0] - true.values[0], full_m), found.known & true.known)
 
     line = error_map(np.linspace(-full_m, full_m, maps.STOPS, dtype=np.float32)[None], full_m)[0]
     ticks = [f"{value:+g}" if value else "0" for value in np.linspace(-full_m, full_m, maps.TICKS)]
-    legend = scale(f"surface less {difference.name}, m", ", ".join(maps.css(colour) for colour in line), ticks)
+    legend = scale(f"surface less {reference.name}, m", ", ".join(maps.css(colour) for colour in line), ticks)
     return Layer("difference", "Difference to the reference", legend, draw)
 
 

@@ -14,7 +14,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from zlocus.inspector.folder import SurfaceFolder
-from zlocus.inspector.reference import Difference
+from zlocus.inspector.reference import Reference
 from zlocus.io.opening import kept_raster
 from zlocus.sensors.model import FloatArray
 
@@ -24,7 +24,7 @@ PIECE = 512
 
 
 def profile(
-    folder: SurfaceFolder, difference: Difference | None, start: tuple[float, float], end: tuple[float, float]
+    folder: SurfaceFolder, reference: Reference | None, start: tuple[float, float], end: tuple[float, float]
 ) -> dict[str, Any]:
     """Heights and what is known of them at cells along a line, a cell or more apart, `MOST_PLACES` at most.
 
@@ -37,10 +37,10 @@ def profile(
     xy = (1 - share) * start + share * end
     cells = cells_of(folder, xy)
     height, sigma = (values_at(folder, name, cells) for name in ("dsm", "sigma"))
-    reference = None if difference is None else height - differences_at(folder, difference, cells)
+    true = None if reference is None else reference_at(folder, reference, cells)
     return {
         "distance_m": (share[:, 0] * length).round(3).tolist(), "height_m": listed(height), "sigma_m": listed(sigma),
-        "reference_m": None if reference is None else listed(reference), "spacing_m": length / (n - 1),
+        "reference_m": None if true is None else listed(true), "spacing_m": length / (n - 1),
         "length_m": length,
     }  # fmt: skip
 
@@ -59,10 +59,10 @@ def values_at(folder: SurfaceFolder, name: str, cells: NDArray[np.int64]) -> Flo
         return picked(file, cells)
 
 
-def differences_at(folder: SurfaceFolder, difference: Difference, cells: NDArray[np.int64]) -> FloatArray:
-    """Surface less reference at cells (n, 2), NaN where it is not known."""
+def reference_at(folder: SurfaceFolder, reference: Reference, cells: NDArray[np.int64]) -> FloatArray:
+    """Heights of the reference at cells (n, 2), NaN where it has none."""
     with ExitStack() as stack:
-        file = stack.enter_context(kept_raster(difference.path))
+        file = stack.enter_context(kept_raster(reference.path))
         view = stack.enter_context(
             WarpedVRT(
                 file, src_crs=file.crs or folder.crs.to_wkt(), crs=folder.crs.to_wkt(), transform=folder.transform,

@@ -1,22 +1,28 @@
-"""The surface less a reference, as `zlocus evaluate` finds it, kept as a raster with overviews."""
+"""A reference beside the surface: judged as `zlocus evaluate` does, and made comparable cell by cell."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zlocus.evaluation.evaluate import evaluate
+import numpy as np
+from odc.geo.geobox import GeoBox
+
+from zlocus.evaluation.evaluate import Shift, evaluate
+from zlocus.evaluation.heights import HeightRaster, read_heights
+from zlocus.evaluation.vertical import same_heights
 from zlocus.io.raster import RasterSink
+from zlocus.io.vertical import vertical_datum
 from zlocus.products.report.comparison import Comparison, full_colour_m
 from zlocus.products.report.words import against_reference
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Surface less reference.
+class Reference:
+    """Heights that those of the surface can be compared with.
 
-    path : of the raster, NaN where it cannot be told; name : of the reference; full_m : size from which its colours are
-    full; sentence : how the two compare.
+    path : raster of them, on their own grid, above what those of the surface are, any shift between the two removed;
+    name : of the file given; full_m : size of a difference from which colours are full; sentence : how the two compare.
     """
 
     path: Path
@@ -25,18 +31,34 @@ class Difference:
     sentence: str
 
 
-def difference_to(dsm: Path, comparison: Comparison, scratch: Path) -> Difference:
-    """Compare a surface with a reference. scratch : folder that the raster is written to.
+def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference:
+    """Compare a surface with a reference. scratch : folder that the comparable heights are written to.
 
     Raises
     ------
     InputError, ConfigError
         See `evaluate`.
     """
-    evaluation = evaluate(dsm, **vars(comparison))
-    assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
-    path = scratch / "difference.tif"
-    with RasterSink(path, evaluation.error_map.geobox, "float32", nodata=float("nan"), units="m") as sink:
-        sink.write(0, 0, evaluation.error_map.errors)
-    name = comparison.reference.name
-    return Difference(path, name, full_colour_m(evaluation), against_reference(evaluation, name))
+    evaluation, name = evaluate(dsm, **vars(comparison)), comparison.reference.name
+    heights = comparable(dsm, comparison, evaluation.shift)
+    crs = None if heights.horizontal is None else heights.horizontal.to_wkt()
+    path, geobox = scratch / "reference.tif", GeoBox(heights.z.shape, heights.transform, crs)
+    with RasterSink(path, geobox, "float32", nodata=float("nan"), units="m") as sink:
+        sink.write(0, 0, heights.z.astype(np.float32))
+    return Reference(path, name, full_colour_m(evaluation), against_reference(evaluation, name))
+
+
+def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> HeightRaster:
+    """The reference's heights above what those of the surface are, moved as the surface is."""
+    surface = read_heights(dsm)
+    compared = same_heights(surface, read_heights(comparison.reference), comparison.geoid)
+    heights = compared.reference
+    if compared.converted == surface.path and heights.horizontal is not None:
+        # The surface's heights were raised to the ellipsoid: the reference's are lowered instead.
+        geobox = GeoBox(heights.z.shape, heights.transform, heights.horizontal.to_wkt())
+        datum = vertical_datum(str(comparison.geoid), "--geoid")
+        heights = replace(heights, z=datum.of_cells(heights.z.astype(np.float32), geobox).astype(np.float64))
+    if shift is not None:
+        moved = heights.transform.translation(shift.east_m, shift.north_m) * heights.transform
+        heights = replace(heights, z=heights.z + shift.up_m, transform=moved)
+    return heights

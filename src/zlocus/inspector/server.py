@@ -197,7 +197,7 @@ def line(inspection: Inspection, request: Request) -> Response:
     names = ("x0", "y0", "x1", "y1")
     values, _ = queries.once(request.query_params.multi_items(), names)
     x0, y0, x1, y1 = (queries.number(values, name, -queries.FARTHEST_M, queries.FARTHEST_M) for name in names)
-    found = profile(inspection.folder, inspection.difference, (x0, y0), (x1, y1))
+    found = profile(inspection.folder, inspection.reference, (x0, y0), (x1, y1))
     return Response(json_of(found), media_type="application/json")
 
 

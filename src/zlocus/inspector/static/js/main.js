@@ -48,6 +48,9 @@ async function start() {
     if (canvas) saveCanvas(canvas, `${surface.title}_map`);
   });
   addEventListener("keydown", key);
+  // Where the keyboard is used, the map's middle is marked.
+  addEventListener("keydown", () => (document.body.dataset.keys = "true"), true);
+  addEventListener("pointerdown", () => delete document.body.dataset.keys, true);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   state.onOpened(reopen);
   await reopen();
@@ -77,6 +80,7 @@ async function watch(surface) {
     const waiting = found.scene.is === "opening" ? ["The images are being opened."] : [];
     if (found.reference?.is === "opening") waiting.push("The reference is being compared.");
     notice([...failed, ...waiting, ...found.notes].join(" "));
+    $("comparison").textContent = found.comparison ?? "";
     if (found.difference && !map.has("difference")) {
       map.addLate(found.difference);
       await Promise.all([cell.open(), profile.open()]);
@@ -88,12 +92,11 @@ async function watch(surface) {
 }
 
 function clicked(latlng) {
-  if (profile.isDrawing()) profile.point(latlng);
+  if (!$("profile").hidden) profile.point(latlng);
   else inspect(latlng);
 }
 
 function inspect({ lat, lng }) {
-  if ($("cell").hidden && $("profile").hidden === false) return;
   open("cell");
   cell.look(lng, lat);
 }
@@ -164,11 +167,7 @@ function key(event) {
 }
 
 function centre() {
-  if (profile.isDrawing()) profile.point(leaflet.getCenter());
-  else {
-    open("cell");
-    cell.look(leaflet.getCenter().lng, leaflet.getCenter().lat);
-  }
+  clicked(leaflet.getCenter());
 }
 
 function profilePoint() {

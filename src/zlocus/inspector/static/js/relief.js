@@ -45,6 +45,10 @@ function begin() {
   }
   renderer.setPixelRatio(devicePixelRatio);
   scene = new THREE.Scene();
+  scene.add(new THREE.AmbientLight(0xffffff, 1.7));
+  const sun = new THREE.DirectionalLight(0xffffff, 2);
+  sun.position.set(-1, 1.6, -1); // from the north-west
+  scene.add(sun);
   camera = new THREE.PerspectiveCamera(45, 1, 0.01, 100);
   controls = new OrbitControls(camera, renderer.domElement);
   controls.listenToKeyEvents($("relief-view"));
@@ -107,7 +111,8 @@ function build(part, heights, texture) {
   geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
   geometry.setAttribute("uv", new THREE.BufferAttribute(uv, 2));
   geometry.setIndex(new THREE.BufferAttribute(triangles(heights, rows, cols), 1));
-  const material = new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide });
+  geometry.computeVertexNormals();
+  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide, alphaTest: 0.5 });
   if (mesh) {
     scene.remove(mesh);
     mesh.geometry.dispose();

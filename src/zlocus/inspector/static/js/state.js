@@ -30,8 +30,9 @@ export function onOpened(listener) {
 }
 
 export function numbers(name, count) {
-  const found = (values.get(name) ?? "").split(",").map(Number);
-  return found.length === count && found.every(Number.isFinite) && values.get(name) !== "" ? found : null;
+  const parts = (values.get(name) ?? "").split(",");
+  const found = parts.map(Number);
+  return parts.length === count && parts.every((part) => part.trim()) && found.every(Number.isFinite) ? found : null;
 }
 
 addEventListener("hashchange", () => {
