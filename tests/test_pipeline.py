@@ -139,8 +139,8 @@ def test_products(whole, images):
         assert valid, (problems, warnings)
         with rasterio.open(whole / name) as file:
             assert "STATISTICS_MEAN" in file.tags(1)
-    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "run.json", "item.json", "events.jsonl",
-            *REPORT_FILES}  # fmt: skip
+    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json", "item.json",
+            "events.jsonl", *REPORT_FILES}  # fmt: skip
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
@@ -241,6 +241,7 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
         *PRODUCTS,
         *REPORT_FILES,
         "ties.gpkg",
+        "observations.npz",
         "run.json",
         "item.json",
         "events.jsonl",

@@ -22,6 +22,7 @@ from typer.testing import CliRunner
 import zlocus.products.report.page as page
 import zlocus.products.report.survey as survey_module
 import zlocus.reporting
+from browser import found_browser
 from rendered_scenes import HEIGHTS, SMALL_TILES, read, run, truth_at
 from zlocus.cli import app
 from zlocus.errors import InputError, OutputError
@@ -44,7 +45,6 @@ SECTIONS = [
 ]  # fmt: skip
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 SCRIPTED = "<script>alert(1)</script>"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS = (390, 1280)
 # Of numbers with three digits behind the point.
 ROUNDED = 6e-4
@@ -622,9 +622,7 @@ addEventListener("load", () => {{
 
 
 def test_a_browser_shows_it_at_both_widths_and_asks_for_nothing(out):
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        pytest.skip(f"none of {', '.join(BROWSERS)} is here: the page is not looked at in a browser")
+    browser = found_browser()
     frames = "".join(f'<iframe src="report.html" style="border:0;width:{w}px;height:900px"></iframe>' for w in WIDTHS)
     (out / "look.html").write_text(LOOK.format(frames=frames), encoding="utf-8")
     command = [

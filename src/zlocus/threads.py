@@ -30,10 +30,7 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
     running: dict[Future[Result], Task] = {}
 
     def begin(task: Task) -> None:
-        future = pool.submit(function, task)
-        running[future] = task
-        _running.add(future)
-        future.add_done_callback(_running.discard)
+        running[submitted(pool, function, task)] = task
 
     try:
         for task in islice(remaining, workers):
@@ -53,6 +50,14 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
         pool.shutdown(wait=True, cancel_futures=True)
         raise
     pool.shutdown()
+
+
+def submitted(pool: ThreadPoolExecutor, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+    """A call that a pool is to make, which `is_busy` knows of."""
+    future = pool.submit(function, *arguments)
+    _running.add(future)
+    future.add_done_callback(_running.discard)
+    return future
 
 
 def is_busy() -> bool:

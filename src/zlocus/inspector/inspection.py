@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,9 +24,12 @@ from zlocus.products.record import read_record
 from zlocus.products.report.comparison import Comparison
 from zlocus.products.report.page import CURVES, KIND_WORDS
 from zlocus.reporting import said
+from zlocus.threads import submitted
 
 T = TypeVar("T")
 FEWEST_LEVEL_CELLS = 128
+# Tie points at which a first match is tried.
+WARM_PLACES = 8
 NOT_THE_SAME = (
     "Cameras or grey values came out otherwise than in the run: an image has changed since, or this is another "
     "machine. Curves may differ from those that the surface rests on."
@@ -35,7 +39,7 @@ NOT_THE_SAME = (
 class Inspection:
     """A surface and its scene, which is opened in the background, as is the comparison with a reference.
 
-    As a context it removes what it keeps on disk at the end.
+    As a context it opens the scene, and removes at the end what it keeps on disk.
 
     Raises
     ------
@@ -47,39 +51,41 @@ class Inspection:
         self.folder: SurfaceFolder = surface_folder(out)
         self.layers: dict[str, Layer] = layers_of(self.folder)
         self.comparison = comparison
-        self._scratch = TemporaryDirectory(prefix="zlocus-inspect-")
-        self._threads = ThreadPoolExecutor(2, "inspect")
-        self._scene: Future[Restored] = self._threads.submit(self._open)
+        self._scene: Future[Restored] = Future()
         self._reference: Future[Reference] | None = None
-        if comparison is not None:
-            self._reference = self._threads.submit(self._compare, comparison)
+        self._stack = ExitStack()
         # One match at a time: each takes all that the machine has.
         self._matching = threading.Lock()
 
     def __enter__(self) -> Inspection:
+        scratch = TemporaryDirectory(prefix="zlocus-inspect-", ignore_cleanup_errors=True)
+        self._stack.enter_context(scratch)
+        threads = ThreadPoolExecutor(2, "inspect")
+        # Who interrupts does not wait for a scene to open, see `zlocus.threads.is_busy`.
+        self._stack.callback(threads.shutdown, wait=False, cancel_futures=True)
+        self._scene = submitted(threads, self._open)
+        if self.comparison is not None:
+            self._reference = submitted(threads, self._compare, self.comparison, Path(scratch.name))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._threads.shutdown(wait=True, cancel_futures=True)
-        self._scratch.cleanup()
+        self._stack.close()
 
     def _open(self) -> Restored:
         found = restored(self.folder.out, self.folder.run)
-        row, col = (n // 2 for n in self.folder.shape)
         # Kernels are compiled, or loaded, before anyone waits for them.
-        self._warm(found, row, col)
+        for xy in found.matched.ties[:: len(found.matched.ties) // WARM_PLACES + 1, :2]:
+            try:
+                match_record(found, xy, math.nan, WhatIf())
+                break
+            except ZlocusError:
+                continue  # too few images there
         return found
 
-    def _warm(self, found: Restored, row: int, col: int) -> None:
-        try:
-            match_record(found, self.folder.middle_of(row, col), math.nan, WhatIf())
-        except ZlocusError:
-            return  # what is shown there does not matter
-
-    def _compare(self, comparison: Comparison) -> Reference:
-        return reference_for(self.folder.path("dsm"), comparison, Path(self._scratch.name))
+    def _compare(self, comparison: Comparison, scratch: Path) -> Reference:
+        return reference_for(self.folder.path("dsm"), comparison, scratch)
 
     @property
     def reference(self) -> Reference | None:

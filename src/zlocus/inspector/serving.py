@@ -6,7 +6,6 @@ import ipaddress
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import uvicorn
 
@@ -15,6 +14,8 @@ from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.server import application, new_token
 from zlocus.products.report.comparison import Comparison
 
+# Answers under way are waited for so long.
+GRACE_S = 2
 Announce = Callable[[str, bool], None]
 
 
@@ -41,7 +42,10 @@ def inspect_surface(
         names += ["localhost"] if address.is_loopback else []
         app = application(inspection, token, frozenset(f"{name}:{port}" for name in names))
         announce(f"http://{names[0]}:{port}/{token}/{fragment}", not address.is_loopback)
-        config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, ws="none")
+        config = uvicorn.Config(
+            app, log_level="warning", access_log=False, server_header=False, ws="none",
+            timeout_graceful_shutdown=GRACE_S,
+        )  # fmt: skip
         uvicorn.Server(config).run(sockets=[listener])
 
 
@@ -64,7 +68,7 @@ def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
 
 def fragment_of(view: str) -> str:
     """What stands behind the # of a link, with it; "" of nothing."""
-    text = urlsplit(view).fragment if "#" in view else view
+    text = view.partition("#")[2] if "#" in view else view
     return f"#{text}" if text else ""
 
 

@@ -118,8 +118,8 @@ function facts(record) {
 }
 
 function reason({ name, meaning, fate, advice }) {
-  const said = `: ${meaning}${fate === "none" ? ", so there is no height" : ""}. ${advice ?? ""}`;
-  return element("li", {}, element("b", {}, name), said);
+  const said = [meaning, fate === "none" ? "so there is no height" : "", advice].filter(Boolean).join("; ");
+  return element("li", {}, element("b", {}, name), `: ${said}.`);
 }
 
 // The cell, and the tie points that order its images, on the map.
@@ -169,13 +169,14 @@ function peak(found) {
 
 // What the run did otherwise than a cell alone would.
 function ofRun() {
-  const n = surface.images.length;
-  if (surface.views === "all") return "The run was told to use every image in every cell (--views all).";
-  if (n < surface.fewest_views) {
-    return `With fewer than ${surface.fewest_views} images the run uses all of them where nothing hides the cell; order and stop ` +
-      "are what the rule says of this cell.";
+  const settles = surface.method === "mvll" ? "" :
+    " The height is settled together with those of the neighbours, and need not lie at this peak.";
+  if (surface.views === "all") return `The run was told to use every image in every cell (--views all).${settles}`;
+  if (surface.images.length < surface.fewest_views) {
+    return `With fewer than ${surface.fewest_views} images the run uses all of them where nothing hides the cell: order and stop ` +
+      `are what the rule says of this cell alone.${settles}`;
   }
-  return "The run decides for blocks of cells, one level up, by the same rule; neighbours then settle the height together.";
+  return `The run decides by the same rule, for blocks of cells and one level up.${settles}`;
 }
 
 function nearest(found, height) {

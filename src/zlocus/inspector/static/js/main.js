@@ -47,7 +47,8 @@ async function start() {
     const canvas = await map.exportMap();
     if (canvas) saveCanvas(canvas, `${surface.title}_map`);
   });
-  addEventListener("keydown", key);
+  // Before the map, which would move for shift and arrows.
+  addEventListener("keydown", key, true);
   // Where the keyboard is used, the map's middle is marked.
   addEventListener("keydown", () => (document.body.dataset.keys = "true"), true);
   addEventListener("pointerdown", () => delete document.body.dataset.keys, true);

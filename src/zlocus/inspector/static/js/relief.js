@@ -142,7 +142,7 @@ function triangles(heights, rows, cols) {
 }
 
 function place() {
-  const kept = state.numbers("eye", 6) ?? [0, 0.75, 0.95, 0, 0, 0];
+  const kept = state.numbers("eye", 6) ?? [0, 0.85, 1.05, 0, 0.05, 0];
   camera.position.set(...kept.slice(0, 3));
   controls.target.set(...kept.slice(3));
   controls.update();

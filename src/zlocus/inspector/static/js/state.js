@@ -21,6 +21,7 @@ export function set(changes) {
     values.delete(name);
     for (const each of [value].flat()) if (each !== null && each !== undefined) values.append(name, each);
   }
+  values.sort(); // the same view has the same link
   const text = values.toString();
   history.replaceState(null, "", text ? `#${text}` : "#");
 }

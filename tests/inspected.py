@@ -1,0 +1,44 @@
+"""A page that is served, as the tests ask for it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import uvicorn
+
+from zlocus.inspector.inspection import Inspection
+from zlocus.inspector.server import application, new_token
+from zlocus.inspector.serving import checked_address, listening
+from zlocus.products.report.comparison import Comparison
+
+# The scene of a small run is open by then, kernels and all.
+OPENED_S = 120.0
+
+
+def opened(inspection: Inspection) -> Inspection:
+    """An inspection once all that is made in the background is there."""
+    end = time.monotonic() + OPENED_S
+    while any(part == {"is": "opening"} for part in inspection.state().values()):
+        assert time.monotonic() < end, "the scene does not open"
+        time.sleep(0.02)
+    return inspection
+
+
+@contextmanager
+def served(out: Path, comparison: Comparison | None = None) -> Iterator[tuple[Inspection, str]]:
+    """An inspection, and the address of its page."""
+    with listening(checked_address("127.0.0.1"), 0) as listener, Inspection(out, comparison) as inspection:
+        host, token = f"127.0.0.1:{listener.getsockname()[1]}", new_token()
+        config = uvicorn.Config(application(inspection, token, frozenset({host})), log_level="warning", ws="none")
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        try:
+            yield opened(inspection), f"http://{host}/{token}/"
+        finally:
+            server.should_exit = True
+            thread.join(OPENED_S)
