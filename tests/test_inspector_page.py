@@ -132,10 +132,10 @@ def number(text: str) -> float:
 def shown_table(page) -> dict[str, dict[str, str]]:
     """The table of images: what stands in each cell that holds a value, by image."""
     return page.evaluate(
-        """() => Object.fromEntries([...document.querySelectorAll("#images tr[data-image]")].map((row) => [
-            row.dataset.image,
-            Object.fromEntries([...row.querySelectorAll("[data-value]")].map((td) => [td.dataset.value, td.textContent])),
-        ]))"""
+        """() => Object.fromEntries([...document.querySelectorAll("#images tr[data-image]")].map((row) => {
+            const cells = [...row.querySelectorAll("[data-value]")];
+            return [row.dataset.image, Object.fromEntries(cells.map((td) => [td.dataset.value, td.textContent]))];
+        }))"""
     )
 
 
