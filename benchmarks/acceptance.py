@@ -23,6 +23,7 @@ import numpy as np
 import rasterio
 from pyproj import CRS, Transformer
 
+import inspecting
 import large
 import terrain_features
 from baselines import baselines
@@ -636,9 +637,10 @@ ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "new-scenes": new_scenes, "ventoux": ventoux, "datum": datum, "ortho": ortho,
     "dmc": dmc, "tuniu": tuniu, "herzjesu": herzjesu, "kernels": kernels,
     "selection": selection, "features": features, "middlebury": middlebury, "memory": memory, "speed": speed,
+    "inspect": inspecting.inspect, "inspect-large": inspecting.inspect_large,
     "halo": large.halo, "growth": large.growth, "clone": clone,
 }  # fmt: skip
-SLOW = ("new-scenes", "memory", "speed", "growth", "clone")
+SLOW = ("new-scenes", "memory", "speed", "inspect-large", "growth", "clone")
 
 
 def show(name: str, lines: list[tuple[str, str, str, str]]) -> None:

@@ -56,6 +56,14 @@ export async function open() {
     shown = null;
     return;
   }
+  if (!map.holds(...at)) {
+    shown = null;
+    $("cell-title").textContent = map.words(...at, 2);
+    for (const id of ["cell-facts", "cell-reasons"]) $(id).replaceChildren();
+    $("match").hidden = true;
+    fail("The point lies outside the surface.");
+    return;
+  }
   busy = new AbortController();
   const { signal } = busy;
   $("match").setAttribute("aria-busy", "true");

@@ -17,6 +17,7 @@ const KEYS = [
   ["[ and ]", "the height looked at, down and up"],
   ["P", "one end of a profile, then the other, in the middle of the map"],
   ["Esc", "end drawing"],
+  ["H", "all of the surface"],
   ["C, F, V", "cell, profile, 3-D"],
   ["L", "copy the link of this view"],
   ["D", "light or dark"],
@@ -159,7 +160,7 @@ function key(event) {
   else if (event.key === "Escape") profile.cancel();
   else if (event.key === "?") $("keys").showModal();
   else {
-    const action = { c: () => open("cell"), f: () => open("profile"), v: () => open("relief"), l: copyLink, d: changeTheme, p: profilePoint }[event.key.toLowerCase()];
+    const action = { c: () => open("cell"), f: () => open("profile"), v: () => open("relief"), h: map.home, l: copyLink, d: changeTheme, p: profilePoint }[event.key.toLowerCase()];
     if (!action) return;
     action();
   }

@@ -29,6 +29,9 @@ export function make(about) {
   });
   L.control.scale({ imperial: false, maxWidth: 160 }).addTo(map);
   about.layers.forEach(addLayer);
+  // Not so far away that nothing is seen of it.
+  map.setMinZoom(Math.min(map.getBoundsZoom(bounds()) - 1, 0));
+  map.setMaxBounds(bounds().pad(1));
   openView();
   map.on("moveend", () => {
     const { lat, lng } = map.getCenter();
@@ -64,6 +67,17 @@ function parsed(text) {
 
 function clamp(share) {
   return Number.isFinite(share) ? Math.min(Math.max(share, 0), 1) : 1;
+}
+
+// Whether a ground point lies on the grid.
+export function holds(x, y) {
+  const box = bounds();
+  return x >= box.getWest() && x < box.getEast() && y > box.getSouth() && y <= box.getNorth();
+}
+
+// All of the surface.
+export function home() {
+  map.fitBounds(bounds());
 }
 
 export function bounds() {
