@@ -16,7 +16,7 @@ from zlocus.options import RunConfig
 # What begins a sentence that is of no single parameter, though it stands behind one.
 OF_ALL = re.compile(r"(?<=\.) (?=(?:Returns|Source:|Heights come back) )")
 # Pages on what comes out, in their order, where they are there.
-RESULTS = ("products", "vertical", "evaluate", "report")
+RESULTS = ("products", "vertical", "evaluate", "report", "inspect")
 
 
 def command_reference() -> str:

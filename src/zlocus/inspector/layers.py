@@ -146,7 +146,8 @@ def _sigma(folder: SurfaceFolder) -> Layer:
         cells = read_patch(folder.path("sigma"), patch, True)
         return with_opacity(maps.sigma_colours(cells.values[0], top), cells.known)
 
-    legend = scale("standard deviation, m", maps.gradient(cv2.COLORMAP_CIVIDIS), maps.sigma_ticks(top))
+    ticks = [tick.replace(" m", "") for tick in maps.sigma_ticks(top)]
+    legend = scale("standard deviation, m", maps.gradient(cv2.COLORMAP_CIVIDIS), ticks)
     return Layer("sigma", "Standard deviation", legend, draw)
 
 

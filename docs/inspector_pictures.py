@@ -1,0 +1,80 @@
+"""Pictures of the inspector, taken in a browser: `python docs/inspector_pictures.py [FOLDER]`.
+
+Renders the scene of the demo, makes its surface, and looks at it beside its truth. Needs Chromium (from CHROMIUM or the
+PATH).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import sync_playwright
+
+HERE = Path(__file__).parent
+ZLOCUS = Path(sys.executable).with_name("zlocus")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SIZE = {"width": 1360, "height": 1000}
+WAIT_MS = 120_000
+# A cell by a house, which some images do not see; all of the middle from the south.
+VIEWS = {
+    "inspect_cell.png": "at=462049,5246924,1&cell=462055.5,5246913.9&layers=hillshade:1,height:0.55&tab=cell",
+    "inspect_relief.png": "at=462049,5246940,0.75&layers=hillshade:1,ortho:0.5,sigma:0.5&tab=relief"
+    "&eye=-0.35,0.75,0.95,0,-0.02,0.03",
+}
+# How far the panel of the cell is scrolled, px.
+SCROLLED = 330
+
+
+def main() -> None:
+    """Make the surface, and take the pictures."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else HERE
+    browser = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        sys.exit(f"There is no browser: set CHROMIUM, or install one of {', '.join(BROWSERS)}.")
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / "demo"
+        subprocess.run([ZLOCUS, "demo", "-o", out], check=True, stdout=subprocess.DEVNULL)
+        words = [ZLOCUS, "inspect", out, "--reference", out / "scene" / "truth_dsm.tif"]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            try:
+                take(server.stdout.readline().strip(), browser, folder)
+            finally:
+                server.terminate()
+
+
+def take(address: str, browser: str, folder: Path) -> None:
+    """All views of a page, as files."""
+    with sync_playwright() as playwright:
+        arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        chromium = playwright.chromium.launch(executable_path=browser, args=arguments)
+        for name, view in VIEWS.items():
+            page = chromium.new_context(viewport=SIZE, color_scheme="light").new_page()
+            page.set_default_timeout(WAIT_MS)
+            page.goto(f"{address}#{view}")
+            page.wait_for_selector('body[data-ready="true"][data-scene="ready"]')
+            page.wait_for_selector("#layer-difference", state="attached")
+            prepare(page, view)
+            (folder / name).write_bytes(page.screenshot())
+        chromium.close()
+
+
+def prepare(page: Any, view: str) -> None:
+    """Wait for all of a view, and scroll to what is to be seen."""
+    if "tab=relief" in view:
+        page.wait_for_selector("#relief-view[data-places]")
+    else:
+        page.wait_for_selector('#match:not([hidden])[aria-busy="false"]')
+        page.locator("#height").fill("52")
+        page.evaluate(f"document.getElementById('cell').scrollTop = {SCROLLED}")
+    page.wait_for_timeout(1500)
+
+
+if __name__ == "__main__":
+    main()
