@@ -10,8 +10,9 @@ from pathlib import Path
 
 import uvicorn
 
+from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
-from zlocus.inspector.server import application, new_token
+from zlocus.inspector.server import application
 from zlocus.inspector.serving import checked_address, listening
 from zlocus.products.report.comparison import Comparison
 
@@ -22,7 +23,7 @@ OPENED_S = 120.0
 def opened(inspection: Inspection) -> Inspection:
     """An inspection once all that is made in the background is there."""
     end = time.monotonic() + OPENED_S
-    while any(part == {"is": "opening"} for part in inspection.state().values()):
+    while any(isinstance(part, dict) and part.get("is") == "opening" for part in inspection.state().values()):
         assert time.monotonic() < end, "the scene does not open"
         time.sleep(0.02)
     return inspection

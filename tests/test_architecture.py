@@ -97,7 +97,11 @@ def test_public_names_have_a_docstring(module):
 
 
 # Modules that answer on this machine, and what they need for it.
-LISTENS = {"inspector/serving.py": {"socket", "uvicorn"}, "inspector/server.py": {"starlette"}}
+LISTENS = {
+    "inspector/serving.py": {"socket", "uvicorn"},
+    "inspector/server.py": {"starlette"},
+    "inspector/guard.py": {"starlette"},
+}
 
 
 @every_module

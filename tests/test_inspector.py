@@ -23,10 +23,11 @@ from zlocus.errors import ConfigError, InputError, OutputError
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.inspector.cell import WhatIf, match_record
 from zlocus.inspector.folder import Patch, read_patch, surface_folder
+from zlocus.inspector.guard import inline_hashes
 from zlocus.inspector.inspection import NOT_THE_SAME, Inspection
 from zlocus.inspector.queries import BadQuery, number, once, what_if, whole
 from zlocus.inspector.restore import folder_of, request_of, restored
-from zlocus.inspector.server import inline_hashes, page_files
+from zlocus.inspector.server import page_files
 from zlocus.inspector.serving import checked_address, fragment_of, listening
 from zlocus.options import RunConfig
 from zlocus.place import curves_at
@@ -500,7 +501,7 @@ def test_other_hosts_origins_and_methods_are_refused(page, path, method, headers
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/api/surface", "/wrong/api/surface", "/tiles/height/0/0/0.png", "{token}", "{token}x/", "/%00/"]
+    "path", ["/", "/api/surface", "/wrong/api/surface", "/tiles/height/0/0/0.png", "{token}x/", "{token}x", "/%00/"]
 )
 def test_without_the_token_nothing_is_answered(page, path):
     _, client = page
@@ -573,9 +574,10 @@ def test_addresses_and_views():
     assert fragment_of("http://127.0.0.1:1/t/#tab=cell&cell=1,2") == "#tab=cell&cell=1,2"
     assert fragment_of("tab=cell") == "#tab=cell"
     with listening(checked_address("127.0.0.1"), 0) as listener:
-        listener.listen()
+        taken = listener.getsockname()[1]
+        address = checked_address("127.0.0.1")
         with pytest.raises(OutputError, match="Choose another --port"):
-            listening(checked_address("127.0.0.1"), listener.getsockname()[1])
+            listening(address, taken)
 
 
 def test_the_crs_is_that_of_the_run(out):

@@ -13,7 +13,7 @@ from zlocus.cli_report import check_about
 from zlocus.errors import ConfigError
 from zlocus.evaluation.command import Align, Coregister, Geoid, Margin
 
-NEEDED = ("starlette", "uvicorn")
+NEEDED = ("anyio", "starlette", "uvicorn")
 
 
 def inspect(
@@ -23,6 +23,7 @@ def inspect(
     coregister: Coregister = None,
     geoid: Geoid = None,
     margin: Margin = 0.0,
+    remote: Annotated[bool, typer.Option("--remote", help="Ask servers for images that the run read there.")] = False,
     view: Annotated[
         str, typer.Option(help="Link of a view, or what stands behind its #, to begin with.", metavar="LINK")
     ] = "",
@@ -50,4 +51,4 @@ def inspect(
         if open_it:
             webbrowser.open(address)
 
-    inspect_surface(out, comparison, host, port, view, announce)
+    inspect_surface(out, comparison, remote, host, port, view, announce)

@@ -30,7 +30,7 @@ from zlocus.products.curves import (
     where_it_stops,
 )
 from zlocus.products.report.maps import data_uri
-from zlocus.reporting import SHOWN_WITHIN_CELLS, place_of_cell
+from zlocus.reporting import NOT_SHOWN, SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.sensors.model import FloatArray
 
 # Cells a side that are shown around a window, most first: an image's end may cut the larger ones.
@@ -72,7 +72,9 @@ class WhatIf:
         names = [view.name for view in settled.views]
         unknown = (self.left_out | ({self.reference} if self.reference else set())) - set(names)
         if unknown:
-            raise ConfigError(f"There is no image {min(unknown)}. Choose from {', '.join(names[:12])}.")
+            raise ConfigError(f"This surface has no image {min(unknown)[:60]!r}.")
+        if self.reference in self.left_out:
+            raise ConfigError(f"{self.reference} is the reference, and switched off. Choose another reference.")
         kept = [i for i, name in enumerate(names) if name not in self.left_out]
         return replace(settled, views=tuple(settled.views[i] for i in kept), grey=tuple(settled.grey[i] for i in kept))
 
@@ -109,7 +111,10 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     settled = what_if.scene(matched.settled)
     if len(settled.views) < 2:
         raise GeometryError("Two images are needed at least. Switch another one on.")
-    looked = curves_at("The cell", what_if.reference, settled, place, config, SHOWN_WITHIN_CELLS)
+    try:
+        looked = curves_at("The cell", what_if.reference, settled, place, config, SHOWN_WITHIN_CELLS)
+    except GeometryError as error:
+        raise GeometryError(why_not_shown(what_if)) from error
     report = PointReport.of("the cell", looked, settled, matched.scene.crs)
     images = image_records(looked, loci(looked.views, report))
     below = float(matched.undulation(xy[None])[0])
@@ -130,21 +135,30 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     }
 
 
+def why_not_shown(what_if: WhatIf) -> str:
+    """Why a cell has no curves, in a sentence."""
+    if what_if.reference is not None:
+        return f"{what_if.reference} does not show this cell, or no other image does. Choose another reference."
+    return NOT_SHOWN + (" Some are switched off." if what_if.left_out else "")
+
+
 def image_records(looked: LookedAt, found: list[Locus]) -> list[dict[str, Any]]:
     """What each image shows of a place, the reference first: a crop with the locus, and windows at every height."""
     names = [view.name for view in looked.views]
-    patches = {side: looked.patches(side) for side in SHOWN_SIDES}
-    middle = len(looked.heights_m) // 2
+    middle, large, less = len(looked.heights_m) // 2, looked.patches(SHOWN_SIDES[0]), None
     records = []
     for locus in found:
         i = names.index(locus.name)
-        side = next((side for side in SHOWN_SIDES if np.isfinite(patches[side][i, middle]).all()), SHOWN_SIDES[-1])
+        side, patches = SHOWN_SIDES[0], large[i]
+        if not np.isfinite(patches[middle]).all():
+            less = looked.patches(SHOWN_SIDES[1]) if less is None else less
+            side, patches = SHOWN_SIDES[1], less[i]
         records.append(
             {
-                "image": locus.name, "crop": data_uri(png_of(stretched(locus.grey)), "image/png"),
+                "image": locus.name, "crop": data_uri(encoded(stretched(locus.grey)), "image/png"),
                 "row": locus.first[0], "col": locus.first[1], "rows": locus.grey.shape[0], "cols": locus.grey.shape[1],
                 "line": locus.line.round(2).tolist(),
-                "side": side, "patches": base64.b64encode(stretched(patches[side][i]).tobytes()).decode("ascii"),
+                "side": side, "patches": base64.b64encode(stretched(patches).tobytes()).decode("ascii"),
             }
         )  # fmt: skip
     return records
@@ -164,13 +178,13 @@ def neighbour_records(looked: LookedAt, settled: MatchScene, config: RunConfig) 
 
 
 def stretched(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Grey values as `BLACK` to `BRIGHT`, 0 where not known."""
+    """Grey values of any shape as uint8 from `BLACK` to `BRIGHT`, 0 where not known."""
     known = np.isfinite(values)
     low, high = np.percentile(values[known], STRETCH_PERCENT) if known.any() else (0.0, 1.0)
     share = np.clip((np.nan_to_num(values) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
     return np.where(known, np.rint(BLACK + (BRIGHT - BLACK) * share), 0).astype(np.uint8)
 
 
-def png_of(grey: NDArray[np.uint8]) -> bytes:
+def encoded(grey: NDArray[np.uint8]) -> bytes:
     """A grey picture as PNG."""
     return bytes(cv2.imencode(".png", grey)[1].tobytes())

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
 from pyproj import CRS
+from pyproj.exceptions import CRSError
 from rasterio import DatasetReader
 from rasterio.enums import MaskFlags, Resampling
 from rasterio.vrt import WarpedVRT
@@ -18,7 +20,7 @@ from rasterio.windows import Window
 
 from zlocus.errors import InputError
 from zlocus.io.opening import kept_raster
-from zlocus.products.report.page import run_record
+from zlocus.products.report.page import RECORD, run_record
 from zlocus.scene import is_local
 from zlocus.sensors.model import FloatArray
 
@@ -96,6 +98,69 @@ class SurfaceFolder:
         return found
 
 
+class _Request(BaseModel):
+    out: str
+    inputs: list[str]
+    method: str
+    views: str
+
+
+class _Sun(BaseModel):
+    sun_azimuth_deg: float
+    sun_altitude_deg: float
+
+
+class _Options(BaseModel):
+    products: _Sun
+
+
+class _Config(BaseModel):
+    request: _Request
+    options: _Options
+
+
+class _Grid(BaseModel):
+    crs: str
+    shape: tuple[int, int]
+
+
+class _Orientation(BaseModel):
+    views: dict[str, Any]
+
+
+class _Input(BaseModel):
+    path: str
+
+
+class _Run(BaseModel):
+    """What is taken from run.json without another look."""
+
+    config: _Config
+    grid: _Grid
+    orientation: _Orientation
+    inputs: list[_Input]
+
+
+def checked_run(out: Path) -> dict[str, Any]:
+    """run.json of a surface, with all that the page takes for granted.
+
+    Raises
+    ------
+    InputError
+        It is missing, damaged, or of something else.
+    """
+    run = run_record(out)
+    try:
+        found = _Run.model_validate(run)
+        CRS.from_user_input(found.grid.crs)
+    except (ValidationError, CRSError) as error:
+        where = ""
+        if isinstance(error, ValidationError):
+            where = f" ({'.'.join(map(str, error.errors()[0]['loc']))})"
+        raise InputError(f"{out / RECORD} is not what a run writes{where}. Make the surface again.") from error
+    return run
+
+
 def surface_folder(out: Path) -> SurfaceFolder:
     """The surface in a folder.
 
@@ -104,7 +169,7 @@ def surface_folder(out: Path) -> SurfaceFolder:
     InputError
         There is no complete surface in it.
     """
-    run = run_record(out)
+    run = checked_run(out)
     for name in NEEDED:
         with kept_raster(out / f"{name}.tif") as file:
             if file.shape != tuple(run["grid"]["shape"]):
@@ -133,11 +198,16 @@ def read_patch(path: Path, patch: Patch, average: bool, like: SurfaceFolder | No
     with kept_raster(path) as file:
         if like is None:
             return _patch_of(file, patch, average)
-        with WarpedVRT(
-            file, src_crs=file.crs or like.crs.to_wkt(), crs=like.crs.to_wkt(), transform=like.transform,
-            height=like.shape[0], width=like.shape[1], resampling=Resampling.nearest, nodata=float("nan"),
-        ) as view:  # fmt: skip
+        with on_grid(file, like) as view:
             return _patch_of(view, patch, average)
+
+
+def on_grid(file: DatasetReader, like: SurfaceFolder) -> WarpedVRT:
+    """A raster of heights as it lies on the grid of a surface, cell by cell."""
+    return WarpedVRT(
+        file, src_crs=file.crs or like.crs.to_wkt(), crs=like.crs.to_wkt(), transform=like.transform,
+        height=like.shape[0], width=like.shape[1], resampling=Resampling.nearest, nodata=float("nan"),
+    )  # fmt: skip
 
 
 def _patch_of(file: DatasetReader, patch: Patch, average: bool) -> Cells:

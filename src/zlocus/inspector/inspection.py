@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import fields
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, TypeVar
 
-from zlocus.errors import GeometryError, ZlocusError
+from zlocus.errors import ConfigError, GeometryError, InputError, ZlocusError
 from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
-from zlocus.inspector.queries import KINDS, WINDOWS
+from zlocus.inspector.queries import KINDS, MOST, WINDOWS
 from zlocus.inspector.reference import Reference, reference_for
 from zlocus.inspector.restore import Restored, config_of, restored
-from zlocus.options import SelectionOptions
+from zlocus.io.opening import existing_file
+from zlocus.options import RunConfig, SelectionOptions
 from zlocus.products.record import read_record
 from zlocus.products.report.comparison import Comparison
-from zlocus.products.report.page import CURVES, KIND_WORDS
+from zlocus.products.report.page import CURVES, KIND_WORDS, RECORD
 from zlocus.reporting import said
 from zlocus.threads import submitted
 
@@ -34,6 +36,38 @@ NOT_THE_SAME = (
     "Cameras or grey values came out otherwise than in the run: an image has changed since, or this is another "
     "machine. Curves may differ from those that the surface rests on."
 )
+NOT_KNOWN = "The run did not keep what tells whether cameras come out again as they were."
+MADE_AGAIN = "The surface was made again since this page was opened. Start `zlocus inspect` anew."
+# Options that nothing of a single cell depends on.
+OF_RUNS = ("stopped_share", "fewest_views")
+
+
+@dataclass
+class Told:
+    """What the opening of a scene says last, as a `Progress`."""
+
+    text: str = ""
+    _name: str = ""
+    _total: float | None = None
+    _done: float = 0.0
+
+    @contextmanager
+    def stage(self, name: str, total: float | None = None) -> Iterator[Told]:
+        """See `Progress`."""
+        self.text, self._name, self._total, self._done = name, name, total, 0.0
+        yield self
+
+    def note(self, sentence: str) -> None:
+        """See `Progress`."""
+
+    def advance(self, n: float = 1) -> None:
+        """See `Stage`."""
+        self._done += n
+        if self._total:
+            self.text = f"{self._name}, {min(self._done / self._total, 1):.0%}"
+
+    def tell(self, text: str) -> None:
+        """See `Stage`."""
 
 
 class Inspection:
@@ -41,14 +75,20 @@ class Inspection:
 
     As a context it opens the scene, and removes at the end what it keeps on disk.
 
+    comparison : with a reference; may_ask : whether images on a server are asked for.
+
     Raises
     ------
     InputError
-        There is no complete surface in the folder.
+        There is no complete surface in the folder, or no reference.
     """
 
-    def __init__(self, out: Path, comparison: Comparison | None = None) -> None:
+    def __init__(self, out: Path, comparison: Comparison | None = None, may_ask: bool = False) -> None:
         self.folder: SurfaceFolder = surface_folder(out)
+        self._state = self._now()
+        if comparison is not None:
+            existing_file(comparison.reference, "reference")
+        self._may_ask, self._told = may_ask, Told()
         self.layers: dict[str, Layer] = layers_of(self.folder)
         self.comparison = comparison
         self._scene: Future[Restored] = Future()
@@ -74,14 +114,14 @@ class Inspection:
         self._stack.close()
 
     def _open(self) -> Restored:
-        found = restored(self.folder.out, self.folder.run)
+        found = restored(self.folder.out, self.folder.run, self._may_ask, self._told)
         # Kernels are compiled, or loaded, before anyone waits for them.
         for xy in found.matched.ties[:: len(found.matched.ties) // WARM_PLACES + 1, :2]:
             try:
                 match_record(found, xy, math.nan, WhatIf())
                 break
-            except ZlocusError:
-                continue  # too few images there
+            except Exception:
+                continue  # too few images there, or a place that is none: nothing depends on it
         return found
 
     def _compare(self, comparison: Comparison, scratch: Path) -> Reference:
@@ -105,8 +145,12 @@ class Inspection:
         if self._reference is not None:
             state["reference"] = _progress(self._reference)
         scene, reference = _done(self._scene), self.reference
+        if state["scene"]["is"] == "opening":
+            state["scene"]["what"] = self._told.text
         if scene is not None and not scene.is_same:
-            state["notes"].append(NOT_THE_SAME)
+            state["notes"].append(NOT_KNOWN if scene.is_same is None else NOT_THE_SAME)
+        if self._now() != self._state:
+            state["notes"].append(MADE_AGAIN)
         if reference is not None:
             layer = difference_layer(self.folder, reference)
             state["comparison"] = reference.sentence
@@ -126,6 +170,8 @@ class Inspection:
         at = self.folder.cell_of(x, y)
         if at is None:
             raise GeometryError("The point lies outside the surface.")
+        if self._now() != self._state:
+            raise InputError(MADE_AGAIN)
         record = cell_record(self.folder, self.reference, *at)
         if not self._scene.done():
             return record | {"is_pending": True}
@@ -134,14 +180,25 @@ class Inspection:
         try:
             with self._matching:
                 match = match_record(self._scene.result(), self.folder.middle_of(*at), record["height_m"], what_if)
-        except GeometryError as error:
+        except (GeometryError, InputError) as error:
             return record | {"error": str(error)}
         return record | {"match": match}
+
+    def _now(self) -> tuple[int, int] | None:
+        """What tells whether the run is still the one that was opened."""
+        try:
+            found = (self.folder.out / RECORD).stat()
+        except OSError:
+            return None
+        return found.st_mtime_ns, found.st_size
 
     def summary(self) -> dict[str, Any]:
         """What the page has to know before it shows anything."""
         folder, run = self.folder, self.folder.run
-        config = config_of(folder.out, run)
+        try:
+            config = config_of(folder.out, run)
+        except ConfigError:
+            config = RunConfig()  # the scene does not open then, and says why
         rows, cols = folder.shape
         return {
             "title": folder.out.resolve().name, "shape": [rows, cols], "transform": list(folder.transform)[:6],
@@ -151,9 +208,9 @@ class Inspection:
             "layers": [
                 {"name": layer.name, "title": layer.title, "legend": layer.legend} for layer in self.layers.values()
             ],
-            "has_reference": self.comparison is not None,
+            "made": run.get("created", ""),
             "images": list(run["orientation"]["views"]), "method": run["config"]["request"]["method"],
-            "created": run.get("created"), "coverage": run["coverage"],
+            "small_window": config.measure.small_window, "few_views": config.measure.few_views,
             "fewest_views": config.selection.fewest_views, "views": run["config"]["request"]["views"],
             "options": options_record(config.selection),
             "window": {"value": config.measure.large_window, "choices": list(WINDOWS)},
@@ -177,10 +234,11 @@ def options_record(selection: SelectionOptions) -> list[dict[str, Any]]:
     return [
         {
             "name": f.name, "doc": f.metadata["doc"], "value": getattr(selection, f.name), "low": f.metadata["low"],
-            "high": f.metadata["high"], "choices": f.metadata["choices"], "unit": f.metadata["unit"],
+            "high": MOST.get(f.name, f.metadata["high"]), "choices": f.metadata["choices"], "unit": f.metadata["unit"],
             "is_whole": KINDS[f.name] is int,
         }
         for f in fields(selection)
+        if f.name not in OF_RUNS
     ]  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from zlocus.inspector.folder import Cells, Patch, SurfaceFolder, read_patch
 from zlocus.inspector.reference import Reference
+from zlocus.io.opening import kept_raster
 from zlocus.products.hillshade import hillshade
 from zlocus.products.picture import error_map
 from zlocus.products.report import maps, words
@@ -47,7 +48,7 @@ def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
     full_m = reference.full_m
 
     def draw(patch: Patch) -> Rgba:
-        # One cell of each: means of cells would differ at every edge.
+        # A single cell of each where the map is near: means would differ at every edge.
         found, true = read_patch(folder.path("dsm"), patch, False), read_patch(reference.path, patch, False, folder)
         return with_opacity(error_map(found.values[0] - true.values[0], full_m), found.known & true.known)
 
@@ -59,13 +60,14 @@ def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
 
 def composed(layers: Sequence[tuple[Layer, float]], patch: Patch) -> Rgba:
     """Layers over each other, the first below, each with an opacity of 0 to 1, as the map shows them."""
-    colours, opacity = np.zeros((patch.height, patch.width, 3)), np.zeros((patch.height, patch.width, 1))
+    shape = (patch.height, patch.width)
+    colours, opacity = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 1), np.float32)
     for layer, share in layers:
-        drawn = layer.draw(patch).astype(float)
-        above = share * drawn[..., 3:] / OPAQUE
+        drawn = layer.draw(patch).astype(np.float32)
+        above = np.float32(share / OPAQUE) * drawn[..., 3:]
         total = above + opacity * (1 - above)
         mixed = drawn[..., :3] * above + colours * opacity * (1 - above)
-        colours, opacity = mixed / np.maximum(total, 1e-9), total
+        colours, opacity = mixed / np.maximum(total, np.float32(1e-6)), total
     return np.asarray(np.rint(np.concatenate([colours, OPAQUE * opacity], axis=-1)), np.uint8)
 
 
@@ -152,9 +154,11 @@ def _sigma(folder: SurfaceFolder) -> Layer:
 
 
 def _views(folder: SurfaceFolder) -> Layer:
-    used = np.unique(sampled(folder, "views", average=False).values[0])
+    # A count that is rare is not missed: the raster knows its largest.
+    with kept_raster(folder.path("views")) as file:
+        top = max(int(float(file.tags(1).get("STATISTICS_MAXIMUM", 0))), 1)
+    used = np.unique([*sampled(folder, "views", average=False).values[0].ravel(), top])
     used = used[used > 0]
-    top = int(used.max()) if used.size else 1
     table = maps.ramp(cv2.COLORMAP_VIRIDIS, top)
     colours = np.vstack([[maps.WHITE], table]).astype(np.uint8)
 
@@ -174,14 +178,13 @@ def _quality(folder: SurfaceFolder) -> Layer:
     """Reasons; clear where nothing is to be said, so that what lies below is seen."""
     colours = np.array([*(colour for *_, colour in maps.GROUPS), maps.PLAIN[1]], np.uint8)[:, ::-1]
     groups = maps.groups_of(np.arange(1 << 16))
-    present = np.unique(groups[sampled(folder, "quality", average=False).values[0]])
 
     def draw(patch: Patch) -> Rgba:
         cells = read_patch(folder.path("quality"), patch, False)
         group = groups[cells.values[0]]
         return with_opacity(colours[group], cells.known & (group < len(maps.GROUPS)))
 
-    items = [(maps.css(colours[k]), maps.GROUPS[k][0]) for k in present.tolist() if k < len(maps.GROUPS)]
+    items = [(maps.css(colours[k]), meaning) for k, (meaning, *_) in enumerate(maps.GROUPS)]
     return Layer("quality", "Reasons", classes("why there is no height, or one to be checked", items), draw)
 
 

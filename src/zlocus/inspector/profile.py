@@ -1,19 +1,16 @@
-"""Heights along a line, cell by cell, and of an area for the view in three dimensions."""
+"""Heights along a line, cell by cell."""
 
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rasterio import DatasetReader
-from rasterio.enums import Resampling
-from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from zlocus.inspector.folder import SurfaceFolder
+from zlocus.inspector.folder import SurfaceFolder, on_grid
 from zlocus.inspector.reference import Reference
 from zlocus.io.opening import kept_raster
 from zlocus.sensors.model import FloatArray
@@ -61,14 +58,7 @@ def values_at(folder: SurfaceFolder, name: str, cells: NDArray[np.int64]) -> Flo
 
 def reference_at(folder: SurfaceFolder, reference: Reference, cells: NDArray[np.int64]) -> FloatArray:
     """Heights of the reference at cells (n, 2), NaN where it has none."""
-    with ExitStack() as stack:
-        file = stack.enter_context(kept_raster(reference.path))
-        view = stack.enter_context(
-            WarpedVRT(
-                file, src_crs=file.crs or folder.crs.to_wkt(), crs=folder.crs.to_wkt(), transform=folder.transform,
-                height=folder.shape[0], width=folder.shape[1], resampling=Resampling.nearest, nodata=float("nan"),
-            )
-        )  # fmt: skip
+    with kept_raster(reference.path) as file, on_grid(file, folder) as view:
         return picked(view, cells)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import Field, fields
 from typing import Any, get_type_hints
@@ -13,8 +14,11 @@ from zlocus.inspector.folder import Patch
 from zlocus.options import MeasureOptions, SelectionOptions
 
 Pairs = Iterable[tuple[str, str]]
-# Of a picture; of one side of it; and levels of a map.
-MOST_PX, MOST_LEVELS = 4096, 24
+# Pixels of a picture, and along one side of it; layers over each other; levels of a map.
+MOST_PX, MOST_SIDE_PX, MOST_LAYERS, MOST_LEVELS = 10_000_000, 4096, 8, 24
+# Options that make an answer large are held below what a run may take.
+MOST = {"reach_steps": 200, "candidates": 48, "nearest": 500, "most_images": 48, "least_images": 48}
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 # Cells from the grid at which something may still be asked for.
 FARTHEST_CELLS = 1e7
 # No coordinate is larger, in any frame.
@@ -62,10 +66,7 @@ def number(values: Mapping[str, str], name: str, low: float = -math.inf, high: f
         It is missing, no number, not finite, or out of range.
     """
     text = values.get(name, "")
-    try:
-        value = float(text) if len(text) <= LONGEST_NUMBER else math.nan
-    except ValueError:
-        value = math.nan
+    value = float(text) if len(text) <= LONGEST_NUMBER and NUMBER.fullmatch(text) else math.nan
     if not (math.isfinite(value) and low <= value <= high):
         raise BadQuery(f"{name} must be a number{_between(low, high)}.")
     return value
@@ -90,7 +91,9 @@ def patch(values: Mapping[str, str]) -> Patch:
     far = FARTHEST_CELLS
     row, col = (number(values, name, -far, far) for name in PATCH[:2])
     rows, cols = (number(values, name, 1e-3, far) for name in PATCH[2:4])
-    height, width = (whole(values, name, 1, MOST_PX) for name in PATCH[4:])
+    height, width = (whole(values, name, 1, MOST_SIDE_PX) for name in PATCH[4:])
+    if height * width > MOST_PX:
+        raise BadQuery(f"A picture has {MOST_PX} pixels at most.")
     return Patch(row, col, rows, cols, height, width)
 
 
@@ -116,7 +119,7 @@ def what_if(values: Mapping[str, str], left_out: Iterable[str]) -> WhatIf:
 
 
 def _option(values: Mapping[str, str], option: Field[Any]) -> Any:
-    low, high = option.metadata["low"], option.metadata["high"]
+    low, high = option.metadata["low"], MOST.get(option.name, option.metadata["high"])
     if KINDS[option.name] is str:
         return values[option.name]
     if KINDS[option.name] is int:

@@ -11,6 +11,7 @@ from odc.geo.geobox import GeoBox
 from zlocus.evaluation.evaluate import Shift, evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.vertical import same_heights
+from zlocus.io.opening import open_raster
 from zlocus.io.raster import RasterSink
 from zlocus.io.vertical import vertical_datum
 from zlocus.products.report.comparison import Comparison, full_colour_m
@@ -50,10 +51,9 @@ def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference
 
 def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> HeightRaster:
     """The reference's heights above what those of the surface are, moved as the surface is."""
-    surface = read_heights(dsm)
-    compared = same_heights(surface, read_heights(comparison.reference), comparison.geoid)
+    compared = same_heights(described(dsm), read_heights(comparison.reference), comparison.geoid)
     heights = compared.reference
-    if compared.converted == surface.path and heights.horizontal is not None:
+    if compared.converted == dsm and heights.horizontal is not None:
         # The surface's heights were raised to the ellipsoid: the reference's are lowered instead.
         geobox = GeoBox(heights.z.shape, heights.transform, heights.horizontal.to_wkt())
         datum = vertical_datum(str(comparison.geoid), "--geoid")
@@ -62,3 +62,9 @@ def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> Height
         moved = heights.transform.translation(shift.east_m, shift.north_m) * heights.transform
         heights = replace(heights, z=heights.z + shift.up_m, transform=moved)
     return heights
+
+
+def described(dsm: Path) -> HeightRaster:
+    """What a surface says of its heights, without them."""
+    with open_raster(dsm, "raster of heights") as file:
+        return HeightRaster(dsm, np.full((2, 2), np.nan), file.transform, file.crs, file.descriptions[0] or "")

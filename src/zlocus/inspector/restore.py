@@ -17,7 +17,7 @@ from zlocus.options import RunConfig
 from zlocus.preparing import oriented
 from zlocus.products.observations import OBSERVATIONS, read_observations
 from zlocus.products.report.page import RECORD
-from zlocus.progress import SilentProgress
+from zlocus.progress import Progress, SilentProgress
 from zlocus.reporting import Matched
 from zlocus.request import DsmRequest
 from zlocus.settling import opened, settled_run
@@ -29,15 +29,20 @@ DATUMS = ("vertical", "dem_vertical")
 
 @dataclass(frozen=True)
 class Restored:
-    """A scene that was matched. is_same : whether cameras, heights and grey values came out as in the run."""
+    """A scene that was matched.
+
+    is_same : whether cameras, heights and grey values came out as in the run, None where it did not say.
+    """
 
     matched: Matched
     config: RunConfig
-    is_same: bool
+    is_same: bool | None
 
 
-def restored(out: Path, run: Mapping[str, Any]) -> Restored:
-    """The scene of the run in a folder. run : its run.json.
+def restored(out: Path, run: Mapping[str, Any], may_ask: bool = False, progress: Progress | None = None) -> Restored:
+    """The scene of the run in a folder.
+
+    run : its run.json; may_ask : whether images that it names on a server are asked for.
 
     Raises
     ------
@@ -46,7 +51,13 @@ def restored(out: Path, run: Mapping[str, Any]) -> Restored:
     ConfigError, GeometryError
         run.json is not what a run writes.
     """
-    request, config, progress = request_of(out, run), config_of(out, run), SilentProgress()
+    request, config, progress = request_of(out, run), config_of(out, run), progress or SilentProgress()
+    elsewhere = [each["path"] for each in run["inputs"] if is_remote(Path(each["path"]))]
+    elsewhere += [str(path) for path in request.inputs if is_remote(path)]
+    if elsewhere and not may_ask:
+        raise InputError(
+            f"The run read {elsewhere[0]} from a server, which is not asked again unbidden. Add --remote for curves."
+        )
     found = opened(request, progress)
     ties = read_observations(out, len(found.scene.views))
     if ties is None and run["orientation"].get("n_ties"):
@@ -60,7 +71,8 @@ def restored(out: Path, run: Mapping[str, Any]) -> Restored:
         settled.scene, settled.matching, settled.grid, orientation.xyz,
         lambda xy: found.vertical.undulation(xy, found.scene.crs),
     )  # fmt: skip
-    is_same = digest_of(settled.matching, orientation) == run.get("settled_sha256")
+    known = run.get("settled_sha256")
+    is_same = None if known is None else digest_of(settled.matching, orientation) == known
     return Restored(matched, config, is_same)
 
 
@@ -104,10 +116,10 @@ def folder_of(out: Path, run: Mapping[str, Any]) -> Path:
     """
     started, asked = run.get("started_in"), Path(str(run["config"]["request"]["out"]))
     candidates = [Path(started)] if isinstance(started, str) else []
+    place, n = out.resolve(), len(asked.parts)
+    if not asked.is_absolute() and ".." not in asked.parts and place.parts[len(place.parts) - n :] == asked.parts:
+        candidates.append(place.parents[n - 1] if n else place)
     candidates.append(Path.cwd())
-    place = out.resolve()
-    if not asked.is_absolute() and ".." not in asked.parts and place.parts[-len(asked.parts) :] == asked.parts:
-        candidates.append(place.parents[len(asked.parts) - 1] if asked.parts else place)
     local = [Path(each["path"]) for each in run["inputs"] if not is_remote(Path(each["path"]))]
     for folder in candidates:
         if all((folder / path).is_file() for path in local):

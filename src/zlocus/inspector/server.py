@@ -1,109 +1,38 @@
-"""The server of the page: read only, for who knows its address, and for nobody else.
-
-Every address begins with a token that is made anew for each server. No part of an address is ever taken for a path: it
+"""What the page of a surface asks, answered. No part of an address is ever taken for a path: it
 names a layer, or one of the page's own files, which are read once when the server starts.
 """
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
-import re
-import secrets
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import Any
 
-from anyio.to_thread import current_default_thread_limiter
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp
 
-from zlocus.errors import ConfigError, GeometryError
+from zlocus.errors import ConfigError, GeometryError, ZlocusError
 from zlocus.inspector import queries
 from zlocus.inspector.folder import Patch, read_patch
+from zlocus.inspector.guard import POLICY, WORDS, Guard, inline_hashes
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.layers import Layer, composed, png_of
 from zlocus.inspector.profile import profile
 from zlocus.products.record import finite_only
 
-THREADS = 8
-TOKEN_BYTES = 24
+THREADS = 6
 TILE_PX = 256
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json",
          ".svg": "image/svg+xml"}  # fmt: skip
-# Scripts are the page's own files, and the one line in it that says where modules are.
-POLICY = (
-    "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-HEADERS = {
-    "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY",
-    "Cross-Origin-Resource-Policy": "same-origin", "Cross-Origin-Opener-Policy": "same-origin",
-}  # fmt: skip
-Answer = Callable[[Request], Response]
-
-
-def new_token() -> str:
-    """A token that nobody guesses."""
-    return secrets.token_urlsafe(TOKEN_BYTES)
-
-
-class Guard:
-    """Lets through what comes from this page: the right token, host and origin, and only what reads.
-
-    hosts : "host:port" as the browser may write them.
-    """
-
-    def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str], policy: str) -> None:
-        self.app, self.token, self.hosts = app, token, hosts
-        self.headers = {**HEADERS, "Content-Security-Policy": policy}
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it."""
-        if scope["type"] == "lifespan":
-            await self.app(scope, receive, send)
-            return
-        if scope["type"] != "http":
-            return  # no other kind of connection is ever accepted
-        request = Request(scope)
-        status = self._refusal(request)
-        if status is not None:
-            await PlainTextResponse(WORDS[status], status, headers=self.headers)(scope, receive, send)
-            return
-
-        async def send_guarded(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                extra = [(name.lower().encode(), value.encode()) for name, value in self.headers.items()]
-                message = {**message, "headers": [*message["headers"], *extra]}
-            await send(message)
-
-        # What is behind the token is all that the routes see.
-        await self.app({**scope, "path": request.url.path[len(self.token) + 1 :]}, receive, send_guarded)
-
-    def _refusal(self, request: Request) -> int | None:
-        """Status of what is not let through."""
-        if request.headers.get("host", "") not in self.hosts:
-            return 403
-        origin = request.headers.get("origin")
-        if origin is not None and origin not in {f"http://{host}" for host in self.hosts}:
-            return 403
-        given = request.scope["path"].encode("utf-8", "replace")
-        if not secrets.compare_digest(given[: len(self.token) + 2], f"/{self.token}/".encode()):
-            return 403
-        return None if request.method in ("GET", "HEAD") else 405
-
-
-WORDS = {
-    403: "Not allowed. Open the address that `zlocus inspect` printed when it started.",
-    404: "There is nothing here.",
-    405: "Nothing can be changed here.",
-}
+Answer = Callable[[Request], Awaitable[Response]]
+Reply = Callable[[Inspection, Request], Response]
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
@@ -122,35 +51,27 @@ def page_files() -> dict[str, tuple[bytes, str]]:
     }
 
 
-def inline_hashes(page: str) -> str:
-    """What the policy has to know of the scripts that stand in the page itself."""
-    found = re.findall(r"<script(?![^>]*\bsrc=)[^>]*>(.*?)</script>", page, re.DOTALL)
-    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in found)
-    return " ".join(f"'sha256-{digest}'" for digest in digests)
-
-
 def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> ASGIApp:
     """The page of an inspection. hosts : "host:port" under which it is asked for."""
     static = page_files()
-    content = json_of(inspection.summary())
+    # A click that nobody waits for any more does not keep the others waiting.
+    clicks, others = CapacityLimiter(1), CapacityLimiter(THREADS)
 
-    @asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        current_default_thread_limiter().total_tokens = THREADS
-        yield
+    async def of_page(request: Request) -> Response:
+        return file_of(static, request.path_params.get("name", "index.html"))
 
     routes = [
-        Route("/", lambda request: file_of(static, "index.html")),
-        Route("/static/{name:path}", lambda request: file_of(static, request.path_params["name"])),
-        Route("/api/surface", lambda request: Response(content, media_type="application/json")),
-        *(Route(f"/api/{name}", answered(inspection, answer)) for name, answer in ANSWERS.items()),
-        Route("/tiles/{layer}/{level}/{col}/{row}.png", answered(inspection, tile)),
+        Route("/", of_page),
+        Route("/static/{name:path}", of_page),
+        Route("/api/cell", answered(inspection, cell, clicks)),
+        *(Route(f"/api/{name}", answered(inspection, answer, others)) for name, answer in ANSWERS.items()),
+        Route("/tiles/{layer}/{level}/{col}/{row}.png", answered(inspection, tile, others)),
     ]
-    app = Starlette(routes=routes, lifespan=lifespan, exception_handlers={404: nothing_here, 405: nothing_here})
+    app = Starlette(routes=routes, exception_handlers={404: nothing_here, 405: nothing_here})
     return Guard(app, token, hosts, POLICY.format(hashes=inline_hashes(static["index.html"][0].decode())))
 
 
-def nothing_here(request: Request, error: Exception) -> Response:
+async def nothing_here(request: Request, error: Exception) -> Response:
     """For what is not known."""
     return PlainTextResponse(WORDS[404], 404)
 
@@ -163,18 +84,34 @@ def file_of(static: Mapping[str, tuple[bytes, str]], name: str) -> Response:
     return Response(content, media_type=kind, headers={"Cache-Control": "no-cache"})
 
 
-def answered(inspection: Inspection, answer: Callable[[Inspection, Request], Response]) -> Answer:
-    """An answer in which what is wrong with the question is a sentence."""
+def answered(inspection: Inspection, answer: Reply, slots: CapacityLimiter) -> Answer:
+    """An answer in which what is wrong with the question is a sentence. slots : how many are worked on at a time."""
 
-    def endpoint(request: Request) -> Response:
+    def said(request: Request) -> Response:
         try:
             return answer(inspection, request)
-        except GeometryError as error:
-            return Response(json_of({"error": str(error)}), 404, media_type="application/json")
-        except ConfigError as error:
-            return Response(json_of({"error": str(error)}), 400, media_type="application/json")
+        except ZlocusError as error:
+            return Response(json_of({"error": str(error)}), status_of(error), media_type="application/json")
+
+    async def endpoint(request: Request) -> Response:
+        async with slots:
+            if await request.is_disconnected():
+                return Response(status_code=408)
+            return await run_sync(said, request)
 
     return endpoint
+
+
+def status_of(error: ZlocusError) -> int:
+    """The status of an answer that is an error: a wrong question, nothing there, or files that are no more what they
+    were."""
+    return 400 if isinstance(error, ConfigError) else 404 if isinstance(error, GeometryError) else 409
+
+
+def surface(inspection: Inspection, request: Request) -> Response:
+    """What the page has to know first."""
+    queries.once(request.query_params.multi_items(), ())
+    return Response(json_of(inspection.summary()), media_type="application/json")
 
 
 def state(inspection: Inspection, request: Request) -> Response:
@@ -211,13 +148,15 @@ def heights(inspection: Inspection, request: Request) -> Response:
 def picture(inspection: Inspection, request: Request) -> Response:
     """Layers of a patch over each other: `layer` once for each, NAME or NAME:OPACITY, the lowest first."""
     values, names = queries.once(request.query_params.multi_items(), queries.PATCH, "layer")
+    if len(names) > queries.MOST_LAYERS:
+        raise queries.BadQuery(f"A picture has {queries.MOST_LAYERS} layers at most.")
     layers = [(layer_of(inspection, name), opacity) for name, opacity in map(queries.layer_and_opacity, names)]
     return Response(png_of(composed(layers, queries.patch(values))), media_type="image/png")
 
 
 def tile(inspection: Inspection, request: Request) -> Response:
     """A square of `TILE_PX` pixels of a layer; at level n a pixel is 2 ** n cells a side."""
-    queries.once(request.query_params.multi_items(), ("v",))
+    queries.once(request.query_params.multi_items(), ("of",))
     values = {name: str(request.path_params[name]) for name in ("level", "col", "row")}
     level = queries.whole(values, "level", 0, queries.MOST_LEVELS)
     side = TILE_PX << level
@@ -247,4 +186,4 @@ def json_of(record: Any) -> bytes:
     return json.dumps(finite_only(record), allow_nan=False).encode()
 
 
-ANSWERS = {"state": state, "cell": cell, "profile": line, "heights": heights, "picture.png": picture}
+ANSWERS = {"surface": surface, "state": state, "profile": line, "heights": heights, "picture.png": picture}

@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import ipaddress
+import os
+import signal
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import uvicorn
 
 from zlocus.errors import ConfigError, OutputError
+from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
-from zlocus.inspector.server import application, new_token
+from zlocus.inspector.server import application
 from zlocus.products.report.comparison import Comparison
 
 # Answers under way are waited for so long.
 GRACE_S = 2
+USUAL_PORT = 80
 Announce = Callable[[str, bool], None]
 
 
 def inspect_surface(
-    out: Path, comparison: Comparison | None, host: str, port: int, view: str, announce: Announce
+    out: Path, comparison: Comparison | None, may_ask: bool, host: str, port: int, view: str, announce: Announce
 ) -> None:
     """Serve the page of a surface until interrupted.
 
-    host, port : where; port 0 is any that is free. view : link of a view, or what stands behind its #, to begin with.
-    announce : is given the address, and whether others than this machine can reach it.
+    may_ask : whether images that run.json names on a server are asked for; host, port : where; port 0 is any that is
+    free; view : link of a view, or what stands behind its #, to begin with; announce : is given the address, and
+    whether others than this machine can reach it.
 
     Raises
     ------
@@ -36,11 +42,15 @@ def inspect_surface(
     """
     address = checked_address(host)
     fragment = fragment_of(view)
-    with listening(address, port) as listener, Inspection(out, comparison) as inspection:
+    # An end that is asked for this way cleans up too.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    with listening(address, port) as listener, Inspection(out, comparison, may_ask) as inspection:
         port, token = listener.getsockname()[1], new_token()
         names = [f"[{address}]" if address.version == 6 else str(address)]
-        names += ["localhost"] if address.is_loopback else []
-        app = application(inspection, token, frozenset(f"{name}:{port}" for name in names))
+        hosts = names + (["localhost"] if address.is_loopback else [])
+        # A browser leaves out the port that is usual.
+        known = {f"{host}:{port}" for host in hosts} | (set(hosts) if port == USUAL_PORT else set())
+        app = application(inspection, token, frozenset(known))
         announce(f"http://{names[0]}:{port}/{token}/{fragment}", not address.is_loopback)
         config = uvicorn.Config(
             app, log_level="warning", access_log=False, server_header=False, ws="none",
@@ -84,8 +94,10 @@ def listening(address: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int)
     # Named as TCP, for only then does asyncio send answers without waiting (TCP_NODELAY): else each takes 40 ms more.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if os.name != "nt":  # where it would let two processes share a port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((str(address), port))
+        listener.listen()
     except OSError as error:
         listener.close()
         raise OutputError(

@@ -4,12 +4,12 @@ import { colour, element } from "./dom.js";
 
 const SCALE = 2;
 
-// Give a figure its buttons. svg : gives the drawing as it is now.
+// Give a figure its buttons. svg, name : give the drawing as it is now, if there is one, and the name of its file.
 export function exportable(figure, name, svg) {
-  const buttons = element("span", {});
+  const buttons = element("span", {}), title = figure.querySelector("figcaption span").textContent;
   for (const kind of ["SVG", "PNG"]) {
-    const save = () => (kind === "SVG" ? saveSvg(svg(), name) : savePng(svg(), name));
-    buttons.append(element("button", { type: "button", onclick: save, "aria-label": `${name} as ${kind}` }, kind));
+    const save = () => svg() && (kind === "SVG" ? saveSvg(svg(), name()) : savePng(svg(), name()));
+    buttons.append(element("button", { type: "button", onclick: save, "aria-label": `${title}, as ${kind}` }, kind));
   }
   figure.querySelector("figcaption").append(buttons);
 }

@@ -1,7 +1,7 @@
 // The map: layers of tiles on the surface's own grid, a pixel being a cell at zoom 0.
 
 import { address } from "./api.js";
-import { $, element, notice } from "./dom.js";
+import { $, digitsFor, element, notice } from "./dom.js";
 import * as state from "./state.js";
 
 const TILE_PX = 256;
@@ -12,10 +12,8 @@ const layers = new Map();
 
 const Tiles = L.TileLayer.extend({
   getTileUrl({ x, y }) {
-    return `tiles/${this.options.name}/${-this._tileZoom_()}/${x}/${y}.png`;
-  },
-  _tileZoom_() {
-    return this._clampZoom(this._tileZoom);
+    // Of a surface that is made again nothing is kept.
+    return `tiles/${this.options.name}/${-this._clampZoom(this._tileZoom)}/${x}/${y}.png?of=${encodeURIComponent(surface.made)}`;
   },
 });
 
@@ -35,7 +33,8 @@ export function make(about) {
   openView();
   map.on("moveend", () => {
     const { lat, lng } = map.getCenter();
-    state.set({ at: [lng.toFixed(2), lat.toFixed(2), map.getZoom()].join(",") });
+    state.set({ at: [place(lng), place(lat), map.getZoom()].join(",") });
+    if (document.body.dataset.keys) $("pointer").textContent = words(lng, lat);
   });
   map.on("mousemove", ({ latlng }) => ($("pointer").textContent = words(latlng.lng, latlng.lat)));
   map.on("mouseout", () => ($("pointer").textContent = ""));
@@ -44,7 +43,12 @@ export function make(about) {
   return map;
 }
 
-export function words(x, y, digits = 1) {
+// A coordinate as links have it, to a hundredth of a cell.
+export function place(value) {
+  return value.toFixed(digitsFor(surface.transform[0]));
+}
+
+export function words(x, y, digits = digitsFor(surface.transform[0]) - 1) {
   const [first, second] = surface.axes;
   return `${first} ${x.toFixed(digits)}, ${second} ${y.toFixed(digits)} m`;
 }
@@ -69,6 +73,12 @@ function clamp(share) {
   return Number.isFinite(share) ? Math.min(Math.max(share, 0), 1) : 1;
 }
 
+// A little less than all of the surface: no tile is asked for that only touches it.
+function inner() {
+  const box = bounds(), aside = surface.transform[0] * 1e-3;
+  return L.latLngBounds([box.getSouth() + aside, box.getWest() + aside], [box.getNorth() - aside, box.getEast() - aside]);
+}
+
 // Whether a ground point lies on the grid.
 export function holds(x, y) {
   const box = bounds();
@@ -89,7 +99,7 @@ export function bounds() {
 export function addLayer(about) {
   const tiles = new Tiles("", {
     name: about.name, tileSize: TILE_PX, minZoom: -surface.levels - 1, maxZoom: CLOSEST, minNativeZoom: -surface.levels,
-    maxNativeZoom: 0, bounds: bounds(), noWrap: true, keepBuffer: 3, zIndex: layers.size + 1, className: `layer-${about.name}`,
+    maxNativeZoom: 0, bounds: inner(), noWrap: true, keepBuffer: 3, zIndex: layers.size + 1, className: `layer-${about.name}`,
   });
   const number = layers.size + 1;
   const box = element("input", { type: "checkbox", id: `layer-${about.name}`, onchange: () => changed(layer) });
@@ -97,7 +107,7 @@ export function addLayer(about) {
     type: "range", min: 0, max: 1, step: 0.05, value: 1, "aria-label": `Opacity of ${about.title}`, oninput: () => changed(layer),
   });
   const legend = legendOf(about);
-  const layer = { ...about, tiles, box, share, legend, number };
+  const layer = { ...about, drawnLegend: about.legend, tiles, box, share, legend, number };
   layers.set(about.name, layer);
   // The highest stands at the top.
   $("layer-rows").prepend(
@@ -190,7 +200,8 @@ export function pictureAddress(part, names) {
 
 // The map as a picture: what is shown, and what is drawn on it.
 export async function exportMap() {
-  const size = map.getSize();
+  notice("");
+  const size = map.getSize(), below = legendLines();
   const part = { ...patch(1), height: Math.round(size.y), width: Math.round(size.x) };
   const names = shown().map(([name, share]) => `${name}:${share}`);
   const picture = new Image();
@@ -201,15 +212,54 @@ export async function exportMap() {
     notice("The map could not be drawn.");
     return null;
   }
-  const canvas = element("canvas", { width: size.x, height: size.y });
+  const canvas = element("canvas", { width: size.x, height: size.y + below.height });
   const context = canvas.getContext("2d");
   context.fillStyle = "white";
-  context.fillRect(0, 0, size.x, size.y);
+  context.fillRect(0, 0, canvas.width, canvas.height);
   context.drawImage(picture, 0, 0);
   const drawn = document.querySelector("#map .leaflet-overlay-pane svg");
   if (drawn) await overlay(context, drawn);
   scaleBar(context, size);
+  below.draw(context, size.y);
   return canvas;
+}
+
+// Legends of the layers that are shown, one below the other, for a picture.
+function legendLines() {
+  const all = [...layers.values()].filter((layer) => layer.box.checked && layer.drawnLegend).map((layer) => layer.drawnLegend);
+  const heights = all.map((legend) => (legend.kind === "scale" ? 62 : 26 + 20 * legend.items.length));
+  const draw = (context, top) => {
+    all.forEach((legend, i) => {
+      context.fillStyle = "black";
+      context.font = "bold 13px system-ui, sans-serif";
+      context.fillText(legend.title, 12, top + 20);
+      context.font = "12px system-ui, sans-serif";
+      if (legend.kind === "scale") drawScale(context, legend, top + 26);
+      else drawClasses(context, legend, top + 28);
+      top += heights[i];
+    });
+  };
+  return { height: heights.reduce((one, other) => one + other, 0), draw };
+}
+
+function drawScale(context, { gradient, ticks }, top) {
+  const width = 300, colours = gradient.split(", ");
+  const fill = context.createLinearGradient(12, 0, 12 + width, 0);
+  colours.forEach((colour, i) => fill.addColorStop(i / (colours.length - 1), colour));
+  context.fillStyle = fill;
+  context.fillRect(12, top, width, 12);
+  context.fillStyle = "black";
+  ticks.forEach((tick, i) => context.fillText(tick, 12 + (i / (ticks.length - 1)) * (width - 30), top + 27));
+}
+
+function drawClasses(context, { items }, top) {
+  items.forEach(({ colour, meaning }, i) => {
+    context.fillStyle = colour;
+    context.fillRect(12, top + 20 * i, 12, 12);
+    context.strokeRect(12, top + 20 * i, 12, 12);
+    context.fillStyle = "black";
+    context.fillText(meaning, 30, top + 20 * i + 11);
+  });
 }
 
 async function overlay(context, drawn) {

@@ -1,6 +1,9 @@
 // The view, kept behind the # of the address: whoever opens the link sees the same.
 
+// Some browsers refuse to write the address more often than this.
+const WRITE_MS = 250;
 const listeners = [];
+let writing = null;
 let values = read();
 
 export function get(name) {
@@ -22,6 +25,18 @@ export function set(changes) {
     for (const each of [value].flat()) if (each !== null && each !== undefined) values.append(name, each);
   }
   values.sort(); // the same view has the same link
+  writing ??= setTimeout(write, WRITE_MS);
+}
+
+// The link of the view as it is.
+export function link() {
+  write();
+  return location.href;
+}
+
+function write() {
+  clearTimeout(writing);
+  writing = null;
   const text = values.toString();
   history.replaceState(null, "", text ? `#${text}` : "#");
 }
@@ -37,6 +52,8 @@ export function numbers(name, count) {
 }
 
 addEventListener("hashchange", () => {
+  clearTimeout(writing);
+  writing = null;
   values = read();
   listeners.forEach((listener) => listener());
 });
