@@ -30,8 +30,8 @@ def opened(inspection: Inspection) -> Inspection:
 
 
 @contextmanager
-def served(out: Path, comparison: Comparison | None = None) -> Iterator[tuple[Inspection, str]]:
-    """An inspection, and the address of its page."""
+def served(out: Path, comparison: Comparison | None = None, wait: bool = True) -> Iterator[tuple[Inspection, str]]:
+    """An inspection, and the address of its page; with `wait` once the scene is open."""
     with listening(checked_address("127.0.0.1"), 0) as listener, Inspection(out, comparison) as inspection:
         host, token = f"127.0.0.1:{listener.getsockname()[1]}", new_token()
         config = uvicorn.Config(application(inspection, token, frozenset({host})), log_level="warning", ws="none")
@@ -39,7 +39,7 @@ def served(out: Path, comparison: Comparison | None = None) -> Iterator[tuple[In
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
-            yield opened(inspection), f"http://{host}/{token}/"
+            yield opened(inspection) if wait else inspection, f"http://{host}/{token}/"
         finally:
             server.should_exit = True
             thread.join(OPENED_S)

@@ -6,6 +6,11 @@ import hashlib
 import json
 import re
 import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -16,15 +21,17 @@ import httpx
 import numpy as np
 import pytest
 import rasterio
+from typer.testing import CliRunner
 
 from inspected import opened, served
 from rendered_scenes import SMALL_TILES, UTM, run
+from zlocus.cli import app
 from zlocus.errors import ConfigError, InputError, OutputError
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.inspector.cell import WhatIf, match_record
 from zlocus.inspector.folder import Patch, read_patch, surface_folder
 from zlocus.inspector.guard import inline_hashes
-from zlocus.inspector.inspection import NOT_THE_SAME, Inspection
+from zlocus.inspector.inspection import MADE_AGAIN, NOT_THE_SAME, Inspection
 from zlocus.inspector.queries import BadQuery, number, once, what_if, whole
 from zlocus.inspector.restore import folder_of, request_of, restored
 from zlocus.inspector.server import page_files
@@ -40,6 +47,8 @@ from zlocus.reporting import SHOWN_WITHIN_CELLS, place_of_cell
 # Of what is rounded for the page: correlations, heights.
 ROUNDED_NCC, ROUNDED_M = 1e-5, 1e-4
 UNDULATION_M = 47.0
+# Longer than any answer takes, and than an end.
+PATIENCE_S = 5.0
 SHIFT_M = (2.0, -1.0, 0.5)
 
 
@@ -587,3 +596,121 @@ def test_the_crs_is_that_of_the_run(out):
     assert folder.cell_of(*folder.middle_of(3, 4)) == (3, 4)
     assert folder.cell_of(*folder.middle_of(-1, 4)) is None
     assert folder.cell_of(np.inf, 0) is None
+
+
+def test_clicks_that_nobody_waits_for_keep_nobody_waiting(page, out):
+    """Those that were given up are not computed, and what else is asked is answered meanwhile."""
+    inspection, client = page
+    x, y = inspection.folder.middle_of(*a_cell(out))
+    base = urlsplit(str(client.base_url))
+    gone = [HTTPConnection(base.hostname, base.port) for _ in range(60)]
+    for connection in gone:
+        connection.request("GET", f"{base.path}api/cell?x={x}&y={y}&reach_steps=200&neighbours=tin")
+        connection.sock.shutdown(socket.SHUT_WR)
+        connection.close()
+    begin = time.perf_counter()
+    assert client.get("api/state").status_code == 200
+    assert client.get("api/cell", params={"x": x, "y": y}).status_code == 200
+    assert time.perf_counter() - begin < PATIENCE_S
+
+
+def test_a_surface_that_is_made_again_is_not_mixed_with_the_old(out, tmp_path):
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    with Inspection(copy) as inspection:
+        opened(inspection)
+        x, y = inspection.folder.middle_of(*a_cell(out))
+        assert "match" in inspection.cell(x, y, WhatIf())
+        record = (copy / "run.json").read_text()
+        (copy / "run.json").write_text(record + " ")
+        with pytest.raises(InputError, match="made again"):
+            inspection.cell(x, y, WhatIf())
+        assert inspection.state()["notes"] == [MADE_AGAIN]
+
+
+def test_files_that_are_gone_are_an_answer(out, tmp_path):
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    with served(copy) as (inspection, address), httpx.Client(base_url=address) as client:
+        x, y = inspection.folder.middle_of(*a_cell(out))
+        (copy / "sigma.tif").unlink()
+        for path in (f"api/cell?x={x}&y={y}", "tiles/sigma/0/0/0.png", f"api/profile?x0={x}&y0={y}&x1={x}&y1={y}"):
+            answer = client.get(path)
+            assert answer.status_code == 409
+            assert "sigma.tif" in answer.json()["error"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda run: run["grid"].update(shape=[3]), "grid.shape"), (lambda run: run["grid"].update(crs="nowhere"), ""),
+        (lambda run: run["orientation"].pop("views"), "orientation.views"),
+        (lambda run: run["config"]["options"].pop("products"), "config.options.products"),
+        (lambda run: run["config"].update(request=[]), "config.request"), (lambda run: run.update(inputs=7), "inputs"),
+    ],
+)  # fmt: skip
+def test_a_damaged_record_is_one_sentence(out, tmp_path, change, says):
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    record = json.loads((copy / "run.json").read_text())
+    change(record)
+    (copy / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=rf"run\.json is not what a run writes.*{says}.* Make the surface again"):
+        Inspection(copy)
+
+
+def test_of_options_that_are_not_known_there_is_a_page_without_curves(out, tmp_path):
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    record = json.loads((copy / "run.json").read_text())
+    record["config"]["options"]["selection"]["nonsense"] = 1
+    (copy / "run.json").write_text(json.dumps(record))
+    with Inspection(copy) as inspection:
+        opened(inspection)
+        assert inspection.summary()["shape"] == list(inspection.folder.shape)
+        assert "nonsense is not an option" in inspection.state()["scene"]["why"]
+
+
+def test_servers_are_asked_only_where_that_is_wanted(out, tmp_path):
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    record = json.loads((copy / "run.json").read_text())
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        record["inputs"].append({"path": f"/vsicurl/http://127.0.0.1:{server.getsockname()[1]}/image.tif"})
+        record["config"]["request"]["inputs"][0] = record["inputs"][-1]["path"]
+        (copy / "run.json").write_text(json.dumps(record))
+        with Inspection(copy) as inspection:
+            opened(inspection)
+            assert "Add --remote" in inspection.state()["scene"]["why"]
+        with pytest.raises(BlockingIOError):  # nobody came
+            server.accept()
+
+
+def test_the_command_serves_until_it_is_interrupted(out, tmp_path):
+    command = [sys.executable, "-m", "zlocus", "inspect", str(out), "--view", "http://127.0.0.1:1/old/#tab=profile"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        address = process.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/#tab=profile", address)
+        assert "Ctrl-C" in process.stdout.readline()
+        assert httpx.get(address).status_code == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 130
+        assert process.stderr.read().strip() == "zlocus: Interrupted."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--align",), "--align is about a reference, and none is given"), (("--host", "0.0.0.0"), "all addresses"),
+        (("--host", "example.org"), "no address"),
+        (("--reference", "nothing.tif"), "There is no reference nothing.tif"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_served_is_one_sentence(out, arguments, says):
+    said = CliRunner().invoke(app, ["inspect", str(out), *arguments])
+    assert said.exit_code == 2
+    assert says in said.stderr
+    assert said.stderr.count("\n") == 1
+
+
+def test_without_its_libraries_it_says_what_to_install(out, monkeypatch):
+    monkeypatch.setattr("zlocus.cli_inspect.find_spec", lambda name: None)
+    said = CliRunner().invoke(app, ["inspect", str(out)])
+    assert said.exit_code == 2
+    assert "pip install '.[inspect]'" in said.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +28,8 @@ WAIT_MS = 30_000
 SHOWN_RHO, SHOWN_RATIO, SHOWN_M = 5.1e-5, 5.1e-4, 5.1e-3
 REFERENCE_M = 0.25
 LEAST_TARGET_PX = 36
+# Height of a legend of colours that run, below a saved map.
+LEGEND_PX = 62
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +86,12 @@ def page_at(browser, address, size, **options):
     page.wait_for_selector('body[data-ready="true"][data-scene="ready"]')
     page.wait_for_selector("#layer-difference", state="attached")
     return page, faults
+
+
+def link_of(page) -> str:
+    """The page's address once it is written."""
+    page.wait_for_timeout(400)
+    return page.url
 
 
 def settled(page) -> None:
@@ -160,7 +169,7 @@ def test_every_layer_can_be_switched_and_made_fainter(page):
         share = page.locator(f".layer:has(#layer-{name}) input[type=range]")
         share.fill("0.4")
         assert float(shown.evaluate("layer => layer.style.opacity")) == pytest.approx(0.4)
-        assert f"{name}%3A0.4" in page.url
+        assert f"{name}%3A0.4" in link_of(page)
         box.uncheck()
         assert shown.count() == 0
     page.locator("#layer-height").check()
@@ -224,6 +233,7 @@ def test_an_image_can_be_switched_off_and_on(page, inspected, out):
     agrees(shown_table(page), report_of(out, folder, row, col, without=(off,)))
     page.locator("#reset").click()
     page.wait_for_selector("#changed", state="hidden")
+    settled(page)
     assert shown_table(page) == as_run
 
 
@@ -238,7 +248,7 @@ def test_window_and_thresholds_change_the_curves(page, inspected, out):
     page.locator("#options input[name=rho1_high]").fill("7")
     page.locator("#options input[name=rho1_high]").dispatch_event("change")
     assert page.locator("#options input[name=rho1_high]").evaluate("input => !input.checkValidity()")
-    assert "rho1_high" not in page.url
+    assert "rho1_high" not in link_of(page)
 
 
 def test_a_profile_is_drawn_between_two_clicks(page, inspected):
@@ -248,9 +258,9 @@ def test_a_profile_is_drawn_between_two_clicks(page, inspected):
         page.mouse.click(box["x"] + share * box["width"], box["y"] + 0.5 * box["height"])
     page.wait_for_selector("#profile-figure svg")
     said = page.locator("#profile-text").inner_text()
-    ends = [float(part) for part in re.search(r"line=([^&]*)", page.url)[1].split("%2C")]
+    ends = [float(part) for part in re.search(r"line=([^&]*)", link_of(page))[1].split("%2C")]
     assert number(said) == pytest.approx(np.hypot(ends[2] - ends[0], ends[3] - ends[1]), abs=0.051)
-    assert "one standard deviation to either side, and the reference in orange" in said
+    assert "one standard deviation to either side, and the reference dashed, in orange" in said
     assert page.locator("#profile-figure svg path").count() >= 3  # band, reference, surface
 
 
@@ -262,14 +272,14 @@ def test_a_link_reopens_the_view(page, browser, inspected, out):
     page.get_by_label("Use aft").uncheck()
     page.wait_for_selector("#changed", state="visible")
     settled(page)
-    link = page.url
+    link = link_of(page)
     other, faults = page_at(browser, link, DESK)
     settled(other)
     for what in ("#cell-title", "#height-value", "#match-stop"):
         assert other.locator(what).inner_text() == page.locator(what).inner_text()
     assert other.locator("#layer-sigma").is_checked()
     assert shown_table(other) == shown_table(page)
-    assert other.url == link
+    assert link_of(other) == link
     other.context.close()
     assert faults == []
 
@@ -316,7 +326,7 @@ def test_figures_and_map_are_saved(page, inspected, out, tmp_path):
     content = saved(page, page.locator("#export-map"), tmp_path)
     width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
     box = page.locator("#map").bounding_box()
-    assert (width, height) == (round(box["width"]), round(box["height"]))
+    assert (width, height) == (round(box["width"]), round(box["height"]) + LEGEND_PX)
 
 
 def saved(page, button, folder: Path) -> bytes:
@@ -367,6 +377,46 @@ def test_it_fits_laptops_and_telephones_by_day_and_night(browser, inspected, out
     assert faults == []
 
 
+def test_the_page_is_used_while_the_scene_opens(browser, out, monkeypatch):
+    """A link with a cell, a profile and a tab: all but the curves is there at once, and they follow."""
+    may_open = threading.Event()
+
+    def slowly(*arguments):
+        may_open.wait(WAIT_MS / 1e3)
+        return restored(*arguments)
+
+    monkeypatch.setattr("zlocus.inspector.inspection.restored", slowly)
+    with served(out, wait=False) as (inspection, address):
+        x, y = inspection.folder.middle_of(*a_cell(out))
+        context = browser.new_context(viewport=DESK)
+        page = context.new_page()
+        page.goto(f"{address}#cell={x},{y}&tab=profile&line={x - 9},{y},{x + 9},{y}")
+        page.wait_for_selector("#profile-figure svg")
+        assert page.locator("#tab-profile").get_attribute("aria-selected") == "true"
+        page.locator("#tab-cell").click()
+        page.wait_for_selector("text=curves follow")
+        assert page.locator("#cell-height").inner_text() != "none"
+        assert "The images are being opened" in page.locator("#notice").inner_text()
+        may_open.set()
+        settled(page)
+        assert page.locator("#cell-error").is_hidden()
+        assert page.locator("#tab-cell").get_attribute("aria-selected") == "true"
+        context.close()
+
+
+def test_nothing_old_stays_beside_an_error(page, inspected, out):
+    folder, (row, col) = inspected[0].folder, a_cell(out)
+    click_cell(page, folder, row, col)
+    for name in ("fore", "aft"):
+        page.get_by_label(f"Use {name}").uncheck()
+        page.wait_for_timeout(300)
+    page.wait_for_selector("text=Two images are needed at least")
+    assert page.locator("#match").is_hidden()
+    page.locator("#reset").click()
+    settled(page)
+    assert page.locator("#cell-error").is_hidden()
+
+
 def test_a_wrong_link_is_said(browser, inspected):
     page, faults = page_at(browser, f"{inspected[1]}#cell=1,2&line=a,b&at=x", DESK)
     page.wait_for_selector("#cell-error:not([hidden])")
@@ -381,14 +431,21 @@ def test_names_that_are_code_do_not_run(images, browser, tmp_path):
     bad = "<img src=x onerror=alert(1)>"
     record["orientation"]["views"] = {bad: {}, **record["orientation"]["views"]}
     (out / "run.json").write_text(json.dumps(record))
+    curves = json.loads((out / "curves.json").read_text())
+    curves["cells"][0]["why"] = bad
+    (out / "curves.json").write_text(json.dumps(curves))
     with served(out) as (inspection, address):
         x, y = inspection.folder.middle_of(*a_cell(out))
         context = browser.new_context(viewport=DESK)
         page, asked = context.new_page(), []
         page.on("dialog", lambda dialog: asked.append(dialog.message))
+        page.on("console", lambda message: asked.append(message.text))
         page.goto(f"{address}#cell={x},{y}")
-        page.wait_for_selector("#images tr[data-image]")
-        assert bad in page.locator("#images").inner_text()
-        assert page.locator("#images img").count() == 0
+        settled(page)
+        page.locator("#others summary").click()
+        page.wait_for_selector("#other-images tr")
+        assert bad in page.locator("#other-images").inner_text()
+        assert bad in page.locator("#go").inner_text()
+        assert page.locator("img[src=x]").count() == 0
         assert asked == []
         context.close()

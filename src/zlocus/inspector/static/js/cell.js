@@ -2,21 +2,24 @@
 
 import { asked, Refused } from "./api.js";
 import * as curves from "./curves.js";
-import { $, colour, element, metres, notice, signed } from "./dom.js";
+import { $, digitsFor, element, metres, signed } from "./dom.js";
 import { exportable } from "./figures.js";
 import * as map from "./map.js";
 import * as state from "./state.js";
 import * as windows from "./windows.js";
 
+const MOST_LISTED = 100;
 const LABELS = { 1: "good", 0: "fair", "-1": "poor" };
 const WAIT_MS = 700;
+// Keys and spinners that are held ask for the last of many cells only.
+const REST_MS = 60;
 // Options that a cell's curves depend on most; the others are behind them.
 const FIRST = [
   "rho1_high", "ratio_high", "rho1_middle", "ratio_middle", "rho1_low", "ratio_low", "rho1_fair", "ratio_fair", "sigma_steps",
   "neighbours", "radius_px", "order", "least_worth", "most_images",
 ];
-let surface, leaflet, drawn, shown = null, asRun = null, busy = null, unpacked = [];
-const charts = {};
+let surface, leaflet, drawn, shown = null, asRun = null, busy = null, resting = null, unpacked = [];
+let charts = {};
 
 export function make(about, theMap) {
   [surface, leaflet] = [about, theMap];
@@ -26,23 +29,33 @@ export function make(about, theMap) {
   $("options").addEventListener("change", () => changed());
   $("options").addEventListener("submit", (event) => event.preventDefault());
   makeOptions();
-  const name = (what) => () => `${surface.title}_${what}_${state.get("cell")?.replace(",", "_")}`;
   for (const [id, what] of [["ncc", "correlation"], ["sncc", "mean"], ["windows", "windows"], ["loci", "lines"]]) {
-    exportable($(`${id}-figure`), name(what)(), () => charts[id]);
+    const name = () => `${surface.title}_${what}_${shown?.row}_${shown?.col}`;
+    exportable($(`${id}-figure`), name, () => charts[id]);
   }
+  $("others").addEventListener("toggle", () => otherImages());
+  $("find").addEventListener("input", () => otherImages());
 }
 
 // Look at the cell at a ground point.
 export function look(x, y) {
-  state.set({ cell: `${x.toFixed(3)},${y.toFixed(3)}`, height: null });
+  state.set({ cell: `${map.place(x)},${map.place(y)}`, height: null });
   return open();
 }
 
-// Look at the neighbour of the cell.
+// Look at the neighbour of the cell, as far as there is one.
 export function step(down, across) {
-  if (!shown) return;
-  const [a, , , , e] = surface.transform;
-  look(shown.x + across * a, shown.y + down * e);
+  const at = state.numbers("cell", 2);
+  if (!at) return;
+  const [a, , , , e] = surface.transform, next = [at[0] + across * a, at[1] + down * e];
+  if (!map.holds(...next)) return;
+  state.set({ cell: next.map(map.place).join(","), height: null });
+  soon();
+}
+
+function soon() {
+  clearTimeout(resting);
+  resting = setTimeout(open, REST_MS);
 }
 
 // The cell that the address names, or none.
@@ -56,11 +69,9 @@ export async function open() {
     shown = null;
     return;
   }
+  $("changed").hidden = !Object.keys(whatIf()).length;
   if (!map.holds(...at)) {
-    shown = null;
-    $("cell-title").textContent = map.words(...at, 2);
-    for (const id of ["cell-facts", "cell-reasons"]) $(id).replaceChildren();
-    $("match").hidden = true;
+    $("cell-title").textContent = map.words(...at);
     fail("The point lies outside the surface.");
     return;
   }
@@ -92,37 +103,55 @@ async function load([x, y], signal) {
   else if (asRun?.row !== record.row || asRun?.col !== record.col) asRun = await asked("cell", { x, y }, signal);
   shown = record;
   facts(record);
-  $("changed").hidden = !isChanged;
-  $("cell-error").hidden = !record.error;
-  $("cell-error").textContent = record.error ?? "";
-  $("match").hidden = !record.match && !isChanged;
-  $("match").setAttribute("aria-busy", "false");
   mark(record);
-  if (record.match) match(record.match, isChanged ? asRun.match : null);
-  else imageTable(null);
+  if (record.match) {
+    $("cell-error").hidden = true;
+    $("match").hidden = false;
+    match(record.match, isChanged ? asRun.match : null);
+    $("match").setAttribute("aria-busy", "false");
+  } else {
+    noMatch(record.error);
+  }
   document.dispatchEvent(new CustomEvent("looked", { detail: record }));
 }
 
+// Nothing of the cell before stays beside what went wrong.
 function fail(text) {
+  shown = null;
+  for (const id of ["cell-facts", "cell-reasons"]) $(id).replaceChildren();
+  noMatch(text);
+}
+
+function noMatch(text) {
+  charts = {};
   $("cell-error").hidden = false;
   $("cell-error").textContent = text;
+  $("match").hidden = true;
   $("match").setAttribute("aria-busy", "false");
 }
 
 function facts(record) {
   $("cell-title").textContent = `Cell at row ${record.row}, column ${record.col}`;
+  for (const each of document.querySelectorAll(".begun")) {
+    each.textContent = record.height_m === null ? "height that the search began with" : "height of the surface";
+  }
   const rows = [
-    ["Place", map.words(record.x, record.y, 2)],
-    ["Height", record.height_m === null ? "none" : `${metres(record.height_m)} (${surface.above})`],
-    ["Standard deviation", metres(record.sigma_m, 3)],
+    ["Place", map.words(record.x, record.y, digitsFor(surface.transform[0]))],
+    ["Height", record.height_m === null ? "none" : `${metres(record.height_m, digits())} (${surface.above})`],
+    ["Standard deviation", metres(record.sigma_m, digits() + 1)],
     ["Images used", record.height_m === null ? "–" : String(record.n_images)],
   ];
-  if (record.difference_m !== null) rows.push(["Less the reference", `${signed(Number(record.difference_m.toFixed(2)))} m`]);
+  if (record.difference_m !== null) rows.push(["Less the reference", `${signed(Number(record.difference_m.toFixed(digits())))} m`]);
   const ids = { Height: "cell-height", "Standard deviation": "cell-sigma", "Images used": "cell-images", "Less the reference": "cell-difference" };
   $("cell-facts").replaceChildren(
     ...rows.flatMap(([name, text]) => [element("dt", {}, name), element("dd", { id: ids[name] ?? null }, text)]),
   );
   $("cell-reasons").replaceChildren(...record.reasons.map(reason));
+}
+
+// Of heights: they are no better than a tenth of a cell.
+function digits() {
+  return digitsFor(surface.transform[0]);
 }
 
 function reason({ name, meaning, fate, advice }) {
@@ -163,6 +192,7 @@ function match(found, before) {
   draw("loci", windows.loci(found, Math.max(2, Math.floor(($("loci-figure").clientWidth || 500) / 200))));
   imageTable(found);
   tieTable(found);
+  fillReferences(found);
   $("height").max = found.heights_m.length - 1;
   const asked = state.numbers("height", 1);
   $("height").value = asked ? nearest(found, asked[0]) : windows.middle(found);
@@ -172,13 +202,18 @@ function match(found, before) {
 function peak(found) {
   if (found.peak_m === null) return "There is no peak.";
   const sigma = found.sigma_m[found.stop.images - 1];
-  return `The peak lies at ${metres(found.peak_m, 3)}, predicted to ${sigma === null ? "no precision" : metres(sigma, 3)}.`;
+  const precisely = digitsFor(found.step_m) + 1;
+  return `The peak lies at ${metres(found.peak_m, precisely)}, predicted to ${sigma === null ? "no precision" : metres(sigma, precisely)}.`;
 }
 
 // What the run did otherwise than a cell alone would.
 function ofRun() {
-  const settles = surface.method === "mvll" ? "" :
-    " The height is settled together with those of the neighbours, and need not lie at this peak.";
+  if (surface.method === "gc3-sgm") {
+    return "The run matched the pixels of the images (gc3-sgm); these are the curves of the vertical line through the cell, where the heights found lie.";
+  }
+  const window = `${surface.window.value} x ${surface.window.value}`;
+  const settles = ` Curves compare windows of ${window} cells; the run also compares smaller ones and grey values` +
+    (surface.method === "mvll" ? "." : ", and settles the height together with those of the neighbours: it need not lie at this peak.");
   if (surface.views === "all") return `The run was told to use every image in every cell (--views all).${settles}`;
   if (surface.images.length < surface.fewest_views) {
     return `With fewer than ${surface.fewest_views} images the run uses all of them where nothing hides the cell: order and stop ` +
@@ -207,13 +242,20 @@ function moved(isAsked) {
   const found = shown?.match;
   if (!found) return;
   const k = Number($("height").value), height = found.heights_m[k];
-  $("height-value").textContent = metres(height);
-  $("height").setAttribute("aria-valuetext", metres(height));
+  const text = metres(height, digitsFor(found.step_m));
+  $("height-value").textContent = text;
+  $("height").setAttribute("aria-valuetext", text);
+  const each = found.curves.map(({ image }, j) => `${image} ${correlation(found.ncc[j][k])}`);
+  $("height-text").textContent = `There: mean of ${found.stop.images} ${correlation(found.sncc[found.stop.images - 1][k])}; ${each.join(", ")}`;
   curves.mark(charts.ncc, found, k);
   curves.mark(charts.sncc, found, k);
   windows.show(charts.windows, found, unpacked, "moving", k);
   windows.moveLoci(charts.loci, k);
   if (isAsked) state.set({ height: height.toFixed(3) });
+}
+
+function correlation(value) {
+  return value === null ? "not seen" : value.toFixed(2);
 }
 
 export function slide(by) {
@@ -229,27 +271,47 @@ function imageTable(found) {
   order.forEach((name, j) => {
     const [one, mean] = [found.curves[j], found.means[j]];
     const cells = [
-      label(one.label, name, "label"), text(one.rho1, 4, "rho1"), text(one.ratio, 3, "ratio"), text(one.peak_m, 2, "peak"),
+      label(one.label, name, "label"), text(one.rho1, 4, "rho1"), text(one.ratio, 3, "ratio", one.rho1 !== null),
+      text(one.rho1 === null ? null : one.peak_m, digitsFor(found.step_m), "peak"),
       signed(found.order.images[j].accumulated), label(mean.label, name, "mean"), text(found.sigma_m[j], 3, "sigma"),
     ];
     rows.push(imageRow(`${j + 1}. ${name}`, cells, name, j + 1 === found.stop.images ? "last" : j + 1 > found.stop.images ? "off" : ""));
   });
-  const rest = surface.images.filter((name) => name !== found?.reference && !order.includes(name));
   const off = new Set(state.all("without"));
-  rest.forEach((name) => rows.push(imageRow(name, [off.has(name) ? "switched off" : "not compared", "", "", "", "", "", ""], name, "off")));
-  $("images").replaceChildren(...rows);
+  off.forEach((name) => rows.push(imageRow(name, ["switched off", "", "", "", "", "", ""], name, "off")));
+  const held = document.activeElement?.getAttribute("aria-label");
+  $("images").replaceChildren(element("caption", { class: "hidden" }, "Images in their order"), ...rows);
+  if (held?.startsWith("Use ")) [...$("images").querySelectorAll("input")].find((box) => box.getAttribute("aria-label") === held)?.focus();
+  const rest = others();
+  $("others").hidden = !rest.length;
+  $("others").querySelector("summary").textContent = `Not compared: ${rest.length} of ${surface.images.length} images`;
+  otherImages();
+}
+
+// Images that do not show the cell, or promise less than those that are compared.
+function others() {
+  const found = shown?.match, known = new Set([found?.reference, ...(found?.curves ?? []).map((curve) => curve.image), ...state.all("without")]);
+  return surface.images.filter((name) => !known.has(name));
+}
+
+// Those that are looked for, when somebody looks.
+function otherImages() {
+  const names = $("others").open ? others().filter((name) => name.toLowerCase().includes($("find").value.toLowerCase())) : [];
+  const rows = names.slice(0, MOST_LISTED).map((name) => imageRow(name, ["not compared"], name, "off"));
+  if (names.length > MOST_LISTED) rows.push(element("tr", {}, element("td", {}, `and ${names.length - MOST_LISTED} more`)));
+  $("other-images").replaceChildren(...rows);
 }
 
 function imageRow(heading, cells, name = heading, kind = "") {
   const isOff = state.all("without").includes(name);
   const box = element("input", { type: "checkbox", "aria-label": `Use ${name}`, onchange: () => switchImage(name, box.checked) });
   box.checked = !isOff;
-  return element("tr", { class: kind, "data-image": name }, element("td", {}, heading), ...cells.map((cell) =>
+  return element("tr", { class: kind, "data-image": name }, element("th", { scope: "row" }, heading), ...cells.map((cell) =>
     cell instanceof Node ? cell : element("td", {}, cell)), element("td", {}, box));
 }
 
-function text(value, digits, what) {
-  return element("td", { "data-value": what }, value === null ? (what === "ratio" ? "∞" : "none") : value.toFixed(digits));
+function text(value, digits, what, hasPeak = true) {
+  return element("td", { "data-value": what }, value === null ? (what === "ratio" && hasPeak ? "∞" : "none") : value.toFixed(digits));
 }
 
 function label(value, name, what) {
@@ -258,11 +320,12 @@ function label(value, name, what) {
 
 function tieTable(found) {
   const { points } = found.neighbours;
+  const caption = element("caption", { class: "hidden" }, "Labels of the images at tie points around the cell");
   const heads = ["distance", ...found.curves.map(({ image }) => image)];
-  const rows = points.slice(0, 12).map((point) => element("tr", {}, element("td", {}, `${point.distance_m.toFixed(1)} m`),
+  const rows = points.slice(0, 12).map((point) => element("tr", {}, element("th", { scope: "row" }, `${point.distance_m.toFixed(digitsFor(surface.transform[0]) - 1)} m`),
     ...point.labels.map((value) => element("td", { class: `label-${value}` }, signed(value)))));
   if (!points.length) rows.push(element("tr", {}, element("td", {}, "none near enough")));
-  $("ties").replaceChildren(element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);
+  $("ties").replaceChildren(caption, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);
 }
 
 function switchImage(name, isOn) {
@@ -287,7 +350,7 @@ function makeOptions() {
   const known = Object.fromEntries(surface.options.map((each) => [each.name, each]));
   const others = surface.options.map(({ name }) => name).filter((name) => !FIRST.includes(name));
   const window = { name: "window", value: surface.window.value, choices: surface.window.choices, doc: "Side of the window that is compared.", unit: "cells" };
-  const reference = { name: "reference", value: "", choices: ["", ...surface.images], doc: "Image that the others are compared with.", unit: "" };
+  const reference = { name: "reference", value: "", choices: [""], doc: "Image that the others are compared with.", unit: "" };
   $("options").append(...[window, reference, ...FIRST.map((name) => known[name])].map(optionRow));
   $("options").append(element("details", { style: "grid-column: 1 / -1" }, element("summary", {}, "More"), ...others.map((name) => optionRow(known[name]))));
 }
@@ -299,6 +362,14 @@ function optionRow({ name, value, choices, low, high, is_whole, doc, unit }) {
   input.value = value;
   input.dataset.asRun = String(value);
   return element("label", { title: `${doc}${unit ? ` [${unit}]` : ""}` }, element("span", {}, name), input);
+}
+
+// References to choose from: images that are compared here.
+function fillReferences(found) {
+  const select = $("options").querySelector("select[name=reference]"), value = state.get("if.reference") ?? "";
+  const names = new Set(["", found.reference, ...found.curves.map(({ image }) => image), value]);
+  select.replaceChildren(...[...names].map((name) => element("option", { value: name }, name || "the best")));
+  select.value = value;
 }
 
 function inputs() {
@@ -320,14 +391,10 @@ function changed() {
     return;
   }
   state.set(Object.fromEntries(inputs().map((input) => [`if.${input.name}`, input.value === input.dataset.asRun ? null : input.value])));
-  open();
+  soon();
 }
 
 // After colours changed.
 export function redraw() {
   if (shown?.match) match(shown.match, $("changed").hidden ? null : asRun?.match);
-}
-
-export function current() {
-  return shown;
 }

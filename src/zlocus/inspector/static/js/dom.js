@@ -31,9 +31,9 @@ export function metres(value, digits = 2) {
   return value === null || value === undefined ? "none" : `${value.toFixed(digits)} m`;
 }
 
-// Digits behind the point that show a hundredth of a size, in m; two at least.
+// Digits behind the point that show a tenth of a size, in m; two at least.
 export function digitsFor(size) {
-  return Math.max(2, Math.ceil(2 - Math.log10(size) - 1e-9));
+  return Math.max(2, Math.ceil(1 - Math.log10(size) - 1e-9));
 }
 
 export function signed(value) {

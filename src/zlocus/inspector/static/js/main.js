@@ -8,10 +8,11 @@ import * as map from "./map.js";
 import * as profile from "./profile.js";
 import * as state from "./state.js";
 
+const LETTERS = "zlocus.letters";
 const TABS = ["cell", "profile", "relief"];
 const KEYS = [
   ["1 to 7", "layers, on and off"],
-  ["Arrows, + and −", "move the map and zoom, while it has the focus"],
+  ["Arrows, + and −", "move the map and zoom, while it has the focus; the same for the view in three dimensions, which Shift and arrows turn"],
   ["Enter", "look at the cell in the middle of the map"],
   ["Shift and arrows", "the neighbouring cell"],
   ["[ and ]", "the height looked at, down and up"],
@@ -23,12 +24,12 @@ const KEYS = [
   ["D", "light or dark"],
   ["?", "these keys"],
 ];
-const WAIT_MS = 1000;
-let leaflet, relief = null;
+const WAIT_MS = 1000, PATIENCE_MS = 5000;
+let leaflet, surface, relief = null;
 
 async function start() {
   theme(state.get("theme"));
-  const surface = await asked("surface");
+  surface = await asked("surface");
   document.title = `${surface.title} – zlocus inspect`;
   $("title").textContent = surface.title;
   const [rows, cols] = surface.shape;
@@ -36,7 +37,7 @@ async function start() {
   leaflet = map.make(surface);
   cell.make(surface, leaflet);
   profile.make(surface, leaflet);
-  makeGo(surface);
+  makeGo();
   makeKeys();
   leaflet.on("click", ({ latlng }) => clicked(latlng));
   TABS.forEach((name) => $(`tab-${name}`).addEventListener("click", () => open(name)));
@@ -52,40 +53,46 @@ async function start() {
   addEventListener("keydown", key, true);
   // Where the keyboard is used, the map's middle is marked.
   addEventListener("keydown", () => (document.body.dataset.keys = "true"), true);
+  $("letters").checked = localStorage.getItem(LETTERS) !== "off";
+  $("letters").addEventListener("change", () => localStorage.setItem(LETTERS, $("letters").checked ? "on" : "off"));
   addEventListener("pointerdown", () => delete document.body.dataset.keys, true);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   state.onOpened(reopen);
-  await reopen();
+  reopen();
   document.body.dataset.ready = "true";
-  watch(surface);
+  watch();
 }
 
-async function reopen() {
+function reopen() {
   theme(state.get("theme"));
   map.openView();
   const tab = state.get("tab");
-  await Promise.all([cell.open(), profile.open()]);
-  await open(TABS.includes(tab) ? tab : "cell", false);
+  cell.open();
+  profile.open();
+  open(TABS.includes(tab) ? tab : "cell", false);
 }
 
 // Until everything that is made in the background is there.
-async function watch(surface) {
+async function watch() {
   for (;;) {
     let found;
     try {
       found = await asked("state");
     } catch {
       notice("The server does not answer. Is `zlocus inspect` still running?");
-      return;
+      await new Promise((done) => setTimeout(done, PATIENCE_MS));
+      continue;
     }
     const failed = ["scene", "reference"].filter((what) => found[what]?.is === "failed").map((what) => found[what].why);
-    const waiting = found.scene.is === "opening" ? ["The images are being opened."] : [];
+    const what = found.scene.what ? ` (${found.scene.what})` : "";
+    const waiting = found.scene.is === "opening" ? [`The images are being opened${what}.`] : [];
     if (found.reference?.is === "opening") waiting.push("The reference is being compared.");
     notice([...failed, ...waiting, ...found.notes].join(" "));
     $("comparison").textContent = found.comparison ?? "";
     if (found.difference && !map.has("difference")) {
       map.addLate(found.difference);
-      await Promise.all([cell.open(), profile.open()]);
+      cell.open();
+      profile.open();
     }
     document.body.dataset.scene = found.scene.is;
     if (!waiting.length) return;
@@ -114,11 +121,16 @@ async function open(name, isAsked = true) {
   if (name === "profile" && !state.get("line")) profile.begin();
   if (name === "relief") {
     // Three dimensions are loaded when somebody wants them.
-    if (!relief) {
-      relief = await import("./relief.js");
-      relief.make(await asked("surface"));
+    relief ??= import("./relief.js").then((found) => {
+      found.make(surface);
+      return found;
+    });
+    try {
+      await (await relief).show();
+    } catch {
+      relief = null;
+      $("relief-text").textContent = "The view in three dimensions could not be loaded. Open it again.";
     }
-    await relief.show();
   }
 }
 
@@ -131,7 +143,7 @@ function moveTab(event) {
   $(`tab-${next}`).focus();
 }
 
-function makeGo(surface) {
+function makeGo() {
   for (const { x, y, what } of surface.cells) $("go").append(element("option", { value: `${x},${y}` }, what));
   $("go").addEventListener("change", () => {
     if (!$("go").value) return;
@@ -150,8 +162,11 @@ function makeKeys() {
 
 function key(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
-  const isTyping = event.target.matches("input, select, textarea");
+  const isTyping = event.target.matches("input:not([type=checkbox], [type=range]), select, textarea");
   const arrows = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+  // There arrows turn the view.
+  if (event.target.closest("#relief-view") && arrows[event.key]) return;
+  if (event.key.length === 1 && !$("letters").checked) return;
   if (event.shiftKey && arrows[event.key] && !isTyping) cell.step(...arrows[event.key]);
   else if (isTyping) return;
   else if (/^[1-9]$/.test(event.key)) map.toggle(Number(event.key));
@@ -178,11 +193,12 @@ function profilePoint() {
 }
 
 async function copyLink() {
+  const link = state.link();
   try {
-    await navigator.clipboard.writeText(location.href);
+    await navigator.clipboard.writeText(link);
     flash("Copied.");
   } catch {
-    prompt("The link of this view:", location.href);
+    prompt("The link of this view:", link);
   }
 }
 
@@ -208,7 +224,7 @@ function changeTheme() {
 function redraw() {
   cell.redraw();
   profile.redraw();
-  relief?.draw();
+  relief?.then((found) => found.draw());
 }
 
 start().catch((error) => notice(`The page could not be opened: ${error.message}`));

@@ -43,7 +43,7 @@ export function make(about) {
   return map;
 }
 
-// A coordinate as links have it, to a hundredth of a cell.
+// A coordinate as links have it, to a tenth of a cell.
 export function place(value) {
   return value.toFixed(digitsFor(surface.transform[0]));
 }

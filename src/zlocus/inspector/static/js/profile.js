@@ -6,13 +6,14 @@ import { exportable } from "./figures.js";
 import * as map from "./map.js";
 import * as state from "./state.js";
 
-let surface, leaflet, line, dot, first = null, chart = null, last = null;
+let surface, leaflet, line, dot, first = null, chart = null, last = null, busy = null;
 
 export function make(about, theMap) {
   [surface, leaflet] = [about, theMap];
   line = L.layerGroup().addTo(leaflet);
   $("draw").addEventListener("click", begin);
-  exportable($("profile-figure"), `${surface.title}_profile`, () => chart);
+  exportable($("profile-figure"), () => `${surface.title}_profile`, () => chart);
+  $("along").addEventListener("input", () => along(Number($("along").value)));
 }
 
 export function isDrawing() {
@@ -26,9 +27,11 @@ export function begin() {
 }
 
 export function cancel() {
+  const isBegun = first !== null;
   first = null;
   $("map").classList.remove("drawing");
   $("draw").setAttribute("aria-pressed", "false");
+  if (isBegun) open(); // the line that was there before
 }
 
 // One end of the line, then the other.
@@ -40,24 +43,29 @@ export function point({ lat, lng }) {
     L.circleMarker(first, { radius: 5, color: "#e6007a", interactive: false }).addTo(line);
     return;
   }
-  state.set({ line: [first.lng, first.lat, lng, lat].map((value) => value.toFixed(2)).join(",") });
+  state.set({ line: [first.lng, first.lat, lng, lat].map(map.place).join(",") });
+  first = null;
   cancel();
   open();
 }
 
 // The line that the address names, or none.
 export async function open() {
+  if (first) return; // somebody draws
   const ends = state.numbers("line", 4);
+  busy?.abort();
   line.clearLayers();
   $("profile-figure").hidden = !ends;
   $("profile-text").textContent = "";
   if (!ends) return;
+  busy = new AbortController();
   const [x0, y0, x1, y1] = ends;
   L.polyline([[y0, x0], [y1, x1]], { color: "#e6007a", weight: 3, interactive: false }).addTo(line);
   dot = L.circleMarker([y0, x0], { radius: 6, color: "#e6007a", fillOpacity: 1, interactive: false });
   try {
-    last = await asked("profile", { x0, y0, x1, y1 });
+    last = await asked("profile", { x0, y0, x1, y1 }, busy.signal);
   } catch (error) {
+    if (error.name === "AbortError") return;
     $("profile-figure").hidden = true;
     $("profile-text").textContent = error.message;
     return;
@@ -84,22 +92,40 @@ function draw([x0, y0, x1, y1]) {
     marks: [
       // Where a height is missing there is a gap.
       Plot.areaY(points, { x: "distance", y1: (d) => low(d), y2: (d) => high(d), fill: colour("accent"), fillOpacity: 0.3 }),
-      ...(hasReference ? [Plot.line(points, { x: "distance", y: (d) => d.reference ?? NaN, stroke: colour("warn"), strokeWidth: 1.4 })] : []),
+      ...(hasReference ? [Plot.line(points, { x: "distance", y: (d) => d.reference ?? NaN, stroke: colour("warn"), strokeWidth: 1.4, strokeDasharray: "5 3" })] : []),
       Plot.line(points, { x: "distance", y: (d) => d.height ?? NaN, stroke: colour("accent"), strokeWidth: 1.6 }),
       Plot.ruleX(known, Plot.pointerX({ x: "distance", stroke: "currentColor", strokeOpacity: 0.4 })),
       Plot.tip(known, Plot.pointerX({ x: "distance", y: "height", fill: colour("raised"), stroke: colour("line"), title: words })),
     ],
   });
   chart.addEventListener("input", () => {
-    if (!chart.value) return dot.remove();
-    const share = chart.value.distance / Math.max(last.length_m, 1e-9);
-    return dot.setLatLng([y0 + share * (y1 - y0), x0 + share * (x1 - x0)]).addTo(line);
+    if (chart.value) mark(chart.value.distance);
+    else dot.remove();
   });
+  $("along").max = points.length - 1;
+  $("along").value = 0;
+  $("along-value").textContent = "";
   $("profile-figure").querySelector(".drawing").replaceChildren(chart);
-  const reference = hasReference ? ", and the reference in orange" : "";
+  const reference = hasReference ? ", and the reference dashed, in orange" : "";
   $("profile-text").textContent =
     `${last.length_m.toFixed(1)} m from ${map.words(x0, y0)} to ${map.words(x1, y1)}: ${known.length} of ${points.length} places, ` +
     `${last.spacing_m.toFixed(2)} m apart, have a height. The band is one standard deviation to either side${reference}.`;
+}
+
+// The place on the map.
+function mark(distance) {
+  const [x0, y0, x1, y1] = state.numbers("line", 4), share = distance / Math.max(last.length_m, 1e-9);
+  dot.setLatLng([y0 + share * (y1 - y0), x0 + share * (x1 - x0)]).addTo(line);
+}
+
+// One place of the line in words, for who does not point at the chart.
+function along(i) {
+  const [height, sigma, reference] = [last.height_m[i], last.sigma_m[i], last.reference_m?.[i] ?? null];
+  mark(last.distance_m[i]);
+  const text = height === null ? `${last.distance_m[i].toFixed(1)} m along: no height` :
+    words({ distance: last.distance_m[i], height, sigma, reference }).replaceAll("\n", ", ");
+  $("along-value").textContent = text;
+  $("along").setAttribute("aria-valuetext", text);
 }
 
 function low({ height, sigma }) {

@@ -9,13 +9,12 @@ import * as state from "./state.js";
 import { OrbitControls } from "../vendor/three/OrbitControls.js";
 
 const MOST_SIDE = 512, PICTURE_SIDE = 2048;
-let surface, renderer, scene, camera, controls, mesh = null, span = 0;
+// Of the distance, with each key.
+const CLOSER = 0.85;
+let surface, renderer, scene, camera, controls, mesh = null, span = 0, shows = 0, isPlaced = false;
 
 export function make(about) {
   surface = about;
-  const choices = [["map", "what the map shows"], ...map.titles().map(({ name, title }) => [name, title])];
-  $("drape").replaceChildren(...choices.map(([value, text]) => element("option", { value }, text)));
-  $("drape").value = about.layers.some(({ name }) => name === "ortho") ? "ortho" : "map";
   $("drape").addEventListener("change", () => {
     state.set({ drape: $("drape").value });
     show();
@@ -31,8 +30,12 @@ export function make(about) {
   });
 }
 
-export function isReady() {
-  return mesh !== null;
+// Layers may come later.
+function fillDrapes() {
+  const choices = [["map", "what the map shows"], ...map.titles().map(({ name, title }) => [name, title])];
+  const usual = map.has("ortho") ? "ortho" : "map", asked = state.get("drape") ?? usual;
+  $("drape").replaceChildren(...choices.map(([value, text]) => element("option", { value }, text)));
+  $("drape").value = choices.some(([value]) => value === asked) ? asked : usual;
 }
 
 function begin() {
@@ -53,8 +56,11 @@ function begin() {
   controls = new OrbitControls(camera, renderer.domElement);
   controls.listenToKeyEvents($("relief-view"));
   controls.maxPolarAngle = Math.PI / 2;
-  controls.addEventListener("change", draw);
-  controls.addEventListener("end", keepPlace);
+  controls.addEventListener("change", () => {
+    draw();
+    if (isPlaced) keepPlace();
+  });
+  $("relief-view").addEventListener("keydown", nearer);
   $("relief-view").replaceChildren(renderer.domElement);
   new ResizeObserver(fit).observe($("relief-view"));
   return true;
@@ -63,19 +69,23 @@ function begin() {
 // The part of the surface that the map shows.
 export async function show() {
   if (!begin()) return;
-  $("drape").value = state.get("drape") ?? $("drape").value;
+  const number = ++shows;
+  fillDrapes();
   $("exaggeration").value = state.get("exaggeration") ?? $("exaggeration").value;
   const part = map.patch(MOST_SIDE, true);
   if (!part) {
     $("relief-text").textContent = "The map shows nothing of the surface. Move it there.";
     return;
   }
-  const names = $("drape").value === "map" ? map.shown().map(([name, share]) => `${name}:${share}`) : [$("drape").value];
+  // Below what is clear the surface is seen all the same.
+  const on = $("drape").value === "map" ? map.shown().map(([name, share]) => `${name}:${share}`) : [$("drape").value];
+  const names = ["hillshade", ...on];
   const scale = PICTURE_SIDE / Math.max(part.rows, part.cols);
   const size = { height: Math.max(Math.min(Math.round(part.rows * scale), PICTURE_SIDE), 2), width: Math.max(Math.min(Math.round(part.cols * scale), PICTURE_SIDE), 2) };
   try {
     const [answer, texture] = await Promise.all([ask("heights", part), load(map.pictureAddress({ ...part, ...size }, names))]);
-    build(part, new Float32Array(await answer.arrayBuffer()), texture);
+    const heights = new Float32Array(await answer.arrayBuffer());
+    if (number === shows) build(part, heights, texture);
   } catch (error) {
     $("relief-text").textContent = error.message || "The surface could not be shown.";
   }
@@ -112,7 +122,7 @@ function build(part, heights, texture) {
   geometry.setAttribute("uv", new THREE.BufferAttribute(uv, 2));
   geometry.setIndex(new THREE.BufferAttribute(triangles(heights, rows, cols), 1));
   geometry.computeVertexNormals();
-  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide, alphaTest: 0.5 });
+  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide });
   if (mesh) {
     scene.remove(mesh);
     mesh.geometry.dispose();
@@ -145,7 +155,17 @@ function place() {
   const kept = state.numbers("eye", 6) ?? [0, 0.85, 1.05, 0, 0.05, 0];
   camera.position.set(...kept.slice(0, 3));
   controls.target.set(...kept.slice(3));
+  isPlaced = false;
   controls.update();
+  isPlaced = true;
+}
+
+function nearer(event) {
+  const share = { "+": CLOSER, "=": CLOSER, "-": 1 / CLOSER }[event.key];
+  if (!share) return;
+  camera.position.sub(controls.target).multiplyScalar(share).add(controls.target);
+  controls.update();
+  event.preventDefault();
 }
 
 function keepPlace() {

@@ -1,6 +1,6 @@
 // What the images show: the ground around the cell at two heights, and the vertical line with the match on it.
 
-import { colour, element } from "./dom.js";
+import { colour, digitsFor, element } from "./dom.js";
 import { lineColour } from "./curves.js";
 
 const CELL_PX = 4, GAP = 14, HEAD = 34;
@@ -29,13 +29,12 @@ export function windows(match, unpacked, columns) {
   const n = match.images.length, across = Math.min(n, columns), blocks = Math.ceil(n / across);
   const width = across * (size + GAP), block = 2 * (size + 18) + HEAD + GAP, height = blocks * block;
   const svg = d3.create("svg").attr("viewBox", [0, 0, width, height]).attr("width", width).attr("height", height)
-    .attr("role", "img").attr("aria-label", "The ground in each image at the surface's height and at the height looked at")
+    .attr("role", "img").attr("aria-label", "The ground in each image at the height in the middle and at the height looked at")
     .attr("font-size", 11).attr("fill", "currentColor");
   match.images.forEach((image, i) => {
     const x = (i % across) * (size + GAP), y = Math.floor(i / across) * block;
     const name = i ? `${i}. ${image.image}` : `${image.image} (reference)`;
-    svg.append("text").attr("x", x).attr("y", y + 13).attr("font-weight", 600)
-      .attr("fill", i ? lineColour(i - 1) : "currentColor").text(short(name));
+    heading(svg, x, y + 13, name, i);
     for (const row of [0, 1]) {
       const top = y + 20 + row * (size + 18);
       svg.append("image").attr("class", row ? "moving" : "fixed").attr("data-image", i).attr("x", x).attr("y", top)
@@ -59,7 +58,7 @@ export function show(svg, match, unpacked, which, k) {
   });
   d3.select(svg).selectAll(`text.${which}-value`).text(function () {
     const i = Number(this.dataset.image);
-    const at = `${match.heights_m[k].toFixed(2)} m`;
+    const at = `${match.heights_m[k].toFixed(digitsFor(match.step_m))} m`;
     return i ? `${at}: ${value(match.ncc[i - 1][k])}` : at;
   });
 }
@@ -84,19 +83,23 @@ export function loci(match, columns) {
   match.images.forEach((image, i) => {
     const scale = size / Math.max(image.rows, image.cols);
     const place = svg.append("g").attr("transform", `translate(${(i % across) * (size + GAP)} ${Math.floor(i / across) * block + 20})`);
-    place.append("text").attr("y", -7).attr("font-weight", 600).attr("fill", i ? lineColour(i - 1) : "currentColor")
-      .text(short(i ? `${i}. ${image.image}` : `${image.image} (reference)`));
+    heading(place, 0, -7, i ? `${i}. ${image.image}` : `${image.image} (reference)`, i);
     place.append("image").attr("href", image.crop).attr("width", image.cols * scale).attr("height", image.rows * scale)
       .attr("preserveAspectRatio", "none").style("image-rendering", "pixelated");
     const line = image.line.map((xy) => drawn(xy, image, scale));
     if (i) {
-      place.append("path").attr("d", d3.line().defined((d) => d !== null)(line)).attr("fill", "none")
-        .attr("stroke", "#ffd400").attr("stroke-width", 1.8);
+      // Dark below light, so that it is seen on any ground.
+      for (const [stroke, width] of [["#000000", 3.6], ["#ffd400", 1.8]]) {
+        place.append("path").attr("d", d3.line().defined((d) => d !== null)(line)).attr("fill", "none")
+          .attr("stroke", stroke).attr("stroke-width", width);
+      }
     }
     cross(place, line[middle(match)], "M-7 0H7M0 -7V7", "#00d0ff");
     cross(place, along(line, match), "M-5 -5L5 5M-5 5L5 -5", "#ff3030");
-    place.append("circle").attr("class", "looked-at").attr("r", 5).attr("fill", "none").attr("stroke", "#ffffff")
-      .attr("stroke-width", 2).datum(line);
+    for (const [stroke, width] of [["#000000", 4], ["#ffffff", 2]]) {
+      place.append("circle").attr("class", "looked-at").attr("r", 5).attr("fill", "none").attr("stroke", stroke)
+        .attr("stroke-width", width).datum(line);
+    }
   });
   return svg.node();
 }
@@ -106,7 +109,16 @@ function drawn([x, y], image, scale) {
 }
 
 function cross(place, at, path, stroke) {
-  if (at) place.append("path").attr("d", path).attr("transform", `translate(${at})`).attr("stroke", stroke).attr("stroke-width", 2);
+  if (!at) return;
+  for (const [colour, width] of [["#000000", 4], [stroke, 2]]) {
+    place.append("path").attr("d", path).attr("transform", `translate(${at})`).attr("stroke", colour).attr("stroke-width", width);
+  }
+}
+
+// The name of an image, with the colour of its curve below it.
+function heading(svg, x, y, name, i) {
+  svg.append("text").attr("x", x).attr("y", y).attr("font-weight", 600).text(short(name)).append("title").text(name);
+  if (i) svg.append("rect").attr("x", x).attr("y", y + 2).attr("width", 24).attr("height", 3).attr("fill", lineColour(i - 1));
 }
 
 // The peak lies between two of the heights.
