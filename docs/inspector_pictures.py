@@ -28,7 +28,7 @@ VIEWS = {
     "&eye=-0.35,0.75,0.95,0,-0.02,0.03",
 }
 # How far the panel of the cell is scrolled, px.
-SCROLLED = 330
+SCROLLED = 390
 
 
 def main() -> None:

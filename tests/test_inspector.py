@@ -454,7 +454,7 @@ def test_what_is_no_surface_is_refused_with_a_sentence(out, tmp_path):
         ("api/heights?row=1e9&col=0&rows=10&cols=10&height=10&width=10", 400),
         ("api/picture.png?row=0&col=0&rows=1&cols=1&height=1&width=1&layer=..", 404),
         ("api/picture.png?row=0&col=0&rows=1&cols=1&height=1&width=1&layer=height:7", 400),
-        ("api/state?x=1", 400), ("api/nothing", 404), ("index.html", 404), ("dsm.tif", 404), ("run.json", 404),
+        ("api/surface?x=1", 400), ("api/nothing", 404), ("index.html", 404), ("dsm.tif", 404), ("run.json", 404),
     ],
 )  # fmt: skip
 def test_nothing_but_what_the_page_asks_is_answered(page, out, path, status):
@@ -582,6 +582,7 @@ def test_addresses_and_views():
     assert fragment_of("") == ""
     assert fragment_of("http://127.0.0.1:1/t/#tab=cell&cell=1,2") == "#tab=cell&cell=1,2"
     assert fragment_of("tab=cell") == "#tab=cell"
+    assert fragment_of("\x1b[31m a\n\u00e9") == "#%1B[31m%20a%0A%C3%A9"
     with listening(checked_address("127.0.0.1"), 0) as listener:
         taken = listener.getsockname()[1]
         address = checked_address("127.0.0.1")
@@ -623,7 +624,7 @@ def test_a_surface_that_is_made_again_is_not_mixed_with_the_old(out, tmp_path):
         record = (copy / "run.json").read_text()
         (copy / "run.json").write_text(record + " ")
         with pytest.raises(InputError, match="made again"):
-            inspection.cell(x, y, WhatIf())
+            inspection.check_unchanged()
         assert inspection.state()["notes"] == [MADE_AGAIN]
 
 
@@ -636,6 +637,11 @@ def test_files_that_are_gone_are_an_answer(out, tmp_path):
             answer = client.get(path)
             assert answer.status_code == 409
             assert "sigma.tif" in answer.json()["error"]
+        (copy / "run.json").unlink()
+        for path in ("api/heights?row=0&col=0&rows=9&cols=9&height=9&width=9", "tiles/height/0/0/0.png", "api/surface"):
+            answer = client.get(path)
+            assert (answer.status_code, answer.json()["error"]) == (409, MADE_AGAIN)
+        assert client.get("api/state").status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -697,9 +703,12 @@ def test_the_command_serves_until_it_is_interrupted(out, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--align",), "--align is about a reference, and none is given"), (("--host", "0.0.0.0"), "all addresses"),
+        (("--align",), "--align is about a reference, and none is given"), (("--host", "0.0.0.0"), "no single address"),
         (("--host", "example.org"), "no address"),
         (("--reference", "nothing.tif"), "There is no reference nothing.tif"),
+        (("--reference", "pyproject.toml", "--margin", "nan"), "--margin nan"),
+        (("--reference", "pyproject.toml", "--coregister", "foo"), "--coregister foo is not known"),
+        (("--reference", "pyproject.toml", "--geoid", "nothing.tif"), "nothing.tif"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_served_is_one_sentence(out, arguments, says):

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -58,6 +59,17 @@ def submitted(pool: ThreadPoolExecutor, function: Callable[..., Result], *argume
     _running.add(future)
     future.add_done_callback(_running.discard)
     return future
+
+
+@contextmanager
+def busy() -> Iterator[None]:
+    """A call of a thread of somebody else's, which `is_busy` knows of meanwhile."""
+    call: Future[Any] = Future()
+    _running.add(call)
+    try:
+        yield
+    finally:
+        _running.discard(call)
 
 
 def is_busy() -> bool:

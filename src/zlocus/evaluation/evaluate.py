@@ -141,7 +141,7 @@ def evaluate(
     ConfigError
         A margin, threshold or slope out of range, classes on another grid, or both kinds of alignment.
     """
-    _check_options(margin_m, (threshold_m, *more_thresholds_m), align, coregister)
+    check_options(margin_m, (threshold_m, *more_thresholds_m), align, coregister)
     slope_bands(np.zeros(0), slope_edges_deg)
     compared = same_heights(read_heights(dsm), read_heights(reference), geoid)
     surface, heights = compared.surface, compared.reference
@@ -172,7 +172,14 @@ def evaluate(
     )  # fmt: skip
 
 
-def _check_options(margin_m: float, thresholds_m: Sequence[float], align: bool, coregister: str | None) -> None:
+def check_options(margin_m: float, thresholds_m: Sequence[float], align: bool, coregister: str | None) -> None:
+    """Refuse what no evaluation can be asked.
+
+    Raises
+    ------
+    ConfigError
+        A margin or threshold out of range, a co-registration that is not known, or both kinds of alignment.
+    """
     if not margin_m >= 0:
         raise ConfigError(f"--margin {margin_m:g} is negative. Give 0 or more metres.")
     for threshold_m in thresholds_m:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from zlocus.products.report.page import RECORD, run_record
 from zlocus.scene import is_local
 from zlocus.sensors.model import FloatArray
 
-NEEDED = ("dsm", "sigma", "quality", "views")
+NEEDED = {"dsm": "float32", "sigma": "float32", "quality": "uint16", "views": "uint8"}
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,13 @@ class Patch:
     cols: float
     height: int
     width: int
+
+    def strips(self, px: int) -> Iterator[Patch]:
+        """The patch from top to bottom, so many rows of pixels at a time."""
+        down = self.rows / self.height
+        for top in range(0, self.height, px):
+            height = min(px, self.height - top)
+            yield Patch(self.row + top * down, self.col, height * down, self.cols, height, self.width)
 
     def widened(self, px: int) -> Patch:
         """With so many more pixels on all sides."""
@@ -170,10 +177,10 @@ def surface_folder(out: Path) -> SurfaceFolder:
         There is no complete surface in it.
     """
     run = checked_run(out)
-    for name in NEEDED:
+    for name, kind in NEEDED.items():
         with kept_raster(out / f"{name}.tif") as file:
-            if file.shape != tuple(run["grid"]["shape"]):
-                raise InputError(f"{out / name}.tif is not on the grid that run.json says. Make the surface again.")
+            if file.shape != tuple(run["grid"]["shape"]) or file.dtypes != (kind,):
+                raise InputError(f"{out / name}.tif is not the one that run.json tells of. Make the surface again.")
     with kept_raster(out / "dsm.tif") as file:
         above = file.descriptions[0] or "height"
         crs = CRS.from_user_input(run["grid"]["crs"])

@@ -18,9 +18,8 @@ from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
 from zlocus.inspector.queries import KINDS, MOST, WINDOWS
-from zlocus.inspector.reference import Reference, reference_for
+from zlocus.inspector.reference import Reference, check_comparison, reference_for
 from zlocus.inspector.restore import Restored, config_of, restored
-from zlocus.io.opening import existing_file
 from zlocus.options import RunConfig, SelectionOptions
 from zlocus.products.record import read_record
 from zlocus.products.report.comparison import Comparison
@@ -37,7 +36,7 @@ NOT_THE_SAME = (
     "machine. Curves may differ from those that the surface rests on."
 )
 NOT_KNOWN = "The run did not keep what tells whether cameras come out again as they were."
-MADE_AGAIN = "The surface was made again since this page was opened. Start `zlocus inspect` anew."
+MADE_AGAIN = "The surface was made again, or removed, since this page was opened. Start `zlocus inspect` anew."
 # Options that nothing of a single cell depends on.
 OF_RUNS = ("stopped_share", "fewest_views")
 
@@ -87,7 +86,7 @@ class Inspection:
         self.folder: SurfaceFolder = surface_folder(out)
         self._state = self._now()
         if comparison is not None:
-            existing_file(comparison.reference, "reference")
+            check_comparison(comparison)
         self._may_ask, self._told = may_ask, Told()
         self.layers: dict[str, Layer] = layers_of(self.folder)
         self.comparison = comparison
@@ -170,8 +169,6 @@ class Inspection:
         at = self.folder.cell_of(x, y)
         if at is None:
             raise GeometryError("The point lies outside the surface.")
-        if self._now() != self._state:
-            raise InputError(MADE_AGAIN)
         record = cell_record(self.folder, self.reference, *at)
         if not self._scene.done():
             return record | {"is_pending": True}
@@ -183,6 +180,17 @@ class Inspection:
         except (GeometryError, InputError) as error:
             return record | {"error": str(error)}
         return record | {"match": match}
+
+    def check_unchanged(self) -> None:
+        """Refuse to look at a surface that is no more the one that was opened.
+
+        Raises
+        ------
+        InputError
+            It was made again, or removed.
+        """
+        if self._now() != self._state:
+            raise InputError(MADE_AGAIN)
 
     def _now(self) -> tuple[int, int] | None:
         """What tells whether the run is still the one that was opened."""

@@ -22,6 +22,8 @@ Rgba = NDArray[np.uint8]
 SAMPLED = 800
 MOST_CLASSES = 12
 OPAQUE = 255
+# Rows of a picture that are worked on at a time.
+STRIP_PX = 256
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,11 @@ def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
 
 def composed(layers: Sequence[tuple[Layer, float]], patch: Patch) -> Rgba:
     """Layers over each other, the first below, each with an opacity of 0 to 1, as the map shows them."""
+    strips = [_composed(layers, strip) for strip in patch.strips(STRIP_PX)]
+    return np.concatenate(strips)
+
+
+def _composed(layers: Sequence[tuple[Layer, float]], patch: Patch) -> Rgba:
     shape = (patch.height, patch.width)
     colours, opacity = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 1), np.float32)
     for layer, share in layers:
@@ -148,7 +155,7 @@ def _sigma(folder: SurfaceFolder) -> Layer:
         cells = read_patch(folder.path("sigma"), patch, True)
         return with_opacity(maps.sigma_colours(cells.values[0], top), cells.known)
 
-    ticks = [tick.replace(" m", "") for tick in maps.sigma_ticks(top)]
+    ticks = [tick.replace(" m", "", 1) for tick in maps.sigma_ticks(top)]
     legend = scale("standard deviation, m", maps.gradient(cv2.COLORMAP_CIVIDIS), ticks)
     return Layer("sigma", "Standard deviation", legend, draw)
 

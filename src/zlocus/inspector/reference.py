@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from odc.geo.geobox import GeoBox
 
-from zlocus.evaluation.evaluate import Shift, evaluate
+from zlocus.evaluation.evaluate import Shift, check_options, evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.vertical import same_heights
-from zlocus.io.opening import open_raster
+from zlocus.io.opening import existing_file, open_raster
 from zlocus.io.raster import RasterSink
 from zlocus.io.vertical import vertical_datum
 from zlocus.products.report.comparison import Comparison, full_colour_m
@@ -30,6 +30,20 @@ class Reference:
     name: str
     full_m: float
     sentence: str
+
+
+def check_comparison(comparison: Comparison) -> None:
+    """Refuse at once what `reference_for` would refuse later.
+
+    Raises
+    ------
+    InputError, ConfigError
+        There is no such file, or an option is out of range.
+    """
+    existing_file(comparison.reference, "reference")
+    check_options(comparison.margin_m, (comparison.threshold_m,), comparison.align, comparison.coregister)
+    if comparison.geoid is not None:
+        vertical_datum(str(comparison.geoid), "--geoid")
 
 
 def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference:

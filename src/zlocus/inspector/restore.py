@@ -122,6 +122,14 @@ def folder_of(out: Path, run: Mapping[str, Any]) -> Path:
     candidates.append(Path.cwd())
     local = [Path(each["path"]) for each in run["inputs"] if not is_remote(Path(each["path"]))]
     for folder in candidates:
-        if all((folder / path).is_file() for path in local):
+        if all(_is_file(folder / path) for path in local):
             return folder
     return candidates[0]
+
+
+def _is_file(path: Path) -> bool:
+    """Whether a file is there; a name that none can have is not."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False

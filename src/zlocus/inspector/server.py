@@ -26,6 +26,7 @@ from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.layers import Layer, composed, png_of
 from zlocus.inspector.profile import profile
 from zlocus.products.record import finite_only
+from zlocus.threads import busy
 
 THREADS = 6
 TILE_PX = 256
@@ -55,15 +56,21 @@ def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> AS
     """The page of an inspection. hosts : "host:port" under which it is asked for."""
     static = page_files()
     # A click that nobody waits for any more does not keep the others waiting.
-    clicks, others = CapacityLimiter(1), CapacityLimiter(THREADS)
+    clicks, pictures, others = CapacityLimiter(1), CapacityLimiter(1), CapacityLimiter(THREADS)
 
     async def of_page(request: Request) -> Response:
         return file_of(static, request.path_params.get("name", "index.html"))
 
+    async def of_state(request: Request) -> Response:
+        return Response(json_of(inspection.state()), media_type="application/json")
+
     routes = [
         Route("/", of_page),
         Route("/static/{name:path}", of_page),
+        Route("/api/state", of_state),
         Route("/api/cell", answered(inspection, cell, clicks)),
+        Route("/api/heights", answered(inspection, heights, pictures)),
+        Route("/api/picture.png", answered(inspection, picture, pictures)),
         *(Route(f"/api/{name}", answered(inspection, answer, others)) for name, answer in ANSWERS.items()),
         Route("/tiles/{layer}/{level}/{col}/{row}.png", answered(inspection, tile, others)),
     ]
@@ -89,7 +96,9 @@ def answered(inspection: Inspection, answer: Reply, slots: CapacityLimiter) -> A
 
     def said(request: Request) -> Response:
         try:
-            return answer(inspection, request)
+            with busy():
+                inspection.check_unchanged()
+                return answer(inspection, request)
         except ZlocusError as error:
             return Response(json_of({"error": str(error)}), status_of(error), media_type="application/json")
 
@@ -112,12 +121,6 @@ def surface(inspection: Inspection, request: Request) -> Response:
     """What the page has to know first."""
     queries.once(request.query_params.multi_items(), ())
     return Response(json_of(inspection.summary()), media_type="application/json")
-
-
-def state(inspection: Inspection, request: Request) -> Response:
-    """How far the scene is."""
-    queries.once(request.query_params.multi_items(), ())
-    return Response(json_of(inspection.state()), media_type="application/json")
 
 
 def cell(inspection: Inspection, request: Request) -> Response:
@@ -186,4 +189,4 @@ def json_of(record: Any) -> bytes:
     return json.dumps(finite_only(record), allow_nan=False).encode()
 
 
-ANSWERS = {"surface": surface, "state": state, "profile": line, "heights": heights, "picture.png": picture}
+ANSWERS = {"surface": surface, "profile": line}

@@ -43,7 +43,9 @@ def inspect_surface(
     address = checked_address(host)
     fragment = fragment_of(view)
     # An end that is asked for this way cleans up too.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), lambda number, frame: sys.exit(128 + number))
     with listening(address, port) as listener, Inspection(out, comparison, may_ask) as inspection:
         port, token = listener.getsockname()[1], new_token()
         names = [f"[{address}]" if address.version == 6 else str(address)]
@@ -53,7 +55,7 @@ def inspect_surface(
         app = application(inspection, token, frozenset(known))
         announce(f"http://{names[0]}:{port}/{token}/{fragment}", not address.is_loopback)
         config = uvicorn.Config(
-            app, log_level="warning", access_log=False, server_header=False, ws="none",
+            app, log_level="error", access_log=False, server_header=False, ws="none",
             timeout_graceful_shutdown=GRACE_S,
         )  # fmt: skip
         uvicorn.Server(config).run(sockets=[listener])
@@ -71,14 +73,18 @@ def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError as error:
         raise ConfigError(f"--host {host} is no address. Give one of this machine, such as 127.0.0.1.") from error
-    if address.is_unspecified:
-        raise ConfigError(f"--host {host} stands for all addresses. Give the one under which the page is asked for.")
+    if address.is_unspecified or address.is_multicast:
+        raise ConfigError(
+            f"--host {host} stands for no single address. Give that under which the page is asked for."
+        )
     return address
 
 
 def fragment_of(view: str) -> str:
     """What stands behind the # of a link, with it; "" of nothing."""
     text = view.partition("#")[2] if "#" in view else view
+    # What no address holds, as a terminal would otherwise take it for its own.
+    text = "".join(c if "!" <= c <= "~" else "".join(f"%{byte:02X}" for byte in c.encode()) for c in text)
     return f"#{text}" if text else ""
 
 

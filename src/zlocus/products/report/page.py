@@ -124,7 +124,7 @@ def run_record(out: Path) -> dict[str, Any]:
         It is missing, damaged, or of something else.
     """
     path = out / RECORD
-    if not path.exists():
+    if not path.is_file():
         raise InputError(f"There is no {RECORD} in {out}. Give the folder that `zlocus dsm` wrote (-o).")
     run = read_record(path)
     missing = [key for key in NEEDED if key not in run]

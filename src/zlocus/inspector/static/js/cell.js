@@ -18,13 +18,19 @@ const FIRST = [
   "rho1_high", "ratio_high", "rho1_middle", "ratio_middle", "rho1_low", "ratio_low", "rho1_fair", "ratio_fair", "sigma_steps",
   "neighbours", "radius_px", "order", "least_worth", "most_images",
 ];
-let surface, leaflet, drawn, shown = null, asRun = null, busy = null, resting = null, unpacked = [];
+let surface, leaflet, drawn, shown = null, asRun = null, busy = null, resting = null, framed = null, unpacked = [];
 let charts = {};
 
 export function make(about, theMap) {
   [surface, leaflet] = [about, theMap];
   drawn = L.layerGroup().addTo(leaflet);
-  $("height").addEventListener("input", () => moved(true));
+  $("height").addEventListener("input", () => {
+    // Once per frame, however fast it is dragged.
+    framed ??= requestAnimationFrame(() => {
+      framed = null;
+      moved(true);
+    });
+  });
   $("reset").addEventListener("click", () => asInRun());
   $("options").addEventListener("change", () => changed());
   $("options").addEventListener("submit", (event) => event.preventDefault());
@@ -89,14 +95,14 @@ export async function open() {
 
 async function load([x, y], signal) {
   const changes = whatIf();
-  let record = await asked("cell", { x, y, ...changes }, signal);
+  let record = await asked("cell", { ...changes, x, y }, signal);
   facts(record);
   while (record.is_pending) {
     $("cell-error").hidden = false;
     $("cell-error").textContent = "The images are being opened; curves follow.";
     await new Promise((done) => setTimeout(done, WAIT_MS));
     if (signal.aborted) return;
-    record = await asked("cell", { x, y, ...changes }, signal);
+    record = await asked("cell", { ...changes, x, y }, signal);
   }
   const isChanged = Object.keys(changes).length > 0;
   if (!isChanged) asRun = record;

@@ -6,7 +6,7 @@ import { colour } from "./dom.js";
 const LIGHT = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195"];
 const DARK = ["#4aa8e0", "#ff8a4a", "#33cfa3", "#e39ac6", "#f0b73a", "#8fd0f5", "#c08a58", "#ad85c9"];
 const DASHES = ["", "7 4", "2 3"];
-const SIZE = { width: 520, height: 260, marginLeft: 42, marginBottom: 38, marginTop: 16, marginRight: 12 };
+const SIZE = { width: 520, height: 266, marginLeft: 42, marginBottom: 44, marginTop: 16, marginRight: 12 };
 
 export function isDark() {
   return document.documentElement.dataset.theme === "dark" ||

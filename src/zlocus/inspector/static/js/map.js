@@ -30,6 +30,7 @@ export function make(about) {
   // Not so far away that nothing is seen of it.
   map.setMinZoom(Math.min(map.getBoundsZoom(bounds()) - 1, 0));
   map.setMaxBounds(bounds().pad(1));
+  if (matchMedia("(max-width: 860px)").matches) $("layers").open = false;
   openView();
   map.on("moveend", () => {
     const { lat, lng } = map.getCenter();
@@ -39,7 +40,6 @@ export function make(about) {
   map.on("mousemove", ({ latlng }) => ($("pointer").textContent = words(latlng.lng, latlng.lat)));
   map.on("mouseout", () => ($("pointer").textContent = ""));
   new ResizeObserver(() => map.invalidateSize()).observe($("map"));
-  if (matchMedia("(max-width: 860px)").matches) $("layers").open = false;
   return map;
 }
 
@@ -56,8 +56,8 @@ export function words(x, y, digits = digitsFor(surface.transform[0]) - 1) {
 // The place and the layers that the address asks for.
 export function openView() {
   const at = state.numbers("at", 3);
-  if (at) map.setView([at[1], at[0]], at[2], { animate: false });
-  else map.fitBounds(bounds(), { animate: false });
+  if (at && bounds().pad(1).contains([at[1], at[0]])) map.setView([at[1], at[0]], at[2], { animate: false });
+  else home();
   const asked = state.get("layers");
   const shown = asked === undefined || asked === null ? DEFAULT_LAYERS : parsed(asked);
   for (const layer of layers.values()) show(layer, shown[layer.name]);
@@ -87,7 +87,9 @@ export function holds(x, y) {
 
 // All of the surface.
 export function home() {
-  map.fitBounds(bounds());
+  // Beside the list of layers, where there is room.
+  const list = $("layers"), aside = list.open && list.offsetWidth < $("map").clientWidth / 2 ? list.offsetWidth : 0;
+  map.fitBounds(bounds(), { animate: false, paddingTopRight: [aside, 0] });
 }
 
 export function bounds() {

@@ -85,7 +85,7 @@ function draw([x0, y0, x1, y1]) {
   const known = points.filter((each) => each.height !== null);
   const hasReference = points.some((each) => each.reference !== null);
   chart = Plot.plot({
-    width: 520, height: 300, marginLeft: 52, marginBottom: 38, ariaLabel: "Height along the line",
+    width: 520, height: 306, marginLeft: 52, marginBottom: 44, ariaLabel: "Height along the line",
     style: { fontSize: "12px", background: "transparent" },
     x: { label: "distance, m", labelAnchor: "center", labelArrow: "none" },
     y: { label: "height, m", labelArrow: "none", nice: true, zero: false },

@@ -131,9 +131,9 @@ function build(part, heights, texture) {
   }
   mesh = new THREE.Mesh(geometry, material);
   scene.add(mesh);
+  fit();
   place();
   exaggerate();
-  fit();
   const shape = `${rows} x ${cols} places, ${step.toFixed(2)} m apart`;
   $("relief-text").textContent = `${shape}, ${sorted[0].toFixed(1)} to ${sorted.at(-1).toFixed(1)} m. Drag to turn, wheel or pinch to come closer; holes are holes.`;
   $("relief-view").dataset.places = String(known.length);
@@ -152,7 +152,9 @@ function triangles(heights, rows, cols) {
 }
 
 function place() {
-  const kept = state.numbers("eye", 6) ?? [0, 0.85, 1.05, 0, 0.05, 0];
+  // All of it, in a window that may be narrow.
+  const away = Math.max(1, 1.1 / camera.aspect);
+  const kept = state.numbers("eye", 6) ?? [0, 0.85 * away, 1.05 * away, 0, 0, 0];
   camera.position.set(...kept.slice(0, 3));
   controls.target.set(...kept.slice(3));
   isPlaced = false;

@@ -138,7 +138,7 @@ export function moveLoci(svg, k) {
 }
 
 function short(name) {
-  return name.length > 18 ? `${name.slice(0, 8)}…${name.slice(-9)}` : name;
+  return name.length > 15 ? `${name.slice(0, 7)}…${name.slice(-7)}` : name;
 }
 
 export function inkOf(label) {
