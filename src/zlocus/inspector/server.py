@@ -1,5 +1,7 @@
-"""What the page of a surface asks, answered. No part of an address is ever taken for a path: it
-names a layer, or one of the page's own files, which are read once when the server starts.
+"""What the page of a surface asks, answered.
+
+No part of an address is ever taken for a path: it names a layer, or one of the page's own files, which are read once
+when the server starts.
 """
 
 from __future__ import annotations
@@ -71,7 +73,8 @@ def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> AS
         Route("/api/cell", answered(inspection, cell, clicks)),
         Route("/api/heights", answered(inspection, heights, pictures)),
         Route("/api/picture.png", answered(inspection, picture, pictures)),
-        *(Route(f"/api/{name}", answered(inspection, answer, others)) for name, answer in ANSWERS.items()),
+        Route("/api/surface", answered(inspection, surface, others)),
+        Route("/api/profile", answered(inspection, line, others)),
         Route("/tiles/{layer}/{level}/{col}/{row}.png", answered(inspection, tile, others)),
     ]
     app = Starlette(routes=routes, exception_handlers={404: nothing_here, 405: nothing_here})
@@ -187,6 +190,3 @@ def layer_of(inspection: Inspection, name: str) -> Layer:
 def json_of(record: Any) -> bytes:
     """JSON, with null for every number that is not finite."""
     return json.dumps(finite_only(record), allow_nan=False).encode()
-
-
-ANSWERS = {"surface": surface, "profile": line}

@@ -74,9 +74,7 @@ def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     except ValueError as error:
         raise ConfigError(f"--host {host} is no address. Give one of this machine, such as 127.0.0.1.") from error
     if address.is_unspecified or address.is_multicast:
-        raise ConfigError(
-            f"--host {host} stands for no single address. Give that under which the page is asked for."
-        )
+        raise ConfigError(f"--host {host} stands for no single address. Give that under which the page is asked for.")
     return address
 
 
