@@ -169,6 +169,7 @@ LAID_OUT = {
     "products.md": lay_out_products,
     "large.md": lay_out_images,
     "report.md": lay_out_comparison,
+    "inspect.md": lay_out_images,
     "evaluate.md": lay_out_surfaces,
     "vertical.md": lay_out_datums,
     "tutorial.md": lambda folder: None,

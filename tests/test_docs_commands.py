@@ -7,10 +7,12 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
 import typer.main
 from typer.testing import CliRunner
@@ -23,6 +25,7 @@ PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks"
 COMMANDS = vars(typer.main.get_command(app))["commands"]
 # Per cent, of the figures in the tutorial.
 TOLD_TO = 0.5
+ENDS_WITHIN_S = 10.0
 # What stands for the inputs of a run in lines that tell the usage.
 INPUTS = "img_1.tif img_2.tif img_3.tif"
 
@@ -85,8 +88,21 @@ def run(step: Step, folder: Path) -> None:
     out = folder / words[words.index("-o") + 1] if "-o" in words else folder / "scene.yaml"
     if words[:2] == ["zlocus", "import"] or "-o" in words:
         shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
+    if words[:2] == ["zlocus", "inspect"]:
+        check_page(words, folder, environment)
+        return
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{step.text}\n{done.stdout}\n{done.stderr}"
+
+
+def check_page(words: list[str], folder: Path, environment: dict[str, str]) -> None:
+    """A command that serves a page prints its address, which answers, and ends when it is interrupted."""
+    with subprocess.Popen(words, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        assert httpx.get(address).status_code == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(ENDS_WITHIN_S) == 130
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if steps_of(p)], ids=lambda p: p.relative_to(ROOT).as_posix())
@@ -193,5 +209,5 @@ def test_blocks_of_commands_are_found():
     assert steps[0] == "zlocus import colmap PROJECT -o scene.yaml"
     assert steps[-1] == "zlocus dsm scene.yaml -o facade"
     assert len(steps) == 8
-    assert len(steps_of(ROOT / "benchmarks" / "README.md")) == 13
+    assert len(steps_of(ROOT / "benchmarks" / "README.md")) == 14
     assert INLINE.findall("as `zlocus dsm IN` says") == ["zlocus dsm IN"]

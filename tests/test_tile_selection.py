@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 
-import zlocus.pipeline
+import zlocus.settling
 import zlocus.tile
 from rendered_scenes import read, run
 from zlocus.matching.visibility import covers
@@ -176,14 +176,14 @@ def test_of_three_images_none_is_left_out(town, tmp_path, blocks_used):
 
 
 def test_the_order_of_tie_points_changes_nothing(guided, town, tmp_path, monkeypatch):
-    settle = zlocus.pipeline.settle
+    settle = zlocus.settling.settle
 
     def shuffled(*arguments):
         settled = settle(*arguments)
         order = np.random.default_rng(3).permutation(len(settled.ties))
         return replace(settled, ties=settled.ties[order])
 
-    monkeypatch.setattr(zlocus.pipeline, "settle", shuffled)
+    monkeypatch.setattr(zlocus.settling, "settle", shuffled)
     again = surface(town, tmp_path / "out")
     for product in PRODUCTS:
         assert (again / product).read_bytes() == (guided[0] / product).read_bytes(), product
