@@ -24,6 +24,8 @@ MOST_CLASSES = 12
 OPAQUE = 255
 # Rows of a picture that are worked on at a time.
 STRIP_PX = 256
+# Of what was not asked for, and its opacity as a part of the others'.
+GREY, SHADE = 128, 3
 
 
 @dataclass(frozen=True)
@@ -184,12 +186,16 @@ def _views(folder: SurfaceFolder) -> Layer:
 def _quality(folder: SurfaceFolder) -> Layer:
     """Reasons; clear where nothing is to be said, so that what lies below is seen."""
     colours = np.array([*(colour for *_, colour in maps.GROUPS), maps.PLAIN[1]], np.uint8)[:, ::-1]
+    colours[0] = GREY
     groups = maps.groups_of(np.arange(1 << 16))
 
     def draw(patch: Patch) -> Rgba:
         cells = read_patch(folder.path("quality"), patch, False)
         group = groups[cells.values[0]]
-        return with_opacity(colours[group], cells.known & (group < len(maps.GROUPS)))
+        drawn = with_opacity(colours[group], cells.known & (group < len(maps.GROUPS)))
+        # What was not asked for, or cannot be seen, is no more than a shade.
+        drawn[..., 3][group == 0] //= SHADE
+        return drawn
 
     items = [(maps.css(colours[k]), meaning) for k, (meaning, *_) in enumerate(maps.GROUPS)]
     return Layer("quality", "Reasons", classes("why there is no height, or one to be checked", items), draw)

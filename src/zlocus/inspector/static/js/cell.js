@@ -2,7 +2,7 @@
 
 import { asked, Refused } from "./api.js";
 import * as curves from "./curves.js";
-import { $, digitsFor, element, metres, signed } from "./dom.js";
+import { $, digitsFor, element, metres, notice, signed } from "./dom.js";
 import { exportable } from "./figures.js";
 import * as map from "./map.js";
 import * as state from "./state.js";
@@ -37,10 +37,26 @@ export function make(about, theMap) {
   makeOptions();
   for (const [id, what] of [["ncc", "correlation"], ["sncc", "mean"], ["windows", "windows"], ["loci", "lines"]]) {
     const name = () => `${surface.title}_${what}_${shown?.row}_${shown?.col}`;
-    exportable($(`${id}-figure`), name, () => charts[id]);
+    exportable($(`${id}-figure`), name, () => charts[id], () => words(id));
   }
+  for (const kind of ["focusin", "pointerover"]) $("options").addEventListener(kind, explain);
   $("others").addEventListener("toggle", () => otherImages());
   $("find").addEventListener("input", () => otherImages());
+}
+
+// What stands beside a figure that is saved alone.
+function words(id) {
+  const lines = id === "ncc" ? shown.match.curves.map(({ image }, j) => ({ text: `${j + 1}. ${image}`, colour: curves.lineColour(j) })) : [];
+  const below = $(`${id}-figure`).querySelector(":scope > p.aside")?.textContent.replace(/\s+/g, " ").trim();
+  if (below) lines.push({ text: below });
+  if (["windows", "ncc", "sncc"].includes(id)) lines.push({ text: `height looked at: ${$("height-value").textContent}` });
+  const title = `${$(`${id}-figure`).querySelector("figcaption span").textContent}, reference ${shown.match.reference}`;
+  return { title, subtitle: `${surface.title}, row ${shown.row}, column ${shown.col} (${map.words(shown.x, shown.y)})`, lines };
+}
+
+function explain(event) {
+  const text = event.target.closest("#options label")?.title;
+  if (text) $("option-doc").textContent = text;
 }
 
 // Look at the cell at a ground point.
@@ -73,6 +89,7 @@ export async function open() {
   drawn.clearLayers();
   if (!at) {
     shown = null;
+    if (state.get("cell")) notice(`The link names no place: cell=${state.get("cell")}.`);
     return;
   }
   $("changed").hidden = !Object.keys(whatIf()).length;
@@ -147,12 +164,14 @@ function facts(record) {
     ["Standard deviation", metres(record.sigma_m, digits() + 1)],
     ["Images used", record.height_m === null ? "–" : String(record.n_images)],
   ];
-  if (record.difference_m !== null) rows.push(["Less the reference", `${signed(Number(record.difference_m.toFixed(digits())))} m`]);
-  const ids = { Height: "cell-height", "Standard deviation": "cell-sigma", "Images used": "cell-images", "Less the reference": "cell-difference" };
+  if (record.difference_m !== null) rows.push(["Surface less reference", `${signed(Number(record.difference_m.toFixed(digits())))} m`]);
+  const ids = { Height: "cell-height", "Standard deviation": "cell-sigma", "Images used": "cell-images", "Surface less reference": "cell-difference" };
   $("cell-facts").replaceChildren(
     ...rows.flatMap(([name, text]) => [element("dt", {}, name), element("dd", { id: ids[name] ?? null }, text)]),
   );
-  $("cell-reasons").replaceChildren(...record.reasons.map(reason));
+  // Of a cell without a height: why it has none.
+  const said = record.height_m === null ? record.reasons.filter(({ fate }) => fate === "none") : record.reasons;
+  $("cell-reasons").replaceChildren(...said.map(reason));
 }
 
 // Of heights: they are no better than a tenth of a cell.
@@ -182,17 +201,19 @@ function mark(record) {
   for (const point of around.points) {
     const sum = point.labels.reduce((one, other) => one + other, 0);
     L.circleMarker([point.y, point.x], { radius: 5, weight: 1.5, color: "#fff", fillColor: windows.inkOf(Math.sign(sum)), fillOpacity: 1 })
-      .bindTooltip(`Tie point ${point.distance_m.toFixed(1)} m away: ${point.labels.map(signed).join(", ")}`).addTo(drawn);
+      .bindTooltip(`Tie point ${point.distance_m.toFixed(1)} m away: ${point.labels.map(signed).join(", ")}`).addTo(drawn)
+      .getElement().setAttribute("tabindex", "-1");
   }
 }
 
 function match(found, before) {
   unpacked = windows.unpack(found);
-  $("match-stop").textContent = `${found.says.stop} ${peak(found)}`;
-  $("match-run").textContent = ofRun();
-  $("match-order").textContent = `Order, from ${found.says.order}. A line is drawn below the last image that is used.`;
-  draw("ncc", curves.single(found), key(found));
-  draw("sncc", curves.means(found, before), before ? element("p", { class: "aside" }, "dashed in colour: the mean that the run's options end with") : null);
+  const reference = shown.difference_m === null ? null : shown.height_m - shown.difference_m;
+  $("match-stop").textContent = `${found.says.stop} ${peak(found)} One step of height is ${metres(found.step_m, digitsFor(found.step_m) + 1)}.`;
+  $("match-run").textContent = `${apart(found)}${ofRun(found)}`;
+  $("match-order").textContent = `Labels are of ${found.says.order}; ${howOrdered()} A line is drawn below the last image that is used.`;
+  draw("ncc", curves.single(found, reference), key(found, reference));
+  draw("sncc", curves.means(found, before, reference), before ? element("p", { class: "aside" }, "dashed in colour: the mean that the run's options end with") : null);
   const columns = Math.max(2, Math.floor(($("windows-figure").clientWidth || 500) / 118));
   draw("windows", windows.windows(found, unpacked, columns));
   draw("loci", windows.loci(found, Math.max(2, Math.floor(($("loci-figure").clientWidth || 500) / 200))));
@@ -212,20 +233,40 @@ function peak(found) {
   return `The peak lies at ${metres(found.peak_m, precisely)}, predicted to ${sigma === null ? "no precision" : metres(sigma, precisely)}.`;
 }
 
+// How far the surface is from the peak, and why.
+function apart(found) {
+  if (shown.height_m === null || found.peak_m === null) return "";
+  const away = shown.height_m - found.peak_m, reasons = shown.reasons.map(({ name }) => name);
+  if (Math.abs(away) < 1.5 * found.step_m) return "";
+  const [low, high] = [found.heights_m[0], found.heights_m.at(-1)];
+  const atEnd = Math.min(found.peak_m - low, high - found.peak_m) < 1.5 * found.step_m ? " (which is at an end of the heights looked at, so it is none to be trusted)" : "";
+  const why = reasons.includes("PLANE") ? "it is that of the plane fitted to the plain segment around" :
+    reasons.includes("FILLED") ? "it was filled from its neighbours" : "neighbours, other windows or other images decided otherwise than this cell alone";
+  return `The surface lies ${metres(Math.abs(away))} ${away > 0 ? "above" : "below"} this peak${atEnd}: ${why}. `;
+}
+
+function howOrdered() {
+  const chosen = (name) => state.get(`if.${name}`) ?? surface.options.find((each) => each.name === name)?.value;
+  return chosen("order") === "angle" ?
+    `images that help come in the order of their angle to the reference, nearest to ${chosen("best_angle_deg")} degrees first, the others behind them.` :
+    "images of the highest sum come first.";
+}
+
 // What the run did otherwise than a cell alone would.
-function ofRun() {
+function ofRun(found) {
   if (surface.method === "gc3-sgm") {
     return "The run matched the pixels of the images (gc3-sgm); these are the curves of the vertical line through the cell, where the heights found lie.";
   }
-  const window = `${surface.window.value} x ${surface.window.value}`;
+  const window = `${found.window} x ${found.window}`;
+  const used = shown.height_m === null ? "" : `In the run ${shown.n_images} of ${surface.images.length} images, the reference among them, took part in the last fit of this height; what hides one there leaves it out. `;
   const settles = ` Curves compare windows of ${window} cells; the run also compares smaller ones and grey values` +
     (surface.method === "mvll" ? "." : ", and settles the height together with those of the neighbours: it need not lie at this peak.");
-  if (surface.views === "all") return `The run was told to use every image in every cell (--views all).${settles}`;
+  if (surface.views === "all") return `${used}The run was told to use every image in every cell (--views all).${settles}`;
   if (surface.images.length < surface.fewest_views) {
-    return `With fewer than ${surface.fewest_views} images the run uses all of them where nothing hides the cell: order and stop ` +
+    return `${used}With fewer than ${surface.fewest_views} images it leaves out no other: order and stop ` +
       `are what the rule says of this cell alone.${settles}`;
   }
-  return `The run decides by the same rule, for blocks of cells and one level up.${settles}`;
+  return `${used}It decides by the same rule, for blocks of cells and one level up.${settles}`;
 }
 
 function nearest(found, height) {
@@ -237,8 +278,9 @@ function draw(id, svg, ...below) {
   $(`${id}-figure`).querySelector(".drawing").replaceChildren(svg, ...below.filter(Boolean));
 }
 
-function key(found) {
-  return element("div", { class: "key" }, ...found.curves.map(({ image }, j) =>
+function key(found, reference) {
+  const own = reference === null ? [] : [element("span", {}, element("i", { style: "border-color: var(--warn); border-top-style: dashed" }), `reference, ${metres(reference, digits())}`)];
+  return element("div", { class: "key" }, ...own, ...found.curves.map(({ image }, j) =>
     element("span", {}, element("i", { style: `border-color: ${curves.lineColour(j)}; border-top-style: ${curves.dashes(j) ? "dashed" : "solid"}` }), `${j + 1}. ${image}`),
   ));
 }
@@ -270,7 +312,7 @@ export function slide(by) {
 }
 
 function imageTable(found) {
-  const heads = ["image", "label", "ρ1", "ratio", "peak m", "labels around", "mean", "σ m", "use"];
+  const heads = ["use, image", "label", "ρ1", "ratio", "peak m", "around", "mean", "σ m"];
   const rows = [element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))];
   const order = found?.curves.map((curve) => curve.image) ?? [];
   if (found) rows.push(imageRow(found.reference, ["reference", "", "", "", "", "", ""]));
@@ -312,8 +354,8 @@ function imageRow(heading, cells, name = heading, kind = "") {
   const isOff = state.all("without").includes(name);
   const box = element("input", { type: "checkbox", "aria-label": `Use ${name}`, onchange: () => switchImage(name, box.checked) });
   box.checked = !isOff;
-  return element("tr", { class: kind, "data-image": name }, element("th", { scope: "row" }, heading), ...cells.map((cell) =>
-    cell instanceof Node ? cell : element("td", {}, cell)), element("td", {}, box));
+  return element("tr", { class: kind, "data-image": name }, element("th", { scope: "row" }, element("label", {}, box, heading)), ...cells.map((cell) =>
+    cell instanceof Node ? cell : element("td", {}, cell)));
 }
 
 function text(value, digits, what, hasPeak = true) {
@@ -330,6 +372,7 @@ function tieTable(found) {
   const heads = ["distance", ...found.curves.map(({ image }) => image)];
   const rows = points.slice(0, 12).map((point) => element("tr", {}, element("th", { scope: "row" }, `${point.distance_m.toFixed(digitsFor(surface.transform[0]) - 1)} m`),
     ...point.labels.map((value) => element("td", { class: `label-${value}` }, signed(value)))));
+  if (points.length > rows.length) rows.push(element("tr", {}, element("td", {}, `and ${points.length - rows.length} more`)));
   if (!points.length) rows.push(element("tr", {}, element("td", {}, "none near enough")));
   $("ties").replaceChildren(caption, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);
 }
@@ -367,7 +410,8 @@ function optionRow({ name, value, choices, low, high, is_whole, doc, unit }) {
     : element("input", { type: "number", name, min: low, max: high, step: is_whole ? 1 : "any" });
   input.value = value;
   input.dataset.asRun = String(value);
-  return element("label", { title: `${doc}${unit ? ` [${unit}]` : ""}` }, element("span", {}, name), input);
+  const range = choices || low === null || high === null ? "" : ` ${low} to ${high}${unit ? ` ${unit}` : ""}.`;
+  return element("label", { title: `${name}: ${doc}${range}` }, element("span", {}, name), input);
 }
 
 // References to choose from: images that are compared here.

@@ -26,7 +26,7 @@ function points(heights, values, name) {
   return heights.map((height, k) => ({ height, value: values[k], name }));
 }
 
-function frame(match, marks, label) {
+function frame(match, marks, label, reference) {
   const heights = match.heights_m;
   return Plot.plot({
     ...SIZE, ariaLabel: label, style: { fontSize: "12px", background: "transparent" },
@@ -34,6 +34,7 @@ function frame(match, marks, label) {
     y: { domain: [-1, 1.05], label: "correlation", ticks: [-1, -0.5, 0, 0.5, 1], labelArrow: "none" },
     marks: [
       Plot.ruleY([0], { stroke: "currentColor", strokeOpacity: 0.3 }),
+      ...(reference > heights[0] && reference < heights.at(-1) ? [Plot.ruleX([reference], { stroke: colour("warn"), strokeDasharray: "2 3", strokeWidth: 1.6 })] : []),
       Plot.ruleX([match.xyz[2]], { stroke: "currentColor", strokeOpacity: 0.45, strokeDasharray: "5 4" }),
       ...marks,
     ],
@@ -41,7 +42,7 @@ function frame(match, marks, label) {
 }
 
 // NCC with each search image, their peaks, and the values at the pointer.
-export function single(match) {
+export function single(match, reference) {
   const drawn = match.curves.map((curve, j) => ({ ...curve, j, points: points(match.heights_m, match.ncc[j], curve.image) }));
   const marks = drawn.map((each) =>
     Plot.line(each.points, { x: "height", y: "value", stroke: lineColour(each.j), strokeWidth: 1.5, strokeDasharray: dashes(each.j) }),
@@ -51,11 +52,11 @@ export function single(match) {
     ...marks,
     Plot.dot(peaks, { x: "peak_m", y: "rho1", symbol: "times", stroke: (d) => lineColour(d.j), strokeWidth: 2, r: 5 }),
     tips(drawn.flatMap((each) => each.points)),
-  ], "Correlation with each search image against height");
+  ], "Correlation with each search image against height", reference);
 }
 
 // The mean of the first 1, 2, ... images, from pale to dark, that at which the match ends thick.
-export function means(match, before) {
+export function means(match, before, reference) {
   const used = match.stop.images;
   const steps = match.sncc.map((values, m) => ({ m: m + 1, points: points(match.heights_m, values, `mean of ${m + 1}`) }));
   const marks = steps.map((each) => {
@@ -69,7 +70,7 @@ export function means(match, before) {
   }
   const end = match.means[used - 1];
   const peak = end && end.rho1 !== null ? [Plot.dot([end], { x: "peak_m", y: "rho1", symbol: "times", stroke: "currentColor", strokeWidth: 2.5, r: 7 })] : [];
-  return frame(match, [...marks, ...peak, tips(steps.flatMap((each) => each.points))], "Mean correlation against height");
+  return frame(match, [...marks, ...peak, tips(steps.flatMap((each) => each.points))], "Mean correlation against height", reference);
 }
 
 function tips(all) {

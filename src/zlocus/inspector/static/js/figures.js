@@ -4,14 +4,51 @@ import { colour, element } from "./dom.js";
 
 const SCALE = 2;
 
-// Give a figure its buttons. svg, name : give the drawing as it is now, if there is one, and the name of its file.
-export function exportable(figure, name, svg) {
+// Give a figure its buttons. svg, name, words : give the drawing as it is now, if there is one, the name of its file, and
+// what the page says beside it.
+export function exportable(figure, name, svg, words) {
   const buttons = element("span", {}), title = figure.querySelector("figcaption span").textContent;
   for (const kind of ["SVG", "PNG"]) {
-    const save = () => svg() && (kind === "SVG" ? saveSvg(svg(), name()) : savePng(svg(), name()));
+    const save = () => {
+      if (!svg()) return;
+      const drawn = captioned(svg(), words());
+      if (kind === "SVG") saveSvg(drawn, name());
+      else savePng(drawn, name());
+    };
     buttons.append(element("button", { type: "button", onclick: save, "aria-label": `${title}, as ${kind}` }, kind));
   }
   figure.querySelector("figcaption").append(buttons);
+}
+
+// A drawing with its title above and its key below.
+function captioned(svg, { title, subtitle, lines }) {
+  const [width, height] = [widthOf(svg), heightOf(svg)], most = Math.floor(width / 6.4);
+  const wrapped = lines.flatMap(({ text, colour: ink }) => wrap(text, most).map((part, i) => ({ text: part, ink: i ? null : ink })));
+  const whole = d3.create("svg").attr("width", width).attr("height", height + 48 + 17 * wrapped.length + 8)
+    .attr("fill", "currentColor").attr("font-size", 12);
+  whole.attr("viewBox", `0 0 ${width} ${whole.attr("height")}`);
+  whole.append("text").attr("x", 4).attr("y", 16).attr("font-weight", 600).attr("font-size", 13).text(title);
+  whole.append("text").attr("x", 4).attr("y", 33).attr("font-size", 11).text(subtitle);
+  const copy = svg.cloneNode(true);
+  copy.setAttribute("y", 42);
+  copy.setAttribute("width", width);
+  copy.setAttribute("height", height);
+  whole.node().append(copy);
+  wrapped.forEach(({ text, ink }, i) => {
+    const y = height + 60 + 17 * i;
+    if (ink) whole.append("rect").attr("x", 4).attr("y", y - 5).attr("width", 22).attr("height", 3).attr("fill", ink);
+    whole.append("text").attr("x", ink ? 32 : 4).attr("y", y).attr("font-size", 11).text(text);
+  });
+  return whole.node();
+}
+
+function wrap(text, most) {
+  const lines = [""];
+  for (const word of text.split(" ")) {
+    if (lines.at(-1).length + word.length > most) lines.push("");
+    lines.push(`${lines.pop()} ${word}`.trim());
+  }
+  return lines;
 }
 
 export function saveSvg(svg, name) {

@@ -11,7 +11,7 @@ import * as state from "./state.js";
 const LETTERS = "zlocus.letters";
 const TABS = ["cell", "profile", "relief"];
 const KEYS = [
-  ["1 to 7", "layers, on and off"],
+  ["1 to 7", "layers, on and off, by the number before their name"],
   ["Arrows, + and −", "move the map and zoom, while it has the focus; the same for the view in three dimensions, which Shift and arrows turn"],
   ["Enter", "look at the cell in the middle of the map"],
   ["Shift and arrows", "the neighbouring cell"],

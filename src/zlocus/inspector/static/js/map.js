@@ -38,7 +38,7 @@ export function make(about) {
     if (document.body.dataset.keys) $("pointer").textContent = words(lng, lat);
   });
   map.on("mousemove", ({ latlng }) => ($("pointer").textContent = words(latlng.lng, latlng.lat)));
-  map.on("mouseout", () => ($("pointer").textContent = ""));
+  map.on("mouseout move", () => ($("pointer").textContent = ""));
   new ResizeObserver(() => map.invalidateSize()).observe($("map"));
   return map;
 }
@@ -113,7 +113,7 @@ export function addLayer(about) {
   layers.set(about.name, layer);
   // The highest stands at the top.
   $("layer-rows").prepend(
-    element("div", { class: "layer" }, element("label", { title: `Key ${number}` }, box, about.title), share),
+    element("div", { class: "layer" }, element("label", { title: `Key ${number}` }, box, element("span", { class: "number" }, number), about.title), share),
   );
   $("legends").prepend(legend);
   show(layer, undefined);

@@ -12,7 +12,9 @@ export function make(about, theMap) {
   [surface, leaflet] = [about, theMap];
   line = L.layerGroup().addTo(leaflet);
   $("draw").addEventListener("click", begin);
-  exportable($("profile-figure"), () => `${surface.title}_profile`, () => chart);
+  exportable($("profile-figure"), () => `${surface.title}_profile`, () => chart, () => ({
+    title: "Height along a line", subtitle: surface.title, lines: [{ text: $("profile-text").textContent }],
+  }));
   $("along").addEventListener("input", () => along(Number($("along").value)));
 }
 
