@@ -89,7 +89,7 @@ export function holds(x, y) {
 export function home() {
   // Beside the list of layers, where there is room.
   const list = $("layers"), aside = list.open && list.offsetWidth < $("map").clientWidth / 2 ? list.offsetWidth : 0;
-  map.fitBounds(bounds(), { animate: false, paddingTopRight: [aside, 0] });
+  map.fitBounds(bounds(), { animate: false, paddingBottomRight: [aside, 0] });
 }
 
 export function bounds() {
