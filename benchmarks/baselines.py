@@ -21,16 +21,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
-from rasterio.transform import from_origin
-from scipy.ndimage import distance_transform_edt
 
+from rectifying import (
+    STEP_M,
+    Rectified,
+    disparity_range,
+    gridded,
+    ground_points,
+    on_plane,
+    parallax,
+    rectified,
+    write_surface,
+)
 from zlocus.io.scene_file import open_scene
 from zlocus.scene import View
 
 VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
 PAIR = ("n1", "f1")
-STEP_M = 0.5
-MARGIN_M = 25.0
+RANGE_MARGIN_M = 3.0
 BLOCK = 3
 GREY_PERCENT = (0.2, 99.8)
 SURFACES = ("all", "ground", "building", "tree")
@@ -52,24 +60,6 @@ class RenderedFolder:
     def images(self) -> list[Path]:
         """The six views of one date."""
         return [self.folder / f"img_{view}.tif" for view in VIEWS]
-
-
-@dataclass(frozen=True)
-class Rectified:
-    """A view on the plane: positions on it are metres along and across the parallax, `shape` cells of STEP_M.
-
-    origin : (x, y) m of the first cell's centre; along, across : unit vectors in (x, y).
-    """
-
-    origin: np.ndarray
-    along: np.ndarray
-    across: np.ndarray
-    shape: tuple[int, int]
-
-    def ground(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """(n, 2) m of cells."""
-        at = STEP_M * np.stack([cols, rows], axis=-1).reshape(-1, 2)
-        return self.origin + at @ np.stack([self.along, self.across])
 
 
 def open_rendered(folder: Path) -> RenderedFolder:
@@ -112,9 +102,7 @@ def opencv(scene: RenderedFolder, out: Path, record: Path | None = None) -> Path
     moved = parallax(scene, opened.views, shifts, middle)
     plane = rectified(scene, moved)
     left, right = (grey_on_plane(view, shift, plane, middle) for view, shift in zip(opened.views, shifts, strict=True))
-    per_m = float(np.hypot(*moved)) / STEP_M
-    reach = per_m * ((scene.high - scene.low) / 2 + 3.0)
-    first, count = -int(np.ceil(reach)), 16 * int(np.ceil(2 * reach / 16) + 1)
+    first, count = disparity_range((scene.low, scene.high), moved, RANGE_MARGIN_M)
     border = count
     left, right = (cv2.copyMakeBorder(grey, 0, 0, border, border, cv2.BORDER_REPLICATE) for grey in (left, right))
     matcher = cv2.StereoSGBM_create(
@@ -122,74 +110,17 @@ def opencv(scene: RenderedFolder, out: Path, record: Path | None = None) -> Path
         preFilterCap=63, uniquenessRatio=5, speckleWindowSize=50, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH,
     )  # fmt: skip
     disparity = matcher.compute(left, right)[:, border:-border].astype(float) / 16.0
-    rows, cols = np.nonzero(disparity >= first)
-    z = middle + disparity[rows, cols] / per_m
-    seen = to_image(opened.views[0], shifts[0], plane.ground(rows, cols), middle)
-    xyz = opened.views[0].sensor.ground_from_image(seen - shifts[0], z)
-    return write_surface(scene, xyz, out)
-
-
-def to_image(view: View, shift: np.ndarray, xy: np.ndarray, z: float) -> np.ndarray:
-    """Image positions (n, 2) px of ground points (n, 2) m at one height."""
-    return np.asarray(view.sensor.image_from_ground(np.column_stack([xy, np.full(len(xy), z)])) + shift)
-
-
-def parallax(scene: RenderedFolder, views: tuple[View, ...], shifts: list[np.ndarray], z: float) -> np.ndarray:
-    """How far (x, y) m on the plane the second view moves against the first for each metre of height; the direction is
-    that in which a higher point of the second view lies before that of the first."""
-    west, south, east, north = scene.bounds
-    point = np.array([[(west + east) / 2, (south + north) / 2]])
-    on_plane = []
-    for view, shift in zip(views, shifts, strict=True):
-        seen = to_image(view, shift, point, z + 10.0)
-        on_plane.append(view.sensor.ground_from_image(seen - shift, np.array([z]))[0, :2])
-    return np.asarray((on_plane[0] - on_plane[1]) / 10.0)
-
-
-def rectified(scene: RenderedFolder, moved: np.ndarray) -> Rectified:
-    """A plane's frame around the area, whose rows run along the parallax."""
-    west, south, east, north = scene.bounds
-    along = moved / np.hypot(*moved)
-    across = np.array([along[1], -along[0]])
-    corners = np.array([(x, y) for x in (west, east) for y in (south, north)])
-    places = corners @ np.stack([along, across], axis=1)
-    low, high = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
-    cols, rows = (int(n) + 1 for n in (high - low) / STEP_M)
-    return Rectified(low @ np.stack([along, across]), along, across, (rows, cols))
+    disparity[disparity < first] = np.nan
+    xyz = ground_points(disparity, opened.views[0], shifts[0], plane, moved, middle)
+    return write_surface(scene, gridded(scene, xyz), out / "dsm.tif")
 
 
 def grey_on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> np.ndarray:
     """(r, c) uint8 of a view on the plane."""
     rows, cols = view.image.shape
-    grey = view.image.read(0, 0, rows, cols).pixels
-    row, col = np.mgrid[: plane.shape[0], : plane.shape[1]]
-    seen = to_image(view, shift, plane.ground(row.ravel(), col.ravel()), z).reshape(*plane.shape, 2)
-    on_plane = cv2.remap(
-        grey, seen[..., 0].astype(np.float32), seen[..., 1].astype(np.float32), cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    dark, bright = np.percentile(grey, GREY_PERCENT)
-    return np.asarray(np.clip(255.0 * (on_plane - dark) / (bright - dark), 0, 255).astype(np.uint8))
-
-
-def write_surface(scene: RenderedFolder, xyz: np.ndarray, out: Path) -> Path:
-    """The highest point in each cell, gaps from the nearest cell that has one. xyz : (n, 3) m."""
-    west, south, east, north = scene.bounds
-    rows, cols = round((north - south) / STEP_M), round((east - west) / STEP_M)
-    row = np.floor((north - xyz[:, 1]) / STEP_M).astype(int)
-    col = np.floor((xyz[:, 0] - west) / STEP_M).astype(int)
-    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-    surface = np.full((rows, cols), -np.inf)
-    np.maximum.at(surface, (row[inside], col[inside]), xyz[inside, 2])
-    nearest = distance_transform_edt(~np.isfinite(surface), return_distances=False, return_indices=True)
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / "dsm.tif"
-    with rasterio.open(
-        path, "w", driver="GTiff", height=rows, width=cols, count=1, dtype="float32", crs=scene.crs,
-        transform=from_origin(west, north, STEP_M, STEP_M),
-    ) as file:  # fmt: skip
-        file.write(surface[tuple(nearest)].astype(np.float32), 1)
-    return path
+    dark, bright = np.percentile(view.image.read(0, 0, rows, cols).pixels, GREY_PERCENT)
+    stretched = 255.0 * (on_plane(view, shift, plane, z) - dark) / (bright - dark)
+    return np.asarray(np.clip(stretched, 0, 255).astype(np.uint8))
 
 
 def judged(scene: RenderedFolder, dsm: Path) -> dict[str, dict[str, float]]:

@@ -1,0 +1,209 @@
+"""Programs that no registry has: s2p, MicMac and SETSM, when a path to a build is given.
+
+Written from their documents; on the machine of the published results there was no build of them. See `configurations/`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import rasterio
+import yaml
+from pyproj import CRS
+
+from peers.environments import CONFIGURATIONS, Missing
+from peers.measuring import Failed, Usage, measured
+from peers.scenes import Scene
+from rectifying import gridded
+from zlocus.io.rpc_text import write_rpc_txt
+from zlocus.io.scene_file import open_scene
+from zlocus.sensors.rpc import RpcCoefficients
+
+
+def recommended(name: str) -> dict:
+    """Of `configurations/NAME.yaml`."""
+    return dict(yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")))
+
+
+def working(program: Path) -> Path:
+    """The program, found. Raises `Missing` otherwise."""
+    found = shutil.which(program)
+    if found is None:
+        raise Missing(f"{program} is no program that can be run: give the path to the command of a build")
+    return Path(found).resolve()
+
+
+def said_version(program: Path, *asks: str) -> str:
+    """What looks like a version in what a program says of itself, or nothing."""
+    said = subprocess.run([program, *asks], capture_output=True, text=True, errors="replace")
+    found = re.search(r"\d+\.\d+[\w.+-]*|\b[0-9a-f]{7,40}\b", said.stdout + said.stderr)
+    return found.group() if found else "unknown"
+
+
+@dataclass(frozen=True)
+class S2p:
+    """Pairs of the first image with each other one, matched by MGM, averaged on a grid (de Franchis et al. 2014)."""
+
+    program: Path
+    name: str = "s2p"
+
+    def versions(self) -> dict[str, str]:
+        return {"s2p": said_version(self.program, "--version")}
+
+    def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
+        out.mkdir(parents=True, exist_ok=True)
+        config = recommended("s2p") | {
+            "out_dir": str(out / "s2p"), "temporary_dir": str(out / "tmp"),
+            "images": [{"img": str(path)} for path in scene.images.values()],
+            "dsm_resolution": scene.resolution_m, "max_processes": len(cores),
+        }  # fmt: skip
+        (out / "config.json").write_text(json.dumps(config, indent=1))
+        used = measured([self.program, out / "config.json"], cores, out / "s2p.log", out)
+        return out / "s2p" / "dsm.tif", used
+
+
+@dataclass(frozen=True)
+class MicMac:
+    """All images at once on a ground grid: tie points, bundle adjustment, Malt (Rupnik et al. 2017)."""
+
+    program: Path
+    name: str = "MicMac"
+
+    def versions(self) -> dict[str, str]:
+        return {"mm3d": said_version(self.program, "CheckDependencies")}
+
+    def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
+        out.mkdir(parents=True, exist_ok=True)
+        for path, view in zip(scene.images.values(), open_scene(list(scene.images.values())).views, strict=True):
+            (out / path.name).unlink(missing_ok=True)
+            (out / path.name).symlink_to(path.resolve())
+            write_rpc_txt(out / f"{path.stem}.txt", view.sensor.coefficients)  # type: ignore[attr-defined]
+        (out / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(CRS(scene.crs).to_proj4()))
+        given = {"program": self.program, "resolution": scene.resolution_m, "cores": len(cores)}
+        used = Usage()
+        for step in recommended("micmac")["steps"]:
+            command = [self.program, *(str(word).format(**given) for word in step), "@ExitOnBrkp"]
+            used += measured(command, cores, out / f"{step[0]}.log", out)
+        return georeferenced(out / "MEC-Malt", scene, out / "dsm.tif"), used
+
+
+# Of MicMac: a projection by a definition of PROJ.
+SYSTEM_OF_COORDINATES = """<SystemeCoord>
+  <BSC>
+    <TypeCoord> eTC_Proj4 </TypeCoord>
+    <AuxR> 1 </AuxR> <AuxR> 1 </AuxR> <AuxR> 1 </AuxR>
+    <AuxStr> {} </AuxStr>
+  </BSC>
+</SystemeCoord>
+"""
+
+
+def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
+    """Malt's last surface as a raster with its place, heights in m, nothing where Malt masks."""
+    steps = sorted(folder.glob("Z_Num*_DeZoom1_STD-MALT.tif"), key=lambda each: int(re.findall(r"\d+", each.name)[0]))
+    if not steps:
+        raise Failed(f"MicMac left no surface in {folder}")
+    frame = ElementTree.parse(steps[-1].with_suffix(".xml")).getroot()
+
+    def numbers(name: str) -> list[float]:
+        return [float(word) for word in (frame.findtext(f".//{name}") or "").split()]
+
+    with rasterio.open(steps[-1]) as file:
+        z = file.read(1) * numbers("ResolutionAlti")[0] + numbers("OrigineAlti")[0]
+    masks = sorted(folder.glob("AutoMask_STD-MALT_Num_*.tif")) or sorted(folder.glob("Masq_STD-MALT_DeZoom1.tif"))
+    if masks:
+        with rasterio.open(masks[-1]) as file:
+            z = np.where(file.read(1) > 0, z, np.nan)
+    (west, north), (right, down) = numbers("OriginePlani"), numbers("ResolutionPlani")
+    transform = rasterio.Affine(right, 0.0, west, 0.0, down, north)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=z.shape[0], width=z.shape[1], count=1, dtype="float32", crs=scene.crs,
+        transform=transform, nodata=np.nan,
+    ) as file:  # fmt: skip
+        file.write(z.astype(np.float32), 1)
+    return path
+
+
+@dataclass(frozen=True)
+class Setsm:
+    """Pairs of images on a TIN that is refined (Noh and Howat 2015); pairs are merged by the median of cells."""
+
+    program: Path
+    name: str = "SETSM"
+
+    def versions(self) -> dict[str, str]:
+        return {"setsm": said_version(self.program, "-help")}
+
+    def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, view in zip(scene.images, open_scene(list(scene.images.values())).views, strict=True):
+            (out / f"{name}.tif").unlink(missing_ok=True)
+            (out / f"{name}.tif").symlink_to(scene.images[name].resolve())
+            write_isd(out / f"{name}.xml", view.sensor.coefficients)  # type: ignore[attr-defined]
+        low, high = scene.heights
+        options = [*itertools.chain(*recommended("setsm")["options"].items()), "-outres", scene.resolution_m]
+        used, surfaces = Usage(), []
+        for left, right in scene.pairs:
+            pair = out / f"{left}-{right}"
+            command = [self.program, "-image", out / f"{left}.tif", "-image", out / f"{right}.tif", "-outpath", pair]
+            command += [*options, "-minH", low, "-maxH", high]
+            used += measured(command, cores, out / f"{pair.name}.log", out)
+            surfaces.append(on_grid(next(pair.glob("*_dem.tif")), scene))
+        return write_median(surfaces, scene, out / "dsm.tif"), used
+
+
+def write_isd(path: Path, rpc: RpcCoefficients) -> None:
+    """The RPC as DigitalGlobe's XML, which SETSM reads beside an image of the same name."""
+    root = ElementTree.Element("isd")
+    block = ElementTree.SubElement(root, "RPB")
+    ElementTree.SubElement(block, "SATID").text = "WV01"
+    image = ElementTree.SubElement(block, "IMAGE")
+    scalars = {
+        "LINEOFFSET": rpc.line_off, "SAMPOFFSET": rpc.samp_off, "LATOFFSET": rpc.lat_off, "LONGOFFSET": rpc.lon_off,
+        "HEIGHTOFFSET": rpc.height_off, "LINESCALE": rpc.line_scale, "SAMPSCALE": rpc.samp_scale,
+        "LATSCALE": rpc.lat_scale, "LONGSCALE": rpc.lon_scale, "HEIGHTSCALE": rpc.height_scale,
+    }  # fmt: skip
+    for name, value in scalars.items():
+        ElementTree.SubElement(image, name).text = repr(float(value))
+    terms = {
+        "LINENUMCOEF": rpc.line_num,
+        "LINEDENCOEF": rpc.line_den,
+        "SAMPNUMCOEF": rpc.samp_num,
+        "SAMPDENCOEF": rpc.samp_den,
+    }
+    for name, values in terms.items():
+        listed = ElementTree.SubElement(ElementTree.SubElement(image, f"{name}List"), name)
+        listed.text = " ".join(repr(float(value)) for value in values)
+    ElementTree.ElementTree(root).write(path)
+
+
+def on_grid(path: Path, scene: Scene) -> np.ndarray:
+    """(r, c) m of a surface on the scene's grid, NaN where it has none."""
+    with rasterio.open(path) as file:
+        z = file.read(1, masked=True).filled(np.nan).astype(float)
+        rows, cols = np.nonzero(np.isfinite(z) & (np.abs(z) < 9000))
+        x, y = file.transform * (cols + 0.5, rows + 0.5)
+    return gridded(scene, np.column_stack([x, y, z[rows, cols]]))
+
+
+def write_median(surfaces: list[np.ndarray], scene: Scene, path: Path) -> Path:
+    """The median of surfaces (r, c) m on the scene's grid, NaN where none has a height."""
+    stacked = np.ma.masked_invalid(np.stack(surfaces))
+    merged = np.ma.median(stacked, axis=0).filled(np.nan).astype(np.float32)
+    west, _, _, north = scene.bounds
+    step = scene.resolution_m
+    with rasterio.open(
+        path, "w", driver="GTiff", height=merged.shape[0], width=merged.shape[1], count=1, dtype="float32",
+        crs=scene.crs, transform=rasterio.transform.from_origin(west, north, step, step), nodata=np.nan,
+    ) as file:  # fmt: skip
+        file.write(merged, 1)
+    return path

@@ -1,0 +1,81 @@
+"""CARS: pairs of images resampled along epipolar lines, matched by Pandora, put on one grid (Youssefi et al. 2020)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import yaml
+from pyproj import CRS
+from rasterio.transform import from_origin
+
+from peers.environments import CONFIGURATIONS, Environment
+from peers.measuring import Usage, measured
+from peers.scenes import Scene
+
+# Images with fewer pixels along a side are small.
+SMALL_PX = 1000
+PACKAGES = ("cars", "pandora", "libSGM", "shareloc", "cars-rasterize", "numba", "numpy")
+
+
+@dataclass(frozen=True)
+class Cars:
+    """CARS in an environment of its own."""
+
+    environment: Environment
+    name: str = "CARS"
+
+    def versions(self) -> dict[str, str]:
+        """Of what computes."""
+        return self.environment.versions(*PACKAGES)
+
+    def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
+        """A surface of the scene, and what it took."""
+        out.mkdir(parents=True, exist_ok=True)
+        config = out / "cars.yaml"
+        config.write_text(yaml.safe_dump(configuration(scene, out), sort_keys=False), encoding="utf-8")
+        used = measured([self.environment.program("cars"), config], cores, out / "cars.log")
+        return out / "cars" / "dsm" / "dsm.tif", used
+
+
+def configuration(scene: Scene, out: Path) -> dict[str, Any]:
+    """What `configurations/cars.yaml` says, for a scene. All pairs whose rays meet at a usable angle are given."""
+    recommended = yaml.safe_load((CONFIGURATIONS / "cars.yaml").read_text(encoding="utf-8"))
+    pairs = scene.pairs
+    views = [view for view in scene.images if view in set(itertools.chain(*pairs))]
+    matching = {"dense_matching": {"method": recommended["methods"][scene.kind]}}
+    return {
+        "input": {
+            "sensors": {view: {"image": str(scene.images[view])} for view in views},
+            "pairing": [list(pair) for pair in pairs],
+            "initial_elevation": {"dem": str(scene.terrain), "geoid": str(write_no_geoid(out / "geoid.tif"))},
+        },
+        "output": recommended["output"]
+        | {"directory": str(out / "cars"), "resolution": scene.resolution_m, "epsg": CRS(scene.crs).to_epsg()},
+        "subsampling": {"advanced": {"resolutions": recommended["resolutions"][size_class(scene)]}},
+        "surface_modeling": {"applications": {"all": matching}},
+    }
+
+
+def size_class(scene: Scene) -> str:
+    """By the shortest side of any image."""
+    sides = []
+    for path in scene.images.values():
+        with rasterio.open(path) as file:
+            sides.append(min(file.shape))
+    return "small" if min(sides) < SMALL_PX else "large"
+
+
+def write_no_geoid(path: Path) -> Path:
+    """Undulations of zero: the terrain model's heights are above the ellipsoid, and CARS would add its own geoid."""
+    with rasterio.open(
+        path, "w", driver="GTiff", height=181, width=361, count=1, dtype="float32", crs="EPSG:4326",
+        transform=from_origin(-180.5, 90.5, 1.0, 1.0),
+    ) as file:  # fmt: skip
+        file.write(np.zeros((181, 361), np.float32), 1)
+    return path

@@ -1,0 +1,52 @@
+"""zlocus itself, with the options that it has by default: images, grid and area are all it is given."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from peers.measuring import Usage, measured
+from peers.scenes import Scene
+
+ZLOCUS = Path(sys.executable).with_name("zlocus")
+
+
+@dataclass(frozen=True)
+class Own:
+    """This checkout of zlocus."""
+
+    name: str = "zlocus"
+
+    def versions(self) -> dict[str, str]:
+        """Of what computes."""
+        return {name: version(name) for name in ("zlocus", "numba", "numpy", "opencv-python-headless")}
+
+    def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
+        """A surface of the scene, and what it took."""
+        command = [
+            ZLOCUS,
+            "dsm",
+            *scene.images.values(),
+            "-o",
+            out / "zlocus",
+            "--crs",
+            scene.crs,
+            "--bounds",
+            *scene.bounds,
+        ]
+        command += ["--resolution", scene.resolution_m, "--workers", len(cores), "--overwrite"]
+        used = measured(command, cores, out / "zlocus.log")
+        return out / "zlocus" / "dsm.tif", used
+
+
+def shifts(out: Path, scene: Scene) -> dict[str, tuple[float, float]]:
+    """Pointing corrections (column, row) px by view that a run in this folder found; none where there is no run."""
+    record = out / "zlocus" / "run.json"
+    if not record.exists():
+        return {}
+    views = json.loads(record.read_text())["orientation"]["views"]
+    return {name: tuple(views[path.stem]["shift_px"]) for name, path in scene.images.items()}

@@ -1,0 +1,98 @@
+"""Rectified pairs for matchers, and surfaces from their disparities: `python pairs.py prepare|merge JOB`.
+
+A matcher knows rows of two images: it has no cameras, and no means to merge pairs. So both are done for it: pairs are
+resampled onto a plane (see `rectifying.py`), each pair's points are put on the grid (the highest in a cell), and a
+cell gets the median of all pairs, gaps the nearest height. What it takes counts as the matcher's.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from rectifying import (
+    Rectified,
+    disparity_range,
+    gridded,
+    ground_points,
+    on_plane,
+    parallax,
+    rectified,
+    write_surface,
+)
+from zlocus.io.scene_file import open_scene
+from zlocus.scene import View
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A pair on its plane. moved : m on it per m of height; middle : its height, m."""
+
+    views: tuple[View, View]
+    shifts: tuple[np.ndarray, np.ndarray]
+    frame: Rectified
+    moved: np.ndarray
+    middle: float
+
+
+@dataclass(frozen=True)
+class Area:
+    """What is asked for."""
+
+    crs: str
+    bounds: tuple[float, float, float, float]
+
+
+def planes(job: dict[str, Any]) -> list[Plane]:
+    """One for each pair of a job."""
+    area, middle = area_of(job), sum(job["heights"]) / 2
+    names = list(job["images"])
+    views = dict(zip(names, open_scene([Path(path) for path in job["images"].values()]).views, strict=True))
+    found = []
+    for pair in job["pairs"]:
+        seen = tuple(views[name] for name in pair["views"])
+        shifts = tuple(np.array(job["shifts"][name]) for name in pair["views"])
+        moved = parallax(area, seen, shifts, middle)
+        found.append(Plane(seen, shifts, rectified(area, moved), moved, middle))  # type: ignore[arg-type]
+    return found
+
+
+def area_of(job: dict[str, Any]) -> Area:
+    return Area(job["crs"], tuple(job["bounds"]))
+
+
+def prepare(path: Path) -> None:
+    """Writes both images of each pair and its range of disparities."""
+    job = json.loads(path.read_text())
+    for pair, plane in zip(job["pairs"], planes(job), strict=True):
+        for side, view, shift in zip(("left", "right"), plane.views, plane.shifts, strict=True):
+            cv2.imwrite(pair[side], on_plane(view, shift, plane.frame, plane.middle).astype(np.float32))
+        pair["first"], pair["count"] = disparity_range(tuple(job["heights"]), plane.moved, 0.0)
+    path.write_text(json.dumps(job, indent=1))
+
+
+def merge(path: Path) -> None:
+    """Writes the surface of all pairs."""
+    job = json.loads(path.read_text())
+    surfaces = []
+    for pair, plane in zip(job["pairs"], planes(job), strict=True):
+        disparity = np.load(pair["disparity"])
+        xyz = ground_points(disparity, plane.views[0], plane.shifts[0], plane.frame, plane.moved, plane.middle)
+        surfaces.append(gridded(area_of(job), xyz))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # cells that no pair sees
+        surface = np.nanmedian(np.stack(surfaces), axis=0)
+    write_surface(area_of(job), surface, Path(job["surface"]))
+
+
+if __name__ == "__main__":
+    {"prepare": prepare, "merge": merge}[sys.argv[1]](Path(sys.argv[2]))

@@ -1,0 +1,138 @@
+"""Pairs of images for matchers that know rows of images only: both resampled onto a plane at a constant height.
+
+On the plane the parallax of a pair lies along rows, so a disparity is a height; points go back through the camera
+of the first view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.transform import from_origin
+from scipy.ndimage import distance_transform_edt
+
+from zlocus.scene import View
+
+STEP_M = 0.5
+MARGIN_M = 25.0
+
+
+class Area(Protocol):
+    """What is asked for. bounds : west, south, east, north, m."""
+
+    @property
+    def crs(self) -> str: ...
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]: ...
+
+
+@dataclass(frozen=True)
+class Rectified:
+    """A view on the plane: positions on it are metres along and across the parallax, `shape` cells of STEP_M.
+
+    origin : (x, y) m of the first cell's centre; along, across : unit vectors in (x, y).
+    """
+
+    origin: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+    shape: tuple[int, int]
+
+    def ground(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """(n, 2) m of cells."""
+        at = STEP_M * np.stack([cols, rows], axis=-1).reshape(-1, 2)
+        return self.origin + at @ np.stack([self.along, self.across])
+
+
+def to_image(view: View, shift: np.ndarray, xy: np.ndarray, z: float) -> np.ndarray:
+    """Image positions (n, 2) px of ground points (n, 2) m at one height."""
+    return np.asarray(view.sensor.image_from_ground(np.column_stack([xy, np.full(len(xy), z)])) + shift)
+
+
+def parallax(area: Area, views: Sequence[View], shifts: Sequence[np.ndarray], z: float) -> np.ndarray:
+    """How far (x, y) m on the plane the second view moves against the first for each metre of height; the direction is
+    that in which a higher point of the second view lies before that of the first."""
+    west, south, east, north = area.bounds
+    point = np.array([[(west + east) / 2, (south + north) / 2]])
+    on_plane = []
+    for view, shift in zip(views, shifts, strict=True):
+        seen = to_image(view, shift, point, z + 10.0)
+        on_plane.append(view.sensor.ground_from_image(seen - shift, np.array([z]))[0, :2])
+    return np.asarray((on_plane[0] - on_plane[1]) / 10.0)
+
+
+def rectified(area: Area, moved: np.ndarray) -> Rectified:
+    """A plane's frame around the area, whose rows run along the parallax."""
+    west, south, east, north = area.bounds
+    along = moved / np.hypot(*moved)
+    across = np.array([along[1], -along[0]])
+    corners = np.array([(x, y) for x in (west, east) for y in (south, north)])
+    places = corners @ np.stack([along, across], axis=1)
+    low, high = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
+    cols, rows = (int(n) + 1 for n in (high - low) / STEP_M)
+    return Rectified(low @ np.stack([along, across]), along, across, (rows, cols))
+
+
+def on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> np.ndarray:
+    """(r, c) pixels of a view on the plane, of its own type; beyond the image its border is carried on."""
+    rows, cols = view.image.shape
+    grey = view.image.read(0, 0, rows, cols).pixels
+    row, col = np.mgrid[: plane.shape[0], : plane.shape[1]]
+    seen = to_image(view, shift, plane.ground(row.ravel(), col.ravel()), z).reshape(*plane.shape, 2)
+    return np.asarray(
+        cv2.remap(
+            grey, seen[..., 0].astype(np.float32), seen[..., 1].astype(np.float32), cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )  # fmt: skip
+
+
+def disparity_range(area_heights: tuple[float, float], moved: np.ndarray, margin_m: float) -> tuple[int, int]:
+    """First disparity and their number, a multiple of 16, for heights around the middle of a range."""
+    low, high = area_heights
+    reach = float(np.hypot(*moved)) / STEP_M * ((high - low) / 2 + margin_m)
+    return -int(np.ceil(reach)), 16 * int(np.ceil(2 * reach / 16) + 1)
+
+
+def ground_points(
+    disparity: np.ndarray, view: View, shift: np.ndarray, plane: Rectified, moved: np.ndarray, middle: float
+) -> np.ndarray:
+    """(n, 3) m where a disparity was found. disparity : (r, c) px, NaN where there is none; middle : the plane's
+    height.
+    """
+    rows, cols = np.nonzero(np.isfinite(disparity))
+    z = middle + disparity[rows, cols] * STEP_M / float(np.hypot(*moved))
+    seen = to_image(view, shift, plane.ground(rows, cols), middle)
+    return np.asarray(view.sensor.ground_from_image(seen - shift, z))
+
+
+def gridded(area: Area, xyz: np.ndarray) -> np.ndarray:
+    """(r, c) m: the highest point (n, 3) m in each cell of STEP_M, NaN where there is none."""
+    west, south, east, north = area.bounds
+    rows, cols = round((north - south) / STEP_M), round((east - west) / STEP_M)
+    row = np.floor((north - xyz[:, 1]) / STEP_M).astype(int)
+    col = np.floor((xyz[:, 0] - west) / STEP_M).astype(int)
+    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+    surface = np.full((rows, cols), -np.inf)
+    np.maximum.at(surface, (row[inside], col[inside]), xyz[inside, 2])
+    return np.where(np.isfinite(surface), surface, np.nan)
+
+
+def write_surface(area: Area, surface: np.ndarray, path: Path) -> Path:
+    """Heights (r, c) m as a raster, gaps from the nearest cell that has one."""
+    nearest = distance_transform_edt(np.isnan(surface), return_distances=False, return_indices=True)
+    west, _, _, north = area.bounds
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=surface.shape[0], width=surface.shape[1], count=1, dtype="float32",
+        crs=area.crs, transform=from_origin(west, north, STEP_M, STEP_M),
+    ) as file:  # fmt: skip
+        file.write(surface[tuple(nearest)].astype(np.float32), 1)
+    return path
