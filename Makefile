@@ -9,7 +9,7 @@ ifneq ($(TEST_DATA),)
 export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
 endif
 
-.PHONY: demo docs test test-minimum audit lint bench acceptance acceptance-all clean
+.PHONY: demo docs test test-minimum audit lint bench peers acceptance acceptance-all clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -49,6 +49,10 @@ lint: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only
+
+# Other programs on the same scenes, in environments of their own below build/peers: hours. S2P, MICMAC, SETSM: commands of builds.
+peers: $(STAMP)
+	$(BIN)/python benchmarks/peers $(if $(S2P),--s2p $(S2P)) $(if $(MICMAC),--micmac $(MICMAC)) $(if $(SETSM),--setsm $(SETSM))
 
 acceptance: $(STAMP)
 	$(BIN)/python benchmarks/acceptance.py

@@ -209,5 +209,5 @@ def test_blocks_of_commands_are_found():
     assert steps[0] == "zlocus import colmap PROJECT -o scene.yaml"
     assert steps[-1] == "zlocus dsm scene.yaml -o facade"
     assert len(steps) == 8
-    assert len(steps_of(ROOT / "benchmarks" / "README.md")) == 14
+    assert len(steps_of(ROOT / "benchmarks" / "README.md")) == 16
     assert INLINE.findall("as `zlocus dsm IN` says") == ["zlocus dsm IN"]

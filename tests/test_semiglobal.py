@@ -137,3 +137,17 @@ def test_heights_above_a_base_surface():
     for found, plain in ((moved.best, best), (moved.second, second)):
         assert found.dtype == np.int32
         assert np.abs(found - plain - base).max() <= 0.5
+
+
+@pytest.mark.parametrize("predecessors", [1, 2])
+def test_a_pair_has_a_penalty_of_its_own(predecessors):
+    """Where no cell is seen by more than two views, `p1_two` takes the place of `p1`."""
+    lattice, rng = even_lattice(6, (9, 11), 8), np.random.default_rng(4)
+    cost = rng.integers(0, 129, lattice.size).astype(np.uint8)
+    p2 = penalties(None, (9, 11), 0, OPTIONS)
+    options = replace(OPTIONS, predecessors=predecessors, p1_two=90)
+    of_two, of_three = (aggregate(cost, lattice, p2, 1.0, options, by_two).margin for by_two in (True, False))
+    for found, p1 in ((of_two, 90), (of_three, 20)):
+        expected = aggregate(cost, lattice, p2, 1.0, replace(options, p1=p1)).margin
+        np.testing.assert_array_equal(found, expected)
+    assert (of_two != of_three).any()

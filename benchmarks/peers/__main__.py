@@ -21,7 +21,7 @@ sys.path[:1] = [str(HERE.parent)]
 
 from peers import builds, matchers  # noqa: E402
 from peers.cars import Cars  # noqa: E402
-from peers.environments import Environment, Missing, installed  # noqa: E402
+from peers.environments import Environment, Missing, installed, this_checkout  # noqa: E402
 from peers.own import Own  # noqa: E402
 from peers.page import write_page  # noqa: E402
 from peers.running import Program, run_all  # noqa: E402
@@ -61,7 +61,8 @@ def programs(given: argparse.Namespace, environments: dict[str, Environment]) ->
                     found.append(BUILDS[name](builds.working(path)))
                 continue
             if name == "zlocus":
-                found.append(Own())
+                environments["zlocus"] = this_checkout(given.out / "environments")
+                found.append(Own(environments["zlocus"]))
                 continue
             kind = "cars" if name == "CARS" else "matchers"
             if kind not in environments:

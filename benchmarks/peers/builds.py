@@ -10,6 +10,7 @@ import json
 import re
 import shutil
 import subprocess
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +20,14 @@ import numpy as np
 import rasterio
 import yaml
 from pyproj import CRS
+from rasterio.errors import NotGeoreferencedWarning
 
 from peers.environments import CONFIGURATIONS, Missing
 from peers.measuring import Failed, Usage, measured
 from peers.scenes import Scene
 from rectifying import gridded
+from zlocus.io.cameras import read_rpc
 from zlocus.io.rpc_text import write_rpc_txt
-from zlocus.io.scene_file import open_scene
 from zlocus.sensors.rpc import RpcCoefficients
 
 
@@ -83,11 +85,11 @@ class MicMac:
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         out.mkdir(parents=True, exist_ok=True)
-        for path, view in zip(scene.images.values(), open_scene(list(scene.images.values())).views, strict=True):
+        for path in scene.images.values():
             (out / path.name).unlink(missing_ok=True)
             (out / path.name).symlink_to(path.resolve())
-            write_rpc_txt(out / f"{path.stem}.txt", view.sensor.coefficients)  # type: ignore[attr-defined]
-        (out / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(CRS(scene.crs).to_proj4()))
+            write_rpc_txt(out / f"{path.stem}.txt", read_rpc(path))
+        (out / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(proj_string(scene.crs)))
         given = {"program": self.program, "resolution": scene.resolution_m, "cores": len(cores)}
         used = Usage()
         for step in recommended("micmac")["steps"]:
@@ -107,6 +109,15 @@ SYSTEM_OF_COORDINATES = """<SystemeCoord>
 """
 
 
+def proj_string(crs: str) -> str:
+    """A UTM zone as MicMac takes it. Raises `Failed` for other systems."""
+    zone = CRS(crs).utm_zone
+    if zone is None:
+        raise Failed(f"MicMac is given UTM zones only, and {crs} is none")
+    south = " +south" if zone.endswith("S") else ""
+    return f"+proj=utm +zone={zone[:-1]}{south} +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+
+
 def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
     """Malt's last surface as a raster with its place, heights in m, nothing where Malt masks."""
     steps = sorted(folder.glob("Z_Num*_DeZoom1_STD-MALT.tif"), key=lambda each: int(re.findall(r"\d+", each.name)[0]))
@@ -117,12 +128,10 @@ def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
     def numbers(name: str) -> list[float]:
         return [float(word) for word in (frame.findtext(f".//{name}") or "").split()]
 
-    with rasterio.open(steps[-1]) as file:
-        z = file.read(1) * numbers("ResolutionAlti")[0] + numbers("OrigineAlti")[0]
+    z = pixels(steps[-1]) * numbers("ResolutionAlti")[0] + numbers("OrigineAlti")[0]
     masks = sorted(folder.glob("AutoMask_STD-MALT_Num_*.tif")) or sorted(folder.glob("Masq_STD-MALT_DeZoom1.tif"))
     if masks:
-        with rasterio.open(masks[-1]) as file:
-            z = np.where(file.read(1) > 0, z, np.nan)
+        z = np.where(pixels(masks[-1]) > 0, z, np.nan)
     (west, north), (right, down) = numbers("OriginePlani"), numbers("ResolutionPlani")
     transform = rasterio.Affine(right, 0.0, west, 0.0, down, north)
     with rasterio.open(
@@ -131,6 +140,14 @@ def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
     ) as file:  # fmt: skip
         file.write(z.astype(np.float32), 1)
     return path
+
+
+def pixels(path: Path) -> np.ndarray:
+    """(r, c) of a raster that has no place of its own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as file:
+            return np.asarray(file.read(1))
 
 
 @dataclass(frozen=True)
@@ -145,10 +162,10 @@ class Setsm:
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         out.mkdir(parents=True, exist_ok=True)
-        for name, view in zip(scene.images, open_scene(list(scene.images.values())).views, strict=True):
+        for name, path in scene.images.items():
             (out / f"{name}.tif").unlink(missing_ok=True)
-            (out / f"{name}.tif").symlink_to(scene.images[name].resolve())
-            write_isd(out / f"{name}.xml", view.sensor.coefficients)  # type: ignore[attr-defined]
+            (out / f"{name}.tif").symlink_to(path.resolve())
+            write_isd(out / f"{name}.xml", read_rpc(path))
         low, high = scene.heights
         options = [*itertools.chain(*recommended("setsm")["options"].items()), "-outres", scene.resolution_m]
         used, surfaces = Usage(), []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[2]
 CONFIGURATIONS = Path(__file__).parent / "configurations"
 # Of CPython, newest first; what is chosen has wheels of all that CARS 1.3.0 needs.
 SUPPORTED = ((3, 12), (3, 13), (3, 11))
@@ -51,13 +53,35 @@ def installed(name: str, folder: Path) -> Environment:
         return environment
     shutil.rmtree(environment.folder, ignore_errors=True)
     subprocess.run([supported_python(), "-m", "venv", environment.folder], check=True)
-    install = [environment.python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--prefer-binary"]
-    done = subprocess.run([*install, "-r", requirements], capture_output=True, text=True)
-    if done.returncode:
-        said = (done.stderr.strip() or "nothing said").splitlines()[-1]
-        raise Missing(f"{requirements.name} could not be installed: {said}")
+    pip(environment, "-r", str(requirements))
     stamp.write_text(wanted, encoding="utf-8")
     return environment
+
+
+def this_checkout(folder: Path) -> Environment:
+    """zlocus as a user has it: this checkout with what it needs and no more, installed again where its code differs."""
+    environment = Environment(folder / "zlocus")
+    digest = hashlib.sha256()
+    for path in sorted([ROOT / "pyproject.toml", *(ROOT / "src").rglob("*.py")]):
+        digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
+    stamp = environment.folder / STAMP
+    if stamp.exists() and stamp.read_text(encoding="utf-8") == digest.hexdigest():
+        return environment
+    if not environment.python.exists():
+        subprocess.run([sys.executable, "-m", "venv", environment.folder], check=True)
+    pip(environment, "--upgrade", "--force-reinstall", "--no-deps", str(ROOT))
+    pip(environment, str(ROOT))
+    stamp.write_text(digest.hexdigest(), encoding="utf-8")
+    return environment
+
+
+def pip(environment: Environment, *what: str) -> None:
+    """Installs. Raises `Missing` where that fails, with what pip said last."""
+    install = [environment.python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--prefer-binary"]
+    done = subprocess.run([*install, *what], capture_output=True, text=True)
+    if done.returncode:
+        said = (done.stderr.strip() or "nothing said").splitlines()[-1]
+        raise Missing(f"{what[-1]} could not be installed: {said}")
 
 
 def supported_python() -> Path:

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
+from peers.environments import Environment
 from peers.measuring import Usage, measured
 from peers.scenes import Scene
 
-ZLOCUS = Path(sys.executable).with_name("zlocus")
+PACKAGES = ("zlocus", "numba", "numpy", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
 class Own:
-    """This checkout of zlocus."""
+    """This checkout of zlocus, as a user has it."""
 
+    environment: Environment
     name: str = "zlocus"
 
     def versions(self) -> dict[str, str]:
         """Of what computes."""
-        return {name: version(name) for name in ("zlocus", "numba", "numpy", "opencv-python-headless")}
+        return self.environment.versions(*PACKAGES)
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         """A surface of the scene, and what it took."""
         command = [
-            ZLOCUS,
+            self.environment.program("zlocus"),
             "dsm",
             *scene.images.values(),
             "-o",

@@ -111,8 +111,9 @@ def verdicts(found: dict[str, Any]) -> Iterator[str]:
     ]
     for name in names:
         rows = succeeded(of_scene(found, name))
-        nmad = sorted((row["classes"]["all"]["nmad"], program) for program, row in rows.items())
-        share = sorted(((row["classes"]["all"]["within"], program) for program, row in rows.items()), reverse=True)
+        every = {program: row["classes"]["all"] for program, row in rows.items()}
+        nmad = sorted(((of["nmad"], program) for program, of in every.items()), key=lambda pair: pair[0])
+        share = sorted(((of["within"], program) for program, of in every.items()), key=lambda pair: -pair[0])
         cells = [name, *ranked(nmad), *ranked(share), ratios(rows)]
         lines.append(f"| {' | '.join(cells)} |")
     yield "\n".join(lines)

@@ -113,6 +113,7 @@ def run_all(
     """Everything that is not there yet. names : scenes, of RENDERED, `pleiades`, `middlebury`, `kernels`. Returns the
     file of results."""
     results = Results(out / "results.json", cores)
+    results.found["machine"]["commit"] = commit()
     for program in programs:
         results.found["programs"][program.name] = program.versions()
     results.write()
@@ -142,33 +143,35 @@ def scenes(names: Sequence[str], out: Path) -> Iterator[Scene]:
 
 
 def surfaces_of(scene: Scene, programs: Sequence[Program], results: Results, out: Path, cores: Sequence[int]) -> None:
-    """All programs on one scene: measured, judged, and compared with each other where there is no truth."""
+    """All programs on one scene: measured where that is not done yet, all judged by one judge, and compared with each
+    other where there is no truth."""
     results.found["scenes"][scene.name] = described(scene)
     made: dict[str, Path] = {} if scene.reference is None else {"s2p, delivered": scene.reference}
     for program in programs:
-        folder = out / "surfaces" / scene.slug / program.name
         say(f"{scene.name}: {program.name}")
         if scene.truth is None:
             scene = replace(scene, shifts=own.shifts(out / "surfaces" / scene.slug / OWN, scene))
-        row: dict[str, Any] = {"scene": scene.name, "program": program.name}
-        if not results.has("surfaces", **row):
-            try:
-                runs = [program.run(scene, folder, cores) for _ in range(OWN_RUNS if program.name == OWN else 1)]
-            except Failed as failure:
-                results.add("surfaces", row | {"failed": str(failure).replace(str(out), "OUT")}, "scene", "program")
-                continue
-            row |= {"surface": str(runs[-1][0].relative_to(out)), **middle([used for _, used in runs])}
-            if scene.truth is not None and scene.classes is not None:
-                row["classes"] = judged(runs[-1][0], scene.truth, scene.classes)
-            results.add("surfaces", row, "scene", "program")
-        (done,) = (
-            each
-            for each in results.found["surfaces"]
-            if row["scene"] == each["scene"] and row["program"] == each["program"]
-        )
-        made[program.name] = out / done["surface"]
+        if not results.has("surfaces", scene=scene.name, program=program.name):
+            results.add("surfaces", measured_row(scene, program, out, cores), "scene", "program")
+    rows = [row for row in results.found["surfaces"] if row["scene"] == scene.name and "failed" not in row]
+    made |= {row["program"]: out / row["surface"] for row in rows}
+    for row in rows:
+        if scene.truth is not None and scene.classes is not None:
+            row["classes"] = judged(made[row["program"]], scene.truth, scene.classes)
+    results.write()
     if scene.truth is None:
         differences(scene, made, results)
+
+
+def measured_row(scene: Scene, program: Program, out: Path, cores: Sequence[int]) -> dict[str, Any]:
+    """What a program took for a scene, and where its surface lies; or why there is none."""
+    row: dict[str, Any] = {"scene": scene.name, "program": program.name}
+    folder = out / "surfaces" / scene.slug / program.name
+    try:
+        runs = [program.run(scene, folder, cores) for _ in range(OWN_RUNS if program.name == OWN else 1)]
+    except Failed as failure:
+        return row | {"failed": str(failure).replace(str(out), "OUT")}
+    return row | {"surface": str(runs[-1][0].relative_to(out)), **middle([used for _, used in runs])}
 
 
 def middle(runs: list[Usage]) -> dict[str, Any]:

@@ -39,6 +39,7 @@ BY_DEPTH: dict[str, dict[str, Any]] = {
     "semiglobal": {
         "predecessors": 1,
         "p1": 20,
+        "p1_two": 20,
         "p2": 240,
         "p2_edge": 100,
         "edge_contrast": 2.0,

@@ -75,19 +75,20 @@ def aggregate(
     p2: NDArray[np.uint16],
     step_cells: float,
     options: SemiGlobalOptions,
+    by_two: bool = False,
 ) -> SemiGlobalHeights:
     """Sum of the path costs over 8 paths, and its minima.
 
-    cost : (v,) uint8, see `HeightLattice.address`; step_cells : height of a step over the side of a cell. Two
-    predecessors find more roofs and take up to twice the time; with a narrow base there is little to find (a step is as
-    high as a storey).
+    cost : (v,) uint8, see `HeightLattice.address`; step_cells : height of a step over the side of a cell; by_two :
+    no cell is covered by more than two views, so that `p1_two` applies. Two predecessors find more roofs and take up to
+    twice the time; with a narrow base there is little to find (a step is as high as a storey).
     """
+    p1 = options.p1_two if by_two else options.p1
     if (options.predecessors or (1 if step_cells > NARROW_BASE else 2)) == 2:
-        return pick(more_global_sums(cost, lattice, p2, options.p1), lattice)
+        return pick(more_global_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)
-    p1 = np.uint16(options.p1)
     for sign in (1, -1):
-        sweep(cost, lattice.ranges, lattice.address, lattice.block, p2, p1, sign, total)
+        sweep(cost, lattice.ranges, lattice.address, lattice.block, p2, np.uint16(p1), sign, total)
     return pick(total, lattice)
 
 
