@@ -275,7 +275,7 @@ class Copy:
 
 def run_copy(copy: Copy, scene: Any, out: Path) -> dict[str, Any]:
     results = running.Results(out / "results.json", (CORE,))
-    results.found["programs"][copy.name] = copy.versions()
+    results.say_of("programs", copy.name, copy.versions())
     running.surfaces_of(scene, [copy], results, out, (CORE,))
     return json.loads((out / "results.json").read_text())
 

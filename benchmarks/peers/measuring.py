@@ -35,9 +35,14 @@ class Usage:
 
 
 def measured(
-    command: Sequence[Any], cores: Sequence[int], log: Path, cwd: Path | None = None, limit_s: float = LIMIT_S
+    command: Sequence[Any],
+    cores: Sequence[int],
+    log: Path,
+    cwd: Path | None = None,
+    limit_s: float = LIMIT_S,
+    accept: Sequence[int] = (0,),
 ) -> Usage:
-    """Runs a command to its end; what it says goes to a file. Raises `Failed` where it does not end with 0."""
+    """Runs a command to its end; what it says goes to a file. Raises `Failed` where it ends with another status."""
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | dict.fromkeys(THREADS, str(len(cores)))
     with tempfile.TemporaryDirectory() as scratch, log.open("wb") as said:
@@ -47,7 +52,7 @@ def measured(
             [str(word) for word in launch], stdout=said, stderr=subprocess.STDOUT, cwd=cwd, env=environment
         )
         found = json.loads(usage.read_text()) if usage.exists() else {"status": done.returncode}
-    if found["status"]:
+    if found["status"] not in accept:
         last = [line for line in log.read_text(errors="replace").splitlines() if line.strip()][-1:] or ["nothing said"]
         raise Failed(f"{Path(str(command[0])).name} ended with {found['status']} ({last[0].strip()}); see {log}")
     return Usage(found["cpu_s"], found["wall_s"], found["peak_gb"])

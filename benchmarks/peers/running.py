@@ -74,6 +74,12 @@ class Results:
         self.found[part] = [*kept, row | {"when": now()}]
         self.write()
 
+    def say_of(self, part: str, name: str, what: dict[str, Any]) -> None:
+        """Describes a program or a scene; the page has them in the order of the last run."""
+        self.found[part].pop(name, None)
+        self.found[part][name] = what
+        self.write()
+
     def write(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         fresh = self.path.with_suffix(".tmp")
@@ -115,8 +121,7 @@ def run_all(
     results = Results(out / "results.json", cores)
     results.found["machine"]["commit"] = commit()
     for program in programs:
-        results.found["programs"][program.name] = program.versions()
-    results.write()
+        results.say_of("programs", program.name, program.versions())
     names = list(names)
     warm = WARM_UP.scenes("warm-up", out / "scenes")[0]
     for program in programs:
@@ -145,7 +150,7 @@ def scenes(names: Sequence[str], out: Path) -> Iterator[Scene]:
 def surfaces_of(scene: Scene, programs: Sequence[Program], results: Results, out: Path, cores: Sequence[int]) -> None:
     """All programs on one scene: measured where that is not done yet, all judged by one judge, and compared with each
     other where there is no truth."""
-    results.found["scenes"][scene.name] = described(scene)
+    results.say_of("scenes", scene.name, described(scene))
     made: dict[str, Path] = {} if scene.reference is None else {"s2p, delivered": scene.reference}
     for program in programs:
         say(f"{scene.name}: {program.name}")

@@ -6,6 +6,7 @@ import itertools
 import os
 import subprocess
 import sys
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -148,7 +149,9 @@ def write_terrain(heights: np.ndarray, transform: rasterio.Affine, crs: str, pat
     rows, cols = (-(-n // k) for n in heights.shape)
     padded = np.pad(heights, [(0, rows * k - heights.shape[0]), (0, cols * k - heights.shape[1])], mode="edge")
     blocks = padded.reshape(rows, k, cols, k).swapaxes(1, 2).reshape(rows, cols, -1)
-    coarse = np.nanpercentile(blocks, TERRAIN_PERCENTILE, axis=-1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # cells of which nothing is known
+        coarse = np.nanpercentile(blocks, TERRAIN_PERCENTILE, axis=-1)
     coarse = coarse[tuple(distance_transform_edt(np.isnan(coarse), return_distances=False, return_indices=True))]
     coarse = np.pad(coarse, TERRAIN_BORDER, mode="edge").astype(np.float32)
     border = TERRAIN_BORDER * TERRAIN_M
