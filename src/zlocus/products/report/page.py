@@ -13,8 +13,6 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from zlocus.errors import InputError
-from zlocus.products.curves import mean_figure, svg_of
-from zlocus.products.drawn import MeanCurves
 from zlocus.products.record import read_record, write_whole
 from zlocus.products.report import maps, tables, words
 from zlocus.products.report.comparison import Comparison, comparison_part
@@ -270,8 +268,7 @@ def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any
         f"{LABEL_WORDS[mean['label']]}: largest correlation {words.number(mean['rho1'])}, "
         f"{words.number(mean['ratio'])} times its rival, at {words.number(mean['peak_m'], 'm')}."
     )
-    svg = svg_of(mean_figure(MeanCurves.read(cell), is_small=True))
-    uri = maps.data_uri(svg.encode(), "image/svg+xml")
+    uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
     alt = f"Correlation against height at this cell. {says}"
     lines.append(says)
     if cell["kind"] == "failed" and (despite := words.despite_peak(Quality[cell["why"]], mean["rho1"], run)):
