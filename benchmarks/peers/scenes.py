@@ -137,7 +137,7 @@ class Rendered:
 # Seeds that no option was chosen by. The large one is rendered for three views, of more than 4 M cells.
 RENDERED = {
     "town": Rendered("city", 101, 1024),
-    "hills": Rendered("hills", 101, 1024),
+    "hills": Rendered("hills", 101, 1024, views=(2, 3)),
     "large town": Rendered("city", 102, 2048, views=(3,)),
 }
 WARM_UP = Rendered("city", 100, 640, views=(2,))
