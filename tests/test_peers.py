@@ -174,7 +174,7 @@ def test_s2p_as_its_documents_say(scene, tmp_path):
         """,
     )
     s2p = builds.S2p(build)
-    assert s2p.versions() == {"s2p": "1.4.2"}
+    assert s2p.versions()["s2p"] == "1.4.2"
     dsm, _ = s2p.run(scene, tmp_path / "run", (CORE,))
     assert dsm.read_bytes() == next(iter(scene.images.values())).read_bytes()
 
@@ -205,15 +205,15 @@ def test_micmac_as_its_documents_say(scene, tmp_path):
     dsm, _ = builds.MicMac(build).run(scene, tmp_path / "run", (CORE,))
     with rasterio.open(dsm) as file:
         np.testing.assert_array_equal(file.read(1), [[405.0, 405.5], [np.nan, 406.5]])
-        assert file.transform == from_origin(462000, 5247000, 0.5, 0.5)
+        assert file.transform == from_origin(462000 - 0.25, 5247000 + 0.25, 0.5, 0.5)
         assert file.crs.to_epsg() == 32632
-    steps = (tmp_path / "run" / "steps").read_text().splitlines()
+    steps = (tmp_path / "run" / "work" / "steps").read_text().splitlines()
     assert [step.split()[0] for step in steps] == ["Convert2GenBundle", "Tapioca", "Campari", "Malt"]
     assert "ResolTerrain=0.5" in steps[-1]
-    assert "+proj=utm +zone=32" in (tmp_path / "run" / "ground.xml").read_text()
+    assert "+proj=utm +zone=32" in (tmp_path / "run" / "work" / "ground.xml").read_text()
     for path in scene.images.values():
         with rasterio.open(path) as file:
-            assert read_rpc_txt(tmp_path / "run" / f"{path.stem}.txt").line_off == file.rpcs.line_off
+            assert read_rpc_txt(tmp_path / "run" / "work" / f"{path.stem}.txt").line_off == file.rpcs.line_off
 
 
 def test_setsm_as_its_manual_says(scene, tmp_path):
@@ -296,7 +296,7 @@ def test_what_was_measured_is_not_measured_again(scene, tmp_path):
 def test_a_failure_is_kept_and_tried_again(scene, tmp_path):
     copy = Copy(fails=True)
     (row,) = run_copy(copy, scene, tmp_path)["surfaces"]
-    assert row["failed"] == "copy ended with 1; see OUT/surfaces/sine-3-views/CARS"
+    assert row["failed"] == "copy ended with 1; see surfaces/sine-3-views/CARS"
     run_copy(copy, scene, tmp_path)
     assert copy.runs == 2
 
@@ -304,10 +304,17 @@ def test_a_failure_is_kept_and_tried_again(scene, tmp_path):
 def results_of(**cpu_s: float) -> dict[str, Any]:
     """Made-up results: programs on one scene of two million cells."""
     figures = {"within": 0.9, "nmad": 0.1, "rmse": 1.0, "le90": 0.5, "completeness": 1.0}
-    row = {"scene": "town, 2 views", "wall_s": 4.0, "peak_gb": 1.0, "when": "2026-01-02T03:04:05+00:00"}
+    row = {
+        "scene": "town, 2 views",
+        "wall_s": 4.0,
+        "peak_gb": 1.0,
+        "when": "2026-01-02T03:04:05+00:00",
+        "commit": "abc",
+        "judge": "a judge",
+        "beside": 0.0,
+    }
     return {
-        "machine": {"processor": "P", "cores": [0], "of_cores": 2, "memory_gb": 8, "system": "L", "python": "3",
-                    "commit": "abc"},
+        "machine": {"processor": "P", "cores": [0], "of_cores": 2, "memory_gb": 8, "system": "L", "python": "3"},
         "programs": {name: {} for name in cpu_s},
         "scenes": {"town, 2 views": {"kind": "city", "views": 2, "million_cells": 2.0, "pairs": 1, "truth": True}},
         "surfaces": [row | {"program": name, "cpu_s": cpu, "classes": {"all": figures, "ground": figures}}
@@ -320,18 +327,38 @@ def test_the_page_says_who_wins():
     found = results_of(zlocus=10.0, CARS=600.0, MicMac=70.0)
     found["surfaces"][2]["classes"]["all"] = found["surfaces"][2]["classes"]["all"] | {"nmad": 0.05, "within": 0.8}
     text = page.page_of(found)
-    assert (
-        "| town, 2 views | **MicMac 0.050** | zlocus 0.100 | zlocus 0.900 | CARS 0.900 | CARS 60.0, **MicMac 7.0** |"
-        in text
-    )
-    assert "| zlocus | 5.0 | 2.0 | 1.00 | 1.000 | 0.900 | 0.900 |  |  | 0.100 |" in text
-    assert "Measured 2026-01-02 on 1 of 2 cores of P, 8 GB, L; commit abc." in text
+    row = "| town, 2 views | **MicMac 0.050** | zlocus 0.100 | **zlocus 0.900** | CARS 0.900 | CARS 60.0, **MicMac 7.0** |"
+    assert row in text  # CARS has the same share
+    assert "| zlocus | **5.0** | **2.0** | **1.00** | **1.000** | **0.900** | **0.900** |  |  | 0.100 |" in text
+    assert "Measured 2026-01-02 on 1 of 2 cores of P, 8 GB, L; commit abc; judged by a judge." in text
+
+
+def test_other_work_on_the_machine_is_told():
+    found = results_of(zlocus=10.0, CARS=600.0)
+    found["surfaces"][1]["beside"] = 0.2
+    assert "other work beside CARS on town, 2 views (20% of the cores)" in page.page_of(found)
+
+
+def test_a_class_without_cells_has_no_figures(tmp_path):
+    found = results_of(zlocus=10.0, CARS=600.0)
+    for row in found["surfaces"]:
+        row["classes"]["building"] = {"n": 0, "completeness": None, "within": None, "nmad": None}
+    (tmp_path / "results.json").write_text(json.dumps(found))
+    text = page.write_page(tmp_path / "results.json", tmp_path).read_text()
+    assert "| **0.900** | **0.900** |  |  | **0.100** |" in text
+    assert "0.000" not in text
 
 
 def test_a_failure_stands_on_the_page():
     found = results_of(zlocus=10.0, CARS=600.0)
-    found["surfaces"][1] = {"scene": "town, 2 views", "program": "CARS", "failed": "no", "when": "2026-01-02"}
-    assert "| CARS | failed: no |" in page.page_of(found)
+    found["surfaces"][1] = {
+        "scene": "town, 2 views",
+        "program": "CARS",
+        "failed": "a | b",
+        "when": "2026-01-02",
+        "commit": "abc",
+    }
+    assert "| CARS | failed: a / b |" in page.page_of(found)
 
 
 def test_the_page_of_the_documents_is_that_of_the_results(tmp_path):

@@ -141,7 +141,7 @@ def test_heights_above_a_base_surface():
 
 @pytest.mark.parametrize("predecessors", [1, 2])
 def test_a_pair_has_a_penalty_of_its_own(predecessors):
-    """Where no cell is seen by more than two views, `p1_two` takes the place of `p1`."""
+    """Of two images, `p1_two` takes the place of `p1`."""
     lattice, rng = even_lattice(6, (9, 11), 8), np.random.default_rng(4)
     cost = rng.integers(0, 129, lattice.size).astype(np.uint8)
     p2 = penalties(None, (9, 11), 0, OPTIONS)

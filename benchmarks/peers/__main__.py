@@ -1,6 +1,6 @@
 """zlocus beside other programs, on the same images, area, grid and cores: `make peers`, or
 
-    python benchmarks/peers [--scenes NAME ...] [--programs NAME ...] [--out FOLDER] [--cores 0,1]
+    python benchmarks/peers [--scenes NAME ...] [--programs NAME ...] [--views N ...] [--out FOLDER] [--cores 0,1]
                             [--s2p PATH] [--micmac PATH] [--setsm PATH]
 
 Installs CARS, Pandora with libSGM, and OpenCV from the package registry into environments of their own below FOLDER;
@@ -83,7 +83,7 @@ def main() -> None:
     usable = sorted(os.sched_getaffinity(0))
     cores = tuple(map(int, given.cores.split(","))) if given.cores else tuple(usable[:2])
     environments: dict[str, Environment] = {}
-    results = run_all(programs(given, environments), given.scenes, given.out, cores, environments)
+    results = run_all(programs(given, environments), given.scenes, given.out, cores, environments, given.views)
     print(write_page(results, given.out))
 
 

@@ -5,6 +5,7 @@ Written from their documents; on the machine of the published results there was 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import re
@@ -22,18 +23,25 @@ import yaml
 from pyproj import CRS
 from rasterio.errors import NotGeoreferencedWarning
 
-from peers.environments import CONFIGURATIONS, Missing
+from peers.environments import CONFIGURATIONS, Missing, digest_of
 from peers.measuring import Failed, Usage, measured
-from peers.scenes import Scene
+from peers.scenes import RESOLUTION_M, Scene
 from rectifying import gridded
 from zlocus.io.cameras import read_rpc
 from zlocus.io.rpc_text import write_rpc_txt
 from zlocus.sensors.rpc import RpcCoefficients
 
+ANSWER_S = 60.0
+
 
 def recommended(name: str) -> dict:
     """Of `configurations/NAME.yaml`."""
     return dict(yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")))
+
+
+def digest(name: str) -> dict[str, str]:
+    """Tells states of a configuration apart."""
+    return {"configuration": digest_of([CONFIGURATIONS / f"{name}.yaml"])}
 
 
 def working(program: Path) -> Path:
@@ -46,9 +54,11 @@ def working(program: Path) -> Path:
 
 def said_version(program: Path, *asks: str) -> str:
     """What looks like a version in what a program says of itself, or nothing."""
-    said = subprocess.run([program, *asks], capture_output=True, text=True, errors="replace")
-    found = re.search(r"\d+\.\d+[\w.+-]*|\b[0-9a-f]{7,40}\b", said.stdout + said.stderr)
-    return found.group() if found else "unknown"
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        said = subprocess.run([program, *asks], capture_output=True, text=True, errors="replace", timeout=ANSWER_S)
+        found = re.search(r"\d+\.\d+[\w.+-]*|\b[0-9a-f]{7,40}\b", said.stdout + said.stderr)
+        return found.group() if found else "unknown"
+    return "unknown"
 
 
 @dataclass(frozen=True)
@@ -59,14 +69,14 @@ class S2p:
     name: str = "s2p"
 
     def versions(self) -> dict[str, str]:
-        return {"s2p": said_version(self.program, "--version")}
+        return {"s2p": said_version(self.program, "--version")} | digest("s2p")
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         out.mkdir(parents=True, exist_ok=True)
         config = recommended("s2p") | {
             "out_dir": str(out / "s2p"), "temporary_dir": str(out / "tmp"),
             "images": [{"img": str(path)} for path in scene.images.values()],
-            "dsm_resolution": scene.resolution_m, "max_processes": len(cores),
+            "dsm_resolution": RESOLUTION_M, "max_processes": len(cores),
         }  # fmt: skip
         (out / "config.json").write_text(json.dumps(config, indent=1))
         used = measured([self.program, out / "config.json"], cores, out / "s2p.log", out)
@@ -81,21 +91,22 @@ class MicMac:
     name: str = "MicMac"
 
     def versions(self) -> dict[str, str]:
-        return {"mm3d": said_version(self.program, "CheckDependencies")}
+        return {"mm3d": said_version(self.program, "CheckDependencies")} | digest("micmac")
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
-        out.mkdir(parents=True, exist_ok=True)
+        # Its patterns take every TIFF of a folder.
+        work = out / "work"
+        work.mkdir(parents=True, exist_ok=True)
         for path in scene.images.values():
-            (out / path.name).unlink(missing_ok=True)
-            (out / path.name).symlink_to(path.resolve())
-            write_rpc_txt(out / f"{path.stem}.txt", read_rpc(path))
-        (out / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(proj_string(scene.crs)))
-        given = {"program": self.program, "resolution": scene.resolution_m, "cores": len(cores)}
+            (work / path.name).symlink_to(path.resolve())
+            write_rpc_txt(work / f"{path.stem}.txt", read_rpc(path))
+        (work / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(proj_string(scene.crs)))
+        given = {"program": self.program, "resolution": RESOLUTION_M, "cores": len(cores)}
         used = Usage()
         for step in recommended("micmac")["steps"]:
             command = [self.program, *(str(word).format(**given) for word in step), "@ExitOnBrkp"]
-            used += measured(command, cores, out / f"{step[0]}.log", out)
-        return georeferenced(out / "MEC-Malt", scene, out / "dsm.tif"), used
+            used += measured(command, cores, out / f"{step[0]}.log", work)
+        return georeferenced(work / "MEC-Malt", scene, out / "dsm.tif"), used
 
 
 # Of MicMac: a projection by a definition of PROJ.
@@ -121,7 +132,7 @@ def proj_string(crs: str) -> str:
 def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
     """Malt's last surface as a raster with its place, heights in m, nothing where Malt masks."""
     steps = sorted(folder.glob("Z_Num*_DeZoom1_STD-MALT.tif"), key=lambda each: int(re.findall(r"\d+", each.name)[0]))
-    if not steps:
+    if not steps or not steps[-1].with_suffix(".xml").exists():
         raise Failed(f"MicMac left no surface in {folder}")
     frame = ElementTree.parse(steps[-1].with_suffix(".xml")).getroot()
 
@@ -132,8 +143,9 @@ def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
     masks = sorted(folder.glob("AutoMask_STD-MALT_Num_*.tif")) or sorted(folder.glob("Masq_STD-MALT_DeZoom1.tif"))
     if masks:
         z = np.where(pixels(masks[-1]) > 0, z, np.nan)
-    (west, north), (right, down) = numbers("OriginePlani"), numbers("ResolutionPlani")
-    transform = rasterio.Affine(right, 0.0, west, 0.0, down, north)
+    (x, y), (right, down) = numbers("OriginePlani"), numbers("ResolutionPlani")
+    # The middle of the first cell, as in the world files that MicMac writes of it.
+    transform = rasterio.Affine(right, 0.0, x - right / 2, 0.0, down, y - down / 2)
     with rasterio.open(
         path, "w", driver="GTiff", height=z.shape[0], width=z.shape[1], count=1, dtype="float32", crs=scene.crs,
         transform=transform, nodata=np.nan,
@@ -158,23 +170,22 @@ class Setsm:
     name: str = "SETSM"
 
     def versions(self) -> dict[str, str]:
-        return {"setsm": said_version(self.program, "-help")}
+        return {"setsm": said_version(self.program, "-help")} | digest("setsm")
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         out.mkdir(parents=True, exist_ok=True)
         for name, path in scene.images.items():
-            (out / f"{name}.tif").unlink(missing_ok=True)
             (out / f"{name}.tif").symlink_to(path.resolve())
             write_isd(out / f"{name}.xml", read_rpc(path))
         low, high = scene.heights
-        options = [*itertools.chain(*recommended("setsm")["options"].items()), "-outres", scene.resolution_m]
+        options = [*itertools.chain(*recommended("setsm")["options"].items()), "-outres", RESOLUTION_M]
         used, surfaces = Usage(), []
         for left, right in scene.pairs:
             pair = out / f"{left}-{right}"
             command = [self.program, "-image", out / f"{left}.tif", "-image", out / f"{right}.tif", "-outpath", pair]
             command += [*options, "-minH", low, "-maxH", high]
             used += measured(command, cores, out / f"{pair.name}.log", out)
-            surfaces.append(on_grid(next(pair.glob("*_dem.tif")), scene))
+            surfaces.append(on_grid(only(pair, "*_dem.tif"), scene))
         return write_median(surfaces, scene, out / "dsm.tif"), used
 
 
@@ -203,10 +214,20 @@ def write_isd(path: Path, rpc: RpcCoefficients) -> None:
     ElementTree.ElementTree(root).write(path)
 
 
+def only(folder: Path, pattern: str) -> Path:
+    """Raises `Failed` where there is no such file."""
+    found = sorted(folder.glob(pattern))
+    if not found:
+        raise Failed(f"no {pattern} was left in {folder}")
+    return found[0]
+
+
 def on_grid(path: Path, scene: Scene) -> np.ndarray:
     """(r, c) m of a surface on the scene's grid, NaN where it has none."""
     with rasterio.open(path) as file:
-        z = file.read(1, masked=True).filled(np.nan).astype(float)
+        if file.crs is None or file.crs.to_epsg() != CRS(scene.crs).to_epsg():
+            raise Failed(f"{path} is in {file.crs}, not in {scene.crs}")
+        z = file.read(1, masked=True).astype(float).filled(np.nan)
         rows, cols = np.nonzero(np.isfinite(z) & (np.abs(z) < 9000))
         x, y = file.transform * (cols + 0.5, rows + 0.5)
     return gridded(scene, np.column_stack([x, y, z[rows, cols]]))
@@ -217,7 +238,7 @@ def write_median(surfaces: list[np.ndarray], scene: Scene, path: Path) -> Path:
     stacked = np.ma.masked_invalid(np.stack(surfaces))
     merged = np.ma.median(stacked, axis=0).filled(np.nan).astype(np.float32)
     west, _, _, north = scene.bounds
-    step = scene.resolution_m
+    step = RESOLUTION_M
     with rasterio.open(
         path, "w", driver="GTiff", height=merged.shape[0], width=merged.shape[1], count=1, dtype="float32",
         crs=scene.crs, transform=rasterio.transform.from_origin(west, north, step, step), nodata=np.nan,

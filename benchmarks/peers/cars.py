@@ -14,9 +14,9 @@ import yaml
 from pyproj import CRS
 from rasterio.transform import from_origin
 
-from peers.environments import CONFIGURATIONS, Environment
+from peers.environments import CONFIGURATIONS, Environment, digest_of
 from peers.measuring import Usage, measured
-from peers.scenes import Scene
+from peers.scenes import RESOLUTION_M, Scene
 
 # Images with fewer pixels along a side are small.
 SMALL_PX = 1000
@@ -32,7 +32,8 @@ class Cars:
 
     def versions(self) -> dict[str, str]:
         """Of what computes."""
-        return self.environment.versions(*PACKAGES)
+        configuration = digest_of([CONFIGURATIONS / "cars.yaml"])
+        return self.environment.versions(*PACKAGES) | {"configuration": configuration}
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         """A surface of the scene, and what it took."""
@@ -56,7 +57,7 @@ def configuration(scene: Scene, out: Path) -> dict[str, Any]:
             "initial_elevation": {"dem": str(scene.terrain), "geoid": str(write_no_geoid(out / "geoid.tif"))},
         },
         "output": recommended["output"]
-        | {"directory": str(out / "cars"), "resolution": scene.resolution_m, "epsg": CRS(scene.crs).to_epsg()},
+        | {"directory": str(out / "cars"), "resolution": RESOLUTION_M, "epsg": CRS(scene.crs).to_epsg()},
         "subsampling": {"advanced": {"resolutions": recommended["resolutions"][size_class(scene)]}},
         "surface_modeling": {"applications": {"all": matching}},
     }

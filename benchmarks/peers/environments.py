@@ -1,4 +1,4 @@
-"""Environments of other programs, each with a Python that they support, installed as wheels from the registry."""
+"""Environments of other programs, each with a Python that they support, installed from the registry."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import hashlib
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGURATIONS = Path(__file__).parent / "configurations"
-# Of CPython, newest first; what is chosen has wheels of all that CARS 1.3.0 needs.
+# Of CPython, in the order in which they are looked for: all that CARS 1.3.0 needs is there for them.
 SUPPORTED = ((3, 12), (3, 13), (3, 11))
 STAMP = ".installed"
 
@@ -44,44 +47,58 @@ class Environment:
 def installed(name: str, folder: Path) -> Environment:
     """The environment of `configurations/NAME.txt`, made where it is not there yet or another one is asked for.
 
-    Raises `Missing` where no supported Python is found, or the registry has no wheels for it.
+    Raises `Missing` where no supported Python is found, or something cannot be installed.
     """
     requirements = CONFIGURATIONS / f"{name}.txt"
-    environment, wanted = Environment(folder / name), requirements.read_text(encoding="utf-8")
-    stamp = environment.folder / STAMP
-    if stamp.exists() and stamp.read_text(encoding="utf-8") == wanted:
-        return environment
-    shutil.rmtree(environment.folder, ignore_errors=True)
-    subprocess.run([supported_python(), "-m", "venv", environment.folder], check=True)
-    pip(environment, "-r", str(requirements))
-    stamp.write_text(wanted, encoding="utf-8")
-    return environment
+    wanted = requirements.read_text(encoding="utf-8")
+    return made(Environment(folder / name), wanted, supported_python, ["-r", str(requirements)])
 
 
 def this_checkout(folder: Path) -> Environment:
     """zlocus as a user has it: this checkout with what it needs and no more, installed again where its code differs."""
-    environment = Environment(folder / "zlocus")
+    files = sorted([ROOT / "pyproject.toml", ROOT / "README.md", ROOT / "LICENSE", *(ROOT / "src").rglob("*")])
+    files = [
+        path
+        for path in files
+        if path.is_file() and not {"__pycache__"} & set(path.parts) and ".egg-info" not in str(path)
+    ]
+    digest = digest_of(files)
+    with tempfile.TemporaryDirectory() as scratch:
+        # From a copy: a build leaves its own folders beside what it builds.
+        for path in files:
+            copy = Path(scratch) / path.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+        return made(Environment(folder / "zlocus"), digest, lambda: Path(sys.executable), [scratch])
+
+
+def digest_of(files: Iterable[Path]) -> str:
+    """Of names and contents."""
     digest = hashlib.sha256()
-    for path in sorted([ROOT / "pyproject.toml", *(ROOT / "src").rglob("*.py")]):
-        digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
+    for path in files:
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def made(environment: Environment, wanted: str, python: Callable[[], Path], what: list[str]) -> Environment:
+    """An environment whose stamp says what is wanted, made anew otherwise."""
     stamp = environment.folder / STAMP
-    if stamp.exists() and stamp.read_text(encoding="utf-8") == digest.hexdigest():
+    if stamp.exists() and stamp.read_text(encoding="utf-8") == wanted:
         return environment
-    if not environment.python.exists():
-        subprocess.run([sys.executable, "-m", "venv", environment.folder], check=True)
-    pip(environment, "--upgrade", "--force-reinstall", "--no-deps", str(ROOT))
-    pip(environment, str(ROOT))
-    stamp.write_text(digest.hexdigest(), encoding="utf-8")
+    shutil.rmtree(environment.folder, ignore_errors=True)
+    run([python(), "-m", "venv", environment.folder])
+    options = ["--quiet", "--disable-pip-version-check", "--prefer-binary"]
+    run([environment.python, "-m", "pip", "install", *options, *what])
+    stamp.write_text(wanted, encoding="utf-8")
     return environment
 
 
-def pip(environment: Environment, *what: str) -> None:
-    """Installs. Raises `Missing` where that fails, with what pip said last."""
-    install = [environment.python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--prefer-binary"]
-    done = subprocess.run([*install, *what], capture_output=True, text=True)
+def run(command: list[Any]) -> None:
+    """Raises `Missing` where it fails, with what it said last."""
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        said = (done.stderr.strip() or "nothing said").splitlines()[-1]
-        raise Missing(f"{what[-1]} could not be installed: {said}")
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing said").splitlines()[-1]
+        raise Missing(f"`{' '.join(map(str, command[1:]))}` failed: {said}")
 
 
 def supported_python() -> Path:

@@ -1,8 +1,8 @@
 """Runs a command on given cores and says what it took: `python launch.py USAGE CORES SECONDS COMMAND ...`.
 
-In a process of its own, which adopts what the command leaves behind (a server of workers outlives it by a moment),
-so that CPU counts whatever it started. Memory is that of all its processes together, shared pages once
-(proportional set size).
+In a process of its own, which adopts what the command leaves behind (a server of workers outlives it by a moment), so
+that CPU counts whatever it started. `beside` is the share of the cores that other work had meanwhile. Memory is that
+of all its processes together, shared pages once (proportional set size).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from pathlib import Path
 import psutil
 
 ADOPT = 36  # PR_SET_CHILD_SUBREAPER
-SAMPLE_S, LINGER_S = 0.25, 5.0
+# Memory is asked for rarely: where there are many processes that takes a tenth of a second.
+POLL_S, SAMPLE_S, LINGER_S = 0.02, 0.5, 5.0
 TOO_LONG = 124
 
 
@@ -31,16 +32,24 @@ def memory(process: psutil.Process) -> int:
     return 0
 
 
+def busy(cores: set[int]) -> float:
+    """Seconds of CPU that all processes of the machine have had on some cores."""
+    times = psutil.cpu_times(percpu=True)
+    return sum(sum(times[core]) - times[core].idle - getattr(times[core], "iowait", 0.0) for core in cores)
+
+
 def watch(process: subprocess.Popen[bytes], limit_s: float) -> tuple[int, int]:
     """Exit status and the most bytes that all processes held at once; stops them when time is up."""
-    itself, peak, start = psutil.Process(), 0, time.monotonic()
+    itself, peak, start, sampled = psutil.Process(), 0, time.monotonic(), 0.0
     while process.poll() is None:
-        peak = max(peak, sum(memory(each) for each in itself.children(recursive=True)))
-        if time.monotonic() - start > limit_s:
+        now = time.monotonic()
+        if now - sampled > SAMPLE_S:
+            peak, sampled = max(peak, sum(memory(each) for each in itself.children(recursive=True))), now
+        if now - start > limit_s:
             stop(itself)
             process.wait()
             return TOO_LONG, peak
-        time.sleep(SAMPLE_S)
+        time.sleep(POLL_S)
     return process.returncode, peak
 
 
@@ -66,16 +75,20 @@ def reap(itself: psutil.Process) -> None:
 
 
 def main() -> int:
-    usage, cores, limit_s, *command = sys.argv[1:]
-    os.sched_setaffinity(0, {int(core) for core in cores.split(",")})
+    usage, listed, limit_s, *command = sys.argv[1:]
+    cores = {int(core) for core in listed.split(",")}
+    os.sched_setaffinity(0, cores)
     ctypes.CDLL(None).prctl(ADOPT, 1, 0, 0, 0)
-    start = time.monotonic()
+    start, before = time.monotonic(), busy(cores)
     with subprocess.Popen(command) as process:
         status, peak = watch(process, float(limit_s))
         wall_s = time.monotonic() - start
     reap(psutil.Process())
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    found = {"status": status, "cpu_s": used.ru_utime + used.ru_stime, "wall_s": wall_s, "peak_gb": peak / 1024**3}
+    of_all, took = busy(cores) - before, time.monotonic() - start
+    used, own = (resource.getrusage(who) for who in (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF))
+    cpu_s = used.ru_utime + used.ru_stime
+    beside = max(0.0, of_all - cpu_s - own.ru_utime - own.ru_stime) / (took * len(cores))
+    found = {"status": status, "cpu_s": cpu_s, "wall_s": wall_s, "peak_gb": peak / 1024**3, "beside": beside}
     Path(usage).write_text(json.dumps(found))
     return status
 

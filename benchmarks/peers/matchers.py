@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from peers.environments import CONFIGURATIONS, Environment
+from peers.environments import CONFIGURATIONS, Environment, digest_of
 from peers.measuring import Usage, measured
 from peers.scenes import Scene
 
@@ -30,7 +30,8 @@ class Matcher:
 
     def versions(self) -> dict[str, str]:
         """Of what computes."""
-        return self.environment.versions(*self.packages)
+        configuration = digest_of([CONFIGURATIONS / f"{self.script}.json"])
+        return self.environment.versions(*self.packages) | {"configuration": configuration}
 
     def options(self) -> dict[str, object]:
         """What its documentation recommends."""

@@ -24,14 +24,17 @@ class Failed(Exception):
 
 @dataclass(frozen=True)
 class Usage:
-    """cpu_s, wall_s : s; peak_gb : GB of 1024^3 bytes."""
+    """cpu_s, wall_s : s; peak_gb : GB of 1024^3 bytes; beside : share of the cores that other work had meanwhile."""
 
     cpu_s: float = 0.0
     wall_s: float = 0.0
     peak_gb: float = 0.0
+    beside: float = 0.0
 
     def __add__(self, other: Usage) -> Usage:
-        return Usage(self.cpu_s + other.cpu_s, self.wall_s + other.wall_s, max(self.peak_gb, other.peak_gb))
+        wall_s = self.wall_s + other.wall_s
+        beside = (self.beside * self.wall_s + other.beside * other.wall_s) / wall_s if wall_s else 0.0
+        return Usage(self.cpu_s + other.cpu_s, wall_s, max(self.peak_gb, other.peak_gb), beside)
 
 
 def measured(
@@ -55,4 +58,4 @@ def measured(
     if found["status"] not in accept:
         last = [line for line in log.read_text(errors="replace").splitlines() if line.strip()][-1:] or ["nothing said"]
         raise Failed(f"{Path(str(command[0])).name} ended with {found['status']} ({last[0].strip()}); see {log}")
-    return Usage(found["cpu_s"], found["wall_s"], found["peak_gb"])
+    return Usage(found["cpu_s"], found["wall_s"], found["peak_gb"], found["beside"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ import numpy as np
 
 import middlebury as cases
 from peers.environments import CONFIGURATIONS, Environment
-from peers.measuring import measured
+from peers.measuring import Failed, measured
 
 if TYPE_CHECKING:
     from peers.running import Results
@@ -38,9 +39,12 @@ def middlebury(results: Results, out: Path, environments: dict[str, Environment]
         for program, script in MATCHERS.items():
             if results.has("middlebury", case=name, program=program):
                 continue
-            found = matched(
-                data / case.folder, case, script, out / f"{case.folder}-{script}", environments["matchers"], cores
-            )
+            folder = out / f"{case.folder}-{script}"
+            try:
+                found = matched(data / case.folder, case, script, folder, environments["matchers"], cores)
+            except Failed as failure:
+                print(failure, file=sys.stderr)
+                continue
             row = {"case": name, "program": program, "bad_percent": cases.bad(found, truth)}
             results.add("middlebury", row, "case", "program")
 

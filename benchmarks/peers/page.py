@@ -13,7 +13,6 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 OWN, CARS, MICMAC = "zlocus", "CARS", "MicMac"
-CLASSES = ("all", "ground", "building", "tree")
 # Of the acceptance: so many times less CPU per million cells than these programs.
 LESS_CPU = {CARS: 50.0, MICMAC: 10.0}
 COLOURS = {
@@ -23,29 +22,37 @@ COLOURS = {
     "Pandora": "#c77d0a",
     "s2p": "#6a4c93",
     MICMAC: "#555555",
+    "SETSM": "#00a6a6",
 }
 NAMES = {"opencv": "OpenCV", "libsgm": "libSGM", "pandora": "Pandora"}
+MARKS = "osD^v<>ph*XP"
 PICTURES = ("peers_accuracy.png", "peers_cost.png")
 HEAD = """# Beside other programs
 
 <!-- Made by `python benchmarks/peers --page docs` from benchmarks/peers/results.json: change those, not this page. -->
 
-    make peers                                                     # all of it, some hours
+    make peers                                                     # all of it, some hours: build/peers/peers.md
     python benchmarks/peers --scenes town --programs zlocus CARS   # one scene, two programs
     python benchmarks/peers --micmac /opt/micmac/bin/mm3d          # a program that no registry has
+    python benchmarks/peers --page docs                            # this page, from benchmarks/peers/results.json
 
 The same images, area, grid and cores for all. Programs are installed from the package registry into environments
 of their own; their configurations stand in `benchmarks/peers/configurations`, as their documents recommend them,
 each with its reason. Programs for pairs get every pair whose rays meet at no more than 30 degrees, and merge them
-by their own means. OpenCV and Pandora are matchers of rectified rows without cameras: images are resampled onto a
-plane for them, the range of heights is told them, a cell gets the median of all pairs and gaps the nearest height.
-CARS gets a terrain model with cells of 30 m. zlocus gets images, area and grid.
+by their own means. CARS gets a terrain model with cells of 30 m besides (made of the truth, low in each cell; of the
+Pleiades triplet made of s2p's surface, of the pair SRTM). OpenCV and Pandora are matchers of rectified rows without
+cameras: for them images are resampled onto a plane, the range of heights is that of the truth, a cell gets the
+median of all pairs and gaps the nearest height; of Pleiades they get the pointing corrections that zlocus found.
+That is done by code of this comparison, and counts in their CPU and memory. zlocus gets images, area and grid; its
+page about a run is not asked for. Options of zlocus were chosen on other scenes of the same renderer.
 
 CPU and wall times are those of all processes a program starts, memory that of all of them together (shared pages
 once), after a run on another scene that fills caches; zlocus is run three times and the median counts. Shares are
-of all cells, an empty one is not within 1 m; where the truth has an edge, either side is right. Scenes are
-rendered with seeds that no option was chosen by.
+of the cells with a truth less a rim of 10 m, and an empty one is not within 1 m; where the truth has an edge, either
+side is right. NMAD, RMSE and LE90 are of the cells with a height. The best figure of a column is bold.
 """
+# Other work on the cores from which on it is told, as a share of them.
+BESIDE = 0.05
 
 
 def write_page(results: Path, folder: Path) -> Path:
@@ -67,13 +74,18 @@ def page_of(found: dict[str, Any]) -> str:
 
 
 def where(found: dict[str, Any]) -> Iterator[str]:
-    """Machine and date."""
-    it = found["machine"]
-    dates = sorted(row["when"][:10] for part in PARTS for row in found[part])
-    span = dates[0] if dates[:1] == dates[-1:] else f"{dates[0]} to {dates[-1]}"
+    """Machine, dates, states of the code, judges, and what else the machine did."""
+    it, rows = found["machine"], [row for part in PARTS for row in found[part]]
     cores = f"{len(it['cores'])} of {it['of_cores']} cores"
     computer = f"{cores} of {it['processor']}, {it['memory_gb']} GB, {it['system']}"
-    yield f"Measured {span} on {computer}; commit {it['commit']}."
+    dates, commits = (sorted({row[what] for row in rows}) for what in ("when", "commit"))
+    span = " to ".join(dict.fromkeys(date[:10] for date in (dates[:1] + dates[-1:])))
+    judges = sorted({row["judge"] for row in rows if "judge" in row})
+    yield f"Measured {span} on {computer}; commit {', '.join(commits)}; judged by {', '.join(judges)}."
+    busy = [row for row in rows if row.get("beside", 0.0) > BESIDE]
+    if busy:
+        listed = ", ".join(f"{row['program']} on {row['scene']} ({row['beside']:.0%} of the cores)" for row in busy)
+        yield f"The machine did other work beside {listed}: wall times there are too long, CPU a little."
 
 
 PARTS = ("surfaces", "differences", "kernels", "middlebury")
@@ -99,33 +111,38 @@ def succeeded(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {name: row for name, row in rows.items() if "failed" not in row}
 
 
+def figure(row: dict[str, Any], kind: str, what: str) -> float | None:
+    """Of a class of cells; nothing where there is none."""
+    return row["classes"].get(kind, {}).get(what) if row["classes"].get(kind, {}).get("n", 1) else None
+
+
 def verdicts(found: dict[str, Any]) -> Iterator[str]:
     """Who is first on each scene, and how much less CPU zlocus takes."""
     names = judged(found)
     if not names:
         return
     yield "## Who is first"
-    lines = [
-        "| scene | lowest NMAD, m | next | largest share within 1 m | next | CPU over zlocus' |",
-        "|---|---|---|---|---|---|",
-    ]
+    lines = ["| scene | lowest NMAD, m | next | largest share within 1 m | next | CPU over zlocus' |", "|" + 6 * "---|"]
     for name in names:
         rows = succeeded(of_scene(found, name))
-        every = {program: row["classes"]["all"] for program, row in rows.items()}
-        nmad = sorted(((of["nmad"], program) for program, of in every.items()), key=lambda pair: pair[0])
-        share = sorted(((of["within"], program) for program, of in every.items()), key=lambda pair: -pair[0])
-        cells = [name, *ranked(nmad), *ranked(share), ratios(rows)]
+        cells = [name, *ranked(rows, "nmad", 1.0), *ranked(rows, "within", -1.0), ratios(rows)]
         lines.append(f"| {' | '.join(cells)} |")
     yield "\n".join(lines)
     bars = ", ".join(f"{bar:g} for {program}" for program, bar in LESS_CPU.items())
-    yield f"Bold: zlocus is not first there. Bars of CPU over zlocus': {bars}; what falls short of them is bold."
+    yield (
+        f"Bold: zlocus is not alone in the first place. Bars of CPU over zlocus': {bars}, 1 for others; what falls "
+        "short of them is bold."
+    )
 
 
-def ranked(pairs: list[tuple[float, str]]) -> list[str]:
-    """The first and the next as cells of a table."""
+def ranked(rows: dict[str, dict[str, Any]], what: str, sign: float) -> list[str]:
+    """The first and the next as cells of a table, of all cells; sign : 1 where little is good, -1 where much is."""
+    pairs = [(figure(row, "all", what), program) for program, row in rows.items()]
+    pairs = sorted((pair for pair in pairs if pair[0] is not None), key=lambda pair: sign * pair[0])
     cells = [f"{program} {value:.3f}" for value, program in pairs[:2]]
-    cells[0] = cells[0] if pairs[0][1] == OWN else f"**{cells[0]}**"
-    return [*cells, ""][:2]
+    if cells and (pairs[0][1] != OWN or (len(pairs) > 1 and pairs[1][0] == pairs[0][0])):
+        cells[0] = f"**{cells[0]}**"
+    return [*cells, "", ""][:2]
 
 
 def ratios(rows: dict[str, dict[str, Any]]) -> str:
@@ -137,7 +154,7 @@ def ratios(rows: dict[str, dict[str, Any]]) -> str:
         if program != OWN:
             ratio = row["cpu_s"] / rows[OWN]["cpu_s"]
             text = f"{program} {ratio:.1f}"
-            found.append(f"**{text}**" if ratio < LESS_CPU.get(program, 0.0) else text)
+            found.append(f"**{text}**" if ratio < LESS_CPU.get(program, 1.0) else text)
     return ", ".join(found)
 
 
@@ -147,34 +164,55 @@ def pictures() -> Iterator[str]:
     yield f"![CPU for a million cells, and shares of all cells more than 1 m off, by program and scene]({PICTURES[1]})"
 
 
+# Columns of a scene's table: what is written, of which class and figure (none: of the row, for a million cells where it
+# is a time), and whether little (1) or much (-1) is good.
+COLUMNS = {
+    "CPU, s / M cells": ("{:.1f}", None, "cpu_s", 1), "wall, s / M cells": ("{:.1f}", None, "wall_s", 1),
+    "peak, GB": ("{:.2f}", None, "peak_gb", 1), "complete": ("{:.3f}", "all", "completeness", -1),
+    "within 1 m: all": ("{:.3f}", "all", "within", -1), "ground": ("{:.3f}", "ground", "within", -1),
+    "building": ("{:.3f}", "building", "within", -1), "tree": ("{:.3f}", "tree", "within", -1),
+    "NMAD, m": ("{:.3f}", "all", "nmad", 1), "NMAD ground, m": ("{:.3f}", "ground", "nmad", 1),
+    "RMSE, m": ("{:.2f}", "all", "rmse", 1), "LE90, m": ("{:.2f}", "all", "le90", 1),
+}  # fmt: skip
+
+
 def scene_tables(found: dict[str, Any]) -> Iterator[str]:
     """A table for each scene with truth."""
     for name in judged(found):
         about = found["scenes"][name]
         pairs = f"{about['pairs']} pair" + ("s" if about["pairs"] > 1 else "")
         yield f"## {name[0].upper()}{name[1:]}: {about['million_cells']:.2f} M cells, {pairs}"
-        lines = [
-            "| program | CPU, s / M cells | wall, s / M cells | peak, GB | complete | within 1 m: all | ground "
-            "| building | tree | NMAD, m | NMAD ground, m | RMSE, m | LE90, m |",
-            "|" + 13 * "---|",
-        ]
-        lines += [surface_line(found, row) for row in of_scene(found, name).values()]
+        rows = of_scene(found, name)
+        lines = [f"| program | {' | '.join(COLUMNS)} |", "|" + (len(COLUMNS) + 1) * "---|"]
+        texts = {program: [] for program in rows}
+        for column in COLUMNS.values():
+            for program, text in column_of(found, succeeded(rows), *column).items():
+                texts[program].append(text)
+        for program, row in rows.items():
+            cells = [failure(row), *[""] * (len(COLUMNS) - 1)] if "failed" in row else texts[program]
+            lines.append(f"| {' | '.join([program, *cells])} |")
         yield "\n".join(lines)
 
 
-def surface_line(found: dict[str, Any], row: dict[str, Any]) -> str:
-    """One program on one scene."""
-    if "failed" in row:
-        return f"| {row['program']} | failed: {row['failed']} |" + " |" * 11
-    classes = row["classes"]
-    every = classes["all"]
-    within = (f"{classes[name]['within']:.3f}" if name in classes else "" for name in CLASSES)
-    took = (f"{per_million(found, row, what):.1f}" for what in ("cpu_s", "wall_s"))
-    cells = [
-        row["program"], *took, f"{row['peak_gb']:.2f}", f"{every['completeness']:.3f}", *within,
-        f"{every['nmad']:.3f}", f"{classes['ground']['nmad']:.3f}", f"{every['rmse']:.2f}", f"{every['le90']:.2f}",
-    ]  # fmt: skip
-    return f"| {' | '.join(cells)} |"
+def failure(row: dict[str, Any]) -> str:
+    """Why there are no figures, for a cell of a table."""
+    return f"failed: {row['failed']}".replace("|", "/").replace("\n", " ")
+
+
+def column_of(
+    found: dict[str, Any], rows: dict[str, dict[str, Any]], form: str, kind: str | None, what: str, sign: int
+) -> dict[str, str]:
+    """A column's texts by program, the best one bold."""
+    values: dict[str, float | None] = {}
+    for program, row in rows.items():
+        of_row = row["peak_gb"] if what == "peak_gb" else per_million(found, row, what) if kind is None else None
+        values[program] = of_row if kind is None else figure(row, kind, what)
+    texts = {program: "" if value is None else form.format(value) for program, value in values.items()}
+    known = [sign * value for value in values.values() if value is not None]
+    best = form.format(sign * min(known)) if known else ""
+    return {
+        program: f"**{text}**" if text and text == best and len(known) > 1 else text for program, text in texts.items()
+    }
 
 
 def difference_tables(found: dict[str, Any]) -> Iterator[str]:
@@ -192,7 +230,7 @@ def difference_tables(found: dict[str, Any]) -> Iterator[str]:
         ]
         for row in rows:
             if "failed" in row:
-                lines.append(f"| {row['first']} | {row['second']} | {row['failed']} | | | |")
+                lines.append(f"| {row['first']} | {row['second']} | {failure(row)} | | | |")
                 continue
             figures = (f"{row['median']:+.3f}", *(f"{row[what]:.3f}" for what in ("nmad", "within", "completeness")))
             lines.append(f"| {' | '.join([row['first'], row['second'], *figures])} |")
@@ -206,7 +244,7 @@ def work_lines(found: dict[str, Any], rows: Iterable[dict[str, Any]]) -> Iterato
     yield "|---|---|---|---|"
     for row in rows:
         if "failed" in row:
-            yield f"| {row['program']} | failed: {row['failed']} | | |"
+            yield f"| {row['program']} | {failure(row)} | | |"
         else:
             cpu, wall = (per_million(found, row, what) for what in ("cpu_s", "wall_s"))
             yield f"| {row['program']} | {cpu:.1f} | {wall:.1f} | {row['peak_gb']:.2f} |"
@@ -255,46 +293,40 @@ def versions(found: dict[str, Any]) -> Iterator[str]:
     yield "## Versions"
     yield ""
     for program, parts in found["programs"].items():
-        yield f"- {program}: {', '.join(f'{name} {version}' for name, version in parts.items())}"
-    yield f"- everything else: Python {found['machine']['python']}"
+        named = (f"{name} {version}" for name, version in parts.items() if name != "configuration")
+        yield f"- {program}: {', '.join(named)}"
+    yield f"- kernels and photographs of zlocus, and what compares: Python {found['machine']['python']}"
 
 
 def draw_accuracy(found: dict[str, Any], path: Path) -> None:
-    """Share within 1 m and NMAD, a group of bars for each scene."""
-    figure, axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True, layout="constrained")
+    """Share within 1 m and NMAD, a column of points for each scene."""
     names = judged(found)
-    programs = [name for name in found["programs"] if any(name in succeeded(of_scene(found, scene)) for scene in names)]
-    width = 0.8 / max(len(programs), 1)
+    picture, axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True, layout="constrained")
     for axis, (what, label) in zip(axes, (("within", "share within 1 m"), ("nmad", "NMAD, m")), strict=True):
-        for k, program in enumerate(programs):
-            at = [(i, of_scene(found, scene).get(program)) for i, scene in enumerate(names)]
-            bars = [(i, row["classes"]["all"][what]) for i, row in at if row is not None and "failed" not in row]
-            x = [i + (k - (len(programs) - 1) / 2) * width for i, _ in bars]
-            axis.bar(x, [value for _, value in bars], width, label=program, color=COLOURS.get(program))
+        for k, program in enumerate(found["programs"]):
+            at = [(i, succeeded(of_scene(found, scene)).get(program)) for i, scene in enumerate(names)]
+            points = [(i, figure(row, "all", what)) for i, row in at if row is not None]
+            x = [i + 0.08 * (k - (len(found["programs"]) - 1) / 2) for i, _ in points]
+            axis.plot(
+                x, [value for _, value in points], MARKS[k % len(MARKS)], label=program, color=COLOURS.get(program)
+            )
         axis.set_ylabel(label)
         axis.grid(axis="y", alpha=0.3)
-    axes[0].set_ylim(lowest_share(found, names), 1.0)
     axes[1].set_xticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
-    axes[0].legend(ncols=len(programs), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(figure)
-
-
-def lowest_share(found: dict[str, Any], names: list[str]) -> float:
-    """Where the axis of shares begins: a step below the lowest bar."""
-    shares = [row["classes"]["all"]["within"] for name in names for row in succeeded(of_scene(found, name)).values()]
-    return max(0.0, round(min(shares, default=0.0) - 0.06, 1))
+    axes[0].legend(ncols=max(len(found["programs"]), 1), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    picture.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(picture)
 
 
 def draw_cost(found: dict[str, Any], path: Path) -> None:
     """CPU against what is missed; left and low is good."""
-    figure, axis = plt.subplots(figsize=(10, 5.5), layout="constrained")
-    marks = dict(zip(judged(found), "osD^v<>ph*XP", strict=False))
+    picture, axis = plt.subplots(figsize=(10, 5.5), layout="constrained")
+    marks = dict(zip(judged(found), MARKS, strict=False))
     for program in found["programs"]:
         for scene, mark in marks.items():
             row = succeeded(of_scene(found, scene)).get(program)
             if row is not None:
-                at = per_million(found, row), 100.0 * (1.0 - row["classes"]["all"]["within"])
+                at = per_million(found, row), 100.0 * (1.0 - (figure(row, "all", "within") or 0.0))
                 axis.plot(*at, mark, color=COLOURS.get(program), markersize=9, alpha=0.85)
     axis.set(
         xscale="log", yscale="log", xlabel="CPU, s for a million cells", ylabel="cells more than 1 m off or empty, %"
@@ -303,5 +335,5 @@ def draw_cost(found: dict[str, Any], path: Path) -> None:
     keys = [plt.Line2D([], [], marker="s", ls="", color=COLOURS.get(name), label=name) for name in found["programs"]]
     keys += [plt.Line2D([], [], marker=mark, ls="", color="grey", label=scene) for scene, mark in marks.items()]
     axis.legend(handles=keys, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(figure)
+    picture.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(picture)

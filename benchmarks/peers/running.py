@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import itertools
 import json
 import os
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import psutil
+import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from bench_kernels import processor
-from judging import judged
+from judging import JUDGE, judged
 from peers import own
 from peers.environments import Environment
 from peers.measuring import Failed, Usage, measured
@@ -31,9 +33,8 @@ from zlocus.errors import ZlocusError
 from zlocus.evaluation.evaluate import evaluate
 
 OWN = "zlocus"
-# zlocus is quick, so noise of the machine shows: the median of so many runs, around those of the others.
+# zlocus is quick, so noise of the machine shows: the median of so many runs.
 OWN_RUNS = 3
-CLASSES = ("all", "ground", "building", "tree")
 SPEED_SIDE, SPEED_HEIGHTS, SPEED_ROUNDS, SPEED_TURNS = 576, (16, 64, 128), 3, 3
 SPEED = Path(__file__).with_name("sgm_speed.py")
 
@@ -52,26 +53,31 @@ class Program(Protocol):
 
 
 class Results:
-    """What has been measured, on disk after each step, so that a run that was cut off goes on."""
+    """What has been measured, on disk after each step, so that a run that was cut off goes on.
+
+    cores : which everything is pinned to. What was measured on others, or by other versions, is measured again.
+    """
 
     def __init__(self, path: Path, cores: Sequence[int]) -> None:
         self.path = path
         self.found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-        self.found.setdefault("machine", machine(cores))
+        self.found["machine"] = machine(cores)
         for part in ("programs", "scenes"):
             self.found.setdefault(part, {})
         for part in ("surfaces", "differences", "kernels", "middlebury"):
             self.found.setdefault(part, [])
 
-    def has(self, part: str, **what: str) -> bool:
-        """Whether a measurement was made and did not fail."""
-        return any(what.items() <= row.items() and "failed" not in row for row in self.found[part])
+    def has(self, part: str, **what: object) -> bool:
+        """Whether a measurement was made, on these cores, and did not fail."""
+        same = what | {"cores": self.found["machine"]["cores"]}
+        return any(same.items() <= row.items() for row in self.found[part] if "failed" not in row)
 
     def add(self, part: str, row: dict[str, Any], *key: str) -> None:
         """Adds a measurement in place of an earlier one of the same key, and writes all."""
         same = {name: row[name] for name in key}
         kept = [each for each in self.found[part] if not same.items() <= each.items()]
-        self.found[part] = [*kept, row | {"when": now()}]
+        it = self.found["machine"]
+        self.found[part] = [*kept, row | {"when": now(), "cores": it["cores"], "commit": it["commit"]}]
         self.write()
 
     def say_of(self, part: str, name: str, what: dict[str, Any]) -> None:
@@ -102,47 +108,54 @@ def machine(cores: Sequence[int]) -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Of this checkout, with a mark where files differ from it; nothing where there is none."""
+    """Of this checkout, with a mark where files differ from it."""
     done = subprocess.run(
         ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent
     )
-    return done.stdout.strip()
+    return done.stdout.strip() or "unknown"
 
 
 def run_all(
     programs: Sequence[Program],
-    names: Iterable[str],
+    names: Sequence[str],
     out: Path,
     cores: Sequence[int],
     environments: dict[str, Environment],
+    views: Sequence[int] | None = None,
 ) -> Path:
-    """Everything that is not there yet. names : scenes, of RENDERED, `pleiades`, `middlebury`, `kernels`. Returns the
-    file of results."""
+    """Everything that is not there yet. names : scenes, of RENDERED, `pleiades`, `middlebury`, `kernels`; views : of
+    rendered scenes, these numbers alone. Returns the file of results."""
     results = Results(out / "results.json", cores)
-    results.found["machine"]["commit"] = commit()
     for program in programs:
         results.say_of("programs", program.name, program.versions())
-    names = list(names)
-    warm = WARM_UP.scenes("warm-up", out / "scenes")[0]
-    for program in programs:
-        if not (out / "warm-up" / program.name / "done").exists():
-            with contextlib.suppress(Failed):
-                program.run(warm, out / "warm-up" / program.name, cores)
-            (out / "warm-up" / program.name / "done").touch()
+        warm_up(program, out, cores)
     if "kernels" in names:
         speeds(results, environments, cores[0])
     if "middlebury" in names:
         middlebury(results, out / "middlebury", environments, cores)
-    for scene in scenes(names, out):
+    for scene in scenes(names, out, views):
         surfaces_of(scene, programs, results, out, cores)
     return results.path
 
 
-def scenes(names: Sequence[str], out: Path) -> Iterator[Scene]:
-    """Of these names, rendered as they are needed."""
+def warm_up(program: Program, out: Path, cores: Sequence[int]) -> None:
+    """A run on a small scene, which compiles and fills caches, once for each state of a program."""
+    folder = out / "warm-up" / program.name
+    done, state = folder / "done", json.dumps(program.versions())
+    if done.exists() and done.read_text() == state:
+        return
+    say(f"warm-up: {program.name}")
+    row = measured_row(WARM_UP.scenes("warm-up", out / "scenes")[0], program, folder, cores)
+    if "failed" not in row:
+        done.write_text(state)
+
+
+def scenes(names: Sequence[str], out: Path, views: Sequence[int] | None) -> Iterator[Scene]:
+    """Of these names and numbers of views, rendered as they are needed."""
     for name, rendered in RENDERED.items():
         if name in names:
-            yield from rendered.scenes(name, out / "scenes")
+            found = rendered.scenes(name, out / "scenes")
+            yield from (scene for scene in found if views is None or len(scene.images) in views)
     if "pleiades" in names:
         yield from shared(out / "scenes")
 
@@ -153,30 +166,42 @@ def surfaces_of(scene: Scene, programs: Sequence[Program], results: Results, out
     results.say_of("scenes", scene.name, described(scene))
     made: dict[str, Path] = {} if scene.reference is None else {"s2p, delivered": scene.reference}
     for program in programs:
-        say(f"{scene.name}: {program.name}")
+        key = {"scene": scene.name, "program": program.name, "versions": results.found["programs"][program.name]}
         if scene.truth is None:
             scene = replace(scene, shifts=own.shifts(out / "surfaces" / scene.slug / OWN, scene))
-        if not results.has("surfaces", scene=scene.name, program=program.name):
-            results.add("surfaces", measured_row(scene, program, out, cores), "scene", "program")
+        if not results.has("surfaces", **key):
+            say(f"{scene.name}: {program.name}")
+            folder = out / "surfaces" / scene.slug / program.name
+            row = key | measured_row(scene, program, folder, cores)
+            results.add("surfaces", json.loads(json.dumps(row).replace(f"{out}/", "")), "scene", "program")
     rows = [row for row in results.found["surfaces"] if row["scene"] == scene.name and "failed" not in row]
     made |= {row["program"]: out / row["surface"] for row in rows}
     for row in rows:
-        if scene.truth is not None and scene.classes is not None:
+        # Surfaces of an earlier run may be gone; then its figures stay.
+        if scene.truth is not None and scene.classes is not None and made[row["program"]].exists():
             row["classes"] = judged(made[row["program"]], scene.truth, scene.classes)
+            row["judge"] = JUDGE.name if JUDGE.exists() else "zlocus evaluate"
     results.write()
     if scene.truth is None:
-        differences(scene, made, results)
+        differences(scene, {name: path for name, path in made.items() if path.exists()}, results)
 
 
-def measured_row(scene: Scene, program: Program, out: Path, cores: Sequence[int]) -> dict[str, Any]:
-    """What a program took for a scene, and where its surface lies; or why there is none."""
-    row: dict[str, Any] = {"scene": scene.name, "program": program.name}
-    folder = out / "surfaces" / scene.slug / program.name
+def measured_row(scene: Scene, program: Program, folder: Path, cores: Sequence[int]) -> dict[str, Any]:
+    """What a program took for a scene, and where its surface lies; or why there is none. Each run begins with an empty
+    folder, so that nothing of an earlier one is taken for its work."""
+    runs = []
     try:
-        runs = [program.run(scene, folder, cores) for _ in range(OWN_RUNS if program.name == OWN else 1)]
-    except Failed as failure:
-        return row | {"failed": str(failure).replace(str(out), "OUT")}
-    return row | {"surface": str(runs[-1][0].relative_to(out)), **middle([used for _, used in runs])}
+        for _ in range(OWN_RUNS if program.name == OWN else 1):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            surface, used = program.run(scene, folder, cores)
+            runs.append(used)
+        with rasterio.open(surface) as file:
+            if not np.isfinite(file.read(1, masked=True).astype(float).filled(np.nan)).any():
+                raise Failed(f"{surface} holds no height")
+    except (Failed, rasterio.errors.RasterioIOError) as failure:
+        return {"failed": str(failure)}
+    return {"surface": str(surface), **middle(runs)}
 
 
 def middle(runs: list[Usage]) -> dict[str, Any]:
@@ -212,19 +237,24 @@ def differences(scene: Scene, made: dict[str, Path], results: Results) -> None:
 
 
 def speeds(results: Results, environments: dict[str, Environment], core: int) -> None:
-    """Aggregation of zlocus, OpenCV, libSGM and Pandora on one core, in turns; the best of all turns."""
+    """Aggregation of zlocus, OpenCV, libSGM and Pandora on one core, in turns; the best of all turns. All programs of a
+    number of heights are measured together."""
     matchers = environments.get("matchers")
     pythons: dict[str, Path] = {"zlocus": Path(sys.executable)}
     if matchers is not None:
         pythons |= dict.fromkeys(("opencv", "libsgm", "pandora"), matchers.python)
     for heights in SPEED_HEIGHTS:
-        if results.has("kernels", heights=heights):  # type: ignore[arg-type]
+        if all(results.has("kernels", heights=heights, program=name) for name in pythons):
             continue
         best: dict[tuple[str, str], float] = {}
         for _, (name, python) in itertools.product(range(SPEED_TURNS), pythons.items()):
             say(f"kernels, {heights} heights: {name}")
             log = results.path.parent / "kernels" / f"{name}.log"
-            measured([python, SPEED, name, SPEED_SIDE, heights, SPEED_ROUNDS], (core,), log)
+            try:
+                measured([python, SPEED, name, SPEED_SIDE, heights, SPEED_ROUNDS], (core,), log)
+            except Failed as failure:
+                say(str(failure))
+                continue
             for form, seconds in json.loads(log.read_text().splitlines()[-1]).items():
                 best[name, form] = min(seconds, best.get((name, form), seconds))
         for (name, form), seconds in best.items():

@@ -19,10 +19,11 @@ from rasterio.warp import calculate_default_transform, reproject
 from scipy.ndimage import distance_transform_edt
 from shapely import Polygon, unary_union
 
+from rectifying import STEP_M
 from zlocus.io.scene_file import open_scene
 
 VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
-RESOLUTION_M = 0.5
+RESOLUTION_M = STEP_M
 # What a user of a satellite program has before matching: a terrain model with cells of 30 m, which reaches beyond
 # the area.
 TERRAIN_M, TERRAIN_PERCENTILE, TERRAIN_BORDER = 30.0, 20.0, 30
@@ -54,7 +55,6 @@ class Scene:
     classes: Path | None = None
     reference: Path | None = None
     shifts: dict[str, tuple[float, float]] = field(default_factory=dict)
-    resolution_m: float = RESOLUTION_M
 
     def shift(self, view: str) -> tuple[float, float]:
         """Pointing correction (column, row) px of a view; zero where none is known."""
@@ -69,13 +69,7 @@ class Scene:
     def million_cells(self) -> float:
         """Cells of the area asked for, in millions."""
         west, south, east, north = self.bounds
-        return (east - west) * (north - south) / self.resolution_m**2 / 1e6
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the area asked for."""
-        west, south, east, north = self.bounds
-        return round((north - south) / self.resolution_m), round((east - west) / self.resolution_m)
+        return (east - west) * (north - south) / RESOLUTION_M**2 / 1e6
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -87,7 +81,8 @@ class Scene:
         for pair in itertools.combinations(views, 2):
             angle = np.degrees(np.arccos(np.clip(rays[pair[0]] @ rays[pair[1]], -1.0, 1.0)))
             if angle <= STEEPEST_PAIR_DEG or len(views) == 2:
-                found.append((max(pair, key=steepness.__getitem__), min(pair, key=steepness.__getitem__)))
+                steeper, other = sorted(pair, key=steepness.__getitem__, reverse=True)
+                found.append((steeper, other))
         return found
 
     def rays(self) -> np.ndarray:
@@ -120,7 +115,9 @@ class Rendered:
         if not (where / "scene.json").exists():
             command = [sys.executable, "-m", "zlocus.synthetic", "-o", where, "--kind", self.kind, *self.options]
             command += ["--seed", self.seed, "--size", self.side, "--views", max(self.views)]
-            subprocess.run([str(word) for word in command], check=True, capture_output=True)
+            done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
+            if done.returncode:
+                raise SystemExit(f"{where} could not be rendered: {done.stderr.strip().splitlines()[-1]}")
         truth = where / "truth_dsm.tif"
         with rasterio.open(truth) as file:
             heights, crs, bounds = file.read(1), file.crs.to_string(), tuple(file.bounds)
@@ -134,11 +131,11 @@ class Rendered:
         ]  # fmt: skip
 
 
-# Seeds that no option was chosen by. The large one is rendered for three views, of more than 4 M cells.
+# Seeds that zlocus had not seen when its options were chosen. The large one has more than 4 M cells.
 RENDERED = {
-    "town": Rendered("city", 101, 1024),
-    "hills": Rendered("hills", 101, 1024, views=(2, 3)),
-    "large town": Rendered("city", 102, 2048, views=(3,)),
+    "town": Rendered("city", 211, 1024),
+    "hills": Rendered("hills", 211, 1024),
+    "large town": Rendered("city", 212, 2048, views=(3,)),
 }
 WARM_UP = Rendered("city", 100, 640, views=(2,))
 

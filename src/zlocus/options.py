@@ -188,8 +188,7 @@ class MeasureOptions(Checked):
         low=0.0, high=1.5,
     )  # fmt: skip
     grey_weight_two: float = option(
-        0.3, "The same where only two views see a block of a tile that more see: one pair's grey values are alike by "
-        "chance at many heights.",
+        0.3, "The same where two of more views see a block: a pair's grey values are alike by chance at many heights.",
         low=0.0, high=1.5,
     )  # fmt: skip
     grey_reach: float = option(
@@ -215,7 +214,7 @@ class SemiGlobalOptions(Checked):
     )  # fmt: skip
     p1: int = option(45, "Penalty of a neighbour one step away.", low=0, high=1000)
     p1_two: int = option(
-        110, "The same where no cell of a tile is seen by more than two views: one pair's curves are noisy.",
+        110, "The same in scenes of two images: one pair's curves are noisy.",
         low=0, high=1000,
     )  # fmt: skip
     p2: int = option(400, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)

@@ -328,9 +328,8 @@ def _match_level(
         ground = None if guide.surface is None else guide.surface - base.cells
         used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
     done = _evaluations(used, lattice) + added
-    pair = covered.sum(axis=0) <= PAIR
-    by_two = bool(pair.all())
-    cost = cost_volume(along_base, base, lattice, used, config.measure, by_two)
+    is_pair = len(scene.views) == PAIR
+    cost = cost_volume(along_base, base, lattice, used, config.measure, is_pair)
     agrees = None if guide.coarser is None else guide.coarser.agrees
     if method == "mvll":
         heights = alone(cost, lattice)
@@ -339,8 +338,8 @@ def _match_level(
         if smooth is not None:
             agrees = agreement(views, smooth, covered, own) if agrees is None else agrees
             ortho = edge_image(views, smooth, covered, own, agrees)
-        p2 = penalties(ortho, shape, level, config.semiglobal, pair, own)
-        heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal, by_two)
+        p2 = penalties(ortho, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
+        heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal, is_pair)
     lone = alone(cost, lattice).above(base.cells).best if level else None
     worth = above_base(worth, base.cells)
     return LevelResult(

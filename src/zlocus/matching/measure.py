@@ -18,7 +18,7 @@ def cost_volume(
     lattice: HeightLattice,
     seen: NDArray[np.int32],
     options: MeasureOptions,
-    by_two: bool = False,
+    is_pair: bool = False,
 ) -> NDArray[np.uint8]:
     """64 (1 - NCC) + 64 w d of every cell and height, (v,) uint8, laid out as `HeightLattice.address` says.
 
@@ -27,12 +27,12 @@ def cost_volume(
     views; for more it has no reference image, so that no single view's noise is in every term). d is the mean over the
     same pairs of the two pixels' grey difference, in units of `grey_reach` and at most 1: NCC knows nothing of plain
     roofs, on which all views show one grey, and blurs edges by the width of its window (as AD-Census does: Mei et al.
-    2011, equation 3). w is `grey_weight`, and `grey_weight_two` in blocks that two views take part in, unless no more
-    see any of the tile (by_two). seen : (3, i, r, c) int32, see `coverage`.
+    2011, equation 3). w is `grey_weight`, and `grey_weight_two` in blocks that two views take part in, unless there
+    are no more (is_pair). seen : (3, i, r, c) int32, see `coverage`.
     """
     windows = np.unique([options.small_window // 2, options.large_window // 2])
     greys = options.grey_weight, options.grey_reach, options.hidden_excused
-    weight_two = options.grey_weight if by_two else options.grey_weight_two
+    weight_two = options.grey_weight if is_pair else options.grey_weight_two
     measure = np.array([options.noise**2, *greys, options.few_views, weight_two], np.float32)
     volume = np.empty(lattice.size, np.uint8)
     tile_costs(

@@ -75,15 +75,15 @@ def aggregate(
     p2: NDArray[np.uint16],
     step_cells: float,
     options: SemiGlobalOptions,
-    by_two: bool = False,
+    is_pair: bool = False,
 ) -> SemiGlobalHeights:
     """Sum of the path costs over 8 paths, and its minima.
 
-    cost : (v,) uint8, see `HeightLattice.address`; step_cells : height of a step over the side of a cell; by_two :
-    no cell is covered by more than two views, so that `p1_two` applies. Two predecessors find more roofs and take up to
+    cost : (v,) uint8, see `HeightLattice.address`; step_cells : height of a step over the side of a cell; is_pair :
+    there are two views and no more, so that `p1_two` applies. Two predecessors find more roofs and take up to
     twice the time; with a narrow base there is little to find (a step is as high as a storey).
     """
-    p1 = options.p1_two if by_two else options.p1
+    p1 = options.p1_two if is_pair else options.p1
     if (options.predecessors or (1 if step_cells > NARROW_BASE else 2)) == 2:
         return pick(more_global_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)
