@@ -40,6 +40,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument(
         "--programs", nargs="+", choices=PROGRAMS, default=PROGRAMS, metavar="NAME", help=", ".join(PROGRAMS)
     )
+    parser.add_argument("--views", nargs="+", type=int, metavar="N", help="of rendered scenes, these numbers alone")
     parser.add_argument(
         "--out", type=Path, default=Path("build/peers"), help="folder for environments, scenes and results"
     )
