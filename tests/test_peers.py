@@ -327,8 +327,8 @@ def test_the_page_says_who_wins():
     found = results_of(zlocus=10.0, CARS=600.0, MicMac=70.0)
     found["surfaces"][2]["classes"]["all"] = found["surfaces"][2]["classes"]["all"] | {"nmad": 0.05, "within": 0.8}
     text = page.page_of(found)
-    row = "| town, 2 views | **MicMac 0.050** | zlocus 0.100 | **zlocus 0.900** | CARS 0.900 | CARS 60.0, **MicMac 7.0** |"
-    assert row in text  # CARS has the same share
+    first = "| **MicMac 0.050** | zlocus 0.100 | **zlocus 0.900** | CARS 0.900 |"  # CARS has the same share
+    assert f"| town, 2 views {first} CARS 60.0, **MicMac 7.0** |" in text
     assert "| zlocus | **5.0** | **2.0** | **1.00** | **1.000** | **0.900** | **0.900** |  |  | 0.100 |" in text
     assert "Measured 2026-01-02 on 1 of 2 cores of P, 8 GB, L; commit abc; judged by a judge." in text
 
