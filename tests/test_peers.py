@@ -9,6 +9,7 @@ import importlib
 import json
 import os
 import re
+import subprocess
 import sys
 import textwrap
 from dataclasses import replace
@@ -95,6 +96,17 @@ def test_a_command_keeps_to_its_cores_and_threads(tmp_path):
     ask = "import os; print(sorted(os.sched_getaffinity(0)), os.environ['OMP_NUM_THREADS'])"
     measuring.measured([sys.executable, "-c", ask], (CORE,), tmp_path / "log")
     assert (tmp_path / "log").read_text() == f"[{CORE}] 1\n"
+
+
+def test_other_work_on_the_cores_is_noticed(tmp_path):
+    """Two processes that share a core: half of it is the other's."""
+    command = [sys.executable, "-c", BURN]
+    pin = f"import os; os.sched_setaffinity(0, {{{CORE}}})\n{BURN.replace(str(BURNT_S), '60.0')}"
+    with subprocess.Popen([sys.executable, "-c", pin]) as other:
+        used = measuring.measured(command, (CORE,), tmp_path / "log")
+        other.kill()
+    assert used.beside > 0.3
+    assert used.cpu_s < BURNT_S + STARTED_S
 
 
 def test_a_command_that_fails_is_told(tmp_path):
