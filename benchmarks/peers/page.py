@@ -26,6 +26,7 @@ COLOURS = {
 }
 NAMES = {"opencv": "OpenCV", "libsgm": "libSGM", "pandora": "Pandora"}
 MARKS = "osD^v<>ph*XP"
+PLAIN = "{x:g}"
 PICTURES = ("peers_accuracy.png", "peers_cost.png")
 HEAD = """# Beside other programs
 
@@ -112,8 +113,9 @@ def succeeded(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def figure(row: dict[str, Any], kind: str, what: str) -> float | None:
-    """Of a class of cells; nothing where there is none."""
-    return row["classes"].get(kind, {}).get(what) if row["classes"].get(kind, {}).get("n", 1) else None
+    """Of a class of cells; nothing where the scene has none of it, of which judges give no count, or zero."""
+    figures = row["classes"].get(kind, {})
+    return figures.get(what) if figures.get("n") else None
 
 
 def verdicts(found: dict[str, Any]) -> Iterator[str]:
@@ -331,6 +333,9 @@ def draw_cost(found: dict[str, Any], path: Path) -> None:
     axis.set(
         xscale="log", yscale="log", xlabel="CPU, s for a million cells", ylabel="cells more than 1 m off or empty, %"
     )
+    for each in (axis.xaxis, axis.yaxis):
+        each.set_major_formatter(PLAIN)
+    axis.yaxis.set_minor_formatter(PLAIN)
     axis.grid(which="both", alpha=0.25)
     keys = [plt.Line2D([], [], marker="s", ls="", color=COLOURS.get(name), label=name) for name in found["programs"]]
     keys += [plt.Line2D([], [], marker=mark, ls="", color="grey", label=scene) for scene, mark in marks.items()]
