@@ -205,10 +205,12 @@ def column_of(
     found: dict[str, Any], rows: dict[str, dict[str, Any]], form: str, kind: str | None, what: str, sign: int
 ) -> dict[str, str]:
     """A column's texts by program, the best one bold."""
-    values: dict[str, float | None] = {}
-    for program, row in rows.items():
-        of_row = row["peak_gb"] if what == "peak_gb" else per_million(found, row, what) if kind is None else None
-        values[program] = of_row if kind is None else figure(row, kind, what)
+    if kind is not None:
+        values = {program: figure(row, kind, what) for program, row in rows.items()}
+    elif what == "peak_gb":
+        values = {program: row[what] for program, row in rows.items()}
+    else:
+        values = {program: per_million(found, row, what) for program, row in rows.items()}
     texts = {program: "" if value is None else form.format(value) for program, value in values.items()}
     known = [sign * value for value in values.values() if value is not None]
     best = form.format(sign * min(known)) if known else ""
