@@ -29,7 +29,7 @@ import numpy as np
 import rasterio
 from scipy.optimize import minimize
 
-from zlocus import cli, pipeline, tile
+from zlocus import cli, job, tile
 from zlocus.evaluation.alignment import best_shift
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import read_heights
@@ -75,16 +75,16 @@ class Judged:
 @contextmanager
 def watched(found: list[tuple[Any, ...]]):
     """Adds (window, core, signs, is_refined, scene) of every tile that is matched."""
-    predict, finish, match = tile.sigma_steps, tile._finish, pipeline.match_tile
+    predict, finish, match = tile.sigma_steps, tile._finish, job.match_tile
     last: dict[str, Any] = {}
 
     def predicted(signs, refined):
         last.update(signs=signs, is_refined=refined.is_refined)
         return predict(signs, refined)
 
-    def finished(scene, pixels, result, config):
+    def finished(scene, pixels, result, *rest):
         last["window"] = result.window
-        return finish(scene, pixels, result, config)
+        return finish(scene, pixels, result, *rest)
 
     def matched(scene, core, *rest):
         last.clear()
@@ -93,11 +93,11 @@ def watched(found: list[tuple[Any, ...]]):
             found.append((last["window"], core, last["signs"], last["is_refined"], scene))
         return result
 
-    tile.sigma_steps, tile._finish, pipeline.match_tile = predicted, finished, matched
+    tile.sigma_steps, tile._finish, job.match_tile = predicted, finished, matched
     try:
         yield
     finally:
-        tile.sigma_steps, tile._finish, pipeline.match_tile = predict, finish, match
+        tile.sigma_steps, tile._finish, job.match_tile = predict, finish, match
 
 
 def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]]:
@@ -108,7 +108,7 @@ def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]
     images = [str(folder / f"img_{name}.tif") for name in views]
     with watched(found), redirect_stdout(sys.stderr):
         cli.app(["dsm", *images, "-o", str(out), "--crs", crs, "--resolution", str(cell), "--bounds",
-                 *map(str, bounds), "--overwrite"], standalone_mode=False)  # fmt: skip
+                 *map(str, bounds), "--overwrite", "--workers", "1", "--no-report"], standalone_mode=False)  # fmt: skip
     return found
 
 
