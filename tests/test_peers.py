@@ -156,6 +156,9 @@ def test_cars_gets_all_that_it_needs(scene, tmp_path):
     assert found["subsampling"]["advanced"]["resolutions"] == [2, 1]
     (method,) = found["surface_modeling"]["applications"]["all"]["dense_matching"].values()
     assert method == "pandora_census_sgm_urban"
+    (sparse,) = found["tie_points"]["applications"]["all"].values()
+    searched = HEIGHTS[1] - HEIGHTS[0]
+    assert sparse["disparity_bounds_estimation"] == {"lower_margin": searched, "upper_margin": searched}
 
 
 @pytest.mark.parametrize("number", [2, 3])

@@ -50,6 +50,8 @@ def configuration(scene: Scene, out: Path) -> dict[str, Any]:
     pairs = scene.pairs
     views = [view for view in scene.images if view in set(itertools.chain(*pairs))]
     matching = {"dense_matching": {"method": recommended["methods"][scene.kind]}}
+    low, high = scene.heights
+    margins = dict.fromkeys(("lower_margin", "upper_margin"), round(high - low))
     return {
         "input": {
             "sensors": {view: {"image": str(scene.images[view])} for view in views},
@@ -59,6 +61,7 @@ def configuration(scene: Scene, out: Path) -> dict[str, Any]:
         "output": recommended["output"]
         | {"directory": str(out / "cars"), "resolution": RESOLUTION_M, "epsg": CRS(scene.crs).to_epsg()},
         "subsampling": {"advanced": {"resolutions": recommended["resolutions"][size_class(scene)]}},
+        "tie_points": {"applications": {"all": {"sparse_matching": {"disparity_bounds_estimation": margins}}}},
         "surface_modeling": {"applications": {"all": matching}},
     }
 
