@@ -20,7 +20,7 @@ from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.reach import block_reach
 from zlocus.kernels.refine import CUBIC, tile_ortho, tile_profile
 from zlocus.kernels.resample import resample_plane
-from zlocus.kernels.sgm import sweep, winners
+from zlocus.kernels.sgm import least_costs, sweep, winners
 from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.kernels.spline import spline_coefficients
 from zlocus.kernels.visibility import lowest_visible
@@ -194,6 +194,19 @@ def winners_case(count: int | None) -> Case:
     return Case(call, heights.size, "cell-step")
 
 
+def least_case(count: int | None) -> Case:
+    """Least costs, beside the minima of sums."""
+    heights = lattice(SGM_SIDE, count)
+    rng, (first, counts) = np.random.default_rng(5), heights.cell_ranges()
+    cost = rng.integers(0, 255, heights.size).astype(np.uint8)
+    best, lone = (first + rng.integers(0, counts)).astype(np.int32), np.empty(heights.shape, np.int32)
+
+    def call():
+        least_costs(cost, heights.ranges, heights.address, BLOCK, best, 4, lone)
+
+    return Case(call, heights.size, "cell-step")
+
+
 def profile_case() -> Case:
     """The measure at three offsets around a surface, cubic, 5 x 5 and 9 x 9, three views."""
     half, offsets = 4, np.linspace(-0.5, 0.5, 3).astype(np.float32)
@@ -301,6 +314,11 @@ def opencv_speed(side: int, n_disparities: int) -> float:
 @pytest.mark.parametrize("count", [32, None], ids=["32", "ragged"])
 def test_winners(benchmark, count):
     timed(benchmark, winners_case(count))
+
+
+@pytest.mark.parametrize("count", [32, None], ids=["32", "ragged"])
+def test_least_costs(benchmark, count):
+    timed(benchmark, least_case(count))
 
 
 def test_profile(benchmark):

@@ -9,7 +9,7 @@ import pytest
 
 from kernel_scene import even_lattice, ragged_lattice
 from reference.semiglobal import dense, path_sums, winner
-from zlocus.kernels.sgm import sweep, winners
+from zlocus.kernels.sgm import least_costs, sweep, winners
 
 NO_RIVAL = 65535
 # A parabola through three whole numbers, in float32.
@@ -123,6 +123,22 @@ def test_a_minimum_at_an_end_is_a_winner_without_a_fraction():
     # A level stretch counts as a minimum of its own.
     assert (margin == 90).all()
     assert (np.abs(second - best) >= 3).all()
+
+
+@pytest.mark.parametrize(("levels", "gain"), [(4, 2), (255, 40), (255, 0)])
+def test_least_costs(levels, gain):
+    """The first of equal costs, where that of the height found lies so far above it; else that height."""
+    lattice = ragged_lattice((37, 70), 16, seed=3, counts=(4, 12, 20, 32))
+    rng, (first, count) = np.random.default_rng(9), lattice.cell_ranges()
+    cost = random_cost(lattice, high=levels)
+    best = (first + rng.integers(0, count)).astype(np.int32)
+    lone = np.empty(lattice.shape, np.int32)
+    least_costs(cost, lattice.ranges, lattice.address, lattice.block, best, gain, lone)
+    costs = dense(cost, lattice, np.inf)
+    for r, c in np.ndindex(lattice.shape):
+        mine = costs[r, c, first[r, c] : first[r, c] + count[r, c]]
+        is_clear = mine[best[r, c] - first[r, c]] - mine.min() >= gain
+        assert lone[r, c] == (first[r, c] + mine.argmin() if is_clear else best[r, c])
 
 
 def test_whatever_index_heights_start_at():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.ranges import LANES, ranges_nearby, without_spikes
+from zlocus.matching.ranges import ALIKE_STEPS, LANES, ranges_nearby, shared_heights, without_spikes
 from zlocus.options import PyramidOptions
 from zlocus.tile import RIVALS_KEPT, _candidates
 
@@ -138,6 +138,20 @@ def test_spikes_beside_cells_that_nobody_saw():
     expected[2:5, 3:6] = 90
     np.testing.assert_array_equal(found_high[:, :6], expected)
     assert (found_low[:, :6] == 40).all()
+
+
+def test_heights_that_cells_share():
+    """Three by three cells agree, however they lean; a cell beside them, and cells that each find another height, do
+    not."""
+    best = np.full((20, 24), 40, np.int32)
+    lone = best.copy()
+    lone[2:5, 3:6] = 90 + np.arange(3) * (ALIKE_STEPS // 2)
+    lone[2:5, 6] = 90 + 3 * ALIKE_STEPS
+    lone[10:18, 2:10] = 60 + 10 * np.random.default_rng(1).permutation(64).reshape(8, 8)
+    lone[10:13, 14:17] = 90 + np.arange(3) * ALIKE_STEPS
+    expected = best.copy()
+    expected[2:5, 3:6] = lone[2:5, 3:6]
+    np.testing.assert_array_equal(shared_heights(lone, best), expected)
 
 
 def test_a_far_rival_is_none():

@@ -1,6 +1,6 @@
 """`python -m zlocus`, the same as the command."""
 
-from zlocus.cli import app
+from zlocus.cli import main
 
 if __name__ == "__main__":
-    app()
+    main()

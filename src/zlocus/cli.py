@@ -41,6 +41,7 @@ from zlocus.request import (
     check_output,
     product_names,
 )
+from zlocus.startup import prepare
 from zlocus.threads import leave_if_busy
 
 if TYPE_CHECKING:
@@ -492,5 +493,6 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit; `arguments` default to those of the process."""
+    prepare()
     warnings.showwarning = _show_warning(warnings.showwarning)
     app(arguments, prog_name="zlocus")

@@ -7,14 +7,12 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
-from zlocus.evaluation.evaluate import Evaluation
-from zlocus.evaluation.evaluate import evaluate as compare
 from zlocus.execution.events import EventLog
 from zlocus.execution.memory import cores
 from zlocus.execution.plan import Tile, plan_tiles
@@ -40,12 +38,15 @@ from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.record import Stopwatch, inputs_record, now, request_as_dict, versions_record, write_record
+from zlocus.products.report.files import forget_report
 from zlocus.progress import Progress
-from zlocus.reporting import Matched, forget_report, try_report, write_shown
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene
 from zlocus.settling import Settled, opened, settled_run
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
+
+if TYPE_CHECKING:
+    from zlocus.evaluation.evaluate import Evaluation
 
 SUFFICIENT_COVERAGE = 0.5
 # Names that files have until they are complete, with the number of the process that writes them.
@@ -129,10 +130,8 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
                 matching.assemble(failed, rasters, tally, progress)
     with watch.stage("points"):
         _write_points(out, settled, tally.ranked, vertical)
-    matched = Matched(
-        settled.scene, settled.matching, settled.grid, orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs)
-    )
-    _show(request, matched, config, watch, progress)
+    if request.report:
+        _show(out, settled, vertical, config, watch, progress)
     with watch.stage("record"):
         asked = _asked_record(request, config, scene, found.files)
     record = {
@@ -193,6 +192,8 @@ def _write_maps(
             failed = error
     write_record(request.out / "run.json", record)
     if request.report:
+        from zlocus.reporting import try_report
+
         try_report(request.out, progress)
     link_all(request.out, progress)
     if failed is not None:
@@ -201,6 +202,7 @@ def _write_maps(
 
 def run_demo(out: Path, progress: Progress) -> DemoResult:
     """Render the built-in block (line scanners, six images in two strips), match it, and compare it with its truth."""
+    from zlocus.evaluation.evaluate import evaluate
     from zlocus.synthetic.files import render_scene
     from zlocus.synthetic.linescan import TrajectoryNoise
     from zlocus.synthetic.scenes import LEVEL_1_M, demo_spec
@@ -217,7 +219,7 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     )  # fmt: skip
     result = run_dsm(request, RunConfig(), progress)
     evaluations = (
-        compare(result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, threshold_m=limit)
+        evaluate(result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, threshold_m=limit)
         for limit in (2 * LEVEL_1_M, 1.0)
     )
     picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")
@@ -293,13 +295,19 @@ def _write_points(out: Path, settled: Settled, ranked: list[RankedPoints], verti
         write_ranking(out / "ranking.gpkg", ranked, names, scene.crs, vertical)
 
 
-def _show(request: DsmRequest, matched: Matched, config: RunConfig, watch: Stopwatch, progress: Progress) -> None:
+def _show(
+    out: Path, settled: Settled, vertical: VerticalDatum, config: RunConfig, watch: Stopwatch, progress: Progress
+) -> None:
     """What the report shows that no other product holds."""
-    if not request.report:
-        return
+    from zlocus.reporting import Matched, write_shown
+
+    scene = settled.scene
+    matched = Matched(
+        scene, settled.matching, settled.grid, settled.orientation.xyz, lambda xy: vertical.undulation(xy, scene.crs)
+    )
     (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
     with watch.stage("curves"), progress.stage("Match curves"):
-        write_shown(request.out, matched, config, match_s, progress)
+        write_shown(out, matched, config, match_s, progress)
 
 
 def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:

@@ -25,7 +25,8 @@ from zlocus.products.footprints import write_footprints
 from zlocus.products.points import counted_pairs, label_counts
 from zlocus.products.record import write_record
 from zlocus.products.report.cells import FAILED, RULE, ChosenCell, chosen_cells
-from zlocus.products.report.page import CURVES, FOOTPRINTS, RANKING, REPORT, write_report
+from zlocus.products.report.files import CURVES, FOOTPRINTS, RANKING, REPORT
+from zlocus.products.report.page import write_report
 from zlocus.products.report.survey import Survey, survey
 from zlocus.products.report.tables import MOST_MATRIX
 from zlocus.progress import Progress
@@ -57,12 +58,6 @@ class Matched:
     grid: Grid
     ties: FloatArray
     undulation: Callable[[FloatArray], FloatArray] = lambda xy: np.zeros(len(xy))
-
-
-def forget_report(out: Path) -> None:
-    """Remove the report of an earlier run, which is not this one's."""
-    for name in (REPORT, CURVES, FOOTPRINTS):
-        (out / name).unlink(missing_ok=True)
 
 
 def write_shown(out: Path, matched: Matched, config: RunConfig, match_s: float, progress: Progress) -> None:

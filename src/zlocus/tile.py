@@ -18,7 +18,7 @@ from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
 from zlocus.matching.ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
 from zlocus.matching.planes import PlanarHeights, with_planes
-from zlocus.matching.ranges import LANES, by_block, ranges_nearby, without_spikes
+from zlocus.matching.ranges import LANES, by_block, ranges_nearby, shared_heights, without_spikes
 from zlocus.matching.ranking import KnownGround, ranked_at_ties
 from zlocus.matching.refine import refine, smoothed
 from zlocus.matching.selection import (
@@ -34,7 +34,7 @@ from zlocus.matching.selection import (
     preselected,
     sampled_cells,
 )
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, counted_above, lone_heights, penalties
 from zlocus.matching.setup import MatchScene
 from zlocus.matching.views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.visibility import (
@@ -71,7 +71,7 @@ class LevelResult:
 
     base : what heights were searched along; of the coarsest level, what its heights give. seen, heights and lone are in
     height indices of the level's lattice, whatever base they were found along.
-    lone : (r, c) int32, heights of the least costs, each cell by itself; None at the finest level.
+    lone : (r, c) int32, see `lone_heights`; None at the finest level.
     evaluations : cell x step x view that were compared; all_views : if every view that covers a cell had been.
     agrees : (i,) how alike each view is to the others, see `agreement`; None where no surface was known yet.
     is_planar : (r, c) cells whose heights are those of planes through plain segments.
@@ -340,7 +340,7 @@ def _match_level(
             ortho = edge_image(views, smooth, covered, own, agrees)
         p2 = penalties(ortho, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
         heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal, is_pair)
-    lone = alone(cost, lattice).above(base.cells).best if level else None
+    lone = counted_above(lone_heights(cost, lattice, heights.best), base.cells) if level else None
     worth = above_base(worth, base.cells)
     return LevelResult(
         level, window, views, base, lattice, worth, heights.above(base.cells), lone, done, all_views, agrees
@@ -402,8 +402,8 @@ def _choose(
 def _candidates(
     scene: MatchScene, coarser: LevelResult, window: CellWindow, level: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest height index worth a look in every cell: best, near rivals, tie points, and what a cell would
-    choose if its neighbours had no say.
+    """Lowest and highest height index worth a look in every cell: best, near rivals, tie points, and what some cells
+    would choose if the others had no say.
 
     The last is what keeps a tower of few coarse cells, or a crown, which the semi-global constraint levels there.
     """
@@ -411,7 +411,7 @@ def _candidates(
     assert coarser.lone is not None
     known = covers(coarser.seen).sum(axis=0) >= PAIR
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
-    found = np.stack([heights.best, rival, coarser.lone])
+    found = np.stack([heights.best, rival, shared_heights(coarser.lone, heights.best)])
     low, high = without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
     low, high = (2 * on_cells(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):

@@ -20,7 +20,8 @@ from rasterio.windows import Window
 
 from zlocus.errors import InputError
 from zlocus.io.opening import kept_raster
-from zlocus.products.report.page import RECORD, run_record
+from zlocus.products.report.files import RECORD
+from zlocus.products.report.page import run_record
 from zlocus.scene import is_local
 from zlocus.sensors.model import FloatArray
 

@@ -23,7 +23,8 @@ from zlocus.inspector.restore import Restored, config_of, restored
 from zlocus.options import RunConfig, SelectionOptions
 from zlocus.products.record import read_record
 from zlocus.products.report.comparison import Comparison
-from zlocus.products.report.page import CURVES, KIND_WORDS, RECORD
+from zlocus.products.report.files import CURVES, RECORD
+from zlocus.products.report.page import KIND_WORDS
 from zlocus.reporting import said
 from zlocus.threads import submitted
 

@@ -16,7 +16,7 @@ from zlocus.io.opening import is_remote
 from zlocus.options import RunConfig
 from zlocus.preparing import oriented
 from zlocus.products.observations import OBSERVATIONS, read_observations
-from zlocus.products.report.page import RECORD
+from zlocus.products.report.files import RECORD
 from zlocus.progress import Progress, SilentProgress
 from zlocus.reporting import Matched
 from zlocus.request import DsmRequest

@@ -309,3 +309,27 @@ def winners(total, ranges, address, block, best, second, margin, vertex):
                 left, right = np.float32(sums[where - 1] - low), np.float32(sums[where + 1] - low)
                 if left + right > 0:
                     vertex[r, c] += np.float32(0.5) * (left - right) / (left + right)
+
+
+# (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (r,c) i4, i8, (r,c) i4 -> None
+@kernel
+def least_costs(cost, ranges, address, block, best, gain, lone):
+    """Height index of the least cost of each cell by itself, the first of equals; that of `best` where its cost is
+    less than `gain` above the least. (r, c) int32."""
+    n_rows, n_cols = best.shape
+    for r in range(n_rows):
+        b = r // block
+        for c in range(n_cols):
+            d = c // block
+            first, count = ranges[0, b, d], ranges[1, b, d]
+            start = address[0, b, d] + (r - b * block) * address[1, b, d] + address[2, b, d] + (c - d * block) * count
+            costs = cost[start : start + count]
+            least = np.uint8(255)
+            for k in range(count):
+                least = min(least, costs[k])
+            lone[r, c] = best[r, c]
+            if np.int64(costs[best[r, c] - first]) - np.int64(least) >= gain:
+                where = np.int64(0)
+                while costs[where] != least:
+                    where += 1
+                lone[r, c] = first + where

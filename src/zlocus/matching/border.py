@@ -8,7 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
@@ -76,8 +75,10 @@ def covered_ground(
         is_ground = (np.abs(own - beside) <= rise) & _two_show(matched[:, :, ring], beside, np.float32(0.0))
         ground[ring] = np.where(is_shown, np.where(is_ground, own, beside), 0.0)
         known[ring], beyond[ring] = is_shown, ~is_shown
-    regions, _ = label(covered & ~known, AROUND)
-    found = covered & ~np.isin(regions, np.unique(regions[beyond]))
+    count, regions = cv2.connectedComponents((covered & ~known).astype(np.uint8), connectivity=8)
+    is_beyond = np.zeros(count, np.bool_)
+    is_beyond[regions[beyond]] = True
+    found = covered & ~is_beyond[regions]
     # A cell that is cut off alone is as good as those on both sides of it.
     closed = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, AROUND, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(covered & (closed > 0))

@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.mgm import sweep_quarter
-from zlocus.kernels.sgm import sweep, winners
+from zlocus.kernels.sgm import least_costs, sweep, winners
 from zlocus.matching.contrast import ALL, Part, edge_unit
 from zlocus.matching.lattice import NARROW_BASE, HeightLattice
 from zlocus.options import SemiGlobalOptions
 
 # From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
 BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
+# A cell's own least cost, of 255, counts where it lies so far below that of the height found.
+CLEARLY = 4
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,13 @@ class SemiGlobalHeights:
 
     def above(self, base: NDArray[np.float32]) -> SemiGlobalHeights:
         """The same heights counted from the lattice's origin, from indices counted from a base surface (r, c)."""
-        best, second = (np.rint(v + base).astype(np.int32) for v in (self.best, self.second))
+        best, second = (counted_above(found, base) for found in (self.best, self.second))
         return SemiGlobalHeights(best, second, self.margin, self.vertex + base)
+
+
+def counted_above(found: NDArray[np.int32], base: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Height indices counted from the lattice's origin, from those counted from a base surface, all (r, c)."""
+    return np.asarray(np.rint(found + base), np.int32)
 
 
 def penalties(
@@ -98,6 +105,14 @@ def alone(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
     Costs count once per path there, so they do here, and margins mean the same.
     """
     return pick(np.multiply(cost, np.uint16(2 * len(BEHIND)), dtype=np.uint16), lattice)
+
+
+def lone_heights(cost: NDArray[np.uint8], lattice: HeightLattice, found: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Height indices (r, c) of the least costs, each cell by itself, where they lie clearly below that of `found`, (r,
+    c), which is given elsewhere."""
+    lone = np.empty(lattice.shape, np.int32)
+    least_costs(cost, lattice.ranges, lattice.address, lattice.block, found, CLEARLY, lone)
+    return lone
 
 
 def more_global_sums(

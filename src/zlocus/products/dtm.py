@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from zlocus.io.raster import RasterSink
 from zlocus.options import ProductOptions
@@ -94,4 +93,6 @@ def _is_near(mean: FloatImage, reach: float) -> NDArray[np.bool_]:
     unknown = np.isnan(mean)
     if unknown.all():
         return ~unknown
+    from scipy.ndimage import distance_transform_edt  # a tenth of a second
+
     return np.asarray(distance_transform_edt(unknown) <= reach)

@@ -14,7 +14,6 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from zlocus.options import ProductOptions
 
@@ -44,9 +43,12 @@ def terrain(lowest: FloatImage, cell_m: float, options: ProductOptions) -> Float
 
 def outside_of(z: FloatImage) -> NDArray[np.bool_]:
     """Gaps (NaN) that reach the rim of the raster: no ground surrounds them. (r, c)."""
-    gaps, _ = label(np.isnan(z))
-    rim = np.concatenate([gaps[0], gaps[-1], gaps[:, 0], gaps[:, -1]])
-    return np.isin(gaps, np.unique(rim[rim > 0]))
+    is_gap = np.isnan(z)
+    count, gaps = cv2.connectedComponents(is_gap.astype(np.uint8), connectivity=4)
+    at_rim = np.zeros(count, np.bool_)
+    for rim in (gaps[0], gaps[-1], gaps[:, 0], gaps[:, -1]):
+        at_rim[rim] = True
+    return np.asarray(is_gap & at_rim[gaps])
 
 
 def rises(

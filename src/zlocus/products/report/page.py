@@ -16,14 +16,12 @@ from zlocus.errors import InputError
 from zlocus.products.record import read_record, write_whole
 from zlocus.products.report import maps, tables, words
 from zlocus.products.report.comparison import Comparison, comparison_part
+from zlocus.products.report.files import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.report.survey import Survey, survey
 from zlocus.scene import is_local
 from zlocus.sensors.model import FloatArray
 from zlocus.surface.reasons import Quality
 
-REPORT, RECORD, CURVES, FOOTPRINTS, RANKING = (
-    "report.html", "run.json", "curves.json", "footprints.geojson", "ranking.gpkg",
-)  # fmt: skip
 NEEDED = ("config", "versions", "inputs", "stages", "orientation", "grid", "heights", "coverage")
 QUANTILES = (10, 25, 50, 75, 90)
 LABEL_WORDS = {1: "good", 0: "fair", -1: "poor"}

@@ -1,0 +1,15 @@
+"""Files of a run that its report is made of, by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+REPORT, RECORD, CURVES, FOOTPRINTS, RANKING = (
+    "report.html", "run.json", "curves.json", "footprints.geojson", "ranking.gpkg",
+)  # fmt: skip
+
+
+def forget_report(out: Path) -> None:
+    """Remove the report of an earlier run, which is not this one's."""
+    for name in (REPORT, CURVES, FOOTPRINTS):
+        (out / name).unlink(missing_ok=True)
