@@ -202,7 +202,7 @@ def least_case(count: int | None) -> Case:
     best, lone = (first + rng.integers(0, counts)).astype(np.int32), np.empty(heights.shape, np.int32)
 
     def call():
-        least_costs(cost, heights.ranges, heights.address, BLOCK, best, 4, lone)
+        least_costs(cost, heights.ranges, heights.address, BLOCK, best, lone)
 
     return Case(call, heights.size, "cell-step")
 

@@ -311,11 +311,10 @@ def winners(total, ranges, address, block, best, second, margin, vertex):
                     vertex[r, c] += np.float32(0.5) * (left - right) / (left + right)
 
 
-# (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (r,c) i4, i8, (r,c) i4 -> None
+# (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (r,c) i4, (r,c) i4 -> None
 @kernel
-def least_costs(cost, ranges, address, block, best, gain, lone):
-    """Height index of the least cost of each cell by itself, the first of equals; that of `best` where its cost is
-    less than `gain` above the least. (r, c) int32."""
+def least_costs(cost, ranges, address, block, best, lone):
+    """Height index of the least cost of each cell by itself: of equals that of `best`, else the first. (r, c) int32."""
     n_rows, n_cols = best.shape
     for r in range(n_rows):
         b = r // block
@@ -327,9 +326,9 @@ def least_costs(cost, ranges, address, block, best, gain, lone):
             least = np.uint8(255)
             for k in range(count):
                 least = min(least, costs[k])
-            lone[r, c] = best[r, c]
-            if np.int64(costs[best[r, c] - first]) - np.int64(least) >= gain:
+            where = np.int64(best[r, c] - first)
+            if costs[where] != least:
                 where = np.int64(0)
                 while costs[where] != least:
                     where += 1
-                lone[r, c] = first + where
+            lone[r, c] = first + where

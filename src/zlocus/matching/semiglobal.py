@@ -15,8 +15,6 @@ from zlocus.options import SemiGlobalOptions
 
 # From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
 BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
-# A cell's own least cost, of 255, counts where it lies so far below that of the height found.
-CLEARLY = 4
 
 
 @dataclass(frozen=True)
@@ -108,10 +106,9 @@ def alone(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
 
 
 def lone_heights(cost: NDArray[np.uint8], lattice: HeightLattice, found: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Height indices (r, c) of the least costs, each cell by itself, where they lie clearly below that of `found`, (r,
-    c), which is given elsewhere."""
+    """Height indices (r, c) of the least costs, each cell by itself; of equals that of `found`, (r, c)."""
     lone = np.empty(lattice.shape, np.int32)
-    least_costs(cost, lattice.ranges, lattice.address, lattice.block, found, CLEARLY, lone)
+    least_costs(cost, lattice.ranges, lattice.address, lattice.block, found, lone)
     return lone
 
 
