@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.ranges import ALIKE_STEPS, LANES, ranges_nearby, shared_heights, without_spikes
+from zlocus.matching.ranges import ALIKE_PX, LANES, ranges_nearby, shared_heights, without_spikes
 from zlocus.options import PyramidOptions
 from zlocus.tile import RIVALS_KEPT, _candidates
 
@@ -78,7 +78,8 @@ def coarse_result(best, second, margin, lone, window):
     heights = SimpleNamespace(best=best, second=second, margin=margin)
     seen = np.zeros((3, 3, *best.shape), np.int32)
     seen[1] = 100
-    return SimpleNamespace(window=window, heights=heights, lone=lone, seen=seen)
+    base = SimpleNamespace(cells=np.zeros(best.shape, np.float32))
+    return SimpleNamespace(window=window, heights=heights, lone=lone, seen=seen, base=base)
 
 
 def candidates(second_at, margin_at, ties=(), side=3, lone_at=20):
@@ -94,7 +95,7 @@ def candidates(second_at, margin_at, ties=(), side=3, lone_at=20):
     scene = SimpleNamespace(
         ties=np.array(ties, float).reshape(-1, 3), cell_m=0.5, anchor=(1000.0, 2000.0), origin_m=10.0, step_m=0.25
     )
-    return _candidates(scene, coarse_result(best, second, margin, lone, coarse), CellWindow(0, 0, 40, 40), 1)
+    return _candidates(scene, coarse_result(best, second, margin, lone, coarse), CellWindow(0, 0, 40, 40), 1, OPTIONS)
 
 
 def test_a_near_rival_is_a_candidate():
@@ -141,17 +142,22 @@ def test_spikes_beside_cells_that_nobody_saw():
 
 
 def test_heights_that_cells_share():
-    """Three by three cells agree, however they lean; a cell beside them, and cells that each find another height, do
-    not."""
+    """Three by three cells agree; a cell beside them, and cells that each find another height, do not. Whatever slope
+    they stand on."""
+    alike = round(ALIKE_PX / OPTIONS.max_shift_px)
+    slope = 3 * alike * np.arange(24, dtype=np.float32) * np.ones((20, 1), np.float32)
     best = np.full((20, 24), 40, np.int32)
     lone = best.copy()
-    lone[2:5, 3:6] = 90 + np.arange(3) * (ALIKE_STEPS // 2)
-    lone[2:5, 6] = 90 + 3 * ALIKE_STEPS
+    lone[2:5, 3:6] = 90 + np.arange(3) * (alike // 2)
+    lone[2:5, 6] = 90 + 3 * alike
     lone[10:18, 2:10] = 60 + 10 * np.random.default_rng(1).permutation(64).reshape(8, 8)
-    lone[10:13, 14:17] = 90 + np.arange(3) * ALIKE_STEPS
+    lone[10:13, 14:17] = 90 + np.arange(3) * alike
     expected = best.copy()
     expected[2:5, 3:6] = lone[2:5, 3:6]
-    np.testing.assert_array_equal(shared_heights(lone, best), expected)
+    for base in (np.zeros_like(slope), slope):
+        steps = base.astype(np.int32)
+        found = shared_heights(lone + steps, best + steps, base, OPTIONS)
+        np.testing.assert_array_equal(found, expected + steps)
 
 
 def test_a_far_rival_is_none():

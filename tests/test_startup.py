@@ -3,24 +3,42 @@
 import subprocess
 import sys
 
-COMMAND = """
+PREPARED = """
 import gc, sys
 from zlocus import startup
 startup.prepare()
 import zlocus.pipeline, pyogrio.raw
-print(gc.isenabled(), gc.get_threshold()[0] >= startup.LOOKS[0], hasattr(sys.modules["pandas"], "DataFrame"))
+print(gc.isenabled(), gc.get_threshold()[0] == startup.NEW_OBJECTS, hasattr(sys.modules["pandas"], "DataFrame"))
 print(*sorted({"matplotlib", "scipy.ndimage", "zlocus.reporting", "zlocus.evaluation.evaluate"} & set(sys.modules)))
 """
+COMMAND = """
+import gc, sys
+from zlocus import cli, startup
+try:
+    cli.main(["config"])
+except SystemExit:
+    print(gc.get_threshold()[0] == startup.NEW_OBJECTS, sys.modules.get("pandas", "there"), file=sys.stderr)
+"""
+LIBRARY = """
+import gc, sys
+was = gc.get_threshold()
+import zlocus.api, zlocus.cli, zlocus.pipeline
+print(gc.get_threshold() == was, "pandas" in sys.modules)
+"""
+
+
+def said(code):
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
 
 
 def test_what_a_surface_takes_no_part_in_is_not_imported():
     """pyogrio does without pandas; cycles are still looked for."""
-    said = subprocess.run([sys.executable, "-c", COMMAND], check=True, capture_output=True, text=True).stdout
-    assert said.splitlines() == ["True True False", ""]
+    assert said(PREPARED).stdout.splitlines() == ["True True False", ""]
+
+
+def test_a_command_is_prepared():
+    assert said(COMMAND).stderr.split() == ["True", "None"]
 
 
 def test_the_package_as_a_library_leaves_the_process_alone():
-    code = "import gc, sys; was = gc.get_threshold(); import zlocus.api; print(gc.get_threshold() == was, *sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
-    assert said.split()[0] == "True"
-    assert "pandas" not in said.split()
+    assert said(LIBRARY).stdout.split() == ["True", "False"]

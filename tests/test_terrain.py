@@ -65,10 +65,13 @@ def test_a_rise_is_found_by_the_first_window_wider_than_it():
 
 def test_gaps_that_reach_the_rim_are_outside():
     z = np.zeros((9, 9), np.float32)
-    z[:2, 3:] = z[5, 5] = z[7:, 0] = np.nan
+    z[:2, 3:] = z[5, 5] = z[7:, 0] = z[6, 1] = np.nan
     expected = np.isnan(z)
-    expected[5, 5] = False
+    # The second one touches a gap at the rim by a corner.
+    expected[5, 5] = expected[6, 1] = False
     np.testing.assert_array_equal(outside_of(z), expected)
+    for row in (np.zeros((1, 9), np.float32), np.full((3, 9), np.nan, np.float32)):
+        np.testing.assert_array_equal(outside_of(row), np.isnan(row))
 
 
 def test_buildings_trees_and_pits_on_tilted_ground():

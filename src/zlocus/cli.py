@@ -492,7 +492,7 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit; `arguments` default to those of the process."""
+    """Run the command line and exit, in a process of its own; `arguments` default to those of the process."""
     prepare()
     warnings.showwarning = _show_warning(warnings.showwarning)
     app(arguments, prog_name="zlocus")

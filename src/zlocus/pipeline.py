@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shutil
 from collections.abc import Callable
@@ -98,6 +99,8 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     """See `run_dsm`. kept : becomes where the tiles are, once they are made."""
     watch = Stopwatch()
     check_maps(request.products, config.products)
+    if request.report:
+        importlib.import_module("zlocus.reporting")  # what is broken there is to show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
         found = opened(request, progress)
         scene, vertical = found.scene, found.vertical

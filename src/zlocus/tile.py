@@ -47,7 +47,7 @@ from zlocus.matching.visibility import (
     sees,
     spare_pairs,
 )
-from zlocus.options import RunConfig
+from zlocus.options import PyramidOptions, RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
 from zlocus.surface.precision import sigma_steps, signs_of_precision
@@ -138,7 +138,7 @@ def match_tile(
     for level in range(coarsest - 1, -1, -1):
         window = _level_window(scene, core, level, config, worth.finer(coarsest - level))
         above = 2 * on_cells(result.heights.vertex, result.window, window)
-        guide = Guide(above, *_candidates(scene, result, window, level), result)
+        guide = Guide(above, *_candidates(scene, result, window, level, config.pyramid), result)
         result = _match_level(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
         levels.append(result)
         done, every = done + result.evaluations, every + result.all_views
@@ -400,10 +400,10 @@ def _choose(
 
 
 def _candidates(
-    scene: MatchScene, coarser: LevelResult, window: CellWindow, level: int
+    scene: MatchScene, coarser: LevelResult, window: CellWindow, level: int, options: PyramidOptions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Lowest and highest height index worth a look in every cell: best, near rivals, tie points, and what some cells
-    would choose if the others had no say.
+    """Lowest and highest height index worth a look in every cell: best, near rivals, tie points, and what cells would
+    choose if the others had no say (see `shared_heights`).
 
     The last is what keeps a tower of few coarse cells, or a crown, which the semi-global constraint levels there.
     """
@@ -411,7 +411,7 @@ def _candidates(
     assert coarser.lone is not None
     known = covers(coarser.seen).sum(axis=0) >= PAIR
     rival = np.where(heights.margin < RIVALS_KEPT, heights.second, heights.best)
-    found = np.stack([heights.best, rival, shared_heights(coarser.lone, heights.best)])
+    found = np.stack([heights.best, rival, shared_heights(coarser.lone, heights.best, coarser.base.cells, options)])
     low, high = without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), known)
     low, high = (2 * on_cells(v, coarser.window, window) for v in (low, high))
     if len(scene.ties):

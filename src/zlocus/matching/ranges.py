@@ -15,8 +15,9 @@ from zlocus.options import PyramidOptions
 LANES = 4
 UNKNOWN = np.float32(1e9)
 SPIKE = np.ones((3, 3), np.uint8)
-# Cells agree on a height within so many steps: a crown is round.
-ALIKE_STEPS = 8
+# Equivalent disparity within which cells that found heights by themselves agree: crowns are round (docs/accuracy.md,
+# "Heights that cells find alone").
+ALIKE_PX = 4.0
 
 
 def ranges_nearby(
@@ -52,11 +53,15 @@ def by_block(values: NDArray[Any], block: int, reduce: np.ufunc) -> NDArray[Any]
     return np.asarray(reduce.reduceat(reduce.reduceat(values, rows, axis=0), cols, axis=1))
 
 
-def shared_heights(lone: NDArray[np.int32], best: NDArray[np.int32]) -> NDArray[np.int32]:
+def shared_heights(
+    lone: NDArray[np.int32], best: NDArray[np.int32], base: NDArray[np.float32], options: PyramidOptions
+) -> NDArray[np.int32]:
     """Height indices (r, c) that cells found by themselves, where 3 x 3 of them, the cell among them, agree within
-    ALIKE_STEPS; else `best`. Where nothing tells heights apart each finds its own, and any range would be searched."""
-    high, low = (fold(lone.astype(np.float32), SPIKE) for fold in (cv2.dilate, cv2.erode))
-    agree = (high - low <= ALIKE_STEPS).astype(np.uint8)
+    ALIKE_PX above the base surface (r, c); else `best`. Where nothing tells heights apart each finds its own, and any
+    range would be searched."""
+    above = (lone - base).astype(np.float32)
+    spread = cv2.dilate(above, SPIKE) - cv2.erode(above, SPIKE)
+    agree = (spread <= ALIKE_PX / options.max_shift_px).astype(np.uint8)
     return np.where(cv2.dilate(agree, SPIKE) > 0, lone, best)
 
 

@@ -172,7 +172,7 @@ def write_features(
     OutputError
         Where the file cannot be written.
     """
-    # pyogrio brings pandas, a third of a second.
+    # With pandas, where a command has not put it away (`startup.py`), a third of a second.
     import pyogrio.raw
     from pyogrio.errors import DataLayerError, DataSourceError
     from shapely import to_wkb

@@ -1,4 +1,4 @@
-"""Files of a run that its report is made of, by name."""
+"""Names of the report, and of the files of a run that it is made of."""
 
 from __future__ import annotations
 
