@@ -41,11 +41,12 @@ The same images, area, grid and cores for all. Programs are installed from the p
 of their own; their configurations stand in `benchmarks/peers/configurations`, as their documents recommend them,
 each with its reason. Programs for pairs get every pair whose rays meet at no more than 30 degrees, and merge them
 by their own means. CARS gets a terrain model with cells of 30 m besides (made of the truth, low in each cell; of the
-Pleiades triplet made of s2p's surface, of the pair SRTM). OpenCV and Pandora are matchers of rectified rows without
-cameras: for them images are resampled onto a plane, the range of heights is that of the truth, a cell gets the
-median of all pairs and gaps the nearest height; of Pleiades they get the pointing corrections that zlocus found.
-That is done by code of this comparison, and counts in their CPU and memory. zlocus gets images, area and grid; its
-page about a run is not asked for. Options of zlocus were chosen on other scenes of the same renderer.
+Pleiades triplet made of s2p's surface, of the pair SRTM). Around its tie points it searches as far as the heights
+reach apart. OpenCV and Pandora are matchers of rectified rows without cameras: for them images are resampled onto a
+plane, the range of heights is that of the truth, a cell gets the median of all pairs and gaps the nearest height;
+of Pleiades they get the pointing corrections that zlocus found. That is done by code of this comparison, and counts
+in their CPU and memory. zlocus gets images, area and grid; its page about a run is not asked for. Options of zlocus
+were chosen on other scenes of the same renderer.
 
 CPU and wall times are those of all processes a program starts, memory that of all of them together (shared pages
 once), after a run on another scene that fills caches; zlocus is run three times and the median counts. Shares are
