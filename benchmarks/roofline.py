@@ -47,8 +47,8 @@ COSTS = (
     "ns a window"
 )
 SGM_LOST = (
-    "80 ns a cell whatever its heights (104 ns with 16, 175 with 64: minima across lanes, ends of loops, some 20 "
-    "pointers); the row before lies in the second cache (450 KB with 64)"
+    "47 ns a cell whatever its heights (76 ns with 16, 163 with 64: minima across lanes, ends of loops, pointers); the "
+    "row before lies in the second cache (450 KB with 64)"
 )
 MGM_LOST = "some 200 ns a cell whatever its heights; volumes and sheets larger than the caches: see below"
 SEEN_LOST = "scalar code: places in float64 turned into indices, a branch a cell"

@@ -142,10 +142,11 @@ def costs(n_views: int, windows: list[int], n_heights: int, with_greys: bool = T
 
 
 # path_cost: min, + P1, min, min, - least, + cost; minimum of the path; eight paths. Sums of four: 3, twice. Costs
-# become uint16, twice. Sums of the up sweep are added: 1. Reads: 3 path costs, 8 times; costs as uint16 twice, and
-# once to turn them round; sums to be turned round and those of the down sweep. Writes: 8 path costs, sums twice, turned
-# costs, total. Memory: costs twice; sums written, then read and written.
-SGM = Count(narrow=8 * 7 + 6 + 2 + 1, loads=48 + 4 + 1 + 4, stores=16 + 4 + 1 + 2, memory=2 + 2 + 4)
+# become uint16, twice a sweep (paths from W, the three others). Sums of the up sweep are added: 1. Reads: 3 path costs,
+# 8 times; costs as uint16 four times, and once to turn them round; sums of the paths from W; sums to be turned round
+# and those of the down sweep. Writes: 8 path costs, sums twice a sweep, turned costs, total. Memory: costs twice; sums
+# written, then read and written.
+SGM = Count(narrow=8 * 7 + 6 + 4 + 1, loads=48 + 8 + 1 + 4 + 4, stores=16 + 8 + 1 + 2, memory=2 + 2 + 4)
 # One sweep, of four. run_along: two path costs of 5 and their minima, 12; offers 4; run_across: offers 4, sum 1;
 # lay_costs 2, add_sums 3. 17 reads and 7 writes of uint16. Memory: costs 1, sums read 2 and written 2.
 MGM_SWEEP = Count(narrow=12 + 4 + 5 + 5, loads=34, stores=14, memory=5)

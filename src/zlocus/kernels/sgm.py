@@ -8,7 +8,9 @@ them, W ... NE are the neighbours behind; only the previous row of path costs is
 Why it is fast: every sum and minimum is cast back to uint16 (Numba widens integers to 64 bits and the lanes would be
 lost), and all addresses in `run_cells` grow evenly and upwards from cell to cell, so that the compiler checks once a
 run, not in every cell, that what is read and what is written are apart. Hence the copies: the up sweep turns its rows
-round, and a neighbour with another range is copied by the heights of the cell.
+round, and a neighbour with another range is copied by the heights of the cell. A path from W cannot begin a cell
+before the one behind it is done, which takes longer than its 16 heights; so those of some rows go side by side, ahead
+of the three others.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ from zlocus.kernels._jit import kernel
 
 PAD = 2
 FAR = np.uint16(16000)
-FIRST, COUNT, LEFT, PLACE = 0, 1, 2, 3
+FIRST, COUNT, LEFT, PLACE, SHEET = 0, 1, 2, 3, 4
+NW, N, NE, BEHIND = 0, 1, 2, 3
+# Rows whose paths from W go side by side; where a cell from W is copied by the heights of another range.
+BESIDE, COPY = 4, 2
 NOBODY = -1
 NONE, LOWER = np.uint32(0xFFFFFFFF), np.uint32(0xFFFF)
 
@@ -32,86 +37,107 @@ def path_cost(same, down, up, p1, jump, least, cost):
     return np.uint16(np.uint16(min(best, jump) - least) + cost)
 
 
-# (v,) u1, (v,) u2, i8, (2,) i8, (l,) u2, (2,4) i8, (4,c) u2, (4,c) u2, (4,c) u2, i8, u2 -> None
+# (v,) u1, (v,) u2, (2,) i8, (3,) i8, (3,r,l) u2, (3,) i8, (r,) u2, (r,4,c) u2, i8, u2 -> None
+@kernel
+def run_west(cost, sums, start, size, paths, spots, least, edges, position, p1):
+    """Path costs from W of neighbouring cells of one range, in some rows at once; they are written to `sums`.
+
+    start : of the first cell in `cost` and `sums`, and the step to the next row; size : heights, cells and rows;
+    spots : planes of `paths` where the first cell reads, where it writes, and where the second one does, from there on
+    in turns; least : of the cells before; edges : P2.
+
+    Rows lie inside the planes: the compiler compares what all rows read with what all of them write.
+    """
+    n, n_rows, step, one = np.uint64(size[0]), np.uint64(size[2]), np.uint64(start[1]), np.uint64(1)
+    pad = np.uint64(PAD)
+    behind, ahead, other = np.uint64(spots[0]), np.uint64(spots[1]), np.uint64(spots[2])
+    for cell in range(np.uint64(size[1])):
+        s0, i = np.uint64(start[0]) + cell * n, np.uint64(position) + cell
+        for row in range(n_rows):
+            s, low = s0 + row * step, np.uint16(65535)
+            before = least[row]
+            jump = np.uint16(before + edges[row, 0, i])
+            for k in range(n):
+                down, up = paths[behind, row, pad + k - one], paths[behind, row, pad + k + one]
+                here = path_cost(paths[behind, row, pad + k], down, up, p1, jump, before, np.uint16(cost[s + k]))
+                paths[ahead, row, pad + k] = here
+                sums[s + k] = here
+                low = min(low, here)
+            least[row] = low
+        behind, ahead, other = ahead, other, ahead
+
+
+# (v,) u1, (v,) u2, i8, (2,) i8, (l,) u2, (2,3) i8, (3,c) u2, (3,c) u2, (4,c) u2, i8, u2 -> None
 @kernel
 def run_cells(cost, sums, start, size, paths, spots, behind, ahead, edge, position, p1):
-    """Path costs of neighbouring cells of one range, whose neighbours all share it; their sums are written to `sums`.
+    """Path costs from NW, N and NE of neighbouring cells of one range, whose neighbours all share it, added to `sums`.
 
     start : of the first cell in `cost` and `sums`; size : heights and cells; spots : where the first cell's path costs
-    are read and written in `paths`, those of W swap from cell to cell; behind, ahead : (4, c + 2) uint16, least path
-    costs of the previous and of this row, cell i at i + 1; edge : (4, c) uint16, P2.
+    are read and written in `paths`; behind, ahead : (3, c + 2) uint16, least path costs of the previous and of this
+    row, cell i at i + 1; edge : (4, c) uint16, P2.
     """
-    n_heights, n_cells = size[0], size[1]
-    n, one = np.uint64(n_heights), np.uint64(1)
-    w_behind, nw_behind, n_behind, ne_behind = spots[0, 0], spots[0, 1], spots[0, 2], spots[0, 3]
-    w_ahead, nw_ahead, n_ahead, ne_ahead = spots[1, 0], spots[1, 1], spots[1, 2], spots[1, 3]
-    l0 = ahead[0, position]
-    for cell in range(n_cells):
-        i, away = position + cell, cell * (n_heights + PAD)
-        s = np.uint64(start + cell * n_heights)
-        r0, r1 = np.uint64(w_behind), np.uint64(nw_behind + away)
-        r2, r3 = np.uint64(n_behind + away), np.uint64(ne_behind + away)
-        a0, a1 = np.uint64(w_ahead), np.uint64(nw_ahead + away)
-        a2, a3 = np.uint64(n_ahead + away), np.uint64(ne_ahead + away)
-        w_behind, w_ahead = w_ahead, w_behind
-        l1, l2, l3 = behind[1, i], behind[2, i + 1], behind[3, i + 2]
-        j0, j1 = np.uint16(l0 + edge[0, i]), np.uint16(l1 + edge[1, i])
-        j2, j3 = np.uint16(l2 + edge[2, i]), np.uint16(l3 + edge[3, i])
-        m0 = m1 = m2 = m3 = np.uint16(65535)
+    n, one, two = np.uint64(size[0]), np.uint64(1), np.uint64(2)
+    wide = n + np.uint64(PAD)
+    nw_behind, n_behind, ne_behind = np.uint64(spots[0, NW]), np.uint64(spots[0, N]), np.uint64(spots[0, NE])
+    nw_ahead, n_ahead, ne_ahead = np.uint64(spots[1, NW]), np.uint64(spots[1, N]), np.uint64(spots[1, NE])
+    for cell in range(np.uint64(size[1])):
+        i, away, s = np.uint64(position) + cell, cell * wide, np.uint64(start) + cell * n
+        r1, r2, r3 = nw_behind + away, n_behind + away, ne_behind + away
+        a1, a2, a3 = nw_ahead + away, n_ahead + away, ne_ahead + away
+        l1, l2, l3 = behind[NW, i], behind[N, i + one], behind[NE, i + two]
+        j1, j2, j3 = np.uint16(l1 + edge[1, i]), np.uint16(l2 + edge[2, i]), np.uint16(l3 + edge[3, i])
+        m1 = m2 = m3 = np.uint16(65535)
         for k in range(n):
             c = np.uint16(cost[s + k])
-            v0 = path_cost(paths[r0 + k], paths[r0 + k - one], paths[r0 + k + one], p1, j0, l0, c)
             v1 = path_cost(paths[r1 + k], paths[r1 + k - one], paths[r1 + k + one], p1, j1, l1, c)
             v2 = path_cost(paths[r2 + k], paths[r2 + k - one], paths[r2 + k + one], p1, j2, l2, c)
             v3 = path_cost(paths[r3 + k], paths[r3 + k - one], paths[r3 + k + one], p1, j3, l3, c)
-            paths[a0 + k] = v0
             paths[a1 + k] = v1
             paths[a2 + k] = v2
             paths[a3 + k] = v3
-            m0, m1, m2, m3 = min(m0, v0), min(m1, v1), min(m2, v2), min(m3, v3)
-            sums[s + k] = np.uint16(np.uint16(v0 + v1) + np.uint16(v2 + v3))
-        paths[a0 + n] = FAR
-        ahead[0, i + 1], ahead[1, i + 1], ahead[2, i + 1], ahead[3, i + 1] = m0, m1, m2, m3
-        l0 = m0
+            m1, m2, m3 = min(m1, v1), min(m2, v2), min(m3, v3)
+            sums[s + k] = np.uint16(np.uint16(sums[s + k] + v1) + np.uint16(v2 + v3))
+        ahead[NW, i + one], ahead[N, i + one], ahead[NE, i + one] = m1, m2, m3
 
 
-# (l,) u2, i8, i8, i8, i8, i8 -> None
+# (l,) u2, i8, i8, (l,) u2, i8 -> None
 @kernel
-def shifted(paths, behind, n_behind, shift, spot, count):
-    """Copy a neighbour's path costs to `spot` - 1 ... `spot` + count, by the heights of this cell.
+def restated(behind, n_behind, shift, here, count):
+    """Copy a neighbour's path costs by the heights of this cell and one more at both ends; both begin at PAD.
 
     shift = first index here less the neighbour's. Heights that it did not search are FAR: only a jump (P2) leads from
     there. n_behind < 0: no neighbour, zeros (L = C).
     """
     nothing = FAR if n_behind >= 0 else np.uint16(0)
-    for k in range(spot - 1, spot + count + 1):
-        paths[k] = nothing
+    for k in range(PAD - 1, PAD + count + 1):
+        here[k] = nothing
     low, high = max(-1, -shift), min(count + 1, n_behind - shift)
     if low < high:
-        source, target = paths[behind + shift + low : behind + shift + high], paths[spot + low : spot + high]
+        source, target = behind[PAD + shift + low : PAD + shift + high], here[PAD + low : PAD + high]
         for k in range(source.shape[0]):
             target[k] = source[k]
 
 
-# (2,b,d) i8, i8, i8, i8, i8, (4,d) i8 -> None
+# (2,b,d) i8, i8, i8, i8, i8, (5,d) i8 -> None
 @kernel
 def row_segments(ranges, block_row, block, n_cols, sign, segments):
-    """Segments of a row: FIRST and COUNT of its heights, LEFT position, PLACE of its first cell in a row of path costs.
+    """Segments of a row: FIRST, COUNT of heights, LEFT position, PLACE of its first cell among path costs, on a SHEET.
 
-    segments : (4, d + 2) int64, segment e at e + 1; the count NOBODY stands where there is none.
+    segments : (5, d + 2) int64, segment e at e + 1; the count NOBODY stands where there is none.
     """
     n_d = ranges.shape[2]
     segments[COUNT] = NOBODY
-    left, place = 0, PAD
+    left, place, sheet = 0, PAD, 0
     for e in range(n_d):
         d = e if sign > 0 else n_d - 1 - e
         count = ranges[1, block_row, d]
         segments[FIRST, e + 1], segments[COUNT, e + 1] = ranges[0, block_row, d], count
-        segments[LEFT, e + 1], segments[PLACE, e + 1] = left, place
+        segments[LEFT, e + 1], segments[PLACE, e + 1], segments[SHEET, e + 1] = left, place, sheet
         n_cells = min(block, n_cols - d * block)
         left += n_cells
         place += n_cells * (count + PAD)
-    segments[LEFT, n_d + 1] = left
+        sheet += n_cells * count
+    segments[LEFT, n_d + 1], segments[SHEET, n_d + 1] = left, sheet
 
 
 # (4,r,c) u2, i8, i8, (4,c) u2 -> None
@@ -134,65 +160,84 @@ def row_edges(p2, row, sign, edge):
         edge[3, i] = p2[3, behind, max(c - 1, 0)]
 
 
-# (4,d) i8, i8, (4,d) i8, i8 -> b1
+# (2,5,d) i8, i8, i8, i8, i8 -> b1
 @kernel
-def alike(segments, e, others, f):
-    """Whether two segments search the same heights."""
-    return segments[COUNT, e] == others[COUNT, f] and segments[FIRST, e] == others[FIRST, f]
+def alike(segments, row, e, other, f):
+    """Whether two segments of two rows, even (0) or odd, search the same heights."""
+    same_count = segments[row, COUNT, e] == segments[other, COUNT, f]
+    return same_count and segments[row, FIRST, e] == segments[other, FIRST, f]
 
 
-# (l,) u2, (3,4) i8, (2,4,d) i8, i8, i8, i8, i8, (2,4) i8 -> None
+# (v,) u1, (v,) u2, (d,) i8, i8, (2,5,d) i8, i8, i8, (3,r,l) u2, (r,4,c) u2, u2 -> None
 @kernel
-def find_neighbours(paths, planes, segments, now, turn, e, position, spots):
-    """Where a cell reads and writes its four paths; neighbours of another range are copied to a place of their own.
+def sweep_west(cost, sums, starts, step, segments, now, n_rows, paths, edges, p1):
+    """Path costs from W of the cells of some rows, which have the same segments; they are written to `sums`.
 
-    planes : (3, 4) int64, start of the path costs of even and odd rows (for W of even and odd cells), and of copies.
+    starts : of the segments of the first row; step : to the next row; paths : (3, r, l) uint16, of the last two cells
+    of each row, and copies.
     """
-    here = segments[now]
-    count = here[COUNT, e]
-    for path in range(4):
-        across = position - 1 if path < 2 else position + path - 2
-        row = now if path == 0 else 1 - now
-        there = segments[row]
-        f = e - 1 if across < here[LEFT, e] else (e + 1 if across >= here[LEFT, e + 1] else e)
-        if path == 0:
-            spots[0, 0], spots[1, 0] = planes[turn, 0], planes[1 - turn, 0]
-        else:
-            spots[0, path] = planes[row, path] + there[PLACE, f] + (across - there[LEFT, f]) * (there[COUNT, f] + PAD)
-            spots[1, path] = planes[now, path] + here[PLACE, e] + (position - here[LEFT, e]) * (count + PAD)
-        if not alike(here, e, there, f):
-            shift = here[FIRST, e] - there[FIRST, f]
-            shifted(paths, spots[0, path], there[COUNT, f], shift, planes[2, path], count)
+    turn = 0
+    start, size, spots = np.empty(2, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    least = np.zeros(n_rows, np.uint16)
+    for e in range(1, starts.shape[0] - 1):
+        count, n_cells = segments[now, COUNT, e], segments[now, LEFT, e + 1] - segments[now, LEFT, e]
+        behind = turn
+        if not alike(segments, now, e, now, e - 1):
+            behind, shift = COPY, segments[now, FIRST, e] - segments[now, FIRST, e - 1]
+            for row in range(n_rows):
+                restated(paths[turn, row], segments[now, COUNT, e - 1], shift, paths[COPY, row], count)
+                paths[0, row, PAD + count] = paths[1, row, PAD + count] = FAR
+        start[0], start[1] = starts[e], step
+        size[0], size[1], size[2] = count, n_cells, n_rows
+        spots[0], spots[1], spots[2] = behind, 1 - turn, turn
+        run_west(cost, sums, start, size, paths, spots, least, edges, segments[now, LEFT, e], p1)
+        turn = (turn + n_cells) % 2
+
+
+# (l,) u2, (3,3) i8, (2,5,d) i8, i8, i8, i8, (2,3) i8 -> None
+@kernel
+def find_neighbours(paths, planes, segments, now, e, position, spots):
+    """Where a cell reads and writes its path costs; neighbours of another range are copied to a place of their own.
+
+    planes : (3, 3) int64, start of the path costs of even and odd rows, and of copies.
+    """
+    count, left, right = segments[now, COUNT, e], segments[now, LEFT, e], segments[now, LEFT, e + 1]
+    place, before = segments[now, PLACE, e] + (position - left) * (count + PAD), 1 - now
+    for path in range(BEHIND):
+        across = position + path - 1
+        f = e - 1 if across < left else (e + 1 if across >= right else e)
+        from_left = (across - segments[before, LEFT, f]) * (segments[before, COUNT, f] + PAD)
+        spots[0, path] = planes[before, path] + segments[before, PLACE, f] + from_left
+        spots[1, path] = planes[now, path] + place
+        if not alike(segments, now, e, before, f):
+            shift = segments[now, FIRST, e] - segments[before, FIRST, f]
+            here, there = paths[planes[2, path] - PAD :], paths[spots[0, path] - PAD :]
+            restated(there, segments[before, COUNT, f], shift, here, count)
             spots[0, path] = planes[2, path]
 
 
-# (v,) u1, (v,) u2, i8, (l,) u2, (3,4) i8, (2,4,d) i8, i8, i8, i8, (2,4,c) u2, (4,c) u2, u2 -> i8
+# (v,) u1, (v,) u2, i8, (l,) u2, (3,3) i8, (2,5,d) i8, i8, i8, (2,3,c) u2, (4,c) u2, u2, (2,3) i8, (2,) i8 -> None
 @kernel
-def sweep_segment(cost, sums, start, paths, planes, segments, now, turn, e, least, edge, p1):
+def sweep_segment(cost, sums, start, paths, planes, segments, now, e, least, edge, p1, spots, size):
     """All cells of a segment: those at its ends and under another range one by one, the others in one run.
 
-    Returns the next cell's `turn`.
+    spots, size : where `run_cells` gets them.
     """
-    here, there = segments[now], segments[1 - now]
-    left, right, count = here[LEFT, e], here[LEFT, e + 1], here[COUNT, e]
-    run, end = left, right
-    if not alike(here, e, there, e):
+    left, right, count = segments[now, LEFT, e], segments[now, LEFT, e + 1], segments[now, COUNT, e]
+    run, end, before = left, right, 1 - now
+    if not alike(segments, now, e, before, e):
         run = right
-    elif not (alike(here, e, here, e - 1) and alike(here, e, there, e - 1)):
+    elif not alike(segments, now, e, before, e - 1):
         run = left + 1
-    if not alike(here, e, there, e + 1):
+    if not alike(segments, now, e, before, e + 1):
         end = right - 1
-    spots, size = np.empty((2, 4), np.int64), np.empty(2, np.int64)
+    behind, ahead = least[before], least[now]
     i = left
     while i < right:
         size[0], size[1] = count, (end - i if run <= i < end else 1)
-        find_neighbours(paths, planes, segments, now, turn, e, i, spots)
-        run_cells(
-            cost, sums, start + (i - left) * count, size, paths, spots, least[1 - now], least[now], edge, i, p1
-        )  # fmt: skip
+        find_neighbours(paths, planes, segments, now, e, i, spots)
+        run_cells(cost, sums, start + (i - left) * count, size, paths, spots, behind, ahead, edge, i, p1)
         i += size[1]
-        turn = (turn + size[1]) % 2
-    return turn
 
 
 # (v,) u1, i8, i8, i8, (s,) u1 -> None
@@ -217,6 +262,47 @@ def add_reversed(source, start, count, n_cells, total):
             b[k] = np.uint16(b[k] + a[k])
 
 
+# (v,) u1, (v,) u2, (d,) i8, i8, (5,d) i8, i8, b1, (s,) u1, (s,) u2 -> None
+@kernel
+def turn_rows(cost, total, starts, step, segments, n_rows, is_done, sheet_cost, sheet_sums):
+    """Lay the costs of some rows on a sheet, their cells in reverse order, or add the sums of the sheet to theirs."""
+    length = segments[SHEET, starts.shape[0] - 1]
+    for row in range(n_rows):
+        for e in range(1, starts.shape[0] - 1):
+            start, n_cells = starts[e] + row * step, segments[LEFT, e + 1] - segments[LEFT, e]
+            at, end = row * length + segments[SHEET, e], row * length + segments[SHEET, e + 1]
+            if is_done:
+                add_reversed(sheet_sums[at:end], start, segments[COUNT, e], n_cells, total)
+            else:
+                reverse_cells(cost, start, segments[COUNT, e], n_cells, sheet_cost[at:end])
+
+
+# i8, i8 -> (3,3) i8
+@kernel
+def path_planes(width, longest):
+    """Where the path costs of even and odd rows and copies of neighbours start, for NW, N, NE."""
+    planes = np.empty((3, BEHIND), np.int64)
+    for path in range(BEHIND):
+        planes[0, path], planes[1, path] = path * width, (BEHIND + path) * width
+        planes[2, path] = 2 * BEHIND * width + path * longest + PAD
+    return planes
+
+
+# (v,) u1, (v,) u2, (d,) i8, i8, (l,) u2, (3,3) i8, (2,5,d) i8, i8, b1, (2,3,c) u2, (4,c) u2, u2 -> None
+@kernel
+def sweep_row(cost, sums, starts, shift, paths, planes, segments, now, is_new, least, edge, p1):
+    """Paths from NW, N and NE of a row, whose segments start `shift` after `starts`.
+
+    is_new : with segments unlike those of the row before the last.
+    """
+    if is_new:
+        width = planes[0, 1]
+        paths[planes[now, 0] : planes[now, 0] + BEHIND * width] = FAR
+    spots, size = np.empty((2, BEHIND), np.int64), np.empty(2, np.int64)
+    for e in range(1, starts.shape[0] - 1):
+        sweep_segment(cost, sums, starts[e] + shift, paths, planes, segments, now, e, least, edge, p1, spots, size)
+
+
 # (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (4,r,c) u2, u2, i8, (v,) u2 -> None
 @kernel
 def sweep(cost, ranges, address, block, p2, p1, sign, total):
@@ -225,35 +311,40 @@ def sweep(cost, ranges, address, block, p2, p1, sign, total):
     p2 : (4, r, c) uint16, penalty of the jump into a cell from W, NW, N, NE.
     """
     n_rows, n_cols, n_d = p2.shape[1], p2.shape[2], ranges.shape[2]
-    width = address[1].max() + PAD * (n_cols + 2)
-    longest = ranges[1].max() + 2 * PAD
-    planes = np.empty((3, 4), np.int64)
-    for row in range(3):
-        planes[row, 0] = 6 * width + row * longest + PAD
-        for path in range(1, 4):
-            planes[row, path] = (3 * row + path - 1) * width if row < 2 else 6 * width + (2 + path) * longest + PAD
-    paths = np.full(6 * width + 6 * longest, FAR, np.uint16)
-    least, edge = np.zeros((2, 4, n_cols + 2), np.uint16), np.empty((4, n_cols), np.uint16)
-    segments = np.full((2, 4, n_d + 2), NOBODY, np.int64)
-    row_cost, row_sums = np.empty(block * longest, np.uint8), np.empty(block * longest, np.uint16)
-    turn, row_start = np.int64(0), np.int64(0)
-    for step in range(n_rows):
-        r = step if sign > 0 else n_rows - 1 - step
-        now, br = step % 2, r // block
-        row_segments(ranges, br, block, n_cols, sign, segments[now])
-        row_edges(p2, r, sign, edge)
-        if step < 2 or br != (r - 2 * sign) // block:
-            paths[planes[now, 1] : planes[now, 1] + 3 * width] = FAR
+    width, longest = address[1].max() + PAD * (n_cols + 2), ranges[1].max() + 2 * PAD
+    planes, paths = path_planes(width, longest), np.full(2 * BEHIND * width + BEHIND * longest, FAR, np.uint16)
+    west = np.full((3, BESIDE, longest), FAR, np.uint16)
+    least, edges = np.zeros((2, BEHIND, n_cols + 2), np.uint16), np.empty((BESIDE, 4, n_cols), np.uint16)
+    segments, starts = np.full((2, 5, n_d + 2), NOBODY, np.int64), np.empty(n_d + 2, np.int64)
+    n_sheet = 0 if sign > 0 else BESIDE * address[1].max()
+    sheet_cost, sheet_sums = np.empty(n_sheet, np.uint8), np.empty(n_sheet, np.uint16)
+    done = 0
+    while done < n_rows:
+        r = done if sign > 0 else n_rows - 1 - done
+        br = r // block
+        n_beside = min(BESIDE, min((br + 1) * block, n_rows) - r if sign > 0 else r - br * block + 1)
+        here = segments[done % 2]
+        row_segments(ranges, br, block, n_cols, sign, here)
+        for row in range(n_beside):
+            row_edges(p2, r + sign * row, sign, edges[row])
         for e in range(1, n_d + 1):
-            d = e - 1 if sign > 0 else n_d - e
-            start = address[0, br, 0] + (r - br * block) * address[1, br, 0] + address[2, br, d]
-            if sign > 0:
-                turn = sweep_segment(cost, total, start, paths, planes, segments, now, turn, e, least, edge, p1)
-                continue
-            count, n_cells = segments[now, COUNT, e], segments[now, LEFT, e + 1] - segments[now, LEFT, e]
-            reverse_cells(cost, start, count, n_cells, row_cost)
-            turn = sweep_segment(row_cost, row_sums, row_start, paths, planes, segments, now, turn, e, least, edge, p1)
-            add_reversed(row_sums, start, count, n_cells, total)
+            d, first = (e - 1 if sign > 0 else n_d - e), address[0, br, 0] + (r - br * block) * address[1, br, 0]
+            starts[e] = first + address[2, br, d]
+        step, source, sums = address[1, br, 0], cost, total
+        if sign < 0:
+            turn_rows(cost, total, starts, -step, here, n_beside, False, sheet_cost, sheet_sums)
+            source, sums = sheet_cost, sheet_sums
+            volume = starts.copy()
+            starts[:] = here[SHEET]
+        sweep_west(source, sums, starts, step, segments, done % 2, n_beside, west, edges, p1)
+        for row in range(n_beside):
+            now = (done + row) % 2
+            row_segments(ranges, br, block, n_cols, sign, segments[now])
+            is_new = done + row < 2 or br != (r - sign * (2 - row)) // block
+            sweep_row(source, sums, starts, row * step, paths, planes, segments, now, is_new, least, edges[row], p1)
+        if sign < 0:
+            turn_rows(cost, total, volume, -step, here, n_beside, True, sheet_cost, sheet_sums)
+        done += n_beside
 
 
 # (h,) u2 -> u4
