@@ -1,4 +1,4 @@
-"""A page that is served, as the tests ask for it."""
+"""A page that is served, as the tests ask for it, and a cell to ask for."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+import rasterio
 import uvicorn
 
 from zlocus.inspector.guard import new_token
@@ -43,3 +45,16 @@ def served(out: Path, comparison: Comparison | None = None, wait: bool = True) -
         finally:
             server.should_exit = True
             thread.join(OPENED_S)
+
+
+def heights_of(out: Path) -> np.ndarray:
+    with rasterio.open(out / "dsm.tif") as file:
+        return file.read(1)
+
+
+def a_cell(out: Path) -> tuple[int, int]:
+    """A cell with a height, nearest to the middle."""
+    known = np.isfinite(heights_of(out))
+    rows, cols = np.nonzero(known)
+    middle = np.argmin(np.hypot(rows - known.shape[0] / 2, cols - known.shape[1] / 2))
+    return int(rows[middle]), int(cols[middle])

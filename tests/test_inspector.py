@@ -23,7 +23,7 @@ import pytest
 import rasterio
 from typer.testing import CliRunner
 
-from inspected import opened, served
+from inspected import a_cell, heights_of, opened, served
 from rendered_scenes import SMALL_TILES, UTM, run
 from zlocus.cli import app
 from zlocus.errors import ConfigError, InputError, OutputError
@@ -88,19 +88,6 @@ def page(out, beside):
 @pytest.fixture(scope="module")
 def scene(out):
     return restored(out, surface_folder(out).run)
-
-
-def heights_of(out) -> np.ndarray:
-    with rasterio.open(out / "dsm.tif") as file:
-        return file.read(1)
-
-
-def a_cell(out) -> tuple[int, int]:
-    """A cell with a height, away from the ends."""
-    known = np.isfinite(heights_of(out))
-    rows, cols = np.nonzero(known)
-    middle = np.argmin(np.hypot(rows - known.shape[0] / 2, cols - known.shape[1] / 2))
-    return int(rows[middle]), int(cols[middle])
 
 
 def report_of(scene, folder, row, col, config: RunConfig, reference=None, views=None) -> PointReport:

@@ -13,7 +13,7 @@ import pytest
 import rasterio
 
 from browser import found_browser
-from inspected import served
+from inspected import a_cell, served
 from rendered_scenes import SMALL_TILES, run
 from zlocus.inspector.restore import restored
 from zlocus.place import curves_at
@@ -109,15 +109,6 @@ def click_cell(page, folder, row, col) -> None:
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.wait_for_selector(f"text=Cell at row {row}, column {col}")
     settled(page)
-
-
-def a_cell(out) -> tuple[int, int]:
-    """A cell with a height, in the middle."""
-    with rasterio.open(out / "dsm.tif") as file:
-        known = np.isfinite(file.read(1))
-    rows, cols = np.nonzero(known)
-    middle = np.argmin(np.hypot(rows - known.shape[0] / 2, cols - known.shape[1] / 2))
-    return int(rows[middle]), int(cols[middle])
 
 
 def report_of(out, folder, row, col, without=(), window=None) -> PointReport:
