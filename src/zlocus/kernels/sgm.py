@@ -9,8 +9,8 @@ Why it is fast: every sum and minimum is cast back to uint16 (Numba widens integ
 lost), and all addresses in `run_cells` grow evenly and upwards from cell to cell, so that the compiler checks once a
 run, not in every cell, that what is read and what is written are apart. Hence the copies: the up sweep turns its rows
 round, and a neighbour with another range is copied by the heights of the cell. A path from W cannot begin a cell
-before the one behind it is done, which takes longer than its 16 heights; so those of some rows go side by side, ahead
-of the three others.
+before the one behind it is stored, and with few heights that wait is longer than the work; so the paths from W of some
+rows go side by side, ahead of the three others.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PAD = 2
 FAR = np.uint16(16000)
 FIRST, COUNT, LEFT, PLACE, SHEET = 0, 1, 2, 3, 4
 NW, N, NE, BEHIND = 0, 1, 2, 3
-# Rows whose paths from W go side by side; where a cell from W is copied by the heights of another range.
+# Rows whose paths from W go side by side. Of their cells: two planes that swap, and one for copies of those behind.
 BESIDE, COPY = 4, 2
 NOBODY = -1
 NONE, LOWER = np.uint32(0xFFFFFFFF), np.uint32(0xFFFF)
@@ -37,20 +37,20 @@ def path_cost(same, down, up, p1, jump, least, cost):
     return np.uint16(np.uint16(min(best, jump) - least) + cost)
 
 
-# (v,) u1, (v,) u2, (2,) i8, (3,) i8, (3,r,l) u2, (3,) i8, (r,) u2, (r,4,c) u2, i8, u2 -> None
+# (v,) u1, (v,) u2, (2,) i8, (3,) i8, (3,r,l) u2, (2,) i8, (r,) u2, (r,4,c) u2, i8, u2 -> None
 @kernel
 def run_west(cost, sums, start, size, paths, spots, least, edges, position, p1):
     """Path costs from W of neighbouring cells of one range, in some rows at once; they are written to `sums`.
 
     start : of the first cell in `cost` and `sums`, and the step to the next row; size : heights, cells and rows;
-    spots : planes of `paths` where the first cell reads, where it writes, and where the second one does, from there on
-    in turns; least : of the cells before; edges : P2.
+    spots : planes of `paths` where the first cell reads and where it writes (0 or 1, from cell to cell in turns);
+    least : of the cells before; edges : P2.
 
     Rows lie inside the planes: the compiler compares what all rows read with what all of them write.
     """
     n, n_rows, step, one = np.uint64(size[0]), np.uint64(size[2]), np.uint64(start[1]), np.uint64(1)
     pad = np.uint64(PAD)
-    behind, ahead, other = np.uint64(spots[0]), np.uint64(spots[1]), np.uint64(spots[2])
+    behind, ahead = np.uint64(spots[0]), np.uint64(spots[1])
     for cell in range(np.uint64(size[1])):
         s0, i = np.uint64(start[0]) + cell * n, np.uint64(position) + cell
         for row in range(n_rows):
@@ -64,7 +64,7 @@ def run_west(cost, sums, start, size, paths, spots, least, edges, position, p1):
                 sums[s + k] = here
                 low = min(low, here)
             least[row] = low
-        behind, ahead, other = ahead, other, ahead
+        behind, ahead = ahead, one - ahead
 
 
 # (v,) u1, (v,) u2, i8, (2,) i8, (l,) u2, (2,3) i8, (3,c) u2, (3,c) u2, (4,c) u2, i8, u2 -> None
@@ -102,7 +102,7 @@ def run_cells(cost, sums, start, size, paths, spots, behind, ahead, edge, positi
 
 # (l,) u2, i8, i8, (l,) u2, i8 -> None
 @kernel
-def restated(behind, n_behind, shift, here, count):
+def shifted(behind, n_behind, shift, here, count):
     """Copy a neighbour's path costs by the heights of this cell and one more at both ends; both begin at PAD.
 
     shift = first index here less the neighbour's. Heights that it did not search are FAR: only a jump (P2) leads from
@@ -177,7 +177,7 @@ def sweep_west(cost, sums, starts, step, segments, now, n_rows, paths, edges, p1
     of each row, and copies.
     """
     turn = 0
-    start, size, spots = np.empty(2, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    start, size, spots = np.empty(2, np.int64), np.empty(3, np.int64), np.empty(2, np.int64)
     least = np.zeros(n_rows, np.uint16)
     for e in range(1, starts.shape[0] - 1):
         count, n_cells = segments[now, COUNT, e], segments[now, LEFT, e + 1] - segments[now, LEFT, e]
@@ -185,11 +185,11 @@ def sweep_west(cost, sums, starts, step, segments, now, n_rows, paths, edges, p1
         if not alike(segments, now, e, now, e - 1):
             behind, shift = COPY, segments[now, FIRST, e] - segments[now, FIRST, e - 1]
             for row in range(n_rows):
-                restated(paths[turn, row], segments[now, COUNT, e - 1], shift, paths[COPY, row], count)
+                shifted(paths[turn, row], segments[now, COUNT, e - 1], shift, paths[COPY, row], count)
                 paths[0, row, PAD + count] = paths[1, row, PAD + count] = FAR
         start[0], start[1] = starts[e], step
         size[0], size[1], size[2] = count, n_cells, n_rows
-        spots[0], spots[1], spots[2] = behind, 1 - turn, turn
+        spots[0], spots[1] = behind, 1 - turn
         run_west(cost, sums, start, size, paths, spots, least, edges, segments[now, LEFT, e], p1)
         turn = (turn + n_cells) % 2
 
@@ -212,7 +212,7 @@ def find_neighbours(paths, planes, segments, now, e, position, spots):
         if not alike(segments, now, e, before, f):
             shift = segments[now, FIRST, e] - segments[before, FIRST, f]
             here, there = paths[planes[2, path] - PAD :], paths[spots[0, path] - PAD :]
-            restated(there, segments[before, COUNT, f], shift, here, count)
+            shifted(there, segments[before, COUNT, f], shift, here, count)
             spots[0, path] = planes[2, path]
 
 
@@ -339,7 +339,9 @@ def sweep(cost, ranges, address, block, p2, p1, sign, total):
         sweep_west(source, sums, starts, step, segments, done % 2, n_beside, west, edges, p1)
         for row in range(n_beside):
             now = (done + row) % 2
-            row_segments(ranges, br, block, n_cols, sign, segments[now])
+            if row == 1:
+                # From here on the row before has the same segments.
+                row_segments(ranges, br, block, n_cols, sign, segments[now])
             is_new = done + row < 2 or br != (r - sign * (2 - row)) // block
             sweep_row(source, sums, starts, row * step, paths, planes, segments, now, is_new, least, edges[row], p1)
         if sign < 0:
