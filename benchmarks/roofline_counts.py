@@ -187,11 +187,11 @@ REACH = Count(ops=8 + 8 + 3 + 2 + 7, loads=4 + 16, stores=4 + 16)
 # filter_columns: down 2, up 2, gain 1; reads two rows, two, one. transposed: one read, one write. Each twice. Memory:
 # three sweeps over the image a filter, and the turned images.
 SPLINE = Count(ops=5, loads=20, stores=12, memory=24) * 2 + Count(loads=4, stores=4, memory=8) * 2
-# Level in float64 from the surface: product, sum, difference, 2 each, division, 2 conversions. Cells of a block:
-# quotient, remainder, conversions. Positions as in `profile`; fractions: floor and difference, x and y; index 5. Least
-# and greatest of the surface. Memory: surface, image, result.
+# Level in float64 from the surface: product, sum, difference, 2 each, division, 2 conversions. Positions as in
+# `profile`; fractions: floor and difference, x and y; index 5. Least and greatest of the surface. Memory: surface,
+# image, result.
 ORTHO = (
-    Count(ops=8 + 4 + 48 + 4 + 5 + 2, roots=1, loads=4 + 24 + 8 + 8 + 8, stores=4 + 8 + 8 + 16 + 4, memory=12)
+    Count(ops=8 + 48 + 4 + 5 + 2, roots=1, loads=4 + 24 + 8 + 8 + 8, stores=4 + 8 + 16 + 4, memory=12)
     + BILINEAR_GATHER
     + Count(loads=4, stores=4)
 )

@@ -16,7 +16,7 @@ from zlocus.kernels.reach import block_reach, surely_covered, tile_reach
 from zlocus.kernels.refine import CUBIC, LINEAR, block_profile, resample_surface, tile_ortho, tile_profile
 from zlocus.kernels.resample import RUN
 from zlocus.kernels.smooth import add_tap, slopes, smaller_slope, smooth_surface
-from zlocus.kernels.visibility import lowest_visible
+from zlocus.kernels.visibility import count_seeing, finest_view, hide_below, lowest_visible
 from zlocus.kernels.volume import flat_cells, plane_grid
 
 # Float32 images with a spread of 1.4 grey values.
@@ -67,6 +67,59 @@ def test_a_tower_hides_what_its_shadow_covers():
     found = visible_from(surface, 0.5, 0.0)[2]
     np.testing.assert_allclose(found[10:20], np.arange(0.0, 20.0, 2.0))
     assert (found[:9] < 0).all()
+
+
+def any_seen(n_views, shape, seed=0):
+    """(3, i, r, c), ranges of height indices that meet, touch or miss a surface of heights 0 to 9; some cover none."""
+    rng = np.random.default_rng(seed)
+    seen = rng.integers(0, 10, (3, n_views, *shape)).astype(np.int32)
+    seen[1] += seen[0] - 2
+    seen[0][seen[1] < seen[0]] = HIDDEN
+    return seen, np.round(rng.uniform(0, 9, shape) * 2).astype(np.float32) / 2
+
+
+def test_views_that_see_a_surface():
+    seen, surface = any_seen(3, (11, 14))
+    found = np.full(surface.shape, -7, np.int32)
+    count_seeing(seen, surface, found)
+    for at in np.ndindex(surface.shape):
+        low, high, visible = seen[:, :, *at]
+        assert found[at] == sum(max(a, v) <= surface[at] <= b for a, b, v in zip(low, high, visible, strict=True))
+    assert set(found.ravel().tolist()) == {0, 1, 2, 3}
+
+
+def test_the_finest_view_of_those_that_see_a_cell():
+    """Blocks of 4 cells; of equal sizes the first; a cell that has a view already keeps it."""
+    (seen, surface), block = any_seen(4, (11, 14)), 4
+    size = np.random.default_rng(1).integers(0, 4, (4, 3, 4)).astype(float)
+    size[0, 0, 0] = np.nan
+    found = np.full(surface.shape, -1, np.int32)
+    found[5, :] = 9
+    finest_view(size, seen, surface, block, found)
+    for r, c in np.ndindex(surface.shape):
+        low, high, visible = seen[:, :, r, c]
+        sees = (np.maximum(low, visible) <= surface[r, c]) & (surface[r, c] <= high)
+        of_view = np.where(sees, np.nan_to_num(size[:, r // block, c // block]), 0)
+        assert found[r, c] == (9 if r == 5 else of_view.argmax() if of_view.max() > 0 else -1)
+    assert {-1, 0, 1, 2, 3} <= set(found.ravel().tolist())
+
+
+def test_height_indices_from_which_nothing_hides_a_cell():
+    """Of a part of the tile, which begins at row 2 and column 3 of a wider surface; other cells stay."""
+    rng, least = np.random.default_rng(0), np.float32(-(2**29))
+    lowest, base = rng.uniform(-9, 9, (12, 15)).astype(np.float32), rng.uniform(-3, 3, (8, 10)).astype(np.float32)
+    lowest[4, 5] = -1e30
+    out = np.full(base.shape, 77, np.int32)
+    hide_below(lowest, np.array([2, 3]), base, np.float32(1.5), least, np.array([[1, 6], [2, 10]]), out)
+    expected = np.full(base.shape, 77)
+    expected[1:6, 2:10] = np.floor(np.maximum(lowest[3:8, 5:13] - base[1:6, 2:10] - 1.5, least))
+    np.testing.assert_array_equal(out, expected)
+    assert out[2, 2] == -(2**29)
+
+
+def test_rows_and_columns_of_a_block():
+    rows, cols = np.indices((3, 5))
+    np.testing.assert_array_equal(flat_cells((3, 5)), [rows.ravel(), cols.ravel()])
 
 
 EVERYWHERE = np.array([-(2**29), 2**29])

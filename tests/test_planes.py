@@ -9,6 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from kernel_scene import at_all_heights
+from rendered_scenes import PART, rendered, run
+from zlocus import tile
 from zlocus.kernels.planes import (
     SPAN,
     disagreement,
@@ -21,6 +23,7 @@ from zlocus.kernels.planes import (
     solve_damped,
 )
 from zlocus.matching.contrast import deviation
+from zlocus.matching.ortho import ortho_image
 from zlocus.matching.planes import PlanarHeights, plain_segments, with_planes
 from zlocus.matching.views import TileViews
 from zlocus.options import PlaneOptions
@@ -216,6 +219,23 @@ def test_segments_and_their_rims():
     assert np.bincount(both.of_cell, both.is_core).tolist() == [100, 80]
     assert np.bincount(both.of_cell).tolist() == [144, 10 * 11]
     assert plain_segments(np.zeros((9, 9), bool), OPTIONS).start.tolist() == [0]
+
+
+def test_each_view_is_looked_at_on_the_heights_so_far(monkeypatch, tmp_path):
+    """Planes of the view before change them."""
+    looked_at = []
+
+    def raised(views, ortho, known, seen, options, core):
+        same = [view for view in range(3) if np.array_equal(ortho, ortho_image(views, known.height, view))]
+        looked_at.append((same, float(known.height.mean())))
+        return PlanarHeights(known.height + 1, known.is_planar)
+
+    monkeypatch.setattr(tile, "with_planes", raised)
+    images = rendered(tmp_path, "sine").inputs[:3]
+    run(images, tmp_path / "out", bounds=PART, report=False)
+    assert [len(same) for same, _ in looked_at] == [1, 1]
+    assert looked_at[0][0] != looked_at[1][0]
+    assert looked_at[1][1] == pytest.approx(looked_at[0][1] + 1)
 
 
 def test_deviation_of_a_window():

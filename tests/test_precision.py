@@ -109,6 +109,23 @@ def test_every_sign_has_a_curve_and_every_cell_a_sigma():
         assert (found > 0).all()
 
 
+@pytest.mark.parametrize("is_known", [(12, 15), (slice(None), slice(None)), (slice(0), slice(0))])
+def test_each_cell_has_the_sigma_of_its_model(is_known):
+    """Some cells of either model, all of one, all of the other; half of them refined."""
+    rng, apart = np.random.default_rng(0), np.full(SHAPE, np.nan, np.float32)
+    apart[is_known] = 0.3
+    height = rng.normal(20, 1, SHAPE).astype(np.float32)
+    found = refined(apart=apart, height=height, is_refined=rng.random(SHAPE) < 0.5)
+    said = signs(found)
+    split, sigmas = is_split(said), sigma_steps(said, found)
+    for model, cells in ((SPLIT, split), (PAIR, ~split)):
+        constant, not_refined, curves = model
+        expected = constant + np.where(found.is_refined, 0.0, not_refined)
+        for name, (first, spacing, curve) in curves.items():
+            expected += np.interp(said[name], first + spacing * np.arange(len(curve)), curve)
+        np.testing.assert_allclose(np.log(sigmas[cells]), expected[cells], rtol=0, atol=LOGARITHM)
+
+
 @pytest.mark.parametrize(
     ("better", "worse"),
     [

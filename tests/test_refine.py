@@ -61,6 +61,40 @@ def test_bend_and_distance_of_two_parabolas():
     assert (peaks_apart(np.stack([profiles[0], nearly_flat]), spacing) == FARTHEST_APART).all()
 
 
+@pytest.mark.parametrize("n_samples", [3, 4, 7])
+def test_peaks_of_any_profile(n_samples):
+    """Against the parabola of each cell by itself; a third of the cells are flat or have equal samples."""
+    rng, offsets = np.random.default_rng(n_samples), np.linspace(-0.6, 0.6, n_samples, dtype=np.float32)
+    profile = rng.random((n_samples, 8, 9)).astype(np.float32)
+    profile[:, :, :3] = np.round(2 * profile[:, :, :3]) / 2
+    at, value, inside = parabola_peak(profile, offsets)
+    for cell in np.ndindex(8, 9):
+        y = profile[:, *cell].astype(float)
+        k = min(max(int(y.argmax()), 1), n_samples - 2)
+        bend, lean = y[k - 1] - 2 * y[k] + y[k + 1], y[k - 1] - y[k + 1]
+        shift = 0.5 * lean / min(bend, -1e-6)
+        assert inside[cell] == (bend < -1e-6 and abs(shift) < 1)
+        shift = float(np.clip(shift, -1, 1))
+        assert at[cell] == pytest.approx(offsets[k] + shift * (offsets[1] - offsets[0]), abs=1e-4)
+        assert value[cell] == pytest.approx(y[k] - 0.25 * lean * shift, abs=1e-4)
+
+
+def test_peaks_apart_of_any_profiles():
+    rng, spacing = np.random.default_rng(0), np.float32(0.4)
+    profiles = rng.random((2, 3, 8, 9)).astype(np.float32)
+    found, known = peaks_apart(profiles, spacing), 0
+    for cell in np.ndindex(8, 9):
+        low, middle, high = profiles[:, :, *cell].astype(float).T
+        bend = 2 * middle - low - high
+        if (bend <= 1e-6).any():
+            assert np.isnan(found[cell])
+            continue
+        vertex = (high - low) / (2 * bend)
+        assert found[cell] == pytest.approx(min(abs(vertex[0] - vertex[1]) * spacing, FARTHEST_APART), abs=1e-3)
+        known += 1
+    assert 10 < known < 70
+
+
 def test_a_peak_beyond_the_largest_sample_lies_between_the_samples():
     """Of three samples the largest is an end one; the parabola's vertex still lies within them, or it does not."""
     offsets = np.linspace(-0.5, 0.5, 3, dtype=np.float32)

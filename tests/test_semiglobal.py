@@ -10,9 +10,11 @@ from scipy.ndimage import gaussian_filter
 
 from kernel_scene import even_lattice
 from zlocus.matching.contrast import edge_unit
-from zlocus.matching.semiglobal import BEHIND, SemiGlobalHeights, aggregate, alone, penalties
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.options import SemiGlobalOptions
 
+# From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
+BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
 OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, level_easing=0.5)
 
 
@@ -34,6 +36,21 @@ def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
                 assert abs(p2[path, r, c] - max(plain, 60)) <= 1
     assert p2.min() < 100
     assert p2.max() > 150
+
+
+@pytest.mark.parametrize("shape", [(9, 14), (1, 6), (5, 1), (1, 1)])
+def test_penalties_of_all_cells(shape):
+    """At the border too, where the image goes on as it ends; to a rounding of P2."""
+    rng, options = np.random.default_rng(3), replace(OPTIONS, edge_contrast_two=6.0)
+    ortho, by_two = rng.normal(size=shape).astype(np.float32), rng.random(shape) < 0.5
+    ortho[rng.random(shape) < 0.1] = np.nan
+    found, unit = penalties(ortho, shape, 0, options, by_two), max(edge_unit(ortho), 1e-6)
+    for path, (dr, dc) in enumerate(BEHIND):
+        for r, c in np.ndindex(shape):
+            away = abs(ortho[r, c] - ortho[max(r + dr, 0), min(max(c + dc, 0), shape[1] - 1)])
+            contrast = options.edge_contrast_two if by_two[r, c] else options.edge_contrast
+            plain = 240 / (1 + (0 if np.isnan(away) else away) / (contrast * unit))
+            assert abs(found[path, r, c] - max(plain, 60)) <= 1, (path, r, c)
 
 
 def test_a_strong_edge_is_cheap_to_cross_only_where_it_is():

@@ -3,12 +3,14 @@
 import subprocess
 import sys
 
+import pytest
+
 PREPARED = """
 import gc, sys
 from zlocus import startup
 startup.prepare()
 import zlocus.pipeline, pyogrio.raw
-print(gc.isenabled(), gc.get_threshold()[0] == startup.NEW_OBJECTS, hasattr(sys.modules["pandas"], "DataFrame"))
+print(gc.isenabled(), gc.get_threshold()[0] == startup.NEW_OBJECTS, sys.modules["pandas"], sys.modules["dask"])
 print(*sorted({"matplotlib", "scipy.ndimage", "zlocus.reporting", "zlocus.evaluation.evaluate"} & set(sys.modules)))
 """
 COMMAND = """
@@ -23,7 +25,17 @@ LIBRARY = """
 import gc, sys
 was = gc.get_threshold()
 import zlocus.api, zlocus.cli, zlocus.pipeline
-print(gc.get_threshold() == was, "pandas" in sys.modules)
+print(gc.get_threshold() == was, "pandas" in sys.modules, sys.modules.get("dask", "nothing") is None)
+"""
+CLUSTER = """
+from zlocus import startup
+startup.prepare()
+from zlocus.errors import ConfigError
+from zlocus.execution.cluster import Cluster
+try:
+    Cluster(print, "tcp://127.0.0.1:9")
+except ConfigError as error:
+    print(error)
 """
 
 
@@ -32,8 +44,8 @@ def said(code):
 
 
 def test_what_a_surface_takes_no_part_in_is_not_imported():
-    """pyogrio does without pandas; cycles are still looked for."""
-    assert said(PREPARED).stdout.splitlines() == ["True True False", ""]
+    """pyogrio does without pandas, odc-geo without dask; cycles are still looked for."""
+    assert said(PREPARED).stdout.splitlines() == ["True True None None", ""]
 
 
 def test_a_command_is_prepared():
@@ -41,4 +53,10 @@ def test_a_command_is_prepared():
 
 
 def test_the_package_as_a_library_leaves_the_process_alone():
-    assert said(LIBRARY).stdout.split() == ["True", "False"]
+    assert said(LIBRARY).stdout.split() == ["True", "False", "False"]
+
+
+def test_a_command_finds_its_cluster():
+    """Which needs dask."""
+    pytest.importorskip("distributed")
+    assert said(CLUSTER).stdout.startswith("--scheduler tcp://127.0.0.1:9 does not answer")

@@ -44,6 +44,7 @@ from zlocus.matching.visibility import (
     covers,
     hide,
     left_out,
+    n_seeing,
     sees,
     spare_pairs,
 )
@@ -431,10 +432,11 @@ def _with_planes(result: LevelResult, core: CellWindow, config: RunConfig) -> Le
     heights = result.heights
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
     own, n_views = _own_cells(core, result.window, 0), len(result.views.layout)
-    units = [texture_unit(ortho_image(result.views, planar.height, view), own) for view in range(n_views)]
+    shown = [ortho_image(result.views, planar.height, view) for view in range(n_views)]
+    units = [texture_unit(ortho, own) for ortho in shown]
     sharp = [view for view, unit in enumerate(units) if unit * SHARP > sorted(units)[-2]]
-    for view in sharp[:PLAIN_IN]:
-        ortho = ortho_image(result.views, planar.height, view)
+    for number, view in enumerate(sharp[:PLAIN_IN]):
+        ortho = shown[view] if number == 0 else ortho_image(result.views, planar.height, view)
         planar = with_planes(result.views, ortho, planar, result.seen, config.planes, own)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
 
@@ -454,9 +456,8 @@ def _finish(
         config.refine,
         result.is_planar,
     )
-    at = refined.height[None]
     covering = covers(result.seen).sum(axis=0)
-    seeing = sees(result.seen, at).sum(axis=0)
+    seeing = n_seeing(result.seen, refined.height)
     last = scene.n_steps - 1
     signs = signs_of_precision(result.heights, refined, seeing)
     quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)

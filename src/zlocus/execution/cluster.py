@@ -14,6 +14,7 @@ from typing import Any
 from zlocus.errors import ConfigError, StoppedError
 from zlocus.execution.engine import Cause, Failure, Outcome, attempted, failure_of
 from zlocus.execution.processes import one_thread
+from zlocus.startup import let_in
 
 CONNECT_S, WORKERS_S = 10.0, 120.0
 LOOK_S = 5.0  # between looks at whether there are workers
@@ -54,6 +55,7 @@ class Cluster:
     """
 
     def __init__(self, function: Callable[[Any], Any], address: str) -> None:
+        let_in("dask")
         try:
             from distributed import Client
         except ImportError as error:

@@ -230,6 +230,7 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
     low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
     middle, reach = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
     grids, level, grey = np.empty((3, 8)), np.empty(block * block, np.float32), np.empty(block * block, np.float32)
+    cells, last_width = flat_cells((block, block)), block
     for br in range((n_rows + block - 1) // block):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
@@ -237,12 +238,28 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
             for m in range(3):
                 plane_grid(nodes[:, br : br + 2, bc : bc + 2], view, middle + (m - 1) * reach, block, 0, grids[m])
             width, n = c1 - c0, (r1 - r0) * (c1 - c0)
+            if cells.shape[1] != n or last_width != width:
+                cells, last_width = flat_cells((r1 - r0, width)), width
             for r in range(r0, r1):
                 for c in range(width):
                     index = heights[0] + surface[r, c0 + c] * heights[1]
                     level[(r - r0) * width + c] = (index - middle) / reach
-            resample_surface(pixels, layout[view], grids, flat_cells((r1 - r0, width)), level[:n], LINEAR, grey[:n])
+            resample_surface(pixels, layout[view], grids, cells, level[:n], LINEAR, grey[:n])
             out[r0:r1, c0:c1] = grey[:n].reshape((r1 - r0, width))
+
+
+# (j,n) f4, (j,) f4, (n,) f4, (3,n) f4 -> None
+@kernel
+def around_largest(profile, offsets, position, three):
+    """The three samples around the largest one of each cell, at an end the three there, and the offset of the middle
+    one. See `profile_peaks`; three : (3, n), written."""
+    for p in range(position.shape[0]):
+        best = 0
+        for j in range(1, profile.shape[0]):
+            best = j if profile[j, p] > profile[best, p] else best
+        at = min(max(best, 1), profile.shape[0] - 2)
+        three[0, p], three[1, p], three[2, p] = profile[at - 1, p], profile[at, p], profile[at + 1, p]
+        position[p] = offsets[at]
 
 
 # (j,n) f4, (j,) f4, (n,) f4, (n,) f4, (n,) b1 -> None
@@ -251,16 +268,37 @@ def profile_peaks(profile, offsets, position, value, is_inside):
     """Position and value of the maximum of equally spaced samples by the parabola through the three around the largest
     one (at an end, the three at that end), and whether there is one between the first and the last. profile : (j, n), a
     cell a column, j >= 3."""
-    n_samples, spacing = profile.shape[0], offsets[1] - offsets[0]
-    for p in range(profile.shape[1]):
-        best = 0
-        for j in range(1, n_samples):
-            best = j if profile[j, p] > profile[best, p] else best
-        at = min(max(best, 1), n_samples - 2)
-        left, here, right = profile[at - 1, p], profile[at, p], profile[at + 1, p]
-        bend = min(left - np.float32(2.0) * here + right, np.float32(-1e-6))
-        shift = np.float32(0.5) * (left - right) / bend
+    three, spacing = profile, offsets[1] - offsets[0]
+    if profile.shape[0] == 3:
+        position[:] = offsets[1]
+    else:
+        three = np.empty((3, position.shape[0]), np.float32)
+        around_largest(profile, offsets, position, three)
+    left, here, right = three[0], three[1], three[2]
+    for p in range(position.shape[0]):
+        bend = min(left[p] - np.float32(2.0) * here[p] + right[p], np.float32(-1e-6))
+        shift = np.float32(0.5) * (left[p] - right[p]) / bend
         is_inside[p] = (bend < np.float32(-1e-6)) & (abs(shift) < np.float32(1.0))
         shift = min(max(shift, np.float32(-1.0)), np.float32(1.0))
-        value[p] = here - np.float32(0.25) * (left - right) * shift
-        position[p] = offsets[at] + shift * spacing
+        value[p] = here[p] - np.float32(0.25) * (left[p] - right[p]) * shift
+        position[p] += shift * spacing
+
+
+# f4, f4, f4, f4 -> f4
+@kernel
+def vertex_of(left, here, right, least):
+    """Vertex of the parabola through three samples, in spacings from the middle one; NaN where they do not bend by more
+    than `least` to a maximum."""
+    bend = np.float32(2.0) * here - left - right
+    return (right - left) / (np.float32(2.0) * bend) if bend > least else np.float32(np.nan)
+
+
+# (2,3,n) f4, f4, f4, f4, (n,) f4 -> None
+@kernel
+def vertices_apart(profiles, spacing, least, farthest, out):
+    """Distance of the vertices of two groups' parabolas through three samples, at most `farthest`; NaN where one has
+    none. profiles : (2, 3, n), a cell a column; least : see `vertex_of`; out : (n,), written."""
+    a, b, c, d, e, f = profiles[0, 0], profiles[0, 1], profiles[0, 2], profiles[1, 0], profiles[1, 1], profiles[1, 2]
+    for p in range(out.shape[0]):
+        apart = abs(vertex_of(a[p], b[p], c[p], least) - vertex_of(d[p], e[p], f[p], least)) * spacing
+        out[p] = farthest if apart > farthest else apart

@@ -19,6 +19,14 @@ def smaller_slope(before, after):
     return before if abs(before) < abs(after) else after
 
 
+# (n,) f4, (n,) f4, (n,) f4, f4, (n,) f4 -> None
+@kernel
+def slopes_between(before, here, after, inverse, out):
+    """Slopes of cells from those as far on both sides; inverse : of how far, in cells."""
+    for j in range(here.shape[0]):
+        out[j] = smaller_slope(here[j] - before[j], after[j] - here[j]) * inverse
+
+
 # (r,c) f4, i8, (r,c) f4, (r,c) f4 -> None
 @kernel
 def slopes(surface, reach, by_row, by_col):
@@ -29,14 +37,12 @@ def slopes(surface, reach, by_row, by_col):
     by_col[:] = 0.0
     inverse = np.float32(1.0 / reach)
     for r in range(n_rows):
-        for c in range(n_cols):
-            here = surface[r, c]
-            if reach <= r < n_rows - reach:
-                before, after = here - surface[r - reach, c], surface[r + reach, c] - here
-                by_row[r, c] = smaller_slope(before, after) * inverse
-            if reach <= c < n_cols - reach:
-                before, after = here - surface[r, c - reach], surface[r, c + reach] - here
-                by_col[r, c] = smaller_slope(before, after) * inverse
+        here = surface[r]
+        if reach <= r < n_rows - reach:
+            slopes_between(surface[r - reach], here, surface[r + reach], inverse, by_row[r])
+        if n_cols > 2 * reach:
+            n = n_cols - reach
+            slopes_between(here[: n - reach], here[reach:n], here[2 * reach :], inverse, by_col[r, reach:n])
     if n_rows > 2 * reach:
         for r in range(reach):
             by_row[r], by_row[n_rows - 1 - r] = by_row[reach], by_row[n_rows - 1 - reach]

@@ -124,8 +124,9 @@ def taking_part(ranges, span):
 def flat_cells(shape):
     """Rows and columns of cells on the flat layout."""
     cells = np.empty((2, shape[0] * shape[1]), np.float32)
-    for j in range(cells.shape[1]):
-        cells[0, j], cells[1, j] = j // shape[1], j % shape[1]
+    for r in range(shape[0]):
+        for c in range(shape[1]):
+            cells[0, r * shape[1] + c], cells[1, r * shape[1] + c] = r, c
     return cells
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.smooth import slopes
+from zlocus.matching.median import median
 from zlocus.matching.views import TileViews
 
 PATCH = 8
@@ -192,7 +193,7 @@ def patch_medians(values: NDArray[np.float32], patch: int) -> NDArray[np.float64
             part = values[b, d].reshape(-1, height, (d.stop - d.start) // width, width)
             by_patch = part.transpose(0, 2, 1, 3).reshape(len(part), part.shape[2], height * width)
             first_b, first_d = b.start // patch, d.start // patch
-            out[first_b : first_b + len(part), first_d : first_d + part.shape[2]] = np.median(by_patch, axis=2)
+            out[first_b : first_b + len(part), first_d : first_d + part.shape[2]] = median(by_patch)
     return out
 
 

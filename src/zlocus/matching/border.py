@@ -13,7 +13,7 @@ from zlocus.matching.base import BaseSurface
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews, ViewPixels
-from zlocus.matching.visibility import PAIR, coverage, covers, sees
+from zlocus.matching.visibility import PAIR, coverage, covers, n_seeing
 
 AROUND = np.ones((3, 3), np.uint8)
 # Cells around those that are worth matching.
@@ -97,7 +97,7 @@ def worth_matching(
 
     seen : (3, i, r, c), see `coverage`; surface : (r, c) height indices; ground : (r, c), see `covered_ground`.
     """
-    seeing = (sees(seen, surface[None]).sum(axis=0) >= PAIR) & ground
+    seeing = (n_seeing(seen, surface) >= PAIR) & ground
     rows, cols = np.flatnonzero(seeing.any(axis=1)), np.flatnonzero(seeing.any(axis=0))
     if not len(rows):
         return CellWindow(window.row, window.col, 0, 0)

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.matching.median import median
+
 AROUND = (5, 5)  # cells of a window whose texture is looked at
 # Units are powers of two of so many to a doubling: what differs a little in two tiles makes no difference.
 TO_A_DOUBLING = 8
@@ -17,7 +19,7 @@ def edge_unit(ortho: NDArray[np.float32], core: Part = ALL) -> float:
     """Median difference of neighbours along the rows of an image (r, c), in its core; 0 where none are known."""
     away = np.abs(np.diff(ortho[core], axis=1))
     known = away[np.isfinite(away)]
-    return rounded(float(np.median(known))) if known.size else 0.0
+    return rounded(float(median(known))) if known.size else 0.0
 
 
 def texture_unit(ortho: NDArray[np.float32], core: Part = ALL) -> float:
@@ -26,7 +28,7 @@ def texture_unit(ortho: NDArray[np.float32], core: Part = ALL) -> float:
     shown = np.isfinite(grey)
     if not shown.any():
         return 0.0
-    return rounded(float(np.median(deviation(np.where(shown, grey, np.float32(0.0)), AROUND)[shown])))
+    return rounded(float(median(deviation(np.where(shown, grey, np.float32(0.0)), AROUND)[shown])))
 
 
 def rounded(unit: float) -> float:

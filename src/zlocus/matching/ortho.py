@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.refine import tile_ortho
+from zlocus.kernels.visibility import finest_view
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.views import TileViews, ViewPixels
-from zlocus.matching.visibility import cells_per_step, hide, sees
+from zlocus.matching.visibility import cells_per_step, hide
 from zlocus.scene import ColourSource
 
 # Steps by which a surface must stand above a ray to hide what lies behind: less is its noise.
@@ -124,7 +125,7 @@ def true_ortho(
 
 def best_view(
     views: TileViews, seen: NDArray[np.int32], surface: NDArray[np.float32], around: Around | None = None
-) -> NDArray[np.int64]:
+) -> NDArray[np.int32]:
     """The view that shows each cell of a surface on most pixels, of those from which the surface itself, or what stands
     around it, does not hide it; the leading one unless another is clearly finer; -1 where none sees it. (r, c)
 
@@ -133,29 +134,16 @@ def best_view(
     """
     size = pixels_per_cell(views)
     size[0] *= FINER
-    best = np.full(surface.shape, -1)
+    best = np.full(surface.shape, -1, np.int32)
     first = (0, 0) if around is None else (around.row, around.col)
     whole = surface if around is None else around.with_inside(surface)
+    free, level = seen.copy(), np.zeros_like(surface)
     for obstacle in (cv2.dilate(whole, EDGE), whole):
-        free = seen.copy()
-        hide(free, views, obstacle, np.zeros_like(surface), STANDS_ABOVE_STEPS, first)
-        found = _on_most_pixels(size, free, views.block, surface)
-        best = np.where(best < 0, found, best)
+        hide(free, views, obstacle, level, STANDS_ABOVE_STEPS, first)
+        finest_view(size, free, surface, views.block, best)
         if (best >= 0).all():
             return best
-    return np.where(best < 0, _on_most_pixels(size, seen, views.block, surface), best)
-
-
-def _on_most_pixels(
-    size: NDArray[np.float64], seen: NDArray[np.int32], block: int, surface: NDArray[np.float32]
-) -> NDArray[np.int64]:
-    """Of the views that see each cell that with the largest size (i, b, d), -1 where none does. (r, c)"""
-    rows, cols = surface.shape
-    best, most = np.full(surface.shape, -1), np.zeros(surface.shape)
-    for i in range(len(size)):
-        of_cell = size[i].repeat(block, axis=0).repeat(block, axis=1)[:rows, :cols]
-        better = sees(seen[:, i], surface) & (of_cell > most)
-        best[better], most[better] = i, of_cell[better]
+    finest_view(size, seen, surface, views.block, best)
     return best
 
 

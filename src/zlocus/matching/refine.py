@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels.refine import CUBIC, LINEAR, profile_peaks, tile_profile
+from zlocus.kernels.refine import CUBIC, LINEAR, profile_peaks, tile_profile, vertices_apart
 from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.lattice import NARROW_BASE
 from zlocus.matching.views import TileViews
-from zlocus.matching.visibility import sees
+from zlocus.matching.visibility import n_seeing
 from zlocus.options import RefineOptions
 
 FloatGrid = NDArray[np.float32]
@@ -102,12 +102,12 @@ def refine(
         is_refined = inside & (np.abs(found + surface - coarse) < options.reach_steps)
         if is_last:
             bend, apart = bend_at_centre(profile, spacing), peaks_apart(profiles[-1], spacing)
-            n_seeing = sees(seen, surface[None]).sum(axis=0)
-            variance = peak_variance(best, bend, n_seeing, (2 * half + 1) ** 2)
+            seeing = n_seeing(seen, surface)
+            variance = peak_variance(best, bend, seeing, (2 * half + 1) ** 2)
             noise = variance
             for window, narrow in zip(windows[:-1], profiles[:-1].sum(axis=1), strict=True):
                 sharp, ncc, known = parabola_peak(narrow, offsets)
-                of_sharp = peak_variance(ncc, bend_at_centre(narrow, spacing), n_seeing, (2 * int(window) + 1) ** 2)
+                of_sharp = peak_variance(ncc, bend_at_centre(narrow, spacing), seeing, (2 * int(window) + 1) ** 2)
                 found, noise = sharpened(found, variance, sharp, of_sharp, is_refined & known)
             found = weighed(found, is_refined, noise)
         height = np.where(is_refined & ~fixed, found + surface, height)
@@ -188,8 +188,6 @@ def bend_at_centre(profile: NDArray[np.float32], spacing: np.float32) -> FloatGr
 def peaks_apart(profiles: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
     """Distance in steps, at most FARTHEST_APART, of the vertices of two groups' parabolas, through three samples (2, 3,
     r, c) at a spacing in steps; NaN where a group has no peak. (r, c)"""
-    bend = 2 * profiles[:, 1] - profiles[:, 0] - profiles[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        vertex = np.where(bend > LEAST_BEND, (profiles[:, 2] - profiles[:, 0]) / (2 * bend), np.float32(np.nan))
-    apart = np.abs(vertex[0] - vertex[1]) * spacing
-    return np.asarray(np.minimum(apart, FARTHEST_APART), np.float32)
+    apart, columns = np.empty(profiles.shape[2:], np.float32), np.ascontiguousarray(profiles).reshape(2, 3, -1)
+    vertices_apart(columns, spacing, LEAST_BEND, FARTHEST_APART, apart.ravel())
+    return apart

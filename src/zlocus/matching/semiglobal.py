@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.mgm import sweep_quarter
+from zlocus.kernels.penalties import jump_penalties
 from zlocus.kernels.sgm import least_costs, sweep, winners
 from zlocus.matching.contrast import ALL, Part, edge_unit
 from zlocus.matching.lattice import NARROW_BASE, HeightLattice
 from zlocus.options import SemiGlobalOptions
 
-# From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
-BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
+PATHS = 4  # from W, NW, N and NE; as many come from the other side
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,13 @@ def penalties(
     """
     easing = options.level_easing**level
     p2, p2_edge = options.p2 * easing, min(options.p2_edge, options.p2) * easing
-    steps = np.full((4, *shape), p2, np.uint16)
     if ortho is None:
-        return steps
-    padded = np.pad(ortho, 1, mode="edge")
-    rows, cols = shape
+        return np.full((PATHS, *shape), p2, np.uint16)
+    steps = np.empty((PATHS, *shape), np.uint16)
     unit = np.float32(max(edge_unit(ortho, core), 1e-6))
-    contrast: np.float32 | NDArray[np.float32] = np.float32(options.edge_contrast)
-    if by_two is not None:
-        contrast = np.where(by_two, np.float32(options.edge_contrast_two), contrast)
-    for path, (dr, dc) in enumerate(BEHIND):
-        away = np.nan_to_num(np.abs(ortho - padded[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols]))
-        steps[path] = np.maximum(p2 / (1.0 + away / (contrast * unit)), p2_edge).astype(np.uint16)
+    units = np.array([options.edge_contrast, options.edge_contrast_two], np.float32) * unit
+    by_two = np.zeros(shape, np.bool_) if by_two is None else by_two
+    jump_penalties(ortho, by_two, units, np.float32(p2), np.float32(p2_edge), steps)
     return steps
 
 
@@ -102,7 +97,7 @@ def alone(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
 
     Costs count once per path there, so they do here, and margins mean the same.
     """
-    return pick(np.multiply(cost, np.uint16(2 * len(BEHIND)), dtype=np.uint16), lattice)
+    return pick(np.multiply(cost, np.uint16(2 * PATHS), dtype=np.uint16), lattice)
 
 
 def lone_heights(cost: NDArray[np.uint8], lattice: HeightLattice, found: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -10,7 +10,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from zlocus.kernels.reach import tile_reach
-from zlocus.kernels.visibility import lowest_visible
+from zlocus.kernels.visibility import count_seeing, hide_below, lowest_visible
 from zlocus.kernels.volume import HIDDEN
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.lattice import HeightLattice
@@ -62,21 +62,18 @@ def hide(
     margin_steps: float,
     first: tuple[int, int] = (0, 0),
 ) -> None:
-    """Raise the lowest visible height of every view to what `surface` lets it see; changes `seen`.
+    """Set the lowest visible height of every view to what `surface` lets it see; changes `seen`.
 
     surface : float32 height indices of what may stand in the way, a lower bound of it, on the cells of the tile and,
     where some are known, of those around it; base : (r, c) float32, the base surface that the indices of `seen` are
     counted from; first : row and column of the tile's first cell in `surface`.
     """
-    lowest = np.empty(surface.shape, np.float32)
-    rows, cols = base.shape
-    mine = lowest[first[0] : first[0] + rows, first[1] : first[1] + cols]
+    lowest, begin = np.empty(surface.shape, np.float32), np.array(first)
     for i in range(len(views.layout)):
         for part in parts_of_one_direction(views, i):
             lowest_visible(surface, *cells_per_step(views, i, part), lowest)
-            mine -= base + np.float32(margin_steps)
-            np.floor(np.maximum(mine, NOTHING_HIDDEN, out=mine), out=mine)
-            seen[2, i][part] = mine[part]
+            ends = np.array([span.indices(n)[:2] for span, n in zip(part, base.shape, strict=True)])
+            hide_below(lowest, begin, base, np.float32(margin_steps), np.float32(NOTHING_HIDDEN), ends, seen[2, i])
 
 
 def spare_pairs(seen: IntVolume) -> None:
@@ -90,6 +87,13 @@ def spare_pairs(seen: IntVolume) -> None:
 def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which views see the cells at the given height indices. seen : (3, ..., r, c); height : (..., r, c)."""
     return np.asarray((seen[0] <= height) & (height <= seen[1]) & (seen[2] <= height))
+
+
+def n_seeing(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.int32]:
+    """How many views see each cell at its height index, (r, c). seen : (3, i, r, c); height : (r, c)."""
+    count = np.empty(height.shape, np.int32)
+    count_seeing(seen, height, count)
+    return count
 
 
 def covers(seen: IntVolume) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.kernels.precision import add_curve
+from zlocus.matching.median import median
 from zlocus.matching.refine import LEAST_PEAK, RefinedHeights
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.surface.calibration import PAIR, SPLIT
@@ -32,11 +33,14 @@ def sigma_steps(signs: dict[str, FloatGrid], refined: RefinedHeights) -> FloatGr
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         if cells.any():
             constant, not_refined, curves = model
-            total = np.where(refined.is_refined[cells], np.float32(constant), np.float32(constant + not_refined))
+            # Most tiles have one model: then nothing is picked out.
+            of_model = ... if cells.all() else cells
+            is_refined = refined.is_refined[of_model]
+            total = np.where(is_refined.ravel(), np.float32(constant), np.float32(constant + not_refined))
             for name, (first, spacing, curve) in curves.items():
-                values = np.ascontiguousarray(signs[name][cells])
+                values = signs[name][of_model].ravel()
                 add_curve(values, np.float32(first), np.float32(spacing), np.array(curve, np.float32), total)
-            sigma[cells] = np.exp(total, out=total)
+            sigma[of_model] = np.exp(total, out=total).reshape(is_refined.shape)
     return sigma
 
 
@@ -58,12 +62,12 @@ def signs_of_precision(
     plane : 1 for heights of a plane through a plain segment, else 0.
     """
     height, n_images = refined.height, np.maximum(n_seeing, 1).astype(np.float32)
-    median = cv2.medianBlur(height, NEAR)
+    plain = cv2.medianBlur(height, NEAR)
     off, moved = np.abs(height - refined.smooth), np.abs(height - heights.vertex)
     known = np.isfinite(refined.apart)
     squares = np.maximum(_mean(np.where(known, refined.apart, np.float32(0)) ** 2, AROUND), 0)
     apart = np.sqrt(squares / np.maximum(_mean(known.astype(np.float32), AROUND), np.float32(1e-3)))
-    centred = height - np.float32(np.median(height))
+    centred = height - median(height.ravel())
     spread = _mean(centred * centred, AROUND) - _mean(centred, AROUND) ** 2
     signs = {
         "noise": np.log(refined.variance) / 2,
@@ -73,8 +77,8 @@ def signs_of_precision(
         "rough": np.log(np.sqrt(np.maximum(_mean(off * off, NEAR), 0)) + np.float32(LEAST_STEPS)),
         "own": np.log(off + np.float32(LEAST_STEPS)),
         "uneven": np.log(np.sqrt(np.maximum(spread, 0)) + np.float32(LEAST_STEPS)),
-        "jump": np.log(_range(median, NEAR) + np.float32(0.1)),
-        "ledge": np.log(_range(median, 9) + np.float32(0.1)),
+        "jump": np.log(_range(plain, NEAR) + np.float32(0.1)),
+        "ledge": np.log(_range(plain, 9) + np.float32(0.1)),
         "rival": np.log(np.minimum(heights.margin, np.float32(MOST_MARGIN)) + np.float32(20)),
         "moved": np.log(moved + np.float32(0.05)),
         "images": np.log(n_images),
