@@ -9,12 +9,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from kernel_scene import even_lattice
+from reference.semiglobal import BEHIND
 from zlocus.matching.contrast import edge_unit
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
 from zlocus.options import SemiGlobalOptions
 
-# From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
-BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
 OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, level_easing=0.5)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from zlocus.matching.semiglobal import BEHIND
+# From which neighbour a path comes: W, NW, N, NE, as (row, column) offsets.
+BEHIND = ((0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 
 def dense(ragged, lattice, outside):
