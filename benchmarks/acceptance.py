@@ -23,6 +23,7 @@ import numpy as np
 import rasterio
 from pyproj import CRS, Transformer
 
+import compared
 import inspecting
 import large
 import terrain_features
@@ -638,7 +639,7 @@ ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "dmc": dmc, "tuniu": tuniu, "herzjesu": herzjesu, "kernels": kernels,
     "selection": selection, "features": features, "middlebury": middlebury, "memory": memory, "speed": speed,
     "inspect": inspecting.inspect, "inspect-large": inspecting.inspect_large,
-    "halo": large.halo, "growth": large.growth, "clone": clone,
+    "halo": large.halo, "growth": large.growth, "clone": clone, "peers": compared.peers,
 }  # fmt: skip
 SLOW = ("new-scenes", "memory", "speed", "inspect-large", "growth", "clone")
 

@@ -1,0 +1,40 @@
+"""The acceptance lines of the comparison with other programs, from its last whole run (`make peers`, hours)."""
+
+from __future__ import annotations
+
+import json
+
+from peers.page import figure, judged, of_scene, per_million, succeeded
+from workplace import ROOT, CannotRun, Figure, Workplace
+
+OWN, CARS = "zlocus", "CARS"
+KEPT = ROOT / "benchmarks" / "peers" / "results.json"
+
+
+def peers(_at: Workplace) -> list[Figure]:
+    """What docs/peers.md is made of."""
+    if not KEPT.exists():
+        raise CannotRun(f"{KEPT} is not there: run `make peers`")
+    found, figures = json.loads(KEPT.read_text(encoding="utf-8")), []
+    for scene in judged(found):
+        rows = succeeded(of_scene(found, scene))
+        own, others = rows.pop(OWN), rows.values()
+        within, nmad = (figure(own, "all", what) for what in ("within", "nmad"))
+        most = max(figure(row, "all", "within") for row in others)
+        least = min(figure(row, "all", "nmad") for row in others)
+        figures += [
+            Figure(f"{scene}, within 1 m over the next", within / most, at_least=1),
+            Figure(f"{scene}, NMAD over the next", nmad / least, at_most=1),
+            Figure(
+                f"{scene}, CPU of {CARS} over ours",
+                per_million(found, rows[CARS]) / per_million(found, own),
+                at_least=50,
+            ),
+        ]
+    speeds: dict[int, dict[bool, float]] = {}
+    for row in found["kernels"]:
+        best, is_own = speeds.setdefault(row["heights"], {}), row["program"] == OWN
+        best[is_own] = max(row["million_cell_steps_per_s"], best.get(is_own, 0.0))
+    for heights, best in sorted(speeds.items()):
+        figures.append(Figure(f"SGM, {heights} heights, over the next", best[True] / best[False], at_least=1))
+    return figures
