@@ -18,6 +18,8 @@ def peers(_at: Workplace) -> list[Figure]:
     found, figures = json.loads(KEPT.read_text(encoding="utf-8")), []
     for scene in judged(found):
         rows = succeeded(of_scene(found, scene))
+        if not {OWN, CARS} <= rows.keys():
+            raise CannotRun(f"{KEPT} has no surface of {scene} by {OWN} and {CARS}")
         own, others = rows.pop(OWN), rows.values()
         within, nmad = (figure(own, "all", what) for what in ("within", "nmad"))
         most = max(figure(row, "all", "within") for row in others)
