@@ -5,8 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import free_ray_scene as free
 from zlocus.kernels.volume import HIDDEN
-from zlocus.matching.border import covered_ground
+from zlocus.matching.base import BaseSurface
+from zlocus.matching.border import (
+    OFF_GROUND_STEPS,
+    RISE_BY_DISTANCE,
+    BorderGround,
+    covered_ground,
+    highest_ground,
+    unsupported,
+)
+from zlocus.matching.cells import CellWindow
+from zlocus.matching.visibility import coverage
 
 ROWS, COLS, LAST = 12, 60, 40
 # Two views whose images end at a column that moves by a cell per two steps of height: further out, only higher ground
@@ -99,3 +110,70 @@ def test_two_views_it_takes(n):
     assert covered[:, :33].all() == (n > 1)
     if n == 1:
         assert not covered.any()
+
+
+# Of the second half: ground that views compare at all heights up to a column, and what stands on and beside it.
+WIDE_ROWS, WIDE_COLS, COMPARED = 40, 90, 60
+OBJECT = 15  # cells, the widest that is taken off the ground
+
+
+def compared(cols=COMPARED):
+    is_compared = np.zeros((WIDE_ROWS, WIDE_COLS), bool)
+    is_compared[:, :cols] = True
+    return is_compared
+
+
+def test_highest_ground_is_that_beside_without_buildings_and_rises_with_the_distance():
+    surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
+    surface[10:22, 48:60] = 30.0  # a building at the border of what views compare
+    highest = highest_ground(surface, compared(), OBJECT, CELL_STEPS)
+    distance = np.arange(WIDE_COLS) - (COMPARED - 1)
+    expected = GROUND + OFF_GROUND_STEPS + RISE_BY_DISTANCE * CELL_STEPS * np.maximum(distance, 0)
+    np.testing.assert_allclose(highest, np.tile(expected, (WIDE_ROWS, 1)), rtol=0, atol=1e-3)
+
+
+def test_a_slope_is_ground():
+    slope = np.tile(0.4 * np.arange(WIDE_COLS, dtype=np.float32), (WIDE_ROWS, 1))
+    highest = highest_ground(slope, compared(), OBJECT, CELL_STEPS)
+    assert (highest[:, :COMPARED] >= slope[:, :COMPARED]).all()
+    assert (highest >= slope).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_where_all_or_nothing_is_compared_no_height_is_too_high(share):
+    surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
+    highest = highest_ground(surface, np.full(surface.shape, share > 0), OBJECT, CELL_STEPS)
+    assert np.isinf(highest).all()
+
+
+def border_of_wide(level=1):
+    surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
+    highest = highest_ground(surface, compared(), OBJECT, CELL_STEPS)
+    window = CellWindow(5, 3, WIDE_ROWS, WIDE_COLS)
+    return BorderGround(window, level, np.ones(surface.shape, bool), compared(), highest)
+
+
+def test_heights_off_the_ground_need_support_where_views_were_not_compared():
+    border = border_of_wide()
+    window = border.window.finer(border.level)
+    height = np.full((window.rows, window.cols), 2 * GROUND, np.float32)
+    assert not border.needs_support(window, height).any()
+    height[20:30, 100:150] = 2 * 35.0
+    needs = border.needs_support(window, height)
+    assert needs[20:30, 2 * COMPARED : 150].all()
+    assert needs.sum() == 10 * (150 - 2 * COMPARED)
+
+
+@pytest.mark.parametrize("n_views", [2, 3])
+def test_a_height_in_free_air_at_the_border_has_no_support(n_views):
+    """All cells stand off the ground that is known; in the patch alone images do not agree."""
+    views, lattice = free.level_ground(free.ANGLES_DEG[:n_views])
+    window = CellWindow(0, 0, *free.SHAPE)
+    nowhere = np.zeros(free.SHAPE, bool)
+    border = BorderGround(window, 0, ~nowhere, nowhere, np.full(free.SHAPE, free.GROUND - 5, np.float32))
+    seen = coverage(views, BaseSurface.level(free.SHAPE, free.BLOCK), lattice)
+    found = unsupported(border, window, views, seen, free.with_patch())
+    in_patch = np.zeros(free.SHAPE, bool)
+    in_patch[free.PATCH] = True
+    assert found[in_patch].mean() > 0.8
+    assert found[~in_patch].mean() < 0.1

@@ -12,7 +12,7 @@ from zlocus.matching.progressive import predicted_sigma
 from zlocus.matching.refine import RefinedHeights, peak_variance
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.surface.calibration import PAIR, SPLIT
-from zlocus.surface.precision import LEAST_STEPS, is_split, sigma_steps, signs_of_precision
+from zlocus.surface.precision import LEAST_STEPS, is_split, sigma_steps, signs_of_precision, spread_around
 
 SHAPE, LOGARITHM = (24, 30), 1e-5
 INNER = (slice(6, -6), slice(6, -6))
@@ -141,3 +141,13 @@ def test_worse_signs_give_a_larger_sigma(better, worse):
         sigma(refined(**{k: np.full(SHAPE, v, np.float32) for k, v in one.items()}))[INNER] for one in (better, worse)
     )
     assert (large > 1.1 * small).all()
+
+
+def test_spread_around_tells_noise_from_one_uncertain_cell():
+    sigma = np.full((21, 23), 0.2, np.float32)
+    sigma[4, 5] = 50.0
+    sigma[12:, 12:] = 20.0
+    spread = spread_around(sigma)
+    assert spread[4, 5] < 0.5
+    np.testing.assert_allclose(spread[15:, 15:], 20.0, rtol=1e-4)
+    np.testing.assert_allclose(spread[:2, :2], 0.2, rtol=1e-4)

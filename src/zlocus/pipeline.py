@@ -222,7 +222,9 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     )  # fmt: skip
     result = run_dsm(request, RunConfig(), progress)
     evaluations = (
-        evaluate(result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, threshold_m=limit)
+        evaluate(
+            result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, margin_m=0.0, threshold_m=limit
+        )
         for limit in (2 * LEVEL_1_M, 1.0)
     )
     picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from zlocus.kernels.spline import spline_coefficients
 from zlocus.matching.base import BaseSurface, CoarserBase
-from zlocus.matching.border import covered_ground, shown_heights, worth_matching
+from zlocus.matching.border import BorderGround, border_ground, unsupported, worth_matching
 from zlocus.matching.cells import CellWindow, on_cells
 from zlocus.matching.contrast import texture_unit
 from zlocus.matching.edges import agreement, edge_image
+from zlocus.matching.free_rays import add_costs_of_rays
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.measure import cost_volume
 from zlocus.matching.ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
@@ -51,7 +52,7 @@ from zlocus.matching.visibility import (
 from zlocus.options import PyramidOptions, RunConfig
 from zlocus.surface.checks import judge
 from zlocus.surface.fill import filled
-from zlocus.surface.precision import sigma_steps, signs_of_precision
+from zlocus.surface.precision import sigma_steps, signs_of_precision, spread_around
 from zlocus.surface.reasons import Quality, is_empty
 from zlocus.surface.surface import Surface
 
@@ -129,11 +130,11 @@ def match_tile(
     coarsest = scene.levels - 1
     result, guide, ranking = _match_coarsest(scene, pixels, core, config, method, use_visibility)
     done, every = result.evaluations, result.all_views
-    ground = covered_ground(
-        shown_heights(pixels, result.views, coarsest, result.lattice, -(-scene.n_steps // 2**coarsest)),
-        result.seen, result.heights.vertex, (guide.low, guide.high), scene.cell_m / scene.step_m,
+    border = border_ground(
+        pixels, result.views, result.lattice, result.seen, result.heights.vertex, (guide.low, guide.high),
+        result.window, coarsest, -(-scene.n_steps // 2**coarsest), scene.cell_m * 2**coarsest,
     )  # fmt: skip
-    worth, levels = worth_matching(result.seen, result.heights.vertex, ground, result.window), [result]
+    worth, levels = worth_matching(result.seen, result.heights.vertex, border.covered, result.window), [result]
     if not core.at_level(coarsest, 0).meets(worth):
         return TileResult(Surface.nothing(core), done, every)
     for level in range(coarsest - 1, -1, -1):
@@ -148,8 +149,7 @@ def match_tile(
         result = _match_level(scene, pixels, core, result.window, 0, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
     levels[-1] = result = result if method == "mvll" else _with_planes(result, core, config)
-    beyond = ~on_cells(ground, levels[0].window, result.window, coarsest)
-    judged, refined = _finish(scene, pixels, result, beyond, config)
+    judged, refined = _finish(scene, pixels, result, border, config)
     surface = judged.precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
@@ -340,7 +340,10 @@ def _match_level(
             agrees = agreement(views, smooth, covered, own) if agrees is None else agrees
             ortho = edge_image(views, smooth, covered, own, agrees)
         p2 = penalties(ortho, shape, level, config.semiglobal, covered.sum(axis=0) <= PAIR, own)
-        heights = aggregate(cost, lattice, p2, scene.step_m / scene.cell_m, config.semiglobal, is_pair)
+        step_cells = scene.step_m / scene.cell_m
+        heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal, is_pair)
+        if smooth is not None and add_costs_of_rays(cost, views, base, lattice, seen, heights.vertex, level):
+            heights = aggregate(cost, lattice, p2, step_cells, config.semiglobal, is_pair)
     lone = counted_above(lone_heights(cost, lattice, heights.best), base.cells) if level else None
     worth = above_base(worth, base.cells)
     return LevelResult(
@@ -442,31 +445,30 @@ def _with_planes(result: LevelResult, core: CellWindow, config: RunConfig) -> Le
 
 
 def _finish(
-    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, beyond: NDArray[np.bool_], config: RunConfig
+    scene: MatchScene, pixels: list[ViewPixels], result: LevelResult, border: BorderGround, config: RunConfig
 ) -> tuple[Surface, NDArray[np.float32]]:
     """Refine the finest level and judge it, halo included: the surface without its ortho-image, and height indices of
-    all cells, (r, c). beyond : (r, c) cells whose ground is not covered."""
+    all cells, (r, c)."""
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in pixels])
     refined = refine(
-        result.views,
-        splines,
-        result.heights.vertex,
-        result.seen,
-        scene.step_m / scene.cell_m,
-        config.refine,
+        result.views, splines, result.heights.vertex, result.seen, scene.step_m / scene.cell_m, config.refine,
         result.is_planar,
-    )
+    )  # fmt: skip
     covering = covers(result.seen).sum(axis=0)
     seeing = n_seeing(result.seen, refined.height)
     last = scene.n_steps - 1
     signs = signs_of_precision(result.heights, refined, seeing)
     quality = judge(result.heights, refined, covering, seeing, np.exp(signs["apart"]), last, config.checks)
     quality[left_out(result.views, quality.shape)] |= np.uint16(Quality.LEFT_OUT)
-    quality[beyond] |= np.uint16(Quality.UNSEEN)
+    quality[border.is_beyond(result.window)] |= np.uint16(Quality.UNSEEN)
+    quality[unsupported(border, result.window, result.views, result.seen, refined.height)] |= np.uint16(Quality.UNSEEN)
     if result.is_planar is not None:
         quality[result.is_planar] |= np.uint16(Quality.PLANE)
     height = result.lattice.metres(refined.height)
-    sigma = sigma_steps(signs, refined) * np.float32(scene.step_m)
+    sigma = sigma_steps(signs, refined)
+    is_noise = border.is_doubtful(result.window) & (spread_around(sigma) > config.checks.most_spread_steps)
+    quality[is_noise] |= np.uint16(Quality.NO_MATCH)
+    sigma *= np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
     used = np.where(np.isnan(height), 0, seeing).astype(np.uint8)

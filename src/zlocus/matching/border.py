@@ -1,16 +1,22 @@
-"""Cells beside the ground that views share, which two views cover at wrong heights only."""
+"""Cells beside the ground that views share, which two views cover at wrong heights only.
+
+Beside that ground, rays of two views still meet at heights that the ground does not have, and something is always
+found there. Two things tell it from a surface: two views must cover the cell at the height of the ground around it, and
+what stands off that ground must be seen alike by more images than chance makes agree.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.matching.base import BaseSurface
-from zlocus.matching.cells import CellWindow
+from zlocus.matching.cells import CellWindow, on_cells
+from zlocus.matching.free_rays import agreement_on
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.views import TileViews, ViewPixels
 from zlocus.matching.visibility import PAIR, coverage, covers, n_seeing
@@ -21,6 +27,119 @@ MARGIN = 4
 # Ground rises by so much of the way to its neighbour at most, to half a step of its height; what views show is asked
 # for within so many steps more.
 STEEPEST, HALF_STEP, ASKED_STEPS = 1.0, 0.5, 4.0
+# What stands higher above the ground than this, in steps of the coarsest level, is no ground; and above ground that
+# rises by so much of the distance, where the ground itself is not known.
+OFF_GROUND_STEPS, RISE_BY_DISTANCE = 8.0, 0.5
+# Buildings and woods narrower than this are not taken for ground.
+WIDEST_OBJECT_M = 50.0
+
+
+@dataclass(frozen=True)
+class BorderGround:
+    """What the coarsest level knows of the ground at the borders of what views share.
+
+    window : its cells, of level `level`; covered : (r, c) bool, see `covered_ground`; is_compared : (r, c) bool, cells
+    at which two views could be compared at every height searched; highest : (r, c) float32, height index up to which
+    a height may be that of the ground; infinite where no ground is known.
+    """
+
+    window: CellWindow
+    level: int
+    covered: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
+    highest: NDArray[np.float32]
+
+    def is_beyond(self, window: CellWindow) -> NDArray[np.bool_]:
+        """Finest cells (r, c) of a window that two views do not cover at the height of the ground."""
+        return ~on_cells(self.covered, self.window, window, self.level)
+
+    def is_doubtful(self, window: CellWindow) -> NDArray[np.bool_]:
+        """Finest cells (r, c) of a window where views could not be compared at all heights searched."""
+        return ~on_cells(self.is_compared, self.window, window, self.level)
+
+    def needs_support(self, window: CellWindow, height: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Finest cells (r, c) of a window that stand off the ground where views could not be compared at all heights:
+        there a height needs the support of more images. height : (r, c) float32, height indices of the finest level."""
+        highest = 2**self.level * on_cells(self.highest, self.window, window, self.level)
+        return np.asarray(self.is_doubtful(window) & (height > highest))
+
+
+def border_ground(
+    pixels: Sequence[ViewPixels],
+    views: TileViews,
+    lattice: HeightLattice,
+    matched: NDArray[np.int32],
+    surface: NDArray[np.float32],
+    searched: tuple[NDArray[np.float32], NDArray[np.float32]],
+    window: CellWindow,
+    level: int,
+    n_steps: int,
+    cell_m: float,
+) -> BorderGround:
+    """The ground at the borders of what views share, as the coarsest level found it.
+
+    pixels, views, lattice, n_steps : see `shown_heights`; matched, surface, searched : see `covered_ground`; window,
+    level : of the cells; cell_m : side of a cell of that level.
+    """
+    shown = shown_heights(pixels, views, level, lattice, n_steps)
+    cell_steps = cell_m / lattice.step_m
+    is_compared = compared_at_all(matched, searched)
+    covered = covered_ground(shown, matched, surface, searched, cell_steps)
+    highest = highest_ground(surface, is_compared, round(WIDEST_OBJECT_M / cell_m), cell_steps)
+    return BorderGround(window, level, covered, is_compared, highest)
+
+
+def unsupported(
+    border: BorderGround,
+    window: CellWindow,
+    views: TileViews,
+    seen: NDArray[np.int32],
+    height: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Finest cells (r, c) at the border that stand off the ground and that no image sees as enough others do.
+
+    window : of the cells; views : of the finest level; seen : (3, i, r, c) height indices, see `coverage`; height :
+    (r, c) float32, the heights found. Two images agree by chance at some height in free air, three rarely do; where
+    only two images see a tile, they have to agree.
+    """
+    doubtful = border.needs_support(window, height)
+    if not doubtful.any():
+        return doubtful
+    covering = (seen[0] <= height) & (height <= seen[1])
+    return doubtful & ~agreement_on(views, height, covering).defended.any(axis=0)
+
+
+def compared_at_all(
+    matched: NDArray[np.int32], searched: tuple[NDArray[np.float32], NDArray[np.float32]]
+) -> NDArray[np.bool_]:
+    """Cells (r, c) at which two views could be compared at every height searched. See `covered_ground`."""
+    at_all = (matched[0] <= searched[0] + 1) & (matched[1] >= searched[1] - 1)
+    return np.asarray(at_all.sum(axis=0) >= PAIR)
+
+
+def highest_ground(
+    surface: NDArray[np.float32], is_compared: NDArray[np.bool_], widest_object: int, cell_steps: float
+) -> NDArray[np.float32]:
+    """Height index (r, c) up to which a height may be that of the ground.
+
+    That is the surface without what is narrower than `widest_object` cells (a grey opening), and beside the cells that
+    are compared at all heights the nearest of it, rising with the distance. surface : (r, c) float32 height indices;
+    is_compared : (r, c), cells whose surface counts; cell_steps : side of a cell in steps of height.
+    """
+    if not is_compared.any() or is_compared.all():
+        return np.full(surface.shape, np.inf, np.float32)
+    wide = np.ones((widest_object | 1,) * 2, np.uint8)
+    far = np.float32(np.finfo(np.float32).max)
+    smooth = cv2.medianBlur(surface, 3)
+    lowest = cv2.erode(np.where(is_compared, smooth, far), wide, borderValue=float(far))
+    opened = cv2.dilate(np.where(is_compared, lowest, -far), wide, borderValue=-float(far))
+    distance, nearest = cv2.distanceTransformWithLabels(
+        (~is_compared).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(nearest.max()) + 1, np.float32)
+    of_label[nearest[is_compared]] = opened[is_compared]
+    rise = np.float32(RISE_BY_DISTANCE * cell_steps) * distance
+    return np.asarray(of_label[nearest] + rise + np.float32(OFF_GROUND_STEPS), np.float32)
 
 
 def shown_heights(
@@ -54,8 +173,7 @@ def covered_ground(
     there; surface : (r, c) indices found; searched : lowest and highest index, (r, c) each; cell_steps : side of a cell
     in steps of height.
     """
-    at_all = (matched[0] <= searched[0] + 1) & (matched[1] >= searched[1] - 1)
-    known = np.asarray(at_all.sum(axis=0) >= PAIR)
+    known = compared_at_all(matched, searched)
     covered = np.asarray(covers(shown).sum(axis=0) >= PAIR)
     if not known.any() or known[covered].all():
         return covered

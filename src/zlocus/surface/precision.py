@@ -44,6 +44,15 @@ def sigma_steps(signs: dict[str, FloatGrid], refined: RefinedHeights) -> FloatGr
     return sigma
 
 
+def spread_around(sigma: FloatGrid) -> FloatGrid:
+    """Geometric mean (r, c) of the standard deviations around every cell, in the unit of `sigma`, (r, c) float32.
+
+    One cell may be uncertain by chance, and so may one that is certain; where all cells around are uncertain, their
+    heights are noise.
+    """
+    return np.exp(_mean(np.log(sigma), NEAR))
+
+
 def is_split(signs: dict[str, FloatGrid]) -> NDArray[np.bool_]:
     """Where two groups of images could be told apart; a single pair cannot, nor images that agree to nothing."""
     return signs["apart"] > np.float32(np.log(1.01 * LEAST_APART))

@@ -15,7 +15,6 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
-from rasterio.transform import from_origin
 
 from zlocus.errors import OutputError
 from zlocus.sensors.rpc import RpcCoefficients
@@ -26,6 +25,7 @@ from zlocus.synthetic.render import Sun, expose, render, sunlit
 from zlocus.synthetic.rpc_fit import RpcFit, fit_rpc
 from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
+from zlocus.synthetic.truth import write_truth
 
 NOISE_STREAM = 9
 HEIGHT_MARGIN_M = 20.0
@@ -99,7 +99,7 @@ def _write_scene(
         write_scene(spec, write_linescan_views(spec, seen_by, folder, linescan), folder / "scene.yaml")
     progress("terrain")
     ground = build_ground(spec, exposures(steady(spec)))
-    write_truth(spec, ground, folder)
+    write_truth(spec, ground, seen_by, folder)
     described = {}
     for exposure, numbers in exposed(spec, ground, seen_by, progress):
         view = exposure.view
@@ -159,26 +159,3 @@ def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients |
             nodata=0, compress="deflate", predictor=2, tiled=True, blockxsize=256, blockysize=256, rpcs=tags,
         ) as file:  # fmt: skip
             file.write(numbers, 1)
-
-
-def write_truth(spec: SceneSpec, ground: SyntheticGround, folder: Path) -> None:
-    """Heights and classes of the area, at the step of the height field."""
-    n = round(spec.size * spec.gsd_m / spec.step_m)
-    cells = ground.cells(spec.west_m, spec.north_m, (n, n))
-    transform = from_origin(spec.west_m, spec.north_m, spec.step_m, spec.step_m)
-    profile = {
-        "driver": "GTiff",
-        "height": n,
-        "width": n,
-        "count": 1,
-        "crs": f"EPSG:{spec.epsg}",
-        "transform": transform,
-    }
-    layers: tuple[tuple[str, NDArray[np.generic], str], ...] = (
-        ("truth_dsm.tif", ground.heights[cells], "height above the ellipsoid"),
-        ("truth_class.tif", ground.classes[cells], "class"),
-    )
-    for name, values, description in layers:
-        with rasterio.open(folder / name, "w", dtype=values.dtype, compress="deflate", **profile) as file:
-            file.write(np.ascontiguousarray(values), 1)
-            file.set_band_description(1, description)

@@ -12,7 +12,7 @@ from zlocus.io.camera_kinds import RpcCamera
 from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.scene_file import ViewEntry
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
-from zlocus.synthetic.files import exposed, fit_exposure, new_folder, write_image, write_truth
+from zlocus.synthetic.files import exposed, fit_exposure, new_folder, write_image
 from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
 from zlocus.synthetic.scenes import (
     ADS40_VIEWS,
@@ -27,6 +27,7 @@ from zlocus.synthetic.scenes import (
     placed,
     steady,
 )
+from zlocus.synthetic.truth import write_truth
 
 # A mapping camera of 100 mm and 6 um, 3500 m above the ground: 0.21 m, three images along a strip 300 m to the west.
 FOCAL_PX, ABOVE_GROUND_M, ASIDE_M, BASE_M = 100.0 / 0.006, 3500.0, 300.0, 1300.0
@@ -78,7 +79,7 @@ def render_mixed_scene(
     still = mixed_exposures(steady(spec))
     with new_folder(Path(folder)) as part:
         ground = build_ground(spec, tuple(exposure for group in still.values() for exposure in group))
-        write_truth(spec, ground, part)
+        write_truth(spec, ground, sum(seen_by.values(), ()), part)
         entries = {
             "linescan": write_linescan_views(spec, seen_by["linescan"], part, TrajectoryNoise()),
             "frame": tuple(_frame_entry(exposure) for exposure in seen_by["frame"]),

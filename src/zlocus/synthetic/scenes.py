@@ -82,6 +82,7 @@ class SceneSpec(Checked):
     shaken: bool = option(False, "Airborne: an unsteady flight (`Shake`), another one in each strip.")
     level: int = option(0, "Of airborne images: as they were taken, or resampled to a plane.", choices=(0, 1))
     truth_step_m: float | None = option(None, "Cell of heights and truth; unset: half of `gsd_m`.", low=0.02, unit="m")
+    whole_truth: bool = option(False, "Truth of all ground that two images see, not of the area alone.")
     samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
     base_m: float = option(430.0, "Lowest terrain, ellipsoidal.", low=-400.0, high=8000.0, unit="m")
     relief_m: float = option(38.0, "Terrain from lowest to highest, without its hill.", low=0.1, high=1000.0, unit="m")
@@ -165,7 +166,7 @@ def demo_spec(seed: int = 4) -> SceneSpec:
     """
     return SceneSpec(
         kind="city", seed=seed, size=600, gsd_m=0.2, camera="ads40", shaken=True, level=1, relief_m=6.0, hill_m=9.0,
-        views=ADS40_VIEWS,
+        views=ADS40_VIEWS, whole_truth=True,
         objects=Objects(70.0, 3.6, 0.8, 14.0, plain_roofs=0.25, max_tree_m=12.0, tower_m=(25.0, 58.0)),
     )  # fmt: skip
 

@@ -1,0 +1,89 @@
+"""Truth rasters of a rendered scene: heights and classes of its area, or of all ground that two images see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.transform import from_origin
+
+from zlocus.sensors.model import FloatArray
+from zlocus.synthetic.scenes import Exposure, SceneSpec
+from zlocus.synthetic.terrain import SyntheticGround
+
+# A camera is evaluated at nodes this many cells and metres apart, and between them by interpolation. The error is below
+# 0.1 px, and decides for a cell beside the border of an image alone.
+NODE_CELLS, NODE_HEIGHT_M = 32, 10.0
+
+
+def write_truth(spec: SceneSpec, ground: SyntheticGround, seen_by: Sequence[Exposure], folder: Path) -> None:
+    """Write `truth_dsm.tif` and `truth_class.tif` at the step of the height field.
+
+    They cover the area of the scene; with `spec.whole_truth` all ground that two or more of the images `seen_by` show
+    instead, and then a height is NaN where fewer do. Occlusion is not regarded: an image shows what lies inside it.
+    """
+    known: NDArray[np.bool_] | None = None
+    if spec.whole_truth:
+        known = n_showing(ground, seen_by) >= 2
+        rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        cells = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+    else:
+        n_cells = round(spec.size * spec.gsd_m / spec.step_m)
+        cells = ground.cells(spec.west_m, spec.north_m, (n_cells, n_cells))
+    heights, classes = ground.heights[cells], ground.classes[cells]
+    if known is not None:
+        heights = np.where(known[cells], heights, np.float32(np.nan))
+    west, north = ground.x0 + cells[1].start * ground.step, ground.y0 - cells[0].start * ground.step
+    profile = {
+        "driver": "GTiff", "height": heights.shape[0], "width": heights.shape[1], "count": 1, "compress": "deflate",
+        "crs": f"EPSG:{spec.epsg}", "transform": from_origin(west, north, spec.step_m, spec.step_m),
+    }  # fmt: skip
+    layers: tuple[tuple[str, NDArray[np.generic], str, float | None], ...] = (
+        ("truth_dsm.tif", heights, "height above the ellipsoid", None if known is None else np.nan),
+        ("truth_class.tif", classes, "class", None),
+    )
+    for name, values, description, nodata in layers:
+        with rasterio.open(folder / name, "w", dtype=values.dtype, nodata=nodata, **profile) as file:
+            file.write(np.ascontiguousarray(values), 1)
+            file.set_band_description(1, description)
+
+
+def n_showing(ground: SyntheticGround, seen_by: Sequence[Exposure]) -> NDArray[np.uint8]:
+    """How many images show each cell of the ground inside their borders, (r, c) uint8, hidden or not."""
+    count = np.zeros(ground.heights.shape, np.uint8)
+    for exposure in seen_by:
+        xy = image_positions(ground, exposure)
+        last = np.array([exposure.shape[1] - 1, exposure.shape[0] - 1])
+        count += ((xy >= 0) & (xy <= last)).all(axis=-1)
+    return count
+
+
+def image_positions(ground: SyntheticGround, exposure: Exposure) -> FloatArray:
+    """Where an image shows the cells of the ground, (r, c, 2) px, column and row; interpolated between nodes."""
+    rows, cols = ground.heights.shape
+    low, high = ground.height_range
+    levels = np.linspace(low, high, max(int(np.ceil((high - low) / NODE_HEIGHT_M)), 1) + 1)
+    # cv2.resize puts the centre of node k at (k + 0.5) NODE_CELLS - 0.5 cells.
+    n_nodes = [-(-n // NODE_CELLS) + 2 for n in (rows, cols)]
+    at_row, at_col = ((np.arange(n) - 0.5) * NODE_CELLS - 0.5 for n in n_nodes)
+    x = ground.x0 + (at_col + 0.5) * ground.step
+    y = ground.y0 - (at_row + 0.5) * ground.step
+    column, row = np.meshgrid(x, y)
+    below, place = np.empty((rows, cols, 2)), np.full((rows, cols, 2), np.nan)
+    for k, level in enumerate(levels):
+        nodes = np.column_stack([column.ravel(), row.ravel(), np.full(column.size, level)])
+        xy = exposure.camera.image_from_ground(nodes).reshape(*column.shape, 2)
+        size = n_nodes[1] * NODE_CELLS, n_nodes[0] * NODE_CELLS
+        here = cv2.resize(xy, size, interpolation=cv2.INTER_LINEAR)[NODE_CELLS : NODE_CELLS + rows]
+        here = here[:, NODE_CELLS : NODE_CELLS + cols]
+        if k:
+            share = (ground.heights - levels[k - 1]) / (level - levels[k - 1])
+            between = (share >= 0) & (share <= 1)
+            part = share[between, None]
+            place[between] = below[between] * (1 - part) + here[between] * part
+        below = here
+    return place
