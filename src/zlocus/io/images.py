@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -12,13 +13,16 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
-from zlocus.errors import InputError
-from zlocus.io.opening import check_complete, kept_raster, open_raster
+from zlocus.errors import InputError, ZlocusWarning
+from zlocus.io.opening import check_complete, is_remote, kept_raster, open_raster
+from zlocus.io.usable_pixels import LARGEST_GREY, BorderPlateau, absurd_values, border_plateau, without
 from zlocus.scene import ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
 LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}
 CHECK_SIZE = 1024
+# Of larger images, in pixels, absurd values are left out all the same, but not counted.
+MOST_COUNTED = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -27,12 +31,13 @@ class RasterImage:
 
     The grey channel is the luminance (Rec. 601) where the file declares red, green and blue bands, otherwise the first
     band. Not valid are: the declared nodata value, pixels off in an internal or side-car mask or fully transparent in
-    an alpha band, NaN and infinities. An integer image that declares no nodata value is valid everywhere: 0 is a
-    legal grey value and is never taken for nodata.
+    an alpha band, NaN, infinities and other numbers that cannot be grey values, and a `plateau` at the border. Beside
+    that, an integer image that declares no nodata value is valid everywhere: 0 is a legal grey value.
 
     The object is a plain value that threads and processes can share: open files are kept by thread, see `kept_raster`.
 
-    bands : 1-based indices of the bands that are read, with `weights`.
+    bands : 1-based indices of the bands that are read, with `weights`; plateau : pixels of one value at the border,
+    which are not valid; see `with_plateau`.
     """
 
     path: Path
@@ -42,6 +47,7 @@ class RasterImage:
     nodata: float | None
     bands: tuple[int, ...]
     weights: tuple[float, ...]
+    plateau: BorderPlateau | None = None
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """The window of rows x cols pixels that starts at (row, col); it lies inside the image.
@@ -56,7 +62,8 @@ class RasterImage:
         with kept_raster(self.path) as source:
             if source.shape != self.shape:
                 raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
-            return self._read(source, Window(col, row, cols, rows))
+            window = self._read(source, Window(col, row, cols, rows))
+        return window if self.plateau is None else without(window, self.plateau.covers(row, col, rows, cols))
 
     @property
     def has_colours(self) -> bool:
@@ -82,10 +89,10 @@ class RasterImage:
         for band, weight in zip(self.bands, self.weights, strict=True):
             stored = source.read(band, window=window)
             values = stored.astype(np.float32)
-            if stored.dtype.kind == "f":
-                finite = np.isfinite(values)
-                valid &= finite
-                values[~finite] = 0.0
+            if may_be_absurd(stored.dtype):
+                is_grey = np.abs(values) <= LARGEST_GREY  # neither are NaN and infinities
+                valid &= is_grey
+                values[~is_grey] = 0.0
             pixels += values if weight == 1.0 else np.float32(weight) * values
         plain = len(self.bands) == 1 and stored.dtype.kind in "iu"
         if plain and source.mask_flag_enums[self.bands[0] - 1] == [MaskFlags.nodata]:
@@ -161,6 +168,65 @@ def check_content(image: RasterImage) -> None:
             f"{image.path} has no valid pixel (nodata = {image.nodata}). Check its nodata value, or leave it out."
         )
     raise InputError(f"{image.path} has the value {first:g} everywhere: nothing to match. Leave it out.")
+
+
+def may_be_absurd(dtype: np.dtype[np.generic]) -> bool:
+    """Whether pixels of a type can hold numbers that are larger than any grey value."""
+    return dtype.kind == "f" or dtype.itemsize > 4
+
+
+def check_grey_values(image: RasterImage) -> None:
+    """Warn of values that are too large for grey values, which are left out; refuse an image that has little else.
+
+    Raises
+    ------
+    InputError
+        Where more than half of the values are too large.
+    """
+    if not may_be_absurd(np.dtype(image.dtype)) or is_remote(image.path):
+        return
+    if image.shape[0] * image.shape[1] > MOST_COUNTED:
+        return
+    with kept_raster(image.path) as source:
+
+        def rows_of_first_band(row: int, count: int) -> NDArray[np.floating]:
+            return np.asarray(source.read(image.bands[0], window=Window(0, row, image.shape[1], count)), np.float64)
+
+        found = absurd_values(image.shape, rows_of_first_band)
+    if not found.n_pixels or (image.nodata is not None and found.largest == abs(image.nodata)):
+        return
+    if 2 * found.n_pixels > found.n_known:
+        raise InputError(
+            f"{image.path} holds values up to {found.largest:.3g}, which cannot be grey values. Scale them to numbers "
+            f"below {LARGEST_GREY:.3g}, or declare them as nodata."
+        )
+    warnings.warn(
+        f"{image.path}: {found.n_pixels} of its pixels hold values up to {found.largest:.3g}, which cannot be grey "
+        "values: they are left out.",
+        ZlocusWarning,
+        stacklevel=2,
+    )
+
+
+def with_plateau(image: RasterImage) -> RasterImage:
+    """The image without the pixels of one value at its border, if it has such, and a warning that says so.
+
+    Raises
+    ------
+    InputError
+        Where the image cannot be read.
+    """
+    found = border_plateau(image)
+    if found is None:
+        return image
+    share = 100.0 * found.n_pixels / (image.shape[0] * image.shape[1])
+    warnings.warn(
+        f"{image.path}: {share:.1f} % of its pixels are a border of the constant value {found.value:g} that no tag "
+        "declares: it is taken for nodata. Declare it with gdal_edit.py -a_nodata to be rid of this note.",
+        ZlocusWarning,
+        stacklevel=2,
+    )
+    return replace(image, plateau=found)
 
 
 def _grey_bands(source: rasterio.DatasetReader) -> tuple[tuple[int, ...], tuple[float, ...]]:

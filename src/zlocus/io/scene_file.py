@@ -36,7 +36,7 @@ from zlocus.io.camera_kinds import KINDS, RpcCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
 from zlocus.io.documents import read_yaml
 from zlocus.io.frame_camera import FrameCamera
-from zlocus.io.images import RasterImage, check_content, open_image
+from zlocus.io.images import RasterImage, check_content, check_grey_values, open_image, with_plateau
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import Number, StrictModel, validated
 from zlocus.io.text import shown
@@ -321,7 +321,9 @@ def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[Refused] | None 
 
 def _load(entry: _Entry, folder: Path) -> _Loaded:
     image = open_image(entry.path)
+    check_grey_values(image)
     check_content(image)
+    image = with_plateau(image)
     return _Loaded(entry, image, entry.camera.read(folder, entry.path))
 
 

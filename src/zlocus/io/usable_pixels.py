@@ -1,0 +1,136 @@
+"""Pixels that hold no grey value although no tag of the file says so: borders of one value, and absurd numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.scene import ImageSource, ImageWindow
+
+# No sensor has larger grey values: those of 32-bit integers end here. The square of a larger number, summed over an
+# image, leaves the range of float32.
+LARGEST_GREY = 2.0**32
+# A border of one value is looked for at so many places along every side of an image, and is at least so many pixels
+# wide at one of them.
+PLACES, LEAST_WIDTH_PX = 24, 8
+# It fills at least this share of the image; less is a dark corner or a bright roof.
+LEAST_SHARE = 1e-3
+BAND_ROWS = 256  # read at a time
+
+
+@dataclass(frozen=True, eq=False)
+class BorderPlateau:
+    """Pixels of one value that are connected to the border of an image.
+
+    value : the grey value that all of them have; left, right : (r,) int64, how many of them each row begins and ends
+    with; top, bottom : (c,) int64, the same for columns.
+    """
+
+    value: float
+    left: NDArray[np.int64]
+    right: NDArray[np.int64]
+    top: NDArray[np.int64]
+    bottom: NDArray[np.int64]
+
+    def covers(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_]:
+        """The pixels (r, c) of a window that belong to the plateau."""
+        r, c = np.arange(row, row + rows)[:, None], np.arange(col, col + cols)
+        n_rows, n_cols = len(self.left), len(self.top)
+        left, right = self.left[row : row + rows, None], n_cols - self.right[row : row + rows, None]
+        top, bottom = self.top[col : col + cols], n_rows - self.bottom[col : col + cols]
+        return np.asarray((c < left) | (c >= right) | (r < top) | (r >= bottom))
+
+    @property
+    def n_pixels(self) -> int:
+        """How many pixels belong to it."""
+        n_cols = len(self.top)
+        return sum(int(self.covers(row, 0, rows, n_cols).sum()) for row, rows in bands(len(self.left)))
+
+
+def border_plateau(image: ImageSource) -> BorderPlateau | None:
+    """The pixels of one value at the border of an image; None where there are none worth the name.
+
+    A few windows along the border decide whether the image is read as a whole: an ordinary image costs these alone.
+
+    Raises
+    ------
+    InputError
+        Where the image cannot be read.
+    """
+    rows, cols = image.shape
+    value = _value_at_border(image)
+    if value is None:
+        return None
+    left, right = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
+    first_other, last_other = np.full(cols, rows), np.full(cols, -1)
+    for row, count in bands(rows):
+        window = image.read(row, 0, count, cols)
+        is_other = window.valid & (window.pixels != value)
+        has_other = is_other.any(axis=1)
+        left[row : row + count] = np.where(has_other, is_other.argmax(axis=1), cols)
+        right[row : row + count] = np.where(has_other, is_other[:, ::-1].argmax(axis=1), cols)
+        here = is_other.any(axis=0)
+        first_other[here] = np.minimum(first_other[here], row + is_other[:, here].argmax(axis=0))
+        last_other[here] = row + count - 1 - is_other[::-1, here].argmax(axis=0)
+    found = BorderPlateau(value, left, right, first_other.astype(np.int64), (rows - 1 - last_other).astype(np.int64))
+    return found if found.n_pixels >= LEAST_SHARE * rows * cols else None
+
+
+def _value_at_border(image: ImageSource) -> float | None:
+    """The value of a plateau at the border, where several neighbours towards the inside have the same; None of none."""
+    rows, cols = image.shape
+    depth = LEAST_WIDTH_PX
+    if min(rows, cols) < 4 * depth:
+        return None
+    votes: dict[float, int] = {}
+    across = [(int(row), col, 1, depth) for row in np.linspace(0, rows - 1, PLACES) for col in (0, cols - depth)]
+    down = [(row, int(col), depth, 1) for col in np.linspace(0, cols - 1, PLACES) for row in (0, rows - depth)]
+    for place in (*across, *down):
+        window = image.read(*place)
+        first = float(window.pixels.flat[0])
+        if window.valid.all() and (window.pixels == first).all():
+            votes[first] = votes.get(first, 0) + 1
+    return max(votes, key=lambda value: votes[value]) if votes else None
+
+
+@dataclass(frozen=True)
+class AbsurdValues:
+    """Pixels whose value is larger than any grey value.
+
+    n_pixels : how many, of `n_known` that hold a finite number; largest : the largest magnitude of all.
+    """
+
+    n_pixels: int
+    n_known: int
+    largest: float
+
+
+def absurd_values(shape: tuple[int, int], read: Callable[[int, int], NDArray[np.floating]]) -> AbsurdValues:
+    """Count the values beyond `LARGEST_GREY`.
+
+    read : gives some rows, from the first of them and their number, (r, c) float.
+    """
+    n_pixels, n_known, largest = 0, 0, 0.0
+    for row, count in bands(shape[0]):
+        magnitude = np.abs(read(row, count))
+        magnitude = magnitude[np.isfinite(magnitude)]
+        n_known += magnitude.size
+        n_pixels += int((magnitude > LARGEST_GREY).sum())
+        largest = max(largest, float(magnitude.max(initial=0.0)))
+    return AbsurdValues(n_pixels, n_known, largest)
+
+
+def bands(n_rows: int) -> Iterator[tuple[int, int]]:
+    """First row and number of rows of the parts in which an image is read as a whole."""
+    for row in range(0, n_rows, BAND_ROWS):
+        yield row, min(BAND_ROWS, n_rows - row)
+
+
+def without(window: ImageWindow, dropped: NDArray[np.bool_]) -> ImageWindow:
+    """A window in which some pixels (r, c) are not valid."""
+    if not dropped.any():
+        return window
+    return ImageWindow(np.where(dropped, np.float32(0.0), window.pixels), window.valid & ~dropped)
