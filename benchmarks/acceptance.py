@@ -561,11 +561,15 @@ def features(at: Workplace) -> list[Figure]:
     return lines
 
 
-def kernels(at: Workplace) -> list[Figure]:
-    """Speed of the kernels: what the benchmarks leave in their `extra_info`."""
+def kernels(at: Workplace, side: int | None = None) -> list[Figure]:
+    """Speed of the kernels: what the benchmarks leave in their `extra_info`.
+
+    side : cells along a side of their scenes, where that is not to be the usual one.
+    """
     report = at.out / "benchmarks.json"
     at.out.mkdir(parents=True, exist_ok=True)
     options = ["--benchmark-enable", "--benchmark-only", f"--benchmark-json={report}"]
+    options += [] if side is None else ["--side", str(side)]
     run([sys.executable, "-m", "pytest", ROOT / "benchmarks", *options], cwd=ROOT)
     found: dict[str, float] = {}
     for benchmark in json.loads(report.read_text())["benchmarks"]:

@@ -1,4 +1,6 @@
-"""Known vulnerabilities of everything installed beside zlocus, as the package registry lists them: `make audit`.
+"""Known vulnerabilities of everything installed beside zlocus, as the package registry lists them: `make audit`, or
+
+    python benchmarks/audit.py [--registry URL]
 
 The registry answers for a version; where it does not, for the latest one, which tells nothing of an older one that is
 installed. Such versions are listed too: whoever needs to know asks for them elsewhere. Status 1 where something is
@@ -7,6 +9,7 @@ known.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -30,11 +33,11 @@ class Answer:
     known: tuple[str, ...] | None
 
 
-def asked(name: str, version: str) -> Answer:
+def asked(name: str, version: str, registry: str = REGISTRY) -> Answer:
     """The registry's answer for a version, or for the latest one if that is it."""
     for page in (f"{name}/{version}", name):
         try:
-            with urlopen(Request(f"{REGISTRY}/{page}/json"), timeout=TIMEOUT_S) as reply:
+            with urlopen(Request(f"{registry}/{page}/json"), timeout=TIMEOUT_S) as reply:
                 found = json.load(reply)
         except HTTPError as error:
             if error.code != 404:
@@ -53,9 +56,12 @@ def sentence(vulnerability: dict[str, Any]) -> str:
 
 def main() -> int:
     """Ask for all, and say what is known."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--registry", default=REGISTRY, metavar="URL", help="where NAME/VERSION/json is answered")
+    registry = parser.parse_args().registry.rstrip("/")
     installed = sorted({(d.metadata["Name"], d.version) for d in distributions() if d.metadata["Name"] != OWN})
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        answers = list(pool.map(lambda one: asked(*one), installed))
+        answers = list(pool.map(lambda one: asked(*one, registry), installed))
     bad = [answer for answer in answers if answer.known]
     unknown = [answer for answer in answers if answer.known is None]
     for answer in bad:

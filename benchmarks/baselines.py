@@ -4,14 +4,14 @@
 
 Each FOLDER holds a rendered scene. `mvll` is plain vertical line locus matching: independent cells, six views. `opencv`
 is StereoSGBM with eight paths on two views resampled onto a plane at a constant height. Both get the same pointing
-corrections, and the area with truth. The shared judge of `ZLOCUS_TEST_DATA` gives the shares within 1 m.
+corrections, and the area with truth. The shared judge of `ZLOCUS_TEST_DATA` gives the shares within 1 m, or `zlocus
+evaluate` where that judge is not at hand.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,6 +22,8 @@ import cv2
 import numpy as np
 import rasterio
 
+import judging
+from judging import rendered_scene
 from rectifying import (
     STEP_M,
     Rectified,
@@ -33,6 +35,7 @@ from rectifying import (
     rectified,
     write_surface,
 )
+from workplace import ended
 from zlocus.io.scene_file import open_scene
 from zlocus.scene import View
 
@@ -64,6 +67,7 @@ class RenderedFolder:
 
 def open_rendered(folder: Path) -> RenderedFolder:
     """What is in a folder of a rendered scene."""
+    folder = rendered_scene(folder)
     text = json.loads((folder / "scene.json").read_text())
     with rasterio.open(folder / "truth_dsm.tif") as truth:
         heights = truth.read(1)
@@ -77,6 +81,7 @@ def mvll(scene: RenderedFolder, out: Path) -> Path:
     command = [
         sys.executable, "-c", "from zlocus.cli import app; app()", "dsm", *scene.images, "-o", out,
         "--method", "mvll", "--resolution", STEP_M, "--crs", scene.crs, "--bounds", *scene.bounds, "--overwrite",
+        "--no-report",
     ]  # fmt: skip
     subprocess.run([str(word) for word in command], check=True, capture_output=True)
     return out / "dsm.tif"
@@ -124,13 +129,9 @@ def grey_on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> 
 
 
 def judged(scene: RenderedFolder, dsm: Path) -> dict[str, dict[str, float]]:
-    """The shared judge's figures; hills are aligned first, for their pointing errors."""
-    script = Path(os.environ["ZLOCUS_TEST_DATA"]).parent / "tools" / "evaluate_dsm.py"
-    truth = [scene.folder / "truth_dsm.tif", "--class", scene.folder / "truth_class.tif", "--json"]
-    align = ["--align"] if scene.kind == "hills" else []
-    command = [sys.executable, script, dsm, *truth, *align]
-    found: dict[str, dict[str, float]] = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
-    return found
+    """The judge's figures; hills are aligned first, for their pointing errors."""
+    truth, classes = scene.folder / "truth_dsm.tif", scene.folder / "truth_class.tif"
+    return judging.judged(dsm, truth, classes, align=scene.kind == "hills")
 
 
 def baselines(folder: Path, out: Path, methods: tuple[str, ...] = METHODS) -> dict[str, dict[str, dict[str, float]]]:
@@ -162,4 +163,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

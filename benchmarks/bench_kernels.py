@@ -109,9 +109,9 @@ def city_lattice(side: int) -> HeightLattice:
     return HeightLattice(0.0, 1.0, (side, side), BLOCK, rng.integers(-6, 7, blocks) - count // 2, count)
 
 
-def rolling() -> np.ndarray:
+def rolling(side: int = SIDE) -> np.ndarray:
     """A smooth surface of height indices."""
-    r, c = np.mgrid[:SIDE, :SIDE].astype(np.float32)
+    r, c = np.mgrid[:side, :side].astype(np.float32)
     return (32 + 8 * np.sin(r / 30) * np.cos(c / 40)).astype(np.float32)
 
 
@@ -132,14 +132,14 @@ def resample_case() -> Case:
     return Case(call, 500 * side * side, "sample")
 
 
-def costs_case(n_views: int, windows: list[int], weight: float) -> Case:
+def costs_case(n_views: int, windows: list[int], weight: float, side: int = SIDE) -> Case:
     """Costs of a tile: half widths of its windows, weight of grey differences."""
-    heights = lattice(SIDE, 32)
+    heights = lattice(side, 32)
     volume = np.empty(heights.size, np.uint8)
-    seen, half = all_seen(n_views), np.array(windows, np.int64)
+    seen, half = all_seen(n_views, side), np.array(windows, np.int64)
     border, measure = 2 * max(windows), np.array([0.0, weight, 0.3, 0.5, n_views, weight], np.float32)
-    base = np.zeros((SIDE + border, SIDE + border), np.float32), np.zeros((SIDE // BLOCK + 1, SIDE // BLOCK + 1))
-    scene = views(n_views)
+    base = np.zeros((side + border, side + border), np.float32), np.zeros((side // BLOCK + 1, side // BLOCK + 1))
+    scene = views(n_views, side)
 
     def call():
         tile_costs(*scene, *base, heights.ranges, heights.address, half, seen, BLOCK, measure, volume)
@@ -155,9 +155,9 @@ def sums_scene(side: int, heights: HeightLattice):
     return cost, p2, np.zeros(heights.size, np.uint16)
 
 
-def sgm_case(count: int | None) -> Case:
+def sgm_case(count: int | None, side: int = SGM_SIDE) -> Case:
     """Eight paths, all cells with `count` heights, or ragged ranges."""
-    side = SGM_SIDE // 2 if count == 128 else SGM_SIDE
+    side = side // 2 if count == 128 else side
     heights = lattice(side, count)
     cost, p2, total = sums_scene(side, heights)
 
@@ -168,10 +168,10 @@ def sgm_case(count: int | None) -> Case:
     return Case(call, heights.size, "cell-step")
 
 
-def mgm_case(count: int | str | None) -> Case:
+def mgm_case(count: int | str | None, side: int = SGM_SIDE) -> Case:
     """Two predecessors, eight directions; as `sgm_case`, or with the ranges of a town."""
-    heights = city_lattice(SGM_SIDE) if count == "city" else lattice(SGM_SIDE, count)
-    cost, p2, total = sums_scene(SGM_SIDE, heights)
+    heights = city_lattice(side) if count == "city" else lattice(side, count)
+    cost, p2, total = sums_scene(side, heights)
 
     def call():
         for turn in range(4):
@@ -180,9 +180,9 @@ def mgm_case(count: int | str | None) -> Case:
     return Case(call, heights.size, "cell-step")
 
 
-def winners_case(count: int | None) -> Case:
+def winners_case(count: int | None, side: int = SGM_SIDE) -> Case:
     """Minima of sums."""
-    heights = lattice(SGM_SIDE, count)
+    heights = lattice(side, count)
     total = np.random.default_rng(5).integers(100, 2000, heights.size).astype(np.uint16)
     shape = heights.shape
     best, second = np.empty(shape, np.int32), np.empty(shape, np.int32)
@@ -194,9 +194,9 @@ def winners_case(count: int | None) -> Case:
     return Case(call, heights.size, "cell-step")
 
 
-def least_case(count: int | None) -> Case:
+def least_case(count: int | None, side: int = SGM_SIDE) -> Case:
     """Least costs, beside the minima of sums."""
-    heights = lattice(SGM_SIDE, count)
+    heights = lattice(side, count)
     rng, (first, counts) = np.random.default_rng(5), heights.cell_ranges()
     cost = rng.integers(0, 255, heights.size).astype(np.uint8)
     best, lone = (first + rng.integers(0, counts)).astype(np.int32), np.empty(heights.shape, np.int32)
@@ -207,11 +207,11 @@ def least_case(count: int | None) -> Case:
     return Case(call, heights.size, "cell-step")
 
 
-def profile_case() -> Case:
+def profile_case(side: int = SIDE) -> Case:
     """The measure at three offsets around a surface, cubic, 5 x 5 and 9 x 9, three views."""
     half, offsets = 4, np.linspace(-0.5, 0.5, 3).astype(np.float32)
-    surface, seen, (pixels, *scene) = np.pad(rolling(), half, mode="edge"), all_seen(3), views(3)
-    out, windows = np.empty((2, 1, len(offsets), SIDE, SIDE), np.float32), np.array([2, half])
+    surface, seen, (pixels, *scene) = np.pad(rolling(side), half, mode="edge"), all_seen(3, side), views(3, side)
+    out, windows = np.empty((2, 1, len(offsets), side, side), np.float32), np.array([2, half])
 
     def call():
         tile_profile(pixels, CUBIC, *scene, surface, offsets, BLOCK, windows, seen, np.float32(0), out)
@@ -219,17 +219,17 @@ def profile_case() -> Case:
     return Case(call, out[0].size * 3, "cell, offset and image")
 
 
-def smooth_case() -> Case:
+def smooth_case(side: int = SIDE) -> Case:
     """One pass of 25 taps, two cells apart."""
-    surface = rolling()
+    surface = rolling(side)
     by_row, by_col, out = np.empty_like(surface), np.empty_like(surface), np.empty_like(surface)
     slopes(surface, 8, by_row, by_col)
     return Case(lambda: smooth_surface(surface, by_row, by_col, 2, np.float32(2.0), out), surface.size, "cell")
 
 
-def visibility_case(by_col: float = 0.4, by_row: float = 0.2) -> Case:
+def visibility_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) -> Case:
     """What hides a surface from a view; the sweep goes by column where the view looks rather along rows."""
-    surface = rolling()
+    surface = rolling(side)
     out = np.empty_like(surface)
     return Case(lambda: lowest_visible(surface, by_col, by_row, out), surface.size, "cell")
 
@@ -256,9 +256,9 @@ def spline_case() -> Case:
     return Case(lambda: spline_coefficients(image), image.size, "pixel")
 
 
-def ortho_case() -> Case:
+def ortho_case(side: int = SIDE) -> Case:
     """One view on a surface, bilinear."""
-    surface, scene, out = rolling(), views(1), np.empty((SIDE, SIDE), np.float32)
+    surface, scene, out = rolling(side), views(1, side), np.empty((side, side), np.float32)
     return Case(lambda: tile_ortho(*scene, surface, 0, BLOCK, out), out.size, "cell")
 
 
@@ -271,25 +271,25 @@ def test_resample(benchmark):
     [(2, [3], 0.0), (3, [1, 2], 0.0), (3, [1, 2], 1.0), (6, [1, 2], 1.0)],
     ids=["2-views-7x7", "3-views-3x3-5x5", "3-views-3x3-5x5-greys", "6-views-3x3-5x5-greys"],
 )
-def test_costs(benchmark, n_views, windows, weight):
-    case = costs_case(n_views, windows, weight)
+def test_costs(benchmark, side, n_views, windows, weight):
+    case = costs_case(n_views, windows, weight, side or SIDE)
     seconds = timed(benchmark, case)
     if windows == [3]:
         benchmark.extra_info["resample_ncc_ns"] = seconds / case.n * 1e9
 
 
 @pytest.mark.parametrize("count", [16, 32, 64, 128, None], ids=["16", "32", "64", "128", "ragged"])
-def test_sgm(benchmark, count):
-    case = sgm_case(count)
+def test_sgm(benchmark, side, count):
+    case = sgm_case(count, side or SGM_SIDE)
     seconds = timed(benchmark, case)
     if count == 64:
         benchmark.extra_info["sgm_cell_steps_per_s"] = case.n / seconds
-        benchmark.extra_info["opencv_hh_cell_steps_per_s"] = opencv_speed(SGM_SIDE, count)
+        benchmark.extra_info["opencv_hh_cell_steps_per_s"] = opencv_speed(side or SGM_SIDE, count)
 
 
 @pytest.mark.parametrize("count", [16, 32, 64, None, "city"], ids=["16", "32", "64", "ragged", "city"])
-def test_mgm(benchmark, count):
-    timed(benchmark, mgm_case(count))
+def test_mgm(benchmark, side, count):
+    timed(benchmark, mgm_case(count, side or SGM_SIDE))
 
 
 def opencv_speed(side: int, n_disparities: int) -> float:
@@ -312,31 +312,31 @@ def opencv_speed(side: int, n_disparities: int) -> float:
 
 
 @pytest.mark.parametrize("count", [32, None], ids=["32", "ragged"])
-def test_winners(benchmark, count):
-    timed(benchmark, winners_case(count))
+def test_winners(benchmark, side, count):
+    timed(benchmark, winners_case(count, side or SGM_SIDE))
 
 
 @pytest.mark.parametrize("count", [32, None], ids=["32", "ragged"])
-def test_least_costs(benchmark, count):
-    timed(benchmark, least_case(count))
+def test_least_costs(benchmark, side, count):
+    timed(benchmark, least_case(count, side or SGM_SIDE))
 
 
-def test_profile(benchmark):
-    timed(benchmark, profile_case())
+def test_profile(benchmark, side):
+    timed(benchmark, profile_case(side or SIDE))
 
 
-def test_smooth(benchmark):
-    surface = rolling()
+def test_smooth(benchmark, side):
+    surface = rolling(side or SIDE)
     timed(benchmark, Case(lambda: smoothed(surface, 2.0), surface.size, "cell"))
 
 
-def test_visibility(benchmark):
-    timed(benchmark, visibility_case())
+def test_visibility(benchmark, side):
+    timed(benchmark, visibility_case(side=side or SIDE))
 
 
-def test_shade(benchmark):
+def test_shade(benchmark, side):
     """Shaded as hillshade.tif is, a cell in a hundred empty."""
-    surface = rolling()
+    surface = rolling(side or SIDE)
     surface[np.random.default_rng(1).random(surface.shape) < 0.01] = np.nan
     timed(benchmark, Case(lambda: hillshade(surface, 0.5, 315.0, 45.0), surface.size, "cell"))
 
@@ -349,5 +349,5 @@ def test_spline(benchmark):
     timed(benchmark, spline_case())
 
 
-def test_ortho(benchmark):
-    timed(benchmark, ortho_case())
+def test_ortho(benchmark, side):
+    timed(benchmark, ortho_case(side or SIDE))

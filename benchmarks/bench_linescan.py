@@ -14,16 +14,17 @@ from zlocus.synthetic.scenes import demo_spec, exposures, steady
 SIDE = 700
 
 
-@pytest.fixture(scope="module")
-def scanner():
+@pytest.fixture
+def scanner(side):
     """The forward line of the demo, raw and of a steady flight, and a grid of ground points that it sees."""
     spec = steady(demo_spec())
     exposure = exposures(spec)[1]
     interval = -exposure.camera.advance_m / SPEED_M_S
     lines = LineTimes.regular(0.0, interval, exposure.shape[0])
     model = LineScanModel(focal_line(exposure.camera), lines, sampled(exposure.camera, exposure.shape[0]), FrameSpace())
-    x, y = np.meshgrid(np.linspace(0.0, 120.0, SIDE), np.linspace(0.0, -120.0, SIDE))
-    xyz = np.column_stack([x.ravel() + spec.west_m, y.ravel() + spec.north_m, np.full(SIDE * SIDE, 440.0)])
+    n = side or SIDE
+    x, y = np.meshgrid(np.linspace(0.0, 120.0, n), np.linspace(0.0, -120.0, n))
+    xyz = np.column_stack([x.ravel() + spec.west_m, y.ravel() + spec.north_m, np.full(n * n, 440.0)])
     return spec, model, xyz
 
 

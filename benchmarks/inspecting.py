@@ -1,8 +1,9 @@
 """Rows of the acceptance table on the inspector: how long a click takes, and a tile of the map.
 
-    python benchmarks/inspecting.py OUT [--bar-ms N]
+    python benchmarks/inspecting.py OUT [--bar-ms N] [--clicks N] [--tiles N]
 
-Clicks are answered by the server, and drawn by the page in a browser (from CHROMIUM or the PATH) where there is one.
+OUT holds a surface of `zlocus dsm`. Clicks are answered by the server, and half of them are drawn by the page in a
+browser (from CHROMIUM or the PATH) where there is one.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ import rasterio
 from rasterio.windows import Window
 
 import scaling
-from workplace import ZLOCUS, CannotRun, Figure, Workplace, run
+from workplace import ZLOCUS, CannotRun, Figure, Workplace, ended, run
 
-N_CLICKS, N_DRAWN, N_TILES = 60, 30, 200
+N_CLICKS, N_TILES = 60, 200
 DEMO_MS, LARGE_MS, LARGE_M = 300.0, 1000.0, 100.0
 OPENED_S = 300.0
 SIZE = {"width": 1280, "height": 860}
@@ -55,26 +56,29 @@ def inspect_large(at: Workplace) -> list[Figure]:
         return measured(at.out, LARGE_MS)
 
 
-def measured(out: Path, bar_ms: float) -> list[Figure]:
-    """Clicks at random cells with a height, and tiles of all levels, one after the other."""
+def measured(out: Path, bar_ms: float, n_clicks: int = N_CLICKS, n_tiles: int = N_TILES) -> list[Figure]:
+    """Clicks at random cells with a height, and tiles of all levels, one after the other.
+
+    n_clicks : answered by the server; half of them are drawn by the browser too.
+    """
     with served(out) as address, httpx.Client(base_url=address, timeout=60) as client:
         about = client.get("api/surface").json()
-        cells = list(places(out, N_CLICKS))
+        cells = list(places(out, n_clicks))
         clicks = [timed(client, "api/cell", {"x": x, "y": y}) for x, y in cells]
-        tiles = [timed(client, path) for path in tile_paths(about, N_TILES)]
-        drawn = drawn_ms(address, cells[:N_DRAWN])
+        tiles = [timed(client, path) for path in tile_paths(about, n_tiles)]
+        drawn = drawn_ms(address, cells[: n_clicks // 2])
     million = about["shape"][0] * about["shape"][1] / 1e6
     figures = [
         Figure("million cells", million),
         Figure("a click answered, median", float(np.median(clicks)), "ms", at_most=bar_ms),
-        Figure(f"the slowest of {N_CLICKS}", max(clicks), "ms", at_most=bar_ms),
+        Figure(f"the slowest of {n_clicks}", max(clicks), "ms", at_most=bar_ms),
         Figure("a tile of the map, median", float(np.median(tiles)), "ms"),
-        Figure(f"the slowest of {N_TILES}", max(tiles), "ms"),
+        Figure(f"the slowest of {n_tiles}", max(tiles), "ms"),
     ]
     if drawn:
         figures += [
             Figure("a click drawn in the browser, median", float(np.median(drawn)), "ms", at_most=bar_ms),
-            Figure(f"nine in ten of {N_DRAWN}", float(np.percentile(drawn, 90)), "ms"),
+            Figure(f"nine in ten of {n_clicks // 2}", float(np.percentile(drawn, 90)), "ms"),
         ]
     return figures
 
@@ -157,10 +161,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--bar-ms", type=float, default=DEMO_MS)
+    parser.add_argument("--clicks", type=int, default=N_CLICKS, metavar="N", help="cells that are clicked")
+    parser.add_argument("--tiles", type=int, default=N_TILES, metavar="N", help="tiles of the map that are asked for")
     options = parser.parse_args()
-    for figure in measured(options.out, options.bar_ms):
+    for figure in measured(options.out, options.bar_ms, options.clicks, options.tiles):
         print("  ".join(figure.cells()))
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -1,24 +1,31 @@
-"""What benchmarks of `zlocus dsm` share: a run with its work, judging its surface, and tables."""
+"""What benchmarks of `zlocus dsm` share: a run with its work, judging its surface, and tables.
+
+Shared scenes, and the judge that shares no code with zlocus, are those of `ZLOCUS_TEST_DATA`; where that is not set,
+those of the folder `shared` beside this checkout.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from workplace import CannotRun
 from zlocus import cli
 from zlocus.io.config import write_config
 from zlocus.options import RunConfig
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
-JUDGE = SHARED / "tools" / "evaluate_dsm.py"
+DATA = Path(os.environ.get("ZLOCUS_TEST_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+JUDGE = DATA.parent / "tools" / "evaluate_dsm.py"
+RENDERED_TOWN = DATA / "rendered-city"
 
 
 @dataclass(frozen=True)
@@ -30,30 +37,68 @@ class Work:
     cpu_s: float
 
 
+def rendered_scene(folder: Path) -> Path:
+    """The folder of a rendered scene, once it is known to be one.
+
+    Raises
+    ------
+    CannotRun
+        Where the folder has no truth.
+    """
+    if not (folder / "truth_dsm.tif").exists():
+        raise CannotRun(
+            f"`{folder}` holds no truth_dsm.tif: name the folder of a rendered scene, which "
+            "`python -m zlocus.synthetic -o FOLDER` makes, or set ZLOCUS_TEST_DATA."
+        )
+    return folder
+
+
+def run_here(command: Sequence[str]) -> None:
+    """Run a command of zlocus in this process, where a benchmark can watch it. What it prints goes to standard error.
+
+    command : what follows `zlocus` on the command line.
+
+    Raises
+    ------
+    CannotRun
+        Where the command ends with another status than 0.
+    """
+    with redirect_stdout(sys.stderr):
+        # In this mode the command line returns the status of a failure instead of ending the process.
+        status = cli.app(list(command), standalone_mode=False)
+    if status:
+        raise CannotRun(f"`zlocus {command[0]}` ends with status {status}: its message stands above.")
+
+
 def matched(images: Iterable[Path], out: Path, config: RunConfig, options: Iterable[str]) -> Work:
-    """One run of `zlocus dsm` in this process, into an empty folder; its configuration lies beside it."""
+    """One run of `zlocus dsm` in this process, into an empty folder; its configuration lies beside it.
+
+    Its page about the run is not asked for: nobody reads it, and it takes longer than matching a small scene.
+    """
     shutil.rmtree(out, ignore_errors=True)
     file = out.with_name(f"{out.name}.toml")
     file.write_text(write_config(config), encoding="utf-8")
-    command = ["dsm", *map(str, images), "-o", str(out), "--config", str(file), *options]
-    with redirect_stdout(sys.stderr):
-        cli.app(command, standalone_mode=False)
+    command = ["dsm", *map(str, images), "-o", str(out), "--config", str(file), "--no-report", *options]
+    run_here(command)
     record = json.loads((out / "run.json").read_text())
     done, every = record["evaluations"]["done"], record["evaluations"]["all_images"]
     cpu = next(stage["cpu_s"] for stage in record["stages"] if stage["name"] == "match")
     return Work(done / 1e6, done / every, cpu)
 
 
-def judged(dsm: Path, truth: Path, classes: Path, threshold_m: float = 1.0) -> dict[str, Any]:
-    """Figures per class: of the independent script where it is at hand, else of our own evaluation."""
+def judged(dsm: Path, truth: Path, classes: Path, threshold_m: float = 1.0, align: bool = False) -> dict[str, Any]:
+    """Figures of each class: of the independent script where it is at hand, else of our own evaluation.
+
+    align : remove a common shift of the surface first, for images with pointing errors.
+    """
     if JUDGE.exists():
         command = [sys.executable, str(JUDGE), str(dsm), str(truth), "--class", str(classes), "--json"]
-        command += ["--thr", str(threshold_m)]
+        command += ["--thr", str(threshold_m), *(["--align"] if align else [])]
         found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         return {kind: {**figures, "completeness": figures["complete"]} for kind, figures in found.items()}
     from zlocus.evaluation.evaluate import evaluate
 
-    return evaluate(dsm, truth, classes=classes, threshold_m=threshold_m).as_dict()
+    return evaluate(dsm, truth, classes=classes, threshold_m=threshold_m, align=align).as_dict()
 
 
 def table_head(columns: dict[str, str]) -> str:

@@ -41,7 +41,7 @@ def changes(at: Workplace, images: Sequence[str | Path], tile: int | None, wider
         out, options = at.out / f"halo{cells}", at.out / f"{cells}.toml"
         options.parent.mkdir(parents=True, exist_ok=True)
         options.write_text(f"[pyramid]\nhalo = {cells}\n" + (f"tile = {tile}\n" if tile else ""))
-        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--config", options, "--overwrite"])
+        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--config", options, "--overwrite", "--no-report"])
         heights[cells], step_m = heights_of(out), scaling.record_of(out)["heights"]["step_m"]
     of = f"tiles of {tile}" if tile else "usual tiles"
     return [
@@ -65,20 +65,26 @@ def heights_of(out: Path) -> np.ndarray:
         return file.read(1)
 
 
-def growth(at: Workplace) -> list[Figure]:
-    """100 M cells of six images beside 4 M cells, and two workers beside one."""
-    town, rows = scaling.town(), {}
+def growth(
+    at: Workplace, usual_m: float = USUAL_M, large_m: float = LARGE_M, period_px: int = scaling.PERIOD_PX
+) -> list[Figure]:
+    """100 M cells of six images beside 4 M cells, and two workers beside one.
+
+    usual_m, large_m : cells asked for, in millions; period_px : side of the town that is repeated.
+    """
+    town, rows = scaling.town(period_px), {}
     with tempfile.TemporaryDirectory(dir=at.out.parent) as scratch:
-        for million in (USUAL_M, LARGE_M):
+        for million in (usual_m, large_m):
             images = scaling.write_views(Path(scratch), town, 6, round((million * 1e6) ** 0.5))
             for workers in (1, 2):
                 rows[million, workers] = scaling.measured(images, Path(scratch) / "out", workers, 2 * WORKER_GB)
-    one, two, usual = rows[LARGE_M, 1], rows[LARGE_M, 2], rows[USUAL_M, 2]
+    one, two, usual = rows[large_m, 1], rows[large_m, 2], rows[usual_m, 2]
     return [
-        Figure("million cells", two.million, at_least=LARGE_M),
+        Figure("million cells", two.million, at_least=large_m),
         Figure("worker's memory", two.worker_mb / 1e3, "GB", at_most=WORKER_GB),
         Figure("command's memory", two.command_mb / 1e3, "GB", at_most=WORKER_GB),
-        Figure("CPU per cell over that of 4 M", two.cpu_s_per_million / usual.cpu_s_per_million, at_most=GROWTH),
+        Figure(f"CPU per cell over that of {usual_m:g} M", two.cpu_s_per_million / usual.cpu_s_per_million,
+               at_most=GROWTH),
         Figure("the same, matching alone", two.match_cpu_s / two.million * usual.million / usual.match_cpu_s,
                at_most=GROWTH),
         Figure("two workers over one", one.wall_s / two.wall_s, at_least=SPEED_UP),

@@ -120,8 +120,11 @@ class Machine:
         return self.reads[max((known for known in self.reads if known <= size), default=min(self.reads))]
 
 
-def rate(call: Callable[[int], object], n: float, seconds: float = 0.02) -> float:
-    """1e9 units a second of the best run. call : with the number of rounds; n : units of a round."""
+def rate(call: Callable[[int], object], n: float, runs: int = RUNS, seconds: float = 0.02) -> float:
+    """1e9 units a second of the best of some runs, each of about so many seconds of CPU.
+
+    call : with the number of rounds; n : units of a round.
+    """
     call(1)
     start, rounds = time.thread_time(), 1
     while (passed := time.thread_time() - start) < seconds / 4:
@@ -129,15 +132,15 @@ def rate(call: Callable[[int], object], n: float, seconds: float = 0.02) -> floa
         rounds *= 2
     rounds = max(1, int(rounds * seconds / max(passed, 1e-9) / 2))
     best = np.inf
-    for _ in range(RUNS):
+    for _ in range(runs):
         start = time.thread_time()
         call(rounds)
         best = min(best, time.thread_time() - start)
     return rounds * n / best / 1e9
 
 
-def measured() -> Machine:
-    """The rates of the core that this runs on."""
+def measured(runs: int = RUNS) -> Machine:
+    """The rates of the core that this runs on, each the best of so many runs."""
     rng = np.random.default_rng(1)
     n = IN_L1 // 4
     grey, out = rng.random(n // 2).astype(np.float32) + np.float32(0.5), np.empty(n // 2, np.float32)
@@ -148,14 +151,14 @@ def measured() -> Machine:
     reads = {}
     for size in (IN_L1, IN_L2, IN_L3, IN_MEMORY):
         a, b = np.ones(size // 4, np.uint16), np.ones(size // 4, np.uint16)
-        reads[size] = rate(lambda rounds, a=a, b=b: added(a, b, rounds), 6 * len(a))
+        reads[size] = rate(lambda rounds, a=a, b=b: added(a, b, rounds), 6 * len(a), runs)
     x, y = np.float32(0.9), np.float32(0.1)
     return Machine(
-        arithmetic=rate(lambda rounds: multiply_add(grey, x, y, rounds, out), FLOAT_TERMS * len(grey)),
-        narrow=rate(lambda rounds: least_sums(short, terms, rounds, short_out), SHORT_TERMS * len(short)),
-        roots=rate(lambda rounds: inverse_roots(grey, rounds, out), len(grey)),
-        gathers=rate(lambda rounds: gathers(grey, index, rounds, out), 4 * len(index)),
-        loads=rate(lambda rounds: greatest(*quarters, rounds), 8 * len(quarters[0])),
-        stores=rate(lambda rounds: written(short, terms[0], rounds), 2 * len(short)),
+        arithmetic=rate(lambda rounds: multiply_add(grey, x, y, rounds, out), FLOAT_TERMS * len(grey), runs),
+        narrow=rate(lambda rounds: least_sums(short, terms, rounds, short_out), SHORT_TERMS * len(short), runs),
+        roots=rate(lambda rounds: inverse_roots(grey, rounds, out), len(grey), runs),
+        gathers=rate(lambda rounds: gathers(grey, index, rounds, out), 4 * len(index), runs),
+        loads=rate(lambda rounds: greatest(*quarters, rounds), 8 * len(quarters[0]), runs),
+        stores=rate(lambda rounds: written(short, terms[0], rounds), 2 * len(short), runs),
         reads=reads,
     )

@@ -1,10 +1,10 @@
 """Rectified photographs with ground truth (Scharstein & Szeliski 2002, 2003), beside OpenCV's semi-global matcher.
 
-    python benchmarks/middlebury.py FOLDER [--keep OUT]
+    python benchmarks/middlebury.py FOLDER [--only CASE ...] [--keep OUT]
 
-FOLDER holds cones, teddy and tsukuba. A pixel is bad when its disparity is wrong by more than 1 px, or missing.
-Counted are all pixels whose truth is known and, where both images have a truth, confirmed by the
-other's (not occluded).
+FOLDER holds cones, teddy and tsukuba, or those of them that the CASEs need (a CASE is "teddy, 2 views"). A pixel is bad
+when its disparity is wrong by more than 1 px, or missing. Counted are all pixels whose truth is known and, where both
+images have a truth, confirmed by the other's (not occluded).
 """
 
 from __future__ import annotations
@@ -144,11 +144,13 @@ def opencv_disparity(folder: Path, case: Case) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="folder that holds cones, teddy and tsukuba")
+    parser.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES), metavar="CASE",
+                        help="; ".join(CASES))  # fmt: skip
     parser.add_argument("--keep", type=Path, help="folder for the runs")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         print("| scene | zlocus | OpenCV SGBM HH | gaps before filling |\n|---|---|---|---|")
-        for name in CASES:
+        for name in arguments.only:
             out = (arguments.keep or Path(scratch)) / name.replace(", ", "-").replace(" ", "-")
             found = judge(arguments.data, name, out)
             print(f"| {name} | {found.zlocus:.2f} % | {found.opencv:.2f} % | {found.unfilled:.2f} % |", flush=True)

@@ -1,14 +1,15 @@
 """Calibrates the standard deviations of `sigma.tif`, and judges them.
 
-    python benchmarks/precision.py fit [-o OUT]
+    python benchmarks/precision.py fit [FOLDER ...] [--views 6 3 2] [--calibration FILE] [--fewest N] [-o OUT]
     python benchmarks/precision.py judge [FOLDER ...] [--views 6 3 2] [-o OUT]
 
-`fit` renders the scenes of TRAINING, runs `zlocus dsm` on them with six, three and two views, and writes
-src/zlocus/surface/calibration.py. `judge` runs `zlocus dsm` on folders with img_*.tif, truth_dsm.tif and
-truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and
-trees, the share of true errors within one and two sigma (68 and 95 % of a normal distribution); the share within one
-sigma in each quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the
-largest sigma is dropped. Draws calibration.png.
+`fit` renders the scenes of TRAINING, or takes the FOLDERs given, runs `zlocus dsm` on them with six, three and two
+views, and writes src/zlocus/surface/calibration.py, or FILE. Runs with fewer than N cells of a kind (seen by a pair,
+or by more images) do not count. `judge` runs `zlocus dsm` on folders with img_*.tif, truth_dsm.tif and truth_class.tif
+(default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and trees, the share
+of true errors within one and two sigma (68 and 95 % of a normal distribution); the share within one sigma in each
+quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the largest sigma is
+dropped. Draws calibration.png.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,9 @@ import numpy as np
 import rasterio
 from scipy.optimize import minimize
 
-from zlocus import cli, job, tile
+from judging import rendered_scene, run_here
+from workplace import CannotRun, ended
+from zlocus import job, tile
 from zlocus.evaluation.alignment import best_shift
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import read_heights
@@ -106,9 +109,9 @@ def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]
         bounds, crs, cell = file.bounds, file.crs.to_string(), 2 * file.res[0]
     found: list[tuple[Any, ...]] = []
     images = [str(folder / f"img_{name}.tif") for name in views]
-    with watched(found), redirect_stdout(sys.stderr):
-        cli.app(["dsm", *images, "-o", str(out), "--crs", crs, "--resolution", str(cell), "--bounds",
-                 *map(str, bounds), "--overwrite", "--workers", "1", "--no-report"], standalone_mode=False)  # fmt: skip
+    with watched(found):
+        run_here(["dsm", *images, "-o", str(out), "--crs", crs, "--resolution", str(cell), "--bounds",
+                  *map(str, bounds), "--overwrite", "--workers", "1", "--no-report"])  # fmt: skip
     return found
 
 
@@ -170,13 +173,41 @@ def rising(names: list[str], n: int) -> tuple[np.ndarray, list[tuple[float | Non
     return whole, bounds
 
 
-def fit(samples: list[Sample]) -> dict[str, Any]:
-    """Models of cells where groups of images can be told apart, and of single pairs."""
+def fit(samples: list[Sample], fewest: int = FEWEST) -> dict[str, Any]:
+    """Models of cells where groups of images can be told apart, and of single pairs.
+
+    fewest : cells of a kind that a run must have to count.
+
+    Raises
+    ------
+    CannotRun
+        Where no run has as many cells of one of the two kinds.
+    """
     split = [is_split(one.signs) for one in samples]
     return {
-        "SPLIT": fit_model([part(one, rows) for one, rows in zip(samples, split, strict=True)]),
-        "PAIR": fit_model([part(one, ~rows) for one, rows in zip(samples, split, strict=True)]),
+        "SPLIT": fit_model(enough(samples, split, fewest, "more than a pair of images")),
+        "PAIR": fit_model(enough(samples, [~rows for rows in split], fewest, "a single pair of images")),
     }
+
+
+def enough(samples: list[Sample], rows: list[np.ndarray], fewest: int, kind: str) -> list[Sample]:
+    """Some cells of each sample, of those samples that have enough of them.
+
+    rows : (n,) bool for each sample; kind : what sees these cells, for the message.
+
+    Raises
+    ------
+    CannotRun
+        Where no sample has as many.
+    """
+    parts = [part(one, chosen) for one, chosen in zip(samples, rows, strict=True)]
+    parts = [one for one in parts if len(one.error_m) >= fewest]
+    if not parts:
+        raise CannotRun(
+            f"No run has {fewest} cells of known error seen by {kind}: give larger scenes and --views 6 2, or a lower "
+            "--fewest."
+        )
+    return parts
 
 
 def part(one: Sample, rows: np.ndarray) -> Sample:
@@ -189,7 +220,6 @@ def fit_model(samples: list[Sample]) -> dict[str, Any]:
     """Curves of the additive model: least sum of the quantile losses of log |error| at one and two sigma."""
     rng = np.random.default_rng(0)
     chosen, weights = [], []
-    samples = [one for one in samples if len(one.error_m) >= FEWEST]
     for one in samples:
         few = rng.choice(len(one.error_m), min(CELLS, len(one.error_m)), replace=False)
         chosen.append(few)
@@ -319,19 +349,21 @@ def rendered(kind: str, seed: int, out: Path) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("fit", "judge"))
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--views", nargs="+", type=int, choices=tuple(VIEWS), default=tuple(VIEWS))
+    parser.add_argument("--calibration", type=Path, default=CALIBRATION, metavar="FILE", help="module that fit writes")
+    parser.add_argument("--fewest", type=int, default=FEWEST, metavar="N", help="cells of a kind that a run must have")
     parser.add_argument("-o", "--out", type=Path, default=Path("precision"))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     scenes = TRAINING if args.action == "fit" else JUDGED
-    folders = args.folders or [rendered(kind, seed, args.out) for kind, seed in scenes]
+    folders = [*map(rendered_scene, args.folders)] or [rendered(kind, seed, args.out) for kind, seed in scenes]
     if args.action == "fit":
         samples = {(f.name, n): sample(f, VIEWS[n], args.out / "run") for f in folders for n in args.views}
-        model = fit(list(samples.values()))
-        write(model, CALIBRATION)
+        model = fit(list(samples.values()), args.fewest)
+        write(model, args.calibration)
         for (name, n), one in samples.items():
             print(f"{name}, {n} views:", judgement(Judged(one.error_m, predicted_sigma(model, one), one.kind)))
         return
@@ -344,4 +376,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

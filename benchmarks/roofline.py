@@ -1,10 +1,13 @@
 """What bounds each kernel on this machine, and what it reaches; then what a second thread gains.
 
-    python benchmarks/roofline.py [--no-threads] [--program FOLDER]
+    python benchmarks/roofline.py [--no-threads] [--program FOLDER [--rounds N]] [--kernels NAME ...] [--seconds S]
+                                  [--rates N]
 
 Counts are in `roofline_counts.py`, rates of the machine are measured (`machine.py`), kernels run on the scenes of
-`bench_kernels.py`. Times are CPU times of the thread, the best of short runs. A kernel faster than its bound would be a
-wrong count: exit status 1. FOLDER : a rendered scene; the whole program runs there with one worker and two.
+`bench_kernels.py`. Times are CPU times of the thread, the best of short runs: each kernel runs for S seconds, each rate
+N times. A kernel faster than its bound would be a wrong count: exit status 1. NAME : kernels whose names begin with it,
+the others being left out. FOLDER : a rendered scene; the whole program runs there with one worker and two, so many
+rounds, of which the best counts.
 """
 
 from __future__ import annotations
@@ -18,11 +21,12 @@ from pathlib import Path
 
 import bench_kernels as bench
 from bench_kernels import SGM_SIDE, SIDE, Case
-from machine import IN_L1, IN_L2, IN_L3, IN_MEMORY, Machine, measured
+from machine import IN_L1, IN_L2, IN_L3, IN_MEMORY, RUNS, Machine, measured
 from roofline_counts import MGM, ORTHO, REACH, RESAMPLE, SGM, SMOOTH, SPLINE, VISIBILITY, WINNERS, Count, costs, profile
-from threads import kernels_on_two, program_on_two
+from threads import RUN_SECONDS, kernels_on_two, program_on_two
 
 SECONDS, FEWEST_RUNS = 1.5, 5
+ROUNDS = 2
 STEPS = 32
 # Noise of the best of short runs: a kernel this much below its bound is one whose count is wrong.
 TOLERANCE = 1.05
@@ -112,10 +116,10 @@ KERNELS = (
 )  # fmt: skip
 
 
-def best_ns(case: Case) -> float:
-    """CPU time of a unit of work in the best of several runs, after one that compiles."""
+def best_ns(case: Case, seconds: float = SECONDS) -> float:
+    """CPU time of a unit of work in the best of the runs of some seconds, after one that compiles."""
     case.call()
-    best, runs, end = float("inf"), 0, time.perf_counter() + SECONDS
+    best, runs, end = float("inf"), 0, time.perf_counter() + seconds
     while runs < FEWEST_RUNS or time.perf_counter() < end:
         start = time.thread_time()
         case.call()
@@ -142,7 +146,7 @@ def show_kernels(machine: Machine, cases: dict[str, Case], reached_ns: dict[str,
     print("| kernel | unit | operations | bytes in cache, from beyond | bound, ns | reached, ns | share | lost |")
     print("|---|---|---|---|---|---|---|---|")
     sound = True
-    for kernel in KERNELS:
+    for kernel in (kernel for kernel in KERNELS if kernel.name in cases):
         case, reached = cases[kernel.name], reached_ns[kernel.name]
         bounds = kernel.count.bounds_ns(machine, kernel.size)
         what, bound = max(bounds.items(), key=lambda item: item[1])
@@ -169,16 +173,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--no-threads", dest="threads", action="store_false", help="only the roofline")
     parser.add_argument("--program", type=Path, metavar="FOLDER", help="also the whole program on a rendered scene")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, metavar="N", help="of the whole program")
+    parser.add_argument("--kernels", nargs="+", metavar="NAME", help="; ".join(kernel.name for kernel in KERNELS))
+    parser.add_argument("--seconds", type=float, default=SECONDS, metavar="S", help="for each kernel")
+    parser.add_argument("--rates", type=int, default=RUNS, metavar="N", help="runs for each rate of the machine")
     options = parser.parse_args()
-    before, cases = measured(), {kernel.name: kernel.case() for kernel in KERNELS}
-    reached_ns = {name: best_ns(case) for name, case in cases.items()}
-    machine = before.or_better(measured())
+    chosen = [kernel for kernel in KERNELS if kernel.name.startswith(tuple(options.kernels or ("",)))]
+    if not chosen:
+        parser.error(f"no kernel begins with {options.kernels[0]}; there are {', '.join(k.name for k in KERNELS)}")
+    before, cases = measured(options.rates), {kernel.name: kernel.case() for kernel in chosen}
+    reached_ns = {name: best_ns(case, options.seconds) for name, case in cases.items()}
+    machine = before.or_better(measured(options.rates))
     show_machine(machine)
     sound = show_kernels(machine, cases, reached_ns)
     if options.threads:
-        kernels_on_two({kernel.name: kernel.case for kernel in KERNELS})
+        kernels_on_two({kernel.name: kernel.case for kernel in chosen}, min(options.seconds, RUN_SECONDS))
     if options.program:
-        program_on_two(options.program)
+        program_on_two(options.program, options.rounds)
     if not sound:
         print("A kernel is faster than its bound: its count is wrong.", file=sys.stderr)
     return 0 if sound else 1

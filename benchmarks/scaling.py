@@ -3,14 +3,14 @@ needed.
 
     python benchmarks/scaling.py area --million 4 16 100
     python benchmarks/scaling.py workers --million 16
-    python benchmarks/scaling.py views --million 1
+    python benchmarks/scaling.py views --million 1 --images 2 4 8
     python benchmarks/scaling.py block --side 4 8 16
-    python benchmarks/scaling.py draw
+    python benchmarks/scaling.py draw [--picture FILE]
 
 One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
 the repeated image. CPU is that of all processes, from `run.json`; memory the most that one worker held, from
-`events.jsonl`. Measured rows are kept in `growth.csv`, in place of those of the same kind; `draw` shows them as
-docs/growth.png.
+`events.jsonl`. Measured rows are kept in `growth.csv`, or the table that `--table` names, in place of those of the same
+kind; `draw` shows them as docs/growth.png. `--period` makes the town, and the images of a block, smaller.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
@@ -34,9 +35,11 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from pyproj import CRS
+from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
 from rasterio.windows import Window
 
+from workplace import CannotRun, ended
 from zlocus.sensors.rpc import RpcCoefficients
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.render import Optics, expose, render
@@ -45,7 +48,7 @@ from zlocus.synthetic.scenes import build_ground, city_spec, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
 
 ROOT = Path(__file__).parents[1]
-KEPT = ROOT / "benchmarks" / "growth.csv"
+KEPT, PICTURE = ROOT / "benchmarks" / "growth.csv", ROOT / "docs" / "growth.png"
 PERIOD_PX, GSD_M = 1024, 0.5
 # So far away that rays are parallel over the largest scene, to a thousandth of a pixel.
 FAR_M = 1e9
@@ -53,23 +56,25 @@ UTM = CRS.from_epsg(32632)
 BLOCK = 256
 # Along and across, degrees: in pairs from all sides, the first straight down.
 LOOKS = (1.0, -1.0), (16.0, 2.0), (-16.0, -2.0), (8.0, 12.0), (-8.0, -12.0), (4.0, -18.0)
+IMAGES = (2, 4, 8, 16, 32, 64)
 
 
 @dataclass(frozen=True)
 class Town:
-    """A period of a town: ground that is repeated around it, and its place."""
+    """A period of a town: ground that is repeated around it, and its place. period_px : its side, pixels of `GSD_M`."""
 
     ground: SyntheticGround
     west_m: float
     north_m: float
     z: tuple[float, float]
+    period_px: int
 
 
-def town() -> Town:
+def town(period_px: int = PERIOD_PX) -> Town:
     """One period of a rendered town, with the same town around it."""
-    spec = replace(steady(city_spec(7)), size=PERIOD_PX, gsd_m=GSD_M)
+    spec = replace(steady(city_spec(7)), size=period_px, gsd_m=GSD_M)
     ground = build_ground(spec, exposures(spec))
-    n = round(PERIOD_PX * GSD_M / ground.step)
+    n = round(period_px * GSD_M / ground.step)
     row, col = round((ground.y0 - spec.north_m) / ground.step), round((spec.west_m - ground.x0) / ground.step)
     one = (slice(row, row + n), slice(col, col + n))
     whole = SyntheticGround(
@@ -77,7 +82,7 @@ def town() -> Town:
         np.tile(ground.planes[one], (3, 3, 1)), np.tile(ground.material[one], (3, 3)), ground.materials,
         ground.textures, ground.texel_m,
     )  # fmt: skip
-    return Town(whole, spec.west_m, spec.north_m, ground.height_range)
+    return Town(whole, spec.west_m, spec.north_m, ground.height_range, period_px)
 
 
 def looks(n_views: int) -> list[tuple[float, float]]:
@@ -96,15 +101,16 @@ def write_views(folder: Path, at: Town, n_views: int, side: int) -> list[Path]:
 
 
 def write_block(folder: Path, at: Town, side: int) -> list[Path]:
-    """A square block of side x side images of `PERIOD_PX`, each half over the next."""
-    step, paths = PERIOD_PX // 2, []
+    """A square block of side x side images, each of one period of the town and half over the next."""
+    period, paths = at.period_px, []
+    step = period // 2
     made = [pixels(at, look, number) for number, look in enumerate(LOOKS)]
     for row, col in product(range(side), range(side)):
         # So that neighbours on all sides look elsewhere.
         number = (row * 2 + col) % len(LOOKS)
         numbers = np.roll(made[number], (-step * (row % 2), -step * (col % 2)), (0, 1))
         paths.append(folder / f"b{row:02d}_{col:02d}.tif")
-        write_repeated(paths[-1], numbers, PERIOD_PX, rpc_of(at, LOOKS[number], (row * step, col * step), PERIOD_PX))
+        write_repeated(paths[-1], numbers, period, rpc_of(at, LOOKS[number], (row * step, col * step), period))
     return paths
 
 
@@ -116,10 +122,9 @@ def camera(at: Town, look: tuple[float, float], first: tuple[int, int]) -> Satel
 
 
 def pixels(at: Town, look: tuple[float, float], number: int) -> NDArray[np.integer]:
-    """One period of the image of the repeated town (`PERIOD_PX`, `PERIOD_PX`)."""
-    seen = render(
-        at.ground, camera(at, look, (0, 0)), (PERIOD_PX, PERIOD_PX), exposures(steady(city_spec(7)))[0].view.sun
-    )
+    """One period of the image of the repeated town, (`period_px`, `period_px`)."""
+    shape = (at.period_px, at.period_px)
+    seen = render(at.ground, camera(at, look, (0, 0)), shape, exposures(steady(city_spec(7)))[0].view.sun)
     return expose(seen, Optics(), np.random.default_rng([5, number]))
 
 
@@ -136,12 +141,17 @@ def write_repeated(path: Path, numbers: NDArray[np.integer], side: int, rpc: Rpc
         line_scale=rpc.line_scale, long_off=rpc.lon_off, long_scale=rpc.lon_scale, samp_den_coeff=list(rpc.samp_den),
         samp_num_coeff=list(rpc.samp_num), samp_off=rpc.samp_off, samp_scale=rpc.samp_scale,
     )  # fmt: skip
-    with rasterio.open(
-        path, "w", driver="GTiff", height=side, width=side, count=1, dtype=numbers.dtype, nodata=0, tiled=True,
-        blockxsize=BLOCK, blockysize=BLOCK, rpcs=tags, BIGTIFF="IF_SAFER",
-    ) as file:  # fmt: skip
-        for row in range(0, side, PERIOD_PX):
-            for col in range(0, side, PERIOD_PX):
+    period = len(numbers)
+    # An image without a place of its own but for its RPC is what is wanted here.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        file = rasterio.open(
+            path, "w", driver="GTiff", height=side, width=side, count=1, dtype=numbers.dtype, nodata=0, tiled=True,
+            blockxsize=BLOCK, blockysize=BLOCK, rpcs=tags, BIGTIFF="IF_SAFER",
+        )  # fmt: skip
+    with file:
+        for row in range(0, side, period):
+            for col in range(0, side, period):
                 part = numbers[: side - row, : side - col]
                 file.write(part, 1, window=Window(col, row, part.shape[1], part.shape[0]))
 
@@ -220,24 +230,24 @@ def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) 
     )
 
 
-def kept(what: str, found: Sequence[Growth]) -> None:
-    """Put rows of a kind into `KEPT`, in place of those that are there."""
-    rows = [] if not KEPT.exists() else [row for row in read_kept() if row["what"] != what]
+def kept(what: str, found: Sequence[Growth], path: Path = KEPT) -> None:
+    """Put rows of a kind into a table, in place of those that are there."""
+    rows = [] if not path.exists() else [row for row in read_kept(path) if row["what"] != what]
     rows += [{"what": what, **{name: f"{value:.6g}" for name, value in asdict(one).items()}} for one in found]
-    with KEPT.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, ["what", *(f.name for f in fields(Growth))], lineterminator="\n")
         table.writeheader()
         table.writerows(rows)
 
 
-def read_kept() -> list[dict[str, str]]:
-    """All rows of `KEPT`."""
-    with KEPT.open(newline="", encoding="utf-8") as file:
+def read_kept(path: Path = KEPT) -> list[dict[str, str]]:
+    """All rows of a table that `kept` wrote."""
+    with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def draw(path: Path) -> None:
-    """Curves of what is kept: against area, and against the images of a growing block."""
+def draw(path: Path, table: Path = KEPT) -> None:
+    """Curves of what a table keeps: against area, and against the images of a growing block."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -245,8 +255,11 @@ def draw(path: Path) -> None:
 
     def lines(what: str, **only: float) -> dict[str, np.ndarray]:
         chosen = [
-            row for row in read_kept() if row["what"] == what and all(float(row[k]) == v for k, v in only.items())
+            row for row in read_kept(table) if row["what"] == what and all(float(row[k]) == v for k, v in only.items())
         ]
+        if not chosen:
+            wanted = "".join(f" with {v:g} {k}" for k, v in only.items())
+            raise CannotRun(f"`{table}` has no rows of `{what}`{wanted}: measure them first.")
         found = {name: np.array([float(row[name]) for row in chosen]) for name in chosen[0] if name != "what"}
         order = np.lexsort((found["workers"], found["n_views"], found["million"]))
         return {name: values[order] for name, values in found.items()}
@@ -289,7 +302,7 @@ def record_of(out: Path) -> dict[str, Any]:
 def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
     """Pixels along each image, images and workers of each run; of a block, images along each side."""
     if asked.what == "block":
-        yield from ((PERIOD_PX, side, asked.workers) for side in asked.side)
+        yield from ((asked.period, side, asked.workers) for side in asked.side)
         return
     for million in asked.million:
         side = round((million * 1e6) ** 0.5)
@@ -298,7 +311,7 @@ def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
         elif asked.what == "workers":
             yield from ((side, 6, n) for n in range(1, asked.workers + 1))
         else:
-            yield from ((side, n, asked.workers) for n in (2, 4, 8, 16, 32, 64))
+            yield from ((side, n, asked.workers) for n in asked.images)
 
 
 def main() -> None:
@@ -307,16 +320,20 @@ def main() -> None:
     parser.add_argument("what", choices=("area", "workers", "views", "block", "draw"))
     parser.add_argument("--million", type=float, nargs="+", default=[4.0], help="cells")
     parser.add_argument("--side", type=int, nargs="+", default=[4, 8], help="images along each side of a block")
+    parser.add_argument("--images", type=int, nargs="+", default=IMAGES, help="numbers of images, for views")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--memory", type=float, default=8.0, help="GB of all workers together")
     parser.add_argument("--scratch", type=Path, default=Path(tempfile.gettempdir()), help="images and surfaces")
+    parser.add_argument("--period", type=int, default=PERIOD_PX, metavar="PX", help="side of the town that is repeated")
+    parser.add_argument("--table", type=Path, default=KEPT, metavar="FILE", help="where measured rows are kept")
+    parser.add_argument("--picture", type=Path, default=PICTURE, metavar="FILE", help="what draw writes")
     asked = parser.parse_args()
     if asked.what == "draw":
-        draw(ROOT / "docs" / "growth.png")
+        draw(asked.picture, asked.table)
         return
     folder = Path(tempfile.mkdtemp(prefix="scaling-", dir=asked.scratch))
     try:
-        at, made, found = town(), {}, []
+        at, made, found = town(asked.period), {}, []
         print(HEAD, flush=True)
         for side, n, workers in plans(asked):
             if (side, n) not in made:
@@ -325,10 +342,10 @@ def main() -> None:
                 )
             found.append(measured(made[side, n], folder / "out", workers, asked.memory))
             print(found[-1].row(), flush=True)
-        kept(asked.what, found)
+        kept(asked.what, found, asked.table)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -1,6 +1,6 @@
 """Which views to match a cell with: all of them, some by geometry, or those that tie points and match curves ask for.
 
-    python benchmarks/selection.py [SCENE_FOLDER] [-o OUT] [--only NAME ...]
+    python benchmarks/selection.py [SCENE_FOLDER] [-o OUT] [--only NAME ...] [--curves N]
 
 SCENE_FOLDER holds img_*.tif with RPC, truth_dsm.tif and truth_class.tif; the default is the rendered town, two of whose
 eight views are spoiled: d1 (another date) and d2 (haze, blur, clouds). Each choice is one run of `zlocus dsm`:
@@ -13,8 +13,8 @@ eight views are spoiled: d1 (another date) and d2 (haze, blur, clouds). Each cho
 - guided, rule of the paper: the label alone stops, for 95 % of the cells, and no view is left out for its labels.
 
 Judged against the truth: share of cells within 1 m (empty ones are not), NMAD; NCC evaluations against those of all
-images; CPU of the matching. Then, as the paper does, the final match curves: at about 2000 regularly spaced cells the
-mean NCC over the views that were used there, along the fixed range around the height found; medians of its largest
+images; CPU of the matching. Then, as the paper does, the final match curves: at about N regularly spaced cells (2000)
+the mean NCC over the views that were used there, along the fixed range around the height found; medians of its largest
 value and of the ratio to the second peak. Writes selection.csv and selection.png, prints a table.
 """
 
@@ -31,7 +31,8 @@ import numpy as np
 import rasterio
 from pyproj import CRS
 
-from judging import SHARED, judged, matched, table_head, table_row, write_table
+from judging import RENDERED_TOWN, judged, matched, rendered_scene, table_head, table_row, write_table
+from workplace import CannotRun, ended
 from zlocus import tile
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.curve import GOOD, curve_peaks, quality_labels
@@ -100,13 +101,13 @@ def watched(tiles: list[tuple[Any, np.ndarray, RunConfig]]) -> Iterator[None]:
     used: list[np.ndarray] = []
     costs, finish = tile.cost_volume, tile._finish
 
-    def cost_volume(views: Any, base: Any, lattice: Any, seen: Any, measure: Any) -> Any:
+    def cost_volume(views: Any, base: Any, lattice: Any, seen: Any, *rest: Any) -> Any:
         used[:] = [seen]
-        return costs(views, base, lattice, seen, measure)
+        return costs(views, base, lattice, seen, *rest)
 
-    def finished(scene: Any, pixels: Any, result: Any, config: RunConfig) -> Any:
+    def finished(scene: Any, pixels: Any, result: Any, beyond: Any, config: RunConfig) -> Any:
         tiles.append((result, used[0], config))
-        return finish(scene, pixels, result, config)
+        return finish(scene, pixels, result, beyond, config)
 
     tile.cost_volume, tile._finish = cost_volume, finished
     try:
@@ -151,19 +152,24 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
     return np.stack([peaks.rho1, peaks.ratio, labels, takes.sum(axis=1)], axis=1)
 
 
-def run(name: str, choice: Choice, folder: Path, out: Path) -> dict[str, Any]:
-    """One choice: the run, its judgement and its curves, by the names of `COLUMNS` (evaluations in millions)."""
+def run(name: str, choice: Choice, folder: Path, out: Path, curves: int = CURVES) -> dict[str, Any]:
+    """One choice: the run, its judgement and its curves, by the names of `COLUMNS` (evaluations in millions).
+
+    curves : about how many cells are asked for their match curves.
+    """
     truth, classes = folder / "truth_dsm.tif", folder / "truth_class.tif"
     with rasterio.open(truth) as file:
         bounds, crs, cell = file.bounds, str(file.crs), 2 * file.res[0]
-    spacing = max(int(np.sqrt((bounds.right - bounds.left) * (bounds.top - bounds.bottom) / CURVES) / cell), 1)
+    spacing = max(int(np.sqrt((bounds.right - bounds.left) * (bounds.top - bounds.bottom) / curves) / cell), 1)
     place = out / name.replace(",", "").replace(" ", "-")
     images = [folder / f"img_{image}.tif" for image in choice.images]
     tiles: list[tuple[Any, np.ndarray, RunConfig]] = []
     with watched(tiles):
         work = matched(
             images, place, choice.config,
-            ["--crs", crs, "--resolution", str(cell), "--views", choice.views, "--bounds", *map(str, bounds)],
+            ["--crs", crs, "--resolution", str(cell), "--views", choice.views, "--bounds", *map(str, bounds),
+             # In this process, where `watched` sees the tiles.
+             "--workers", "1"],
         )  # fmt: skip
     figures = judged(place / "dsm.tif", truth, classes)
     of_curves = np.concatenate([final_curves(*one, spacing) for one in tiles])
@@ -207,23 +213,28 @@ def picture(found: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", nargs="?", type=Path, default=SHARED / "data" / "rendered-city")
+    parser.add_argument("folder", nargs="?", type=Path, default=RENDERED_TOWN)
     parser.add_argument("-o", "--out", type=Path, default=Path("selection"))
     parser.add_argument("--only", nargs="*", help="names of the choices to run")
+    parser.add_argument("--curves", type=int, default=CURVES, metavar="N", help="cells whose match curves are judged")
     arguments = parser.parse_args()
+    folder = rendered_scene(arguments.folder)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    images = {path.stem.removeprefix("img_"): path for path in sorted(arguments.folder.glob("img_*.tif"))}
-    with rasterio.open(arguments.folder / "truth_dsm.tif") as file:
+    images = {path.stem.removeprefix("img_"): path for path in sorted(folder.glob("img_*.tif"))}
+    with rasterio.open(folder / "truth_dsm.tif") as file:
         crs, z = str(file.crs), float(np.median(file.read(1)))
+    known = choices(list(images), ranked_by_geometry(images, crs, z))
+    if unknown := [name for name in arguments.only or () if name not in known]:
+        raise CannotRun(f"There is no choice `{unknown[0]}`: --only takes {', '.join(f'`{name}`' for name in known)}.")
     found = []
     print(table_head(COLUMNS), flush=True)
-    for name, choice in choices(list(images), ranked_by_geometry(images, crs, z)).items():
+    for name, choice in known.items():
         if arguments.only is None or name in arguments.only:
-            found.append(run(name, choice, arguments.folder, arguments.out))
+            found.append(run(name, choice, folder, arguments.out, arguments.curves))
             print(table_row(COLUMNS, found[-1]), flush=True)
     write_table(found, arguments.out / "selection.csv")
     picture(found, arguments.out / "selection.png")
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -28,7 +28,8 @@ import numpy as np
 import rasterio
 from matplotlib.colors import BoundaryNorm
 
-from judging import SHARED, matched, table_head, table_row, write_table
+from judging import RENDERED_TOWN, matched, rendered_scene, table_head, table_row, write_table
+from workplace import CannotRun, ended
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import TruthBlocks, read_classes, truth_blocks
 from zlocus.io.scene_file import open_scene
@@ -74,7 +75,7 @@ def truth_of(folder: Path, views: tuple[str, ...]) -> Truth:
     blocks = truth_blocks(reference, MARGIN_M, read_classes(folder / "truth_class.tif", reference))
     shape = (len(np.unique(blocks.xy[:, 1])), len(np.unique(blocks.xy[:, 0])))
     if shape[0] * shape[1] != len(blocks.xy):
-        raise SystemExit(f"{folder}/truth_dsm.tif has gaps; this benchmark needs a height everywhere.")
+        raise CannotRun(f"`{folder}/truth_dsm.tif` has gaps: this benchmark needs a scene with a height everywhere.")
     z = blocks.mean.reshape(shape).astype(np.float32)
     near = np.ones((2 * NEAR_CELLS + 1,) * 2, np.uint8)
     edges = cv2.dilate(z, near) - cv2.erode(z, near) > JUMP_M
@@ -150,14 +151,14 @@ def picture(truth: Truth, errors: dict[tuple[int, str], np.ndarray], path: Path)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", type=Path, default=[SHARED / "data" / "rendered-city"])
+    parser.add_argument("folders", nargs="*", type=Path, default=[RENDERED_TOWN])
     parser.add_argument("-o", "--out", type=Path, default=Path("spaces"))
     parser.add_argument("--views", type=int, nargs="*", default=NUMBERS, choices=range(2, len(VIEWS) + 1), metavar="N")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     print(table_head(COLUMNS), flush=True)
     found = []
-    for folder in arguments.folders:
+    for folder in map(rendered_scene, arguments.folders):
         errors = {}
         for n in arguments.views:
             truth = truth_of(folder, VIEWS[:n])
@@ -172,4 +173,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -18,6 +18,8 @@ from rasterio.warp import Resampling, reproject
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import binary_dilation
 
+from judging import rendered_scene
+from workplace import ended
 from zlocus.evaluation.statistics import error_statistics
 from zlocus.evaluation.truth import CLASS_NAMES
 from zlocus.io.raster import write_cog
@@ -48,8 +50,17 @@ def on_grid(values, source, target, resampling, nodata):
     return out
 
 
-def main(scene, surface=None):
-    """Print the figures."""
+def main():
+    """Print the figures of the scene and the surface that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, metavar="SCENE")
+    parser.add_argument("surface", type=Path, nargs="?", metavar="SURFACE")
+    asked = parser.parse_args()
+    show(rendered_scene(asked.scene), asked.surface)
+
+
+def show(scene, surface=None):
+    """Print the figures of a scene's terrain, from a surface or else from the true one."""
     with rasterio.open(scene / "truth_dsm.tif") as truth, rasterio.open(scene / "truth_class.tif") as classes:
         # Counted from 1, so that 0 can mean none.
         z, kinds, source = truth.read(1), classes.read(1) + np.uint8(1), truth
@@ -79,7 +90,4 @@ def main(scene, surface=None):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path, metavar="SCENE")
-    parser.add_argument("surface", type=Path, nargs="?", metavar="SURFACE")
-    main(*(path for path in vars(parser.parse_args()).values() if path is not None))
+    ended(main)

@@ -1,8 +1,8 @@
 """What the semi-global constraint and the levels gain on three terrain features: the paper's test, on rendered crops.
 
-    python benchmarks/terrain_features.py [-o OUT] [--only FEATURE ...] [--views N]
+    python benchmarks/terrain_features.py [-o OUT] [--only FEATURE ...] [--views N] [--size CELLS]
 
-The crops are 200 m square, rendered at 0.5 m with exact truth:
+The crops are 200 m square (400 cells, unless CELLS says otherwise), rendered at 0.5 m with exact truth:
 
 - uneven: a relief of 120 m, half of it steeper than 46 degrees, with some trees;
 - similar: crops in straight rows that repeat every 1.6 to 4 m, roads, houses;
@@ -32,6 +32,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from scipy.ndimage import distance_transform_edt
 
 from judging import judged, matched, table_head, table_row, write_table
+from workplace import ended
 from zlocus.execution.warm import kernels_compiling
 from zlocus.options import PyramidOptions, RunConfig
 from zlocus.synthetic.files import render_scene
@@ -95,10 +96,13 @@ class Crop:
         return self.spec.west_m, self.spec.north_m - side, self.spec.west_m + side, self.spec.north_m
 
 
-def rendered(name: str, n_views: int, out: Path) -> Crop:
-    """The crop, rendered anew only where it is not there yet: with all views, on which the ground depends."""
-    spec = FEATURES[name](size=CELLS, views=SATELLITE_VIEWS[:MOST_VIEWS])
-    folder = out / f"{name}-scene"
+def rendered(name: str, n_views: int, out: Path, size: int = CELLS) -> Crop:
+    """The crop, rendered anew only where it is not there yet: with all views, on which the ground depends.
+
+    size : cells along a side.
+    """
+    spec = FEATURES[name](size=size, views=SATELLITE_VIEWS[:MOST_VIEWS])
+    folder = out / (f"{name}-scene" if size == CELLS else f"{name}-{size}-scene")
     if not folder.exists():
         render_scene(spec, folder)
     seen_by = exposures(spec)
@@ -173,14 +177,14 @@ def picture(crops: list[tuple[Crop, dict[str, Path]]], path: Path, panel_px: int
     norm = BoundaryNorm(ERRORS_M, len(ERRORS_M) + 1, extend="both")
     font = {"fontsize": 9 if panel_px > SMALL_PX else 7}
     for (crop, surfaces), (shades, errors) in zip(crops, axes.reshape(-1, 2, n_columns), strict=True):
-        true = heights(crop.truth, CELLS)
+        true = heights(crop.truth, crop.spec.size)
         shades[0].imshow(hillshade(true, crop.spec.gsd_m), **GREY)
         shades[0].set_title("truth, and an image", **font)
         shades[0].set_ylabel(f"{crop.name}: relief", **font)
         errors[0].imshow(leading_image(crop), **GREY)
         errors[0].set_ylabel(f"{crop.name}: errors", **font)
         for (name, dsm), shade, error in zip(surfaces.items(), shades[1:], errors[1:], strict=True):
-            found = heights(dsm, CELLS)
+            found = heights(dsm, crop.spec.size)
             shade.imshow(hillshade(found, crop.spec.gsd_m), **GREY)
             shade.set_title(name, **font)
             drawn = error.imshow(found - true, cmap=colours, norm=norm, interpolation="nearest")
@@ -212,8 +216,9 @@ def leading_image(crop: Crop) -> np.ndarray:
     """The most nadir image as it was taken, cut to the size of the crop and stretched."""
     with rasterio.open(crop.folder / f"img_{crop.views[0]}.tif") as file:
         grey = file.read(1).astype(float)
-    first = [(n - CELLS) // 2 for n in grey.shape]
-    grey = grey[first[0] : first[0] + CELLS, first[1] : first[1] + CELLS]
+    size = crop.spec.size
+    first = [(n - size) // 2 for n in grey.shape]
+    grey = grey[first[0] : first[0] + size, first[1] : first[1] + size]
     low, high = np.percentile(grey, (1, 99))
     return np.clip((grey - low) / (high - low), 0, 1)
 
@@ -224,10 +229,13 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=list(FEATURES), default=list(FEATURES), help="crops to match")
     parser.add_argument("--views", type=int, default=VIEWS, choices=range(2, MOST_VIEWS + 1), metavar="N",
                         help="the first N of the six views of one date")  # fmt: skip
+    parser.add_argument(
+        "--size", type=int, default=CELLS, metavar="CELLS", help="cells of 0.5 m along a side of a crop"
+    )
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     with kernels_compiling():
-        crops = [rendered(name, arguments.views, arguments.out) for name in arguments.only]
+        crops = [rendered(name, arguments.views, arguments.out, arguments.size) for name in arguments.only]
     for crop in crops:
         print(f"{crop.name}: {crop.share:.0%} of the cells show it", flush=True)
     print(table_head(COLUMNS), flush=True)
@@ -245,4 +253,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -55,8 +55,8 @@ def run_together(cases: list[Case], calls: int) -> Run:
     return Run(time.perf_counter() - start, max(cpu))
 
 
-def kernels_on_two(cases: dict[str, Callable[[], Case]]) -> None:
-    """Each kernel on one thread and on two, in turn; the best of each."""
+def kernels_on_two(cases: dict[str, Callable[[], Case]], seconds: float = RUN_SECONDS) -> None:
+    """Each kernel on one thread and on two, in turn; the best of each. seconds : about how long a run takes."""
     print("\n| kernel | two threads over one, wall | CPU per wall | the same from CPU: 2 x alone / beside the other |")
     print("|---|---|---|---|")
     for name, make in cases.items():
@@ -65,7 +65,7 @@ def kernels_on_two(cases: dict[str, Callable[[], Case]]) -> None:
             case.call()
         start = time.perf_counter()
         two[0].call()
-        calls = max(1, round(RUN_SECONDS / (time.perf_counter() - start)))
+        calls = max(1, round(seconds / (time.perf_counter() - start)))
         runs = [(run_together(two[:1], calls), run_together(two, calls)) for _ in range(PAIRS)]
         alone, both = min(a.wall_s for a, _ in runs), min((b for _, b in runs), key=lambda run: run.wall_s)
         clean = 2 * min(a.cpu_s for a, _ in runs) / min(b.cpu_s for _, b in runs)
@@ -74,7 +74,10 @@ def kernels_on_two(cases: dict[str, Callable[[], Case]]) -> None:
 
 
 def program_on_two(scene: Path, rounds: int = 2) -> None:
-    """`zlocus dsm` with one worker and two, in turn; wall and CPU of each stage in the best run of each."""
+    """`zlocus dsm` with one worker and two, in turn; wall and CPU of each stage in the best run of each.
+
+    rounds : runs with each number of workers, after one that compiles.
+    """
     images = [image for name in STRIPS if (image := scene / f"img_{name}.tif").exists()]
     best: dict[int, tuple[float, float, list[dict]]] = {}
     with tempfile.TemporaryDirectory() as scratch:

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,15 @@ sys.exit(status)
 
 
 class CannotRun(Exception):
-    """Why a row has no figures."""
+    """Why a row, or a benchmark, has no figures."""
+
+
+def ended(main: Callable[[], object]) -> None:
+    """Run a script to its end. What keeps it from running is said in one sentence, with status 1."""
+    try:
+        main()
+    except CannotRun as reason:
+        sys.exit(f"Error: {reason}")
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-# One thread per test process, set before Numba reads it.
+# One thread per test process, set before Numba and NumPy read it. The command line does the same for linear algebra,
+# whose threads wait for each other in vain where another process has the core.
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import settings
@@ -25,6 +27,41 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.fail(f"ZLOCUS_TEST_DATA is {folder}, which is not a folder")
     return path
+
+
+@pytest.fixture(scope="session")
+def small_town(tmp_path_factory) -> Path:
+    """Folder of a rendered town of 56 m with ground, roofs and trees, its exact truth, and all eight views."""
+    from dataclasses import replace
+
+    from zlocus.synthetic.files import render_scene
+    from zlocus.synthetic.scenes import city_spec
+
+    folder = tmp_path_factory.mktemp("town") / "small-town"
+    render_scene(replace(city_spec(16), size=112), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_surface(small_town, tmp_path_factory) -> Path:
+    """Folder of the surface of `small_town`, from its six views of one date, on 0.5 m cells of the truth's area. Its
+    ortho-image keeps the grey values of the images."""
+    import io
+
+    import rasterio
+
+    from zlocus.options import ProductOptions, RunConfig
+    from zlocus.pipeline import run_dsm
+    from zlocus.progress import progress_for
+    from zlocus.request import DsmRequest
+
+    out = tmp_path_factory.mktemp("town") / "surface"
+    with rasterio.open(small_town / "truth_dsm.tif") as truth:
+        area = {"crs": truth.crs.to_string(), "bounds": tuple(truth.bounds), "resolution": 0.5}
+    images = tuple(small_town / f"img_{view}.tif" for view in ("n1", "f1", "b1", "n2", "f2", "b2"))
+    config = RunConfig(products=ProductOptions(ortho_levels="own"))
+    run_dsm(DsmRequest(inputs=images, out=out, report=False, **area), config, progress_for(io.StringIO()))
+    return out
 
 
 @pytest.fixture(scope="session")

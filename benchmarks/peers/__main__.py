@@ -1,12 +1,13 @@
 """zlocus beside other programs, on the same images, area, grid and cores: `make peers`, or
 
-    python benchmarks/peers [--scenes NAME ...] [--programs NAME ...] [--views N ...] [--out FOLDER] [--cores 0,1]
-                            [--s2p PATH] [--micmac PATH] [--setsm PATH]
+    python benchmarks/peers [--scenes NAME ...] [--programs NAME ...] [--views N ...] [--side CELLS] [--runs N]
+                            [--out FOLDER] [--cores 0,1] [--s2p PATH] [--micmac PATH] [--setsm PATH]
 
 Installs CARS, Pandora with libSGM, and OpenCV from the package registry into environments of their own below FOLDER;
 s2p, MicMac and SETSM are run when a path to their command is given. Renders its scenes; the Pleiades sets and
 Middlebury's photographs are used where `ZLOCUS_TEST_DATA` has them. Hours; a run that was cut off goes on. Writes
 results.json, and from it peers.md with its pictures; `--page FOLDER` writes the page alone, from `--results FILE`.
+`--side` makes the rendered scenes smaller or larger, and `--runs` says how often zlocus is run, for a first look.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:1] = [str(HERE.parent)]
+# Python puts the folder of this script first, where `middlebury` would be another module than beside it.
+sys.path[:] = [str(HERE.parent), *(path for path in sys.path if Path(path or ".").resolve() != HERE)]
 
 from peers import builds, matchers  # noqa: E402
 from peers.cars import Cars  # noqa: E402
 from peers.environments import Environment, Missing, installed, this_checkout  # noqa: E402
 from peers.own import Own  # noqa: E402
 from peers.page import write_page  # noqa: E402
-from peers.running import Program, run_all  # noqa: E402
+from peers.running import OWN_RUNS, Asked, Program, run_all  # noqa: E402
 from peers.scenes import RENDERED  # noqa: E402
 
 NAMES = (*RENDERED, "pleiades", "middlebury", "kernels")
@@ -41,6 +43,8 @@ def parsed() -> argparse.Namespace:
         "--programs", nargs="+", choices=PROGRAMS, default=PROGRAMS, metavar="NAME", help=", ".join(PROGRAMS)
     )
     parser.add_argument("--views", nargs="+", type=int, metavar="N", help="of rendered scenes, these numbers alone")
+    parser.add_argument("--side", type=int, metavar="CELLS", help="of 0.5 m, of rendered scenes; else each has its own")
+    parser.add_argument("--runs", type=int, default=OWN_RUNS, metavar="N", help="of zlocus, whose median counts")
     parser.add_argument(
         "--out", type=Path, default=Path("build/peers"), help="folder for environments, scenes and results"
     )
@@ -84,7 +88,8 @@ def main() -> None:
     usable = sorted(os.sched_getaffinity(0))
     cores = tuple(map(int, given.cores.split(","))) if given.cores else tuple(usable[:2])
     environments: dict[str, Environment] = {}
-    results = run_all(programs(given, environments), given.scenes, given.out, cores, environments, given.views)
+    asked = Asked(given.scenes, given.views, given.side, given.runs)
+    results = run_all(programs(given, environments), asked, given.out, cores, environments)
     print(write_page(results, given.out))
 
 

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -50,6 +50,21 @@ class Program(Protocol):
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         """The surface of a scene, and what it took."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be measured.
+
+    names : scenes, of RENDERED, `pleiades`, `middlebury`, `kernels`; views : of rendered scenes, these numbers of views
+    alone; side : cells along a side of the rendered scenes in place of their own; own_runs : of zlocus, whose median
+    counts.
+    """
+
+    names: Sequence[str]
+    views: Sequence[int] | None = None
+    side: int | None = None
+    own_runs: int = OWN_RUNS
 
 
 class Results:
@@ -117,50 +132,61 @@ def commit() -> str:
 
 def run_all(
     programs: Sequence[Program],
-    names: Sequence[str],
+    asked: Asked,
     out: Path,
     cores: Sequence[int],
     environments: dict[str, Environment],
-    views: Sequence[int] | None = None,
 ) -> Path:
-    """Everything that is not there yet. names : scenes, of RENDERED, `pleiades`, `middlebury`, `kernels`; views : of
-    rendered scenes, these numbers alone. Returns the file of results."""
+    """Measure everything that is not there yet. Returns the file of results."""
     results = Results(out / "results.json", cores)
     for program in programs:
         results.say_of("programs", program.name, program.versions())
-        warm_up(program, out, cores)
-    if "kernels" in names:
+        warm_up(program, out, cores, asked)
+    if "kernels" in asked.names:
         speeds(results, environments, cores[0])
-    if "middlebury" in names:
+    if "middlebury" in asked.names:
         middlebury(results, out / "middlebury", environments, cores)
-    for scene in scenes(names, out, views):
-        surfaces_of(scene, programs, results, out, cores)
+    for scene in scenes(asked, out):
+        surfaces_of(scene, programs, results, out, cores, asked.own_runs)
     return results.path
 
 
-def warm_up(program: Program, out: Path, cores: Sequence[int]) -> None:
+def warm_up(program: Program, out: Path, cores: Sequence[int], asked: Asked) -> None:
     """A run on a small scene, which compiles and fills caches, once for each state of a program."""
     folder = out / "warm-up" / program.name
     done, state = folder / "done", json.dumps(program.versions())
     if done.exists() and done.read_text() == state:
         return
     say(f"warm-up: {program.name}")
-    row = measured_row(WARM_UP.scenes("warm-up", out / "scenes")[0], program, folder, cores)
+    rendered = WARM_UP if asked.side is None else replace(WARM_UP, side=min(asked.side, WARM_UP.side))
+    row = measured_row(rendered.scenes("warm-up", out / "scenes")[0], program, folder, cores, asked.own_runs)
     if "failed" not in row:
         done.write_text(state)
 
 
-def scenes(names: Sequence[str], out: Path, views: Sequence[int] | None) -> Iterator[Scene]:
-    """Of these names and numbers of views, rendered as they are needed."""
+def scenes(asked: Asked, out: Path) -> Iterator[Scene]:
+    """Of the names and numbers of views asked for, rendered as they are needed.
+
+    A rendered scene of another side than its own has that in its name, so that results of both stay apart.
+    """
     for name, rendered in RENDERED.items():
-        if name in names:
+        if name in asked.names:
+            if asked.side not in (None, rendered.side):
+                name, rendered = f"{name} of {asked.side} cells", replace(rendered, side=asked.side)
             found = rendered.scenes(name, out / "scenes")
-            yield from (scene for scene in found if views is None or len(scene.images) in views)
-    if "pleiades" in names:
+            yield from (scene for scene in found if asked.views is None or len(scene.images) in asked.views)
+    if "pleiades" in asked.names:
         yield from shared(out / "scenes")
 
 
-def surfaces_of(scene: Scene, programs: Sequence[Program], results: Results, out: Path, cores: Sequence[int]) -> None:
+def surfaces_of(
+    scene: Scene,
+    programs: Sequence[Program],
+    results: Results,
+    out: Path,
+    cores: Sequence[int],
+    own_runs: int = OWN_RUNS,
+) -> None:
     """All programs on one scene: measured where that is not done yet, all judged by one judge, and compared with each
     other where there is no truth."""
     results.say_of("scenes", scene.name, described(scene))
@@ -172,7 +198,7 @@ def surfaces_of(scene: Scene, programs: Sequence[Program], results: Results, out
         if not results.has("surfaces", **key):
             say(f"{scene.name}: {program.name}")
             folder = out / "surfaces" / scene.slug / program.name
-            row = key | measured_row(scene, program, folder, cores)
+            row = key | measured_row(scene, program, folder, cores, own_runs)
             results.add("surfaces", json.loads(json.dumps(row).replace(f"{out}/", "")), "scene", "program")
     rows = [row for row in results.found["surfaces"] if row["scene"] == scene.name and "failed" not in row]
     made |= {row["program"]: out / row["surface"] for row in rows}
@@ -186,12 +212,14 @@ def surfaces_of(scene: Scene, programs: Sequence[Program], results: Results, out
         differences(scene, {name: path for name, path in made.items() if path.exists()}, results)
 
 
-def measured_row(scene: Scene, program: Program, folder: Path, cores: Sequence[int]) -> dict[str, Any]:
+def measured_row(
+    scene: Scene, program: Program, folder: Path, cores: Sequence[int], own_runs: int = OWN_RUNS
+) -> dict[str, Any]:
     """What a program took for a scene, and where its surface lies; or why there is none. Each run begins with an empty
     folder, so that nothing of an earlier one is taken for its work."""
     runs = []
     try:
-        for _ in range(OWN_RUNS if program.name == OWN else 1):
+        for _ in range(own_runs if program.name == OWN else 1):
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             surface, used = program.run(scene, folder, cores)
@@ -236,29 +264,39 @@ def differences(scene: Scene, made: dict[str, Path], results: Results) -> None:
         results.add("differences", row, "scene", "first", "second")
 
 
-def speeds(results: Results, environments: dict[str, Environment], core: int) -> None:
+def speeds(
+    results: Results,
+    environments: dict[str, Environment],
+    core: int,
+    side: int = SPEED_SIDE,
+    all_heights: Sequence[int] = SPEED_HEIGHTS,
+    turns: int = SPEED_TURNS,
+) -> None:
     """Aggregation of zlocus, OpenCV, libSGM and Pandora on one core, in turns; the best of all turns. All programs of a
-    number of heights are measured together."""
+    number of heights are measured together.
+
+    side : cells along a side of the volume; all_heights : numbers of heights of a cell, one measurement for each.
+    """
     matchers = environments.get("matchers")
     pythons: dict[str, Path] = {"zlocus": Path(sys.executable)}
     if matchers is not None:
         pythons |= dict.fromkeys(("opencv", "libsgm", "pandora"), matchers.python)
-    for heights in SPEED_HEIGHTS:
+    for heights in all_heights:
         if all(results.has("kernels", heights=heights, program=name) for name in pythons):
             continue
         best: dict[tuple[str, str], float] = {}
-        for _, (name, python) in itertools.product(range(SPEED_TURNS), pythons.items()):
+        for _, (name, python) in itertools.product(range(turns), pythons.items()):
             say(f"kernels, {heights} heights: {name}")
             log = results.path.parent / "kernels" / f"{name}.log"
             try:
-                measured([python, SPEED, name, SPEED_SIDE, heights, SPEED_ROUNDS], (core,), log)
+                measured([python, SPEED, name, side, heights, SPEED_ROUNDS], (core,), log)
             except Failed as failure:
                 say(str(failure))
                 continue
             for form, seconds in json.loads(log.read_text().splitlines()[-1]).items():
                 best[name, form] = min(seconds, best.get((name, form), seconds))
         for (name, form), seconds in best.items():
-            million = SPEED_SIDE**2 * heights / seconds / 1e6
+            million = side**2 * heights / seconds / 1e6
             row = {"program": name, "form": form, "heights": heights, "million_cell_steps_per_s": million}
             results.add("kernels", row, "program", "form", "heights")
 
