@@ -35,11 +35,11 @@ def refused(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.chdir(folder)
 
-    def run(*arguments, out="out"):
+    def run(*arguments, out="out", status=2):
         before = sorted(folder.rglob("*"))
         result = CliRunner().invoke(app, ["dsm", *map(str, arguments), "-o", str(out)])
         said = [line for line in result.stderr.splitlines() if line.startswith("zlocus: ")]
-        assert result.exit_code == 2, result.output
+        assert result.exit_code == status, result.output
         assert len(said) == 1
         assert result.stderr.rstrip().endswith(said[0])
         assert "Traceback" not in result.stderr
@@ -217,12 +217,15 @@ def test_empty_and_constant_images(refused, good, value, says):
     assert says in sentence
 
 
-def test_unrelated_images_show_no_height_range(refused, good):
-    """Noise instead of an image: no tie points, so no heights can be found, and --heights is asked for."""
+@pytest.mark.parametrize("heights", [(), ("--heights", 20, 90)])
+def test_an_image_of_noise_is_not_matched(refused, good, heights):
+    """No tie point supports either image, with heights given and without."""
     pixels, rpc = pixels_and_rpc(good[1])
     noise = np.random.default_rng(0).integers(1, 3000, pixels.shape).astype(np.uint16)
     write_image(Path("noise.tif"), noise, None, rpcs=rpc)
-    assert "--heights" in refused(good[0], "noise.tif")
+    said = refused(good[0], "noise.tif", *heights, status=3)
+    assert "No two images are held together by tie points" in said
+    assert "noise" in said
 
 
 def test_two_images_from_the_same_direction(refused, good):

@@ -27,6 +27,7 @@ from zlocus.errors import InputError
 from zlocus.io.scene_file import open_scene, open_usable
 from zlocus.options import OrientationOptions
 from zlocus.orientation.orient import Orientation, Residuals, ViewOrientation
+from zlocus.orientation.plausibility import Doubt, LeftOut
 from zlocus.orientation.triangulate import Observations
 from zlocus.overlap import view_geometry
 from zlocus.scene import View
@@ -239,7 +240,9 @@ def test_a_black_border_that_is_not_declared(good, tmp_path):
         return pixels
 
     _, _, report = doctor(tmp_path / "out", good["nadir"], good["fore"], changed(good["aft"], tmp_path, border))
-    assert any(s.startswith("aft: 13 % of its pixels are exactly 0") for s in sentences(report, "poor"))
+    expected = "aft.tif: 13.3 % of its pixels are a border of the constant value 0 that no tag declares"
+    assert any(expected in s for s in sentences(report, "poor"))
+    assert report["views"]["aft"]["nodata"] == pytest.approx(0.133, abs=0.01)
 
 
 def elsewhere(path, folder):
@@ -276,7 +279,7 @@ def test_one_of_three_images_lies_elsewhere(good, tmp_path):
     assert status == 0
     told = sentences(report, "poor")
     assert any("far" in s and "overlaps no other image" in s for s in told)
-    assert any(s.startswith("far: no tie point") for s in told)
+    assert any(s.startswith("far: it takes no part: no tie point") for s in told)
 
 
 def looking(folder, name, along_deg, seed=5):
@@ -310,7 +313,7 @@ def test_an_image_of_another_ground_has_no_ties(good, tmp_path):
     other = looking(tmp_path, "other.tif", 10.0, seed=77)
     _, _, report = doctor(tmp_path / "out", good["nadir"], good["fore"], other)
     assert report["views"]["other"]["n_ties"] == 0
-    assert any(s.startswith("other: no tie point was found in it") for s in sentences(report, "poor"))
+    assert any(s.startswith("other: it takes no part: no tie point") for s in sentences(report, "poor"))
 
 
 def bare(path, folder):
@@ -538,24 +541,45 @@ def test_a_camera_that_does_not_agree_with_itself(first_column, share):
     assert any("cannot map 40 %" in sentence for sentence in told) == (share > 0)
 
 
-@pytest.mark.parametrize(
-    ("n_ties", "left_px", "shift_px", "said"),
-    [
-        (500, 0.1, 2.0, None),
-        (0, np.nan, 0.0, "no tie point"),
-        (20, 0.1, 2.0, "only 20 tie points"),
-        (500, 0.4, 2.0, "still lie 0.40 px off"),
-        (500, 0.1, 25.0, "off by 25 px, close to the 30 px"),
-    ],
-)
-def test_what_ties_say_of_a_view(n_ties, left_px, shift_px, said):
-    left = Residuals(left_px, left_px, left_px)
-    views = (ViewOrientation("odd", (shift_px, -1.0), n_ties, left, left),)
+def oriented_as(views, left_out=(), doubts=()):
+    """An orientation without tie points that says this of its views."""
     nothing = np.empty(0)
     seen = Observations(nothing.astype(int), nothing.astype(int), np.empty((0, 2)))
-    found = Orientation(views, (), np.empty((0, 3)), nothing, seen, "shift", 0, (0.0, 1.0), 0)
-    told = [finding.sentence for finding in tie_findings(["odd"], found, [], OrientationOptions())]
-    assert [said in sentence for sentence in told] == ([] if said is None else [True])
+    return Orientation(
+        views, (), np.empty((0, 3)), nothing, seen, "shift", 0, (0.0, 1.0), 0, left_out=left_out, doubts=doubts
+    )
+
+
+@pytest.mark.parametrize(
+    ("n_ties", "shift_px", "said"),
+    [
+        (500, 2.0, None),
+        (20, 2.0, "only 20 tie points"),
+        (500, 25.0, "off by 25 px, close to the 30 px"),
+        (500, 200.0, None),  # its doubt says more
+    ],
+)
+def test_what_ties_say_of_a_view(n_ties, shift_px, said):
+    left = Residuals(0.1, 0.1, 0.1)
+    views = tuple(ViewOrientation(name, (shift_px, -1.0), n_ties, left, left) for name in ("odd", "even"))
+    told = [f.sentence for f in tie_findings(["odd", "even"], oriented_as(views), [], OrientationOptions())]
+    assert [said in sentence for sentence in told] == ([] if said is None else [True, True])
+
+
+def test_what_takes_no_part_and_what_is_doubtful_is_told():
+    left = Residuals(0.1, 0.1, 0.1)
+    views = tuple(ViewOrientation(name, (0.0, 0.0), 500, left, left) for name in "abc")
+    doubts = (Doubt("b: its camera is odd."), Doubt("The cameras of b and c are exchanged.", is_grave=True))
+    found = oriented_as(views, (LeftOut("a", "nothing supports it."),), doubts)
+    told = tie_findings(["a", "b", "c"], found, [], OrientationOptions())
+    assert [(f.level, f.sentence) for f in told] == [
+        ("poor", "a: it takes no part: nothing supports it."),
+        ("poor", doubts[0].sentence),
+        ("stops", doubts[1].sentence),
+    ]
+    found = oriented_as(views[:2], (LeftOut("a", "nothing supports it."),))
+    told = tie_findings(["a", "b"], found, [], OrientationOptions())
+    assert any(f.level == "stops" and "No two images are held together" in f.sentence for f in told)
 
 
 @pytest.mark.parametrize(("machine", "level"), [(None, []), (9 * 10**9, []), (7 * 10**9, ["poor"])])

@@ -11,6 +11,7 @@ import rasterio
 from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.errors import NotGeoreferencedWarning
+from scipy.ndimage import gaussian_filter
 
 from rendered_scenes import HEIGHTS, errors_of, read, run
 from zlocus.errors import InputError, ZlocusWarning
@@ -89,6 +90,14 @@ def test_plateaus_that_are_small_or_not_at_the_border_are_grey_values(inside):
     else:
         side = int(np.sqrt(0.5 * LEAST_SHARE * pixels.size))
         pixels[:side, :side] = 0  # a dark corner
+    assert border_plateau(ArrayImage(pixels)) is None
+
+
+def test_an_image_that_is_saturated_everywhere_has_no_border():
+    """A third of it has the greatest value, at the border too."""
+    pixels = gaussian_filter(np.random.default_rng(4).normal(size=(400, 500)), 6.0)
+    pixels = np.minimum(pixels / pixels.std() * 300 + 2000, 2100).astype(np.uint16)
+    assert 0.2 < (pixels == 2100).mean() < 0.5
     assert border_plateau(ArrayImage(pixels)) is None
 
 

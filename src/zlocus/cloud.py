@@ -30,7 +30,7 @@ from zlocus.per_image import (
     orient_scene,
     settle_all,
 )
-from zlocus.preparing import AREA_MARGIN, asked_crs, made_folder, what_was_applied, with_heights
+from zlocus.preparing import AREA_MARGIN, asked_crs, check_doubts, made_folder, note_orientation, with_heights
 from zlocus.products.cloud import PointCloud, file_names, write_map
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
@@ -77,7 +77,8 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         ready = orient_scene(scene, scene.heights, config.orientation, progress)
-        progress.note(what_was_applied(ready.orientation))
+        note_orientation(ready.orientation, progress)
+        references = references_taking_part(references, ready)
     with watch.stage("settle"):
         settled, options = settle_all(ready, references, options)
         check_geoid(vertical, ready)
@@ -111,7 +112,27 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
             f"confirm in {request.out / 'cloud.laz'}. See the reasons in the quality maps; give --heights or other "
             "images, or accept it with --partial."
         )
+    if not request.partial:
+        check_doubts(ready.orientation.doubts, request.out / "cloud.laz")
     return CloudResult(request.out, n_points, coverage)
+
+
+def references_taking_part(references: Sequence[str], ready: OrientedScene) -> list[str]:
+    """The reference images that tie points support.
+
+    Raises
+    ------
+    CoverageError
+        Where none of them is.
+    """
+    used = {view.name for view in ready.scene.views}
+    found = [name for name in references if name in used]
+    if not found:
+        raise CoverageError(
+            f"No tie point supports {', '.join(references)}, so no pixel was matched. Choose another --reference, or "
+            "check that the camera belongs to the image."
+        )
+    return found
 
 
 def check_geoid(vertical: VerticalDatum, ready: OrientedScene) -> None:

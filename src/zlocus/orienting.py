@@ -16,7 +16,7 @@ from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
 from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import Orientation
-from zlocus.preparing import made_folder, note_dem, opened_alone, oriented, possible_heights, what_was_applied
+from zlocus.preparing import made_folder, note_dem, note_orientation, opened_alone, oriented, possible_heights
 from zlocus.products.cameras import SCENE, write_cameras
 from zlocus.products.orientation import orientation_record
 from zlocus.products.points import write_ties
@@ -50,7 +50,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         options = alone(config.orientation, request.cameras)
         found = oriented(scene, options, scene.heights, progress, control, terrain)
         check_ties(found, scene)
-        progress.note(what_was_applied(found))
+        note_orientation(found, progress)
     corrected = found.apply(scene)
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", found, corrected)

@@ -31,7 +31,7 @@ from zlocus.matching.gc3 import (
 from zlocus.matching.setup import FEWEST_LEVELS, MatchScene
 from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.orient import Orientation, supported
-from zlocus.preparing import heights_of_ties, oriented, possible_heights
+from zlocus.preparing import heights_of_ties, oriented, possible_heights, taking_part
 from zlocus.progress import Progress
 from zlocus.scene import Scene, View, check_overlap, ground_sample_distance
 from zlocus.sensors.frame import FrameModel
@@ -146,14 +146,14 @@ def orient_scene(
         found = oriented(scene, options, heights, progress)
         trusted = supported(found.xyz, found.sigma_z_m)
         z_range = heights or heights_of_ties(scene, found, options)
-        return OrientedScene(found.apply(scene), found, found.xyz, trusted, z_range)
+        return OrientedScene(taking_part(found.apply(scene), found), found, found.xyz, trusted, z_range)
     space = image_space(scene, scene.views[0].name, (0.0, 0.0))
     given = None if heights is None else hypotheses_of_heights(space, heights)
     found = oriented(Scene(space.views, scene.crs), options, given or widest_disparities(space), progress)
     views = tuple(corrected(view, v.shift_px) for view, v in zip(scene.views, found.views, strict=True))
     ground = space.rays.ground(found.xyz[:, :2] * [1.0, -1.0], found.xyz[:, 2])
     trusted = supported(found.xyz, found.sigma_z_m) & np.isfinite(ground).all(axis=1)
-    return OrientedScene(replace(scene, views=views), found, ground, trusted, heights)
+    return OrientedScene(taking_part(replace(scene, views=views), found), found, ground, trusted, heights)
 
 
 def corrected(view: View, shift_px: tuple[float, float]) -> View:

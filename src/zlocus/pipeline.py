@@ -32,7 +32,7 @@ from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import MeasuredTies, supported
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
-from zlocus.preparing import made_folder, oriented, what_was_applied
+from zlocus.preparing import check_doubts, made_folder, note_orientation, oriented, taking_part
 from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
 from zlocus.products.observations import OBSERVATIONS, write_observations
 from zlocus.products.picture import picture_beside_truth
@@ -109,7 +109,7 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     with watch.stage("orient"):
         known = _known_ties(store, scene, progress)
         orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
-        progress.note(what_was_applied(orientation))
+        note_orientation(orientation, progress)
     with watch.stage("settle"):
         settled = settled_run(request, found, orientation, config, progress)
         tiles = plan_tiles(settled.grid.window, settled.matching.seen, config.pyramid)
@@ -150,6 +150,8 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     _write_maps(request, config, watch, record, progress)
     matching.end(failed, tally)
     _check_coverage(tally, out, request.partial, progress)
+    if not request.partial:
+        check_doubts(settled.doubts, out / "dsm.tif")
     return DsmResult(out, tally.coverage)
 
 
@@ -255,7 +257,8 @@ def _maker(
         return job
     config, settled, grid, orientation = job.config, job.settled, job.grid, found.orientation
     is_supported = supported(orientation.xyz, orientation.sigma_z_m)
-    ready = OrientedScene(found.scene, orientation, orientation.xyz, is_supported, found.z_range)
+    used = taking_part(found.scene, orientation)
+    ready = OrientedScene(used, orientation, orientation.xyz, is_supported, found.z_range)
     leading = [view.name for view in settled.views if request.reference in (None, view.name)]
     box, aside = grid.geobox.extent.boundingbox, config.pyramid.halo * grid.cell_m
     bounds = (box.left - aside, box.bottom - aside, box.right + aside, box.top + aside)

@@ -13,7 +13,15 @@ from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pi
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import supported
 from zlocus.place import NEAREST_TIES, Place, cell_of, curves_at, height_nearby
-from zlocus.preparing import asked_crs, heights_of_ties, made_folder, oriented, possible_heights, what_was_applied
+from zlocus.preparing import (
+    asked_crs,
+    heights_of_ties,
+    made_folder,
+    note_orientation,
+    oriented,
+    possible_heights,
+    taking_part,
+)
 from zlocus.products.curves import PointReport, loci, point_text, write_point
 from zlocus.progress import Progress
 from zlocus.request import CurvesRequest
@@ -38,8 +46,8 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
         heights = request.heights or scene.heights
         check_overlap(scene, possible_heights(scene, heights))
     orientation = oriented(scene, config.orientation, heights, progress)
-    progress.note(what_was_applied(orientation))
-    ready = orientation.apply(scene)
+    note_orientation(orientation, progress)
+    ready = taking_part(orientation.apply(scene), orientation)
     z_range = heights or heights_of_ties(ready, orientation, config.orientation)
     z = sum(z_range) / 2
     cell_m = request.resolution or float(f"{median_ground_pixel(ready, z):.2g}")

@@ -13,24 +13,26 @@ import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, GeometryError, OutputError
+from zlocus.errors import ConfigError, CoverageError, GeometryError, OutputError
 from zlocus.execution.memory import cores
 from zlocus.io.crs import checked_crs
 from zlocus.io.reference import says_nothing
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum
-from zlocus.matching.setup import shared_ground
+from zlocus.matching.setup import height_step, shared_ground
 from zlocus.options import OrientationOptions
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orient import RANGE_PERCENT, MeasuredTies, Orientation, height_range, orient, supported
+from zlocus.orientation.plausibility import Doubt
 from zlocus.progress import Progress
-from zlocus.scene import Scene, View, check_overlap, footprint, is_local, is_shared
+from zlocus.scene import Scene, View, check_overlap, footprint, ground_sample_distance, is_local, is_shared
 from zlocus.sensors.model import capped, lowest_station
 
 HEIGHT_SAMPLES = 5
 # Of the time that ties take, about: where it begins, and how much it is.
 SHARES = {"features": (0.0, 0.4), "matches": (0.4, 0.35)}
-MOST_NAMED = 12  # images in a message
+MOST_NAMED = 12  # images, or doubts, in a message
+PAIR = 2  # images that a height takes
 # Ground lies between these on Earth.
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 # Depths below the lowest camera at which footprints are looked at, in equal ratios.
@@ -242,6 +244,66 @@ def note_dem(dem: Path | None, given: str | None, progress: Progress) -> None:
         progress.note(
             f"{dem} does not say what its heights are above: taken to be ellipsoidal. Where they are above a geoid, as "
             "those of most terrain models, give it with --dem-vertical egm96|egm2008|FILE."
+        )
+
+
+def taking_part(scene: Scene, orientation: Orientation) -> Scene:
+    """The scene of the images that tie points support; the others take no part in the matching.
+
+    Raises
+    ------
+    CoverageError
+        Where fewer than two images are supported, so that nothing can be matched.
+    GeometryError
+        Where the reason is that all images look along the same line.
+    """
+    left_out = {each.name for each in orientation.left_out}
+    views = tuple(view for view in scene.views if view.name not in left_out)
+    if len(views) >= PAIR:
+        return replace(scene, views=views)
+    if all(view.sensor.height_bounds() is not None for view in scene.views):
+        levels = possible_heights(scene, scene.heights)
+        middle = levels[len(levels) // 2]
+        height_step(scene.views, middle, ground_sample_distance(scene.views[0], middle), 1.0)  # refuses such images
+    names = [view.name for view in scene.views]
+    told = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+    raise CoverageError(
+        f"No two images are held together by tie points (looked at: {told}), so nothing was matched. Check that they "
+        "show the same ground and that each camera belongs to its image; where cameras may be far off, set a larger "
+        "orientation.max_pointing_px in --config."
+    )
+
+
+def note_orientation(orientation: Orientation, progress: Progress) -> None:
+    """Say which corrections were applied, which images take no part, and what is doubtful."""
+    progress.note(what_was_applied(orientation))
+    for left_out in orientation.left_out[:MOST_NAMED]:
+        progress.note(str(left_out))
+    if len(orientation.left_out) > MOST_NAMED:
+        progress.note(f"{len(orientation.left_out) - MOST_NAMED} more images take no part: see run.json.")
+    note_doubts(orientation.doubts, progress)
+
+
+def note_doubts(doubts: Sequence[Doubt], progress: Progress) -> None:
+    """Say what is doubtful."""
+    for doubt in doubts[:MOST_NAMED]:
+        progress.note(doubt.sentence)
+    if len(doubts) > MOST_NAMED:
+        progress.note(f"There are {len(doubts) - MOST_NAMED} more doubts about the cameras: see run.json.")
+
+
+def check_doubts(doubts: Sequence[Doubt], made: Path) -> None:
+    """Refuse to call a run a success whose heights are likely to be wrong. made : what was written all the same.
+
+    Raises
+    ------
+    CoverageError
+        With the first of the grave doubts.
+    """
+    grave = [doubt for doubt in doubts if doubt.is_grave]
+    if grave:
+        raise CoverageError(
+            f"The heights in {made} are likely to be wrong. {grave[0].sentence} Accept them with --partial."
         )
 
 

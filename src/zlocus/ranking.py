@@ -19,9 +19,10 @@ from zlocus.preparing import (
     heights_asked_for,
     heights_of_ties,
     made_folder,
+    note_orientation,
     opened_alone,
     oriented,
-    what_was_applied,
+    taking_part,
 )
 from zlocus.products.points import counted_pairs, label_counts, write_ranking, write_ties
 from zlocus.products.record import Stopwatch, made_record, write_record
@@ -46,8 +47,9 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     with watch.stage("orient"):
         orientation = oriented(scene, config.orientation, scene.heights, progress)
         check_ties(orientation, scene)
-        progress.note(what_was_applied(orientation))
+        note_orientation(orientation, progress)
         scene = orientation.apply(scene)
+        used = taking_part(scene, orientation)
     with watch.stage("rank"):
         if scene.heights is None:
             z_range = heights_of_ties(scene, orientation, config.orientation)
@@ -56,9 +58,9 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
         z = sum(z_range) / 2
         cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
         check_resolution(cell, scene, z, "--resolution")
-        grid = grid_from_bounds(area_to_match(scene, orientation, z_range), cell, scene.crs)
+        grid = grid_from_bounds(area_to_match(used, orientation, z_range), cell, scene.crs)
         settled = settle(
-            scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, None, config.pyramid, orientation.measured
+            used, grid.cell_m, grid.anchor, z_range, orientation.xyz, None, config.pyramid, orientation.measured
         )
         tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
         ranked = []

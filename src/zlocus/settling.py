@@ -19,19 +19,25 @@ from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, vertical_datum
 from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import Orientation
+from zlocus.orientation.orient import Orientation, supported
+from zlocus.orientation.plausibility import Doubt
 from zlocus.preparing import (
     area_to_match,
     asked_crs,
     heights_asked_for,
     heights_of_ties,
     note_dem,
+    note_doubts,
     possible_heights,
+    taking_part,
     with_heights,
 )
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
 from zlocus.scene import Scene, check_overlap, is_local
+
+# Tie points that it takes to doubt a DEM, or the cameras.
+FEWEST_TO_COMPARE = 20
 
 
 @dataclass(frozen=True)
@@ -47,13 +53,14 @@ class Opened:
 @dataclass(frozen=True)
 class Settled:
     """What all tiles share. scene : with corrected cameras; z_range : heights searched, m; matching : what a tile is
-    matched with."""
+    matched with; doubts : about the cameras."""
 
     scene: Scene
     orientation: Orientation
     z_range: tuple[float, float]
     grid: Grid
     matching: MatchScene
+    doubts: tuple[Doubt, ...] = ()
 
 
 def opened(request: DsmRequest, progress: Progress) -> Opened:
@@ -68,14 +75,18 @@ def settled_run(
     request: DsmRequest, found: Opened, orientation: Orientation, config: RunConfig, progress: Progress
 ) -> Settled:
     """Heights, grid and lattice of a scene whose orientation is known."""
-    scene = orientation.apply(found.scene)
+    corrected = orientation.apply(found.scene)
+    scene = taking_part(corrected, orientation)
     z_range = _searched_heights(request, scene, orientation, config, progress)
     grid = _grid(request, found.like, scene, orientation, z_range)
     matching = settle(
         scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
         orientation.measured,
     )  # fmt: skip
-    return Settled(scene, orientation, z_range, grid, _with_dem(request, matching, scene.crs, config))
+    far = () if request.dem is None else ties_far_from_dem(request, scene, orientation, config)
+    note_doubts(far, progress)
+    matching = _with_dem(request, matching, scene.crs, config)
+    return Settled(corrected, orientation, z_range, grid, matching, (*orientation.doubts, *far))
 
 
 def _scene(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
@@ -130,6 +141,32 @@ def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunCon
     dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
     limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
     return replace(settled, prior=limits)
+
+
+def ties_far_from_dem(
+    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig
+) -> tuple[Doubt, ...]:
+    """A doubt where the tie points lie farther from the DEM than is searched around it."""
+    assert request.dem is not None, "callers make sure"
+    xyz = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
+    if len(xyz) < FEWEST_TO_COMPARE:
+        return ()
+    (west, south), (east, north) = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+    cell = median_ground_pixel(scene, float(np.median(xyz[:, 2]))) * 16
+    geobox = grid_from_bounds((west - cell, south - cell, east + cell, north + cell), cell, scene.crs).geobox
+    heights = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical), may_miss=True)
+    col, row = ~geobox.transform * (xyz[:, 0], xyz[:, 1])
+    above = xyz[:, 2] - heights[np.floor(row).astype(int), np.floor(col).astype(int)]
+    above = above[np.isfinite(above)]
+    if not len(above) or -config.pyramid.dem_down_m <= np.median(above) <= config.pyramid.dem_up_m:
+        return ()
+    return (
+        Doubt(
+            f"The tie points lie {np.median(above):+.0f} m from {request.dem} (median), beyond what is searched around "
+            "it. Check the cameras, and with --dem-vertical what the heights of the DEM are above.",
+            is_grave=True,
+        ),
+    )
 
 
 def _grid(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -38,18 +39,25 @@ class Told:
 
     findings: list[Finding] = field(default_factory=list)
 
-    def tried(self, step: Callable[[], T], about: tuple[str, ...] = ()) -> T | None:
-        """What a step gives; where it fails a run would too, and its sentence is kept."""
+    @contextmanager
+    def warned(self) -> Iterator[None]:
+        """Keep what is warned of meanwhile."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", ZlocusWarning)
+            try:
+                yield
+            finally:
+                ours = [each.message for each in caught if issubclass(each.category, ZlocusWarning)]
+                self.findings += [Finding(POOR, str(message)) for message in ours]
+
+    def tried(self, step: Callable[[], T], about: tuple[str, ...] = ()) -> T | None:
+        """What a step gives; where it fails a run would too, and its sentence is kept."""
+        with self.warned():
             try:
                 return step()
             except ZlocusError as error:
                 self.findings.append(Finding(STOPS, str(error), about))
                 return None
-            finally:
-                ours = [each.message for each in caught if issubclass(each.category, ZlocusWarning)]
-                self.findings += [Finding(POOR, str(message)) for message in ours]
 
 
 def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) -> Diagnosis:
@@ -61,7 +69,7 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
         Where nothing can be looked at, or written.
     """
     told = Told()
-    with progress.stage("Opening images"):
+    with progress.stage("Opening images"), told.warned():
         usable = open_usable(request.inputs, asked_crs(request.crs))
     told.findings += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
     scene = usable.scene

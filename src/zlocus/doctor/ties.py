@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from zlocus.doctor.findings import POOR, Finding, poor
+from zlocus.doctor.findings import POOR, STOPS, Finding, poor
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions, RunConfig
 from zlocus.orientation.orient import Orientation
 from zlocus.overlap import PairGeometry
-from zlocus.preparing import heights_asked_for, heights_of_ties, oriented
+from zlocus.preparing import PAIR, heights_asked_for, heights_of_ties, oriented
 from zlocus.progress import Progress
 from zlocus.scene import Scene
 
@@ -19,7 +19,6 @@ QUICK_FEATURES = 4000
 LARGE_MPX, LARGE_DETAIL = 4.0, 1.0 / 16.0
 # Limits of what is told.
 EXPECTED_OVERLAP = 0.2
-POOR_RESIDUAL_PX = 0.3
 FEW_TIES = 30
 NEAR_LIMIT = 0.7
 
@@ -85,21 +84,14 @@ def tie_findings(
 ) -> list[Finding]:
     """What the ties let expect, in sentences."""
     findings = []
+    left_out = {each.name: each.reason for each in found.left_out}
     for view in found.views:
         moved = max(map(abs, view.shift_px))
-        if not view.n_ties:
-            sentence = (
-                "no tie point was found in it, so its camera is used as delivered, however far it is off. Check that "
-                "it shows the same ground as the others and that its camera belongs to it."
-            )
+        if view.name in left_out:
+            sentence = f"it takes no part: {left_out[view.name]}"
         elif view.n_ties < FEW_TIES:
             sentence = f"only {view.n_ties} tie points hold its camera. Its correction may be off."
-        elif view.after.median > POOR_RESIDUAL_PX:
-            sentence = (
-                f"its tie points still lie {view.after.median:.2f} px off after the correction (median). Its camera "
-                "has an error that the correction cannot take: try `zlocus orient`, or ask for better cameras."
-            )
-        elif moved > NEAR_LIMIT * options.max_pointing_px:
+        elif NEAR_LIMIT * options.max_pointing_px < moved <= options.max_pointing_px:
             sentence = (
                 f"its camera is off by {moved:.0f} px, close to the {options.max_pointing_px:g} px within which ties "
                 "are looked for. Set a larger orientation.max_pointing_px in --config."
@@ -107,11 +99,13 @@ def tie_findings(
         else:
             continue
         findings.append(poor(view.name, sentence))
+    if len(found.views) - len(left_out) < PAIR:
+        findings.append(Finding(STOPS, "No two images are held together by tie points: a run will match nothing."))
+    findings += [Finding(STOPS if doubt.is_grave else POOR, doubt.sentence) for doubt in found.doubts]
     tied = {frozenset(pair.views) for pair in found.pairs}
-    alone = {view.name for view in found.views if not view.n_ties}
     for pair in pairs:
         a, b = (names[i] for i in pair.views)
-        if pair.overlap > EXPECTED_OVERLAP and frozenset((a, b)) not in tied and not {a, b} & alone:
+        if pair.overlap > EXPECTED_OVERLAP and frozenset((a, b)) not in tied and not {a, b} & left_out.keys():
             findings.append(
                 Finding(
                     POOR,

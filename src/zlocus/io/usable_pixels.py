@@ -16,8 +16,9 @@ LARGEST_GREY = 2.0**32
 # A border of one value is looked for at so many places along every side of an image, and is at least so many pixels
 # wide at one of them.
 PLACES, LEAST_WIDTH_PX = 24, 8
-# It fills at least this share of the image; less is a dark corner or a bright roof.
-LEAST_SHARE = 1e-3
+# It fills at least this share of the image; less is a dark corner or a bright roof. And it holds at least this share of
+# the pixels of its value; else the value is a grey value that the image has elsewhere too, as a saturated one has.
+LEAST_SHARE, LEAST_SHARE_OF_VALUE = 1e-3, 0.5
 BAND_ROWS = 256  # read at a time
 
 
@@ -66,8 +67,10 @@ def border_plateau(image: ImageSource) -> BorderPlateau | None:
         return None
     left, right = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     first_other, last_other = np.full(cols, rows), np.full(cols, -1)
+    n_of_value = 0
     for row, count in bands(rows):
         window = image.read(row, 0, count, cols)
+        n_of_value += int((window.valid & (window.pixels == value)).sum())
         is_other = window.valid & (window.pixels != value)
         has_other = is_other.any(axis=1)
         left[row : row + count] = np.where(has_other, is_other.argmax(axis=1), cols)
@@ -76,7 +79,8 @@ def border_plateau(image: ImageSource) -> BorderPlateau | None:
         first_other[here] = np.minimum(first_other[here], row + is_other[:, here].argmax(axis=0))
         last_other[here] = row + count - 1 - is_other[::-1, here].argmax(axis=0)
     found = BorderPlateau(value, left, right, first_other.astype(np.int64), (rows - 1 - last_other).astype(np.int64))
-    return found if found.n_pixels >= LEAST_SHARE * rows * cols else None
+    is_large = found.n_pixels >= LEAST_SHARE * rows * cols
+    return found if is_large and found.n_pixels >= LEAST_SHARE_OF_VALUE * n_of_value else None
 
 
 def _value_at_border(image: ImageSource) -> float | None:

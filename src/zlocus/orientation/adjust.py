@@ -24,6 +24,8 @@ SEEN_INFORMATION = 0.01
 # Shifts like a translation of the ground that are not unseen, by more than this sine, need the information that counts
 # for two images, however many there are: no chain of images adds any to them.
 APART_SINE = 0.5
+# Below this size, px, a shift is as good as none where it is decided which images keep their place.
+NO_SHIFT_PX, MAJORITY_ROUNDS, MOST_SUSPECTS = 1.0, 30, 12
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,53 @@ def adjust(
     points = triangulate(sensors, moved(seen, shift), xyz)
     before = triangulate(sensors, seen, points.xyz, by_ground=points.by_ground)
     return Adjustment(shift, n_seen, seen, points, before.residual, numbers)
+
+
+def with_datum_of_most(sensors: Sequence[SensorModel], found: Adjustment, options: OrientationOptions) -> Adjustment:
+    """The same adjustment with the common translation of ground and images that leaves most images where they were.
+
+    Ties do not see that translation. Among errors of a few pixels the least squares of all shifts are a good choice.
+    One image that is far off would draw the ground, and with it all other images, a part of the way along. So the sum
+    of the logarithms of the shifts' lengths is minimised instead, which few large shifts please more than many small
+    ones (iteratively reweighted least squares, begun without each of the images that moved most in turn).
+    """
+    n_views = len(found.shift_px)
+    tied = np.bincount(found.seen.view, minlength=n_views) > 0
+    basis = translations(found.seen, found.points, np.ones(len(found.seen)), n_views)
+    begun = [moved_least(found.shift_px, basis, tied, suspect) for suspect in _farthest(found.shift_px, tied)]
+    shift_px = min(begun, key=lambda shift: _sum_of_logarithms(shift[tied]))
+    points = triangulate(sensors, moved(found.seen, shift_px), found.points.xyz)
+    # A translation is not quite a shift of every image: the rest is solved for.
+    shift_px, _ = solve_shifts(sensors, found.seen, points.xyz, options.prior_px, shift_px)
+    points = triangulate(sensors, moved(found.seen, shift_px), points.xyz)
+    before = triangulate(sensors, found.seen, points.xyz, by_ground=points.by_ground)
+    return Adjustment(shift_px, found.n_seen, found.seen, points, before.residual, found.numbers)
+
+
+def moved_least(shift_px: FloatArray, basis: FloatArray, tied: NDArray[np.bool_], suspect: int) -> FloatArray:
+    """Shifts (i, 2) px plus the translation that leaves most images where they were, looked for from a first guess in
+    which one image, `suspect`, has no say.
+
+    basis : (2 i, k), see `translations`; tied : (i,) images that have a say.
+    """
+    start, weight = shift_px.ravel(), np.where(np.arange(len(tied)) == suspect, 0.0, tied.astype(float))
+    moved_shift = shift_px
+    for _ in range(MAJORITY_ROUNDS):
+        of_row = np.repeat(weight, 2)[:, None]
+        step = np.linalg.lstsq(basis.T @ (of_row * basis), basis.T @ (of_row[:, 0] * start), rcond=1e-9)[0]
+        moved_shift = (start - basis @ step).reshape(-1, 2)
+        weight = tied / ((moved_shift**2).sum(axis=1) + NO_SHIFT_PX**2)
+    return np.where(tied[:, None], moved_shift, 0.0)
+
+
+def _farthest(shift_px: FloatArray, tied: NDArray[np.bool_]) -> list[int]:
+    """Numbers of the tied images that were moved farthest, at most `MOST_SUSPECTS`."""
+    order = np.argsort(-np.hypot(*shift_px.T), kind="stable")
+    return [int(number) for number in order if tied[number]][:MOST_SUSPECTS]
+
+
+def _sum_of_logarithms(shift_px: FloatArray) -> float:
+    return float(np.log((shift_px**2).sum(axis=1) + NO_SHIFT_PX**2).sum())
 
 
 def solve_shifts(

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from zlocus.errors import GeometryError
 from zlocus.options import OrientationOptions
-from zlocus.orientation.adjust import Adjustment, adjust, consistent, moved, renumbered
+from zlocus.orientation.adjust import Adjustment, consistent, moved, renumbered
 from zlocus.orientation.blocks import kind_of, needs_joint
 from zlocus.orientation.control import GroundControl, TerrainHeights
+from zlocus.orientation.corrections import Solver, views_left_out, without_contradictions
 from zlocus.orientation.locus import Sightlines, locate
+from zlocus.orientation.plausibility import Doubt, LeftOut, doubts_about
 from zlocus.orientation.sharpen import sharpened
 from zlocus.orientation.ties import Progress, Ties, find_ties, looseness
 from zlocus.orientation.triangulate import GroundPoints, Observations, ground_jacobian, rows_of_views, triangulate
@@ -132,7 +134,8 @@ class Orientation:
     seen: their observations; model: the kind of correction; n_seen: how many of the shifts' 2 i components the ties
     could show; z_bounds: the heights (m) within which ties were looked for; n_measured: the first so many ties were
     measured again and agree, the others look different from everywhere, see `with_rough_ties`; joint: where all cameras
-    were corrected jointly; ties: what was measured in the images.
+    were corrected jointly; ties: what was measured in the images; left_out: images that take no part in the matching;
+    doubts: about the cameras.
     """
 
     views: tuple[ViewOrientation, ...]
@@ -146,6 +149,8 @@ class Orientation:
     n_measured: int
     joint: JointAdjustment | None = None
     ties: MeasuredTies | None = None
+    left_out: tuple[LeftOut, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     def __repr__(self) -> str:
         """In a line: ties are thousands."""
@@ -220,6 +225,8 @@ class Orientation:
             "model": self.model,
             "n_ties": len(self.xyz),
             "unobservable": self.unobservable,
+            "left_out": {each.name: each.reason for each in self.left_out},
+            "doubts": [doubt.as_dict() for doubt in self.doubts],
         }
 
 
@@ -253,19 +260,14 @@ def orient(
         jacobian = ground_jacobian(sensors, ties.seen, xyz)
         precise = sharpened(scene.views, ties.seen, jacobian, options, threads)
         known = MeasuredTies(replace(ties, pairs=()), precise)
-    seen = known.precise
-    strict = replace(options, inlier_px=options.inlier_px * MEASURED_SHARE)
-    joint, corrected = None, sensors
-    if is_joint:
-        # SciPy's sparse matrices and linear algebra cost 0.2 s to import.
-        from zlocus.orientation.joint import adjust_jointly
-
-        joint = adjust_jointly(scene.views, seen, xyz, strict, control, terrain)
-        adjusted, corrected = joint.adjusted, list(joint.sensors)
-    else:
-        adjusted = adjust(sensors, seen, xyz, strict)
-    ground = with_rough_ties(adjusted, corrected, ties.seen, xyz, options.inlier_px * looseness(scene.views, options))
+    solve = Solver(scene, replace(options, inlier_px=options.inlier_px * MEASURED_SHARE), is_joint, control, terrain)
+    solved, wrong, contradictions = without_contradictions(solve, known.precise, xyz)
+    adjusted, corrected = solved.adjusted, solved.sensors
+    seen = ties.seen.kept(~np.isin(ties.seen.view, wrong))
+    ground = with_rough_ties(adjusted, corrected, seen, xyz, options.inlier_px * looseness(scene.views, options))
     views = tuple(view_orientation(view, i, adjusted, corrected[i]) for i, view in enumerate(scene.views))
+    heights = ground.xyz[supported(ground.xyz, ground.sigma_z_m), 2]
+    doubts = doubts_about(scene.views, [v.after.median for v in views], [v.shift_px for v in views], heights)
     return Orientation(
         views=views,
         pairs=pair_orientations(scene, corrected, adjusted, ties.z_range),
@@ -276,8 +278,10 @@ def orient(
         n_seen=adjusted.n_seen,
         z_bounds=ties.z_range,
         n_measured=len(adjusted.points.xyz),
-        joint=joint,
+        joint=solved.joint,
         ties=known,
+        left_out=views_left_out(scene, ties.seen, wrong, options),
+        doubts=(*contradictions, *doubts),
     )
 
 

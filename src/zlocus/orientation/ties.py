@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -26,6 +26,9 @@ PART_POINTS = 5  # along each side of a part, whose loci are looked at
 SAMPLE = 1000  # features of a pair's first search
 # Loci of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
 DEPTH_RATIO = 1.5
+# Images that tie to none are looked for this many times farther away from where their cameras point, beside so many of
+# the others; and are believed where they tie to so many that tie to each other.
+WIDER, MOST_PARTNERS, FEWEST_PARTNERS = 10.0, 6, 2
 
 
 @dataclass(frozen=True)
@@ -97,9 +100,37 @@ def find_ties(
         done += int(near[a, a + 1 :].sum())
         report("matches", done / n_pairs if n_pairs else 1.0)
     every = tuple(pair for a in sorted(pairs) for pair in pairs[a])
+    every += lost_images(scene.views, features, every, z_ranges, options)
     if len(z_ranges) > 1 and every:
         z_range = likely_range(np.concatenate([pair.z for pair in every]))
     return join_tracks(features, every, z_range)
+
+
+def lost_images(
+    views: Sequence[View],
+    features: Sequence[Features],
+    pairs: Sequence[PairMatches],
+    z_ranges: Sequence[tuple[float, float]],
+    options: OrientationOptions,
+) -> tuple[PairMatches, ...]:
+    """Matches of images that tie to no other within the pointing error that is looked for, found farther away.
+
+    pairs : the matches so far. Along its locus a shift cannot be told from a height, so an image that is far off counts
+    where it ties to several others that already tie to each other.
+    """
+    n_ties = np.zeros(len(views), np.int64)
+    for pair in pairs:
+        n_ties[list(pair.views)] += len(pair)
+    tied = np.argsort(-n_ties, kind="stable")[: int((n_ties > 0).sum())]
+    wide, found = replace(options, max_pointing_px=WIDER * options.max_pointing_px), []
+    for lost in np.flatnonzero(n_ties == 0).tolist():
+        lines = [Sightlines.of(views[lost].sensor, features[lost].xy, z_range) for z_range in z_ranges]
+        matches = [match_pair(views, features, (lost, int(b)), lines, wide) for b in tied[:MOST_PARTNERS]]
+        matches = [pair for pair in matches if len(pair)]
+        partners = {pair.views[1] for pair in matches}
+        if len(partners) >= FEWEST_PARTNERS and any(partners >= set(pair.views) for pair in pairs):
+            found += matches
+    return tuple(found)
 
 
 def slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tuple[float, float]]:

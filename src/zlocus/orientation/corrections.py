@@ -1,0 +1,135 @@
+"""The cameras of a scene corrected by its ties, without the images that contradict the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.options import OrientationOptions
+from zlocus.orientation.adjust import Adjustment, adjust, with_datum_of_most
+from zlocus.orientation.control import GroundControl, TerrainHeights
+from zlocus.orientation.plausibility import (
+    FEWEST_THAT_AGREE,
+    Doubt,
+    LeftOut,
+    agreeing_shares,
+    contradicting_views,
+    exchanged_views,
+    untied_views,
+)
+from zlocus.orientation.triangulate import Observations
+from zlocus.scene import Scene
+from zlocus.sensors.model import FloatArray, SensorModel
+
+if TYPE_CHECKING:
+    from zlocus.orientation.joint import JointAdjustment
+
+
+@dataclass(frozen=True)
+class Solved:
+    """adjusted : the ties; sensors : corrected, but for the shifts of `adjusted`; joint : where all were jointly."""
+
+    adjusted: Adjustment
+    sensors: list[SensorModel]
+    joint: JointAdjustment | None = None
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Corrects the cameras of a scene by ties. is_joint : all jointly, else one shift each; control, terrain : see
+    `orient`."""
+
+    scene: Scene
+    options: OrientationOptions
+    is_joint: bool
+    control: GroundControl | None
+    terrain: TerrainHeights | None
+
+    def __call__(self, seen: Observations, xyz: FloatArray) -> Solved:
+        """seen, xyz : observations and first ground points (n, 3) m of the ties."""
+        views, options = self.scene.views, self.options
+        sensors = [view.sensor for view in views]
+        if self.is_joint:
+            # SciPy's sparse matrices and linear algebra cost 0.2 s to import.
+            from zlocus.orientation.joint import adjust_jointly
+
+            joint = adjust_jointly(views, seen, xyz, options, self.control, self.terrain)
+            return Solved(joint.adjusted, list(joint.sensors), joint)
+        adjusted = adjust(sensors, seen, xyz, options)
+        if np.hypot(*adjusted.shift_px.T).max(initial=0.0) > options.max_pointing_px:
+            adjusted = with_datum_of_most(sensors, adjusted, options)
+        return Solved(adjusted, sensors)
+
+
+def without_contradictions(
+    solve: Solver, seen: Observations, xyz: FloatArray
+) -> tuple[Solved, NDArray[np.int64], list[Doubt]]:
+    """The cameras corrected without images that contradict the others, the numbers of these, and what is to be doubted.
+
+    Where too few images agree with each other all are kept, and doubted. seen, xyz : see `Solver`.
+    """
+    solved, nobody = solve(seen, xyz), np.empty(0, np.int64)
+    names = [view.name for view in solve.scene.views]
+    shares = agreeing_shares(seen, solved.adjusted, len(names))
+    wrong = contradicting_views(shares)
+    n_tied = len(np.unique(seen.view))
+    if solve.options.model == "none" or not n_tied:
+        return solved, nobody, []
+    doubts = []
+    sensors = [view.sensor for view in solve.scene.views]
+    # Of more images those that are exchanged contradict the others.
+    candidates = np.unique(seen.view) if n_tied <= FEWEST_THAT_AGREE else wrong
+    pair = exchanged_views(sensors, seen, xyz, candidates.tolist(), solve.options) if len(candidates) > 1 else None
+    if pair is not None:
+        one, other = (names[number] for number in pair)
+        doubts.append(
+            Doubt(
+                f"The cameras of {one} and {other} seem to be exchanged: with each other's, the tie points agree. Give "
+                "each image its own.",
+                is_grave=True,
+            )
+        )
+    if not len(wrong):
+        return solved, nobody, doubts
+    rest = ~np.isin(seen.view, wrong)
+    rest &= np.bincount(seen.point[rest], minlength=len(xyz))[seen.point] >= 2
+    if len(np.unique(seen.view[rest])) >= FEWEST_THAT_AGREE:
+        others = seen.kept(rest)
+        again = solve(others, xyz)
+        if not len(contradicting_views(agreeing_shares(others, again.adjusted, len(names)))):
+            return again, wrong, [replace(doubt, is_grave=False) for doubt in doubts]
+    told = ", ".join(f"{names[number]} ({100 * shares[number]:.0f} %)" for number in wrong)
+    doubts.append(
+        Doubt(
+            f"Only a part of the tie points of {told} agrees with the other images, and too few images agree for it to "
+            "be known which cameras are wrong. Check that each camera belongs to its image.",
+            is_grave=True,
+        )
+    )
+    return solved, nobody, doubts
+
+
+def views_left_out(
+    scene: Scene, found: Observations, wrong: NDArray[np.int64], options: OrientationOptions
+) -> tuple[LeftOut, ...]:
+    """Images that take no part. found : observations of all ties; wrong : numbers of those that contradict others."""
+    untied = untied_views(found, len(scene.views))
+    left_out = []
+    for number, view in enumerate(scene.views):
+        if number in wrong:
+            reason = (
+                "most of its tie points contradict those of the other images, which agree with each other. Check that "
+                "its camera belongs to it."
+            )
+        elif untied[number]:
+            reason = (
+                f"no tie point with another image supports it, within {options.max_pointing_px:g} px of where its "
+                "camera points. Check that it shows the same ground and that its camera belongs to it."
+            )
+        else:
+            continue
+        left_out.append(LeftOut(view.name, reason))
+    return tuple(left_out)
