@@ -12,13 +12,12 @@ from orientation_scenes import image_of
 from rendered_scenes import CENTRE, UTM, line_scanner
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.ground_pixels import check_resolution, median_ground_pixel
 from zlocus.matching.radiometry import grey_scales
 from zlocus.matching.setup import (
-    check_resolution,
     height_step,
     leading_first,
     levels_for,
-    median_ground_pixel,
     nadir_offset,
     seen_window,
     settle,

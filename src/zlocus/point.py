@@ -9,7 +9,8 @@ import numpy as np
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.cells import CellWindow
-from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle
+from zlocus.matching.ground_pixels import check_resolution, default_cell
+from zlocus.matching.setup import MatchScene, settle
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import supported
 from zlocus.place import NEAREST_TIES, Place, cell_of, curves_at, height_nearby
@@ -50,13 +51,13 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
     ready = taking_part(orientation.apply(scene), orientation)
     z_range = heights or heights_of_ties(ready, orientation, config.orientation)
     z = sum(z_range) / 2
-    cell_m = request.resolution or float(f"{median_ground_pixel(ready, z):.2g}")
+    cell_m = request.resolution or default_cell(ready, z)
     check_resolution(cell_m, ready, z, "--resolution")
     settled = settle(
         ready, cell_m, (0.0, 0.0), z_range, orientation.xyz, request.reference, config.pyramid, orientation.measured
     )
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
-    place = located(request, settled, ties)
+    place = located(request, ready, settled, ties)
     with progress.stage("Match curves"):
         looked = curves_at(asked(request), request.reference, settled, place, config)
     report = PointReport.of(asked(request), looked, settled, scene.crs)
@@ -93,8 +94,9 @@ def check_views(request: CurvesRequest, scene: Scene) -> None:
         )
 
 
-def located(request: CurvesRequest, settled: MatchScene, ties: FloatArray) -> Place:
-    """The point on the ground, at the height asked for, else at that of the ties around it. ties : (n, 3) m.
+def located(request: CurvesRequest, scene: Scene, settled: MatchScene, ties: FloatArray) -> Place:
+    """The point on the ground, at the height asked for, else at that of the ties around it. scene : with
+    corrected cameras of the images as they are; ties : (n, 3) m.
 
     Raises
     ------
@@ -107,7 +109,7 @@ def located(request: CurvesRequest, settled: MatchScene, ties: FloatArray) -> Pl
         xy = np.array(request.at)
         z = height_nearby(xy, ties) if request.height is None else request.height
     else:
-        xy, z = pixel_on_ground(request, settled, ties)
+        xy, z = pixel_on_ground(request, scene, ties)
     source = "as asked for"
     if request.height is None:
         away = float(np.hypot(*(ties[:, :2] - xy).T).min())
@@ -118,11 +120,11 @@ def located(request: CurvesRequest, settled: MatchScene, ties: FloatArray) -> Pl
     return Place(np.array([*xy, z]), source, cell, middle)
 
 
-def pixel_on_ground(request: CurvesRequest, settled: MatchScene, ties: FloatArray) -> tuple[FloatArray, float]:
+def pixel_on_ground(request: CurvesRequest, scene: Scene, ties: FloatArray) -> tuple[FloatArray, float]:
     """Where a pixel meets the ground, (2,) m and its height: of the ties around the place, which the height moves."""
     assert request.pixel is not None
     name, row, col = request.pixel
-    (sensor,) = (view.sensor for view in settled.views if view.name == name)
+    (sensor,) = (view.sensor for view in scene.views if view.name == name)
     z = float(np.median(ties[:, 2])) if request.height is None else request.height
     seen: list[float] = []
     while True:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
+from zlocus.matching.ground_pixels import check_resolution, default_cell
 from zlocus.matching.ranking import RankedPoints
-from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
+from zlocus.matching.setup import settle
 from zlocus.options import RunConfig
 from zlocus.orienting import check_ties
 from zlocus.preparing import (
@@ -56,7 +57,7 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
         else:
             z_range = heights_asked_for(scene, scene.heights, progress)
         z = sum(z_range) / 2
-        cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
+        cell = request.resolution or default_cell(scene, z)
         check_resolution(cell, scene, z, "--resolution")
         grid = grid_from_bounds(area_to_match(used, orientation, z_range), cell, scene.crs)
         settled = settle(

@@ -17,7 +17,8 @@ from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.io.reference import dem_datum, read_dem, read_geobox
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, vertical_datum
-from zlocus.matching.setup import MatchScene, check_resolution, median_ground_pixel, settle, shared_ground
+from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
+from zlocus.matching.setup import MatchScene, settle, shared_ground
 from zlocus.options import RunConfig
 from zlocus.orientation.orient import Orientation, supported
 from zlocus.orientation.plausibility import Doubt
@@ -178,7 +179,7 @@ def _grid(
         grid = grid_from_geobox(like, str(request.like))
         check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
         return grid
-    cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
+    cell = request.resolution or default_cell(scene, z)
     check_resolution(cell, scene, z, "--resolution")
     bounds = request.bounds or area_to_match(scene, orientation, z_range)
     return grid_from_bounds(bounds, cell, scene.crs)

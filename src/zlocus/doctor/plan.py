@@ -15,7 +15,8 @@ from zlocus.errors import GeometryError
 from zlocus.execution.memory import WORKER_BYTES
 from zlocus.execution.plan import plan_tiles, tile_needs
 from zlocus.grid import grid_from_bounds
-from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
+from zlocus.matching.ground_pixels import check_resolution, default_cell
+from zlocus.matching.setup import settle
 from zlocus.options import RunConfig
 from zlocus.preparing import area_to_match
 from zlocus.request import DoctorRequest
@@ -58,7 +59,7 @@ def run_plan(
         Where a run would stop for the same reason.
     """
     z_range, z = ties.z_range, sum(ties.z_range) / 2
-    cell = request.resolution or float(f"{median_ground_pixel(scene, z):.2g}")
+    cell = request.resolution or default_cell(scene, z)
     check_resolution(cell, scene, z, "--resolution")
     bounds = area_to_match(scene, ties.orientation, z_range)
     grid = grid_from_bounds(bounds, cell, scene.crs)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from zlocus.errors import ConfigError, GeometryError
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.ground_pixels import with_common_pixel
 from zlocus.matching.radiometry import GreyScale, grey_scales
 from zlocus.matching.views import MARGIN_PX
 from zlocus.options import PyramidOptions
 from zlocus.scene import ColourSource, Scene, View, footprint, ground_box, ground_sample_distance
 from zlocus.sensors.model import Scanning, bare
 
-FINEST_CELL = 0.1
 ON_GRID = 1e-6
 FEWEST_LEVELS = 3
 SHARED_SAMPLES, GROUND_SAMPLES = 9, 65
@@ -105,21 +105,6 @@ def leading_first(scene: Scene, z: float, reference: str | None) -> tuple[View, 
     slant = [float(np.hypot(*nadir_offset(view, z))) for view in scene.views]
     order = sorted(range(len(names)), key=lambda i: (names[i] != reference, slant[i], names[i]))
     return tuple(scene.views[i] for i in order)
-
-
-def median_ground_pixel(scene: Scene, z: float) -> float:
-    """Median over the views of the ground pixel, m."""
-    return float(np.median([ground_sample_distance(view, z) for view in scene.views]))
-
-
-def check_resolution(resolution: float, scene: Scene, z: float, given: str) -> None:
-    """Refuse cells much finer than the images. given : what asked for the resolution, for the message."""
-    pixel = min(ground_sample_distance(view, z) for view in scene.views)
-    if resolution < FINEST_CELL * pixel:
-        raise ConfigError(
-            f"{given} {resolution:g} m is finer than a tenth of the finest image's pixel ({pixel:.3g} m on the "
-            f"ground). Ask for {pixel:.2g} m or a few times that."
-        )
 
 
 def shared_ground(scene: Scene, z_range: tuple[float, float]) -> tuple[float, float, float, float]:
@@ -271,10 +256,11 @@ def settle(
 ) -> MatchScene:
     """Lattice of heights, levels and extent of a scene.
 
-    z_range : m; ties : (n, 3) m; see `MatchScene`. ground : (k, 3) m, where grey values compare; None: at the ties.
+    z_range : m; ties : (n, 3) m; see `MatchScene`. ground : (k, 3) m, where grey values compare; None: at the ties. An
+    image that is much finer than all others is reduced, see `with_common_pixel`.
     """
     z = (z_range[0] + z_range[1]) / 2
-    views = leading_first(scene, z, reference)
+    views = with_common_pixel(leading_first(scene, z, reference), z)
     step = height_step(views, z, cell_m, options.max_shift_px)
     n_steps = max(int(np.ceil((z_range[1] - z_range[0]) / step)), 4)
     levels = levels_for(n_steps, options)

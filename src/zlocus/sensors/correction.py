@@ -1,4 +1,4 @@
-"""Orientation corrections laid over a sensor model: a shift in the image, or an affine map of it."""
+"""What is laid over a sensor model: a shift in the image, an affine map of it, or larger pixels."""
 
 from __future__ import annotations
 
@@ -70,3 +70,23 @@ class AffineModel:
     def _growth(self) -> FloatArray:
         """(2, 2) corrected image positions per px of those that `base` projects."""
         return np.asarray(np.eye(2) + np.array([self.column[1:], self.row[1:]]), float)
+
+
+@dataclass(frozen=True)
+class ReducedModel:
+    """A sensor model of an image whose pixels are `factor` x `factor` pixels of the one that `base` is of."""
+
+    base: SensorModel
+    factor: int
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return np.asarray((self.base.image_from_ground(xyz) + 0.5) / self.factor - 0.5, float)
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return self.base.ground_from_image((np.asarray(xy, float) + 0.5) * self.factor - 0.5, z)
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`."""
+        return self.base.height_bounds()

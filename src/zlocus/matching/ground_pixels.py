@@ -1,0 +1,150 @@
+"""Images of one ground pixel: which cells a set of images supports, and the finest image reduced to the others.
+
+A correlation compares what both images resolve. Beside an image of coarser pixels a finer one shows details that the
+other does not have, and in cells much finer than the coarser pixels windows hold less than one of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.errors import ConfigError
+from zlocus.scene import ColourSource, ImageSource, ImageWindow, Scene, View, ground_sample_distance
+from zlocus.sensors.correction import ReducedModel
+
+# Cells are not finer than this share of the finest image's ground pixel.
+FINEST_CELL = 0.1
+# The finest image is reduced, and bounds what cells may be asked for, where the second finest has ground pixels more
+# than this many times as large. At twice the size all is well without.
+MIXED_RATIO = 2.2
+# Cells are not finer than this share of the second finest image's ground pixel in such a scene: two images are needed.
+FINEST_MIXED_CELL = 0.5
+
+
+@dataclass(frozen=True)
+class ReducedImage:
+    """An image whose pixels are the means of `factor` x `factor` pixels of another, valid where most of them are.
+
+    Rows and columns at the end that fill no whole pixel are dropped.
+    """
+
+    base: ImageSource
+    factor: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        rows, cols = self.base.shape
+        return rows // self.factor, cols // self.factor
+
+    @property
+    def dtype(self) -> str:
+        """See `ImageSource`."""
+        return self.base.dtype
+
+    def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+        """See `ImageSource`."""
+        window = self.base.read(*(number * self.factor for number in (row, col, rows, cols)))
+        share = self._means(window.valid.astype(np.float32))
+        total = self._means(np.where(window.valid, window.pixels, np.float32(0.0)))
+        valid = share > 0.5
+        return ImageWindow(np.where(valid, total / np.maximum(share, np.float32(1e-6)), np.float32(0.0)), valid)
+
+    @property
+    def has_colours(self) -> bool:
+        """See `ColourSource`."""
+        return isinstance(self.base, ColourSource) and self.base.has_colours
+
+    def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
+        """See `ColourSource`."""
+        assert isinstance(self.base, ColourSource), "callers ask whether it has colours"
+        full = self.base.colours(*(number * self.factor for number in (row, col, rows, cols)))
+        return np.stack([self._means(band) for band in full])
+
+    def _means(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        rows, cols = (size // self.factor for size in values.shape)
+        return np.asarray(values.reshape(rows, self.factor, cols, self.factor).mean(axis=(1, 3)), np.float32)
+
+
+def median_ground_pixel(scene: Scene, z: float) -> float:
+    """Median over the views of the ground pixel, m."""
+    return float(np.median(ground_pixels(scene.views, z)))
+
+
+def ground_pixels(views: Sequence[View], z: float) -> list[float]:
+    """Ground pixel of every view at height z (m), m."""
+    return [ground_sample_distance(view, z) for view in views]
+
+
+def default_cell(scene: Scene, z: float) -> float:
+    """Side of the cells where none is asked for, m, to two digits: the median ground pixel.
+
+    Where all images but one are much coarser, it is that of the second finest image.
+    """
+    common = common_pixel(ground_pixels(scene.views, z))
+    pixel = median_ground_pixel(scene, z)
+    return float(f"{pixel if common is None else max(pixel, common):.2g}")
+
+
+def common_pixel(pixels: Sequence[float]) -> float | None:
+    """Ground pixel (m) of the second finest image where it is much coarser than the finest; else None."""
+    finest = sorted(pixel for pixel in pixels if np.isfinite(pixel))[:2]
+    return finest[1] if len(finest) == 2 and finest[1] > MIXED_RATIO * finest[0] else None
+
+
+def check_resolution(resolution: float, scene: Scene, z: float, given: str) -> None:
+    """Refuse cells much finer than the images. given : what asked for the resolution, for the message.
+
+    Raises
+    ------
+    ConfigError
+        The cells are finer than a tenth of the finest image's ground pixel, or than half of the second finest image's
+        in a scene of mixed ground pixels.
+    """
+    pixels = ground_pixels(scene.views, z)
+    finest, common = min(pixels), common_pixel(pixels)
+    if resolution < FINEST_CELL * finest:
+        raise ConfigError(
+            f"{given} {resolution:g} m is finer than a tenth of the finest image's pixel ({finest:.3g} m on the "
+            f"ground). Ask for {finest:.2g} m or a few times that."
+        )
+    if common is not None and resolution < FINEST_MIXED_CELL * common:
+        name = scene.views[int(np.argmin(pixels))].name
+        raise ConfigError(
+            f"{given} {resolution:g} m is too fine: two images are compared in every cell, and only {name} has pixels "
+            f"of {finest:.2g} m on the ground, the next has {common:.2g} m. Ask for "
+            f"{rounded_up(FINEST_MIXED_CELL * common):g} m or more, or add another fine image."
+        )
+
+
+def rounded_up(size: float) -> float:
+    """The next larger number of two digits."""
+    unit = 10.0 ** (math.floor(math.log10(size)) - 1)
+    return float(f"{math.ceil(size / unit - 1e-9) * unit:.6g}")
+
+
+def with_common_pixel(views: Sequence[View], z: float) -> tuple[View, ...]:
+    """The views, of which the finest is reduced to about the ground pixel of the second finest, if that is much larger.
+
+    z : m, a height of the ground.
+    """
+    pixels = ground_pixels(views, z)
+    common = common_pixel(pixels)
+    if common is None:
+        return tuple(views)
+    return tuple(
+        reduced(view, max(round(common / pixel), 1)) if pixel < common else view
+        for view, pixel in zip(views, pixels, strict=True)
+    )
+
+
+def reduced(view: View, factor: int) -> View:
+    """A view whose image has `factor` times larger pixels."""
+    if factor == 1:
+        return view
+    return replace(view, image=ReducedImage(view.image, factor), sensor=ReducedModel(view.sensor, factor))
