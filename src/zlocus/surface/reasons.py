@@ -12,10 +12,12 @@ class Quality(IntFlag):
     """Bits of `quality.tif`. The first eight empty a cell, the others only warn."""
 
     OUTSIDE = 1  # not asked for: outside the area, or inside a mask
-    UNSEEN = 2  # fewer than two images cover the cell at the height of the ground around it
+    UNSEEN = (
+        2  # fewer than two images cover the cell at the height of the ground around it, or support a height above it
+    )
     HIDDEN = 4  # fewer than two images see the surface there, the others are behind it
     RANGE_END = 8  # best match at an end of the height range: the true height may lie beyond it
-    NO_MATCH = 16  # images do not agree at any height
+    NO_MATCH = 16  # images do not agree at any height, or heights at the border are noise
     FAILED = 32  # its tile could not be processed
     UNCONFIRMED = 64  # no other image finds the same height when matched back (image space only)
     IMPRECISE = 128  # its standard deviation is larger than asked for (checks.most_sigma_m)
