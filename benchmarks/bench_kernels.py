@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from zlocus.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.kernels.mgm import sweep_quarter
 from zlocus.kernels.reach import block_reach
 from zlocus.kernels.refine import CUBIC, tile_ortho, tile_profile
@@ -25,6 +26,7 @@ from zlocus.kernels.smooth import slopes, smooth_surface
 from zlocus.kernels.spline import spline_coefficients
 from zlocus.kernels.visibility import lowest_visible
 from zlocus.kernels.volume import flat_cells, tile_costs
+from zlocus.matching.free_rays import pair_agreement
 from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.refine import smoothed
 from zlocus.products.hillshade import hillshade
@@ -234,6 +236,36 @@ def visibility_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) 
     return Case(lambda: lowest_visible(surface, by_col, by_row, out), surface.size, "cell")
 
 
+def free_ray_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) -> Case:
+    """The lowest ray of a view to a surface of which it clearly sees two thirds."""
+    surface, out = rolling(side), np.empty((side, side), np.float32)
+    supported = np.random.default_rng(2).random(surface.shape) < 0.67
+    return Case(lambda: lowest_free_ray(surface, supported, by_col, by_row, out), surface.size, "cell")
+
+
+def ray_costs_case(side: int = SIDE, n_views: int = 6, count: int = 32) -> Case:
+    """Costs of rays on a volume, in a tenth of whose cells two views have a ray below some of the heights."""
+    rng = np.random.default_rng(3)
+    blocks = (-(-side // BLOCK), -(-side // BLOCK))
+    lattice = HeightLattice(0.0, 1.0, (side, side), BLOCK, np.zeros(blocks, np.int64), np.full(blocks, count, np.int64))
+    rays = np.full((n_views, side, side), np.inf, np.float32)
+    crossed = rng.random((side, side)) < 0.1
+    rays[:2, crossed] = rng.uniform(0, count, (2, int(crossed.sum())))
+    base, cost = np.zeros((side, side), np.float32), np.zeros(lattice.size, np.uint8)
+
+    def call():
+        add_ray_costs(rays, base, lattice.ranges, lattice.address, lattice.block, 12, 80, cost)
+
+    return Case(call, side * side, "cell")
+
+
+def agreement_case(n_views: int = 6, side: int = SIDE) -> Case:
+    """How many images agree with each other on a surface, all pairs of them."""
+    grey = np.random.default_rng(4).normal(size=(n_views, side, side)).astype(np.float32)
+    covers = np.ones(grey.shape, np.bool_)
+    return Case(lambda: pair_agreement(grey, covers), side * side * n_views * (n_views - 1) // 2, "cell and pair")
+
+
 def reach_case() -> Case:
     """A block that the borders of three views cross at every one of 64 heights, so that each is judged cell by cell."""
     pixels, layout, nodes, heights = views(3)
@@ -332,6 +364,18 @@ def test_smooth(benchmark, side):
 
 def test_visibility(benchmark, side):
     timed(benchmark, visibility_case(side=side or SIDE))
+
+
+def test_free_rays(benchmark, side):
+    timed(benchmark, free_ray_case(side=side or SIDE))
+
+
+def test_ray_costs(benchmark, side):
+    timed(benchmark, ray_costs_case(side or SIDE))
+
+
+def test_agreement(benchmark, side):
+    timed(benchmark, agreement_case(side=side or SIDE))
 
 
 def test_shade(benchmark, side):
