@@ -95,7 +95,9 @@ def judged(dsm: Path, truth: Path, classes: Path, threshold_m: float = 1.0, alig
         command = [sys.executable, str(JUDGE), str(dsm), str(truth), "--class", str(classes), "--json"]
         command += ["--thr", str(threshold_m), *(["--align"] if align else [])]
         found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        return {kind: {**figures, "completeness": figures["complete"]} for kind, figures in found.items()}
+        # The shift that was removed stands beside the classes.
+        classes_of = {kind: figures for kind, figures in found.items() if isinstance(figures, dict)}
+        return {kind: {**figures, "completeness": figures["complete"]} for kind, figures in classes_of.items()}
     from zlocus.evaluation.evaluate import evaluate
 
     return evaluate(dsm, truth, classes=classes, threshold_m=threshold_m, align=align).as_dict()

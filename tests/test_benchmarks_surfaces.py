@@ -240,3 +240,13 @@ def test_cells_that_show_what_hides_them(small_town, small_surface):
     assert found.keys() == {"ground", "building", "tree"}
     assert found["ground"][0] < 0.02
     assert all(0 <= right <= 1 for shares in found.values() for right in shares)
+
+
+def test_a_judge_that_names_the_shift_that_it_removed(tmp_path, monkeypatch):
+    """The shift is no class of the ground, and stands among the classes in the judge's answer."""
+    script = tmp_path / "judge.py"
+    answer = {"shift": [0.5, -0.5, 0.1], "all": {"complete": 0.9, "within": 0.8}}
+    script.write_text(f"print({json.dumps(json.dumps(answer))})\n")
+    monkeypatch.setattr(judging, "JUDGE", script)
+    found = judging.judged(Path("a.tif"), Path("b.tif"), Path("c.tif"), align=True)
+    assert found == {"all": {"complete": 0.9, "within": 0.8, "completeness": 0.9}}

@@ -7,16 +7,19 @@ import pytest
 
 import free_ray_scene as free
 from zlocus.kernels.volume import HIDDEN
+from zlocus.matching import border
 from zlocus.matching.base import BaseSurface
 from zlocus.matching.border import (
     OFF_GROUND_STEPS,
     RISE_BY_DISTANCE,
     BorderGround,
+    border_ground,
     covered_ground,
-    highest_ground,
+    ground_nearby,
     unsupported,
 )
 from zlocus.matching.cells import CellWindow
+from zlocus.matching.lattice import HeightLattice
 from zlocus.matching.visibility import coverage
 
 ROWS, COLS, LAST = 12, 60, 40
@@ -123,45 +126,55 @@ def compared(cols=COMPARED):
     return is_compared
 
 
-def test_highest_ground_is_that_beside_without_buildings_and_rises_with_the_distance():
+def test_the_ground_nearby_has_no_buildings_and_may_rise_with_the_distance():
     surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
     surface[10:22, 48:60] = 30.0  # a building at the border of what views compare
-    highest = highest_ground(surface, compared(), OBJECT, CELL_STEPS)
+    surface[:, COMPARED:] = GHOST
+    found, rise = ground_nearby(surface, compared(), OBJECT, CELL_STEPS)
+    np.testing.assert_array_equal(found, GROUND)
     distance = np.arange(WIDE_COLS) - (COMPARED - 1)
-    expected = GROUND + OFF_GROUND_STEPS + RISE_BY_DISTANCE * CELL_STEPS * np.maximum(distance, 0)
-    np.testing.assert_allclose(highest, np.tile(expected, (WIDE_ROWS, 1)), rtol=0, atol=1e-3)
+    expected = RISE_BY_DISTANCE * CELL_STEPS * np.maximum(distance, 0)
+    np.testing.assert_allclose(rise, np.tile(expected, (WIDE_ROWS, 1)), rtol=0, atol=1e-3)
 
 
 def test_a_slope_is_ground():
     slope = np.tile(0.4 * np.arange(WIDE_COLS, dtype=np.float32), (WIDE_ROWS, 1))
-    highest = highest_ground(slope, compared(), OBJECT, CELL_STEPS)
-    assert (highest[:, :COMPARED] >= slope[:, :COMPARED]).all()
-    assert (highest >= slope).all()
+    found, rise = ground_nearby(slope, compared(), OBJECT, CELL_STEPS)
+    assert (found + rise + OFF_GROUND_STEPS >= slope).all()
+    np.testing.assert_allclose(found[5:-5, 10:50], slope[5:-5, 10:50], rtol=0, atol=0.5)
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_where_all_or_nothing_is_compared_no_height_is_too_high(share):
-    surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
-    highest = highest_ground(surface, np.full(surface.shape, share > 0), OBJECT, CELL_STEPS)
-    assert np.isinf(highest).all()
-
-
-def border_of_wide(level=1):
-    surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
-    highest = highest_ground(surface, compared(), OBJECT, CELL_STEPS)
+def border_of_wide(level=1, beside=COMPARED):
+    highest = np.full((WIDE_ROWS, WIDE_COLS), GROUND + OFF_GROUND_STEPS, np.float32)
     window = CellWindow(5, 3, WIDE_ROWS, WIDE_COLS)
-    return BorderGround(window, level, np.ones(surface.shape, bool), compared(), highest)
+    return BorderGround(window, level, ~compared(0), ~compared(), ~compared(beside), highest)
 
 
-def test_heights_off_the_ground_need_support_where_views_were_not_compared():
-    border = border_of_wide()
-    window = border.window.finer(border.level)
+def test_heights_off_the_ground_need_support_beside_it():
+    beside = border_of_wide(beside=COMPARED + 5)
+    window = beside.window.finer(beside.level)
     height = np.full((window.rows, window.cols), 2 * GROUND, np.float32)
-    assert not border.needs_support(window, height).any()
+    assert not beside.needs_support(window, height).any()
     height[20:30, 100:150] = 2 * 35.0
-    needs = border.needs_support(window, height)
-    assert needs[20:30, 2 * COMPARED : 150].all()
-    assert needs.sum() == 10 * (150 - 2 * COMPARED)
+    needs = beside.needs_support(window, height)
+    assert needs[20:30, 2 * (COMPARED + 5) : 150].all()
+    assert needs.sum() == 10 * (150 - 2 * (COMPARED + 5))
+    assert beside.is_near(window)[:, 2 * COMPARED :].all()
+    assert not beside.is_near(window)[:, : 2 * COMPARED].any()
+
+
+@pytest.mark.parametrize("edge", [EDGE + 20, EDGE - 24])
+def test_where_most_cells_are_border_none_is(edge, monkeypatch):
+    """Of oblique views hardly a cell is compared at all heights, and the ground beside would be guessed far away."""
+    matched = views(edge)
+    searched = np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32)
+    monkeypatch.setattr(border, "shown_heights", lambda *_: views(EDGE + 24))
+    lattice = HeightLattice(0.0, 1.0, (ROWS, COLS), 4, np.zeros((3, 15), np.int64), np.full((3, 15), LAST, np.int64))
+    window = CellWindow(0, 0, ROWS, COLS)
+    found = border_ground([], None, lattice, matched, ground(), searched, window, 0, LAST, CELL_STEPS)
+    assert found.is_border.any() == (edge > EDGE)
+    assert found.is_beside.any() == (edge > EDGE)
+    assert np.isinf(found.highest).all() == (edge < EDGE)
 
 
 @pytest.mark.parametrize("n_views", [2, 3])
@@ -170,9 +183,10 @@ def test_a_height_in_free_air_at_the_border_has_no_support(n_views):
     views, lattice = free.level_ground(free.ANGLES_DEG[:n_views])
     window = CellWindow(0, 0, *free.SHAPE)
     nowhere = np.zeros(free.SHAPE, bool)
-    border = BorderGround(window, 0, ~nowhere, nowhere, np.full(free.SHAPE, free.GROUND - 5, np.float32))
+    low = np.full(free.SHAPE, free.GROUND - 5, np.float32)
+    around = BorderGround(window, 0, ~nowhere, ~nowhere, ~nowhere, low)
     seen = coverage(views, BaseSurface.level(free.SHAPE, free.BLOCK), lattice)
-    found = unsupported(border, window, views, seen, free.with_patch())
+    found = unsupported(around, window, views, seen, free.with_patch())
     in_patch = np.zeros(free.SHAPE, bool)
     in_patch[free.PATCH] = True
     assert found[in_patch].mean() > 0.8

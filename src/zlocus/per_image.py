@@ -206,7 +206,7 @@ def match_images(
 ) -> list[Matched]:
     """Every tile of every reference image, or those that may show an area; of any precision, for there it is not in
     metres. scratch : makes the arrays of all pixels; store : keeps tiles, and has those of a run that is taken on."""
-    options = replace(options, checks=replace(options.checks, most_sigma_m=None))
+    options = replace(options, checks=replace(options.checks, most_sigma_m=None, most_spread_steps=None))
     images = [CellWindow(0, 0, *space.reference.image.shape) for space, _ in settled]
     surfaces = [Surface.nothing(window, full=scratch.full) for window in images]
     tasks = [

@@ -32,36 +32,41 @@ STEEPEST, HALF_STEP, ASKED_STEPS = 1.0, 0.5, 4.0
 OFF_GROUND_STEPS, RISE_BY_DISTANCE = 8.0, 0.5
 # Buildings and woods narrower than this are not taken for ground.
 WIDEST_OBJECT_M = 50.0
+# Border is what is left over where two views could be compared at all heights in at least this share of the cells that
+# they cover.
+LEAST_COMPARED = 0.5
 
 
 @dataclass(frozen=True)
 class BorderGround:
     """What the coarsest level knows of the ground at the borders of what views share.
 
-    window : its cells, of level `level`; covered : (r, c) bool, see `covered_ground`; is_compared : (r, c) bool, cells
-    at which two views could be compared at every height searched; highest : (r, c) float32, height index up to which
-    a height may be that of the ground; infinite where no ground is known.
+    window : its cells, of level `level`; covered : (r, c) bool, see `covered_ground`; is_border : (r, c) bool, cells at
+    which two views could not be compared at every height searched; is_beside : (r, c) bool, those of them at which they
+    could not at the height of the ground either; highest : (r, c) float32, height index up to which a height may be
+    that of the ground. Where most cells would be border, as of oblique views, none is.
     """
 
     window: CellWindow
     level: int
     covered: NDArray[np.bool_]
-    is_compared: NDArray[np.bool_]
+    is_border: NDArray[np.bool_]
+    is_beside: NDArray[np.bool_]
     highest: NDArray[np.float32]
 
     def is_beyond(self, window: CellWindow) -> NDArray[np.bool_]:
         """Finest cells (r, c) of a window that two views do not cover at the height of the ground."""
         return ~on_cells(self.covered, self.window, window, self.level)
 
-    def is_doubtful(self, window: CellWindow) -> NDArray[np.bool_]:
-        """Finest cells (r, c) of a window where views could not be compared at all heights searched."""
-        return ~on_cells(self.is_compared, self.window, window, self.level)
+    def is_near(self, window: CellWindow) -> NDArray[np.bool_]:
+        """Finest cells (r, c) of a window that are border."""
+        return on_cells(self.is_border, self.window, window, self.level)
 
     def needs_support(self, window: CellWindow, height: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Finest cells (r, c) of a window that stand off the ground where views could not be compared at all heights:
-        there a height needs the support of more images. height : (r, c) float32, height indices of the finest level."""
+        """Finest cells (r, c) of a window beside the ground that stand off it: such a height needs the support of more
+        images. height : (r, c) float32, height indices of the finest level."""
         highest = 2**self.level * on_cells(self.highest, self.window, window, self.level)
-        return np.asarray(self.is_doubtful(window) & (height > highest))
+        return np.asarray(on_cells(self.is_beside, self.window, window, self.level) & (height > highest))
 
 
 def border_ground(
@@ -83,10 +88,14 @@ def border_ground(
     """
     shown = shown_heights(pixels, views, level, lattice, n_steps)
     cell_steps = cell_m / lattice.step_m
-    is_compared = compared_at_all(matched, searched)
     covered = covered_ground(shown, matched, surface, searched, cell_steps)
-    highest = highest_ground(surface, is_compared, round(WIDEST_OBJECT_M / cell_m), cell_steps)
-    return BorderGround(window, level, covered, is_compared, highest)
+    known = compared_at_all(matched, searched)
+    if known.sum() < LEAST_COMPARED * covered.sum():
+        nowhere = np.zeros_like(known)
+        return BorderGround(window, level, covered, nowhere, nowhere, np.full(known.shape, np.inf, np.float32))
+    ground, rise = ground_nearby(surface, known, round(WIDEST_OBJECT_M / cell_m), cell_steps)
+    is_beside = ~known & ~_two_show(matched, ground, np.float32(HALF_STEP))
+    return BorderGround(window, level, covered, ~known, is_beside, ground + rise + np.float32(OFF_GROUND_STEPS))
 
 
 def unsupported(
@@ -117,29 +126,25 @@ def compared_at_all(
     return np.asarray(at_all.sum(axis=0) >= PAIR)
 
 
-def highest_ground(
-    surface: NDArray[np.float32], is_compared: NDArray[np.bool_], widest_object: int, cell_steps: float
-) -> NDArray[np.float32]:
-    """Height index (r, c) up to which a height may be that of the ground.
+def ground_nearby(
+    surface: NDArray[np.float32], known: NDArray[np.bool_], widest_object: int, cell_steps: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Height index (r, c) of the ground in or nearest to every cell, and by how much it may have risen on the way.
 
-    That is the surface without what is narrower than `widest_object` cells (a grey opening), and beside the cells that
-    are compared at all heights the nearest of it, rising with the distance. surface : (r, c) float32 height indices;
-    is_compared : (r, c), cells whose surface counts; cell_steps : side of a cell in steps of height.
+    The ground is the surface without what is narrower than `widest_object` cells (a grey opening). surface : (r, c)
+    float32 height indices; known : (r, c), cells whose surface counts, not none; cell_steps : side of a cell in steps
+    of height.
     """
-    if not is_compared.any() or is_compared.all():
-        return np.full(surface.shape, np.inf, np.float32)
     wide = np.ones((widest_object | 1,) * 2, np.uint8)
     far = np.float32(np.finfo(np.float32).max)
-    smooth = cv2.medianBlur(surface, 3)
-    lowest = cv2.erode(np.where(is_compared, smooth, far), wide, borderValue=float(far))
-    opened = cv2.dilate(np.where(is_compared, lowest, -far), wide, borderValue=-float(far))
+    lowest = cv2.erode(np.where(known, cv2.medianBlur(surface, 3), far), wide, borderValue=float(far))
+    opened = cv2.dilate(np.where(known, lowest, -far), wide, borderValue=-float(far))
     distance, nearest = cv2.distanceTransformWithLabels(
-        (~is_compared).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
     )
     of_label = np.zeros(int(nearest.max()) + 1, np.float32)
-    of_label[nearest[is_compared]] = opened[is_compared]
-    rise = np.float32(RISE_BY_DISTANCE * cell_steps) * distance
-    return np.asarray(of_label[nearest] + rise + np.float32(OFF_GROUND_STEPS), np.float32)
+    of_label[nearest[known]] = opened[known]
+    return of_label[nearest], np.asarray(np.float32(RISE_BY_DISTANCE * cell_steps) * distance, np.float32)
 
 
 def shown_heights(
