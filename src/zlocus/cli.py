@@ -205,7 +205,7 @@ def dsm(
         str, typer.Option(help="What to do with gaps: small ones, or all.", metavar="none|interpolate|dem")
     ] = "none",
     partial: Annotated[
-        bool, typer.Option("--partial", help="Make the surface with too few heights, or without failed tiles, too.")
+        bool, typer.Option("--partial", help="Accept a surface that is incomplete or whose cameras are doubtful.")
     ] = False,
     workers: Annotated[
         int | None, typer.Option(help="Tiles worked on at a time. Default: by cores, memory and work.", metavar="N")
@@ -253,7 +253,9 @@ def cloud(
     fill: Annotated[
         str, typer.Option(help="What to do with gaps of the height maps.", metavar="none|interpolate")
     ] = "none",
-    partial: Annotated[bool, typer.Option("--partial", help="Count a cloud with too few points as a success.")] = False,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Accept a cloud that is incomplete or whose cameras are doubtful.")
+    ] = False,
     workers: Workers = 1,
     overwrite: Overwrite = False,
     config: ConfigFile = None,

@@ -37,8 +37,8 @@ class DsmRequest:
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
     scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
     together, GB; None: 60 % of what is free. resume : whether finished tiles of the same run are taken as they are.
-    partial : a surface with too few heights counts as a success. products : maps made of the surface, see `PRODUCTS`.
-    report : whether report.html is made.
+    partial : a surface with few heights or doubtful cameras is accepted. products : maps made of the surface, see
+    `PRODUCTS`. report : whether report.html is made.
 
     Raises
     ------

@@ -12,9 +12,7 @@ class Quality(IntFlag):
     """Bits of `quality.tif`. The first eight empty a cell, the others only warn."""
 
     OUTSIDE = 1  # not asked for: outside the area, or inside a mask
-    UNSEEN = (
-        2  # fewer than two images cover the cell at the height of the ground around it, or support a height above it
-    )
+    UNSEEN = 2  # fewer than two images cover the cell at the ground's height, or support a height above it
     HIDDEN = 4  # fewer than two images see the surface there, the others are behind it
     RANGE_END = 8  # best match at an end of the height range: the true height may lie beyond it
     NO_MATCH = 16  # images do not agree at any height, or heights at the border are noise
