@@ -32,6 +32,22 @@ def test_lowest_free_ray_against_its_slow_twin(direction):
     assert np.isfinite(expected).any() == (direction != (0.0, 0.0))
 
 
+@pytest.mark.parametrize("direction", [(0.7, 0.3), (-0.9, 0.2), (0.2, -1.3), (-0.4, -0.5), (0.0, 0.6)])
+def test_a_part_of_a_tile_has_the_rays_that_it_has_in_the_whole(direction):
+    rng = np.random.default_rng(0)
+    surface = (rng.random((90, 110)) * 20).astype(np.float32)
+    supported, highest = rng.random(surface.shape) < 0.3, 25.0
+    whole, part = np.empty_like(surface), (slice(32, 64), slice(64, 96))
+    lowest_free_ray(surface, supported, *direction, whole)
+    around, inside = stage._where_rays_come_from(part, direction, highest - float(surface.min()), surface.shape)
+    found = np.empty(surface[around].shape, np.float32)
+    lowest_free_ray(np.ascontiguousarray(surface[around]), np.ascontiguousarray(supported[around]), *direction, found)
+    matters = whole[part] <= highest
+    assert matters.mean() > 0.5
+    np.testing.assert_array_equal(found[inside][matters], whole[part][matters])
+    assert (found[inside][~matters] > highest).all()
+
+
 @pytest.mark.parametrize("lattice", [ragged_lattice(), even_lattice()], ids=["ragged", "even"])
 def test_costs_of_rays_against_their_slow_twin(lattice):
     rng = np.random.default_rng(5)
@@ -69,7 +85,7 @@ def test_images_agree_on_the_ground_and_not_in_free_air():
 
 def test_rays_to_the_ground_pass_below_a_patch_in_free_air():
     views, _ = level_ground()
-    rays = free_rays(views, with_patch(), np.ones((len(ANGLES_DEG), *SHAPE), bool))
+    rays = free_rays(views, with_patch(), np.ones((len(ANGLES_DEG), *SHAPE), bool), float(N_STEPS))
     below = (rays < with_patch() - stage.MARGIN_STEPS).sum(axis=0)
     # Of three images one looks straight down, and has no ray that passes beside the patch.
     assert (below[PATCH] >= 2).mean() > 0.9

@@ -7,6 +7,7 @@ also show the surface behind it, and there other images agree with them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -105,21 +106,46 @@ def agreement_on(views: TileViews, surface: NDArray[np.float32], covers: NDArray
     return pair_agreement(np.where(covers, grey, np.float32(0.0)), covers)
 
 
-def free_rays(views: TileViews, surface: NDArray[np.float32], covers: NDArray[np.bool_]) -> NDArray[np.float32]:
+def free_rays(
+    views: TileViews, surface: NDArray[np.float32], covers: NDArray[np.bool_], highest: float
+) -> NDArray[np.float32]:
     """Height index (i, r, c) of the lowest ray that each view has above each cell to a surface behind it.
 
-    Infinite where a view has no such ray, or itself sees the cell at the height that it has. Arguments: see
-    `agreement_on`.
+    Infinite where a view has no such ray, or itself sees the cell at the height that it has. highest : height index
+    above which no ray matters; the other arguments: see `agreement_on`.
     """
     agreement = agreement_on(views, surface, covers)
     supported, defended = agreement.supported, agreement.defended
-    rays, lowest = np.empty(covers.shape, np.float32), np.empty(surface.shape, np.float32)
+    rays, span = np.empty(covers.shape, np.float32), highest - float(surface.min())
     for i in range(len(covers)):
         for part in parts_of_one_direction(views, i):
-            lowest_free_ray(surface, supported[i], *cells_per_step(views, i, part), lowest)
-            rays[i][part] = lowest[part]
+            by_cell = cells_per_step(views, i, part)
+            around, inside = _where_rays_come_from(part, by_cell, span, surface.shape)
+            lowest = np.empty(surface[around].shape, np.float32)
+            lowest_free_ray(
+                np.ascontiguousarray(surface[around]), np.ascontiguousarray(supported[i][around]), *by_cell, lowest
+            )
+            rays[i][part] = lowest[inside]
     rays[defended] = np.inf
     return rays
+
+
+def _where_rays_come_from(
+    part: tuple[slice, slice], by_cell: tuple[float, float], span: float, shape: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Rows and columns of the cells that may have rays above a part of a tile, and where the part lies in them.
+
+    by_cell : cells (columns, rows) that the point seen by a fixed pixel moves per step of height; span : steps by which
+    a ray can rise before it matters no more.
+    """
+    around, inside = [], []
+    for cells, speed, size in zip(part, by_cell[::-1], shape, strict=True):
+        start, stop, _ = cells.indices(size)
+        reach = math.ceil(abs(speed) * span) + 1
+        first, end = max(start - (reach if speed > 0 else 1), 0), min(stop + (reach if speed < 0 else 1), size)
+        around.append(slice(first, end))
+        inside.append(slice(start - first, stop - first))
+    return (around[0], around[1]), (inside[0], inside[1])
 
 
 def add_costs_of_rays(
@@ -140,7 +166,8 @@ def add_costs_of_rays(
     if len(views.layout) < FEWEST_VIEWS:
         return False
     covers = (seen[0] <= height) & (height <= seen[1])
-    rays = free_rays(views, height + base.cells, covers)
+    highest = float((lattice.first + lattice.count).max()) + float(base.cells.max())
+    rays = free_rays(views, height + base.cells, covers, highest)
     if not np.isfinite(rays).any():
         return False
     margin, per_ray = (COARSER_MARGIN_STEPS, COARSER_RAY_COST) if level else (MARGIN_STEPS, RAY_COST)
