@@ -16,6 +16,7 @@ from types import ModuleType, TracebackType
 from typing import Any
 
 from zlocus.execution.engine import Cause, Failure, Outcome, attempted
+from zlocus.kernels._jit import CACHE
 
 # Kernels use one core each, and so must the libraries below them: else n workers have n times the threads.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
@@ -96,7 +97,7 @@ class Processes:
         mine, theirs = self._context.Pipe()
         name = f"worker {self._number}"
         process = self._context.Process(target=work, args=(theirs, self._function, name), name=name, daemon=True)
-        with _one_thread_below(), _without_main():
+        with _environment_below(ONE_THREAD | kernel_cache()), _without_main():
             process.start()
         theirs.close()
         return _Worker(process, mine)
@@ -110,11 +111,17 @@ class Processes:
         self.close()
 
 
+def kernel_cache() -> dict[str, str]:
+    """Variables for the environment of processes that this one starts: they keep kernels where it does, if that is a
+    folder of its own."""
+    return {} if CACHE.temporary is None else {"NUMBA_CACHE_DIR": str(CACHE.temporary)}
+
+
 @contextmanager
-def _one_thread_below() -> Iterator[None]:
-    """Processes that are started meanwhile find that libraries shall have one thread."""
-    kept = {key: os.environ.get(key) for key in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
+def _environment_below(variables: dict[str, str]) -> Iterator[None]:
+    """Processes that are started meanwhile find these variables in their environment."""
+    kept = {key: os.environ.get(key) for key in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:

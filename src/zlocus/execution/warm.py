@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from zlocus.execution.processes import kernel_cache
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.setup import MatchScene
@@ -29,7 +31,8 @@ SIDE = 96
 def kernels_compiling() -> Iterator[None]:
     """Kernels compile while the block runs; at its end they are ready."""
     commands = [[sys.executable, "-m", "zlocus.execution.warm", group] for group in GROUPS]
-    running = [subprocess.Popen(c, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
+    quiet, environment = subprocess.DEVNULL, os.environ | kernel_cache()
+    running = [subprocess.Popen(c, stdout=quiet, stderr=quiet, env=environment) for c in commands]
     try:
         yield
         for process in running:
