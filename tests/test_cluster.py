@@ -29,9 +29,9 @@ class Loopback:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / "scheduler.json"
-        tests = str(Path(__file__).parent)
+        paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
         self._environment = os.environ | {
-            "PYTHONPATH": tests, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+            "PYTHONPATH": os.pathsep.join(paths), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
         }  # fmt: skip
         where = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
         self.scheduler = self._started("scheduler", *where, "--scheduler-file", str(self._file))

@@ -138,8 +138,8 @@ def test_without_a_temporary_folder_nothing_is_kept(sources, monkeypatch):
 # A command, with workers, whose kernels are compiled anew.
 PROGRAM = """
 import sys
-from zlocus.cli import _show_warning
-import warnings; warnings.showwarning = _show_warning(warnings.showwarning)
+from zlocus.cli_ending import show_our_warnings
+show_our_warnings()
 
 import numba
 import zlocus.execution.processes as processes
