@@ -25,7 +25,7 @@ import zlocus.job
 import zlocus.per_image
 import zlocus.tile
 from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, read, run
-from zlocus.errors import GeometryError, OutputError, StoppedError
+from zlocus.errors import GeometryError, InputError, OutputError, StoppedError
 from zlocus.execution.engine import ATTEMPTS
 from zlocus.execution.memory import held_bytes
 from zlocus.execution.store import BEFORE, DONE, FOLDER
@@ -169,6 +169,31 @@ def test_a_signal_stops_within_seconds_and_is_taken_on(images, straight, tmp_pat
     events = events_of(out)
     assert [e["event"] for e in events if e["event"] != "tile"] == ["began", "interrupted", "began", "resumed", "ended"]
     assert len({e["tile"] for e in events if e["event"] == "tile"}) == sum(e["event"] == "tile" for e in events)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, number):
+    """As by a system that is short of memory: another takes its place, and its tile is made again."""
+    out = tmp_path / "out"
+    process = started(command(images("sine"), out, tmp_path, "--workers", "2"))
+    killed = []
+
+    def is_one_killed():
+        for child in below(process.pid):
+            with suppress(psutil.NoSuchProcess):
+                if child.ppid() != process.pid and not killed and n_finished(out):
+                    child.send_signal(number)
+                    killed.append(child)
+        return killed or process.poll() is not None
+
+    wait_until(is_one_killed)
+    _, stderr = process.communicate(timeout=12 * STOPS_WITHIN_S)
+    assert killed
+    assert process.returncode == 0, stderr
+    assert same(out, straight)
+    workers = {event["worker"] for event in events_of(out) if event["event"].startswith("tile")}
+    assert "worker 3" in workers
+    assert all(event["again"] for event in events_of(out) if event["event"] == "tile failed")
 
 
 # What is stopped after the matching, at which of its calls, and files that are complete then.
@@ -422,6 +447,37 @@ def test_an_image_that_disappears(images, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").rename(copied[0])
     run(copied, tmp_path / "out", SMALL_TILES, report=False)
     assert same(tmp_path / "out", run(copied, tmp_path / "straight", SMALL_TILES, report=False).out)
+
+
+# When the folder of results is removed, by the call that notices it.
+GOES = {
+    "zlocus.execution.store.write_whole": (6, r"tiles has gone since the run began, with 3 finished tiles in it"),
+    "zlocus.io.raster._check_written": (1, r"ortho\.tif cannot be written"),
+    "zlocus.pipeline.write_observations": (1, r"observations\.npz cannot be written: No such file"),
+    "zlocus.pipeline.make_maps": (1, r"run\.json cannot be written: No such file"),
+    "zlocus.pipeline.link_all": (1, r"There is no raster \S*dsm\.tif"),
+}
+
+
+@pytest.mark.parametrize("step", GOES)
+def test_a_folder_of_results_that_goes(images, straight, tmp_path, monkeypatch, step):
+    """The run ends in a sentence, which promises no tiles that have gone with it; the next one makes everything."""
+    at, says = GOES[step]
+    do, calls, out = pkgutil.resolve_name(step), [], tmp_path / "out"
+
+    def remove(*given, **more):
+        calls.append(given)
+        if len(calls) == at:
+            shutil.rmtree(out)
+        return do(*given, **more)
+
+    monkeypatch.setattr(step, remove)
+    with pytest.raises((StoppedError, OutputError, InputError), match=says) as stop:
+        run(images("sine"), out, SMALL_TILES, workers=1, report=False)
+    assert "kept" not in str(stop.value)
+    assert not out.exists()
+    monkeypatch.undo()
+    assert same(run(images("sine"), out, SMALL_TILES, workers=1, report=False).out, straight)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full or a small tmpfs")

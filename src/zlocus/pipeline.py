@@ -101,7 +101,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         with compressing(request.workers or cores()):
             return _run_dsm(request, config, progress, begun)
     except OutputError as error:
-        if not any(matching.store.finished for matching in begun):
+        if not any(matching.store.finished and matching.store.is_there for matching in begun):
             raise
         n, store = len(begun[0].store.finished), begun[0].store
         raise StoppedError(f"{error} The {n} finished tiles are kept: {store.how_to_go_on}.") from error

@@ -250,7 +250,7 @@ class Matching:
     def tell_interrupted(self, progress: Progress) -> None:
         """Say, after an interrupt, what is kept."""
         self.log.add("interrupted", tiles_done=self.n_there)
-        if self.n_there:
+        if self.n_there and self.store.is_there:
             done = f"{self.n_there} of {len(self.tiles)} tiles"
             progress.note(f"{done} are finished and kept: {self.store.how_to_go_on}.")
 

@@ -141,6 +141,11 @@ class TileStore:
                 done.flush()
                 os.fsync(done.fileno())
         except OSError as error:
+            if not self.is_there:
+                raise StoppedError(
+                    f"{self.folder} has gone since the run began, with {len(self.finished)} finished tiles in it. Give "
+                    "the same command again to make them anew."
+                ) from error
             raise StoppedError(
                 f"{self.folder} cannot be written: {error.strerror or error}. {len(self.finished)} finished tiles are "
                 "kept; make room, and give the same command again to go on."
@@ -154,6 +159,11 @@ class TileStore:
     def holds(self, name: str) -> bool:
         """Whether a finished tile is there, with the bytes that were written."""
         return name in self.finished and self.load(name) is not None
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder still is where `open` made it; somebody may have removed it."""
+        return (self.folder / MANIFEST).exists()
 
     @property
     def how_to_go_on(self) -> str:
