@@ -70,6 +70,7 @@ SPEED_BARS_S = {"six": 8.0, "three": 4.0}
 PRECISE_M = 1.0
 POINTING_PX = {"city": 0, "hills": 4}
 SHARED_SCENES = {"city": "rendered-city", "hills": "rendered-hills-biased"}
+N_SIGNALS = 30
 # Directions in the axes of the facade's cameras: out of the wall, and up along it. Heights are moved by so much to see
 # what the correlations are worth.
 FACADE_UP, FACADE_NORTH, MOVED_M = (-0.733, 0.68, 0.0), (0.0, 0.0, -1.0), 0.05
@@ -658,6 +659,13 @@ def speed(at: Workplace) -> list[Figure]:
     return [Figure("million cells", million_cells, at_least=4), *figures]
 
 
+def signals(at: Workplace) -> list[Figure]:
+    """A run that gets signals of four kinds at random moments and goes on after each: the test of it, with more."""
+    test = "tests/test_resume.py::test_signals_at_random_moments"
+    used = run(["env", f"ZLOCUS_SIGNALS={N_SIGNALS}", sys.executable, "-m", "pytest", "-q", test], cwd=ROOT)
+    return [Figure("signals, and the same bytes afterwards", N_SIGNALS), Figure("CPU", used.cpu_s, "s")]
+
+
 def clone(at: Workplace) -> list[Figure]:
     """Nothing but the repository, Python and make."""
     folder = at.out / "zlocus"
@@ -676,7 +684,7 @@ ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
     "dmc": dmc, "tuniu": tuniu, "herzjesu": herzjesu, "kernels": kernels,
     "selection": selection, "features": features, "middlebury": middlebury, "memory": memory, "speed": speed,
     "inspect": inspecting.inspect, "inspect-large": inspecting.inspect_large,
-    "halo": large.halo, "growth": large.growth, "clone": clone, "peers": compared.peers,
+    "halo": large.halo, "growth": large.growth, "signals": signals, "clone": clone, "peers": compared.peers,
 }  # fmt: skip
 SLOW = ("new-scenes", "memory", "speed", "inspect-large", "growth", "clone")
 

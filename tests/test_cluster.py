@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rendered_scenes import SMALL_TILES, run
+from test_resume import check_end, command, n_finished, started, wait_for_tiles
 from worker_tasks import Planted
 from zlocus.errors import ConfigError, StoppedError
 from zlocus.execution.cluster import Cluster
@@ -29,9 +30,9 @@ class Loopback:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / "scheduler.json"
-        tests = str(Path(__file__).parent)
+        paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
         self._environment = os.environ | {
-            "PYTHONPATH": tests, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+            "PYTHONPATH": os.pathsep.join(paths), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
         }  # fmt: skip
         where = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
         self.scheduler = self._started("scheduler", *where, "--scheduler-file", str(self._file))
@@ -156,3 +157,23 @@ def test_where_nothing_answers(images, tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(ConfigError, match=r"--method gc3-sgm matches whole images in one process\. Leave --scheduler"):
         run(images("sine"), tmp_path / "out", SMALL_TILES, scheduler="tcp://127.0.0.1:9", method="gc3-sgm")
+
+
+def test_a_signal_ends_the_command_and_not_the_cluster(images, straight, tmp_path):
+    """Finished tiles are kept, and the cluster makes the others when the command is given again."""
+    out = tmp_path / "out"
+    with cluster(tmp_path, n_workers=1) as found:
+        words = command(images("sine"), out, tmp_path, "--scheduler", found.address)
+        process = started(words)
+        wait_for_tiles(out, 1, process)
+        process.send_signal(signal.SIGTERM)
+        _, stderr = process.communicate(timeout=60)
+        assert process.returncode == 143
+        check_end(process.returncode, signal.SIGTERM, stderr)
+        assert "tiles are finished and kept: the same command goes on from there" in stderr
+        assert n_finished(out)
+        again = subprocess.run(words, capture_output=True, text=True)
+        assert again.returncode == 0, again.stderr
+        assert "tiles are there already" in again.stderr
+        assert same(out, straight)
+        assert found.workers[0].poll() is None

@@ -233,6 +233,24 @@ def test_yaml_that_grows(good, name, key, laugh):
     assert isinstance(outcome(good(name), d.yaml_laughs(key)[laugh].encode()), str)
 
 
+VIEW = b"{name: a, image: a.tif, camera: {kind: rpc}}"
+# Scene files that are too much, by what there is too much of.
+TOO_MUCH = {
+    "a million views": b"views:\n" + (b"- " + VIEW + b"\n") * 10**6,
+    "a million views in a line": b"views: [" + b"{}, " * 10**6 + b"{}]\n",
+    "a million aliases": b"first: &a " + VIEW + b"\nviews:\n" + b"- *a\n" * 10**6,
+    "lists in lists": b"views: " + b"[" * 1000 + b"]" * 1000 + b"\n",
+    "keys in keys": b"views: " + b"{a: " * 10**5 + b"1" + b"}" * 10**5 + b"\n",
+    "lines in lines": b"views:\n" + b"".join(b" " * n + b"a:\n" for n in range(1, 2000)),
+}
+
+
+@pytest.mark.parametrize("what", TOO_MUCH)
+def test_a_scene_of_too_much(good, what):
+    said = outcome(good("scene-frame"), b"schema: 1\n" + TOO_MUCH[what])
+    assert ("holds more than 500000 values" if "million" in what else "nested more than 32 levels deep") in said
+
+
 @pytest.mark.parametrize("laugh", ["inside", "outside"])
 @pytest.mark.parametrize("name", ["metashape", "dimap-2", "dimap-3", "dimap-dim"])
 def test_xml_with_entities(good, name, laugh):

@@ -6,11 +6,15 @@ import io
 import json
 import os
 import pickle
+import re
 import shutil
 import tarfile
 import zipfile
+from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
+import httpx
 import numpy as np
 import pyogrio
 import pytest
@@ -20,7 +24,9 @@ from pyproj import CRS
 from shapely import box
 from typer.testing import CliRunner
 
-from rendered_scenes import HEIGHTS, SMALL_TILES, run
+import zlocus.inspector
+from inspected import served
+from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, run
 from zlocus.cli import app
 from zlocus.errors import ConfigError, InputError
 from zlocus.execution.store import DONE, FOLDER, TileStore
@@ -86,9 +92,80 @@ def test_names_of_views_lead_nowhere_else(images, tmp_path, command, name):
     assert "\x1b" not in result.output
 
 
-@pytest.mark.parametrize(
-    "prefix", ["/vsizip/", "/vsitar/", "/vsigzip/", "/vsi7z/", "/vsizip//vsicurl/http://127.0.0.1:9/"]
+# Names that are code for a page, a template, a drawing or a terminal.
+CODE = {
+    "script": ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "';alert(1)//</style>"),
+    "template": ("{{7*7}}", "{% for %}", "]]></svg><svg onload=alert(1)>"),
+    "formula": ("$\\frac{$", "a$b$c", "\\$_{"),
+}
+
+
+class Shown(HTMLParser):
+    """What a page is made of, and what can be read on it."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.attributes, self.text = [], [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [name for name, _ in attrs]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.mark.parametrize("kind", CODE)
+def test_names_of_views_are_shown_and_do_not_run(images, tmp_path, kind):
+    """In the report, in drawings, and in what the inspector answers, which its page never takes for HTML."""
+    scene, out = scene_of(images, tmp_path / "scene", CODE[kind]), tmp_path / "out"
+    words = [str(scene), "--heights", *map(str, HEIGHTS)]
+    at = ["--at", *map(str, CENTRE), "--crs", "EPSG:32632"]
+    for command in (["dsm", *words, "--resolution", "1", "-o", str(out)],
+                    ["curves", str(scene), *at, "-o", str(tmp_path / "curves")],
+                    ["doctor", *words, "-o", str(tmp_path / "doctor")]):  # fmt: skip
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0, result.output
+        assert "not made" not in result.output
+    page = Shown((out / "report.html").read_text())
+    assert page.tags.count("script") == 1
+    assert not [name for name in page.attributes if name.startswith("on")]
+    assert all(name in page.text for name in CODE[kind])
+    drawn = [cell["svg"] for cell in json.loads((out / "curves.json").read_text())["cells"] if cell.get("svg")]
+    for svg in drawn:
+        assert all(each.tag.rpartition("}")[2] != "script" for each in ElementTree.fromstring(svg).iter())
+    named = {text for svg in drawn for text in ElementTree.fromstring(svg).itertext()}
+    assert named & set(CODE[kind])
+    with served(out) as (_, address):
+        answer = httpx.get(f"{address}api/surface")
+    assert answer.headers["content-type"] == "application/json"
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert all(name in answer.text.encode().decode("unicode_escape") for name in CODE[kind])
+
+
+TAKEN_FOR_HTML = (
+    r"\.(?:inner|outer)HTML|insertAdjacentHTML|document\.write|DOMParser|createContextualFragment|srcdoc|\.html\("
+    r"|\beval\(|new Function"
 )
+
+
+def test_the_inspector_makes_no_html_of_words():
+    """All that its page shows is put there as text."""
+    scripts = sorted((Path(zlocus.inspector.__file__).parent / "static" / "js").glob("*.js"))
+    assert len(scripts) > 5
+    assert [(path.name, found) for path in scripts for found in re.findall(TAKEN_FOR_HTML, path.read_text())] == []
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    [
+        "/vsizip/", "/vsitar/", "/vsigzip/", "/vsi7z/", "/vsirar/", "/vsizip//vsicurl/http://127.0.0.1:9/",
+        "/vsicached?file=/vsizip/", "/vsisubfile/0_999999,/vsizip/", "/vsisparse/", "/vsicrypt/key=a,file=",
+        "/vsimem/", "/vsistdin/", "/vsistdout/", "/vsicurl_streaming/http://127.0.0.1:9/", "/vsis3_streaming/",
+        "/vsi", "/vsi/", "/vsizip",
+    ],
+)  # fmt: skip
 def test_archives_are_not_followed(images, tmp_path, prefix):
     path = images("sine").inputs[0]
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
@@ -97,9 +174,9 @@ def test_archives_are_not_followed(images, tmp_path, prefix):
         file.add(path, path.name)
     archive = tmp_path / ("a.tar" if "tar" in prefix else "a.zip")
     inside = Path(f"{prefix}{archive}/{path.name}")
-    with pytest.raises(InputError, match="archive"):
+    with pytest.raises(InputError, match="in an archive or a stream, which is not followed"):
         open_image(inside)
-    with pytest.raises(InputError, match="archive"):
+    with pytest.raises(InputError, match="in an archive or a stream, which is not followed"):
         open_scene([inside, images("sine").inputs[1]])
 
 

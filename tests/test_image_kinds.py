@@ -22,6 +22,24 @@ def rewritten(images, folder, change, **profile):
     return tuple(paths)
 
 
+def byte(pixels, share=1.0):
+    return (pixels * share / 4).clip(1, 255).astype(np.uint8)
+
+
+def colours(pixels):
+    return np.stack([byte(pixels, share) for share in (0.9, 1.0, 0.7)])
+
+
+def clear(name, pixels):
+    """An alpha band: one image is transparent in its middle."""
+    return with_hole(name, np.full(pixels.shape, 255.0), 0).astype(np.uint8)
+
+
+def by_gamma(name, pixels):
+    """The grey values of one image through a gamma curve, as a camera's JPEG has them; the others as they are."""
+    return (byte(255 * (pixels / pixels.max()) ** 0.45, 4.0) if name == "nadir" else byte(pixels)).astype(np.uint8)
+
+
 def with_hole(name, pixels, value):
     pixels = pixels.copy()
     if name == "nadir":
@@ -29,6 +47,7 @@ def with_hole(name, pixels, value):
     return pixels
 
 
+BLOCKS = {"blockxsize": 64, "blockysize": 64}
 VARIANTS = {
     "uint8": (lambda name, p: (p / 4).clip(1, 255).astype(np.uint8), {"nodata": 0}),
     "float32": (lambda name, p: (p / 300 - 1).astype(np.float32), {}),
@@ -37,6 +56,17 @@ VARIANTS = {
     "int16": (lambda name, p: with_hole(name, p - 300, -32768).astype(np.int16), {"nodata": -32768}),
     "colours": (lambda name, p: np.stack([(p * s / 4).clip(1, 255) for s in (0.9, 1.0, 0.7)]).astype(np.uint8),
                 {"photometric": "RGB"}),
+    "JPEG": (lambda name, p: byte(p), {"compress": "jpeg", "jpeg_quality": 90, "tiled": True, **BLOCKS}),
+    "JPEG in colours": (lambda name, p: colours(p), {
+        "photometric": "YCbCr", "compress": "jpeg", "jpeg_quality": 90, "tiled": True, "interleave": "pixel", **BLOCKS,
+    }),
+    "LZW": (lambda name, p: p.astype(np.uint16), {"compress": "lzw", "predictor": 2}),
+    "ZSTD": (lambda name, p: (p / 300 - 1).astype(np.float32), {"compress": "zstd", "predictor": 3}),
+    "alpha": (lambda name, p: np.stack([byte(p), clear(name, p)]), {"alpha": "YES"}),
+    "colours with alpha": (lambda name, p: np.concatenate([colours(p), clear(name, p)[None]]),
+                           {"photometric": "RGB", "alpha": "YES"}),
+    "four bands": (lambda name, p: np.stack([p, p * 0 + 7, p[::-1], p * 0]).astype(np.uint16), {}),
+    "gamma": (by_gamma, {}),
     "bands": (lambda name, p: np.stack([p, p * 0 + 7]).astype(np.uint16), {}),
 }  # fmt: skip
 
@@ -49,10 +79,10 @@ def test_kinds_of_images(images, tmp_path, variant):
     error, seen = errors_of(out, "sine")
     assert (np.abs(error[seen]) < BLUNDER_M).mean() > 0.97
     views = read(out / "views.tif")[0]
-    has_hole = variant in ("float NaN", "float nodata", "int16")
+    has_hole = variant in ("float NaN", "float nodata", "int16", "alpha", "colours with alpha")
     assert ((views == 2).sum() > 150) == has_hole
     _, ortho = read(out / "ortho.tif")
-    n_bands = 3 if variant == "colours" else 1
+    n_bands = 3 if "colours" in variant else 1
     assert ortho.dtypes == (read(paths[0])[1].dtypes[0],) * n_bands
 
 

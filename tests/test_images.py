@@ -110,9 +110,17 @@ def test_bands_without_colour_give_the_first(tmp_path):
     np.testing.assert_array_equal(whole(open_image(write_image(tmp_path / "a.tif", bands))).pixels, bands[0])
 
 
-@pytest.mark.parametrize("profile", [{}, {"compress": "deflate"}, {"tiled": True, "blockxsize": 16, "blockysize": 16}])
+@pytest.mark.parametrize(
+    "profile",
+    [
+        {}, {"compress": "deflate"}, {"tiled": True, "blockxsize": 16, "blockysize": 16}, {"compress": "lzw"},
+        {"compress": "zstd"}, {"compress": "jpeg"}, {"compress": "deflate", "alpha": "YES"},
+    ],
+)  # fmt: skip
 def test_truncated_at_any_length(tmp_path, profile):
-    data = write_image(tmp_path / "whole.tif", GREY, **profile).read_bytes()
+    grey = GREY.astype(np.uint8) if profile.get("compress") == "jpeg" else GREY
+    pixels = np.stack([grey, grey]) if "alpha" in profile else grey
+    data = write_image(tmp_path / "whole.tif", pixels, **profile).read_bytes()
     cut = tmp_path / "cut.tif"
     for length in [*range(0, len(data) - 1, 97), len(data) - 1]:
         cut.write_bytes(data[:length])

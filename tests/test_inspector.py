@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import re
@@ -675,16 +676,22 @@ def test_servers_are_asked_only_where_that_is_wanted(out, tmp_path):
             server.accept()
 
 
-def test_the_command_serves_until_it_is_interrupted(out, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "says"),
+    [(signal.SIGINT, "Interrupted."), (signal.SIGTERM, "Ended by SIGTERM."), (signal.SIGHUP, "Ended by SIGHUP.")],
+)
+def test_the_command_serves_until_it_is_ended(out, tmp_path, number, says):
     command = [sys.executable, "-m", "zlocus", "inspect", str(out), "--view", "http://127.0.0.1:1/old/#tab=profile"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    heard = functools.partial(signal.signal, number, signal.SIG_DFL)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heard) as process:
         address = process.stdout.readline().strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/#tab=profile", address)
         assert "Ctrl-C" in process.stdout.readline()
         assert httpx.get(address).status_code == 200
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE_S) == 130
-        assert process.stderr.read().strip() == "zlocus: Interrupted."
+        process.send_signal(number)
+        assert process.wait(PATIENCE_S) == 128 + number
+        assert process.stderr.read() == f"zlocus: {says}\n"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +13,13 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
+from zlocus import tiles
 from zlocus.errors import OutputError
 from zlocus.pipeline import run_demo
 from zlocus.products.picture import CAPTION, GAP, error_map, picture_beside_truth, relief
-from zlocus.progress import SilentProgress
-from zlocus.synthetic import scenes
+from zlocus.progress import LineProgress, SilentProgress
+from zlocus.request import DEMO_ACCURACY, DEMO_BEGUN
+from zlocus.synthetic import files, scenes
 
 SIDE = 60
 
@@ -78,9 +82,51 @@ def test_the_demo_runs_twice_into_one_folder(tmp_path, monkeypatch):
         views=whole.views[:3],
     )
     monkeypatch.setattr(scenes, "demo_spec", lambda: small)
-    first = run_demo(tmp_path, SilentProgress())
+    first = stopped_and_taken_on(tmp_path, monkeypatch)
     assert [limit.threshold_m for limit in first.evaluations] == [0.42, 1.0]
     assert all(each.classes["ground"].within > 0.9 for each in first.evaluations)
     picture = (tmp_path / "demo.png").read_bytes()
+    # Now it is finished, and starts anew.
+    (tmp_path / DEMO_ACCURACY).write_text("{}")
+    (tmp_path / "scene" / "scene.yaml").unlink()
     assert run_demo(tmp_path, SilentProgress()).evaluations == first.evaluations
     assert (tmp_path / "demo.png").read_bytes() == picture
+
+
+def stopped_and_taken_on(out, monkeypatch):
+    """A demo that is stopped when its tiles are made, and goes on with its scene and with them."""
+    said = io.StringIO()
+    with monkeypatch.context() as patch:
+        patch.setattr(tiles.Matching, "assemble", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_demo(out, LineProgress(said))
+    found = re.search(r"(\d) of \1 tiles are finished and kept: the same command goes on from there\.", said.getvalue())
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "render_scene", interrupt)
+        result = run_demo(out, LineProgress(said))
+    assert f"{found[1]} of {found[1]} tiles are there already." in said.getvalue()
+    return result
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_a_demo_that_is_not_of_today_is_rendered_anew(tmp_path, monkeypatch):
+    """Of another version, or damaged: it is a demo's all the same."""
+    monkeypatch.setattr(files, "render_scene", interrupt)
+    (tmp_path / "scene").mkdir()
+    for content in ('{"scene_sha256": "0"}', "{}", "nonsense"):
+        (tmp_path / DEMO_BEGUN).write_text(content)
+        with pytest.raises(KeyboardInterrupt):
+            run_demo(tmp_path, SilentProgress())
+        assert not (tmp_path / "scene").exists()
+        (tmp_path / "scene").mkdir()
+
+
+def test_a_demo_keeps_the_scenes_of_others(tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match="not the scene of a demo"):
+        run_demo(tmp_path, SilentProgress())
+    assert [path.name for path in tmp_path.rglob("*")] == ["scene", "mine.txt"]

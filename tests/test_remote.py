@@ -47,6 +47,30 @@ def test_a_surface_of_images_elsewhere(images, served, tmp_path, workers):
     assert {each["sha256"] for each in record["inputs"]} == {None}
 
 
+VRT = """<VRTDataset rasterXSize="{columns}" rasterYSize="{rows}"><VRTRasterBand dataType="UInt16" band="1">
+<SimpleSource><SourceFilename relativeToVRT="{is_relative}">{source}</SourceFilename><SourceBand>1</SourceBand>
+</SimpleSource></VRTRasterBand></VRTDataset>"""
+
+
+@pytest.mark.parametrize("where", ["beside it", "on a server", "here"])
+def test_a_list_of_images_on_their_server(images, served, where):
+    """It may name what lies beside it or on another server, and nothing on this machine."""
+    path = images("sine").inputs[0]
+    pixels, here = open_image(path), path.parent / f"{where.replace(' ', '_')}.vrt"
+    source = {"beside it": path.name, "on a server": f"/vsicurl/{served}/{path.name}", "here": path}[where]
+    rows, columns = pixels.shape
+    here.write_text(VRT.format(rows=rows, columns=columns, source=source, is_relative=int(where == "beside it")))
+    name = Path(f"/vsicurl/{served}/{here.name}")
+    try:
+        if where == "here":
+            with pytest.raises(InputError, match="which lies on none"):
+                open_image(name)
+        else:
+            assert (open_image(name).read(0, 0, 9, 9).pixels == pixels.read(0, 0, 9, 9).pixels).all()
+    finally:
+        here.unlink()
+
+
 def test_what_is_not_there_is_said(served):
     with pytest.raises(InputError, match=r"nothing\.tif cannot be opened as a raster"):
         open_image(Path(f"/vsicurl/{served}/nothing.tif"))

@@ -1,6 +1,15 @@
-"""`python -m zlocus`, the same as the command."""
+"""The program: `zlocus`, and `python -m zlocus`."""
 
-from zlocus.cli import main
+from zlocus.signals import handle_signals
+
+
+def run() -> None:
+    """Handle signals before anything else is imported, which takes a moment; then run the command line and exit."""
+    handle_signals()
+    from zlocus.cli import main
+
+    main()
+
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -5,17 +5,12 @@ Heavy modules are imported inside the commands, so that `zlocus --help` answers 
 
 from __future__ import annotations
 
-import functools
 import json
 import os
-import shutil
 import sys
-import textwrap
-import traceback
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,14 +18,17 @@ import typer
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
+from zlocus.cli_ending import explained, show_our_warnings
 from zlocus.cli_inspect import inspect
 from zlocus.cli_products import PRODUCTS_HELP, products
 from zlocus.cli_report import report
-from zlocus.errors import OutputError, ZlocusError, ZlocusWarning
+from zlocus.errors import OutputError
 from zlocus.evaluation.command import evaluate
 from zlocus.progress import progress_for
 from zlocus.request import (
     DEFAULT_PRODUCTS,
+    DEMO_ACCURACY,
+    DEMO_BEGUN,
     CloudRequest,
     CurvesRequest,
     DoctorRequest,
@@ -41,19 +39,14 @@ from zlocus.request import (
     check_output,
     product_names,
 )
+from zlocus.signals import handle_signals
 from zlocus.startup import prepare
-from zlocus.threads import leave_if_busy
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
     from zlocus.options import RunConfig
 
-EXIT_OWN_FAULT = 1
 EXIT_WILL_FAIL = 2
-EXIT_INTERRUPTED = 130
-DEMO_ACCURACY = "accuracy.json"
-P = ParamSpec("P")
-R = TypeVar("R")
 
 # Arguments and options that several commands share.
 Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")]
@@ -89,56 +82,6 @@ app = typer.Typer(
 )
 
 
-def explained(command: Callable[P, R]) -> Callable[P, R]:
-    """A command whose errors become one sentence on stderr and an exit status (ZLOCUS_DEBUG=1: the trace too)."""
-
-    @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            return command(*args, **kwargs)
-        except ZlocusError as error:
-            raise _failed(str(error), error.exit_status) from error
-        except KeyboardInterrupt as error:
-            failed = _failed("Interrupted.", EXIT_INTERRUPTED)
-            leave_if_busy(EXIT_INTERRUPTED)
-            raise failed from error
-        except (typer.Exit, BrokenPipeError):
-            raise
-        except Exception as error:
-            what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
-            advice = "This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the trace, and report it."
-            raise _failed(f"Unexpected {what}. {advice}", EXIT_OWN_FAULT) from error
-
-    return run
-
-
-def _failed(sentence: str, status: int) -> typer.Exit:
-    if os.environ.get("ZLOCUS_DEBUG"):
-        traceback.print_exc()
-    _say(f"zlocus: {sentence}")
-    return typer.Exit(status)
-
-
-def _say(sentence: str) -> None:
-    """To stderr, broken between words on a terminal, on one line elsewhere."""
-    if sys.stderr.isatty():
-        width = shutil.get_terminal_size().columns
-        sentence = textwrap.fill(sentence, width, break_long_words=False, break_on_hyphens=False)
-    print(sentence, file=sys.stderr)
-
-
-def _show_warning(show: Callable[..., Any]) -> Callable[..., Any]:
-    """Our own warnings as sentences, those of libraries as they are."""
-
-    def show_warning(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
-        if issubclass(category, ZlocusWarning):
-            _say(f"zlocus: {message}")
-        else:
-            show(message, category, *args, **kwargs)
-
-    return show_warning
-
-
 def _print_version(wanted: bool) -> None:
     if wanted:
         print(f"zlocus {__version__}")
@@ -161,12 +104,14 @@ def demo(
 ) -> None:
     """Render the built-in scene, run everything, and report the accuracy against its truth."""
     # A folder of an earlier demo may be used again, one of any other run not.
-    check_output(out, overwrite=(out / DEMO_ACCURACY).exists())
+    check_output(out, overwrite=any((out / name).exists() for name in (DEMO_ACCURACY, DEMO_BEGUN)))
     from zlocus.pipeline import run_demo
+    from zlocus.products.record import write_whole
 
     result = run_demo(out, progress_for(sys.stderr))
     accuracy = {f"within_{each.threshold_m:g}_m": each.as_dict() for each in result.evaluations}
-    (out / DEMO_ACCURACY).write_text(json.dumps(accuracy, indent=2) + "\n", encoding="utf-8")
+    text = json.dumps(accuracy, indent=2) + "\n"
+    write_whole(out / DEMO_ACCURACY, lambda part: part.write_text(text, encoding="utf-8"))
     print(f"Accuracy of {result.out} against the rendered truth:")
     for evaluation in result.evaluations:
         print()
@@ -465,17 +410,18 @@ def config(
 ) -> None:
     """Write a complete commented configuration."""
     from zlocus.io.config import write_config
+    from zlocus.io.whole import whole_file
     from zlocus.options import RunConfig
 
     text = write_config(RunConfig())
     if out is None or str(out) == "-":
         print(text, end="")
         return
+    if out.exists():
+        raise OutputError(f"{out} exists already and may hold your settings. Choose another name with -o.")
     try:
-        with out.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise OutputError(f"{out} exists already and may hold your settings. Choose another name with -o.") from error
+        with whole_file(out) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{out} cannot be written: {error.strerror}. Choose another name with -o.") from error
 
@@ -495,6 +441,7 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit, in a process of its own; `arguments` default to those of the process."""
+    handle_signals()
     prepare()
-    warnings.showwarning = _show_warning(warnings.showwarning)
+    show_our_warnings()
     app(arguments, prog_name="zlocus")

@@ -256,9 +256,8 @@ def _interruption(store: TileStore | None, tasks: Sequence[tuple[int, Tile]], pr
     except KeyboardInterrupt:
         if store is not None:
             done = sum(tile_name(*task) in store.finished for task in tasks)
-            progress.note(
-                f"{done} of {len(tasks)} tiles of images are finished and kept: the same command goes on from there."
-            )
+            if done:
+                progress.note(f"{done} of {len(tasks)} tiles of images are finished and kept: {store.how_to_go_on}.")
         raise
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,11 +15,12 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
+from zlocus.errors import CoverageError, GeometryError, InputError, OutputError, StoppedError, ZlocusError
 from zlocus.execution.events import EventLog
 from zlocus.execution.memory import cores
 from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.execution.scratch import Scratch
+from zlocus.execution.store import FOLDER as TILES
 from zlocus.execution.store import TileStore
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid
@@ -38,16 +41,26 @@ from zlocus.products.observations import OBSERVATIONS, write_observations
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.record import Stopwatch, inputs_record, now, request_as_dict, versions_record, write_record
+from zlocus.products.record import (
+    Stopwatch,
+    inputs_record,
+    now,
+    read_record,
+    request_as_dict,
+    versions_record,
+    write_record,
+)
 from zlocus.products.report.files import forget_report
 from zlocus.progress import Progress
-from zlocus.request import DsmRequest
+from zlocus.request import DEMO_ACCURACY, DEMO_BEGUN, DsmRequest
 from zlocus.scene import Scene
 from zlocus.settling import Settled, opened, settled_run
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
+    from zlocus.synthetic.files import RenderedScene
+    from zlocus.synthetic.scenes import SceneSpec
 
 SUFFICIENT_COVERAGE = 0.5
 # Names that files have until they are complete, with the number of the process that writes them.
@@ -83,20 +96,23 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     CoverageError
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
-    kept: list[TileStore] = []
+    begun: list[Matching] = []
     try:
         with compressing(request.workers or cores()):
-            return _run_dsm(request, config, progress, kept)
+            return _run_dsm(request, config, progress, begun)
     except OutputError as error:
-        if not any(store.finished for store in kept):
+        if not any(matching.store.finished and matching.store.is_there for matching in begun):
             raise
-        raise StoppedError(
-            f"{error} The {len(kept[0].finished)} finished tiles are kept: give the same command again to go on."
-        ) from error
+        n, store = len(begun[0].store.finished), begun[0].store
+        raise StoppedError(f"{error} The {n} finished tiles are kept: {store.how_to_go_on}.") from error
+    except KeyboardInterrupt:
+        for matching in begun:
+            matching.tell_interrupted(progress)
+        raise
 
 
-def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: list[TileStore]) -> DsmResult:
-    """See `run_dsm`. kept : becomes where the tiles are, once they are made."""
+def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, begun: list[Matching]) -> DsmResult:
+    """See `run_dsm`. begun : becomes the matching, once it begins."""
     watch = Stopwatch()
     check_maps(request.products, config.products)
     if request.report:
@@ -122,7 +138,7 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     matching = Matching(job, tiles, store, EventLog(out))
     ties = {} if orientation.ties is None else orientation.ties.arrays()
     with made_folder(out), store.open(digest, ties):
-        kept.append(store)
+        begun.append(matching)
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, store, settled, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
@@ -206,22 +222,21 @@ def _write_maps(
 
 
 def run_demo(out: Path, progress: Progress) -> DemoResult:
-    """Render the built-in block (line scanners, six images in two strips), match it, and compare it with its truth."""
+    """Render the built-in block (line scanners, six images in two strips), match it, and compare it with its truth.
+
+    A demo that was stopped goes on with the scene and the tiles that are there; one that was finished starts anew.
+
+    Raises
+    ------
+    OutputError
+        Where `out` holds a scene that no demo has rendered.
+    """
     from zlocus.evaluation.evaluate import evaluate
-    from zlocus.synthetic.files import render_scene
-    from zlocus.synthetic.linescan import TrajectoryNoise
     from zlocus.synthetic.scenes import LEVEL_1_M, demo_spec
 
     spec = demo_spec()
-    folder = out / "scene"
-    if folder.exists():
-        shutil.rmtree(folder)
-    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
-        # The files say how the aircraft flew, which is what the images saw.
-        rendered = render_scene(spec, folder, lambda step: stage.advance(), TrajectoryNoise())
-    request = DsmRequest(
-        inputs=rendered.inputs, out=out, resolution=spec.gsd_m, overwrite=True, workers=DEMO_WORKERS
-    )  # fmt: skip
+    rendered = _demo_scene(spec, out, progress)
+    request = DsmRequest(inputs=rendered.inputs, out=out, resolution=spec.gsd_m, workers=DEMO_WORKERS)
     result = run_dsm(request, RunConfig(), progress)
     evaluations = (
         evaluate(
@@ -231,6 +246,39 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     )
     picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")
     return DemoResult(result.out, tuple(evaluations))
+
+
+def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene:
+    """The scene of a demo which was stopped, whose tiles are then left as they are; else a new one."""
+    from zlocus.synthetic.files import render_scene, scene_files
+    from zlocus.synthetic.linescan import TrajectoryNoise
+
+    # The files say how the aircraft flew, which is what the images saw.
+    flown = TrajectoryNoise()
+    made_of = hashlib.sha256(repr((spec, flown, versions_record())).encode()).hexdigest()
+    folder, begun, finished = out / "scene", out / DEMO_BEGUN, out / DEMO_ACCURACY
+    if folder.exists() and not finished.exists():
+        if not begun.exists():
+            raise OutputError(f"{folder} is there already, and not the scene of a demo. Choose another folder with -o.")
+        if _is_scene_of(begun, made_of):
+            progress.note(f"The scene in {folder} is that of a demo which was stopped: it is not rendered again.")
+            return scene_files(spec, folder, is_linescan=True)
+    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
+        # From here on the folder is a demo's, whose scene is not complete.
+        write_record(begun, {})
+        finished.unlink(missing_ok=True)
+        for old in (folder, out / TILES):
+            shutil.rmtree(old, ignore_errors=True)
+        rendered = render_scene(spec, folder, lambda step: stage.advance(), flown)
+        write_record(begun, {"scene_sha256": made_of})
+    return rendered
+
+
+def _is_scene_of(begun: Path, made_of: str) -> bool:
+    """Whether a demo that was begun has rendered its scene, and this one."""
+    with suppress(InputError):  # damaged
+        return bool(read_record(begun).get("scene_sha256") == made_of)
+    return False
 
 
 def _job(request: DsmRequest, settled: Settled, config: RunConfig, area: Polygons) -> TileJob:

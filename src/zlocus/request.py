@@ -12,6 +12,8 @@ from zlocus.errors import ConfigError, InputError, OutputError
 
 SCENE_SUFFIXES = (".yaml", ".yml")
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
+# Of a demo: that its folder is one's, and how its surface compares with the truth, which ends it.
+DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 # Or the file of a geoid.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -75,11 +73,3 @@ def busy() -> Iterator[None]:
 def is_busy() -> bool:
     """Whether threads are at work, as after an interrupt: the process would wait for them at its end."""
     return bool(_running)
-
-
-def leave_if_busy(status: int) -> None:
-    """End the process where threads are at work. Nothing is half-written then, for they only compute."""
-    if is_busy():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)

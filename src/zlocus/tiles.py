@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -219,11 +219,10 @@ class Matching:
                 self.log.add("resumed", tiles_there=len(worked) - len(todo))
                 stage.advance(len(worked) - len(todo))
             if ready is not None:
-                with self._interruption(progress):
-                    for outcome in run_tasks(ready, todo):
-                        self._took(outcome, stage, elsewhere, is_elsewhere=not isinstance(ready, Here))
-                        if outcome.failure is not None and outcome.is_final:
-                            failed.append(outcome)
+                for outcome in run_tasks(ready, todo):
+                    self._took(outcome, stage, elsewhere, is_elsewhere=not isinstance(ready, Here))
+                    if outcome.failure is not None and outcome.is_final:
+                        failed.append(outcome)
         return failed
 
     def _took(self, outcome: Outcome, stage: Stage, elsewhere: Elsewhere, is_elsewhere: bool) -> None:
@@ -248,15 +247,12 @@ class Matching:
         if outcome.peak_mb:
             stage.tell(f"{outcome.peak_mb / 1e3:.1f} GB")
 
-    @contextmanager
-    def _interruption(self, progress: Progress) -> Iterator[None]:
-        try:
-            yield
-        except KeyboardInterrupt:
-            self.log.add("interrupted", tiles_done=self.n_there)
+    def tell_interrupted(self, progress: Progress) -> None:
+        """Say, after an interrupt, what is kept."""
+        self.log.add("interrupted", tiles_done=self.n_there)
+        if self.n_there and self.store.is_there:
             done = f"{self.n_there} of {len(self.tiles)} tiles"
-            progress.note(f"{done} are finished and kept: the same command goes on from there.")
-            raise
+            progress.note(f"{done} are finished and kept: {self.store.how_to_go_on}.")
 
     def assemble(self, failed: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress) -> None:
         """Write all tiles, those that failed as empty, in their order, so that nothing depends on that of making.

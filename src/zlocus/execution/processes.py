@@ -7,21 +7,28 @@ import os
 import pickle
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from multiprocessing.resource_tracker import ensure_running
 from types import ModuleType, TracebackType
 from typing import Any
 
 from zlocus.execution.engine import Cause, Failure, Outcome, attempted
+from zlocus.kernels._jit import CACHE
+from zlocus.signals import ENDING
 
 # Kernels use one core each, and so must the libraries below them: else n workers have n times the threads.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
 # Imported once, by the process that workers are forked from.
 PRELOADED = ("zlocus.execution.preload",)
 TIME_TO_STOP_S = 2.0
+# Signals to all processes of a run reach this one soon after they reach a worker.
+SIGNALS_SPREAD_S = 0.3
 
 
 @dataclass
@@ -96,7 +103,7 @@ class Processes:
         mine, theirs = self._context.Pipe()
         name = f"worker {self._number}"
         process = self._context.Process(target=work, args=(theirs, self._function, name), name=name, daemon=True)
-        with _one_thread_below(), _without_main():
+        with _environment_below(ONE_THREAD | kernel_cache()), _without_main(), _deaf_below():
             process.start()
         theirs.close()
         return _Worker(process, mine)
@@ -110,11 +117,17 @@ class Processes:
         self.close()
 
 
+def kernel_cache() -> dict[str, str]:
+    """Variables for the environment of processes that this one starts: they keep kernels where it does, if that is a
+    folder of its own."""
+    return {} if CACHE.temporary is None else {"NUMBA_CACHE_DIR": str(CACHE.temporary)}
+
+
 @contextmanager
-def _one_thread_below() -> Iterator[None]:
-    """Processes that are started meanwhile find that libraries shall have one thread."""
-    kept = {key: os.environ.get(key) for key in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
+def _environment_below(variables: dict[str, str]) -> Iterator[None]:
+    """Processes that are started meanwhile find these variables in their environment."""
+    kept = {key: os.environ.get(key) for key in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
@@ -123,6 +136,22 @@ def _one_thread_below() -> Iterator[None]:
                 del os.environ[key]
             else:
                 os.environ[key] = value
+
+
+@contextmanager
+def _deaf_below() -> Iterator[None]:
+    """Processes that are started meanwhile do not hear the signals that end a run, until they ask for them: of Ctrl-C
+    the whole group hears, and one that is still importing would print where it was."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # It lets signals through when it is started, as the first process would make it.
+    ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -138,8 +167,7 @@ def _without_main() -> Iterator[None]:
 
 def work(connection: Connection, function: bytes, name: str) -> None:
     """What a process does: tasks, until its other end is closed."""
-    # Of Ctrl-C the whole group hears; who waits for the results decides.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _mind_signals()
     one_thread()
     call = pickle.loads(function)
     cpu_s = 0.0  # what it took to start counts too
@@ -149,6 +177,23 @@ def work(connection: Connection, function: bytes, name: str) -> None:
             outcome = attempted(call, connection.recv(), name, cpu_s)
             cpu_s += outcome.cpu_s
             connection.send(outcome)
+
+
+def _mind_signals() -> None:
+    """Let this process end with the one that waits for its results, and when it is told to by itself."""
+    # Of Ctrl-C the whole group hears; who waits for the results decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_leave_after, args=(parent,), daemon=True).start()
+
+
+def _leave_after(parent: BaseProcess) -> None:
+    """End this process when another has ended, however that was."""
+    parent.join()
+    os._exit(1)
 
 
 def one_thread() -> None:
@@ -167,5 +212,7 @@ def _lost(process: BaseProcess) -> Failure:
             Cause.LOST, f"its process was killed (signal {-status}), as the system does when memory runs out"
         )
     if status is not None and status < 0:
+        if -status in ENDING:
+            time.sleep(SIGNALS_SPREAD_S)  # if it was not meant for the worker alone, this process ends here
         return Failure(Cause.LOST, f"its process ended by signal {-status}")
     return Failure(Cause.LOST, f"its process ended with status {status}")

@@ -33,13 +33,14 @@ class TileStore:
 
     folder : holds them, made by `open`; key : all that the tiles depend on, by name; finished : SHA-256 of each tile
     that is there, by its name; before : SHA-256 of what an earlier run of the same found before its first tile, "" of
-    nothing.
+    nothing; starts_anew_by : the option by which the run takes on no tiles, "" where it does.
     """
 
     folder: Path
     key: dict[str, Any]
     finished: dict[str, str] = field(default_factory=dict)
     before: str = ""
+    starts_anew_by: str = ""
     _lock: BinaryIO | None = None
     _is_ours: bool = False
 
@@ -53,6 +54,7 @@ class TileStore:
             It holds tiles of another run, and may not be overwritten.
         """
         store = cls(out / FOLDER, json.loads(json.dumps(key)))
+        store.starts_anew_by = "--overwrite" if overwrite else "" if is_resumed else "--no-resume"
         if overwrite or not is_resumed or not (store.folder / MANIFEST).exists():
             return store
         found = _read_object(store.folder / MANIFEST)
@@ -139,6 +141,11 @@ class TileStore:
                 done.flush()
                 os.fsync(done.fileno())
         except OSError as error:
+            if not self.is_there:
+                raise StoppedError(
+                    f"{self.folder} has gone since the run began, with {len(self.finished)} finished tiles in it. Give "
+                    "the same command again to make them anew."
+                ) from error
             raise StoppedError(
                 f"{self.folder} cannot be written: {error.strerror or error}. {len(self.finished)} finished tiles are "
                 "kept; make room, and give the same command again to go on."
@@ -153,8 +160,20 @@ class TileStore:
         """Whether a finished tile is there, with the bytes that were written."""
         return name in self.finished and self.load(name) is not None
 
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder still is where `open` made it; somebody may have removed it."""
+        return (self.folder / MANIFEST).exists()
+
+    @property
+    def how_to_go_on(self) -> str:
+        """What a user is to do with the tiles of a run that was stopped, as a clause."""
+        without = f" without {self.starts_anew_by}" if self.starts_anew_by else ""
+        return f"the same command{without} goes on from there"
+
     def remove(self) -> None:
         """Remove all tiles: their surface is complete."""
+        self.finished.clear()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, name: str) -> Path:

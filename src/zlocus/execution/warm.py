@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from zlocus.execution.processes import kernel_cache
 from zlocus.matching.cells import CellWindow
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.setup import MatchScene
@@ -22,22 +25,30 @@ from zlocus.scene import ImageWindow, View
 from zlocus.sensors.model import FloatArray
 
 GROUPS = ("orient", "match", "refine")
+FOR_ANOTHER = "import sys; from zlocus.execution.warm import warm_for_another; warm_for_another(sys.argv[1])"
 SIDE = 96
 
 
 @contextmanager
 def kernels_compiling() -> Iterator[None]:
     """Kernels compile while the block runs; at its end they are ready."""
-    commands = [[sys.executable, "-m", "zlocus.execution.warm", group] for group in GROUPS]
-    running = [subprocess.Popen(c, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
+    running = []
     try:
+        for group in GROUPS:
+            command = [sys.executable, "-c", FOR_ANOTHER, group]
+            # What it prints is not asked for; its input ends when this process does, and so does it.
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                env=os.environ | kernel_cache(),
+            )  # fmt: skip
+            running.append(process)
         yield
         for process in running:
             process.wait()
     finally:
         for process in running:
             process.kill()
-            process.wait()
+            process.communicate()
 
 
 @dataclass(frozen=True)
@@ -128,6 +139,18 @@ def warm(group: str) -> None:
     seen = np.zeros((3, 2, *shape), np.int32)
     seen[1] = 16
     refine(views, views.pixels, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
+
+
+def _leave_after_input() -> None:
+    """End this process when the one that started it has ended, however that was."""
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def warm_for_another(group: str) -> None:
+    """Run a group of kernels once, unless the process that holds the input of this one ends before."""
+    threading.Thread(target=_leave_after_input, daemon=True).start()
+    warm(group)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ import ipaddress
 import os
 import signal
 import socket
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import uvicorn
@@ -42,10 +42,6 @@ def inspect_surface(
     """
     address = checked_address(host)
     fragment = fragment_of(view)
-    # An end that is asked for this way cleans up too.
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), lambda number, frame: sys.exit(128 + number))
     with listening(address, port) as listener, Inspection(out, comparison, may_ask) as inspection:
         port, token = listener.getsockname()[1], new_token()
         names = [f"[{address}]" if address.version == 6 else str(address)]
@@ -53,12 +49,40 @@ def inspect_surface(
         # A browser leaves out the port that is usual.
         known = {f"{host}:{port}" for host in hosts} | (set(hosts) if port == USUAL_PORT else set())
         app = application(inspection, token, frozenset(known))
-        announce(f"http://{names[0]}:{port}/{token}/{fragment}", not address.is_loopback)
         config = uvicorn.Config(
             app, log_level="error", access_log=False, server_header=False, ws="none",
             timeout_graceful_shutdown=GRACE_S,
         )  # fmt: skip
-        uvicorn.Server(config).run(sockets=[listener])
+        link = f"http://{names[0]}:{port}/{token}/{fragment}"
+        _Server(config, lambda: announce(link, not address.is_loopback)).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """A server that says when it answers, and that SIGHUP ends as SIGTERM does: after the answers under way."""
+
+    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer, and say so."""
+        await super().startup(sockets)
+        self._announce()
+
+    @contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        """Note the signals that come in the block, which ends the server; at its end they do what they did before."""
+        with super().capture_signals():
+            hang_up = getattr(signal, "SIGHUP", None)
+            before = None if hang_up is None else signal.getsignal(hang_up)
+            if hang_up is None or before in (None, signal.SIG_IGN):  # as below nohup
+                yield
+                return
+            signal.signal(hang_up, self.handle_exit)
+            try:
+                yield
+            finally:
+                signal.signal(hang_up, before)
 
 
 def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

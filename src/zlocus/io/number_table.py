@@ -11,6 +11,7 @@ import numpy as np
 from zlocus.errors import InputError, OutputError
 from zlocus.io.opening import existing_file
 from zlocus.io.text import AGAIN, LARGEST, LONGEST_LINE, decimal, shown, text_lines
+from zlocus.io.whole import whole_file
 from zlocus.sensors.model import FloatArray
 
 SEPARATORS = (",", ";")
@@ -122,7 +123,8 @@ def write_numbers(
     rows = (",".join([*word, *map(repr, row)]) for word, row in zip(words, numbers, strict=True))
     text = "\n".join([f"# {comment}", ",".join([*(labels or ()), *columns]), *rows]) + "\n"
     try:
-        path.write_text(text, encoding="utf-8")
+        with whole_file(path) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 

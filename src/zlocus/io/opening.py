@@ -22,6 +22,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.errors import InputError
 from zlocus.io.text import shown
+from zlocus.io.virtual import ARCHIVES, FIRST_BYTES, REMOTE, check_served, check_virtual, is_virtual
 
 BLOCK_CACHE_BYTES = 128 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -33,9 +34,6 @@ LARGE_BLOCK_BYTES, DENSEST = 256 << 20, 10_000
 PIXEL_BYTES = {"complex_int16": 4}
 KEPT_OPEN = 32  # rasters of a thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
-# GDAL's virtual files that are read: those of servers, as they are. None within an archive.
-REMOTE = ("vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsihdfs", "vsiwebhdfs")
-ARCHIVES = {b"PK\x03\x04": "ZIP", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7-Zip", b"Rar!": "RAR", b"BZh": "bzip2"}
 # Rasters that are lists of other files or ask services, whatever their file is called. A virtual raster is read where
 # its name says that it is one.
 ELSEWHERE = frozenset((
@@ -120,13 +118,16 @@ def kept_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
 
 
 def _opened(path: Path) -> rasterio.DatasetReader:
+    is_list = path.suffix.lower() == ".vrt"
+    if is_list and not is_remote(path) and is_virtual(first_bytes(path)):
+        check_virtual(path)
     try:
         with _quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             # `rasterio.open` takes one format only.
-            dataset = rasterio.DatasetReader(gdal_name(path), driver=_drivers(path.suffix.lower() == ".vrt"))
+            dataset = rasterio.DatasetReader(gdal_name(path), driver=_drivers(is_list))
     except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
-        if not is_remote(path) and first_bytes(path).lstrip().startswith(b"<VRTDataset"):
+        if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
             raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
         raise InputError(
             f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
@@ -134,6 +135,12 @@ def _opened(path: Path) -> rasterio.DatasetReader:
         ) from error
     if not is_remote(path):
         _check_block(dataset, path)
+    elif dataset.driver == "VRT":
+        try:
+            check_served(path, dataset.tags(ns="xml:VRT")["xml:VRT"])
+        except BaseException:
+            dataset.close()
+            raise
     return dataset
 
 
@@ -164,7 +171,7 @@ def first_bytes(path: Path) -> bytes:
     """How a file begins; nothing where it cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(64)
+            return file.read(FIRST_BYTES)
     except OSError:
         return b""
 

@@ -93,10 +93,14 @@ class RasterSink:
             "tiled": True, "blockxsize": BLOCK_SIZE, "blockysize": BLOCK_SIZE, "BIGTIFF": "IF_SAFER", "SPARSE_OK": True,
             "photometric": "RGB" if has_colours else "MINISBLACK",
         }  # fmt: skip
-        with self._guard():
-            kinds = ((len(descriptions), self.dtype, nodata or 0), (1, np.dtype(bool), 0))
-            for path, (count, kind, empty) in zip(self._paths, kinds, strict=False):
-                self._waiting.append(WaitingCells(path, (count, rows, cols), kind, empty, BLOCK_SIZE))
+        kinds = ((len(descriptions), self.dtype, nodata or 0), (1, np.dtype(bool), 0))
+        try:
+            with self._guard():
+                for path, (count, kind, empty) in zip(self._paths, kinds, strict=False):
+                    self._waiting.append(WaitingCells(path, (count, rows, cols), kind, empty, BLOCK_SIZE))
+        except BaseException:
+            self._remove()
+            raise
 
     def write(self, row: int, col: int, array: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> None:
         """Put a block with its first cell at (row, col).
@@ -110,19 +114,21 @@ class RasterSink:
                 waiting.put(row, col, cells)
 
     def close(self) -> None:
-        """Convert to COG and rename to `path`."""
+        """Convert to COG and rename to `path`; nothing else stays, after an exception either."""
         options = COG_OPTIONS | {
             "PREDICTOR": FLOAT_PREDICTOR if self.dtype.kind == "f" else INTEGER_PREDICTOR,
             "OVERVIEW_RESAMPLING": "AVERAGE" if self._average else "NEAREST",
             "NUM_THREADS": _threads.get(),
         }
-        with self._guard():
-            self._gather()
-            _check_written(self._part)
-            rasterio.shutil.copy(self._part, self._cog, driver="COG", **options)
-            _check_written(self._cog)
-            os.replace(self._cog, self.path)
-        self._remove()
+        try:
+            with self._guard():
+                self._gather()
+                _check_written(self._part)
+                rasterio.shutil.copy(self._part, self._cog, driver="COG", **options)
+                _check_written(self._cog)
+                os.replace(self._cog, self.path)
+        finally:
+            self._remove()
 
     def abort(self) -> None:
         """Remove everything that was begun; harmless after `close`."""

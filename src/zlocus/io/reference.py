@@ -20,7 +20,7 @@ from rasterio.windows import Window
 from zlocus.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, known_crs, raster_crs
 from zlocus.io.heights import check_unit, is_fill
-from zlocus.io.opening import ARCHIVES, existing_file, first_bytes, is_remote, open_raster
+from zlocus.io.opening import existing_file, first_bytes, is_remote, open_raster
 from zlocus.io.vertical import (
     OWN_ELLIPSOIDAL,
     VerticalDatum,
@@ -30,6 +30,7 @@ from zlocus.io.vertical import (
     vertical_datum_of,
     vertical_part,
 )
+from zlocus.io.virtual import ARCHIVES
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
 EDGE_PIECES = 200

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from zlocus.errors import InputError, OutputError
 from zlocus.io.text import BYTE_ORDER_MARK, LARGEST, decimal, is_decimal, read_bytes, shown, stops_within, written
+from zlocus.io.whole import whole_file
 from zlocus.sensors.rpc import RpcCoefficients
 
 SCALARS = (
@@ -142,7 +143,8 @@ def write_rpc_txt(path: Path, rpc: RpcCoefficients) -> None:
     for name, terms in zip(POLYNOMIALS, (rpc.line_num, rpc.line_den, rpc.samp_num, rpc.samp_den), strict=True):
         lines += [f"{name}_{i}: {value!r}" for i, value in enumerate(terms, 1)]
     try:
-        path.write_text("\n".join(lines) + "\n", encoding="ascii")
+        with whole_file(path) as part:
+            part.write_text("\n".join(lines) + "\n", encoding="ascii")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 

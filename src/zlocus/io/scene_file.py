@@ -14,11 +14,9 @@ views:
 from __future__ import annotations
 
 import datetime
-import os
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +38,7 @@ from zlocus.io.images import RasterImage, check_content, check_grey_values, open
 from zlocus.io.opening import existing_file
 from zlocus.io.strict import Number, StrictModel, validated
 from zlocus.io.text import shown
+from zlocus.io.whole import whole_file
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.model import FloatArray
@@ -253,13 +252,10 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
         When the folder cannot be written.
     """
     document = scene_file.model_dump(mode="json", by_alias=True, exclude_none=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-        os.replace(temporary, path)
+        with whole_file(path) as part:
+            part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
     except OSError as error:
-        with suppress(OSError):  # where it could not be made
-            temporary.unlink()
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 
 

@@ -340,7 +340,7 @@ def match_curves_figure(report: PointReport) -> Figure:
             axes.plot(report.heights_m[peaks.peak[j]], peaks.rho1[j], "x", color="black", markersize=7)
         if np.isfinite(peaks.rho2[j]):
             axes.axhline(peaks.rho2[j], color="#777777", linewidth=0.8, linestyle=":")
-        axes.set_title(f"{j + 1}. {report.reference} – {name}", fontsize=9, loc="left")
+        axes.set_title(as_written(f"{j + 1}. {report.reference} – {name}"), fontsize=9, loc="left")
         rho = f"{_signed(label)} {LABELS[label]}   ρ1 {_number(peaks.rho1[j], 2)}   ratio {_number(peaks.ratio[j], 2)}"
         axes.text(0.02, 0.03, rho, transform=axes.transAxes, fontsize=8, color=LABEL_COLOURS[label])
     _labelled(figure, "Correlation with each search image (x: peak, dotted: rival ρ2)")
@@ -358,7 +358,7 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
     for j, name in enumerate(report.search[:n_images]):
         values = curves.single.values[j]
         colour, dashes = COLOURS[j % len(COLOURS)], DASHES[j // len(COLOURS) % len(DASHES)]
-        axes.plot(report.heights_m, values, color=colour, linestyle=dashes, linewidth=0.9, label=name)
+        axes.plot(report.heights_m, values, color=colour, linestyle=dashes, linewidth=0.9, label=as_written(name))
     mean, j = curves.mean, n_images - 1
     # The mean of one image is that image's own curve.
     steps = [curves.n_used] if n_images > curves.n_used else list(range(2, n_images))
@@ -378,10 +378,15 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
         axes.set_xlabel("height, m", fontsize=9)  # the figure's own would be under the legend
         axes.set_ylabel("correlation", fontsize=9)
         return figure
-    axes.set_title(title, fontsize=9, loc="left")
+    axes.set_title(as_written(title), fontsize=9, loc="left")
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     _labelled(figure, None)
     return figure
+
+
+def as_written(text: str) -> str:
+    """Words with names of views in them, for a figure: to matplotlib a formula stands between two signs of dollar."""
+    return text.replace("$", r"\$")
 
 
 def svg_of(figure: Figure) -> str:
@@ -412,7 +417,8 @@ def loci_figure(loci: Sequence[Locus]) -> Figure:
         axes.set_xlim(extent[0], extent[1])
         axes.set_ylim(extent[2], extent[3])
         axes.tick_params(labelsize=7)
-        axes.set_title(f"{locus.name} (reference)" if j == 0 else f"{j}. {locus.name}", fontsize=9, loc="left")
+        title = f"{locus.name} (reference)" if j == 0 else f"{j}. {locus.name}"
+        axes.set_title(as_written(title), fontsize=9, loc="left")
     figure.suptitle("The vertical line in the images, column and row (+: first height, x: peak)", fontsize=10)
     return figure
 

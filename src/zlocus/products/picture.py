@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
-from zlocus.errors import OutputError
 from zlocus.kernels.shade import BRIGHTEST, DARKEST
 from zlocus.options import ProductOptions
 from zlocus.products.hillshade import hillshade
+from zlocus.products.record import write_whole
 
 FloatImage = NDArray[np.float32]
 GAP = 12
@@ -44,12 +44,7 @@ def picture_beside_truth(dsm: Path, truth: Path, path: Path, side: int = 480) ->
     ]
     gap = np.full((panels[0].shape[0], GAP, 3), 255, np.uint8)
     done, png = cv2.imencode(".png", np.hstack([panels[0], gap, panels[1], gap, panels[2]]))
-    try:
-        path.write_bytes(png.tobytes() if done else b"")
-    except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror}. Check the folder and the space left."
-        ) from error
+    write_whole(path, lambda part: part.write_bytes(png.tobytes() if done else b""))
 
 
 def relief(

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from odc.geo.geobox import GeoBox
 
-from zlocus.errors import OutputError
 from zlocus.io.raster import RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.surface.surface import Surface
@@ -75,7 +74,7 @@ class SurfaceRasters:
     ) -> None:
         try:
             self._stack.__exit__(kind, error, trace)
-        except OutputError:
+        except BaseException:
             # Some were complete already: a set of products that do not belong together helps nobody.
             for path in self._paths:
                 with suppress(OSError):

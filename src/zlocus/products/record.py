@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -21,6 +20,7 @@ from zlocus.execution.memory import peak_memory_mb
 from zlocus.io.config import config_as_dict
 from zlocus.io.documents import read_json
 from zlocus.io.opening import gdal_name, is_remote
+from zlocus.io.whole import whole_file
 from zlocus.options import RunConfig
 
 SCHEMA = 1
@@ -138,15 +138,12 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
     OutputError
         Where it cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        write(part)
-        os.replace(part, path)
+        with whole_file(path) as part:
+            write(part)
     except OSError as error:
         reason = error.strerror or str(error)
         raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def finite_only(value: Any) -> Any:

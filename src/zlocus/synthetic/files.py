@@ -63,8 +63,13 @@ def render_scene(
     folder = Path(folder)
     with new_folder(folder) as part:
         _write_scene(spec, part, progress, linescan)
+    return scene_files(spec, folder, linescan is not None)
+
+
+def scene_files(spec: SceneSpec, folder: Path, is_linescan: bool) -> RenderedScene:
+    """The files of a scene that `render_scene` wrote. is_linescan : cameras were written as line scanners."""
     images = {view.name: folder / image_name(view) for view in spec.views}
-    inputs = tuple(images.values()) if linescan is None else (folder / "scene.yaml",)
+    inputs = (folder / "scene.yaml",) if is_linescan else tuple(images.values())
     return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif", inputs)
 
 
