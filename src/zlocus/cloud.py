@@ -35,6 +35,7 @@ from zlocus.products.cloud import PointCloud, file_names, write_map
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
 from zlocus.request import CloudRequest
+from zlocus.room import check_room_for_pixels
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rays import DepthRays
@@ -74,6 +75,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         vertical = vertical_datum(request.vertical)
         scene = with_heights(scene, request.heights, vertical)
         references = chosen_references(scene, request.references)
+        check_room_for_pixels(request.out, scene, references)
     options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         ready = orient_scene(scene, scene.heights, config.orientation, progress)

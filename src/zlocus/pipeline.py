@@ -42,8 +42,9 @@ from zlocus.products.record import Stopwatch, inputs_record, now, request_as_dic
 from zlocus.products.report.files import forget_report
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
+from zlocus.room import check_room, check_room_before_ties, check_room_for_pixels
 from zlocus.scene import Scene
-from zlocus.settling import Settled, opened, settled_run
+from zlocus.settling import Opened, Settled, opened, settled_run
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 if TYPE_CHECKING:
@@ -106,12 +107,14 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
         scene, vertical = found.scene, found.vertical
         store = TileStore.of(request.out, key_of(request, config, found.files), request.resume, request.overwrite)
         polygons = _area_polygons(request, scene.crs)
+        _check_room_first(request, found, store)
     with watch.stage("orient"):
         known = _known_ties(store, scene, progress)
         orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
         progress.note(what_was_applied(orientation))
     with watch.stage("settle"):
         settled = settled_run(request, found, orientation, config, progress)
+        check_room(request.out, settled.grid, settled.matching, _has_colours(request, settled))
         tiles = plan_tiles(settled.grid.window, settled.matching.seen, config.pyramid)
         plan = planned(settled.matching, tiles, config, request)
         vertical.check_covers(_area_matched(settled.grid, settled.matching), scene.crs)
@@ -153,6 +156,15 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     return DsmResult(out, tally.coverage)
 
 
+def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
+    """Refuse, before the images are read, what memory and the disk have no room for."""
+    if request.method == "gc3-sgm":
+        check_room_for_pixels(request.out, found.scene, [view.name for view in found.scene.views])
+    if not store.finished:
+        like = None if found.like is None else found.like.shape.yx
+        check_room_before_ties(request.out, found.scene, request.resolution, request.bounds, like)
+
+
 def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredTies | None:
     """Tie points of the same run, where it was begun before."""
     arrays = store.found_before()
@@ -164,9 +176,13 @@ def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredT
 
 def _rasters(request: DsmRequest, settled: Settled, vertical: VerticalDatum) -> SurfaceRasters:
     """The rasters of the surface; in image space the ortho-image is grey."""
-    matching = settled.matching
-    has_colours = matching.has_colours and request.method != "gc3-sgm"
-    return SurfaceRasters(request.out, settled.grid.geobox, matching.views[0].image.dtype, vertical, has_colours)
+    dtype = settled.matching.views[0].image.dtype
+    return SurfaceRasters(request.out, settled.grid.geobox, dtype, vertical, _has_colours(request, settled))
+
+
+def _has_colours(request: DsmRequest, settled: Settled) -> bool:
+    """Whether the ortho-image of a surface has colours."""
+    return settled.matching.has_colours and request.method != "gc3-sgm"
 
 
 def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: list[Path]) -> dict[str, Any]:
