@@ -175,7 +175,7 @@ def test_record(whole, images):
     assert record["schema"] == 1
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in images("sine").inputs]
     assert all(len(entry["sha256"]) == 64 for entry in record["inputs"])
-    stages = ["open", "orient", "settle", "match", "write", "points", "curves", "record", "products"]
+    stages = ["open", "orient", "settle", "match", "record", "write", "points", "curves", "products"]
     assert [stage["name"] for stage in record["stages"]] == stages
     assert all(set(stage) == {"name", "wall_s", "cpu_s", "peak_mb"} for stage in record["stages"])
     assert record["evaluations"]["done"] <= record["evaluations"]["all_images"]

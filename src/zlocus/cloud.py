@@ -15,6 +15,7 @@ from pyproj import CRS
 from zlocus.errors import CoverageError
 from zlocus.execution.memory import SHARE, free_bytes
 from zlocus.execution.scratch import Scratch
+from zlocus.inputs import InputFiles
 from zlocus.io.colour import read_colours
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
@@ -65,10 +66,12 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     ------
     InputError, ConfigError, GeometryError, OutputError
         Before the first tile, for what cannot be used.
+    StoppedError
+        Where an input has changed meanwhile; nothing is written.
     CoverageError
         At the end, with all products kept, where fewer than half of the pixels seen by two images have a height.
     """
-    watch = Stopwatch()
+    watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = open_scene(request.inputs, asked_crs(request.crs))
         scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
@@ -76,6 +79,8 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         scene = with_heights(scene, request.heights, vertical)
         references = chosen_references(scene, request.references)
         check_room_for_pixels(request.out, scene, references)
+        files = [*request.inputs, *(path for view in scene.views for path in view.files), *vertical.files]
+        inputs = InputFiles.of(files, scene, before)
     options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         ready = orient_scene(scene, scene.heights, config.orientation, progress)
@@ -88,6 +93,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         matched = match_images(settled, options, True, request.workers, progress, scratch)
     with watch.stage("match back"):
         matched = confirmed_images(matched, progress, scratch)
+    checksums = inputs.record()
     with watch.stage("write"), made_folder(request.out), progress.stage("Writing", len(matched)) as stage:
         n_points = write_cloud(request.out, matched, scene, vertical)
         for one, name in zip(matched, file_names(references), strict=True):
@@ -95,11 +101,10 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
             stage.advance()
     n_seen = sum(int(((m.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) == 0).sum()) for m in matched)
     coverage = n_points / n_seen if n_seen else 0.0
-    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
     write_record(
         request.out / "run.json",
         {
-            **made_record(request, options, [*files, *vertical.files], watch),
+            **made_record(request, options, checksums, watch),
             "orientation": ready.orientation.as_dict(),
             "vertical": vertical.as_dict(),
             "images": {name: image_record(m) for name, m in zip(references, matched, strict=True)},

@@ -22,6 +22,7 @@ from zlocus.execution.store import TileStore
 from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid
 from zlocus.identity import digest_of, key_of
+from zlocus.inputs import InputFiles
 from zlocus.io.config import config_as_dict
 from zlocus.io.raster import compressing
 from zlocus.io.reference import cells_inside, dem_datum, read_polygons
@@ -38,8 +39,8 @@ from zlocus.products.observations import OBSERVATIONS, write_observations
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.record import Stopwatch, inputs_record, now, request_as_dict, versions_record, write_record
-from zlocus.products.report.files import forget_report
+from zlocus.products.record import Stopwatch, now, request_as_dict, versions_record, write_record
+from zlocus.products.report.files import CURVES, forget_report
 from zlocus.progress import Progress
 from zlocus.request import DsmRequest
 from zlocus.room import check_room, check_room_before_ties, check_room_for_pixels
@@ -80,7 +81,8 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
     InputError, ConfigError, GeometryError, OutputError
         Before the first tile, for what cannot be used.
     StoppedError
-        Afterwards, where tiles fail or what was found cannot be written; finished tiles are kept.
+        Afterwards, where tiles fail, an input has changed, or what was found cannot be written; finished tiles are
+        kept.
     CoverageError
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
@@ -103,11 +105,9 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     if request.report:
         importlib.import_module("zlocus.reporting")  # what is broken there is to show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
-        found = opened(request, progress)
-        scene, vertical = found.scene, found.vertical
-        store = TileStore.of(request.out, key_of(request, config, found.files), request.resume, request.overwrite)
-        polygons = _area_polygons(request, scene.crs)
-        _check_room_first(request, found, store)
+        begun = _begun(request, config, progress)
+    found, inputs, store, polygons = begun.found, begun.inputs, begun.store, begun.polygons
+    scene, vertical = found.scene, found.vertical
     with watch.stage("orient"):
         known = _known_ties(store, scene, progress)
         orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
@@ -129,19 +129,22 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, store, settled, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
+        inputs.check(len(store.finished), may_miss=bool(failed))
         matching.check(failed, request.partial)
+        with watch.stage("record"):
+            checksums = inputs.record(len(store.finished))
         with watch.stage("write"):
             _forget(out)
             with _rasters(request, settled, vertical) as rasters:
                 matching.assemble(failed, rasters, tally, progress)
+                inputs.check(len(store.finished))  # for a terrain model that fills gaps is read again
     with watch.stage("points"):
         _write_points(out, settled, tally.ranked, vertical)
     if request.report:
         _show(out, settled, vertical, config, watch, progress)
-    with watch.stage("record"):
-        asked = _asked_record(request, config, scene, found.files)
+        _drop_curves_of_others(out, inputs, progress)
     record = {
-        **asked,
+        **_asked_record(request, config, scene, checksums),
         "stages": watch.stages,
         "orientation": orientation.as_dict(),
         "grid": _grid_record(settled.grid, scene.crs),
@@ -154,6 +157,30 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     matching.end(failed, tally)
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run whose files are open. found : what the request names; inputs : all files, as they were; store : where its
+    tiles are, or will be; polygons : of the area asked for."""
+
+    found: Opened
+    inputs: InputFiles
+    store: TileStore
+    polygons: Polygons
+
+
+def _begun(request: DsmRequest, config: RunConfig, progress: Progress) -> Begun:
+    """Open what a request names, and look at what an earlier run left in its folder."""
+    before = InputFiles.of(request.inputs)
+    found = opened(request, progress)
+    inputs = InputFiles.of(found.files, found.scene, before)
+    store = TileStore.of(
+        request.out, key_of(request, config, inputs), request.resume, request.overwrite, inputs.check
+    )  # fmt: skip
+    polygons = _area_polygons(request, found.scene.crs)
+    _check_room_first(request, found, store)
+    return Begun(found, inputs, store, polygons)
 
 
 def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
@@ -185,14 +212,14 @@ def _has_colours(request: DsmRequest, settled: Settled) -> bool:
     return settled.matching.has_colours and request.method != "gc3-sgm"
 
 
-def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: list[Path]) -> dict[str, Any]:
+def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, inputs: list[dict[str, Any]]) -> dict[str, Any]:
     """What was asked of which program, when, with which files, and when the images were taken."""
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         "created": now(),
         "started_in": str(Path.cwd()),
         "versions": versions_record(),
-        "inputs": inputs_record(files),
+        "inputs": inputs,
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
     }
 
@@ -327,6 +354,16 @@ def _show(
     (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
     with watch.stage("curves"), progress.stage("Match curves"):
         write_shown(out, matched, config, match_s, progress)
+
+
+def _drop_curves_of_others(out: Path, inputs: InputFiles, progress: Progress) -> None:
+    """Remove match curves that may show other images than those that were matched."""
+    if changed := inputs.changed():
+        (out / CURVES).unlink(missing_ok=True)
+        progress.note(
+            f"{CURVES} was not made: {changed[0]} has changed since the surface was matched. The surface does not "
+            "depend on it."
+        )
 
 
 def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:

@@ -132,6 +132,11 @@ class View:
     camera_files: tuple[Path, ...] = ()
     date: Date | None = None
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that it is read from."""
+        return (self.path, *getattr(self.image, "sources", ()), *self.camera_files)
+
     def __repr__(self) -> str:
         rows, cols = self.image.shape
         return f"View({self.name}, {rows} x {cols} px, {type(self.sensor).__name__})"

@@ -153,5 +153,5 @@ def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[P
     extra += vertical.files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
+    listed = list(request.inputs) + [path for view in scene.views for path in view.files] + extra
     return list(dict.fromkeys(listed))

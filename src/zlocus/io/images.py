@@ -14,7 +14,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
 from zlocus.errors import InputError
-from zlocus.io.opening import check_complete, kept_raster, open_raster
+from zlocus.io.opening import PLAIN, check_complete, file_state, kept_raster, open_raster
 from zlocus.scene import HeldPixels, ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
@@ -36,7 +36,8 @@ class RasterImage:
 
     The object is a plain value that threads and processes can share: open files are kept by thread, see `kept_raster`.
 
-    bands : 1-based indices of the bands that are read, with `weights`. held : see `SparseSource`.
+    bands : 1-based indices of the bands that are read, with `weights`. held : see `SparseSource`. state : of
+    the file when it was opened, see `file_state`; sources : other files that its pixels and their mask are read from.
     """
 
     path: Path
@@ -47,6 +48,8 @@ class RasterImage:
     bands: tuple[int, ...]
     weights: tuple[float, ...]
     held: HeldPixels | None = field(default=None, compare=False, repr=False)
+    state: tuple[int, ...] = field(default=(), compare=False, repr=False)
+    sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """The window of rows x cols pixels that starts at (row, col); it lies inside the image.
@@ -120,6 +123,7 @@ def open_image(path: Path) -> RasterImage:
         For no such file, a folder, no image, a truncated file, complex or palette pixels.
     """
     path = Path(path)
+    state = file_state(path)
     with open_raster(path) as source:
         if source.count == 0:
             raise InputError(f"{path} holds no image band (it may be a container). Give one of the images in it.")
@@ -141,7 +145,16 @@ def open_image(path: Path) -> RasterImage:
                 "its blocks was ever written. Copy it again from its source, or leave it out."
             )
         image._read(source, _last_block(source, bands[0]))
-        return replace(image, held=held)
+        return replace(image, held=held, state=tuple(state), sources=_sources(source, path))
+
+
+def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:
+    """Files beside an image that its pixels are read from: those that a virtual raster lists, the header of pixels as
+    they are, and a mask. Overviews and statistics are not read, and readers of cameras name their own files."""
+    others = [Path(name) for name in source.files if Path(name) != path]
+    if source.driver == "VRT" or source.driver in PLAIN:
+        return tuple(other for other in others if not other.name.endswith((".ovr", ".aux.xml")))
+    return tuple(other for other in others if other.suffix == ".msk")
 
 
 def _last_block(source: rasterio.DatasetReader, band: int) -> Window:

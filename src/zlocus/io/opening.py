@@ -89,6 +89,17 @@ def existing_file(path: Path, what: str) -> Path:
     return path
 
 
+def file_state(path: Path) -> list[int]:
+    """Size of a file, bytes, and its time of change, ns; empty where it is not there, or on a server."""
+    if is_remote(path):
+        return []
+    try:
+        found = path.stat()
+    except OSError:
+        return []
+    return [found.st_size, found.st_mtime_ns]
+
+
 @contextmanager
 def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetReader]:
     """An open rasterio dataset; what rasterio or GDAL cannot do inside the block becomes an `InputError`.
