@@ -15,7 +15,7 @@ from pyproj import CRS
 from zlocus.errors import CoverageError
 from zlocus.execution.memory import SHARE, free_bytes
 from zlocus.execution.scratch import Scratch
-from zlocus.inputs import InputFiles
+from zlocus.inputs import InputFiles, files_of
 from zlocus.io.colour import read_colours
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
@@ -35,7 +35,7 @@ from zlocus.preparing import AREA_MARGIN, asked_crs, made_folder, what_was_appli
 from zlocus.products.cloud import PointCloud, file_names, write_map
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
-from zlocus.request import CloudRequest
+from zlocus.request import CloudRequest, check_output
 from zlocus.room import check_room_for_pixels
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.model import FloatArray
@@ -71,6 +71,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     CoverageError
         At the end, with all products kept, where fewer than half of the pixels seen by two images have a height.
     """
+    check_output(request.out, request.overwrite)
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = open_scene(request.inputs, asked_crs(request.crs))
@@ -79,8 +80,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         scene = with_heights(scene, request.heights, vertical)
         references = chosen_references(scene, request.references)
         check_room_for_pixels(request.out, scene, references)
-        files = [*request.inputs, *(path for view in scene.views for path in view.files), *vertical.files]
-        inputs = InputFiles.of(files, scene, before)
+        inputs = InputFiles.of([*request.inputs, *files_of(scene), *vertical.files], scene, before)
     options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         ready = orient_scene(scene, scene.heights, config.orientation, progress)

@@ -13,6 +13,11 @@ from zlocus.products.record import inputs_record
 from zlocus.scene import Scene
 
 
+def files_of(scene: Scene) -> list[Path]:
+    """Every file that the views of a scene are read from."""
+    return [path for view in scene.views for path in view.files]
+
+
 @dataclass(frozen=True)
 class InputFiles:
     """Files whose content a result depends on.

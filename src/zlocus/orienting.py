@@ -10,7 +10,7 @@ import numpy as np
 
 from zlocus.errors import GeometryError
 from zlocus.grid import grid_from_bounds
-from zlocus.inputs import InputFiles
+from zlocus.inputs import InputFiles, files_of
 from zlocus.io.control import read_control
 from zlocus.io.reference import dem_datum, read_dem
 from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
@@ -23,7 +23,7 @@ from zlocus.products.orientation import orientation_record
 from zlocus.products.points import write_ties
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
-from zlocus.request import OrientRequest
+from zlocus.request import OrientRequest, check_output
 from zlocus.scene import Scene, footprint, ground_sample_distance, is_local
 
 # Cells of the terrain model are this many ground pixels, its own resolution being coarser.
@@ -43,6 +43,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     StoppedError
         Where an input has changed meanwhile; nothing is written.
     """
+    check_output(request.out, request.overwrite)
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = opened_alone(request.inputs, request.crs, request.heights)
@@ -139,4 +140,4 @@ def files_read(request: OrientRequest, scene: Scene) -> list[Path]:
     extra += control_datum(request).files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    return [*request.inputs, *(path for view in scene.views for path in view.files), *extra]
+    return [*request.inputs, *files_of(scene), *extra]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from zlocus.again import Missing, finished_run, make_missing, missing_products, whole_again
 from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
 from zlocus.execution.events import EventLog
 from zlocus.execution.memory import cores
@@ -34,15 +35,16 @@ from zlocus.options import RunConfig
 from zlocus.orientation.orient import MeasuredTies, supported
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
 from zlocus.preparing import made_folder, oriented, what_was_applied
-from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
+from zlocus.products.finished import Finished, write_finished
+from zlocus.products.maps import FILES, check_maps, link_all, make_maps, remove_maps
 from zlocus.products.observations import OBSERVATIONS, write_observations
 from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.record import Stopwatch, now, request_as_dict, versions_record, write_record
-from zlocus.products.report.files import CURVES, forget_report
+from zlocus.products.record import Stopwatch, now, read_record, request_as_dict, versions_record, write_record
+from zlocus.products.report.files import CURVES, RECORD, forget_report
 from zlocus.progress import Progress
-from zlocus.request import DsmRequest
+from zlocus.request import FINISHED, DsmRequest, check_output
 from zlocus.room import check_room, check_room_before_ties, check_room_for_pixels
 from zlocus.scene import Scene
 from zlocus.settling import Opened, Settled, opened, settled_run
@@ -59,10 +61,12 @@ DEMO_WORKERS = 2
 
 @dataclass(frozen=True)
 class DsmResult:
-    """out : folder of the products; coverage : share of the cells seen by two images or more that have a height."""
+    """out : folder of the products; coverage : share of the cells seen by two images or more that have a height;
+    was_finished : whether the surface was there already, made by the same command."""
 
     out: Path
     coverage: float
+    was_finished: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,18 +78,19 @@ class DemoResult:
 
 
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
-    """Make a surface and write all products to `request.out`.
+    """Make a surface and write all products to `request.out`; where the same one is there already, those that are not.
 
     Raises
     ------
     InputError, ConfigError, GeometryError, OutputError
-        Before the first tile, for what cannot be used.
+        Before the first tile, for what cannot be used, and where `out` holds another run and may not be overwritten.
     StoppedError
         Afterwards, where tiles fail, an input has changed, or what was found cannot be written; finished tiles are
         kept.
     CoverageError
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
+    check_output(request.out, request.overwrite, may_be_same=True)
     kept: list[TileStore] = []
     try:
         with compressing(request.workers or cores()):
@@ -101,11 +106,16 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
 def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: list[TileStore]) -> DsmResult:
     """See `run_dsm`. kept : becomes where the tiles are, once they are made."""
     watch = Stopwatch()
-    check_maps(request.products, config.products)
+    check_maps(request.products, config.products, _may_have_terrain(request))
     if request.report:
         importlib.import_module("zlocus.reporting")  # what is broken there is to show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
         begun = _begun(request, config, progress)
+    if begun.finished is not None:
+        missing = missing_products(request, begun.finished, progress)
+        if not missing.matched:
+            return _already_finished(request, config, begun, missing, progress)
+        request = whole_again(request, begun.finished, missing, progress)
     found, inputs, store, polygons = begun.found, begun.inputs, begun.store, begun.polygons
     scene, vertical = found.scene, found.vertical
     with watch.stage("orient"):
@@ -144,17 +154,13 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
         _show(out, settled, vertical, config, watch, progress)
         _drop_curves_of_others(out, inputs, progress)
     record = {
-        **_asked_record(request, config, scene, checksums),
-        "stages": watch.stages,
-        "orientation": orientation.as_dict(),
-        "grid": _grid_record(settled.grid, scene.crs),
-        "vertical": vertical.as_dict(),
-        "heights": _lattice_record(settled),
-        "settled_sha256": digest,
-        **tally.as_dict(),
-    }
+        **_asked_record(request, config, scene, checksums), "stages": watch.stages,
+        **_found_record(settled, vertical), "settled_sha256": digest, **tally.as_dict(),
+    }  # fmt: skip
     _write_maps(request, config, watch, record, progress)
     matching.end(failed, tally)
+    write_finished(out, store.key)
+    store.remove()
     _check_coverage(tally, out, request.partial, progress)
     return DsmResult(out, tally.coverage)
 
@@ -162,12 +168,13 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
 @dataclass(frozen=True)
 class Begun:
     """A run whose files are open. found : what the request names; inputs : all files, as they were; store : where its
-    tiles are, or will be; polygons : of the area asked for."""
+    tiles are, or will be; polygons : of the area asked for; finished : the same run, where it is there already."""
 
     found: Opened
     inputs: InputFiles
     store: TileStore
     polygons: Polygons
+    finished: Finished | None
 
 
 def _begun(request: DsmRequest, config: RunConfig, progress: Progress) -> Begun:
@@ -178,9 +185,28 @@ def _begun(request: DsmRequest, config: RunConfig, progress: Progress) -> Begun:
     store = TileStore.of(
         request.out, key_of(request, config, inputs), request.resume, request.overwrite, inputs.check
     )  # fmt: skip
-    polygons = _area_polygons(request, found.scene.crs)
-    _check_room_first(request, found, store)
-    return Begun(found, inputs, store, polygons)
+    finished, polygons = finished_run(request, store), _area_polygons(request, found.scene.crs)
+    if finished is None:
+        check_maps(request.products, config.products)
+        _check_room_first(request, found, store)
+    return Begun(found, inputs, store, polygons, finished)
+
+
+def _may_have_terrain(request: DsmRequest) -> bool:
+    """Whether the folder may hold the terrain of this same run, finished."""
+    return not request.overwrite and all((request.out / name).exists() for name in (FINISHED, FILES["dtm"]))
+
+
+def _already_finished(
+    request: DsmRequest, config: RunConfig, begun: Begun, missing: Missing, progress: Progress
+) -> DsmResult:
+    """The result of a run whose surface is there already, with all that was asked for beside it."""
+    assert begun.finished is not None, "callers make sure"
+    make_missing(request, config, begun.found, begun.finished, missing, progress)
+    begun.store.remove()  # of a run that was stopped between its last file and its end
+    tally = Tally.of(read_record(request.out / RECORD))
+    _check_coverage(tally, request.out, request.partial, progress)
+    return DsmResult(request.out, tally.coverage, was_finished=True)
 
 
 def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
@@ -322,7 +348,7 @@ def _forget(out: Path) -> None:
     """Remove what an earlier run left, before its rasters are replaced: nothing of it may stand beside them."""
     remove_maps(out)
     forget_report(out)
-    for name in ("run.json", "ties.gpkg", OBSERVATIONS):
+    for name in (FINISHED, "run.json", "ties.gpkg", OBSERVATIONS):
         (out / name).unlink(missing_ok=True)
     # Of runs that were killed; none of this one's is there yet, and no other writes here meanwhile.
     for path in out.iterdir():
@@ -417,6 +443,16 @@ def _check_coverage(tally: Tally, out: Path, partial: bool, progress: Progress) 
             f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "
             "with --partial."
         )
+
+
+def _found_record(settled: Settled, vertical: VerticalDatum) -> dict[str, Any]:
+    """Corrections of the cameras, grid, and heights searched, as JSON can hold them."""
+    return {
+        "orientation": settled.orientation.as_dict(),
+        "grid": _grid_record(settled.grid, settled.scene.crs),
+        "vertical": vertical.as_dict(),
+        "heights": _lattice_record(settled),
+    }
 
 
 def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:

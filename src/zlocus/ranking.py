@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
-from zlocus.inputs import InputFiles
+from zlocus.inputs import InputFiles, files_of
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import check_resolution, median_ground_pixel, settle
 from zlocus.options import RunConfig
@@ -27,7 +27,7 @@ from zlocus.preparing import (
 from zlocus.products.points import counted_pairs, label_counts, write_ranking, write_ties
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
-from zlocus.request import RankRequest
+from zlocus.request import RankRequest, check_output
 from zlocus.threads import run_all
 from zlocus.tile import rank_tile
 
@@ -43,11 +43,11 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     StoppedError
         Where an input has changed meanwhile; nothing is written.
     """
+    check_output(request.out, request.overwrite)
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = opened_alone(request.inputs, request.crs, request.heights)
-        files = [*request.inputs, *(path for view in scene.views for path in view.files)]
-        inputs = InputFiles.of(files, scene, before)
+        inputs = InputFiles.of([*request.inputs, *files_of(scene)], scene, before)
     with watch.stage("orient"):
         orientation = oriented(scene, config.orientation, scene.heights, progress)
         check_ties(orientation, scene)

@@ -33,13 +33,15 @@ class TileStore:
 
     folder : holds them, made by `open`; key : all that the tiles depend on, by name; finished : SHA-256 of each tile
     that is there, by its name; before : SHA-256 of what an earlier run of the same found before its first tile, "" of
-    nothing; check : ends the run, told how many tiles are kept, where a tile may be made of what the key does not say.
+    nothing; is_of_this_run : whether an earlier run of the same has begun here; check : ends the run, told how many
+    tiles are kept, where a tile may be made of what the key does not say.
     """
 
     folder: Path
     key: dict[str, Any]
     finished: dict[str, str] = field(default_factory=dict)
     before: str = ""
+    is_of_this_run: bool = False
     check: Callable[[int], None] = lambda n_kept: None
     _lock: BinaryIO | None = None
     _is_ours: bool = False
@@ -61,7 +63,7 @@ class TileStore:
             It holds tiles of another run, and may not be overwritten.
         """
         store = cls(out / FOLDER, json.loads(json.dumps(key)), check=check)
-        if overwrite or not is_resumed or not (store.folder / MANIFEST).exists():
+        if overwrite or not (store.folder / MANIFEST).exists():
             return store
         found = _read_object(store.folder / MANIFEST)
         listed = _finished_in(store.folder / DONE)
@@ -69,6 +71,9 @@ class TileStore:
             differs = "its manifest is damaged, or of another version of zlocus"
         else:
             differs = difference(found["key"], store.key)
+        store.is_of_this_run = not differs
+        if not is_resumed:
+            return store
         if differs and listed:
             raise OutputError(
                 f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give what that run was "
