@@ -193,6 +193,20 @@ def test_many_blocks_are_told_apart_in_cells_of_several(tmp_path, monkeypatch):
     assert held.window == (32, 48, 32, 48)
 
 
+def test_what_a_sparse_file_does_not_hold_is_not_valid(images, tmp_path):
+    """Without a declared nodata value too, where GDAL reads 0, a legal grey value."""
+    path = sparse(images("sine").paths["nadir"], tmp_path / "a.tif", 1024, [(256, 512)])
+    with rasterio.open(path, "r+") as file:
+        file.nodata = None
+        stored = file.read(1)
+    image, there = open_image(path), np.zeros((1024, 1024), bool)
+    there[256:512, 512:768] = True
+    for row, col, rows, cols in ((0, 0, 1024, 1024), (250, 500, 300, 100), (300, 600, 40, 50), (700, 0, 9, 9)):
+        window, part = image.read(row, col, rows, cols), np.s_[row : row + rows, col : col + cols]
+        np.testing.assert_array_equal(window.valid, there[part])
+        np.testing.assert_array_equal(window.pixels, stored[part])
+
+
 def test_windows_that_hold_pixels_by_hand():
     rng = np.random.default_rng(8)
     held = HeldPixels((7, 5), (66, 48), rng.random((10, 10)) < 0.1)

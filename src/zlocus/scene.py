@@ -66,6 +66,21 @@ class HeldPixels:
         (top, left), (bottom, right) = first.T, end.T
         return np.asarray(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left] > 0)
 
+    def missing(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+        """The pixels (r, c) of a window that are not held; None where all are."""
+        (top, bottom), (left, right) = (
+            (first // side, -(-(first + count) // side))
+            for first, count, side in zip((row, col), (rows, cols), self.cell_px, strict=True)
+        )
+        cells = self.cells[top:bottom, left:right]
+        if cells.all():
+            return None
+        down, across = (
+            np.arange(first, first + count) // side - first // side
+            for first, count, side in zip((row, col), (rows, cols), self.cell_px, strict=True)
+        )
+        return ~cells[down[:, None], across]
+
 
 class ImageSource(Protocol):
     """An image that is read by window, never whole (implemented in `zlocus.io.images`)."""

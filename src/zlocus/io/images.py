@@ -31,8 +31,8 @@ class RasterImage:
 
     The grey channel is the luminance (Rec. 601) where the file declares red, green and blue bands, otherwise the first
     band. Not valid are: the declared nodata value, pixels off in an internal or side-car mask or fully transparent in
-    an alpha band, NaN and infinities. An integer image that declares no nodata value is valid everywhere: 0 is a
-    legal grey value and is never taken for nodata.
+    an alpha band, NaN and infinities, and what a sparse file never held. Otherwise an integer image that declares no
+    nodata value is valid everywhere: 0 is a legal grey value and is never taken for nodata.
 
     The object is a plain value that threads and processes can share: open files are kept by thread, see `kept_raster`.
 
@@ -64,7 +64,11 @@ class RasterImage:
         with kept_raster(self.path) as source:
             if source.shape != self.shape:
                 raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
-            return self._read(source, Window(col, row, cols, rows))
+            window = self._read(source, Window(col, row, cols, rows))
+        missing = None if self.held is None else self.held.missing(row, col, rows, cols)
+        if missing is None:
+            return window
+        return ImageWindow(np.where(missing, np.float32(0.0), window.pixels), window.valid & ~missing)
 
     @property
     def has_colours(self) -> bool:
