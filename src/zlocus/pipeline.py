@@ -110,13 +110,13 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     if request.report:
         importlib.import_module("zlocus.reporting")  # what is broken there is to show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
-        begun = _begun(request, config, progress)
-    if begun.finished is not None:
-        missing = missing_products(request, begun.finished, progress)
+        run = _open_run(request, config, progress)
+    if run.finished is not None:
+        missing = missing_products(request, run.finished, progress)
         if not missing.matched:
-            return _already_finished(request, config, begun, missing, progress)
-        request = whole_again(request, begun.finished, missing, progress)
-    found, inputs, store, polygons = begun.found, begun.inputs, begun.store, begun.polygons
+            return _already_finished(request, config, run, missing, progress)
+        request = whole_again(request, run.finished, missing, progress)
+    found, inputs, store, polygons = run.found, run.inputs, run.store, run.polygons
     scene, vertical = found.scene, found.vertical
     with watch.stage("orient"):
         known = _known_ties(store, scene, progress)
@@ -166,7 +166,7 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
 
 
 @dataclass(frozen=True)
-class Begun:
+class OpenRun:
     """A run whose files are open. found : what the request names; inputs : all files, as they were; store : where its
     tiles are, or will be; polygons : of the area asked for; finished : the same run, where it is there already."""
 
@@ -177,7 +177,7 @@ class Begun:
     finished: Finished | None
 
 
-def _begun(request: DsmRequest, config: RunConfig, progress: Progress) -> Begun:
+def _open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> OpenRun:
     """Open what a request names, and look at what an earlier run left in its folder."""
     before = InputFiles.of(request.inputs)
     found = opened(request, progress)
@@ -189,7 +189,7 @@ def _begun(request: DsmRequest, config: RunConfig, progress: Progress) -> Begun:
     if finished is None:
         check_maps(request.products, config.products)
         _check_room_first(request, found, store)
-    return Begun(found, inputs, store, polygons, finished)
+    return OpenRun(found, inputs, store, polygons, finished)
 
 
 def _may_have_terrain(request: DsmRequest) -> bool:
@@ -198,12 +198,12 @@ def _may_have_terrain(request: DsmRequest) -> bool:
 
 
 def _already_finished(
-    request: DsmRequest, config: RunConfig, begun: Begun, missing: Missing, progress: Progress
+    request: DsmRequest, config: RunConfig, run: OpenRun, missing: Missing, progress: Progress
 ) -> DsmResult:
     """The result of a run whose surface is there already, with all that was asked for beside it."""
-    assert begun.finished is not None, "callers make sure"
-    make_missing(request, config, begun.found, begun.finished, missing, progress)
-    begun.store.remove()  # of a run that was stopped between its last file and its end
+    assert run.finished is not None, "callers make sure"
+    make_missing(request, config, run.found, run.finished, missing, progress)
+    run.store.remove()  # of a run that was stopped between its last file and its end
     tally = Tally.of(read_record(request.out / RECORD))
     _check_coverage(tally, request.out, request.partial, progress)
     return DsmResult(request.out, tally.coverage, was_finished=True)
