@@ -39,7 +39,7 @@ def pipeline(monkeypatch):
         config: RunConfig
 
         def behave(self) -> Any:
-            return SimpleNamespace(out=Path("OUT"), coverage=0.987)
+            return SimpleNamespace(out=Path("OUT"), coverage=0.987, was_finished=False)
 
         def run_dsm(self, request, config, progress):
             self.request, self.config = request, config
@@ -52,7 +52,8 @@ def pipeline(monkeypatch):
             return SimpleNamespace(out=out, evaluations=evaluations)
 
     fake = Pipeline()
-    monkeypatch.setitem(sys.modules, "zlocus.pipeline", fake)
+    for name in ("zlocus.pipeline", "zlocus.demo"):
+        monkeypatch.setitem(sys.modules, name, fake)
     return fake
 
 

@@ -264,7 +264,7 @@ def test_too_few_heights_are_no_success(images, tmp_path, monkeypatch):
         run(images("plane").inputs, tmp_path / "out", **asked)
     assert failure.value.exit_status == 3
     assert (tmp_path / "out" / "cloud.laz").exists()
-    run(images("plane").inputs, tmp_path / "out", partial=True, **asked)
+    run(images("plane").inputs, tmp_path / "out", partial=True, overwrite=True, **asked)
 
 
 def said(arguments) -> str:

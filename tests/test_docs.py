@@ -17,6 +17,7 @@ from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
 from zlocus.io.vertical import KNOWN
 from zlocus.products.item import PRODUCTS
+from zlocus.request import FINISHED
 from zlocus.surface import reasons
 from zlocus.surface.reasons import EMPTY, Quality
 
@@ -85,7 +86,7 @@ def test_the_page_of_vertical_datums_names_what_there_is():
 
 def test_every_product_is_documented():
     rows = re.findall(r"^\| `(\S+)` \|", (ROOT / "docs" / "products.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert sorted(rows) == sorted([*(product.name for product in PRODUCTS), "item.json"])
+    assert sorted(rows) == sorted([*(product.name for product in PRODUCTS), "item.json", FINISHED])
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in readme for name in rows)
 

@@ -14,8 +14,8 @@ import rasterio
 from rasterio.transform import from_origin
 
 from zlocus import tiles
+from zlocus.demo import run_demo
 from zlocus.errors import OutputError
-from zlocus.pipeline import run_demo
 from zlocus.products.picture import CAPTION, GAP, error_map, picture_beside_truth, relief
 from zlocus.progress import LineProgress, SilentProgress
 from zlocus.request import DEMO_ACCURACY, DEMO_BEGUN

@@ -140,7 +140,7 @@ def test_products(whole, images):
         with rasterio.open(whole / name) as file:
             assert "STATISTICS_MEAN" in file.tags(1)
     made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json", "item.json",
-            "events.jsonl", *REPORT_FILES}  # fmt: skip
+            "events.jsonl", "finished.json", *REPORT_FILES}  # fmt: skip
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
@@ -175,7 +175,7 @@ def test_record(whole, images):
     assert record["schema"] == 1
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in images("sine").inputs]
     assert all(len(entry["sha256"]) == 64 for entry in record["inputs"])
-    stages = ["open", "orient", "settle", "match", "write", "points", "curves", "record", "products"]
+    stages = ["open", "orient", "settle", "match", "record", "write", "points", "curves", "products"]
     assert [stage["name"] for stage in record["stages"]] == stages
     assert all(set(stage) == {"name", "wall_s", "cpu_s", "peak_mb"} for stage in record["stages"])
     assert record["evaluations"]["done"] <= record["evaluations"]["all_images"]
@@ -245,6 +245,7 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
         "run.json",
         "item.json",
         "events.jsonl",
+        "finished.json",
     }
 
 

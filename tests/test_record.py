@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from zlocus.errors import OutputError
+from zlocus.inputs import InputFiles
 from zlocus.io.config import config_as_dict
 from zlocus.options import RunConfig
 from zlocus.products.record import (
@@ -99,7 +100,8 @@ def test_files_are_named_once_with_their_checksums(tmp_path):
     watch = Stopwatch()
     with watch.stage("open"):
         pass
-    record = made_record(RankRequest(tuple(paths[:2]), tmp_path / "out"), RunConfig(), [*paths, paths[2]], watch)
+    inputs = InputFiles.of([*paths, paths[2]]).record()
+    record = made_record(RankRequest(tuple(paths[:2]), tmp_path / "out"), RunConfig(), inputs, watch)
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in paths]
     assert record["config"]["options"] == config_as_dict(RunConfig())
     assert (record["stages"], list(record)) == (watch.stages, ["config", "versions", "inputs", "stages"])

@@ -105,13 +105,16 @@ def match(
     """The surface of a scene: what `zlocus dsm` writes, as a Dataset (see `open_surface`).
 
     inputs : two images or more with RPC, or one `scene.yaml`. out : folder for the products, which are then read from
-    there when they are needed; None: none are kept, and the Dataset is in memory. asked : fields of
-    `zlocus.request.DsmRequest`, such as resolution, bounds, heights, workers; those that name files take paths.
+    there when they are needed; None: none are kept, and the Dataset is in memory. A folder that holds the same surface
+    already, finished, is opened; one that holds another run is refused, unless `overwrite=True` is given. asked :
+    fields of `zlocus.request.DsmRequest`, such as resolution, bounds, heights, workers; those that name files take
+    paths.
 
     Raises
     ------
-    InputError, ConfigError, GeometryError, CoverageError
-        As `zlocus dsm`. CoverageError: too few cells have a height; what was found lies in `out`.
+    InputError, ConfigError, GeometryError, OutputError, StoppedError, CoverageError
+        As `zlocus dsm`. OutputError: `out` holds another run. CoverageError: too few cells have a height; what was
+        found lies in `out`.
     """
     from zlocus.pipeline import run_dsm
 

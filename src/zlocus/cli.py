@@ -105,7 +105,7 @@ def demo(
     """Render the built-in scene, run everything, and report the accuracy against its truth."""
     # A folder of an earlier demo may be used again, one of any other run not.
     check_output(out, overwrite=any((out / name).exists() for name in (DEMO_ACCURACY, DEMO_BEGUN)))
-    from zlocus.pipeline import run_demo
+    from zlocus.demo import run_demo
     from zlocus.products.record import write_whole
 
     result = run_demo(out, progress_for(sys.stderr))
@@ -172,12 +172,13 @@ def dsm(
         vertical=vertical, fill=fill, partial=partial, workers=workers, scheduler=scheduler,
         memory_gb=memory, overwrite=overwrite, resume=resume, products=product_names(maps), report=report,
     )  # fmt: skip
-    check_output(out, overwrite)
+    check_output(out, overwrite, may_be_same=True)
     run_config = _run_config(config)
     from zlocus.pipeline import run_dsm
 
     result = run_dsm(request, run_config, progress_for(sys.stderr))
-    print(f"{result.out}: {100 * result.coverage:.1f} % of the cells seen by two images or more have a height.")
+    state = "already finished, " if result.was_finished else ""
+    print(f"{result.out}: {state}{100 * result.coverage:.1f} % of the cells seen by two images or more have a height.")
 
 
 app.command()(explained(products))

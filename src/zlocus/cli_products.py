@@ -28,6 +28,7 @@ def products(
     check_output(out, overwrite=True)
     from zlocus.io.config import read_config
     from zlocus.io.opening import existing_file
+    from zlocus.products.finished import ITEM, update_finished
     from zlocus.products.maps import FILES, link_all, make_maps
 
     existing_file(out / "dsm.tif", "surface")
@@ -35,6 +36,7 @@ def products(
     progress = progress_for(sys.stderr)
     make_maps(out, chosen, options, progress)
     link_all(out, progress)
+    update_finished(out, (*(FILES[name] for name in chosen), ITEM))
     print(f"{out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")
 
 

@@ -35,6 +35,7 @@ def report(
     """Make report.html of a surface again, with a reference where one is given."""
     check_about(reference, {"--classes": classes, "--align": align, "--coregister": coregister, "--geoid": geoid})
     judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
+    from zlocus.products.finished import ITEM, update_finished
     from zlocus.products.maps import link_all
     from zlocus.products.report.comparison import Comparison
     from zlocus.products.report.page import write_report
@@ -43,6 +44,7 @@ def report(
     comparison = None if reference is None else Comparison(reference, **judged_by)
     path = write_report(out, comparison)
     link_all(out, SilentProgress())
+    update_finished(out, (path.name, ITEM))
     print(f"{path}: open it in a browser.")
 
 

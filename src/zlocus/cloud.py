@@ -15,6 +15,7 @@ from pyproj import CRS
 from zlocus.errors import CoverageError
 from zlocus.execution.memory import SHARE, free_bytes
 from zlocus.execution.scratch import Scratch
+from zlocus.inputs import InputFiles, files_of
 from zlocus.io.colour import read_colours
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, vertical_datum
@@ -34,7 +35,8 @@ from zlocus.preparing import AREA_MARGIN, asked_crs, check_doubts, made_folder, 
 from zlocus.products.cloud import PointCloud, file_names, write_map
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
-from zlocus.request import CloudRequest
+from zlocus.request import CloudRequest, check_output
+from zlocus.room import check_room_for_pixels
 from zlocus.scene import Scene, View, is_local
 from zlocus.sensors.model import FloatArray
 from zlocus.sensors.rays import DepthRays
@@ -64,16 +66,21 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     ------
     InputError, ConfigError, GeometryError, OutputError
         Before the first tile, for what cannot be used.
+    StoppedError
+        Where an input has changed meanwhile; nothing is written.
     CoverageError
         At the end, with all products kept, where fewer than half of the pixels seen by two images have a height.
     """
-    watch = Stopwatch()
+    check_output(request.out, request.overwrite)
+    watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = open_scene(request.inputs, asked_crs(request.crs))
         scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
         vertical = vertical_datum(request.vertical)
         scene = with_heights(scene, request.heights, vertical)
         references = chosen_references(scene, request.references)
+        check_room_for_pixels(request.out, scene, references)
+        inputs = InputFiles.of([*request.inputs, *files_of(scene), *vertical.files], scene, before)
     options = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         ready = orient_scene(scene, scene.heights, config.orientation, progress)
@@ -87,6 +94,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         matched = match_images(settled, options, True, request.workers, progress, scratch)
     with watch.stage("match back"):
         matched = confirmed_images(matched, progress, scratch)
+    checksums = inputs.record()
     with watch.stage("write"), made_folder(request.out), progress.stage("Writing", len(matched)) as stage:
         n_points = write_cloud(request.out, matched, scene, vertical)
         for one, name in zip(matched, file_names(references), strict=True):
@@ -94,11 +102,10 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
             stage.advance()
     n_seen = sum(int(((m.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) == 0).sum()) for m in matched)
     coverage = n_points / n_seen if n_seen else 0.0
-    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
     write_record(
         request.out / "run.json",
         {
-            **made_record(request, options, [*files, *vertical.files], watch),
+            **made_record(request, options, checksums, watch),
             "orientation": ready.orientation.as_dict(),
             "vertical": vertical.as_dict(),
             "images": {name: image_record(m) for name, m in zip(references, matched, strict=True)},
@@ -106,15 +113,20 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
             "coverage": round(coverage, 6),
         },
     )
-    if coverage < SUFFICIENT_COVERAGE and not request.partial:
+    if not request.partial:
+        _check_success(request.out / "cloud.laz", coverage, ready)
+    return CloudResult(request.out, n_points, coverage)
+
+
+def _check_success(cloud: Path, coverage: float, ready: OrientedScene) -> None:
+    """Refuse to call a run a success that found few points, or whose cameras are in grave doubt."""
+    if coverage < SUFFICIENT_COVERAGE:
         raise CoverageError(
             f"Only {100 * coverage:.1f} % of the pixels seen by two images or more have a height that other images "
-            f"confirm in {request.out / 'cloud.laz'}. See the reasons in the quality maps; give --heights or other "
-            "images, or accept it with --partial."
+            f"confirm in {cloud}. See the reasons in the quality maps; give --heights or other images, or accept it "
+            "with --partial."
         )
-    if not request.partial:
-        check_doubts(ready.orientation.doubts, request.out / "cloud.laz")
-    return CloudResult(request.out, n_points, coverage)
+    check_doubts(ready.orientation.doubts, cloud)
 
 
 def references_taking_part(references: Sequence[str], ready: OrientedScene) -> list[str]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from zlocus.inputs import InputFiles
 from zlocus.io.config import config_as_dict
 from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
@@ -22,8 +22,8 @@ from zlocus.request import DsmRequest
 APART = ("out", "workers", "memory_gb", "scheduler", "partial", "overwrite", "resume", "products", "report", "inputs")
 
 
-def key_of(request: DsmRequest, config: RunConfig, files: Iterable[Path]) -> dict[str, Any]:
-    """Options, versions and inputs (size and time of change), by name.
+def key_of(request: DsmRequest, config: RunConfig, inputs: InputFiles) -> dict[str, Any]:
+    """Options, versions and inputs (size and time of change when the run began), by name.
 
     The content of images is not read for it, which would take as long as matching; `run.json` has its checksum.
     """
@@ -32,7 +32,7 @@ def key_of(request: DsmRequest, config: RunConfig, files: Iterable[Path]) -> dic
         "versions": versions_record(),
         "request": {name: str(value) if isinstance(value, Path) else value for name, value in asked.items()},
         "options": config_as_dict(config),
-        "inputs": {str(path): _state(path) for path in files},
+        "inputs": dict(inputs.states),
     }
 
 
@@ -48,12 +48,3 @@ def digest_of(settled: MatchScene, orientation: Orientation) -> str:
         if array is not None:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _state(path: Path) -> list[int]:
-    """Size, bytes, and time of change, ns; of a file that is not there, nothing."""
-    try:
-        found = path.stat()
-    except OSError:
-        return []
-    return [found.st_size, found.st_mtime_ns]

@@ -10,6 +10,7 @@ import numpy as np
 
 from zlocus.errors import GeometryError
 from zlocus.grid import grid_from_bounds
+from zlocus.inputs import InputFiles, files_of
 from zlocus.io.control import read_control
 from zlocus.io.reference import dem_datum, read_dem
 from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
@@ -22,7 +23,7 @@ from zlocus.products.orientation import orientation_record
 from zlocus.products.points import write_ties
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
-from zlocus.request import OrientRequest
+from zlocus.request import OrientRequest, check_output
 from zlocus.scene import Scene, footprint, ground_sample_distance, is_local
 
 # Cells of the terrain model are this many ground pixels, its own resolution being coarser.
@@ -39,26 +40,30 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     ------
     InputError, ConfigError, GeometryError, OutputError
         For what cannot be used, before anything is written.
+    StoppedError
+        Where an input has changed meanwhile; nothing is written.
     """
-    watch = Stopwatch()
+    check_output(request.out, request.overwrite)
+    watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = opened_alone(request.inputs, request.crs, request.heights)
         control = None if request.control is None else control_points(request, scene)
         terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
+    inputs = InputFiles.of(files_read(request, scene), scene, before)
     note_dem(request.dem, request.dem_vertical, progress)
     with watch.stage("orient"):
         options = alone(config.orientation, request.cameras)
         found = oriented(scene, options, scene.heights, progress, control, terrain)
         check_ties(found, scene)
         note_orientation(found, progress)
-    corrected = found.apply(scene)
+    corrected, checksums = found.apply(scene), inputs.record()
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", found, corrected)
         record: dict[str, Any] = orientation_record(found, scene)
         if request.cameras:
             record["cameras"] = write_cameras(request.out, request.inputs, corrected)
         write_record(request.out / "orientation.json", record)
-    write_record(request.out / "run.json", made_record(request, config, files_read(request, scene), watch))
+    write_record(request.out / "run.json", made_record(request, config, checksums, watch))
     if not request.cameras:
         return f"{request.out / 'ties.gpkg'}: {len(found.xyz)} tie points."
     return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(found.measured)} tie points."
@@ -130,9 +135,9 @@ def terrain_heights(dem: Path, scene: Scene, vertical: str | None = None) -> Ter
 
 
 def files_read(request: OrientRequest, scene: Scene) -> list[Path]:
-    """Every file beside the inputs whose content the result depends on."""
+    """Every file whose content the result depends on."""
     extra = [path for path in (request.control, request.dem) if path is not None]
     extra += control_datum(request).files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    return [*(path for view in scene.views for path in (view.path, *view.camera_files)), *extra]
+    return [*request.inputs, *files_of(scene), *extra]

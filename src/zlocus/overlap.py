@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.scene import View, footprint, ground_sample_distance
+from zlocus.scene import View, footprint, ground_sample_distance, held_window
 from zlocus.sensors.model import FloatArray
 
 LEAN_M = 0.5
@@ -44,8 +44,8 @@ def view_geometry(view: View, z: float) -> ViewGeometry:
     """An image's place on the ground at height z (m)."""
     from shapely import MultiPoint  # a tenth of a second
 
-    rows, cols = view.image.shape
-    column, row = np.meshgrid(np.linspace(0, cols - 1, PER_SIDE), np.linspace(0, rows - 1, PER_SIDE))
+    top, left, rows, cols = held_window(view.image)
+    column, row = np.meshgrid(left + np.linspace(0, cols - 1, PER_SIDE), top + np.linspace(0, rows - 1, PER_SIDE))
     xy = np.column_stack([column.ravel(), row.ravel()])
     back = view.sensor.image_from_ground(view.sensor.ground_from_image(xy, np.full(len(xy), z)))
     off = np.hypot(*(back - xy).T)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import re
-import shutil
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from zlocus.errors import CoverageError, GeometryError, InputError, OutputError, StoppedError, ZlocusError
+from zlocus.again import Missing, finished_run, make_missing, missing_products, whole_again
+from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
 from zlocus.execution.events import EventLog
 from zlocus.execution.memory import cores
 from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.execution.scratch import Scratch
-from zlocus.execution.store import FOLDER as TILES
 from zlocus.execution.store import TileStore
-from zlocus.execution.warm import kernels_compiling
 from zlocus.grid import Grid
 from zlocus.identity import digest_of, key_of
+from zlocus.inputs import InputFiles
 from zlocus.io.config import config_as_dict
 from zlocus.io.raster import compressing
 from zlocus.io.reference import cells_inside, dem_datum, read_polygons
@@ -33,34 +30,26 @@ from zlocus.job import Polygons, Terrain, TileJob, TileProduct
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import MeasuredTies, supported
+from zlocus.orientation.orient import MeasuredTies, Orientation, supported
+from zlocus.orientation.plausibility import Doubt
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
 from zlocus.preparing import check_doubts, made_folder, note_orientation, oriented, taking_part
-from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
+from zlocus.products.finished import Finished, write_finished
+from zlocus.products.maps import FILES, check_maps, link_all, make_maps, remove_maps
 from zlocus.products.observations import OBSERVATIONS, write_observations
-from zlocus.products.picture import picture_beside_truth
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.record import (
-    Stopwatch,
-    inputs_record,
-    now,
-    read_record,
-    request_as_dict,
-    versions_record,
-    write_record,
-)
-from zlocus.products.report.files import forget_report
+from zlocus.products.record import Stopwatch, now, read_record, request_as_dict, versions_record, write_record
+from zlocus.products.report.files import CURVES, RECORD, forget_report
 from zlocus.progress import Progress
-from zlocus.request import DEMO_ACCURACY, DEMO_BEGUN, DsmRequest
+from zlocus.request import FINISHED, DsmRequest, check_output
+from zlocus.room import check_room, check_room_before_ties, check_room_for_pixels
 from zlocus.scene import Scene
-from zlocus.settling import Settled, opened, settled_run
+from zlocus.settling import Opened, Settled, opened, settled_run
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 if TYPE_CHECKING:
-    from zlocus.evaluation.evaluate import Evaluation
-    from zlocus.synthetic.files import RenderedScene
-    from zlocus.synthetic.scenes import SceneSpec
+    pass
 
 SUFFICIENT_COVERAGE = 0.5
 # Names that files have until they are complete, with the number of the process that writes them.
@@ -70,32 +59,28 @@ DEMO_WORKERS = 2
 
 @dataclass(frozen=True)
 class DsmResult:
-    """out : folder of the products; coverage : share of the cells seen by two images or more that have a height."""
+    """out : folder of the products; coverage : share of the cells seen by two images or more that have a height;
+    was_finished : whether the surface was there already, made by the same command."""
 
     out: Path
     coverage: float
-
-
-@dataclass(frozen=True)
-class DemoResult:
-    """out : folder of the products; evaluations : against the truth, within two ground pixels and within 1 m."""
-
-    out: Path
-    evaluations: tuple[Evaluation, ...]
+    was_finished: bool = False
 
 
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
-    """Make a surface and write all products to `request.out`.
+    """Make a surface and write all products to `request.out`; where the same one is there already, those that are not.
 
     Raises
     ------
     InputError, ConfigError, GeometryError, OutputError
-        Before the first tile, for what cannot be used.
+        Before the first tile, for what cannot be used, and where `out` holds another run and may not be overwritten.
     StoppedError
-        Afterwards, where tiles fail or what was found cannot be written; finished tiles are kept.
+        Afterwards, where tiles fail, an input has changed, or what was found cannot be written; finished tiles are
+        kept.
     CoverageError
         At the end, with all products kept, where fewer than half of the cells seen by two images have a height.
     """
+    check_output(request.out, request.overwrite, may_be_same=True)
     begun: list[Matching] = []
     try:
         with compressing(request.workers or cores()):
@@ -114,20 +99,23 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
 def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, begun: list[Matching]) -> DsmResult:
     """See `run_dsm`. begun : becomes the matching, once it begins."""
     watch = Stopwatch()
-    check_maps(request.products, config.products)
+    check_maps(request.products, config.products, _may_have_terrain(request))
     if request.report:
         importlib.import_module("zlocus.reporting")  # what is broken there is to show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
-        found = opened(request, progress)
-        scene, vertical = found.scene, found.vertical
-        store = TileStore.of(request.out, key_of(request, config, found.files), request.resume, request.overwrite)
-        polygons = _area_polygons(request, scene.crs)
+        run = _open_run(request, config, progress)
+    if run.finished is not None:
+        missing = missing_products(request, run.finished, progress)
+        if not missing.matched:
+            return _already_finished(request, config, run, missing, progress)
+        request = whole_again(request, run.finished, missing, progress)
+    found, inputs, store, polygons = run.found, run.inputs, run.store, run.polygons
+    scene, vertical = found.scene, found.vertical
     with watch.stage("orient"):
-        known = _known_ties(store, scene, progress)
-        orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
-        note_orientation(orientation, progress)
+        orientation = _oriented(request, scene, store, config, progress)
     with watch.stage("settle"):
         settled = settled_run(request, found, orientation, config, progress)
+        check_room(request.out, settled.grid, settled.matching, _has_colours(request, settled))
         tiles = plan_tiles(settled.grid.window, settled.matching.seen, config.pyramid)
         plan = planned(settled.matching, tiles, config, request)
         vertical.check_covers(_area_matched(settled.grid, settled.matching), scene.crs)
@@ -142,33 +130,95 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, begun: 
         with watch.stage("match") as elsewhere:
             make = _maker(request, job, store, settled, plan, tally, progress)
             failed = matching.run(plan, workers_for(plan, make, progress), progress, elsewhere)
+        inputs.check(len(store.finished), may_miss=bool(failed))
         matching.check(failed, request.partial)
+        with watch.stage("record"):
+            checksums = inputs.record(len(store.finished))
         with watch.stage("write"):
             _forget(out)
             with _rasters(request, settled, vertical) as rasters:
                 matching.assemble(failed, rasters, tally, progress)
+                inputs.check(len(store.finished))  # for a terrain model that fills gaps is read again
     with watch.stage("points"):
         _write_points(out, settled, tally.ranked, vertical)
     if request.report:
         _show(out, settled, vertical, config, watch, progress)
-    with watch.stage("record"):
-        asked = _asked_record(request, config, scene, found.files)
+        _drop_curves_of_others(out, inputs, progress)
     record = {
-        **asked,
-        "stages": watch.stages,
-        "orientation": orientation.as_dict(),
-        "grid": _grid_record(settled.grid, scene.crs),
-        "vertical": vertical.as_dict(),
-        "heights": _lattice_record(settled),
-        "settled_sha256": digest,
-        **tally.as_dict(),
-    }
+        **_asked_record(request, config, scene, checksums), "stages": watch.stages,
+        **_found_record(settled, vertical), "doubts": [doubt.as_dict() for doubt in settled.doubts],
+        "settled_sha256": digest, **tally.as_dict(),
+    }  # fmt: skip
     _write_maps(request, config, watch, record, progress)
     matching.end(failed, tally)
-    _check_coverage(tally, out, request.partial, progress)
-    if not request.partial:
-        check_doubts(settled.doubts, out / "dsm.tif")
+    write_finished(out, store.key)
+    store.remove()
+    _check_success(request, tally, settled.doubts, progress)
     return DsmResult(out, tally.coverage)
+
+
+@dataclass(frozen=True)
+class OpenRun:
+    """A run whose files are open. found : what the request names; inputs : all files, as they were; store : where its
+    tiles are, or will be; polygons : of the area asked for; finished : the same run, where it is there already."""
+
+    found: Opened
+    inputs: InputFiles
+    store: TileStore
+    polygons: Polygons
+    finished: Finished | None
+
+
+def _open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> OpenRun:
+    """Open what a request names, and look at what an earlier run left in its folder."""
+    before = InputFiles.of(request.inputs)
+    found = opened(request, progress)
+    inputs = InputFiles.of(found.files, found.scene, before)
+    store = TileStore.of(
+        request.out, key_of(request, config, inputs), request.resume, request.overwrite, inputs.check
+    )  # fmt: skip
+    finished, polygons = finished_run(request, store), _area_polygons(request, found.scene.crs)
+    if finished is None:
+        check_maps(request.products, config.products)
+        _check_room_first(request, found, store)
+    return OpenRun(found, inputs, store, polygons, finished)
+
+
+def _may_have_terrain(request: DsmRequest) -> bool:
+    """Whether the folder may hold the terrain of this same run, finished."""
+    return not request.overwrite and all((request.out / name).exists() for name in (FINISHED, FILES["dtm"]))
+
+
+def _already_finished(
+    request: DsmRequest, config: RunConfig, run: OpenRun, missing: Missing, progress: Progress
+) -> DsmResult:
+    """The result of a run whose surface is there already, with all that was asked for beside it."""
+    assert run.finished is not None, "callers make sure"
+    make_missing(request, config, run.found, run.finished, missing, progress)
+    run.store.remove()  # of a run that was stopped between its last file and its end
+    record = read_record(request.out / RECORD)
+    tally = Tally.of(record)
+    _check_success(request, tally, [Doubt(**doubt) for doubt in record.get("doubts", [])], progress)
+    return DsmResult(request.out, tally.coverage, was_finished=True)
+
+
+def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
+    """Refuse, before the images are read, what memory and the disk have no room for."""
+    if request.method == "gc3-sgm":
+        check_room_for_pixels(request.out, found.scene, [view.name for view in found.scene.views])
+    if not store.finished:
+        like = None if found.like is None else found.like.shape.yx
+        check_room_before_ties(request.out, found.scene, request.resolution, request.bounds, like)
+
+
+def _oriented(
+    request: DsmRequest, scene: Scene, store: TileStore, config: RunConfig, progress: Progress
+) -> Orientation:
+    """The cameras corrected, from the tie points of the same run where it was begun before."""
+    known = _known_ties(store, scene, progress)
+    orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
+    note_orientation(orientation, progress)
+    return orientation
 
 
 def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredTies | None:
@@ -182,19 +232,23 @@ def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredT
 
 def _rasters(request: DsmRequest, settled: Settled, vertical: VerticalDatum) -> SurfaceRasters:
     """The rasters of the surface; in image space the ortho-image is grey."""
-    matching = settled.matching
-    has_colours = matching.has_colours and request.method != "gc3-sgm"
-    return SurfaceRasters(request.out, settled.grid.geobox, matching.views[0].image.dtype, vertical, has_colours)
+    dtype = settled.matching.views[0].image.dtype
+    return SurfaceRasters(request.out, settled.grid.geobox, dtype, vertical, _has_colours(request, settled))
 
 
-def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, files: list[Path]) -> dict[str, Any]:
+def _has_colours(request: DsmRequest, settled: Settled) -> bool:
+    """Whether the ortho-image of a surface has colours."""
+    return settled.matching.has_colours and request.method != "gc3-sgm"
+
+
+def _asked_record(request: DsmRequest, config: RunConfig, scene: Scene, inputs: list[dict[str, Any]]) -> dict[str, Any]:
     """What was asked of which program, when, with which files, and when the images were taken."""
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         "created": now(),
         "started_in": str(Path.cwd()),
         "versions": versions_record(),
-        "inputs": inputs_record(files),
+        "inputs": inputs,
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
     }
 
@@ -219,66 +273,6 @@ def _write_maps(
     link_all(request.out, progress)
     if failed is not None:
         raise failed
-
-
-def run_demo(out: Path, progress: Progress) -> DemoResult:
-    """Render the built-in block (line scanners, six images in two strips), match it, and compare it with its truth.
-
-    A demo that was stopped goes on with the scene and the tiles that are there; one that was finished starts anew.
-
-    Raises
-    ------
-    OutputError
-        Where `out` holds a scene that no demo has rendered.
-    """
-    from zlocus.evaluation.evaluate import evaluate
-    from zlocus.synthetic.scenes import LEVEL_1_M, demo_spec
-
-    spec = demo_spec()
-    rendered = _demo_scene(spec, out, progress)
-    request = DsmRequest(inputs=rendered.inputs, out=out, resolution=spec.gsd_m, workers=DEMO_WORKERS)
-    result = run_dsm(request, RunConfig(), progress)
-    evaluations = (
-        evaluate(
-            result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, margin_m=0.0, threshold_m=limit
-        )
-        for limit in (2 * LEVEL_1_M, 1.0)
-    )
-    picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")
-    return DemoResult(result.out, tuple(evaluations))
-
-
-def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene:
-    """The scene of a demo which was stopped, whose tiles are then left as they are; else a new one."""
-    from zlocus.synthetic.files import render_scene, scene_files
-    from zlocus.synthetic.linescan import TrajectoryNoise
-
-    # The files say how the aircraft flew, which is what the images saw.
-    flown = TrajectoryNoise()
-    made_of = hashlib.sha256(repr((spec, flown, versions_record())).encode()).hexdigest()
-    folder, begun, finished = out / "scene", out / DEMO_BEGUN, out / DEMO_ACCURACY
-    if folder.exists() and not finished.exists():
-        if not begun.exists():
-            raise OutputError(f"{folder} is there already, and not the scene of a demo. Choose another folder with -o.")
-        if _is_scene_of(begun, made_of):
-            progress.note(f"The scene in {folder} is that of a demo which was stopped: it is not rendered again.")
-            return scene_files(spec, folder, is_linescan=True)
-    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
-        # From here on the folder is a demo's, whose scene is not complete.
-        write_record(begun, {})
-        finished.unlink(missing_ok=True)
-        for old in (folder, out / TILES):
-            shutil.rmtree(old, ignore_errors=True)
-        rendered = render_scene(spec, folder, lambda step: stage.advance(), flown)
-        write_record(begun, {"scene_sha256": made_of})
-    return rendered
-
-
-def _is_scene_of(begun: Path, made_of: str) -> bool:
-    """Whether a demo that was begun has rendered its scene, and this one."""
-    with suppress(InputError):  # damaged
-        return bool(read_record(begun).get("scene_sha256") == made_of)
-    return False
 
 
 def _job(request: DsmRequest, settled: Settled, config: RunConfig, area: Polygons) -> TileJob:
@@ -332,7 +326,7 @@ def _forget(out: Path) -> None:
     """Remove what an earlier run left, before its rasters are replaced: nothing of it may stand beside them."""
     remove_maps(out)
     forget_report(out)
-    for name in ("run.json", "ties.gpkg", OBSERVATIONS):
+    for name in (FINISHED, "run.json", "ties.gpkg", OBSERVATIONS):
         (out / name).unlink(missing_ok=True)
     # Of runs that were killed; none of this one's is there yet, and no other writes here meanwhile.
     for path in out.iterdir():
@@ -364,6 +358,16 @@ def _show(
     (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
     with watch.stage("curves"), progress.stage("Match curves"):
         write_shown(out, matched, config, match_s, progress)
+
+
+def _drop_curves_of_others(out: Path, inputs: InputFiles, progress: Progress) -> None:
+    """Remove match curves that may show other images than those that were matched."""
+    if changed := inputs.changed():
+        (out / CURVES).unlink(missing_ok=True)
+        progress.note(
+            f"{CURVES} was not made: {changed[0]} has changed since the surface was matched. The surface does not "
+            "depend on it."
+        )
 
 
 def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:
@@ -404,6 +408,13 @@ def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
     return Polygons(area, mask)
 
 
+def _check_success(request: DsmRequest, tally: Tally, doubts: Sequence[Doubt], progress: Progress) -> None:
+    """Refuse to call a run a success that found few heights, or whose cameras are in grave doubt, unless `partial`."""
+    _check_coverage(tally, request.out, request.partial, progress)
+    if not request.partial:
+        check_doubts(doubts, request.out / "dsm.tif")
+
+
 def _check_coverage(tally: Tally, out: Path, partial: bool, progress: Progress) -> None:
     """Say where images were left out, and refuse to call a run a success that found few heights, unless `partial`."""
     if tally.n_left_out:
@@ -417,6 +428,16 @@ def _check_coverage(tally: Tally, out: Path, partial: bool, progress: Progress) 
             f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "
             "with --partial."
         )
+
+
+def _found_record(settled: Settled, vertical: VerticalDatum) -> dict[str, Any]:
+    """Corrections of the cameras, grid, and heights searched, as JSON can hold them."""
+    return {
+        "orientation": settled.orientation.as_dict(),
+        "grid": _grid_record(settled.grid, settled.scene.crs),
+        "vertical": vertical.as_dict(),
+        "heights": _lattice_record(settled),
+    }
 
 
 def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:

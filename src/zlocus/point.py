@@ -25,7 +25,7 @@ from zlocus.preparing import (
 )
 from zlocus.products.curves import PointReport, loci, point_text, write_point
 from zlocus.progress import Progress
-from zlocus.request import CurvesRequest
+from zlocus.request import CurvesRequest, check_output
 from zlocus.scene import Scene, check_overlap
 from zlocus.sensors.model import FloatArray
 
@@ -40,6 +40,7 @@ def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> 
     InputError, ConfigError, GeometryError, OutputError
         For what cannot be used, and a point that fewer than two images show.
     """
+    check_output(request.out, request.overwrite)
     with progress.stage("Opening images"):
         scene = open_scene(request.inputs, asked_crs(request.crs))
         scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from zlocus.execution.plan import plan_tiles
 from zlocus.grid import grid_from_bounds
+from zlocus.inputs import InputFiles, files_of
 from zlocus.matching.ground_pixels import check_resolution, default_cell
 from zlocus.matching.ranking import RankedPoints
 from zlocus.matching.setup import settle
@@ -28,7 +29,7 @@ from zlocus.preparing import (
 from zlocus.products.points import counted_pairs, label_counts, write_ranking, write_ties
 from zlocus.products.record import Stopwatch, made_record, write_record
 from zlocus.progress import Progress
-from zlocus.request import RankRequest
+from zlocus.request import RankRequest, check_output
 from zlocus.threads import run_all
 from zlocus.tile import rank_tile
 
@@ -41,10 +42,14 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     ------
     InputError, ConfigError, GeometryError, OutputError
         For what cannot be used, before anything is written.
+    StoppedError
+        Where an input has changed meanwhile; nothing is written.
     """
-    watch = Stopwatch()
+    check_output(request.out, request.overwrite)
+    watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         scene = opened_alone(request.inputs, request.crs, request.heights)
+        inputs = InputFiles.of([*request.inputs, *files_of(scene)], scene, before)
     with watch.stage("orient"):
         orientation = oriented(scene, config.orientation, scene.heights, progress)
         check_ties(orientation, scene)
@@ -70,14 +75,13 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
                 if found is not None:
                     ranked.append(RankedPoints.of(*found, settled.ties, tile.core))
                 stage.advance()
-    names = [view.name for view in settled.views]
+    names, checksums = [view.name for view in settled.views], inputs.record()
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", orientation, scene)
         write_ranking(request.out / "ranking.gpkg", ranked, names, scene.crs)
         counts = label_counts(ranked, len(names))
         write_record(request.out / "ranking.json", ranking_record(counts, names))
-    files = [path for view in scene.views for path in (view.path, *view.camera_files)]
-    write_record(request.out / "run.json", made_record(request, config, files, watch))
+    write_record(request.out / "run.json", made_record(request, config, checksums, watch))
     return ranking_table(counts, names)
 
 

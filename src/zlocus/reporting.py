@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -60,11 +60,21 @@ class Matched:
     undulation: Callable[[FloatArray], FloatArray] = lambda xy: np.zeros(len(xy))
 
 
-def write_shown(out: Path, matched: Matched, config: RunConfig, match_s: float, progress: Progress) -> None:
-    """footprints.geojson and curves.json, or a note. match_s : time that matching took, which bounds that of curves."""
+def write_shown(
+    out: Path,
+    matched: Matched,
+    config: RunConfig,
+    match_s: float,
+    progress: Progress,
+    names: Collection[str] = (FOOTPRINTS, CURVES),
+) -> None:
+    """footprints.geojson and curves.json, or a note. match_s : time that matching took, which bounds that of curves;
+    names : which of the two."""
     most_s = max(LEAST_TIME_S, TIME_SHARE * match_s)
-    _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, matched), progress)
-    _tried(CURVES, lambda: write_curves(out / CURVES, out, matched, config, most_s), progress)
+    if FOOTPRINTS in names:
+        _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, matched), progress)
+    if CURVES in names:
+        _tried(CURVES, lambda: write_curves(out / CURVES, out, matched, config, most_s), progress)
 
 
 def try_report(out: Path, progress: Progress) -> None:

@@ -14,6 +14,8 @@ SCENE_SUFFIXES = (".yaml", ".yml")
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
 # Of a demo: that its folder is one's, and how its surface compares with the truth, which ends it.
 DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
+# What a finished surface depends on, and the checksums of its products.
+FINISHED = "finished.json"
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
 # Or the file of a geoid.
@@ -38,7 +40,8 @@ class DsmRequest:
     vertical : what the heights written are above: one of `VERTICALS`, in capitals too, or the file of a geoid.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
     scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
-    together, GB; None: 60 % of what is free. resume : whether finished tiles of the same run are taken as they are.
+    together, GB; None: 60 % of what is free. overwrite : whether another run in `out` is replaced. resume : whether
+    finished tiles of the same run, and its finished surface, are taken as they are.
     partial : a surface with few heights or doubtful cameras is accepted. products : maps made of the surface, see
     `PRODUCTS`. report : whether report.html is made.
 
@@ -421,10 +424,18 @@ def _check_positive(name: str, value: float | None, unit: str) -> None:
         raise ConfigError(f"{name} {value:g} is not a size. Give a number of {unit} above 0.")
 
 
-def check_output(out: Path, overwrite: bool, files: Sequence[str] | None = None, what: str = "run") -> None:
+def held_files(out: Path, files: Sequence[str] = RUN_FILES) -> list[str]:
+    """Names of those of some files, by default of runs, that are in a folder."""
+    return [name for name in files if (out / name).exists()]
+
+
+def check_output(
+    out: Path, overwrite: bool, files: Sequence[str] = RUN_FILES, what: str = "run", may_be_same: bool = False
+) -> None:
     """Make sure, before any work, that a run may write to `out`; leaves the disk as it was.
 
-    files : that tell of another one, None for those of runs; what : it is, for messages.
+    files : that tell of another one; what : it is, for messages; may_be_same : whether one that was stopped, or is
+    finished, is compared with this one later, see `zlocus.again.finished_run`.
 
     Raises
     ------
@@ -433,10 +444,9 @@ def check_output(out: Path, overwrite: bool, files: Sequence[str] | None = None,
     """
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")
-    held = [name for name in (RUN_FILES if files is None else files) if (out / name).exists()]
-    # What failed, or was stopped, may go on; whose it is its manifest says.
-    may_go_on = files is None and (out / "tiles" / "manifest.json").exists()
-    if held and not overwrite and not may_go_on:
+    held = held_files(out, files)
+    is_compared = may_be_same and ((out / "tiles" / "manifest.json").exists() or (out / FINISHED).exists())
+    if held and not overwrite and not is_compared:
         raise OutputError(f"{out} holds another {what} ({', '.join(held)}). Choose another folder, or add --overwrite.")
     parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     try:

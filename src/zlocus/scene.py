@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date as Date
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -31,6 +32,56 @@ class ImageWindow:
     valid: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class HeldPixels:
+    """The parts of an image whose pixels its file holds. A sparse file leaves out the others, which are empty.
+
+    cell_px : rows and columns of the parts that are told apart; shape : of the image, px; cells : (r, c) bool, whether
+    the file holds a pixel of the part.
+    """
+
+    cell_px: tuple[int, int]
+    shape: tuple[int, int]
+    cells: NDArray[np.bool_]
+
+    @property
+    def regions(self) -> NDArray[np.int64]:
+        """The parts that it holds, (n, 4) first row, first column, and the first row and column beyond, px."""
+        first = np.argwhere(self.cells) * self.cell_px
+        return np.column_stack([first, np.minimum(first + self.cell_px, self.shape)])
+
+    @cached_property
+    def window(self) -> tuple[int, int, int, int]:
+        """First row, first column, rows and columns of the smallest window that holds all of them, px."""
+        (top, left), (bottom, right) = self.regions[:, :2].min(axis=0), self.regions[:, 2:].max(axis=0)
+        return int(top), int(left), int(bottom - top), int(right - left)
+
+    def inside(self, windows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which windows hold a pixel, (n,) bool. windows : (n, 4) first row, first column, and the first row and column
+        beyond, px."""
+        # Sums over all cells above and to the left, of which four tell how many lie inside a window.
+        sums = np.pad(self.cells.cumsum(axis=0, dtype=np.int64).cumsum(axis=1), ((1, 0), (1, 0)))
+        first = windows[:, :2] // self.cell_px
+        end = np.minimum(-(-windows[:, 2:] // self.cell_px), self.cells.shape)
+        (top, left), (bottom, right) = first.T, end.T
+        return np.asarray(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left] > 0)
+
+    def missing(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+        """The pixels (r, c) of a window that are not held; None where all are."""
+        (top, bottom), (left, right) = (
+            (first // side, -(-(first + count) // side))
+            for first, count, side in zip((row, col), (rows, cols), self.cell_px, strict=True)
+        )
+        cells = self.cells[top:bottom, left:right]
+        if cells.all():
+            return None
+        down, across = (
+            np.arange(first, first + count) // side - first // side
+            for first, count, side in zip((row, col), (rows, cols), self.cell_px, strict=True)
+        )
+        return ~cells[down[:, None], across]
+
+
 class ImageSource(Protocol):
     """An image that is read by window, never whole (implemented in `zlocus.io.images`)."""
 
@@ -47,6 +98,27 @@ class ImageSource(Protocol):
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """The window that starts at (row, col); it lies inside the image."""
         ...
+
+
+@runtime_checkable
+class SparseSource(Protocol):
+    """An image whose file may hold only some of its pixels."""
+
+    @property
+    def held(self) -> HeldPixels | None:
+        """Those that it holds; None where it holds all, or does not say."""
+        ...
+
+
+def held_pixels(image: ImageSource) -> HeldPixels | None:
+    """The parts of an image whose pixels its file holds; None where that is all of it, as far as is known."""
+    return image.held if isinstance(image, SparseSource) else None
+
+
+def held_window(image: ImageSource) -> tuple[int, int, int, int]:
+    """First row, first column, rows and columns of the part of an image that its file holds: of most, all of it."""
+    held = held_pixels(image)
+    return (0, 0, *image.shape) if held is None else held.window
 
 
 @runtime_checkable
@@ -74,6 +146,11 @@ class View:
     sensor: SensorModel
     camera_files: tuple[Path, ...] = ()
     date: Date | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that it is read from."""
+        return (self.path, *getattr(self.image, "sources", ()), *self.camera_files)
 
     def __repr__(self) -> str:
         rows, cols = self.image.shape
@@ -107,17 +184,18 @@ def is_local(crs: CRS) -> bool:
 
 
 def footprint(view: View, z: float, per_side: int = 8, margin_px: float = 0.0) -> FloatArray:
-    """The image's outline on the ground at height z (m, ellipsoidal), counter-clockwise or clockwise, not closed.
+    """The image's outline on the ground at height z (m, ellipsoidal), counter-clockwise or clockwise, not closed; of an
+    image in a sparse file, the outline of the part that the file holds.
 
     Runs along the outer edges of the border pixels, or `margin_px` outside of them, `per_side` points a side, because
     the sides of a line scanner's image are curves. Returns (4 * per_side, 2) m; points the sensor cannot map are left
     out.
     """
-    rows, cols = view.image.shape
+    top, left, rows, cols = held_window(view.image)
     t = np.arange(per_side) / per_side
     zero, one = np.zeros(per_side), np.ones(per_side)
-    column = np.concatenate([t, one, 1 - t, zero]) * (cols + 2 * margin_px) - 0.5 - margin_px
-    row = np.concatenate([zero, t, one, 1 - t]) * (rows + 2 * margin_px) - 0.5 - margin_px
+    column = np.concatenate([t, one, 1 - t, zero]) * (cols + 2 * margin_px) - 0.5 - margin_px + left
+    row = np.concatenate([zero, t, one, 1 - t]) * (rows + 2 * margin_px) - 0.5 - margin_px + top
     xyz = view.sensor.ground_from_image(np.column_stack([column, row]), np.full(len(column), float(z)))
     return np.asarray(xyz[np.isfinite(xyz).all(axis=1), :2])
 
@@ -151,8 +229,8 @@ def ground_sample_distance(view: View, z: float) -> float:
 
     NaN where the sensor cannot map the centre.
     """
-    rows, cols = view.image.shape
-    column, row = (cols - 1) / 2, (rows - 1) / 2
+    top, left, rows, cols = held_window(view.image)
+    column, row = left + (cols - 1) / 2, top + (rows - 1) / 2
     xy = np.array([[column - 0.5, row], [column + 0.5, row], [column, row - 0.5], [column, row + 0.5]])
     left, right, up, down = view.sensor.ground_from_image(xy, np.full(4, float(z)))[:, :2]
     (ax, ay), (bx, by) = right - left, down - up

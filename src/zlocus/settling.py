@@ -14,6 +14,7 @@ from pyproj import CRS
 
 from zlocus.errors import GeometryError
 from zlocus.grid import Grid, grid_from_bounds, grid_from_geobox
+from zlocus.inputs import files_of
 from zlocus.io.reference import dem_datum, read_dem, read_geobox
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, vertical_datum
@@ -191,5 +192,5 @@ def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[P
     extra += vertical.files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    listed = list(request.inputs) + [path for view in scene.views for path in (view.path, *view.camera_files)] + extra
+    listed = list(request.inputs) + files_of(scene) + extra
     return list(dict.fromkeys(listed))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from shapely import box
@@ -20,6 +21,7 @@ from zlocus.matching.setup import settle
 from zlocus.options import RunConfig
 from zlocus.preparing import area_to_match
 from zlocus.request import DoctorRequest
+from zlocus.room import check_room
 from zlocus.scene import Scene
 
 # Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
@@ -55,7 +57,7 @@ def run_plan(
 
     Raises
     ------
-    ConfigError, GeometryError
+    ConfigError, GeometryError, OutputError
         Where a run would stop for the same reason.
     """
     z_range, z = ties.z_range, sum(ties.z_range) / 2
@@ -68,6 +70,7 @@ def run_plan(
     matched = grid.window.within(settled.seen)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
+    check_room(request.out or Path(), grid, settled, settled.has_colours)
     tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
     needs = tile_needs(settled, tiles, config)
     tile_bytes = int(needs.n_bytes + WORKER_BYTES)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.doctor.findings import NOTE, Finding, poor
-from zlocus.scene import ImageSource
+from zlocus.scene import ImageSource, held_window
 
 SIDE_PX, MOST_WINDOWS = 512, 4  # windows along an axis
 # Edges are where the grey value changes most over six pixels: this percentile and above.
@@ -47,7 +47,8 @@ def image_quality(image: ImageSource) -> ImageQuality:
     InputError
         Where a window cannot be read.
     """
-    windows = [image.read(*place) for place in sample_windows(image.shape)]
+    top, left, *_ = held = held_window(image)
+    windows = [image.read(top + row, left + col, rows, cols) for row, col, rows, cols in sample_windows(held[2:])]
     values = np.concatenate([window.pixels[window.valid] for window in windows])
     n_pixels = sum(window.valid.size for window in windows)
     if not len(values):

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,6 +28,7 @@ from zlocus.products.footprints import footprints_picture, write_footprints
 from zlocus.products.record import write_record
 from zlocus.progress import Progress
 from zlocus.request import DoctorRequest
+from zlocus.room import check_room_before_ties
 from zlocus.scene import Scene, check_overlap
 
 REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
@@ -58,6 +60,12 @@ class Told:
             except ZlocusError as error:
                 self.findings.append(Finding(STOPS, str(error), about))
                 return None
+
+    def refuses(self, check: Callable[[], object]) -> bool:
+        """Whether a check fails, as a run would."""
+        before = len(self.findings)
+        self.tried(check)
+        return any(finding.level == STOPS for finding in self.findings[before:])
 
 
 def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) -> Diagnosis:
@@ -105,7 +113,10 @@ def examined(
         asked = request.heights or scene.heights
         levels = told.tried(lambda: possible_heights(scene, asked))
     if levels is not None:
-        ties = found_ties(scene, levels, config, asked, told, progress) if all(quality) else None
+        within = replace(scene, heights=asked)
+        room = partial(check_room_before_ties, request.out or Path(), within, request.resolution, None, None)
+        has_room = not told.refuses(room)
+        ties = found_ties(scene, levels, config, asked, told, progress) if all(quality) and has_room else None
         corrected = scene if ties is None else ties.orientation.apply(scene)
         z = ground_height(ties, levels)
         geometry = tuple(view_geometry(view, z) for view in corrected.views)
@@ -129,9 +140,7 @@ def found_ties(
     progress: Progress,
 ) -> QuickTies | None:
     """The quick pass over ties, where images overlap at all."""
-    before = len(told.findings)
-    told.tried(lambda: check_overlap(scene, levels))
-    if any(finding.level == STOPS for finding in told.findings[before:]):
+    if told.refuses(lambda: check_overlap(scene, levels)):
         return None
     return told.tried(lambda: quick_ties(scene, config, asked, progress))
 

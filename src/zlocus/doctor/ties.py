@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from zlocus.orientation.orient import Orientation
 from zlocus.overlap import PairGeometry
 from zlocus.preparing import PAIR, heights_asked_for, heights_of_ties, oriented
 from zlocus.progress import Progress
-from zlocus.scene import Scene
+from zlocus.scene import Scene, held_window
 
 QUICK_FEATURES = 4000
 # Images above this size are reduced by twice as much as for a run.
@@ -35,7 +36,7 @@ class QuickTies:
 
 def quick_options(options: OrientationOptions, scene: Scene) -> OrientationOptions:
     """The options with fewer features, and less detail of large images."""
-    largest = max(view.image.shape[0] * view.image.shape[1] for view in scene.views) / 1e6
+    largest = max(math.prod(held_window(view.image)[2:]) for view in scene.views) / 1e6
     detail = options.full_detail_mpx * (LARGE_DETAIL if largest > LARGE_MPX else 1.0)
     return replace(
         options,

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +33,9 @@ class TileStore:
 
     folder : holds them, made by `open`; key : all that the tiles depend on, by name; finished : SHA-256 of each tile
     that is there, by its name; before : SHA-256 of what an earlier run of the same found before its first tile, "" of
-    nothing; starts_anew_by : the option by which the run takes on no tiles, "" where it does.
+    nothing; starts_anew_by : the option by which the run takes on no tiles, "" where it does; is_of_this_run : whether
+    an earlier run of the same has begun here; check : ends the run, told how many tiles are kept, where a tile may be
+    made of what the key does not say.
     """
 
     folder: Path
@@ -41,11 +43,20 @@ class TileStore:
     finished: dict[str, str] = field(default_factory=dict)
     before: str = ""
     starts_anew_by: str = ""
+    is_of_this_run: bool = False
+    check: Callable[[int], None] = lambda n_kept: None
     _lock: BinaryIO | None = None
     _is_ours: bool = False
 
     @classmethod
-    def of(cls, out: Path, key: Mapping[str, Any], is_resumed: bool, overwrite: bool) -> TileStore:
+    def of(
+        cls,
+        out: Path,
+        key: Mapping[str, Any],
+        is_resumed: bool,
+        overwrite: bool,
+        check: Callable[[int], None] = lambda n_kept: None,
+    ) -> TileStore:
         """The store of a run, with what an earlier one left of the same; looks only.
 
         Raises
@@ -53,9 +64,9 @@ class TileStore:
         OutputError
             It holds tiles of another run, and may not be overwritten.
         """
-        store = cls(out / FOLDER, json.loads(json.dumps(key)))
+        store = cls(out / FOLDER, json.loads(json.dumps(key)), check=check)
         store.starts_anew_by = "--overwrite" if overwrite else "" if is_resumed else "--no-resume"
-        if overwrite or not is_resumed or not (store.folder / MANIFEST).exists():
+        if overwrite or not (store.folder / MANIFEST).exists():
             return store
         found = _read_object(store.folder / MANIFEST)
         listed = _finished_in(store.folder / DONE)
@@ -63,6 +74,9 @@ class TileStore:
             differs = "its manifest is damaged, or of another version of zlocus"
         else:
             differs = difference(found["key"], store.key)
+        store.is_of_this_run = not differs
+        if not is_resumed:
+            return store
         if differs and listed:
             raise OutputError(
                 f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give what that run was "
@@ -88,7 +102,10 @@ class TileStore:
         OutputError
             Another run writes there, the cameras or heights came out otherwise than for the tiles that are there, or it
             cannot be written.
+        StoppedError
+            See `check`.
         """
+        self.check(len(self.finished))
         with _written(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = (self.folder / LOCK).open("wb")
@@ -131,8 +148,9 @@ class TileStore:
         Raises
         ------
         StoppedError
-            It cannot be written: what was kept before stays.
+            It cannot be written, or see `check`: what was kept before stays.
         """
+        self.check(len(self.finished))
         content, digest = _packed(arrays)
         try:
             write_whole(self._path(name), content)

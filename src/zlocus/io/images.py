@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,16 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
 from zlocus.errors import InputError, ZlocusWarning
-from zlocus.io.opening import check_complete, is_remote, kept_raster, open_raster
+from zlocus.io.opening import PLAIN, check_complete, file_state, is_remote, kept_raster, open_raster
 from zlocus.io.usable_pixels import LARGEST_GREY, BorderPlateau, absurd_values, border_plateau, without
-from zlocus.scene import ImageWindow
+from zlocus.scene import HeldPixels, ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
 LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}
-CHECK_SIZE = 1024
+# What is read in search of something to match: pixels of a window, and of all windows before an image is refused.
+CHECKED_PX, MOST_CHECKED_PX = 1 << 20, 1 << 30
+# Four million a side; to look for tie points in more takes months.
+MOST_PX = 1 << 44
 # Of larger images, in pixels, absurd values are left out all the same, but not counted.
 MOST_COUNTED = 2_000_000_000
 
@@ -31,13 +35,15 @@ class RasterImage:
 
     The grey channel is the luminance (Rec. 601) where the file declares red, green and blue bands, otherwise the first
     band. Not valid are: the declared nodata value, pixels off in an internal or side-car mask or fully transparent in
-    an alpha band, NaN, infinities and other numbers that cannot be grey values, and a `plateau` at the border. Beside
-    that, an integer image that declares no nodata value is valid everywhere: 0 is a legal grey value.
+    an alpha band, NaN, infinities and other numbers that cannot be grey values, a `plateau` at the border, and what a
+    sparse file never held. Beside that, an integer image that declares no nodata value is valid everywhere: 0 is a
+    legal grey value.
 
     The object is a plain value that threads and processes can share: open files are kept by thread, see `kept_raster`.
 
     bands : 1-based indices of the bands that are read, with `weights`; plateau : pixels of one value at the border,
-    which are not valid; see `with_plateau`.
+    which are not valid; see `with_plateau`. held : see `SparseSource`. state : of the file when it was opened, see
+    `file_state`; sources : other files that its pixels and their mask are read from.
     """
 
     path: Path
@@ -48,6 +54,9 @@ class RasterImage:
     bands: tuple[int, ...]
     weights: tuple[float, ...]
     plateau: BorderPlateau | None = None
+    held: HeldPixels | None = field(default=None, compare=False, repr=False)
+    state: tuple[int, ...] = field(default=(), compare=False, repr=False)
+    sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """The window of rows x cols pixels that starts at (row, col); it lies inside the image.
@@ -63,6 +72,9 @@ class RasterImage:
             if source.shape != self.shape:
                 raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
             window = self._read(source, Window(col, row, cols, rows))
+        missing = None if self.held is None else self.held.missing(row, col, rows, cols)
+        if missing is not None:
+            window = without(window, missing)
         return window if self.plateau is None else without(window, self.plateau.covers(row, col, rows, cols))
 
     @property
@@ -122,6 +134,7 @@ def open_image(path: Path) -> RasterImage:
         For no such file, a folder, no image, a truncated file, complex or palette pixels.
     """
     path = Path(path)
+    state = file_state(path)
     with open_raster(path) as source:
         if source.count == 0:
             raise InputError(f"{path} holds no image band (it may be a container). Give one of the images in it.")
@@ -129,11 +142,30 @@ def open_image(path: Path) -> RasterImage:
             raise InputError(f"{path} holds complex numbers. Convert it to intensity first.")
         if source.colorinterp[0] == ColorInterp.palette:
             raise InputError(f"{path} holds colour numbers of a palette. Expand it: gdal_translate -expand gray.")
+        if source.height * source.width > MOST_PX:
+            raise InputError(
+                f"{path} is {source.height} x {source.width} px, more than can be matched. Cut out the part that is "
+                "wanted: gdal_translate -srcwin."
+            )
         bands, weights = _grey_bands(source)
         image = RasterImage(path, source.shape, source.dtypes[0], source.count, source.nodata, bands, weights)
-        check_complete(source, path)
+        held = check_complete(source, path)
+        if held is not None and not held.cells.any():
+            raise InputError(
+                f"{path} holds no pixels: it is a sparse file of {image.shape[0]} x {image.shape[1]} px, and none of "
+                "its blocks was ever written. Copy it again from its source, or leave it out."
+            )
         image._read(source, _last_block(source, bands[0]))
-        return image
+        return replace(image, held=held, state=tuple(state), sources=_sources(source, path))
+
+
+def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:
+    """Files beside an image that its pixels are read from: those that a virtual raster lists, the header of pixels as
+    they are, and a mask. Overviews and statistics are not read, and readers of cameras name their own files."""
+    others = [Path(name) for name in source.files if Path(name) != path]
+    if source.driver == "VRT" or source.driver in PLAIN:
+        return tuple(other for other in others if not other.name.endswith((".ovr", ".aux.xml")))
+    return tuple(other for other in others if other.suffix == ".msk")
 
 
 def _last_block(source: rasterio.DatasetReader, band: int) -> Window:
@@ -146,28 +178,89 @@ def _last_block(source: rasterio.DatasetReader, band: int) -> Window:
 def check_content(image: RasterImage) -> None:
     """Refuse an image with nothing to match: all nodata, or one value everywhere.
 
-    Read by windows until two different valid values are met, so that an ordinary image costs one window.
+    Read by windows until two different valid values are met, so that an ordinary image costs one window. Windows are
+    spread over what the file holds; beyond `MOST_CHECKED_PX` no more are read, so that an image of any size is refused
+    within seconds.
 
     Raises
     ------
     InputError
         When no two valid pixels differ.
     """
-    rows, cols = image.shape
     first: float | None = None
-    for row, col in product(range(0, rows, CHECK_SIZE), range(0, cols, CHECK_SIZE)):
-        window = image.read(row, col, min(CHECK_SIZE, rows - row), min(CHECK_SIZE, cols - col))
+    windows = _Windows.of(image)
+    for row, col, rows, cols in windows:
+        window = image.read(row, col, rows, cols)
         values = window.pixels[window.valid]
         if not values.size:
             continue
         first = float(values[0]) if first is None else first
         if (values != first).any():
             return
+    some = f"{windows.n_read} windows spread over its {image.shape[0]} x {image.shape[1]} px"
+    advice = "leave it out" if windows.is_whole else "cut out the part that shows something: gdal_translate -srcwin"
     if first is None:
+        where = "" if windows.is_whole else f" in any of {some}"
         raise InputError(
-            f"{image.path} has no valid pixel (nodata = {image.nodata}). Check its nodata value, or leave it out."
+            f"{image.path} has no valid pixel{where} (nodata = {image.nodata}). Check its nodata value, or {advice}."
         )
-    raise InputError(f"{image.path} has the value {first:g} everywhere: nothing to match. Leave it out.")
+    where = "everywhere" if windows.is_whole else f"in all of {some}"
+    raise InputError(f"{image.path} has the value {first:g} {where}: nothing to match. {advice.capitalize()}.")
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Windows of what the file of an image holds, in an order in which those that follow each other lie far apart.
+
+    regions : (n, 4) first row, first column, and the first row and column beyond, px; they are cut into windows of
+    `size`, rows and columns.
+    """
+
+    regions: NDArray[np.int64]
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, image: RasterImage) -> _Windows:
+        """About as wide as the blocks of the file, which are decoded whole."""
+        with kept_raster(image.path) as source:
+            block_cols = source.block_shapes[image.bands[0] - 1][1]
+        regions = np.array([[0, 0, *image.shape]]) if image.held is None else image.held.regions
+        rows, cols = (int(side.max()) for side in (regions[:, 2:] - regions[:, :2]).T)
+        width = min(max(block_cols, math.isqrt(CHECKED_PX)), CHECKED_PX, cols)
+        return cls(regions, (min(max(CHECKED_PX // width, 1), rows), width))
+
+    def __iter__(self) -> Iterator[tuple[int, int, int, int]]:
+        """First row, first column, rows and columns."""
+        # Steps of the golden section of their number, which meet each once where they have no divisor in common.
+        n = self._n
+        step = max(round(n * (math.sqrt(5.0) - 1.0) / 2.0), 1)
+        while math.gcd(step, n) > 1:
+            step += 1
+        for k in range(self.n_read):
+            part, region = divmod(k * step % n, len(self.regions))
+            top, left, bottom, right = self.regions[region].tolist()
+            row, col = top + part // self._across * self.size[0], left + part % self._across * self.size[1]
+            if row < bottom and col < right:
+                yield row, col, min(self.size[0], bottom - row), min(self.size[1], right - col)
+
+    @property
+    def n_read(self) -> int:
+        """How many of them are read."""
+        return min(self._n, max(MOST_CHECKED_PX // math.prod(self.size), 1))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of them are."""
+        return self.n_read == self._n
+
+    @property
+    def _across(self) -> int:
+        return -(-int((self.regions[:, 3] - self.regions[:, 1]).max()) // self.size[1])
+
+    @property
+    def _n(self) -> int:
+        down = -(-int((self.regions[:, 2] - self.regions[:, 0]).max()) // self.size[0])
+        return down * self._across * len(self.regions)
 
 
 def may_be_absurd(dtype: np.dtype[np.generic]) -> bool:

@@ -22,7 +22,9 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.errors import InputError
 from zlocus.io.text import shown
+from zlocus.io.tiff_blocks import held_in_blocks
 from zlocus.io.virtual import ARCHIVES, FIRST_BYTES, REMOTE, check_served, check_virtual, is_virtual
+from zlocus.scene import HeldPixels
 
 BLOCK_CACHE_BYTES = 128 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -83,6 +85,17 @@ def existing_file(path: Path, what: str) -> Path:
     if not is_there:
         raise InputError(f"There is no {what} {path}. Check the path.")
     return path
+
+
+def file_state(path: Path) -> list[int]:
+    """Size of a file, bytes, and its time of change, ns; empty where it is not there, or on a server."""
+    if is_remote(path):
+        return []
+    try:
+        found = path.stat()
+    except OSError:
+        return []
+    return [found.st_size, found.st_mtime_ns]
 
 
 @contextmanager
@@ -219,11 +232,12 @@ class _Kept(threading.local):
 _kept = _Kept()
 
 
-def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
+def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | None:
     """Compare the offsets and sizes of all TIFF blocks, or of the chunks of a PNG, with the length of the file,
     decoding nothing.
 
-    Other formats pass: GDAL itself finds them truncated, or `open_raster` does. So do files that are elsewhere.
+    Other formats pass: GDAL itself finds them truncated, or `open_raster` does. So do files that are elsewhere. Returns
+    the parts whose pixels a sparse TIFF holds; None of all other files.
 
     Raises
     ------
@@ -231,11 +245,11 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
         When pixels lie behind the end of the file, or there are too many of them.
     """
     if is_remote(path):
-        return
+        return None
     if source.driver == "PNG":
         _check_png(path)
     if source.driver not in ("GTiff", "COG"):
-        return
+        return None
     length = os.path.getsize(path)
     block_rows, block_cols = source.block_shapes[0]
     n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
@@ -244,16 +258,7 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> None:
             f"{path} is damaged: it says that it has {n_down * n_across} blocks of pixels, which its {length} bytes "
             "cannot list. Copy it again from its source."
         )
-    for band in source.indexes if source.interleaving == Interleaving.band else (1,):
-        for y in range(n_down):
-            for x in range(n_across):
-                offset = source.get_tag_item(f"BLOCK_OFFSET_{x}_{y}", "TIFF", bidx=band)
-                size = source.get_tag_item(f"BLOCK_SIZE_{x}_{y}", "TIFF", bidx=band)
-                if offset is not None and int(offset) + int(size or 0) > length:
-                    raise InputError(
-                        f"{path} is truncated: it has {length} bytes, and pixels of row {y * block_rows} on lie behind "
-                        "its end. Copy it again from its source."
-                    )
+    return held_in_blocks(source, path)
 
 
 def _check_plain(source: rasterio.DatasetReader, path: Path) -> None:

@@ -39,7 +39,7 @@ from zlocus.io.opening import existing_file
 from zlocus.io.strict import Number, StrictModel, validated
 from zlocus.io.text import shown
 from zlocus.io.whole import whole_file
-from zlocus.scene import Scene, View, is_local
+from zlocus.scene import Scene, View, held_window, is_local
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.model import FloatArray
 
@@ -393,7 +393,9 @@ def _default_crs(loaded: Sequence[_Loaded]) -> CRS:
     """The UTM zone of the mean of the images' centres (longitudes across the date line are neighbours)."""
     centres = []
     for each in loaded:
-        centre = each.source.centre(each.image.shape)
+        top, left, rows, cols = held_window(each.image)
+        # That of an image whose middle is the middle of what the file holds.
+        centre = each.source.centre((2 * top + rows, 2 * left + cols))
         if centre is None:
             raise InputError(
                 f"The camera of {each.image.path} does not place its centre on the Earth. Check it, or give --crs."

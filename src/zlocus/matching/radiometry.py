@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.scene import View, ground_box
+from zlocus.scene import View, ground_box, held_window
 
 FloatArray = NDArray[np.float64]
 SAMPLE_ROWS = 12
@@ -260,10 +260,10 @@ def moments(values: FloatArray, common: FloatArray, by_medians: bool) -> tuple[F
 def image_grey(view: View) -> tuple[float, float]:
     """Mean and standard deviation of an image, from rows spread over it: the same whatever part is matched. The
     deviation is 1 where they hold nothing that differs."""
-    rows, cols = view.image.shape
+    top, left, rows, cols = held_window(view.image)
     values = []
     for row in np.unique(np.linspace(0, rows - 1, SAMPLE_ROWS).astype(int)):
-        read = view.image.read(int(row), 0, 1, cols)
+        read = view.image.read(top + int(row), left, 1, cols)
         values.append(read.pixels[read.valid])
     grey = np.concatenate(values)
     mean, deviation = (float(grey.mean()), float(grey.std())) if grey.size else (0.0, 0.0)

@@ -17,7 +17,7 @@ from zlocus.matching.ground_pixels import with_common_pixel
 from zlocus.matching.radiometry import GreyScale, grey_scales
 from zlocus.matching.views import MARGIN_PX
 from zlocus.options import PyramidOptions
-from zlocus.scene import ColourSource, Scene, View, footprint, ground_box, ground_sample_distance
+from zlocus.scene import ColourSource, Scene, View, footprint, ground_box, ground_sample_distance, held_window
 from zlocus.sensors.model import Scanning, bare
 
 ON_GRID = 1e-6
@@ -85,8 +85,8 @@ class MatchScene:
 
 def nadir_offset(view: View, z: float, at: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """(dE, dN) that the ground point seen by a pixel, `at` (2,) px or the image's centre, moves per metre of height."""
-    rows, cols = view.image.shape
-    xy = np.array([[(cols - 1) / 2, (rows - 1) / 2] if at is None else at] * 2)
+    top, left, rows, cols = held_window(view.image)
+    xy = np.array([[left + (cols - 1) / 2, top + (rows - 1) / 2] if at is None else at] * 2)
     low, high = view.sensor.ground_from_image(xy, np.array([z - 5.0, z + 5.0]))
     return np.asarray((high - low)[:2] / 10.0)
 

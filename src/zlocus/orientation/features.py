@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zlocus.errors import OutputError
 from zlocus.options import OrientationOptions
-from zlocus.scene import ImageSource, ImageWindow
+from zlocus.scene import ImageSource, ImageWindow, held_pixels, held_window
 from zlocus.sensors.model import FloatArray
 from zlocus.threads import run_all
 
@@ -62,7 +62,7 @@ def detect_all(
     progress: Callable[[float], None] | None = None,
 ) -> list[Features]:
     """Features of several images, see `detect`, parts of all of them in threads. progress : is told the share done."""
-    work = [(i, core) for i, image in enumerate(images) for part, core in parts(image.shape) if wanted[i][part]]
+    work = [(i, core) for i, image in enumerate(images) for part, core in parts(image) if wanted[i][part]]
     left = np.bincount([i for i, _ in work], minlength=len(images))
     waiting: list[dict[int, Features]] = [{} for _ in images]
     found, held_bytes = [NOTHING for _ in images], 0
@@ -116,9 +116,9 @@ def on_disk(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def detect_part(image: ImageSource, core: tuple[int, int, int, int], options: OrientationOptions) -> Features:
     """Features of a part of an image: of rows and columns from the first two to before the last two of `core`."""
-    rows, cols = image.shape
-    area_mpx = rows * cols / 1e6
-    factor = reduction(image.shape, options)
+    (rows, cols), held_shape = image.shape, held_window(image)[2:]
+    area_mpx = math.prod(held_shape) / 1e6
+    factor = reduction(held_shape, options)
     halo = math.ceil(HALO_PX * factor)
     per_mpx = min(options.features_per_mpx * math.sqrt(area_mpx), options.features_per_image) / area_mpx
     row, col = max(core[0] - halo, 0), max(core[1] - halo, 0)
@@ -147,14 +147,25 @@ def part_grid(shape: tuple[int, int]) -> tuple[int, int]:
     return max(round(shape[0] / PART_PX), 1), max(round(shape[1] / PART_PX), 1)
 
 
-def parts(shape: tuple[int, int]) -> Iterator[tuple[tuple[int, int], tuple[int, int, int, int]]]:
-    """Each part's (row, column) in the grid of parts and its (first row, first column, end row, end column) in px."""
-    grid = part_grid(shape)
-    row_edges = np.linspace(0, shape[0], grid[0] + 1).round().astype(int)
-    col_edges = np.linspace(0, shape[1], grid[1] + 1).round().astype(int)
-    for i in range(grid[0]):
-        for j in range(grid[1]):
-            yield (i, j), (int(row_edges[i]), int(col_edges[j]), int(row_edges[i + 1]), int(col_edges[j + 1]))
+def parts(image: ImageSource) -> Iterator[tuple[tuple[int, int], tuple[int, int, int, int]]]:
+    """Each part's (row, column) in the grid of parts and its (first row, first column, end row, end column) in px.
+
+    The grid lies on the window of the image that its file holds (`held_window`); of a sparse file, only the parts of
+    which it holds pixels are given.
+    """
+    top, left, rows, cols = held_window(image)
+    grid = part_grid((rows, cols))
+    row_edges = top + np.linspace(0, rows, grid[0] + 1).round().astype(int)
+    col_edges = left + np.linspace(0, cols, grid[1] + 1).round().astype(int)
+    place = np.moveaxis(np.indices(grid), 0, -1).reshape(-1, 2)
+    i, j = place.T
+    edges = np.column_stack([row_edges[i], col_edges[j], row_edges[i + 1], col_edges[j + 1]])
+    held = held_pixels(image)
+    if held is not None:
+        some = held.inside(edges)
+        place, edges = place[some], edges[some]
+    for part, core in zip(place.tolist(), edges.tolist(), strict=True):
+        yield (part[0], part[1]), (core[0], core[1], core[2], core[3])
 
 
 def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:

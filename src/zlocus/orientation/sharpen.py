@@ -14,7 +14,7 @@ from zlocus.kernels.patches import patch_shifts
 from zlocus.options import OrientationOptions
 from zlocus.orientation.features import parts, reduction
 from zlocus.orientation.triangulate import Observations
-from zlocus.scene import View
+from zlocus.scene import View, held_window
 from zlocus.sensors.model import FloatArray
 from zlocus.threads import run_all
 
@@ -55,7 +55,7 @@ def sharpened(
     # Where the whole pixel of the reference is expected.
     expected = seen.xy + np.einsum("mij,mj->mi", warp, (whole - seen.xy)[reference])
     found = np.zeros((len(seen), 3))
-    reach = math.ceil(max(reduction(view.image.shape, options) for view in views) / 2.0)
+    reach = math.ceil(max(reduction(held_window(view.image)[2:], options) for view in views) / 2.0)
     half = 2 * (options.patch_px // 2) + reach + BORDER_PX
 
     def measure(i: int) -> None:
@@ -137,7 +137,7 @@ def squares_around(view: View, whole: NDArray[np.int64], rows: NDArray[np.int64]
     inside = ((whole[rows] >= half) & (whole[rows] < np.array([n_cols, n_rows]) - half)).all(axis=1)
     rows, offset = rows[inside], np.arange(-half, half + 1)
     col, row = whole[rows].T
-    for _, (top, left, bottom, right) in parts(view.image.shape):
+    for _, (top, left, bottom, right) in parts(view.image):
         here = np.flatnonzero((row >= top) & (row < bottom) & (col >= left) & (col < right))
         if not len(here):
             continue

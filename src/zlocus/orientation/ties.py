@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,14 @@ from zlocus.orientation.features import Features, detect_all, part_grid, parts, 
 from zlocus.orientation.locus import Loci, Sightlines, locate, trace
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.triangulate import Observations
-from zlocus.scene import Scene, View, ground_box
+from zlocus.scene import Scene, View, ground_box, held_window
 from zlocus.sensors.model import FloatArray, lowest_station
 from zlocus.threads import run_all
 
 Progress = Callable[[str, float], None]
 
 PART_POINTS = 5  # along each side of a part, whose loci are looked at
+PARTS_AT_ONCE = 4096  # whose loci are in memory: those of an image of 64 000 px a side
 SAMPLE = 1000  # features of a pair's first search
 # Loci of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
 DEPTH_RATIO = 1.5
@@ -177,21 +178,36 @@ def shared_parts(
 ) -> list[NDArray[np.bool_]]:
     """For each view the grid of its parts (see `features.parts`) that some other view may see too. near : see
     `neighbours`."""
-    wanted = [np.zeros(part_grid(view.image.shape), bool) for view in views]
-    edge = np.linspace(0.0, 1.0, PART_POINTS)
+    wanted = [np.zeros(part_grid(held_window(view.image)[2:]), bool) for view in views]
     for i, view in enumerate(views):
-        numbers, places = zip(*parts(view.image.shape), strict=True)
-        row, col, row_end, col_end = np.array(places).T[:, :, None]
-        y, x = np.broadcast_arrays((row + edge * (row_end - row))[:, :, None], (col + edge * (col_end - col))[:, None])
-        xy = np.stack([x, y], axis=-1).reshape(-1, 2)
-        lines = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges]
-        for other, line in product((views[j] for j in np.flatnonzero(near[i]).tolist()), lines):
-            loci = trace(line, other.sensor, line.z_range)
-            for number, part in enumerate(numbers):
-                if not wanted[i][part]:
-                    at = slice(number * PART_POINTS**2, (number + 1) * PART_POINTS**2)
-                    wanted[i][part] = may_fall_inside(loci.part(at), other.image.shape, margin_px)
+        others, every = [views[j] for j in np.flatnonzero(near[i]).tolist()], parts(view.image)
+        while some := dict(islice(every, PARTS_AT_ONCE)):
+            for part in _seen_by(others, view, some, z_ranges, margin_px):
+                wanted[i][part] = True
     return wanted
+
+
+def _seen_by(
+    others: Sequence[View],
+    view: View,
+    places: Mapping[tuple[int, int], tuple[int, int, int, int]],
+    z_ranges: Sequence[tuple[float, float]],
+    margin_px: float,
+) -> set[tuple[int, int]]:
+    """Those parts of a view that another view may see. places : px of each part, see `parts`."""
+    edge = np.linspace(0.0, 1.0, PART_POINTS)
+    row, col, row_end, col_end = np.array(list(places.values())).T[:, :, None]
+    y, x = np.broadcast_arrays((row + edge * (row_end - row))[:, :, None], (col + edge * (col_end - col))[:, None])
+    xy = np.stack([x, y], axis=-1).reshape(-1, 2)
+    lines, seen = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges], set()
+    for other, line in product(others, lines):
+        loci = trace(line, other.sensor, line.z_range)
+        for number, part in enumerate(places):
+            if part not in seen:
+                at = slice(number * PART_POINTS**2, (number + 1) * PART_POINTS**2)
+                if may_fall_inside(loci.part(at), other.image.shape, margin_px):
+                    seen.add(part)
+    return seen
 
 
 def may_fall_inside(loci: Loci, shape: tuple[int, int], margin_px: float) -> bool:
@@ -252,7 +268,7 @@ def match_pair(
 
 def looseness(views: Sequence[View], options: OrientationOptions) -> float:
     """How much farther than in halved images features may lie from their loci: with the reduction they blur."""
-    return max(1.0, *(reduction(view.image.shape, options) / 2.0 for view in views))
+    return max(1.0, *(reduction(held_window(view.image)[2:], options) / 2.0 for view in views))
 
 
 def likely_range(z: FloatArray) -> tuple[float, float]:

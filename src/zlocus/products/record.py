@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -89,13 +89,17 @@ def request_as_dict(request: Any) -> dict[str, Any]:
     return record | {"inputs": [str(path) for path in request.inputs]}
 
 
-def made_record(request: Any, config: RunConfig, files: Iterable[Path], watch: Stopwatch) -> dict[str, Any]:
-    """What was asked, of which versions and inputs, and how long it took, for run.json. files : read beside those that
-    the request names as inputs."""
+def made_record(
+    request: Any, config: RunConfig, inputs: Sequence[Mapping[str, str | None]], watch: Stopwatch
+) -> dict[str, Any]:
+    """What was asked, of which versions and inputs, and how long it took, for run.json.
+
+    inputs : see `inputs_record`.
+    """
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         "versions": versions_record(),
-        "inputs": inputs_record(dict.fromkeys([*request.inputs, *files])),
+        "inputs": list(inputs),
         "stages": watch.stages,
     }
 
