@@ -159,10 +159,10 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, kept: l
     }  # fmt: skip
     _write_maps(request, config, watch, record, progress)
     matching.end(failed, tally)
-    write_finished(out, store.key)
+    shortcoming = _shortcoming(tally, out, progress)
+    write_finished(out, store.key, shortcoming)
     store.remove()
-    _check_coverage(tally, out, request.partial, progress)
-    return DsmResult(out, tally.coverage)
+    return _ended(request, DsmResult(out, tally.coverage), shortcoming)
 
 
 @dataclass(frozen=True)
@@ -204,9 +204,30 @@ def _already_finished(
     assert run.finished is not None, "callers make sure"
     make_missing(request, config, run.found, run.finished, missing, progress)
     run.store.remove()  # of a run that was stopped between its last file and its end
-    tally = Tally.of(read_record(request.out / RECORD))
-    _check_coverage(tally, request.out, request.partial, progress)
-    return DsmResult(request.out, tally.coverage, was_finished=True)
+    coverage = float(read_record(request.out / RECORD)["coverage"])
+    return _ended(request, DsmResult(request.out, coverage, was_finished=True), run.finished.shortcoming)
+
+
+def _shortcoming(tally: Tally, out: Path, progress: Progress) -> str:
+    """Why a complete surface is no success, unless it is accepted with --partial; "" where it is one."""
+    try:
+        _check_coverage(tally, out, False, progress)
+    except CoverageError as error:
+        return str(error)
+    return ""
+
+
+def _ended(request: DsmRequest, result: DsmResult, shortcoming: str) -> DsmResult:
+    """The result of a run whose products are all there.
+
+    Raises
+    ------
+    CoverageError
+        It is no success, and not accepted as it is.
+    """
+    if shortcoming and not request.partial:
+        raise CoverageError(shortcoming)
+    return result
 
 
 def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
