@@ -112,13 +112,19 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
             "coverage": round(coverage, 6),
         },
     )
-    if coverage < SUFFICIENT_COVERAGE and not request.partial:
+    if not request.partial:
+        check_coverage(coverage, request.out)
+    return CloudResult(request.out, n_points, coverage)
+
+
+def check_coverage(coverage: float, out: Path) -> None:
+    """Refuse to call a run a success that found few heights. coverage : see `CloudResult`."""
+    if coverage < SUFFICIENT_COVERAGE:
         raise CoverageError(
             f"Only {100 * coverage:.1f} % of the pixels seen by two images or more have a height that other images "
-            f"confirm in {request.out / 'cloud.laz'}. See the reasons in the quality maps; give --heights or other "
-            "images, or accept it with --partial."
+            f"confirm in {out / 'cloud.laz'}. See the reasons in the quality maps; give --heights or other images, or "
+            "accept it with --partial."
         )
-    return CloudResult(request.out, n_points, coverage)
 
 
 def check_geoid(vertical: VerticalDatum, ready: OrientedScene) -> None:
