@@ -319,6 +319,12 @@ def test_a_surface_with_too_few_heights_is_no_success_the_second_time(images, tm
         forbid_matching(monkeypatch)
     assert sentences[0] == sentences[1]
     assert asked(images, tmp_path / "out", report=False, partial=True).was_finished
+    # And one that was accepted is none when it is not.
+    monkeypatch.undo()
+    monkeypatch.setattr(zlocus.pipeline, "SUFFICIENT_COVERAGE", 1.1)
+    assert not asked(images, tmp_path / "accepted", report=False, partial=True).was_finished
+    with pytest.raises(CoverageError, match="of the cells seen by two images or more have a height"):
+        asked(images, tmp_path / "accepted", report=False)
 
 
 def test_a_run_that_may_replace_another_goes_on_where_it_was_stopped(images, out, monkeypatch):

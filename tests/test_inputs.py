@@ -13,11 +13,10 @@ import pytest
 import rasterio
 import yaml
 
-import zlocus.cloud
+import zlocus.beginning
 import zlocus.job
-import zlocus.orienting
 import zlocus.pipeline
-import zlocus.ranking
+import zlocus.preparing
 from rendered_scenes import HEIGHTS, PART, SMALL_TILES, run
 from zlocus.cloud import run_cloud
 from zlocus.errors import OutputError, StoppedError
@@ -151,14 +150,14 @@ def test_an_image_that_changes_while_others_are_opened_is_noticed(copied, elsewh
     views = [{"name": path.stem, "image": str(path), "camera": {"kind": "rpc"}} for path in copied]
     scene = tmp_path / "scene.yaml"
     scene.write_text(yaml.safe_dump({"schema": 1, "views": views}))
-    opened = zlocus.pipeline.opened
+    opened = zlocus.beginning.opened
 
     def opening(*given):
         found = opened(*given)
         rewrite(copied[0], elsewhere)
         return found
 
-    monkeypatch.setattr(zlocus.pipeline, "opened", opening)
+    monkeypatch.setattr(zlocus.beginning, "opened", opening)
     for inputs in ((scene,), copied):
         with pytest.raises(StoppedError, match=rf"{copied[0].name} was replaced"):
             asked(inputs, tmp_path / "out")
@@ -197,14 +196,14 @@ def test_a_terrain_model_that_changes_is_an_input_too(copied, tmp_path, monkeypa
 @pytest.mark.parametrize("stage", ["cloud", "orient", "ties", "rank"])
 def test_other_commands_write_nothing_of_inputs_that_changed(copied, tmp_path, monkeypatch, stage):
     out, progress = tmp_path / "out", progress_for(io.StringIO())
-    run_stage, module = {
-        "cloud": (lambda: run_cloud(CloudRequest(copied, out, heights=HEIGHTS), RunConfig(), progress), "cloud"),
-        "orient": (lambda: run_orient(OrientRequest(copied, out), RunConfig(), progress), "orienting"),
-        "ties": (lambda: run_orient(OrientRequest(copied, out, cameras=False), RunConfig(), progress), "orienting"),
-        "rank": (lambda: run_rank(RankRequest(copied, out, resolution=4.0), RunConfig(), progress), "ranking"),
-    }[stage]  # fmt: skip
-    applied = getattr(zlocus, module).what_was_applied
-    monkeypatch.setattr(f"zlocus.{module}.what_was_applied", lambda found: [os.utime(copied[0]), applied(found)][1])
+    run_stage = {
+        "cloud": lambda: run_cloud(CloudRequest(copied, out, heights=HEIGHTS), RunConfig(), progress),
+        "orient": lambda: run_orient(OrientRequest(copied, out), RunConfig(), progress),
+        "ties": lambda: run_orient(OrientRequest(copied, out, cameras=False), RunConfig(), progress),
+        "rank": lambda: run_rank(RankRequest(copied, out, resolution=4.0), RunConfig(), progress),
+    }[stage]
+    orient = zlocus.preparing.orient
+    monkeypatch.setattr(zlocus.preparing, "orient", lambda *given: [os.utime(copied[0]), orient(*given)][1])
     with pytest.raises(StoppedError, match=rf"{copied[0].name} was replaced or written to .* no result is written"):
         run_stage()
     assert not out.exists()

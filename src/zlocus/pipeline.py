@@ -9,33 +9,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import NDArray
 from pyproj import CRS
 
-from zlocus.again import Missing, finished_run, make_missing, missing_products, whole_again
-from zlocus.errors import CoverageError, GeometryError, OutputError, StoppedError, ZlocusError
+from zlocus.again import Missing, make_missing, missing_products, whole_again
+from zlocus.beginning import OpenRun, area_matched, check_polygons, known_ties, may_have_terrain, open_run
+from zlocus.errors import CoverageError, OutputError, StoppedError, ZlocusError
 from zlocus.execution.events import EventLog
 from zlocus.execution.memory import cores
 from zlocus.execution.plan import Tile, plan_tiles
 from zlocus.execution.scratch import Scratch
 from zlocus.execution.store import TileStore
 from zlocus.grid import Grid
-from zlocus.identity import digest_of, key_of
+from zlocus.identity import digest_of
 from zlocus.inputs import InputFiles
 from zlocus.io.config import config_as_dict
 from zlocus.io.raster import compressing
-from zlocus.io.reference import cells_inside, dem_datum, read_polygons
+from zlocus.io.reference import dem_datum
 from zlocus.io.vertical import VerticalDatum
 from zlocus.job import Polygons, Terrain, TileJob, TileProduct
 from zlocus.matching.ranking import RankedPoints
-from zlocus.matching.setup import MatchScene
 from zlocus.options import RunConfig
-from zlocus.orientation.orient import MeasuredTies, Orientation, supported
+from zlocus.orientation.orient import Orientation, supported
 from zlocus.orientation.plausibility import Doubt
 from zlocus.per_image import Area, OrientedScene, grid_tile, match_for_grid
 from zlocus.preparing import check_doubts, made_folder, note_orientation, oriented, taking_part
-from zlocus.products.finished import Finished, write_finished
-from zlocus.products.maps import FILES, check_maps, link_all, make_maps, remove_maps
+from zlocus.products.finished import write_finished
+from zlocus.products.maps import check_maps, link_all, make_maps, remove_maps
 from zlocus.products.observations import OBSERVATIONS, write_observations
 from zlocus.products.points import write_ranking, write_ties
 from zlocus.products.rasters import SurfaceRasters
@@ -43,9 +42,9 @@ from zlocus.products.record import Stopwatch, now, read_record, request_as_dict,
 from zlocus.products.report.files import CURVES, RECORD, forget_report
 from zlocus.progress import Progress
 from zlocus.request import FINISHED, DsmRequest, check_output
-from zlocus.room import check_room, check_room_before_ties, check_room_for_pixels
+from zlocus.room import check_room
 from zlocus.scene import Scene
-from zlocus.settling import Opened, Settled, opened, settled_run
+from zlocus.settling import Settled, settled_run
 from zlocus.tiles import Matching, Plan, Tally, planned, workers_for
 
 if TYPE_CHECKING:
@@ -99,11 +98,11 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
 def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, begun: list[Matching]) -> DsmResult:
     """See `run_dsm`. begun : becomes the matching, once it begins."""
     watch = Stopwatch()
-    check_maps(request.products, config.products, _may_have_terrain(request))
+    check_maps(request.products, config.products, may_have_terrain(request))
     if request.report:
         importlib.import_module("zlocus.reporting")  # what is broken there is to show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
-        run = _open_run(request, config, progress)
+        run = open_run(request, config, progress)
     if run.finished is not None:
         missing = missing_products(request, run.finished, progress)
         if not missing.matched:
@@ -118,8 +117,8 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, begun: 
         check_room(request.out, settled.grid, settled.matching, _has_colours(request, settled))
         tiles = plan_tiles(settled.grid.window, settled.matching.seen, config.pyramid)
         plan = planned(settled.matching, tiles, config, request)
-        vertical.check_covers(_area_matched(settled.grid, settled.matching), scene.crs)
-        _check_polygons(request, settled, polygons.inside)
+        vertical.check_covers(area_matched(settled.grid, settled.matching), scene.crs)
+        check_polygons(request, settled, polygons.inside)
         progress.note(str(plan))
     out, tally = request.out, Tally()
     job, digest = _job(request, settled, config, polygons), digest_of(settled.matching, orientation)
@@ -146,47 +145,14 @@ def _run_dsm(request: DsmRequest, config: RunConfig, progress: Progress, begun: 
         _drop_curves_of_others(out, inputs, progress)
     record = {
         **_asked_record(request, config, scene, checksums), "stages": watch.stages,
-        **_found_record(settled, vertical), "doubts": [doubt.as_dict() for doubt in settled.doubts],
-        "settled_sha256": digest, **tally.as_dict(),
+        **_found_record(settled, vertical), "settled_sha256": digest, **tally.as_dict(),
     }  # fmt: skip
     _write_maps(request, config, watch, record, progress)
     matching.end(failed, tally)
-    write_finished(out, store.key)
+    shortcoming = _shortcoming(tally, settled.doubts, out, progress)
+    write_finished(out, store.key, shortcoming)
     store.remove()
-    _check_success(request, tally, settled.doubts, progress)
-    return DsmResult(out, tally.coverage)
-
-
-@dataclass(frozen=True)
-class OpenRun:
-    """A run whose files are open. found : what the request names; inputs : all files, as they were; store : where its
-    tiles are, or will be; polygons : of the area asked for; finished : the same run, where it is there already."""
-
-    found: Opened
-    inputs: InputFiles
-    store: TileStore
-    polygons: Polygons
-    finished: Finished | None
-
-
-def _open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> OpenRun:
-    """Open what a request names, and look at what an earlier run left in its folder."""
-    before = InputFiles.of(request.inputs)
-    found = opened(request, progress)
-    inputs = InputFiles.of(found.files, found.scene, before)
-    store = TileStore.of(
-        request.out, key_of(request, config, inputs), request.resume, request.overwrite, inputs.check
-    )  # fmt: skip
-    finished, polygons = finished_run(request, store), _area_polygons(request, found.scene.crs)
-    if finished is None:
-        check_maps(request.products, config.products)
-        _check_room_first(request, found, store)
-    return OpenRun(found, inputs, store, polygons, finished)
-
-
-def _may_have_terrain(request: DsmRequest) -> bool:
-    """Whether the folder may hold the terrain of this same run, finished."""
-    return not request.overwrite and all((request.out / name).exists() for name in (FINISHED, FILES["dtm"]))
+    return _ended(request, DsmResult(out, tally.coverage), shortcoming)
 
 
 def _already_finished(
@@ -196,38 +162,41 @@ def _already_finished(
     assert run.finished is not None, "callers make sure"
     make_missing(request, config, run.found, run.finished, missing, progress)
     run.store.remove()  # of a run that was stopped between its last file and its end
-    record = read_record(request.out / RECORD)
-    tally = Tally.of(record)
-    _check_success(request, tally, [Doubt(**doubt) for doubt in record.get("doubts", [])], progress)
-    return DsmResult(request.out, tally.coverage, was_finished=True)
+    coverage = float(read_record(request.out / RECORD)["coverage"])
+    return _ended(request, DsmResult(request.out, coverage, was_finished=True), run.finished.shortcoming)
 
 
-def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
-    """Refuse, before the images are read, what memory and the disk have no room for."""
-    if request.method == "gc3-sgm":
-        check_room_for_pixels(request.out, found.scene, [view.name for view in found.scene.views])
-    if not store.finished:
-        like = None if found.like is None else found.like.shape.yx
-        check_room_before_ties(request.out, found.scene, request.resolution, request.bounds, like)
+def _shortcoming(tally: Tally, doubts: Sequence[Doubt], out: Path, progress: Progress) -> str:
+    """Why a complete surface is no success, unless it is accepted with --partial; "" where it is one."""
+    try:
+        _check_coverage(tally, out, False, progress)
+        check_doubts(doubts, out / "dsm.tif")
+    except CoverageError as error:
+        return str(error)
+    return ""
 
 
 def _oriented(
     request: DsmRequest, scene: Scene, store: TileStore, config: RunConfig, progress: Progress
 ) -> Orientation:
     """The cameras corrected, from the tie points of the same run where it was begun before."""
-    known = _known_ties(store, scene, progress)
+    known = known_ties(store, scene, progress)
     orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
     note_orientation(orientation, progress)
     return orientation
 
 
-def _known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredTies | None:
-    """Tie points of the same run, where it was begun before."""
-    arrays = store.found_before()
-    known = None if arrays is None else MeasuredTies.of(arrays, len(scene.views))
-    if known is not None:
-        progress.note("Tie points are those of the run that is taken on.")
-    return known
+def _ended(request: DsmRequest, result: DsmResult, shortcoming: str) -> DsmResult:
+    """The result of a run whose products are all there.
+
+    Raises
+    ------
+    CoverageError
+        It is no success, and not accepted as it is.
+    """
+    if shortcoming and not request.partial:
+        raise CoverageError(shortcoming)
+    return result
 
 
 def _rasters(request: DsmRequest, settled: Settled, vertical: VerticalDatum) -> SurfaceRasters:
@@ -368,51 +337,6 @@ def _drop_curves_of_others(out: Path, inputs: InputFiles, progress: Progress) ->
             f"{CURVES} was not made: {changed[0]} has changed since the surface was matched. The surface does not "
             "depend on it."
         )
-
-
-def _area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:
-    """Bounds of the area asked for that two images see; refuses one without any."""
-    shared = grid.window.within(settled.seen)
-    if shared.rows and shared.cols:
-        (west, north), (east, south) = (
-            settled.transform(shared, 0) * corner for corner in ((0, 0), (shared.cols, shared.rows))
-        )
-        return west, south, east, north
-    west, north = settled.transform(settled.seen, 0) * (0, 0)
-    east, south = settled.transform(settled.seen, 0) * (settled.seen.cols, settled.seen.rows)
-    asked = grid.geobox.extent.boundingbox
-    raise GeometryError(
-        f"The area asked for (E {asked.left:.0f} to {asked.right:.0f} m, N {asked.bottom:.0f} to {asked.top:.0f} m) "
-        f"lies outside the ground that two images see (E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m). "
-        "Check --bounds, --like and the CRS."
-    )
-
-
-def _check_polygons(request: DsmRequest, settled: Settled, area: NDArray[Any] | None) -> None:
-    """Refuse polygons of an area that hold no cell to be matched."""
-    if area is None:
-        return
-    grid = settled.grid
-    shared = grid.window.within(settled.matching.seen)
-    row, col = shared.row - grid.window.row, shared.col - grid.window.col
-    if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
-        raise GeometryError(
-            f"No cell of the ground that two images see lies inside {request.area}. Check the polygons and their CRS."
-        )
-
-
-def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
-    """Polygons of --area and --mask."""
-    area = None if request.area is None else read_polygons(request.area, crs)
-    mask = None if request.mask is None else read_polygons(request.mask, crs)
-    return Polygons(area, mask)
-
-
-def _check_success(request: DsmRequest, tally: Tally, doubts: Sequence[Doubt], progress: Progress) -> None:
-    """Refuse to call a run a success that found few heights, or whose cameras are in grave doubt, unless `partial`."""
-    _check_coverage(tally, request.out, request.partial, progress)
-    if not request.partial:
-        check_doubts(doubts, request.out / "dsm.tif")
 
 
 def _check_coverage(tally: Tally, out: Path, partial: bool, progress: Progress) -> None:

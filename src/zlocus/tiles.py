@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -131,16 +131,7 @@ class Tally:
             "evaluations": {"done": self.evaluations, "all_images": self.all_images},
             "coverage": round(self.coverage, 6),
             "left_out_cells": self.n_left_out,
-            "cells": {"seen": self.n_seen, "matched": self.n_matched},
         }
-
-    @classmethod
-    def of(cls, record: Mapping[str, Any]) -> Tally:
-        """The counts of a run that is finished, from its run.json."""
-        cells, evaluations = record["cells"], record["evaluations"]
-        return cls(
-            cells["seen"], cells["matched"], record["left_out_cells"], evaluations["done"], evaluations["all_images"]
-        )
 
 
 @dataclass(frozen=True)

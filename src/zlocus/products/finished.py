@@ -7,7 +7,7 @@ import json
 import sqlite3
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,22 +26,28 @@ CHECKED = (*(product.name for product in PRODUCTS if product.name != EVENTS), IT
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished run. key : all that it depends on, by name, empty where the file is damaged; checksums : of each of
-    its products, by the name of the file."""
+    """A finished run.
+
+    key : all that it depends on, by name, empty where the file is damaged; checksums : of each of its products, by the
+    name of the file; shortcoming : why it is no success unless that is accepted, "" where it is one.
+    """
 
     key: dict[str, Any]
     checksums: dict[str, str]
+    shortcoming: str = ""
 
 
-def write_finished(out: Path, key: Mapping[str, Any]) -> None:
-    """Say that the run in a folder is finished, with the checksums of all products that are there.
+def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "") -> None:
+    """Say that the run in a folder is finished, with the checksums of all products that are there. key, shortcoming :
+    see `Finished`.
 
     Raises
     ------
     OutputError
         Where the file cannot be written.
     """
-    _write(out, Finished(dict(key), {name: checksum(out / name) for name in CHECKED if (out / name).is_file()}))
+    checksums = {name: checksum(out / name) for name in CHECKED if (out / name).is_file()}
+    _write(out, Finished(dict(key), checksums, shortcoming))
 
 
 def read_finished(out: Path) -> Finished | None:
@@ -58,7 +64,8 @@ def read_finished(out: Path) -> Finished | None:
     key, checksums = found.get("key"), found.get("products")
     if not isinstance(key, dict) or not isinstance(checksums, dict):
         return damaged
-    return Finished(key, {name: str(digest) for name, digest in checksums.items() if name in CHECKED})
+    known = {name: str(digest) for name, digest in checksums.items() if name in CHECKED}
+    return Finished(key, known, str(found.get("shortcoming", "")))
 
 
 def update_finished(out: Path, names: Iterable[str]) -> None:
@@ -73,7 +80,7 @@ def update_finished(out: Path, names: Iterable[str]) -> None:
     if found is None or not found.key:
         return
     made = {name: checksum(out / name) for name in names if name in CHECKED and (out / name).is_file()}
-    _write(out, Finished(found.key, found.checksums | made))
+    _write(out, replace(found, checksums=found.checksums | made))
 
 
 def comparable(key: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,4 +116,5 @@ def _checksum_of_layers(path: Path) -> str:
 
 
 def _write(out: Path, finished: Finished) -> None:
-    write_record(out / FINISHED, {"schema": SCHEMA, "key": finished.key, "products": finished.checksums})
+    record = {"key": finished.key, "products": finished.checksums, "shortcoming": finished.shortcoming}
+    write_record(out / FINISHED, {"schema": SCHEMA, **record})
