@@ -114,7 +114,6 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         },
     )
     if not request.partial:
-<<<<<<< HEAD
         _check_success(request.out / "cloud.laz", coverage, ready)
     return CloudResult(request.out, n_points, coverage)
 
@@ -146,20 +145,6 @@ def references_taking_part(references: Sequence[str], ready: OrientedScene) -> l
             "check that the camera belongs to the image."
         )
     return found
-=======
-        check_coverage(coverage, request.out)
-    return CloudResult(request.out, n_points, coverage)
-
-
-def check_coverage(coverage: float, out: Path) -> None:
-    """Refuse to call a run a success that found few heights. coverage : see `CloudResult`."""
-    if coverage < SUFFICIENT_COVERAGE:
-        raise CoverageError(
-            f"Only {100 * coverage:.1f} % of the pixels seen by two images or more have a height that other images "
-            f"confirm in {out / 'cloud.laz'}. See the reasons in the quality maps; give --heights or other images, or "
-            "accept it with --partial."
-        )
->>>>>>> wt_c
 
 
 def check_geoid(vertical: VerticalDatum, ready: OrientedScene) -> None:
