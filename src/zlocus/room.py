@@ -14,7 +14,7 @@ from zlocus.errors import GeometryError, OutputError
 from zlocus.execution.memory import SHARE, free_bytes
 from zlocus.execution.store import FOLDER
 from zlocus.grid import Grid
-from zlocus.matching.ground_pixels import median_ground_pixel
+from zlocus.matching.ground_pixels import default_cell
 from zlocus.matching.setup import MatchScene, shared_ground
 from zlocus.preparing import possible_heights
 from zlocus.products.rasters import COLOURS
@@ -72,7 +72,7 @@ def check_room_before_ties(
             shared = shared_ground(scene, (z, z))
         except GeometryError:  # at this height nothing may be left to match
             return
-        cell_m = resolution or median_ground_pixel(scene, z)
+        cell_m = resolution or default_cell(scene, z)
         low, high = np.array(bounds or scene.bounds or shared).reshape(2, 2)
         asked = (high - low) / cell_m
         matched = np.maximum(np.minimum(high, shared[2:]) - np.maximum(low, shared[:2]), 0.0) / cell_m

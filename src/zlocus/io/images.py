@@ -25,7 +25,8 @@ LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue:
 CHECKED_PX, MOST_CHECKED_PX = 1 << 20, 1 << 30
 # Four million a side; to look for tie points in more takes months.
 MOST_PX = 1 << 44
-# Of larger images, in pixels, absurd values are left out all the same, but not counted.
+# Larger images, in pixels, are not read as a whole for what they should not hold: absurd values are left out all the
+# same, but not counted, and borders of one value are matched as they are.
 MOST_COUNTED = 2_000_000_000
 
 
@@ -309,6 +310,8 @@ def with_plateau(image: RasterImage) -> RasterImage:
     InputError
         Where the image cannot be read.
     """
+    if image.shape[0] * image.shape[1] > MOST_COUNTED:
+        return image
     found = border_plateau(image)
     if found is None:
         return image

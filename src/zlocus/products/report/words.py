@@ -18,10 +18,10 @@ from zlocus.surface.reasons import EMPTY, Quality
 # As docs/quality.md has them; a test keeps them the same.
 MEANINGS = {
     Quality.OUTSIDE: "not asked for: outside the area, or inside a mask",
-    Quality.UNSEEN: "fewer than two images cover the cell at the height of the ground around it",
+    Quality.UNSEEN: "fewer than two images cover the cell at the ground's height, or support a height above it",
     Quality.HIDDEN: "fewer than two images see the surface there, the others are behind it",
     Quality.RANGE_END: "best match at an end of the height range: the true height may lie beyond it",
-    Quality.NO_MATCH: "images do not agree at any height",
+    Quality.NO_MATCH: "images do not agree at any height, or heights at the border are noise",
     Quality.FAILED: "its tile could not be processed",
     Quality.UNCONFIRMED: "no other image finds the same height when matched back (image space only)",
     Quality.IMPRECISE: "its standard deviation is larger than asked for (checks.most_sigma_m)",
