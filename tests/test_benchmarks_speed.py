@@ -255,8 +255,10 @@ def test_two_threads_do_the_work_twice():
     assert threads.run_together([bench_kernels.Case(burn, 1, "call")], 1).cpu_s > 0.04
 
 
-def test_the_benchmarks_of_the_kernels(tmp_path):
+def test_the_benchmarks_of_the_kernels(tmp_path, monkeypatch):
     """All of them on scenes of 64 cells, by the row of the acceptance table; speeds mean nothing there."""
+    # Where these tests run in several processes, pytest-benchmark would believe that the benchmarks do so too.
+    monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
     figures = {figure.what: figure for figure in acceptance.kernels(Workplace(None, tmp_path), side=64)}
     report = json.loads((tmp_path / "benchmarks.json").read_text())
     names = {benchmark["name"].split("[")[0] for benchmark in report["benchmarks"]}

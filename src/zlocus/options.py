@@ -399,10 +399,9 @@ class CheckOptions(Checked):
         64, "A cell is marked as ambiguous when another height costs less than this more over the eight paths.",
         low=0, high=10000,
     )  # fmt: skip
-    most_spread_steps: float | None = option(
+    most_spread_steps: float = option(
         8.0, "At the border of the ground that images share, a cell is left empty where the standard deviations of the "
-        "heights around it (geometric mean over 5 x 5 cells) are larger than this: such heights are noise; unset: none "
-        "is.",
+        "heights around it (geometric mean over 5 x 5 cells) are larger than this: such heights are noise.",
         low=0.1, high=1e4, unit="steps",
     )  # fmt: skip
     most_sigma_m: float | None = option(

@@ -44,6 +44,8 @@ from zlocus.threads import run_all
 from zlocus.tile import TileResult, match_tile
 
 AGREE_PX = 1.0
+# A limit that no spread of heights reaches.
+ANY_SPREAD_STEPS = 1e4
 BESIDE_PX = 16
 # Along a side of a window of pixels, at which rays are followed: outlines are bent by lenses and by unsteady scanners.
 SAMPLES = 9
@@ -206,7 +208,7 @@ def match_images(
 ) -> list[Matched]:
     """Every tile of every reference image, or those that may show an area; of any precision, for there it is not in
     metres. scratch : makes the arrays of all pixels; store : keeps tiles, and has those of a run that is taken on."""
-    options = replace(options, checks=replace(options.checks, most_sigma_m=None, most_spread_steps=None))
+    options = replace(options, checks=replace(options.checks, most_sigma_m=None, most_spread_steps=ANY_SPREAD_STEPS))
     images = [CellWindow(0, 0, *space.reference.image.shape) for space, _ in settled]
     surfaces = [Surface.nothing(window, full=scratch.full) for window in images]
     tasks = [

@@ -466,8 +466,8 @@ def _finish(
         quality[result.is_planar] |= np.uint16(Quality.PLANE)
     height = result.lattice.metres(refined.height)
     sigma = sigma_steps(signs, refined)
-    if (most := config.checks.most_spread_steps) is not None:
-        quality[border.is_near(result.window) & (spread_around(sigma) > most)] |= np.uint16(Quality.NO_MATCH)
+    is_noise = border.is_near(result.window) & (spread_around(sigma) > config.checks.most_spread_steps)
+    quality[is_noise] |= np.uint16(Quality.NO_MATCH)
     sigma *= np.float32(scene.step_m)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
