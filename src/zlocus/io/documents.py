@@ -18,6 +18,7 @@ from zlocus.io.text import AGAIN, check_ended, read_bytes, read_text, shown
 
 DEEPEST_XML = 64
 DEEPEST_YAML = 32
+TOO_DEEP = f"{{path}} is nested more than {DEEPEST_YAML} levels deep. Check its brackets."
 LARGEST_YAML = 64_000_000
 # What ten thousand cameras take. Aliases count as what they stand for.
 MOST_VALUES = 500_000
@@ -124,6 +125,9 @@ def read_yaml(path: Path, most: int = LARGEST_YAML) -> Any:
         check_ended(text.rstrip(" \t"), path)
         return yaml.load(text, _Loader)
     except (ValueError, RecursionError, yaml.YAMLError) as error:
+        if "nesting depth" in str(error):
+            # libyaml reads ahead, and has a limit of its own that it may reach first.
+            raise InputError(TOO_DEEP.format(path=path)) from error
         raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
 
 
@@ -160,7 +164,7 @@ class _Checked:
             self._remember(event.anchor, 1)
             return
         if len(self.open) == DEEPEST_YAML:
-            raise InputError(f"{self.path} is nested more than {DEEPEST_YAML} levels deep. Check its brackets.")
+            raise InputError(TOO_DEEP.format(path=self.path))
         self.sizes.pop(event.anchor or "", None)
         self.open.append(
             (event.anchor, self.n_values - 1, set() if isinstance(event, yaml.MappingStartEvent) else None)
