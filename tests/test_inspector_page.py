@@ -89,9 +89,8 @@ def page_at(browser, address, size, **options):
 
 
 def link_of(page) -> str:
-    """The page's address once it is written."""
-    page.wait_for_timeout(400)
-    return page.url
+    """The link of the view that the page shows now."""
+    return page.evaluate('async () => (await import(new URL("static/js/state.js", document.baseURI))).link()')
 
 
 def settled(page) -> None:
@@ -99,12 +98,23 @@ def settled(page) -> None:
     page.wait_for_selector('#match:not([hidden])[aria-busy="false"]')
 
 
+def open_address(page, part) -> None:
+    """Set the part of the address behind #, and wait until the page has followed it."""
+    page.evaluate(
+        """(part) => new Promise((done) => {
+             if (location.hash === part) return done();
+             addEventListener("hashchange", () => done(), { once: true });
+             location.hash = part;
+           })""",
+        part,
+    )
+
+
 def click_cell(page, folder, row, col) -> None:
     """Click the middle of a cell where the map shows it."""
     x, y = folder.middle_of(row, col)
     # One pixel of the map is a cell then, and the cell's middle the map's.
-    page.evaluate(f"location.hash = '#at={x},{y},2'")
-    page.wait_for_timeout(300)
+    open_address(page, f"#at={x},{y},2")
     box = page.locator("#map").bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.wait_for_selector(f"text=Cell at row {row}, column {col}")
@@ -274,6 +284,24 @@ def test_a_link_reopens_the_view(page, browser, inspected, out):
     assert link_of(other) == link
     other.context.close()
     assert faults == []
+
+
+def test_an_address_that_is_opened_is_not_overwritten_by_the_one_before(page, inspected):
+    # What the map wrote late could otherwise come between the new address and the event that reads it.
+    x, y = inspected[0].folder.middle_of(40, 40)
+    address = f"#at={x},{y},2"
+    page.wait_for_timeout(400)
+    page.evaluate(
+        """async (address) => {
+             const state = await import(new URL("static/js/state.js", document.baseURI));
+             state.set({ at: "0,0,0" });
+             location.hash = address;
+             state.link();
+           }""",
+        address,
+    )
+    page.wait_for_timeout(400)
+    assert page.url.replace("%2C", ",").endswith(f"#at={x},{y},2")
 
 
 def test_it_is_used_from_the_keyboard(page, inspected):

@@ -4,6 +4,7 @@
 const WRITE_MS = 250;
 const listeners = [];
 let writing = null;
+let known; // the part of the address behind # when it was last read or written here
 let values = read();
 
 export function get(name) {
@@ -37,8 +38,11 @@ export function link() {
 function write() {
   clearTimeout(writing);
   writing = null;
+  // The address was changed from outside and its event is still to come: it must not be overwritten.
+  if (location.hash !== known) return;
   const text = values.toString();
   history.replaceState(null, "", text ? `#${text}` : "#");
+  known = location.hash;
 }
 
 export function onOpened(listener) {
@@ -59,5 +63,6 @@ addEventListener("hashchange", () => {
 });
 
 function read() {
+  known = location.hash;
   return new URLSearchParams(location.hash.slice(1));
 }
