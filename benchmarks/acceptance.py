@@ -33,10 +33,10 @@ from double_mapping import double_mapped
 from middlebury import CASES, judge
 from reprojection import Surface, reprojected
 from workplace import RENDERED_VIEWS, ROOT, ZLOCUS, CannotRun, Figure, Workplace, render, rendered_images, run
+from zlocus.core.scene import Scene
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.io.scene_file import open_scene, read_scene_file, write_scene_file
-from zlocus.scene import Scene
 from zlocus.synthetic.mixed import SENSORS
 from zlocus.synthetic.scenes import demo_spec
 
@@ -661,7 +661,7 @@ def speed(at: Workplace) -> list[Figure]:
 
 def signals(at: Workplace) -> list[Figure]:
     """A run that gets signals of four kinds at random moments and goes on after each: the test of it, with more."""
-    test = "tests/test_resume.py::test_signals_at_random_moments"
+    test = "tests/runs/test_resume.py::test_signals_at_random_moments"
     used = run(["env", f"ZLOCUS_SIGNALS={N_SIGNALS}", sys.executable, "-m", "pytest", "-q", test], cwd=ROOT)
     return [Figure("signals, and the same bytes afterwards", N_SIGNALS), Figure("CPU", used.cpu_s, "s")]
 

@@ -36,8 +36,8 @@ from rectifying import (
     write_surface,
 )
 from workplace import ended
+from zlocus.core.scene import View
 from zlocus.io.scene_file import open_scene
-from zlocus.scene import View
 
 VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
 PAIR = ("n1", "f1")
@@ -79,7 +79,7 @@ def open_rendered(folder: Path) -> RenderedFolder:
 def mvll(scene: RenderedFolder, out: Path) -> Path:
     """`zlocus dsm --method mvll` on the six views. Returns the surface."""
     command = [
-        sys.executable, "-c", "from zlocus.cli import app; app()", "dsm", *scene.images, "-o", out,
+        sys.executable, "-c", "from zlocus.cli.app import app; app()", "dsm", *scene.images, "-o", out,
         "--method", "mvll", "--resolution", STEP_M, "--crs", scene.crs, "--bounds", *scene.bounds, "--overwrite",
         "--no-report",
     ]  # fmt: skip

@@ -16,19 +16,19 @@ import cv2
 import numpy as np
 import pytest
 
-from zlocus.kernels.free_rays import add_ray_costs, lowest_free_ray
-from zlocus.kernels.mgm import sweep_quarter
-from zlocus.kernels.reach import block_reach
-from zlocus.kernels.refine import CUBIC, tile_ortho, tile_profile
-from zlocus.kernels.resample import resample_plane
-from zlocus.kernels.sgm import least_costs, sweep, winners
-from zlocus.kernels.smooth import slopes, smooth_surface
-from zlocus.kernels.spline import spline_coefficients
-from zlocus.kernels.visibility import lowest_visible
-from zlocus.kernels.volume import flat_cells, tile_costs
 from zlocus.matching.free_rays import pair_agreement
-from zlocus.matching.lattice import HeightLattice
-from zlocus.matching.refine import smoothed
+from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.cost_volume import flat_cells, tile_costs
+from zlocus.matching.kernels.coverage import block_reach
+from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
+from zlocus.matching.kernels.mgm import sweep_quarter
+from zlocus.matching.kernels.occlusion import lowest_visible
+from zlocus.matching.kernels.resample import resample_plane
+from zlocus.matching.kernels.sgm import least_costs, sweep, winners
+from zlocus.matching.kernels.smooth import slopes, smooth_surface
+from zlocus.matching.kernels.spline import spline_coefficients
+from zlocus.matching.kernels.subpixel import CUBIC, tile_ortho, tile_profile
+from zlocus.matching.subpixel import smoothed
 from zlocus.products.hillshade import hillshade
 
 SIDE, BLOCK, ROUNDS = 320, 32, 5

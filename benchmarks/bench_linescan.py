@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bench_kernels import Case, timed
+from zlocus.sensors.earth_frame import EarthSpace, FrameSpace
 from zlocus.sensors.linescan import LineScanModel, LineTimes
-from zlocus.sensors.space import EarthSpace, FrameSpace
 from zlocus.synthetic.linescan import SPEED_M_S, focal_line, sampled
 from zlocus.synthetic.scenes import demo_spec, exposures, steady
 

@@ -10,7 +10,7 @@ import numpy as np
 import rasterio
 from scipy.ndimage import map_coordinates
 
-from zlocus.scene import Scene
+from zlocus.core.scene import Scene
 
 # Grey values: a sample equals its source to rounding; others as near as that leave the source unknown.
 SAME_GREY, RIVAL_GREY = 1.5, 2.0

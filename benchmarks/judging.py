@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from workplace import CannotRun
-from zlocus import cli
+from zlocus.cli.app import app as cli
+from zlocus.core.options import RunConfig
 from zlocus.io.config import write_config
-from zlocus.options import RunConfig
 
 DATA = Path(os.environ.get("ZLOCUS_TEST_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 JUDGE = DATA.parent / "tools" / "evaluate_dsm.py"

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from zlocus.kernels._jit import kernel
+from zlocus.core.jit import kernel
 
 RUNS = 30
 IN_L1, IN_L2, IN_L3, IN_MEMORY = 12 << 10, 192 << 10, 6 << 20, 60 << 20

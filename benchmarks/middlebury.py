@@ -22,10 +22,10 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from zlocus.io.camera_kinds import FrameCamera
+from zlocus.io.cameras.camera_kinds import FrameCamera
 from zlocus.io.images import open_image
 from zlocus.io.scene_file import Frame, SceneFile, ViewEntry, write_scene_file
-from zlocus.surface.reasons import Quality
+from zlocus.matching.quality import Quality
 
 ZLOCUS = Path(sys.executable).with_name("zlocus")
 # Any focal length and step will do; reports are in pixels of disparity.

@@ -32,12 +32,13 @@ from scipy.optimize import minimize
 
 from judging import rendered_scene, run_here
 from workplace import CannotRun, ended
-from zlocus import job, tile
 from zlocus.evaluation.alignment import best_shift
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
-from zlocus.surface.precision import is_split
+from zlocus.matching import tile
+from zlocus.matching.precision import is_split
+from zlocus.pipeline import tile_run as job
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "src" / "zlocus" / "surface" / "calibration.py"
 SIZE, POINTING_PX = 520, 2.0

@@ -17,7 +17,7 @@ import rasterio
 from rasterio.transform import from_origin
 from scipy.ndimage import distance_transform_edt
 
-from zlocus.scene import View
+from zlocus.core.scene import View
 
 STEP_M = 0.5
 MARGIN_M = 25.0

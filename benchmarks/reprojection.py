@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from zlocus.core.jit import kernel
+from zlocus.core.scene import View
 from zlocus.evaluation.heights import read_heights
-from zlocus.kernels._jit import kernel
-from zlocus.scene import View
 
 WINDOW = 11
 # A cell is hidden where the surface stands so many cells above its ray.

@@ -41,9 +41,9 @@ from rasterio.windows import Window
 
 from workplace import CannotRun, ended
 from zlocus.sensors.rpc import RpcCoefficients
+from zlocus.sensors.rpc_fit import fit_rpc
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.render import Optics, expose, render
-from zlocus.synthetic.rpc_fit import fit_rpc
 from zlocus.synthetic.scenes import build_ground, city_spec, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
 

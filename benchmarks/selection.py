@@ -33,16 +33,15 @@ from pyproj import CRS
 
 from judging import RENDERED_TOWN, judged, matched, rendered_scene, table_head, table_row, write_table
 from workplace import CannotRun, ended
-from zlocus import tile
+from zlocus.core.options import RunConfig, SelectionOptions
 from zlocus.io.scene_file import open_scene
-from zlocus.matching.curve import GOOD, curve_peaks, quality_labels
-from zlocus.matching.order import SearchGeometry, candidate_images
-from zlocus.matching.progressive import ProgressiveMean
-from zlocus.matching.refine import smoothed
-from zlocus.matching.selection import Samples
-from zlocus.matching.setup import leading_first, nadir_offset
-from zlocus.matching.visibility import cells_per_step, covers
-from zlocus.options import RunConfig, SelectionOptions
+from zlocus.matching import tile
+from zlocus.matching.match_curve import GOOD, ProgressiveMean, curve_peaks, quality_labels
+from zlocus.matching.match_scene import leading_first, nadir_offset
+from zlocus.matching.occlusion import covers
+from zlocus.matching.subpixel import smoothed
+from zlocus.matching.view_directions import cells_per_step
+from zlocus.matching.view_ranking import Samples, SearchGeometry, candidate_images
 
 SPOILED = "d"
 CURVES = 2000

@@ -30,12 +30,12 @@ from matplotlib.colors import BoundaryNorm
 
 from judging import RENDERED_TOWN, matched, rendered_scene, table_head, table_row, write_table
 from workplace import CannotRun, ended
+from zlocus.core.options import RunConfig
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import TruthBlocks, read_classes, truth_blocks
 from zlocus.io.scene_file import open_scene
-from zlocus.kernels.visibility import lowest_visible
-from zlocus.matching.setup import nadir_offset
-from zlocus.options import RunConfig
+from zlocus.matching.kernels.occlusion import lowest_visible
+from zlocus.matching.match_scene import nadir_offset
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -20,10 +20,10 @@ from scipy.ndimage import binary_dilation
 
 from judging import rendered_scene
 from workplace import ended
+from zlocus.core.options import ProductOptions
 from zlocus.evaluation.statistics import error_statistics
 from zlocus.evaluation.truth import CLASS_NAMES
-from zlocus.io.raster import write_cog
-from zlocus.options import ProductOptions
+from zlocus.io.rasters import write_cog
 from zlocus.products.dtm import write_dtm
 
 NEAR_M = 1.0

@@ -33,8 +33,8 @@ from scipy.ndimage import distance_transform_edt
 
 from judging import judged, matched, table_head, table_row, write_table
 from workplace import ended
-from zlocus.execution.warm import kernels_compiling
-from zlocus.options import PyramidOptions, RunConfig
+from zlocus.core.options import PyramidOptions, RunConfig
+from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.synthetic.files import render_scene
 from zlocus.synthetic.objects import Objects
 from zlocus.synthetic.render import seen_from

@@ -85,7 +85,7 @@ def program_on_two(scene: Path, rounds: int = 2) -> None:
         for turn in range(2 * rounds + 1):  # the first compiles
             workers = 1 + turn % 2
             shutil.rmtree(out, ignore_errors=True)
-            command = [sys.executable, "-c", "from zlocus.cli import main; main()", "dsm", *map(str, images)]
+            command = [sys.executable, "-c", "from zlocus.cli.app import main; main()", "dsm", *map(str, images)]
             command += ["-o", str(out), "--like", str(scene / "truth_dsm.tif"), "--workers", str(workers)]
             start = time.perf_counter()
             done = subprocess.run(command, capture_output=True, text=True)

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import zlocus
-import zlocus.pipeline
-from zlocus.options import RunConfig
-from zlocus.point import run_point
-from zlocus.progress import SilentProgress
-from zlocus.request import CurvesRequest, DsmRequest
+import zlocus.pipeline.dsm
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import SilentProgress
+from zlocus.core.requests import CurvesRequest, DsmRequest
+from zlocus.pipeline.match_curves import run_point
 from zlocus.synthetic.files import RenderedScene, render_scene
 from zlocus.synthetic.scenes import city_spec
 
@@ -176,7 +176,7 @@ def surface(town: Town, method: str) -> dict[str, FloatArray]:
     options = {"bounds": town.bounds, "resolution": CELL_M, "method": method, "partial": True}
     with tempfile.TemporaryDirectory() as scratch:
         request = DsmRequest(inputs=town.images(THREE), out=Path(scratch) / "out", **options)
-        zlocus.pipeline.run_dsm(request, RunConfig(), SilentProgress())
+        zlocus.pipeline.dsm.run_dsm(request, RunConfig(), SilentProgress())
         found = {}
         for name in ("dsm", "sigma"):
             with rasterio.open(request.out / f"{name}.tif") as source:

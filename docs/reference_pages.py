@@ -10,8 +10,8 @@ from typing import Any
 
 import typer.main
 
-from zlocus.cli import app
-from zlocus.options import RunConfig
+from zlocus.cli.app import app
+from zlocus.core.options import RunConfig
 
 # What begins a sentence that is of no single parameter, though it stands behind one.
 OF_ALL = re.compile(r"(?<=\.) (?=(?:Returns|Source:|Heights come back) )")

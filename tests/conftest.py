@@ -50,10 +50,10 @@ def small_surface(small_town, tmp_path_factory) -> Path:
 
     import rasterio
 
-    from zlocus.options import ProductOptions, RunConfig
-    from zlocus.pipeline import run_dsm
-    from zlocus.progress import progress_for
-    from zlocus.request import DsmRequest
+    from zlocus.core.options import ProductOptions, RunConfig
+    from zlocus.core.progress import progress_for
+    from zlocus.core.requests import DsmRequest
+    from zlocus.pipeline.dsm import run_dsm
 
     out = tmp_path_factory.mktemp("town") / "surface"
     with rasterio.open(small_town / "truth_dsm.tif") as truth:

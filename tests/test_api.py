@@ -12,9 +12,9 @@ from scipy.ndimage import uniform_filter
 
 import zlocus
 from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, read, rendered_in_colours, run
-from zlocus.errors import ConfigError, InputError
-from zlocus.options import SemiGlobalOptions
-from zlocus.surface.reasons import Quality
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.options import SemiGlobalOptions
+from zlocus.matching.quality import Quality
 from zlocus.synthetic.terrain import analytic_height
 
 ASKED = {"crs": "EPSG:32632", "resolution": GSD_M, "heights": HEIGHTS, "bounds": PART}
@@ -66,7 +66,7 @@ def test_rasters_written_from_a_surface_know_what_is_missing(written, tmp_path):
 
 def test_nothing_is_made_that_nobody_sees(images, monkeypatch):
     asked = []
-    monkeypatch.setattr("zlocus.pipeline.run_dsm", lambda request, *_: asked.append(request))
+    monkeypatch.setattr("zlocus.pipeline.dsm.run_dsm", lambda request, *_: asked.append(request))
     for more in ({}, {"products": ("hillshade",)}):
         with pytest.raises(InputError, match=r"holds no dsm\.tif"):
             zlocus.match(*images("sine").inputs, **ASKED, **more)

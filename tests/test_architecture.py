@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).parents[1] / "src" / "zlocus"
+from places import ROOT
+
+SOURCE = ROOT / "src" / "zlocus"
 MODULES = sorted(SOURCE.rglob("*.py"))
 MAX_MODULE_LINES = 500
 MAX_FUNCTION_LINES = 60

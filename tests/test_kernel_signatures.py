@@ -10,20 +10,21 @@ import re
 import pytest
 from numba.core import types
 
-import zlocus.kernels
+import zlocus.matching.kernels
+import zlocus.orientation.kernels
 
 
 def all_kernels():
     """Every kernel by name, with the comment above its decorator."""
     found = {}
-    for module in pkgutil.iter_modules(zlocus.kernels.__path__):
-        if module.name.startswith("_"):
-            continue
-        loaded = importlib.import_module(f"zlocus.kernels.{module.name}")
+    packages = (zlocus.matching.kernels, zlocus.orientation.kernels)
+    names = [f"{package.__name__}.{m.name}" for package in packages for m in pkgutil.iter_modules(package.__path__)]
+    for name_of_module in [*names, "zlocus.products.shade_kernel"]:
+        loaded = importlib.import_module(name_of_module)
         source = inspect.getsource(loaded)
         for comment, name in re.findall(r"# (.*)\n@(?:parallel_)?kernel\ndef (\w+)\(", source):
             found[name] = (getattr(loaded, name), comment)
-        assert len(re.findall(r"\n@(?:parallel_)?kernel\n", source)) == source.count("kernel\ndef "), module.name
+        assert len(re.findall(r"\n@(?:parallel_)?kernel\n", source)) == source.count("kernel\ndef "), name_of_module
     return found
 
 

@@ -27,8 +27,8 @@ from peers.environments import CONFIGURATIONS, Missing, digest_of
 from peers.measuring import Failed, Usage, measured
 from peers.scenes import RESOLUTION_M, Scene
 from rectifying import gridded
-from zlocus.io.cameras import read_rpc
-from zlocus.io.rpc_text import write_rpc_txt
+from zlocus.io.cameras.rpc import read_rpc
+from zlocus.io.cameras.rpc_text import write_rpc_txt
 from zlocus.sensors.rpc import RpcCoefficients
 
 ANSWER_S = 60.0

@@ -29,8 +29,8 @@ from rectifying import (
     rectified,
     write_surface,
 )
+from zlocus.core.scene import View
 from zlocus.io.scene_file import open_scene
-from zlocus.scene import View
 
 
 @dataclass(frozen=True)

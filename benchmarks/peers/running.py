@@ -29,7 +29,7 @@ from peers.environments import Environment
 from peers.measuring import Failed, Usage, measured
 from peers.middlebury import middlebury
 from peers.scenes import RENDERED, WARM_UP, Scene, shared
-from zlocus.errors import ZlocusError
+from zlocus.core.errors import ZlocusError
 from zlocus.evaluation.evaluate import evaluate
 
 OWN = "zlocus"

@@ -47,9 +47,9 @@ def pair(side: int, heights: int) -> tuple[np.ndarray, np.ndarray]:
 
 def zlocus(side: int, heights: int) -> Iterator[tuple[str, Callable[[], object]]]:
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from zlocus.kernels.mgm import sweep_quarter
-    from zlocus.kernels.sgm import sweep
-    from zlocus.matching.lattice import HeightLattice
+    from zlocus.matching.height_lattice import HeightLattice
+    from zlocus.matching.kernels.mgm import sweep_quarter
+    from zlocus.matching.kernels.sgm import sweep
 
     block = 32
     blocks = (-(-side // block),) * 2

@@ -1,12 +1,12 @@
 """The program: `zlocus`, and `python -m zlocus`."""
 
-from zlocus.signals import handle_signals
+from zlocus.core.signals import handle_signals
 
 
 def run() -> None:
     """Handle signals before anything else is imported, which takes a moment; then run the command line and exit."""
     handle_signals()
-    from zlocus.cli import main
+    from zlocus.cli.app import main
 
     main()
 

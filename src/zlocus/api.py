@@ -22,23 +22,23 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from zlocus.errors import ConfigError, InputError
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig, SemiGlobalOptions
+from zlocus.core.progress import Progress, SilentProgress
+from zlocus.core.requests import DsmRequest
+from zlocus.core.scene import ImageSource, Scene
 from zlocus.io import scene_file
-from zlocus.matching import ortho
-from zlocus.matching.base import BaseSurface
-from zlocus.matching.lattice import HeightLattice
+from zlocus.matching import true_ortho as ortho
+from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.match_scene import height_step, leading_first
+from zlocus.matching.occlusion import coverage
+from zlocus.matching.quality import Quality
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties
-from zlocus.matching.setup import height_step, leading_first
-from zlocus.matching.views import pixel_window, read_pixels, tile_views
-from zlocus.matching.visibility import coverage
-from zlocus.options import OrientationOptions, PyramidOptions, RunConfig, SemiGlobalOptions
-from zlocus.orientation.orient import Orientation
-from zlocus.preparing import asked_crs, oriented
-from zlocus.progress import Progress, SilentProgress
-from zlocus.request import DsmRequest
-from zlocus.scene import ImageSource, Scene
-from zlocus.surface.reasons import Quality
+from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.tile_views import pixel_window, read_pixels, tile_views
+from zlocus.orientation.orientation import Orientation
+from zlocus.pipeline.preparing import asked_crs, oriented
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -107,8 +107,8 @@ def match(
     inputs : two images or more with RPC, or one `scene.yaml`. out : folder for the products, which are then read from
     there when they are needed; None: none are kept, and the Dataset is in memory. A folder that holds the same surface
     already, finished, is opened; one that holds another run is refused, unless `overwrite=True` is given. asked :
-    fields of `zlocus.request.DsmRequest`, such as resolution, bounds, heights, workers; those that name files take
-    paths.
+    fields of `zlocus.core.requests.DsmRequest`, such as resolution, bounds, heights, workers; those that name files
+    take paths.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def match(
         As `zlocus dsm`. OutputError: `out` holds another run. CoverageError: too few cells have a height; what was
         found lies in `out`.
     """
-    from zlocus.pipeline import run_dsm
+    from zlocus.pipeline.dsm import run_dsm
 
     known = {field for field in DsmRequest.__dataclass_fields__ if field not in ("inputs", "out")}
     if unknown := sorted(set(asked) - known):
@@ -138,7 +138,7 @@ def open_surface(folder: PathLikes) -> xr.Dataset:
     """The result of `zlocus dsm` in a folder: height, sigma (m), quality (bit flags), views and ortho over y and x, the
     ortho-image of colour images over band (red, green, blue) too.
 
-    NaN is a missing height; `zlocus.surface.reasons.Quality` names the flags. Cells are read when they are needed. The
+    NaN is a missing height; `zlocus.matching.quality.Quality` names the flags. Cells are read when they are needed. The
     CRS is that of the `rio` accessor: `surface.rio.crs`.
 
     Raises
@@ -255,7 +255,7 @@ def ncc_cost(grey: NDArray[np.floating], *, window: int = 5, reference: int | No
     SNCC of Ji et al. (2014), section 2.1; None: all pairs are. Returns (r, c, h) float32, in the units of `semiglobal`;
     NaN where fewer than two images show the whole window. A window without texture is unlike every other: 1.
 
-    The matcher's own cost adds grey differences, and knows which images are hidden: `zlocus.matching.measure`.
+    The matcher's own cost adds grey differences, and knows which images are hidden: `zlocus.matching.cost_volume`.
 
     Raises
     ------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zlocus.orientation.blocks import corrected_sensors
+from zlocus.orientation.parameter_groups import corrected_sensors
 from zlocus.orientation.triangulate import project_points
 
 

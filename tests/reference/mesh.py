@@ -1,4 +1,4 @@
-"""Plain twins of `zlocus.kernels.mesh`."""
+"""Plain twins of `zlocus.matching.kernels.rasterise`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def agreed_heights_reference(heights, tolerance):
-    """See `zlocus.kernels.mesh.agreed_heights`: (r, c) heights and (i, r, c) who agrees."""
+    """See `zlocus.matching.kernels.rasterise.agreed_heights`: (r, c) heights and (i, r, c) who agrees."""
     out = np.full(heights.shape[1:], np.nan, np.float32)
     agrees = np.zeros(heights.shape, bool)
     for cell in np.ndindex(out.shape):

@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.evaluation.truth import TruthBlocks

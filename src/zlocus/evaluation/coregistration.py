@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.evaluation.statistics import NORMAL_SIGMA_FROM_MAD
 from zlocus.evaluation.truth import TruthBlocks
-from zlocus.sensors.model import FloatArray
 
 METHOD = "nuth-kaab"
 # It has converged when it would move the surface by less.

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from zlocus.errors import ConfigError, InputError
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation import coregistration
 from zlocus.evaluation.alignment import best_shift
 from zlocus.evaluation.frame import Points, frame_of, points_on
@@ -23,7 +24,6 @@ from zlocus.evaluation.slopes import SLOPE_EDGES_DEG, slope_bands
 from zlocus.evaluation.statistics import ErrorStatistics, error_statistics
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
 from zlocus.evaluation.vertical import same_heights
-from zlocus.sensors.model import FloatArray
 
 COREGISTRATIONS = (coregistration.METHOD,)
 SEARCH = "search"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zlocus.errors import OutputError
-from zlocus.evaluation.command import EVALUATION_FILES
+from zlocus.core.errors import OutputError
+from zlocus.core.requests import EVALUATION_FILES
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.histogram import histogram_figure
-from zlocus.io.raster import write_cog
-from zlocus.products.record import write_record, write_whole
+from zlocus.io.rasters import write_cog
+from zlocus.io.run_record import write_record, write_whole
 
 NAMES = (FIGURES, ERROR_MAP, HISTOGRAM) = EVALUATION_FILES
 DPI = 120

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from pyproj import CRS, Proj
 from pyproj.exceptions import CRSError, ProjError
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.io.crs import is_on_earth, utm_zone
-from zlocus.sensors.model import FloatArray
-from zlocus.sensors.space import WGS84, between
+from zlocus.sensors.earth_frame import WGS84, between
 
 # Web Mercator is out by a factor of two at 60 degrees; maps made for measuring by less than this.
 SCALE_TOLERANCE = 0.01

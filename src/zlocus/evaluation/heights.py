@@ -12,10 +12,10 @@ from affine import Affine
 from pyproj.exceptions import CRSError
 from rasterio.crs import CRS
 
-from zlocus.errors import InputError
-from zlocus.io.heights import check_unit, is_fill
-from zlocus.io.opening import open_raster
-from zlocus.sensors.model import FloatArray
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.height_values import check_unit, is_fill
+from zlocus.io.open_raster import open_raster
 
 # What lies beyond is no height, whatever it means.
 LOWEST_M, HIGHEST_M = -1e4, 1e5

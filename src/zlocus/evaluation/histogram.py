@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.statistics import ErrorStatistics
-from zlocus.sensors.model import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

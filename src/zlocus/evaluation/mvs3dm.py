@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS
 
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.frame import points_on, unit_m
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.evaluation.truth import inside_margin, places
-from zlocus.sensors.model import FloatArray
 
 WITHIN_M = 1.0
 CELLS_AT_A_TIME = 1_000_000

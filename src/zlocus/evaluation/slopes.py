@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from zlocus.errors import ConfigError
+from zlocus.core.errors import ConfigError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.frame import grid_steps
 from zlocus.evaluation.heights import HeightRaster
-from zlocus.sensors.model import FloatArray
 
 SLOPE_EDGES_DEG = (5.0, 15.0, 30.0, 45.0)
 UNKNOWN = "unknown"

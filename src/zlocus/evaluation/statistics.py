@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 
 NORMAL_SIGMA_FROM_MAD = 1.4826
 

@@ -10,12 +10,12 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from zlocus.errors import ConfigError, InputError
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.frame import unit_m
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.evaluation.slopes import block_gradient, slope_deg
-from zlocus.io.opening import open_raster
-from zlocus.sensors.model import FloatArray
+from zlocus.io.open_raster import open_raster
 
 BLOCK_M = 0.5
 EDGE_SPREAD_M = 0.5

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from odc.geo.geobox import GeoBox
 
-from zlocus.errors import ConfigError, InputError
+from zlocus.core.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
 from zlocus.io.vertical import ELLIPSOID, OWN_ELLIPSOIDAL, check_heights, vertical_datum, vertical_part
 

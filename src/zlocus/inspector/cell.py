@@ -11,16 +11,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.errors import ConfigError, GeometryError
+from zlocus.core.errors import ConfigError, GeometryError
+from zlocus.core.options import RunConfig
+from zlocus.core.sensor_model import FloatArray
 from zlocus.inspector.folder import SurfaceFolder
 from zlocus.inspector.layers import reasons_of
 from zlocus.inspector.profile import reference_at
 from zlocus.inspector.reference import Reference
-from zlocus.inspector.restore import Restored
-from zlocus.matching.setup import MatchScene
-from zlocus.options import RunConfig
-from zlocus.place import LookedAt, curves_at
-from zlocus.products.curves import (
+from zlocus.inspector.restored_run import Restored
+from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.point_match import LookedAt, curves_at
+from zlocus.pipeline.report_inputs import NOT_SHOWN, SHOWN_WITHIN_CELLS, place_of_cell
+from zlocus.products.match_curve_figures import (
     STRETCH_PERCENT,
     Locus,
     PointReport,
@@ -30,8 +32,6 @@ from zlocus.products.curves import (
     where_it_stops,
 )
 from zlocus.products.report.maps import data_uri
-from zlocus.reporting import NOT_SHOWN, SHOWN_WITHIN_CELLS, place_of_cell
-from zlocus.sensors.model import FloatArray
 
 # Cells a side that are shown around a window, most first: an image's end may cut the larger ones.
 SHOWN_SIDES = (25, 15)

@@ -18,12 +18,12 @@ from rasterio.enums import MaskFlags, Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from zlocus.errors import InputError
-from zlocus.io.opening import kept_raster
-from zlocus.products.report.files import RECORD
+from zlocus.core.errors import InputError
+from zlocus.core.scene import is_local
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.open_raster import kept_raster
+from zlocus.products.report.file_names import RECORD
 from zlocus.products.report.page import run_record
-from zlocus.scene import is_local
-from zlocus.sensors.model import FloatArray
 
 NEEDED = {"dsm": "float32", "sigma": "float32", "quality": "uint16", "views": "uint8"}
 

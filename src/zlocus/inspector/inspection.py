@@ -13,20 +13,20 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, TypeVar
 
-from zlocus.errors import ConfigError, GeometryError, InputError, ZlocusError
+from zlocus.core.errors import ConfigError, GeometryError, InputError, ZlocusError
+from zlocus.core.options import RunConfig, SelectionOptions
+from zlocus.core.parallel import submitted
 from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
 from zlocus.inspector.queries import KINDS, MOST, WINDOWS
 from zlocus.inspector.reference import Reference, check_comparison, reference_for
-from zlocus.inspector.restore import Restored, config_of, restored
-from zlocus.options import RunConfig, SelectionOptions
-from zlocus.products.record import read_record
+from zlocus.inspector.restored_run import Restored, config_of, restored
+from zlocus.io.run_record import read_record
+from zlocus.pipeline.report_inputs import said
 from zlocus.products.report.comparison import Comparison
-from zlocus.products.report.files import CURVES, RECORD
+from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.report.page import KIND_WORDS
-from zlocus.reporting import said
-from zlocus.threads import submitted
 
 T = TypeVar("T")
 FEWEST_LEVEL_CELLS = 128
@@ -101,7 +101,7 @@ class Inspection:
         scratch = TemporaryDirectory(prefix="zlocus-inspect-", ignore_cleanup_errors=True)
         self._stack.enter_context(scratch)
         threads = ThreadPoolExecutor(2, "inspect")
-        # Who interrupts does not wait for a scene to open, see `zlocus.threads.is_busy`.
+        # Who interrupts does not wait for a scene to open, see `zlocus.core.parallel.is_busy`.
         self._stack.callback(threads.shutdown, wait=False, cancel_futures=True)
         self._scene = submitted(threads, self._open)
         if self.comparison is not None:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from zlocus.inspector.folder import Cells, Patch, SurfaceFolder, read_patch
 from zlocus.inspector.reference import Reference
-from zlocus.io.opening import kept_raster
+from zlocus.io.open_raster import kept_raster
+from zlocus.products.demo_figure import error_map
 from zlocus.products.hillshade import hillshade
-from zlocus.products.picture import error_map
-from zlocus.products.report import maps, words
+from zlocus.products.report import maps
+from zlocus.products.report import text as words
 
 Rgba = NDArray[np.uint8]
 # Cells a side that tell the range of colours.

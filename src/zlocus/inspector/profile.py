@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from rasterio import DatasetReader
 from rasterio.windows import Window
 
+from zlocus.core.sensor_model import FloatArray
 from zlocus.inspector.folder import SurfaceFolder, on_grid
 from zlocus.inspector.reference import Reference
-from zlocus.io.opening import kept_raster
-from zlocus.sensors.model import FloatArray
+from zlocus.io.open_raster import kept_raster
 
 MOST_PLACES = 2000
 # Cells a side that are read at a time.

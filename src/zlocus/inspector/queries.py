@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import Field, fields
 from typing import Any, get_type_hints
 
-from zlocus.errors import ConfigError
+from zlocus.core.errors import ConfigError
+from zlocus.core.options import MeasureOptions, SelectionOptions
 from zlocus.inspector.cell import WhatIf
 from zlocus.inspector.folder import Patch
-from zlocus.options import MeasureOptions, SelectionOptions
 
 Pairs = Iterable[tuple[str, str]]
 # Pixels of a picture, and along one side of it; layers over each other; levels of a map.

@@ -11,11 +11,11 @@ from odc.geo.geobox import GeoBox
 from zlocus.evaluation.evaluate import Shift, check_options, evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.vertical import same_heights
-from zlocus.io.opening import existing_file, open_raster
-from zlocus.io.raster import RasterSink
+from zlocus.io.open_raster import existing_file, open_raster
+from zlocus.io.rasters import RasterSink
 from zlocus.io.vertical import vertical_datum
 from zlocus.products.report.comparison import Comparison, full_colour_m
-from zlocus.products.report.words import against_reference
+from zlocus.products.report.text import against_reference
 
 
 @dataclass(frozen=True)

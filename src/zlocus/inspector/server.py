@@ -20,15 +20,15 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from zlocus.errors import ConfigError, GeometryError, ZlocusError
+from zlocus.core.errors import ConfigError, GeometryError, ZlocusError
+from zlocus.core.parallel import busy
 from zlocus.inspector import queries
 from zlocus.inspector.folder import Patch, read_patch
 from zlocus.inspector.guard import POLICY, WORDS, Guard, inline_hashes
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.layers import Layer, composed, png_of
 from zlocus.inspector.profile import profile
-from zlocus.products.record import finite_only
-from zlocus.threads import busy
+from zlocus.io.run_record import finite_only
 
 THREADS = 6
 TILE_PX = 256

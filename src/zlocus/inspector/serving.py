@@ -12,7 +12,7 @@ from pathlib import Path
 
 import uvicorn
 
-from zlocus.errors import ConfigError, OutputError
+from zlocus.core.errors import ConfigError, OutputError
 from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.server import application

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 from rasterio.windows import Window
 
-from zlocus.io.opening import open_raster
+from zlocus.io.open_raster import open_raster
 
 CHANNELS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 

@@ -13,10 +13,10 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from zlocus.errors import ConfigError, InputError
-from zlocus.io.documents import read_yaml
-from zlocus.io.text import check_ended, read_text
-from zlocus.options import RunConfig
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.options import RunConfig
+from zlocus.io.safe_documents import read_yaml
+from zlocus.io.safe_text import check_ended, read_text
 
 COMMENT_WIDTH = 100
 # Bytes of a file; a complete one has a tenth of it.

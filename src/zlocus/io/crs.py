@@ -10,9 +10,9 @@ import rasterio
 from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
-from zlocus.errors import ConfigError, InputError
-from zlocus.io.text import AGAIN, LARGEST, shown
-from zlocus.sensors.space import WGS84, between
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.io.safe_text import AGAIN, LARGEST, shown
+from zlocus.sensors.earth_frame import WGS84, between
 
 LOCAL = (
     'ENGCRS["Local Cartesian frame, z up",EDATUM["Local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from rasterio.windows import Window
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import named_crs, raster_crs
-from zlocus.io.opening import check_complete, open_raster
-from zlocus.sensors.model import FloatArray
-from zlocus.sensors.space import between
+from zlocus.io.open_raster import check_complete, open_raster
+from zlocus.sensors.earth_frame import between
 
 # Between the lowest undulation of the Earth, -107 m, and the highest, 86 m, with room for local geoids.
 MOST_UNDULATION_M = 120.0

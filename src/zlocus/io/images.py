@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
-from zlocus.errors import InputError, ZlocusWarning
-from zlocus.io.opening import PLAIN, check_complete, file_state, is_remote, kept_raster, open_raster
+from zlocus.core.errors import InputError, ZlocusWarning
+from zlocus.core.scene import HeldPixels, ImageWindow
+from zlocus.io.open_raster import PLAIN, check_complete, file_state, is_remote, kept_raster, open_raster
 from zlocus.io.usable_pixels import LARGEST_GREY, BorderPlateau, absurd_values, border_plateau, without
-from zlocus.scene import HeldPixels, ImageWindow
 
 # Source: ITU-R BT.601, luma of red, green, blue.
 LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}

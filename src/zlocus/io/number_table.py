@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.errors import InputError, OutputError
-from zlocus.io.opening import existing_file
-from zlocus.io.text import AGAIN, LARGEST, LONGEST_LINE, decimal, shown, text_lines
-from zlocus.io.whole import whole_file
-from zlocus.sensors.model import FloatArray
+from zlocus.core.errors import InputError, OutputError
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.atomic_write import whole_file
+from zlocus.io.open_raster import existing_file
+from zlocus.io.safe_text import AGAIN, LARGEST, LONGEST_LINE, decimal, shown, text_lines
 
 SEPARATORS = (",", ";")
 

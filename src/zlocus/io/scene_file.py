@@ -28,20 +28,20 @@ from pydantic import Field, SerializeAsAny, field_validator, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, InputError, OutputError, ZlocusError
-from zlocus.io.camera_entry import Camera, CameraSource, Vector
-from zlocus.io.camera_kinds import KINDS, RpcCamera
+from zlocus.core.errors import ConfigError, InputError, OutputError, ZlocusError
+from zlocus.core.scene import Scene, View, held_window, is_local
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.atomic_write import whole_file
+from zlocus.io.cameras.camera_entry import Camera, CameraSource, Vector
+from zlocus.io.cameras.camera_kinds import KINDS, RpcCamera
+from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
-from zlocus.io.documents import read_yaml
-from zlocus.io.frame_camera import FrameCamera
 from zlocus.io.images import RasterImage, check_content, check_grey_values, open_image, with_plateau
-from zlocus.io.opening import existing_file
-from zlocus.io.strict import Number, StrictModel, validated
-from zlocus.io.text import shown
-from zlocus.io.whole import whole_file
-from zlocus.scene import Scene, View, held_window, is_local
+from zlocus.io.open_raster import existing_file
+from zlocus.io.safe_documents import read_yaml
+from zlocus.io.safe_text import shown
+from zlocus.io.schema import Number, StrictModel, validated
 from zlocus.sensors.frame import FrameModel
-from zlocus.sensors.model import FloatArray
 
 SCENE_SUFFIXES = (".yaml", ".yml")
 OPPOSITE, PARALLEL = 1e-12, 1e-6

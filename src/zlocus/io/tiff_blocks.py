@@ -17,8 +17,8 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Interleaving
 
-from zlocus.errors import InputError
-from zlocus.scene import HeldPixels
+from zlocus.core.errors import InputError
+from zlocus.core.scene import HeldPixels
 
 # Tags with the offsets in the file, and with the lengths in bytes, of strips and of tiles.
 OFFSETS, LENGTHS = (273, 324), (279, 325)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.scene import ImageSource, ImageWindow
+from zlocus.core.scene import ImageSource, ImageWindow
 
 # No sensor has larger grey values: those of 32-bit integers end here. The square of a larger number, summed over an
 # image, leaves the range of float32.

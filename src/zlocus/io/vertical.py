@@ -21,9 +21,9 @@ from pyproj import CRS
 from pyproj.crs import CompoundCRS
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 
-from zlocus.errors import ConfigError, InputError
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.geoid import GeoidRaster
-from zlocus.sensors.model import FloatArray
 
 Float = TypeVar("Float", np.float32, np.float64)
 ELLIPSOID = "ellipsoid"

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels.free_rays import add_ray_costs, lowest_free_ray
-from zlocus.matching.base import BaseSurface
-from zlocus.matching.lattice import HeightLattice
-from zlocus.matching.ortho import ortho_image
-from zlocus.matching.views import TileViews
-from zlocus.matching.visibility import cells_per_step, parts_of_one_direction
+from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
+from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.tile_views import TileViews
+from zlocus.matching.true_ortho import ortho_image
+from zlocus.matching.view_directions import cells_per_step, parts_of_one_direction
 
 # Two images agree on a cell where their correlation in a window of this many cells is larger than LEAST_NCC and their
 # grey values differ by less than ALIKE, as a share of the deviation of an image's grey values.

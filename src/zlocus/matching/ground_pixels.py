@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.errors import ConfigError
-from zlocus.scene import ColourSource, ImageSource, ImageWindow, Scene, View, ground_sample_distance
+from zlocus.core.errors import ConfigError
+from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View, ground_sample_distance
 from zlocus.sensors.correction import ReducedModel
 
 # Cells are not finer than this share of the finest image's ground pixel.

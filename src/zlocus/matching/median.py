@@ -1,4 +1,4 @@
-"""Medians of many values, none of which is NaN."""
+"""Medians along the last axis of an array without NaN."""
 
 from __future__ import annotations
 

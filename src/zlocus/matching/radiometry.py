@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.scene import View, ground_box, held_window
+from zlocus.core.scene import View, ground_box, held_window
 
 FloatArray = NDArray[np.float64]
 SAMPLE_ROWS = 12

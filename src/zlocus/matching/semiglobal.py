@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels.mgm import sweep_quarter
-from zlocus.kernels.penalties import jump_penalties
-from zlocus.kernels.sgm import least_costs, sweep, winners
-from zlocus.matching.contrast import ALL, Part, edge_unit
-from zlocus.matching.lattice import NARROW_BASE, HeightLattice
-from zlocus.options import SemiGlobalOptions
+from zlocus.core.options import SemiGlobalOptions
+from zlocus.matching.height_lattice import NARROW_BASE, HeightLattice
+from zlocus.matching.kernels.mgm import sweep_quarter
+from zlocus.matching.kernels.penalties import jump_penalties
+from zlocus.matching.kernels.sgm import least_costs, sweep, winners
+from zlocus.matching.local_contrast import ALL, Part, edge_unit
 
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.core.sensor_model import FloatArray
 from zlocus.orientation.triangulate import Observations
-from zlocus.sensors.model import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.options import OrientationOptions
-from zlocus.orientation.adjust import Adjustment, adjust, with_datum_of_most
+from zlocus.core.options import OrientationOptions
+from zlocus.core.scene import Scene
+from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.plausibility import (
     FEWEST_THAT_AGREE,
@@ -20,12 +21,11 @@ from zlocus.orientation.plausibility import (
     exchanged_views,
     untied_views,
 )
+from zlocus.orientation.shift_adjustment import Adjustment, adjust, with_datum_of_most
 from zlocus.orientation.triangulate import Observations
-from zlocus.scene import Scene
-from zlocus.sensors.model import FloatArray, SensorModel
 
 if TYPE_CHECKING:
-    from zlocus.orientation.joint import JointAdjustment
+    from zlocus.orientation.bundle_adjustment import JointAdjustment
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Solver:
         sensors = [view.sensor for view in views]
         if self.is_joint:
             # SciPy's sparse matrices and linear algebra cost 0.2 s to import.
-            from zlocus.orientation.joint import adjust_jointly
+            from zlocus.orientation.bundle_adjustment import adjust_jointly
 
             joint = adjust_jointly(views, seen, xyz, options, self.control, self.terrain)
             return Solved(joint.adjusted, list(joint.sensors), joint)

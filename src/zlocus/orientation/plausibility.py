@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.options import OrientationOptions
-from zlocus.orientation.adjust import Adjustment, adjust, renumbered, robust_sigma
+from zlocus.core.options import OrientationOptions
+from zlocus.core.scene import View
+from zlocus.core.sensor_model import FloatArray, SensorModel
+from zlocus.orientation.shift_adjustment import Adjustment, adjust, renumbered, robust_sigma
 from zlocus.orientation.triangulate import Observations
-from zlocus.scene import View
-from zlocus.sensors.model import FloatArray, SensorModel
 
 # An image takes part in the matching where so many tie points were found in it.
 FEWEST_SUPPORTING_TIES = 4

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.orientation.locus import OnLocus
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
+from zlocus.orientation.epipolar import OnLocus
 
 N_HYPOTHESES = 400
 MOST_JUDGES = 500  # matches that choose between the hypotheses, about: up to twice as many

@@ -9,16 +9,16 @@ from itertools import islice, product
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.errors import GeometryError
-from zlocus.kernels.descriptors import nearest_descriptors
-from zlocus.options import OrientationOptions
-from zlocus.orientation.features import Features, detect_all, part_grid, parts, reduction
-from zlocus.orientation.locus import Loci, Sightlines, locate, trace
+from zlocus.core.errors import GeometryError
+from zlocus.core.options import OrientationOptions
+from zlocus.core.parallel import run_all
+from zlocus.core.scene import Scene, View, ground_box, held_window
+from zlocus.core.sensor_model import FloatArray, lowest_station
+from zlocus.orientation.epipolar import Loci, Sightlines, locate, trace
+from zlocus.orientation.kernels.descriptors import nearest_descriptors
 from zlocus.orientation.ransac import find_shift
+from zlocus.orientation.sift import Features, detect_all, part_grid, parts, reduction
 from zlocus.orientation.triangulate import Observations
-from zlocus.scene import Scene, View, ground_box, held_window
-from zlocus.sensors.model import FloatArray, lowest_station
-from zlocus.threads import run_all
 
 Progress = Callable[[str, float], None]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.sensors.model import FloatArray, SensorModel
+from zlocus.core.sensor_model import FloatArray, SensorModel
 
 MAX_ITERATIONS = 10
 TOLERANCE_PX = 1e-3

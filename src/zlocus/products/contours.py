@@ -11,12 +11,12 @@ from tempfile import TemporaryFile
 import numpy as np
 from affine import Affine
 
-from zlocus.errors import ConfigError
+from zlocus.core.errors import ConfigError
+from zlocus.core.options import ProductOptions
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import local_frame
-from zlocus.options import ProductOptions
-from zlocus.products.points import Batch, write_features
-from zlocus.products.strips import STRIP_ROWS, ReadBand, strips_of
-from zlocus.sensors.model import FloatArray
+from zlocus.io.row_strips import STRIP_ROWS, ReadBand, strips_of
+from zlocus.products.tie_layers import Batch, write_features
 
 # By default so many contours at most within two standard deviations of the mean height, and no nearer than this.
 WANTED, CLOSEST_M = 25, 0.1

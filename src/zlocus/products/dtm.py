@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.io.raster import RasterSink
-from zlocus.options import ProductOptions
-from zlocus.products.strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
-from zlocus.surface.reasons import Quality
-from zlocus.surface.terrain import between_blocks, block_least, block_mean, membrane, outside_of, terrain
+from zlocus.core.options import ProductOptions
+from zlocus.io.rasters import RasterSink
+from zlocus.io.row_strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
+from zlocus.matching.quality import Quality
+from zlocus.products.smrf import between_blocks, block_least, block_mean, membrane, outside_of, terrain
 
 FloatImage = NDArray[np.float32]
 # Cells in which ground is looked for; held in memory, some ten arrays of float32 at a time.

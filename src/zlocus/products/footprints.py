@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
-from zlocus.products.record import write_whole
-from zlocus.scene import is_local
+from zlocus.core.scene import is_local
+from zlocus.io.run_record import write_whole
 
 SIDE_PX, RIM_PX, CAPTION_PX = 900, 24, 40
 INK, PAPER, ALONE = (40, 40, 40), (255, 255, 255), (225, 225, 225)

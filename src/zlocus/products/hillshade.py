@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.io.raster import RasterSink
-from zlocus.kernels.shade import shade_cells
-from zlocus.options import ProductOptions
-from zlocus.products.strips import STRIP_ROWS, ReadBand, strips_of
+from zlocus.core.options import ProductOptions
+from zlocus.io.rasters import RasterSink
+from zlocus.io.row_strips import STRIP_ROWS, ReadBand, strips_of
+from zlocus.products.shade_kernel import shade_cells
 
 NO_SHADE = 0
 

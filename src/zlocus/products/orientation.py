@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.orientation.blocks import Block
-from zlocus.orientation.joint import JointAdjustment
-from zlocus.orientation.orient import Orientation, Residuals
-from zlocus.scene import Scene
-from zlocus.sensors.model import FloatArray
+from zlocus.core.scene import Scene
+from zlocus.core.sensor_model import FloatArray
+from zlocus.orientation.bundle_adjustment import JointAdjustment
+from zlocus.orientation.orientation import Orientation, Residuals
+from zlocus.orientation.parameter_groups import Block
 
 DIGITS = 6
 

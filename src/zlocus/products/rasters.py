@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from odc.geo.geobox import GeoBox
 
-from zlocus.io.raster import RasterSink
+from zlocus.io.rasters import RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
-from zlocus.surface.surface import Surface
+from zlocus.matching.surface import Surface
 
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 

@@ -11,11 +11,11 @@ from laspy.errors import LaspyException
 from numpy.typing import NDArray
 
 from zlocus import __version__
-from zlocus.errors import OutputError
-from zlocus.products.cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, SIGMA, VIEWS, add_crs, add_precision
-from zlocus.products.strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
-from zlocus.scene import is_local
-from zlocus.sensors.model import FloatArray
+from zlocus.core.errors import OutputError
+from zlocus.core.scene import is_local
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.row_strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
+from zlocus.products.point_cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, SIGMA, VIEWS, add_crs, add_precision
 
 # Grey values from which on points are white, in standard deviations above the mean; of 8 bits: all are shown.
 WHITE_DEVIATIONS = 3.0

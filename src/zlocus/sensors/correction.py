@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zlocus.sensors.model import FloatArray, SensorModel
+from zlocus.core.sensor_model import FloatArray, SensorModel
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 
 WIDEST_DEG = 89.5
 LEAST_SLOPE = 0.01

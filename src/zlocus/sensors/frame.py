@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pyproj import CRS
 
+from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.distortion import Distortion
-from zlocus.sensors.model import FloatArray
+from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace, Space
 from zlocus.sensors.rotation import from_photogrammetric, from_vectors
-from zlocus.sensors.space import FRAME_SPACE, EarthSpace, Space
 
 Row = tuple[float, float, float]
 

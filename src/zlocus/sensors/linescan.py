@@ -8,8 +8,8 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from zlocus.sensors.model import FloatArray
-from zlocus.sensors.space import Space
+from zlocus.core.sensor_model import FloatArray
+from zlocus.sensors.earth_frame import Space
 from zlocus.sensors.trajectory import Drift, Trajectory
 
 # Pixels around the image where the model still holds: tiles and blocks reach that far beyond it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 
 
 def from_photogrammetric(omega: FloatArray, phi: FloatArray, kappa: FloatArray) -> FloatArray:

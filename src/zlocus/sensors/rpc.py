@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from pyproj import CRS, Transformer
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 
 GEOGRAPHIC = CRS.from_epsg(4979)
 MAX_ITERATIONS = 30

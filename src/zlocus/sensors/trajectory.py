@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.rotation import from_vectors
 
 LEAST_SAMPLES = 4

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zlocus.errors import ZlocusError
+from zlocus.core.errors import ZlocusError
 
 if TYPE_CHECKING:
     from zlocus.synthetic.scenes import SceneSpec

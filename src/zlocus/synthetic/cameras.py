@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from affine import Affine
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 
 CHORD_ITERATIONS = 20
 CHORD_TOLERANCE_ROWS = 1e-8

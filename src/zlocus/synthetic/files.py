@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
 
-from zlocus.errors import OutputError
+from zlocus.core.errors import OutputError
 from zlocus.sensors.rpc import RpcCoefficients
+from zlocus.sensors.rpc_fit import RpcFit, fit_rpc
 from zlocus.synthetic.cameras import RectifiedScanner
 from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
 from zlocus.synthetic.rectify import rectified
 from zlocus.synthetic.render import Sun, expose, render, sunlit
-from zlocus.synthetic.rpc_fit import RpcFit, fit_rpc
 from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
 from zlocus.synthetic.truth import write_truth

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from affine import Affine
 
-from zlocus.errors import ConfigError
-from zlocus.io.linescan import LineScanCamera, Rectification, RegularTimes
-from zlocus.io.linescan_files import write_calibration, write_trajectory
+from zlocus.core.errors import ConfigError
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.cameras.linescan import LineScanCamera, Rectification, RegularTimes
+from zlocus.io.cameras.linescan_files import write_calibration, write_trajectory
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
 from zlocus.sensors.linescan import MARGIN_PX, FocalLine
-from zlocus.sensors.model import FloatArray
 from zlocus.sensors.trajectory import Drift, Trajectory
 from zlocus.synthetic.cameras import LineScanner, RectifiedScanner
 from zlocus.synthetic.scenes import Exposure, SceneSpec, ViewSpec

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.io.camera_kinds import RpcCamera
-from zlocus.io.frame_camera import FrameCamera
+from zlocus.io.cameras.camera_kinds import RpcCamera
+from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.scene_file import ViewEntry
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.files import exposed, fit_exposure, new_folder, write_image

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.terrain import (
     BUILDING,
     GROUND,

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.kernels._jit import kernel
-from zlocus.sensors.model import FloatArray
+from zlocus.core.jit import kernel
+from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.terrain import (
     BLOCK,
     BUILDING,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, minimum_filter
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.cameras import RectifiedScanner
 
 # Columns between which positions in the raw image are interpolated: a row of the plane is all but a row of it.

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from zlocus.errors import GeometryError
-from zlocus.sensors.model import FloatArray, SensorModel
+from zlocus.core.errors import GeometryError
+from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.synthetic.raycast import MISS, Field, Look, cast_rays, render_rows, sunlit_cells
 from zlocus.synthetic.terrain import SyntheticGround
 

@@ -8,9 +8,9 @@ import numpy as np
 from affine import Affine
 from pyproj import CRS
 
-from zlocus.errors import ConfigError
-from zlocus.options import Checked, option
-from zlocus.sensors.model import FloatArray, SensorModel
+from zlocus.core.errors import ConfigError
+from zlocus.core.options.option_fields import Checked, option
+from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.synthetic.cameras import LineScanner, RectifiedScanner, SatelliteCamera, Shake, axes_of_heading
 from zlocus.synthetic.objects import Objects, add_objects
 from zlocus.synthetic.render import Optics, Sun

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from zlocus.errors import ConfigError
-from zlocus.sensors.model import FloatArray
+from zlocus.core.errors import ConfigError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.textures import fractal_surface, natural_textures
 
 GROUND, ROAD, BUILDING, TREE = 0, 1, 2, 3

@@ -11,7 +11,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.transform import from_origin
 
-from zlocus.sensors.model import FloatArray
+from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.scenes import Exposure, SceneSpec
 from zlocus.synthetic.terrain import SyntheticGround
 

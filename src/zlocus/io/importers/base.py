@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.errors import InputError
-from zlocus.io.opening import existing_file
-from zlocus.io.text import AGAIN, LARGEST, decimal, shown
-from zlocus.sensors.model import FloatArray
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.open_raster import existing_file
+from zlocus.io.safe_text import AGAIN, LARGEST, decimal, shown
 
 UNIT = 1e-3
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.requests import ImportRequest
 from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix
-from zlocus.io.text import AGAIN, shown, text_lines
-from zlocus.request import ImportRequest
+from zlocus.io.safe_text import AGAIN, shown, text_lines
 
 FILES = ("bundle.out", "bundle/bundle.out", "bundle.rd.out", "bundler.out")
 LISTS = ("list.txt", "../list.txt", "bundle.out.list.txt", "bundle.rd.out.list.txt")

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.requests import ImportRequest
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.importers.base import UNIT, Exposure, Imported, found_file, number, numbers, size
-from zlocus.io.text import AGAIN, read_bytes, shown, text_lines
-from zlocus.request import ImportRequest
-from zlocus.sensors.model import FloatArray
+from zlocus.io.safe_text import AGAIN, read_bytes, shown, text_lines
 from zlocus.sensors.rotation import from_quaternions
 
 FOLDERS = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")

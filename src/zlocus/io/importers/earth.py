@@ -9,11 +9,11 @@ import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import ConfigError, InputError
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import checked_crs, utm_zone
-from zlocus.io.text import shown
-from zlocus.sensors.model import FloatArray
-from zlocus.sensors.space import EarthSpace, between
+from zlocus.io.safe_text import shown
+from zlocus.sensors.earth_frame import EarthSpace, between
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.errors import ConfigError, InputError
-from zlocus.io.documents import read_yaml
-from zlocus.io.frame_camera import Interior
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.requests import ImportRequest
+from zlocus.io.cameras.frame_camera import Interior
 from zlocus.io.importers.base import Exposure, Imported, found_file, number
-from zlocus.io.opening import existing_file
-from zlocus.io.strict import validated
-from zlocus.io.text import AGAIN, LONGEST_LINE, decimal, shown, text_lines
-from zlocus.request import ImportRequest
+from zlocus.io.open_raster import existing_file
+from zlocus.io.safe_documents import read_yaml
+from zlocus.io.safe_text import AGAIN, LONGEST_LINE, decimal, shown, text_lines
+from zlocus.io.schema import validated
 from zlocus.sensors.frame import rotation_from_angles
 
 FILES = ("eo.csv", "eo.txt", "exterior.csv", "exterior.txt", "camera_pos_ori.txt", "odm_xyz_opk.csv")

@@ -17,14 +17,14 @@ import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.requests import ImportRequest
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import is_on_earth
-from zlocus.io.documents import read_xml
 from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix, size
 from zlocus.io.importers.earth import crs_name, map_poses
-from zlocus.io.text import AGAIN, shown
-from zlocus.request import ImportRequest
-from zlocus.sensors.model import FloatArray
+from zlocus.io.safe_documents import read_xml
+from zlocus.io.safe_text import AGAIN, shown
 
 FILES = ("cameras.xml", "metashape.xml", "agisoft.xml")
 LENSES = {

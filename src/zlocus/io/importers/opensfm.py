@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.errors import InputError
-from zlocus.io.documents import read_json
+from zlocus.core.errors import InputError
+from zlocus.core.requests import ImportRequest
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix, size
 from zlocus.io.importers.earth import crs_name, map_poses
-from zlocus.io.text import AGAIN, shown
-from zlocus.request import ImportRequest
-from zlocus.sensors.model import FloatArray
+from zlocus.io.safe_documents import read_json
+from zlocus.io.safe_text import AGAIN, shown
+from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, east_north_up
 from zlocus.sensors.rotation import from_vectors
-from zlocus.sensors.space import WGS84, WGS84_EARTH, east_north_up
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json", "opensfm_reconstruction.json")
 # Projection, kind of distortion, and its coefficients in zlocus's names.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from zlocus.core.requests import ImportRequest
 from zlocus.io.importers.base import Imported
 from zlocus.io.importers.bundler import read_bundler
 from zlocus.io.importers.colmap import read_colmap
@@ -12,7 +13,6 @@ from zlocus.io.importers.eo import read_eo
 from zlocus.io.importers.metashape import read_metashape
 from zlocus.io.importers.opensfm import read_opensfm
 from zlocus.io.importers.strecha import read_strecha
-from zlocus.request import ImportRequest
 
 
 @dataclass(frozen=True)

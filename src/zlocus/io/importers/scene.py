@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from zlocus.errors import ConfigError, InputError, OutputError
-from zlocus.io.frame_camera import FrameCamera
+from zlocus.core.errors import ConfigError, InputError, OutputError
+from zlocus.core.requests import ImportRequest
+from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.importers.base import Exposure, Imported
 from zlocus.io.importers.earth import asked_crs, crs_name
 from zlocus.io.importers.registry import IMPORTERS
-from zlocus.io.opening import open_raster
+from zlocus.io.open_raster import open_raster
+from zlocus.io.safe_text import AGAIN, shown
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
-from zlocus.io.strict import validated
-from zlocus.io.text import AGAIN, shown
-from zlocus.request import ImportRequest
+from zlocus.io.schema import validated
 from zlocus.sensors.frame import as_row, as_rows
 
 FOLDERS = ("", "images", "../images", "../../images", "../../../images", "undistorted/images", "../visualize")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.errors import InputError
+from zlocus.core.errors import InputError
+from zlocus.core.requests import ImportRequest
 from zlocus.io.importers.base import Exposure, Imported, numbers, rotation_matrix, size
-from zlocus.io.text import AGAIN, text_lines
-from zlocus.request import ImportRequest
+from zlocus.io.safe_text import AGAIN, text_lines
 
 FOLDERS = ("", "gt_dense_cameras", "cameras")
 ENDING = ".camera"

@@ -15,8 +15,9 @@ from zlocus.evaluation.evaluate import Evaluation, evaluate
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.evaluation.slopes import SLOPE_EDGES_DEG
 from zlocus.evaluation.table import evaluation_rows, notes
-from zlocus.products.curves import svg_of
-from zlocus.products.report import maps, words
+from zlocus.products.match_curve_figures import svg_of
+from zlocus.products.report import maps
+from zlocus.products.report import text as words
 
 HISTOGRAM_INCHES, SVG_DPI = (5.6, 4.2), 72
 # The map's colours are full at this many times the NMAD, and at least at the threshold.

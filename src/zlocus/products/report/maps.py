@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-from zlocus.io.opening import open_raster
-from zlocus.products.picture import error_map, relief
-from zlocus.products.report.survey import Survey
-from zlocus.products.report.words import percent, size
-from zlocus.surface.reasons import Quality
+from zlocus.io.open_raster import open_raster
+from zlocus.matching.quality import Quality
+from zlocus.products.demo_figure import error_map, relief
+from zlocus.products.report.sampling import Survey
+from zlocus.products.report.text import percent, size
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader

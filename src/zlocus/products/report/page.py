@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 from pyproj import CRS, Transformer
 
-from zlocus.errors import InputError
-from zlocus.products.record import read_record, write_whole
-from zlocus.products.report import maps, tables, words
+from zlocus.core.errors import InputError
+from zlocus.core.scene import is_local
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.run_record import read_record, write_whole
+from zlocus.matching.quality import Quality
+from zlocus.products.report import maps, tables
+from zlocus.products.report import text as words
 from zlocus.products.report.comparison import Comparison, comparison_part
-from zlocus.products.report.files import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
-from zlocus.products.report.survey import Survey, survey
-from zlocus.scene import is_local
-from zlocus.sensors.model import FloatArray
-from zlocus.surface.reasons import Quality
+from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
+from zlocus.products.report.sampling import Survey, survey
 
 NEEDED = ("config", "versions", "inputs", "stages", "orientation", "grid", "heights", "coverage")
 QUANTILES = (10, 25, 50, 75, 90)

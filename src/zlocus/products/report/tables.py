@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.errors import InputError
-from zlocus.matching.curve import FAIR, GOOD, POOR
-from zlocus.options import RunConfig
-from zlocus.products.points import LABEL, LABELS, TEXT, column_names, labels_in
-from zlocus.products.report.words import NONE, STAGES, number, percent, seconds, whole_percent
+from zlocus.core.errors import InputError
+from zlocus.core.options import RunConfig
+from zlocus.matching.match_curve import FAIR, GOOD, POOR
+from zlocus.products.report.text import NONE, STAGES, number, percent, seconds, whole_percent
+from zlocus.products.tie_layers import LABEL, LABELS, TEXT, column_names, labels_in
 
 # Poor to good, blue and orange being told apart by all eyes.
 POOR_COLOUR, GOOD_COLOUR = np.array([230, 159, 0]), np.array([86, 180, 233])

@@ -1,0 +1,88 @@
+"""How a command ends: whatever goes wrong becomes one sentence on stderr and an exit status."""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import signal
+import sys
+import textwrap
+import traceback
+import warnings
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import typer
+
+from zlocus.core.errors import ZlocusError, ZlocusWarning
+from zlocus.core.parallel import is_busy
+from zlocus.core.signals import Ended, end_children, ended_by_signals, exit_status, leave, sentence_of
+
+EXIT_OWN_FAULT = 1
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def explained(command: Callable[P, R]) -> Callable[P, R]:
+    """A command whose errors become one sentence on stderr and an exit status (ZLOCUS_DEBUG=1: the trace too)."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return ended_by_signals(command, *args, **kwargs)
+        except ZlocusError as error:
+            raise _failed(str(error), error.exit_status) from error
+        except KeyboardInterrupt as error:
+            raise _interrupted(error) from error
+        except (typer.Exit, BrokenPipeError):
+            raise
+        except Exception as error:
+            what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
+            advice = "This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the trace, and report it."
+            raise _failed(f"Unexpected {what}. {advice}", EXIT_OWN_FAULT) from error
+
+    return run
+
+
+def _failed(sentence: str, status: int) -> typer.Exit:
+    if os.environ.get("ZLOCUS_DEBUG"):
+        traceback.print_exc()
+    _say(f"zlocus: {sentence}")
+    return typer.Exit(status)
+
+
+def _interrupted(error: KeyboardInterrupt) -> typer.Exit:
+    """What a command ends with after a signal. Its processes are killed, and its threads are not waited for: nothing is
+    half-written then, for threads only compute."""
+    number = error.number if isinstance(error, Ended) else int(signal.SIGINT)
+    if isinstance(error, Ended):
+        end_children()
+    try:
+        failed = _failed(sentence_of(number), exit_status(number))
+    except OSError:  # the terminal has gone
+        leave(exit_status(number))
+    if is_busy():
+        leave(exit_status(number))
+    return failed
+
+
+def _say(sentence: str) -> None:
+    """To stderr, broken between words on a terminal, on one line elsewhere."""
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns
+        sentence = textwrap.fill(sentence, width, break_long_words=False, break_on_hyphens=False)
+    print(sentence, file=sys.stderr)
+
+
+def show_our_warnings() -> None:
+    """Show our own warnings as sentences from here on, those of libraries as they are."""
+    show: Callable[..., Any] = warnings.showwarning
+
+    def show_warning(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
+        if issubclass(category, ZlocusWarning):
+            _say(f"zlocus: {message}")
+        else:
+            show(message, category, *args, **kwargs)
+
+    warnings.showwarning = show_warning

@@ -1,0 +1,28 @@
+"""The configuration of a whole run: one options class per stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zlocus.core.options.cost_options import MeasureOptions, SemiGlobalOptions
+from zlocus.core.options.height_options import CheckOptions, PlaneOptions, RefineOptions
+from zlocus.core.options.option_fields import Checked, group
+from zlocus.core.options.orientation_options import OrientationOptions
+from zlocus.core.options.product_options import ProductOptions
+from zlocus.core.options.search_options import PyramidOptions
+from zlocus.core.options.selection_options import SelectionOptions
+
+
+@dataclass(frozen=True)
+class RunConfig(Checked):
+    """A whole run."""
+
+    orientation: OrientationOptions = group(OrientationOptions, "Tie points and pointing corrections.")
+    pyramid: PyramidOptions = group(PyramidOptions, "Levels, tiles and ranges of heights.")
+    measure: MeasureOptions = group(MeasureOptions, "How views are compared.")
+    selection: SelectionOptions = group(SelectionOptions, "Which images a block is matched with.")
+    semiglobal: SemiGlobalOptions = group(SemiGlobalOptions, "Semi-global constraint.")
+    refine: RefineOptions = group(RefineOptions, "Sub-step refinement.")
+    planes: PlaneOptions = group(PlaneOptions, "Planes through plain segments.")
+    checks: CheckOptions = group(CheckOptions, "Empty and doubtful cells.")
+    products: ProductOptions = group(ProductOptions, "Maps made of the surface.")

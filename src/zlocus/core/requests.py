@@ -1,0 +1,462 @@
+"""What one run is asked to do: inputs, grid, heights, views, and where the result goes."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from zlocus.core.errors import ConfigError, InputError, OutputError
+
+SCENE_SUFFIXES = (".yaml", ".yml")
+RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
+# Of a demo: that its folder is one's, and how its surface compares with the truth, which ends it.
+DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
+# What a finished surface depends on, and the checksums of its products.
+FINISHED = "finished.json"
+VIEWS = ("auto", "all")
+METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
+# Or the file of a geoid.
+VERTICALS = ("ellipsoid", "egm96", "egm2008")
+FILLS = ("none", "interpolate", "dem")
+PRODUCTS = ("hillshade", "contours", "dtm", "laz")
+# The first thing anyone looks at, at the cost of a second per million cells; the others take a choice.
+DEFAULT_PRODUCTS = ("hillshade",)
+EARTHS = ("curved", "flat")
+
+
+@dataclass(frozen=True)
+class DsmRequest:
+    """A surface to be made. `None` means: not given, to be found by the run.
+
+    inputs : two or more images with a camera, or one scene file.
+    resolution : cell size, m. crs : grid's CRS. bounds : (xmin, ymin, xmax, ymax) in the grid's CRS, m.
+    like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
+    heights : (zmin, zmax), m, above what `vertical` says. dem : raster the heights are searched around; dem_vertical :
+    what its heights are above, as `vertical`, None is what its CRS says.
+    reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
+    vertical : what the heights written are above: one of `VERTICALS`, in capitals too, or the file of a geoid.
+    workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
+    scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
+    together, GB; None: 60 % of what is free. overwrite : whether another run in `out` is replaced. resume : whether
+    finished tiles of the same run, and its finished surface, are taken as they are.
+    partial : a surface with few heights or doubtful cameras is accepted. products : maps made of the surface, see
+    `PRODUCTS`. report : whether report.html is made.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range, or two that exclude each other.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    resolution: float | None = None
+    crs: str | None = None
+    bounds: tuple[float, float, float, float] | None = None
+    like: Path | None = None
+    area: Path | None = None
+    mask: Path | None = None
+    heights: tuple[float, float] | None = None
+    dem: Path | None = None
+    dem_vertical: str | None = None
+    reference: str | None = None
+    views: str = "auto"
+    method: str = "mvll-sgm"
+    vertical: str = "ellipsoid"
+    fill: str = "none"
+    partial: bool = False
+    workers: int | None = None
+    scheduler: str | None = None
+    memory_gb: float | None = None
+    overwrite: bool = False
+    resume: bool = True
+    products: tuple[str, ...] = DEFAULT_PRODUCTS
+    report: bool = True
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        self._check_grid()
+        _check_products(self.products)
+        _check_heights(self.heights)
+        if self.heights is not None and self.dem is not None:
+            raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
+        if self.dem is not None and self.method == "gc3-sgm":
+            raise ConfigError(
+                f"--method gc3-sgm searches one range of heights and cannot follow --dem {self.dem}. Give "
+                "--heights, or use mvll-sgm."
+            )
+        for name, value, choices in (
+            ("views", self.views, VIEWS),
+            ("method", self.method, METHODS),
+            ("fill", self.fill, FILLS),
+        ):
+            _check_choice(name, value, choices)
+        if self.scheduler is not None and self.method == "gc3-sgm":
+            raise ConfigError(
+                "--method gc3-sgm matches whole images in one process. Leave --scheduler out, or use mvll-sgm."
+            )
+        if self.fill == "dem" and self.dem is None:
+            raise ConfigError("--fill dem needs the heights of a terrain model. Add --dem RASTER.")
+        _check_vertical("vertical", self.vertical)
+        _check_vertical_of("dem", self.dem, self.dem_vertical)
+        _check_workers(self.workers)
+        _check_positive("--memory", self.memory_gb, "GB")
+
+    def _check_grid(self) -> None:
+        _check_positive("--resolution", self.resolution, "m")
+        given = {"--resolution": self.resolution, "--crs": self.crs, "--bounds": self.bounds}
+        extra = [name for name, value in given.items() if value is not None]
+        if self.like is not None and extra:
+            raise ConfigError(f"--like {self.like} fixes the whole grid already. Leave out {' and '.join(extra)}.")
+        if self.bounds is not None:
+            xmin, ymin, xmax, ymax = self.bounds
+            if not all(map(math.isfinite, self.bounds)) or xmin >= xmax or ymin >= ymax:
+                numbers = " ".join(f"{value:.12g}" for value in self.bounds)
+                raise ConfigError(
+                    f"--bounds {numbers} holds no area. Give XMIN YMIN XMAX YMAX, the smaller values first."
+                )
+
+
+@dataclass(frozen=True)
+class CloudRequest:
+    """A point cloud to be made. `None` means: not given, to be found by the run.
+
+    inputs, crs, heights, vertical, partial, workers, overwrite : as in `DsmRequest`. references : names of the views
+    whose pixels get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    references: tuple[str, ...] = ()
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    fill: str = "none"
+    partial: bool = False
+    workers: int = 1
+    overwrite: bool = False
+    vertical: str = "ellipsoid"
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_heights(self.heights)
+        _check_choice("fill", self.fill, FILLS[:2])
+        _check_vertical("vertical", self.vertical)
+        _check_workers(self.workers)
+        for name in self.references:
+            if self.references.count(name) > 1:
+                raise ConfigError(f"--reference {name} is given twice. Name each view once.")
+
+
+@dataclass(frozen=True)
+class CurvesRequest:
+    """The match curves of one point, to be shown. `None` means: not given, to be found by the run.
+
+    inputs, resolution, crs, heights, reference, overwrite : as in `DsmRequest`. at : ground point (x, y), m; pixel :
+    view, row and column of an image point; one of both. height : of the point, m, about which curves are sampled.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range, no point, or two.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    at: tuple[float, float] | None = None
+    pixel: tuple[str, float, float] | None = None
+    height: float | None = None
+    resolution: float | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    reference: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_positive("--resolution", self.resolution, "m")
+        _check_heights(self.heights)
+        if (self.at is None) == (self.pixel is None):
+            given = "both are given" if self.at is not None else "none is given"
+            raise ConfigError(f"The point is asked for by --at X Y or by --pixel VIEW ROW COL, and {given}. Give one.")
+        for name, values in (("at", self.at), ("pixel", self.pixel and self.pixel[1:]), ("height", (self.height,))):
+            numbers = [v for v in values or () if v is not None]
+            if not all(map(math.isfinite, numbers)):
+                raise ConfigError(f"--{name} {' '.join(f'{v:g}' for v in numbers)} is no place. Give finite numbers.")
+
+
+@dataclass(frozen=True)
+class OrientRequest:
+    """Tie points to be found, and with `cameras` the cameras to be corrected. `None` means: not given.
+
+    inputs, crs, heights (above the ellipsoid), overwrite : as in `DsmRequest`. control : table of ground control and
+    check points; dem : raster of heights that the ties should have. control_vertical, dem_vertical : what their heights
+    are above, as in `DsmRequest`; None is the ellipsoid of control, and of a DEM what its CRS says.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    cameras: bool = True
+    control: Path | None = None
+    control_vertical: str | None = None
+    dem: Path | None = None
+    dem_vertical: str | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_heights(self.heights)
+        _check_vertical_of("control", self.control, self.control_vertical)
+        _check_vertical_of("dem", self.dem, self.dem_vertical)
+
+
+@dataclass(frozen=True)
+class RankRequest:
+    """Images to be ranked. `None` means: not given, to be found.
+
+    inputs, out, resolution, crs, heights, workers, overwrite : as in `DsmRequest`.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path
+    resolution: float | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    workers: int = 1
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_positive("--resolution", self.resolution, "m")
+        _check_heights(self.heights)
+        _check_workers(self.workers)
+
+
+@dataclass(frozen=True)
+class DoctorRequest:
+    """A run to be looked at before it is made. `None` means: not given, to be found, and of `out`: nothing is written.
+
+    inputs, resolution, crs, heights, workers, memory_gb : as in `DsmRequest`.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range.
+    InputError
+        One image only, an image given twice, or a scene file among images.
+    """
+
+    inputs: tuple[Path, ...]
+    out: Path | None = None
+    resolution: float | None = None
+    crs: str | None = None
+    heights: tuple[float, float] | None = None
+    workers: int = 1
+    memory_gb: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_inputs(self.inputs)
+        _check_positive("--resolution", self.resolution, "m")
+        _check_heights(self.heights)
+        _check_workers(self.workers)
+        _check_positive("--memory", self.memory_gb, "GB")
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """Cameras of another program, to become a scene file. `None` means: not given.
+
+    kind : format; source : its folder or file. images : folder of the images. crs : of the result. local : in the local
+    frame of the source, at no place of the Earth. up : direction, in the axes of the source, that becomes z of a local
+    frame; north : another, that becomes y. focal : px; camera : file with the interior orientation. earth : how a map
+    is understood.
+
+    Raises
+    ------
+    ConfigError
+        A value out of range, or two that exclude each other.
+    """
+
+    kind: str
+    source: Path
+    out: Path
+    images: Path | None = None
+    crs: str | None = None
+    local: bool = False
+    up: tuple[float, float, float] | None = None
+    north: tuple[float, float, float] | None = None
+    focal: float | None = None
+    camera: Path | None = None
+    earth: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if not _is_scene_file(self.out):
+            raise ConfigError(f"-o {self.out} is no name of a scene file. Let it end in {' or '.join(SCENE_SUFFIXES)}.")
+        _check_positive("--focal", self.focal, "px")
+        if self.earth is not None:
+            _check_choice("earth", self.earth, EARTHS)
+        for name, axis in (("up", self.up), ("north", self.north)):
+            if axis is not None and not (all(map(math.isfinite, axis)) and any(axis)):
+                raise ConfigError(
+                    f"--{name} {' '.join(f'{v:g}' for v in axis)} is no direction. Give three numbers, not all 0."
+                )
+        if self.north is not None and self.up is None:
+            raise ConfigError("--north turns the frame about what is up. Give --up too, or leave it out.")
+        for one, other in (("crs", "local"), ("crs", "up"), ("focal", "camera")):
+            if {one, other} <= set(self.given()):
+                raise ConfigError(f"--{one} and --{other} exclude each other. Leave one out.")
+        if self.earth is not None and self.crs is None:
+            raise ConfigError("--earth says how a map is understood, and there is none. Give --crs, or leave it out.")
+
+    def given(self) -> list[str]:
+        """Names of the options that only some formats know, where they are given."""
+        values = {name: getattr(self, name) for name in ("crs", "local", "up", "north", "focal", "camera", "earth")}
+        return [name for name, value in values.items() if value not in (None, False)]
+
+
+def product_names(text: str) -> tuple[str, ...]:
+    """The names of --products, in the order of `PRODUCTS`; `none` is none.
+
+    Raises
+    ------
+    ConfigError
+        A name that is not known.
+    """
+    names = [] if text.strip() == "none" else [name.strip() for name in text.split(",")]
+    _check_products(names)
+    return tuple(name for name in PRODUCTS if name in names)
+
+
+def _check_products(names: Iterable[str]) -> None:
+    for name in names:
+        if name not in PRODUCTS:
+            raise ConfigError(
+                f"--products {name} is not known; choose from {', '.join(PRODUCTS)} with commas between them, or none."
+            )
+
+
+def _check_inputs(inputs: tuple[Path, ...]) -> None:
+    if len(inputs) == 1 and _is_scene_file(inputs[0]):
+        return
+    scene_files = [path for path in inputs if _is_scene_file(path)]
+    if scene_files:
+        raise InputError(f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs.")
+    if len(inputs) < 2:
+        given = f"only {inputs[0]} is given" if inputs else "none is given"
+        raise InputError(f"A surface needs two images or more, and {given}. Add images, or give one scene.yaml.")
+    seen = set()
+    for path in inputs:
+        if path.resolve() in seen:
+            raise InputError(f"{path} is given twice, and an image cannot be matched with itself. Name it once.")
+        seen.add(path.resolve())
+
+
+def _check_heights(heights: tuple[float, float] | None) -> None:
+    if heights is None:
+        return
+    zmin, zmax = heights
+    if not (math.isfinite(zmin) and math.isfinite(zmax)) or zmin >= zmax:
+        raise ConfigError(f"--heights {zmin:.12g} {zmax:.12g} is an empty range. Give ZMIN ZMAX, the lower first.")
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ConfigError(f"--{name} {value} is not known; choose from {', '.join(choices)}.")
+
+
+def _check_vertical(name: str, value: str) -> None:
+    if value.lower() not in VERTICALS and not Path(value).is_file():
+        raise ConfigError(
+            f"--{name} {value} is neither {', '.join(VERTICALS)} nor the file of a geoid. Check the name."
+        )
+
+
+def _check_vertical_of(name: str, of: Path | None, value: str | None) -> None:
+    """What the heights of a file are above, which makes sense with the file only."""
+    if value is None:
+        return
+    if of is None:
+        raise ConfigError(f"--{name}-vertical {value} is given without --{name}. Give both, or leave it out.")
+    _check_vertical(f"{name}-vertical", value)
+
+
+def _check_workers(workers: int | None) -> None:
+    if workers is not None and workers < 1:
+        raise ConfigError(f"--workers {workers} is too few; give 1 or more.")
+
+
+def _is_scene_file(path: Path) -> bool:
+    return path.suffix.lower() in SCENE_SUFFIXES
+
+
+def _check_positive(name: str, value: float | None, unit: str) -> None:
+    if value is not None and not (math.isfinite(value) and value > 0):
+        raise ConfigError(f"{name} {value:g} is not a size. Give a number of {unit} above 0.")
+
+
+def held_files(out: Path, files: Sequence[str] = RUN_FILES) -> list[str]:
+    """Names of those of some files, by default of runs, that are in a folder."""
+    return [name for name in files if (out / name).exists()]
+
+
+def check_output(
+    out: Path, overwrite: bool, files: Sequence[str] = RUN_FILES, what: str = "run", may_be_same: bool = False
+) -> None:
+    """Make sure, before any work, that a run may write to `out`; leaves the disk as it was.
+
+    files : that tell of another one; what : it is, for messages; may_be_same : whether one that was stopped, or is
+    finished, is compared with this one later, see `zlocus.pipeline.finished_run.finished_run`.
+
+    Raises
+    ------
+    OutputError
+        `out` is a file, cannot be written, or holds another one and `overwrite` is False.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")
+    held = held_files(out, files)
+    is_compared = may_be_same and ((out / "tiles" / "manifest.json").exists() or (out / FINISHED).exists())
+    if held and not overwrite and not is_compared:
+        raise OutputError(f"{out} holds another {what} ({', '.join(held)}). Choose another folder, or add --overwrite.")
+    parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    try:
+        # Only an attempt tells for sure: permission bits say nothing of read-only disks.
+        with tempfile.TemporaryDirectory(prefix=".zlocus-", dir=parent):
+            pass
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise OutputError(f"{out} cannot be written: {parent} says {reason}. Choose another folder with -o.") from error
+
+
+# Beside a run, which has no file of these names, there is room for them.
+EVALUATION_FILES = ("evaluation.json", "error.tif", "histogram.png")

@@ -1,0 +1,135 @@
+"""The scene of a run that is over, as it was before its first tile: from run.json and the ties that the run kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from zlocus.core.errors import InputError
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress, SilentProgress
+from zlocus.core.requests import DsmRequest
+from zlocus.io.config import config_from_dict
+from zlocus.io.open_raster import is_remote
+from zlocus.pipeline.fingerprint import digest_of
+from zlocus.pipeline.preparing import oriented
+from zlocus.pipeline.report_inputs import Matched
+from zlocus.pipeline.setup import opened, settled_run
+from zlocus.products.report.file_names import RECORD
+from zlocus.products.tie_observations import OBSERVATIONS, read_observations
+
+# Of a request, what names files; beside these --vertical and --dem-vertical may.
+FILES = ("like", "area", "mask", "dem")
+DATUMS = ("vertical", "dem_vertical")
+
+
+@dataclass(frozen=True)
+class Restored:
+    """A scene that was matched.
+
+    is_same : whether cameras, heights and grey values came out as in the run, None where it did not say.
+    """
+
+    matched: Matched
+    config: RunConfig
+    is_same: bool | None
+
+
+def restored(out: Path, run: Mapping[str, Any], may_ask: bool = False, progress: Progress | None = None) -> Restored:
+    """The scene of the run in a folder.
+
+    run : its run.json; may_ask : whether images that it names on a server are asked for.
+
+    Raises
+    ------
+    InputError
+        An image or another file of the run is not where it was, or the run kept no observations of its ties.
+    ConfigError, GeometryError
+        run.json is not what a run writes.
+    """
+    request, config, progress = request_of(out, run), config_of(out, run), progress or SilentProgress()
+    elsewhere = [each["path"] for each in run["inputs"] if is_remote(Path(each["path"]))]
+    elsewhere += [str(path) for path in request.inputs if is_remote(path)]
+    if elsewhere and not may_ask:
+        raise InputError(
+            f"The run read {elsewhere[0]} from a server, which is not asked again unbidden. Add --remote for curves."
+        )
+    found = opened(request, progress)
+    ties = read_observations(out, len(found.scene.views))
+    if ties is None and run["orientation"].get("n_ties"):
+        raise InputError(
+            f"{out / OBSERVATIONS} is missing or damaged, without which the cameras of the run do not come out again. "
+            "Make the surface again."
+        )
+    orientation = oriented(found.scene, config.orientation, found.scene.heights, progress, known=ties)
+    settled = settled_run(request, found, orientation, config, progress)
+    matched = Matched(
+        settled.scene, settled.matching, settled.grid, orientation.xyz,
+        lambda xy: found.vertical.undulation(xy, found.scene.crs),
+    )  # fmt: skip
+    known = run.get("settled_sha256")
+    is_same = None if known is None else digest_of(settled.matching, orientation) == known
+    return Restored(matched, config, is_same)
+
+
+def config_of(out: Path, run: Mapping[str, Any]) -> RunConfig:
+    """The options of a run."""
+    return config_from_dict(run["config"]["options"], str(out / RECORD))
+
+
+def request_of(out: Path, run: Mapping[str, Any]) -> DsmRequest:
+    """What a run was asked for, its files where they are now.
+
+    Raises
+    ------
+    InputError
+        run.json is not what a run writes.
+    """
+    values = dict(run["config"]["request"])
+    base = folder_of(out, run)
+
+    def placed(path: str) -> str:
+        return path if is_remote(Path(path)) else str(base / path)
+
+    try:
+        values["inputs"] = [placed(path) for path in values["inputs"]]
+        for name in FILES:
+            values[name] = None if values.get(name) is None else placed(values[name])
+        for name in DATUMS:
+            if (value := values.get(name)) is not None and (base / value).is_file():
+                values[name] = placed(value)
+        known = {field.name for field in fields(DsmRequest)}
+        values = {name: value for name, value in values.items() if name in known} | {"out": out, "overwrite": False}
+        return TypeAdapter(DsmRequest).validate_python(values)
+    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        raise InputError(f"{out / RECORD} does not say what was asked for. Make the surface again.") from error
+
+
+def folder_of(out: Path, run: Mapping[str, Any]) -> Path:
+    """Where relative paths of a run begin: the folder it was started in, or the one that holds them now.
+
+    Where the run's folder was moved together with its images, the same steps lead up from it.
+    """
+    started, asked = run.get("started_in"), Path(str(run["config"]["request"]["out"]))
+    candidates = [Path(started)] if isinstance(started, str) else []
+    place, n = out.resolve(), len(asked.parts)
+    if not asked.is_absolute() and ".." not in asked.parts and place.parts[len(place.parts) - n :] == asked.parts:
+        candidates.append(place.parents[n - 1] if n else place)
+    candidates.append(Path.cwd())
+    local = [Path(each["path"]) for each in run["inputs"] if not is_remote(Path(each["path"]))]
+    for folder in candidates:
+        if all(_is_file(folder / path) for path in local):
+            return folder
+    return candidates[0]
+
+
+def _is_file(path: Path) -> bool:
+    """Whether a file is there; a name that none can have is not."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False

@@ -1,0 +1,273 @@
+"""Line-scanner states of the USGS Community Sensor Model, as usgscsm and Ames Stereo Pipeline write them (JSON).
+
+What is read of `USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL`: positions, quaternions, line times, detector geometry and radial
+distortion. Adjusted parameters that are not zero, other distortions and other bodies than the Earth are refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.cameras.camera_entry import Vector
+from zlocus.io.cameras.linescan import LineScanCamera, RegularTimes
+from zlocus.io.cameras.linescan_files import MOST_COLUMNS, write_calibration, write_times, write_trajectory
+from zlocus.io.open_raster import existing_file
+from zlocus.io.safe_documents import read_json
+from zlocus.io.schema import Number, StrictModel, Whole, validated
+from zlocus.sensors.earth_frame import MAJOR_M, MINOR_M
+from zlocus.sensors.linescan import FocalLine, LineTimes
+from zlocus.sensors.rotation import from_quaternions
+from zlocus.sensors.trajectory import Trajectory
+
+MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
+RADIAL = 0
+BODY_M = 100.0
+# Samples of the converted trajectory: doubled until splines between them are this close to the state's own polynomials.
+SAMPLES = (256, 512, 1024, 2048, 4096, 8192, 16384)
+TOLERANCE_PX = 1e-3
+# Of the image's time, before its first row and after its last.
+BEYOND = 0.1
+REGULAR_ROWS = 1e-6
+# Twice as many would take 500 MB.
+MOST_ROWS = 4_000_000
+
+
+class CsmState(StrictModel):
+    """The fields that are read; see UsgsAstroLsSensorModel in usgscsm for what they mean."""
+
+    m_modelName: str
+    m_nLines: Whole = Field(gt=1, le=MOST_ROWS)
+    m_nSamples: Whole = Field(gt=1, le=MOST_COLUMNS)
+    m_platformFlag: Whole = 1
+    m_intTimeLines: tuple[Number, ...] = Field(min_length=1)
+    m_intTimeStartTimes: tuple[Number, ...]
+    m_intTimes: tuple[Number, ...]
+    m_detectorSampleSumming: Number = 1.0
+    m_startingDetectorSample: Number = 0.0
+    m_startingDetectorLine: Number = 0.0
+    m_detectorSampleOrigin: Number
+    m_detectorLineOrigin: Number
+    m_iTransS: Vector
+    m_iTransL: Vector
+    m_focalLength: Number = Field(gt=0)
+    m_zDirection: Literal[1, -1]
+    m_distortionType: Whole
+    m_opticalDistCoeffs: tuple[Number, ...]
+    m_majorAxis: Number
+    m_minorAxis: Number
+    m_t0Ephem: Number
+    m_dtEphem: Number = Field(gt=0)
+    m_positions: tuple[Number, ...] = Field(min_length=6)
+    m_t0Quat: Number
+    m_dtQuat: Number = Field(gt=0)
+    m_quaternions: tuple[Number, ...] = Field(min_length=8)
+    m_currentParameterValue: tuple[Number, ...] = ()
+
+    @field_validator("m_zDirection", mode="before")
+    @classmethod
+    def _whole(cls, value: object) -> object:
+        return int(value) if isinstance(value, float) and value.is_integer() else value
+
+    @model_validator(mode="after")
+    def _supported(self) -> CsmState:
+        if self.m_modelName != MODEL:
+            raise ValueError(f"m_modelName is {self.m_modelName!r}; only {MODEL} is read")
+        if abs(self.m_majorAxis - MAJOR_M) > BODY_M or abs(self.m_minorAxis - MINOR_M) > BODY_M:
+            raise ValueError("m_majorAxis and m_minorAxis are not the Earth's in metres; other bodies are not read")
+        coefficients = self.m_opticalDistCoeffs
+        if any(coefficients) and (self.m_distortionType != RADIAL or len(coefficients) != 3):
+            raise ValueError("m_distortionType is not 0 (radial, three m_opticalDistCoeffs); undistort the image first")
+        if any(self.m_currentParameterValue):
+            raise ValueError("m_currentParameterValue is not zero; apply the adjustment to the state (jitter_solve)")
+        if not len(self.m_intTimeLines) == len(self.m_intTimeStartTimes) == len(self.m_intTimes):
+            raise ValueError("m_intTimeLines, m_intTimeStartTimes and m_intTimes are not of the same length")
+        if len(self.m_positions) % 3 or len(self.m_quaternions) % 4:
+            raise ValueError("m_positions are not triples, or m_quaternions not quadruples")
+        if not np.linalg.norm(np.reshape(self.m_quaternions, (-1, 4)), axis=1).min() > 0:
+            raise ValueError("m_quaternions holds one of length 0")
+        if self.m_iTransL[1] * self.m_iTransS[2] == self.m_iTransL[2] * self.m_iTransS[1]:
+            raise ValueError("m_iTransL and m_iTransS are parallel, so that no place in the focal plane follows")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class CsmLineScanner:
+    """A state that has been read, in geocentric axes. shape : rows and columns of its image."""
+
+    line: FocalLine
+    lines: LineTimes
+    trajectory: Trajectory
+    shape: tuple[int, int]
+
+
+def read_csm(path: Path) -> CsmLineScanner:
+    """The line scanner of a model state.
+
+    Raises
+    ------
+    InputError
+        For a file that is no such state, or holds what is not supported (see the module).
+    """
+    state = _state(existing_file(path, "camera file"))
+    lines = _line_times(state, path)
+    xy = _focal_plane(state)
+    flipped, toward = _toward_the_ground(state, xy, float(lines.time(np.array([state.m_nLines / 2]))[0]))
+    line = FocalLine(xy * flipped, state.m_focalLength)
+    if not line.goes_on():
+        raise InputError(f"{path}: the detectors of the state do not lie along a line. Get it from its source again.")
+    return CsmLineScanner(line, lines, _sampled(state, lines, toward, line, path), (state.m_nLines, state.m_nSamples))
+
+
+def convert_csm(path: Path, folder: Path, name: str) -> LineScanCamera:
+    """Write a model state as line scanner files NAME_*.csv into a folder; the `camera` entry of a scene file there.
+
+    Raises
+    ------
+    InputError
+        As `read_csm`.
+    OutputError
+        When the folder cannot be written.
+    """
+    scanner = read_csm(path)
+    calibration, trajectory, times = (f"{name}_{what}.csv" for what in ("focal_plane", "trajectory", "times"))
+    write_calibration(folder / calibration, {name: scanner.line}, f"from {path.name}")
+    write_trajectory(folder / trajectory, scanner.trajectory, "s; m, geocentric; camera to geocentric", True)
+    given: RegularTimes | str = times
+    if len(scanner.lines.rows) == 2:
+        given = RegularTimes(start=float(scanner.lines.times[0]), interval=scanner.lines.interval)
+    else:
+        write_times(folder / times, scanner.lines, "row of the image; s")
+    return LineScanCamera(
+        calibration=calibration, line=name, focal_mm=scanner.line.focal_mm, trajectory=trajectory, crs="EPSG:4978",
+        times=given,
+    )  # fmt: skip
+
+
+def _state(path: Path) -> CsmState:
+    """The state in a file; the name of the model may stand before it."""
+    document = read_json(path, start="{")
+    if not isinstance(document, dict):
+        raise InputError(f"{path} is not a CSM model state: it must hold m_modelName: {MODEL}.")
+    return validated(CsmState, {key: document[key] for key in CsmState.model_fields if key in document}, path)
+
+
+def _line_times(state: CsmState, path: Path) -> LineTimes:
+    """When the middle of each row was exposed; CSM has line 0.5 there for row 0."""
+    rows = np.arange(state.m_nLines, dtype=np.float64)
+    line = rows + 0.5
+    starts, times, durations = (
+        np.array(v) for v in (state.m_intTimeLines, state.m_intTimeStartTimes, state.m_intTimes)
+    )
+    piece = np.maximum(np.searchsorted(starts, line, side="right") - 1, 0)
+    when = times[piece] + durations[piece] * (line - starts[piece] + 0.5)
+    steps = np.diff(when)
+    if not (np.diff(starts) > 0).all() or not ((steps > 0).all() or (steps < 0).all()):
+        raise InputError(f"{path}: the line times of the state do not run on. Get it from its source again.")
+    straight = np.interp(rows, rows[[0, -1]], when[[0, -1]])
+    if np.abs(when - straight).max() < REGULAR_ROWS * np.abs(steps).mean():
+        return LineTimes(rows[[0, -1]], when[[0, -1]])
+    return LineTimes(rows, when)
+
+
+def _focal_plane(state: CsmState) -> FloatArray:
+    """Undistorted places of all columns in the focal plane (c, 2), in the units of the focal length.
+
+    CSM counts samples from the outer corner of the first pixel, so that its centre is 0.5.
+    """
+    sample = np.arange(state.m_nSamples) + 0.5
+    across = sample * state.m_detectorSampleSumming + state.m_startingDetectorSample - state.m_detectorSampleOrigin
+    along = state.m_startingDetectorLine - state.m_detectorLineOrigin
+    matrix = np.array([state.m_iTransL[1:], state.m_iTransS[1:]])
+    offset = np.stack([np.full(len(sample), along - state.m_iTransL[0]), across - state.m_iTransS[0]])
+    xy = np.linalg.solve(matrix, offset).T
+    if any(state.m_opticalDistCoeffs):
+        k0, k1, k2 = state.m_opticalDistCoeffs
+        squared = (xy**2).sum(axis=1, keepdims=True)
+        xy = xy * (1.0 - (k0 + squared * (k1 + squared * k2)))
+    return xy
+
+
+def _toward_the_ground(state: CsmState, xy: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+    """Signs of x and y, and of the camera's axes (3,), under which columns see along (x, y, -focal) to the ground.
+
+    The state's lines of sight have no direction: (z x, z y, focal) and its opposite are the same, z the m_zDirection.
+    """
+    at = np.array([time])
+    sight = np.append(state.m_zDirection * xy[len(xy) // 2], state.m_focalLength)
+    outwards = float((from_quaternions(_quaternions(state, at))[0] @ sight) @ _positions(state, at)[0])
+    z = state.m_zDirection
+    if outwards < 0:
+        return np.array([z, -z]), np.array([1.0, -1.0, -1.0])
+    return np.array([-z, -z]), np.ones(3)
+
+
+def _sampled(state: CsmState, lines: LineTimes, toward: FloatArray, line: FocalLine, path: Path) -> Trajectory:
+    """The trajectory around the image, so dense that splines follow the state's own interpolation."""
+    first, last = np.sort(lines.times[[0, -1]])
+    known = [
+        max(state.m_t0Ephem, state.m_t0Quat),
+        min(
+            state.m_t0Ephem + state.m_dtEphem * (len(state.m_positions) // 3 - 1),
+            state.m_t0Quat + state.m_dtQuat * (len(state.m_quaternions) // 4 - 1),
+        ),
+    ]
+    if first < known[0] or last > known[1]:
+        raise InputError(
+            f"{path}: rows were exposed from {first:.6f} to {last:.6f} s, but positions and quaternions are known from "
+            f"{known[0]:.6f} to {known[1]:.6f} s only. Get a state that covers the image."
+        )
+    beyond = BEYOND * (last - first)
+    start, end = max(first - beyond, known[0]), min(last + beyond, known[1])
+    pixel = np.linalg.norm(line.xy_mm[-1] - line.xy_mm[0]) / (len(line.xy_mm) - 1)
+    height = np.linalg.norm(_positions(state, np.array([first]))) - MAJOR_M
+    for n in SAMPLES:
+        trajectory = _poses(state, np.linspace(start, end, n), toward)
+        middle = (trajectory.times[1:] + trajectory.times[:-1]) / 2
+        off = np.abs(trajectory.pose(middle) - _poses(state, middle, toward).pose(middle)).max(axis=1)
+        if max(off[:9].max(), off[9:].max() / height) * line.focal_mm / pixel < TOLERANCE_PX:
+            return trajectory
+    raise InputError(f"{path}: positions or quaternions change too fast from sample to sample. Smooth them.")
+
+
+def _poses(state: CsmState, times: FloatArray, toward: FloatArray) -> Trajectory:
+    geocentric_from_camera = from_quaternions(_quaternions(state, times)) * toward
+    return Trajectory(times, _positions(state, times), np.ascontiguousarray(geocentric_from_camera.mT))
+
+
+def _positions(state: CsmState, times: FloatArray) -> FloatArray:
+    order = 8 if state.m_platformFlag else 4
+    return lagrange(np.reshape(state.m_positions, (-1, 3)), state.m_t0Ephem, state.m_dtEphem, times, order)
+
+
+def _quaternions(state: CsmState, times: FloatArray) -> FloatArray:
+    # usgscsm counts the numbers, not the quaternions, so that only one would make it less than 8.
+    order = 8 if state.m_platformFlag else 4
+    return lagrange(np.reshape(state.m_quaternions, (-1, 4)), state.m_t0Quat, state.m_dtQuat, times, order)
+
+
+def lagrange(values: FloatArray, start: float, step: float, times: FloatArray, order: int) -> FloatArray:
+    """Values (k, v) at evenly spaced instants, interpolated at times (n,) by polynomials: (n, v).
+
+    Through the 8 (or `order`) nearest samples, fewer near the ends (6, 4, 2), as usgscsm's lagrangeInterp does it.
+    """
+    at = (times - start) / step
+    index = np.clip(at.astype(int), 0, len(values) - 2)
+    room = np.minimum(np.minimum(2 * (index + 1), 2 * (len(values) - 1 - index)), order)
+    out = np.empty((len(times), values.shape[1]))
+    for count in np.unique(room):
+        chosen = room == count
+        nodes = np.arange(count) - count // 2 + 1
+        since = (at - index)[chosen, None] - nodes
+        weights = np.empty_like(since)
+        for j, node in enumerate(nodes):
+            others = np.delete(np.arange(count), j)
+            weights[:, j] = np.prod(since[:, others] / (node - nodes[others]), axis=1)
+        out[chosen] = np.einsum("nk,nkv->nv", weights, values[index[chosen, None] + nodes])
+    return out

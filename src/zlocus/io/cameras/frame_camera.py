@@ -1,0 +1,213 @@
+"""Frame cameras of a `scene.yaml`: interior orientation, distortion, and a pose in a map or in local axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainSerializer,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.scene import is_local
+from zlocus.core.sensor_model import SensorModel
+from zlocus.io.cameras.camera_entry import Camera, Vector
+from zlocus.io.crs import checked_crs
+from zlocus.io.safe_text import shown
+from zlocus.io.schema import Number, StrictModel
+from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
+from zlocus.sensors.earth_frame import between
+from zlocus.sensors.frame import FrameModel, rotation_from_angles
+
+ORTHONORMAL = 1e-4
+# What no camera on or above the Earth exceeds; larger numbers are damage, and would overflow.
+FARTHEST_M = 1e9
+LARGEST_PX = 1e7
+# What is less is taken for 0.
+LEAST_PX = 1e-6
+
+Coordinate = Annotated[Number, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+Pixels = Annotated[Number, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
+FocalLength = Annotated[Number, Field(gt=LEAST_PX, le=LARGEST_PX)]
+
+
+def _pair(value: Any) -> Any:
+    """One focal length is that of both directions."""
+    return (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _one_or_pair(pair: tuple[float, float]) -> float | list[float]:
+    return pair[0] if pair[0] == pair[1] else list(pair)
+
+
+FocalLengths = Annotated[
+    tuple[FocalLength, FocalLength], BeforeValidator(_pair), PlainSerializer(_one_or_pair, when_used="json")
+]
+
+
+class Sparse(StrictModel):
+    """A mapping that is written without what it has by default, its kind first."""
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values, fields = write(self), type(self).model_fields
+        kept = {key: value for key, value in values.items() if key != "kind" and value != fields[key].default}
+        return ({"kind": values["kind"]} if "kind" in values else {}) | kept
+
+
+class BrownEntry(Sparse):
+    """See `BrownDistortion`; what is left out is 0."""
+
+    kind: Literal["brown"] = "brown"
+    k1: Number = 0.0
+    k2: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    k5: Number = 0.0
+    k6: Number = 0.0
+
+    def model(self) -> BrownDistortion | None:
+        """The distortion; None where there is none."""
+        found = BrownDistortion(self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6)
+        return None if found == BrownDistortion() else found
+
+
+class FisheyeEntry(Sparse):
+    """See `FisheyeDistortion`; what is left out is 0."""
+
+    kind: Literal["fisheye"] = "fisheye"
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+
+    def model(self) -> FisheyeDistortion:
+        """The distortion."""
+        return FisheyeDistortion(self.k1, self.k2, self.k3, self.k4)
+
+
+class Interior(Sparse):
+    """Interior orientation. focal : px, one number or (along rows, down columns); principal_point : (column, row) px,
+    (0, 0) the centre of the first pixel; skew : px by which columns grow per unit of y."""
+
+    focal: FocalLengths
+    principal_point: tuple[Pixels, Pixels]
+    skew: Pixels = 0.0
+    distortion: Annotated[BrownEntry | FisheyeEntry, Field(discriminator="kind")] | None = None
+
+
+class FrameCamera(Camera, Interior):
+    """A frame camera; see `FrameModel`, and `rotation_from_angles` for `angles` (omega, phi, kappa).
+
+    crs : of the centre, that of the scene's frame where it is not given. earth : `curved`, the default, has straight
+    rays in space and the pose relative to the map's axes at the centre; `flat` takes the map for Cartesian axes.
+    """
+
+    kind: Literal["frame"] = "frame"
+    centre: tuple[Coordinate, Coordinate, Coordinate]
+    rotation: tuple[Vector, Vector, Vector] | None = None
+    angles: Vector | None = None
+    crs: str | None = None
+    earth: Literal["curved", "flat"] | None = None
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> FrameCamera:
+        if (self.rotation is None) == (self.angles is None):
+            raise ValueError("give either rotation, the rows of a matrix, or angles, omega, phi and kappa in degrees")
+        if self.rotation is not None:
+            matrix = np.clip(np.array(self.rotation), -2.0, 2.0)
+            if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < ORTHONORMAL and np.linalg.det(matrix) > 0):
+                raise ValueError("the rows of a rotation are at right angles, of length 1, and right-handed")
+        return self
+
+    def read(self, folder: Path, image: Path) -> FrameSource:
+        """See `Camera`."""
+        rotation = self.rotation or rotation_from_angles(*(self.angles or (0.0, 0.0, 0.0)))
+        model = FrameModel(
+            self.centre, rotation, self.focal[0], self.principal_point, self.focal[1] / self.focal[0], self.skew,
+            None if self.distortion is None else self.distortion.model(),
+        )  # fmt: skip
+        return FrameSource(model, image, None if self.crs is None else map_crs(self.crs, image), self.earth != "flat")
+
+    def given_in(self, crs: str | None) -> FrameCamera:
+        """See `Camera`."""
+        return self if self.crs is not None or crs is None else self.model_copy(update={"crs": crs})
+
+
+def map_crs(text: str, image: Path) -> CRS:
+    """The CRS of the camera of an image.
+
+    Raises
+    ------
+    InputError
+        For text that is no CRS.
+    ConfigError
+        For one that is not projected in metres.
+    """
+    try:
+        return checked_crs(CRS.from_user_input(text))
+    except CRSError as error:
+        raise InputError(
+            f"The camera of {image} is given in {shown(text)}, which is no CRS. Write it as EPSG:n."
+        ) from error
+    except ConfigError as error:
+        raise ConfigError(f"The camera of {image}: {error}") from error
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """A frame camera, given in a map's CRS; `given` None: in the scene's frame. curved : see `FrameCamera.earth`."""
+
+    model: FrameModel
+    image: Path
+    given: CRS | None = None
+    curved: bool = True
+    files: tuple[Path, ...] = ()
+
+    def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
+        """See `CameraSource`; below the centre of projection, whichever way it looks."""
+        if self.given is None:
+            return None
+        lon, lat = between(self.given, CRS.from_epsg(4326)).transform(*self.model.centre[:2])
+        return (float(lon), float(lat)) if np.isfinite(lon) and np.isfinite(lat) else None
+
+    def sensor(self, crs: CRS) -> SensorModel:
+        """See `CameraSource`.
+
+        Raises
+        ------
+        ConfigError
+            For a camera that takes another map than the scene's for Cartesian axes.
+        InputError
+            For a centre that lies outside of what its CRS can express.
+        """
+        if is_local(crs):
+            return self.model
+        given = self.given or crs
+        if not self.curved:
+            if given != crs:
+                raise ConfigError(
+                    f"The camera of {self.image} has earth: flat, which holds in {given.to_string()} only, not in "
+                    f"{crs.to_string()}. Leave --crs out, or write earth: curved."
+                )
+            return self.model
+        model = self.model.on_earth(given, crs)
+        if not np.isfinite([*model.centre, *model.camera_from_ground[0]]).all():
+            at = ", ".join(f"{v:.12g}" for v in self.model.centre)
+            raise InputError(
+                f"The camera of {self.image} stands at {at}, which is no place in {given.to_string()}. Check its "
+                "centre and the CRS."
+            )
+        return model

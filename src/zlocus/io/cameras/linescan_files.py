@@ -1,0 +1,240 @@
+"""Files of line scanners: focal planes, trajectories and line times as tables of numbers (see docs/linescan.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pyproj import CRS
+
+from zlocus.core.errors import InputError
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.number_table import NumberTable, read_numbers, write_numbers
+from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, between, east_north_up
+from zlocus.sensors.linescan import FocalLine, LineTimes
+from zlocus.sensors.rotation import from_navigation, from_photogrammetric, from_quaternions, to_photogrammetric
+from zlocus.sensors.trajectory import LEAST_SAMPLES, Trajectory
+
+CALIBRATION, TRAJECTORY, TIMES = "focal plane calibration", "trajectory", "table of line times"
+PLACES = {"projected": ("x", "y", "z"), "geographic": ("lon", "lat", "height")}
+OMEGA_PHI_KAPPA, ROLL_PITCH_HEADING = ("omega", "phi", "kappa"), ("roll", "pitch", "heading")
+QUATERNION = ("qx", "qy", "qz", "qw")
+TURNS = (OMEGA_PHI_KAPPA, ROLL_PITCH_HEADING, QUATERNION)
+WGS84_GEOCENTRIC = CRS.from_epsg(4978)
+Rays = Literal["earth", "frame"]
+# Of the norm of a quaternion.
+UNIT = 1e-3
+MOST_COLUMNS = 1_000_000
+# Above the ellipsoid: what lies outside is a mistake in units or CRS.
+LOWEST_M, HIGHEST_M = -2e4, 2e6
+
+
+def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine:
+    """The line `name` of a focal plane: columns `column`, `x_mm`, `y_mm`, and `line` where the file holds several.
+
+    Columns of detectors that the file leaves out are filled in by a cubic spline.
+
+    Raises
+    ------
+    InputError
+        For a malformed table, a line that is not there, or detectors that do not follow one another along a line.
+    """
+    table = read_numbers(path, CALIBRATION, ("column", "x_mm", "y_mm"), ("line",))
+    _need(table, ("column", "x_mm", "y_mm"))
+    table = _of_line(table, name)
+    if len(table) < 2:
+        raise InputError(f"The {CALIBRATION} {path} holds one column only. At least two are needed.")
+    table.check_steps("column")
+    column, xy_mm = table.columns["column"], table.stacked(("x_mm", "y_mm"))
+    if column[0] != 0.0 or (column != np.rint(column)).any():
+        raise table.refuse(0, "columns are whole numbers from 0 on; number them so")
+    n = int(column[-1]) + 1
+    if n > len(column):
+        if n > MOST_COLUMNS:
+            raise table.refuse(len(column) - 1, f"column {n - 1} is more than the {MOST_COLUMNS} a line may have")
+        from scipy.interpolate import CubicSpline
+
+        xy_mm = CubicSpline(column, xy_mm)(np.arange(n))
+    line = FocalLine(xy_mm, focal_mm)
+    if not line.goes_on():
+        raise InputError(
+            f"The {CALIBRATION} {path} does not run along a line: some column lies behind the one before it. Mend "
+            "x_mm and y_mm."
+        )
+    return line
+
+
+def read_times(path: Path, n_rows: int) -> LineTimes:
+    """When rows were exposed: columns `row` and `time`, from row 0 (or before) to the last one; straight in between.
+
+    Raises
+    ------
+    InputError
+        For a malformed table, or one that does not reach from the first row to the last.
+    """
+    table = read_numbers(path, TIMES, ("row", "time"))
+    _need(table, ("row", "time"))
+    table.check_steps("row")
+    table.check_steps("time", either=True)
+    rows = table.columns["row"]
+    if len(rows) < 2 or rows[0] > 0 or rows[-1] < n_rows - 1:
+        raise InputError(
+            f"The {TIMES} {path} goes from row {rows[0]:g} to {rows[-1]:g}, but the image has rows 0 to {n_rows - 1}. "
+            "Give the times of the first and the last row, or more."
+        )
+    known = (rows > 0) & (rows < n_rows - 1)
+    at = np.concatenate([[0.0], rows[known], [max(n_rows - 1, 1)]])
+    return LineTimes(at, LineTimes(rows, table.columns["time"]).time(at))
+
+
+def read_trajectory(
+    path: Path, crs: CRS | None, rays: Rays, boresight_deg: FloatArray, lever_arm: FloatArray
+) -> Trajectory:
+    """The projection centres and the camera's rotations: `time`, a place and a turn, by the names of the columns.
+
+    crs : of the places; None is WGS84 for `lon`, `lat`, and the scene's frame where rays are straight in that.
+    boresight_deg : (3,) omega, phi, kappa that turn the platform's axes into the camera's; lever_arm : (3,) m from the
+    point of the table to the projection centre, in the platform's axes. The result is in geocentric axes, or the
+    frame's.
+
+    Raises
+    ------
+    InputError
+        For a malformed table, times that do not increase, or places that are not in that CRS.
+    """
+    names = ("time", *PLACES["projected"], *PLACES["geographic"], *OMEGA_PHI_KAPPA, *ROLL_PITCH_HEADING, *QUATERNION)
+    table = read_numbers(path, TRAJECTORY, names)
+    place = _one_of(table, tuple(PLACES.values()))
+    turn = _one_of(table, TURNS)
+    _need(table, ("time", *place, *turn))
+    if len(table) < LEAST_SAMPLES:
+        raise InputError(f"The {TRAJECTORY} {path} has {len(table)} rows. At least {LEAST_SAMPLES} are needed.")
+    table.check_steps("time")
+    platform = _platform(table, turn)
+    if rays == "frame":
+        if place != PLACES["projected"]:
+            raise InputError(f"The {TRAJECTORY} {path} has {', '.join(place)}, but rays: frame needs x, y, z.")
+        places = table.stacked(place)
+    else:
+        places, local = _on_earth(table, place, turn, crs)
+        platform = local @ platform
+    camera = from_photogrammetric(*np.deg2rad(boresight_deg)[:, None])[0]
+    return Trajectory(
+        table.columns["time"] + 0.0, places + platform @ lever_arm, np.ascontiguousarray((platform @ camera).mT)
+    )
+
+
+def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str, every: int = 1) -> None:
+    """Write the lines of a focal plane by name, as `read_calibration` reads them: each `every`-th column and the last,
+    which are enough of straight lines."""
+    last = {name: len(line.xy_mm) - 1 for name, line in lines.items()}
+    columns = {name: np.unique([*range(0, last[name], every), last[name]]) for name in lines}
+    xy_mm = np.concatenate([line.xy_mm[columns[name]] for name, line in lines.items()])
+    column = np.concatenate([*columns.values()]).astype(float)
+    names = [name for name, held in columns.items() for _ in held]
+    write_numbers(path, {"column": column, "x_mm": xy_mm[:, 0], "y_mm": xy_mm[:, 1]}, comment, {"line": names})
+
+
+def write_trajectory(path: Path, trajectory: Trajectory, comment: str, quaternions: bool = False) -> None:
+    """Write a trajectory as `read_trajectory` reads it, without boresight and lever arm: x, y, z of its own axes, and
+    the camera's omega, phi, kappa or quaternions in them."""
+    turn: tuple[str, ...] = OMEGA_PHI_KAPPA
+    if quaternions:
+        from scipy.spatial.transform import Rotation
+
+        turn, turns = QUATERNION, Rotation.from_matrix(trajectory.rotations.mT).as_quat()
+    else:
+        turns = np.rad2deg(to_photogrammetric(trajectory.rotations.mT))
+    values = np.column_stack([trajectory.times, trajectory.centres, turns])
+    write_numbers(path, dict(zip(("time", *PLACES["projected"], *turn), values.T, strict=True)), comment)
+
+
+def write_times(path: Path, lines: LineTimes, comment: str) -> None:
+    """Write line times as `read_times` reads them."""
+    write_numbers(path, {"row": lines.rows, "time": lines.times}, comment)
+
+
+def _need(table: NumberTable, names: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in table.columns:
+            raise InputError(f"The {table.what} {table.path} has no column {name}. Name it in the header.")
+
+
+def _one_of(table: NumberTable, choices: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+    """The one group of names, of several, that the table has some of."""
+    given = [names for names in choices if any(name in table.columns for name in names)]
+    if len(given) != 1:
+        said = " or ".join(", ".join(names) for names in choices)
+        raise InputError(f"The {table.what} {table.path} must have the columns {said}, one of these only.")
+    return given[0]
+
+
+def _of_line(table: NumberTable, name: str | None) -> NumberTable:
+    """The rows of one line."""
+    lines = table.labels.get("line", ())
+    held = sorted(set(lines))
+    if not held and name is None:
+        return table
+    if name not in held:
+        advice = f"Write line: with one of {', '.join(held)}" if held else "Leave line: out, or add that column"
+        said = "names no line" if name is None else f"asks for the line {name!r}"
+        raise InputError(f"The {table.what} {table.path} has {len(held)} named lines, and the scene {said}. {advice}.")
+    rows = np.flatnonzero([line == name for line in lines])
+    columns = {key: values[rows] for key, values in table.columns.items()}
+    return NumberTable(table.path, table.what, columns, {}, tuple(table.lines[row] for row in rows))
+
+
+def _platform(table: NumberTable, turn: tuple[str, ...]) -> FloatArray:
+    """Local axes from the platform's (n, 3, 3)."""
+    if turn == QUATERNION:
+        quaternions = table.stacked(turn)
+        wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > UNIT)
+        if len(wrong):
+            raise table.refuse(int(wrong[0]), "the quaternion qx, qy, qz, qw is not of length 1; mend it")
+        return from_quaternions(quaternions)
+    build = from_photogrammetric if turn == OMEGA_PHI_KAPPA else from_navigation
+    return build(*np.deg2rad(table.stacked(turn)).T)
+
+
+def _on_earth(
+    table: NumberTable, place: tuple[str, ...], turn: tuple[str, ...], crs: CRS | None
+) -> tuple[FloatArray, FloatArray]:
+    """Geocentric places (n, 3) m, and geocentric axes from those of the angles (n, 3, 3): east, north and up, the north
+    of the grid where the CRS is projected; quaternions are geocentric themselves."""
+    given, height = table.stacked(place), table.stacked(place)[:, 2]
+    crs = _checked(table, place, crs)
+    if crs.is_geocentric:
+        places = np.column_stack(between(crs, WGS84_GEOCENTRIC).transform(*given.T))
+        height = WGS84_EARTH.geographic_from_cartesian(places)[:, 2]
+    else:
+        places = EarthSpace(crs, WGS84).cartesian_from_ground(given)
+    wrong = np.flatnonzero(~((height > LOWEST_M) & (height < HIGHEST_M)))
+    if len(wrong):
+        raise table.refuse(int(wrong[0]), f"{', '.join(place)} are not a place in {crs.name}; check crs and the units")
+    if turn == QUATERNION:
+        if not crs.is_geocentric:
+            raise InputError(f"The {table.what} {table.path} has quaternions, which need a geocentric crs: EPSG:4978.")
+        return places, np.broadcast_to(np.eye(3), (len(table), 3, 3))
+    if crs.is_projected:
+        return places, WGS84_EARTH.poses(crs, given)[1].mT
+    lon, lat, _ = WGS84_EARTH.geographic_from_cartesian(places).T
+    return places, east_north_up(np.deg2rad(lon), np.deg2rad(lat))
+
+
+def _checked(table: NumberTable, place: tuple[str, ...], crs: CRS | None) -> CRS:
+    """The CRS of places: projected in metres or geocentric for x, y, z; geographic in degrees for lon, lat."""
+    if place == PLACES["geographic"]:
+        crs = WGS84 if crs is None else crs
+        fits = crs.is_geographic
+    else:
+        if crs is None:
+            raise InputError(f"The {table.what} {table.path} has x, y, z. Name their crs in the scene file.")
+        fits = crs.is_geocentric or crs.is_projected
+    metres = crs.is_geographic or all(abs(axis.unit_conversion_factor - 1.0) < 1e-9 for axis in crs.axis_info)
+    if not fits or crs.is_compound or not metres:
+        raise InputError(
+            f"The {table.what} {table.path} has {', '.join(place)}, which {crs.name} is not for. Allowed: a projected "
+            "CRS in metres or EPSG:4978 for x, y, z; a geographic one for lon, lat, height; heights are ellipsoidal."
+        )
+    return crs

@@ -1,0 +1,64 @@
+"""The camera that belongs to an image file: finds and reads its RPC.
+
+Pixels: all readers give offsets with (0, 0) at the centre of the first pixel. The GeoTIFF tag, `_RPC.TXT` and `.RPB`
+count so already; DIMAP does not (see `rpc_dimap`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from zlocus.core.errors import InputError
+from zlocus.io.cameras.dimap import find_dimap, read_dimap_rpc
+from zlocus.io.cameras.rpc_text import read_rpb, read_rpc_txt, rpc_from_fields
+from zlocus.io.open_raster import existing_file, open_raster
+from zlocus.sensors.rpc import RpcCoefficients
+
+RPB_SUFFIXES = (".RPB", ".rpb")
+TXT_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt")
+
+
+def read_rpc(image: Path, file: Path | None = None) -> RpcCoefficients:
+    """The RPC of an image.
+
+    Looked for in this order, which is GDAL's (a side-car file was put there on purpose, often to mend the tag):
+    `file` when given; NAME.RPB; NAME_RPC.TXT; DIMAP (RPC_*.XML); the tag in the image.
+
+    Raises
+    ------
+    InputError
+        When there is none, or it is damaged: names the file and the field.
+    """
+    image = Path(image)
+    file = find_sidecar(image) if file is None else existing_file(file, "camera file")
+    if file is None:
+        return _from_tag(image)
+    suffix = file.suffix.lower()
+    if suffix == ".xml":
+        return read_dimap_rpc(file, image)
+    if suffix == ".rpb":
+        return read_rpb(file)
+    if suffix == ".txt":
+        return read_rpc_txt(file)
+    return _from_tag(file)
+
+
+def find_sidecar(image: Path) -> Path | None:
+    """The file beside the image that holds its RPC, or None."""
+    names = [image.stem + suffix for suffix in RPB_SUFFIXES] + [image.stem + ending for ending in TXT_ENDINGS]
+    for name in names:
+        if image.with_name(name).exists():
+            return image.with_name(name)
+    return find_dimap(image)
+
+
+def _from_tag(image: Path) -> RpcCoefficients:
+    """The RPC stored in an image file (GeoTIFF's RPC tag, NITF's RPC00B), as GDAL hands it out."""
+    with open_raster(image) as source:
+        fields = source.tags(ns="RPC")
+    if not fields:
+        raise InputError(
+            f"{image} has no camera: no RPC tag, and no {image.stem}.RPB, {image.stem}_RPC.TXT or RPC_*.XML beside it. "
+            "Add one of them, or name the camera in a scene.yaml."
+        )
+    return rpc_from_fields(fields, image)

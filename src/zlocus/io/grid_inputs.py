@@ -1,0 +1,206 @@
+"""What a run is given besides images: the grid of another raster, a DEM, polygons of an area."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import shapely
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from pyproj import CRS, Transformer
+from rasterio.enums import Resampling
+from rasterio.features import rasterize
+from rasterio.warp import reproject, transform_bounds
+from rasterio.windows import Window
+
+from zlocus.core.errors import ConfigError, InputError
+from zlocus.io.crs import checked_crs, known_crs, raster_crs
+from zlocus.io.height_values import check_unit, is_fill
+from zlocus.io.open_raster import existing_file, first_bytes, is_remote, open_raster
+from zlocus.io.vertical import (
+    OWN_ELLIPSOIDAL,
+    VerticalDatum,
+    check_heights,
+    grid_crs,
+    vertical_datum,
+    vertical_datum_of,
+    vertical_part,
+)
+from zlocus.io.virtual_rasters import ARCHIVES
+
+# Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
+EDGE_PIECES = 200
+LONGEST = 300  # of what a library says, characters
+# Formats of vector files that hold their polygons themselves.
+VECTORS = ("ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
+           "OpenFileGDB", "SQLite", "TopoJSON")  # fmt: skip
+# No extent on the Earth, in any unit, is larger.
+WIDEST_EXTENT = 1e9
+
+
+def read_geobox(path: Path) -> GeoBox:
+    """The grid of a raster (for `--like`): CRS, transform and shape, never heights.
+
+    Raises
+    ------
+    InputError
+        For a raster without CRS, or one that is not north-up.
+    ConfigError
+        For a CRS that is not projected in metres.
+    """
+    with open_raster(path, "raster") as source:
+        crs = raster_crs(source, path)
+        transform = source.transform
+        if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
+            raise InputError(f"{path} is rotated or not north-up, so it cannot be the grid. Warp it first (gdalwarp).")
+        try:
+            return GeoBox(source.shape, transform, checked_crs(crs).to_string())
+        except ConfigError as error:
+            raise ConfigError(f"No surface lies on the grid of {path}. {error}") from error
+
+
+def read_dem(
+    path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None, may_miss: bool = False
+) -> NDArray[np.float32]:
+    """Ellipsoidal heights of a DEM at the cell centres of a grid, bilinear. (r, c) float32 m, NaN where it has none.
+
+    vertical : what the DEM's heights are above, see `dem_datum`; None is what its CRS says. may_miss : whether it may
+    have no height anywhere on the grid.
+
+    Raises
+    ------
+    InputError
+        For a file that is no DEM (no CRS, heights not in metres) or covers no cell of the grid, heights above a geoid
+        that is not known, or a geoid that does not cover the DEM's part of the grid.
+    ConfigError
+        For a geoid of PROJ whose grid is not installed.
+    """
+    with open_raster(path, "DEM") as source:
+        crs = raster_crs(source, path)
+        check_heights(crs, path)
+        check_unit(source.units[0], path)
+        heights = _resampled(source, crs.to_2d(), geobox)
+    if not (np.isfinite(heights).any() or may_miss):
+        raise InputError(
+            f"The DEM {path} has no height anywhere on the grid ({_extent(geobox)}). Give one that covers it."
+        )
+    return (vertical or dem_datum(path)).ellipsoidal_of_cells(heights, geobox)
+
+
+def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
+    """What a DEM's heights are above: what is given (see `vertical_datum`), else what its CRS says.
+
+    Raises
+    ------
+    InputError, ConfigError
+        See `vertical_datum` and `vertical_datum_of`.
+    """
+    if given is not None:
+        return vertical_datum(given, "--dem-vertical")
+    with open_raster(path, "DEM") as source:
+        return vertical_datum_of(raster_crs(source, path), path, "--dem-vertical")
+
+
+def says_nothing(path: Path) -> bool:
+    """Whether neither the CRS of a DEM nor its band's description, where it was made here, says what its heights are
+    above."""
+    with open_raster(path, "DEM") as source:
+        crs, description = raster_crs(source, path), source.descriptions[0]
+    return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != OWN_ELLIPSOIDAL
+
+
+def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
+    """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...) in another CRS. (n,) of shapely's.
+
+    Raises
+    ------
+    InputError
+        For a file that is no vector file or names other files, an archive, several layers, no CRS, or anything but
+        polygons.
+    """
+    # A tenth of a second, with pandas a third, that only runs with polygons need.
+    import pyogrio.raw
+
+    path = existing_file(path, "vector file")
+    begins = b"" if is_remote(path) else first_bytes(path)
+    if archive := next((name for start, name in ARCHIVES.items() if begins.startswith(start)), None):
+        raise InputError(f"The vector file {path} is an archive ({archive}), which is not followed. Unpack it.")
+    try:
+        layers = pyogrio.list_layers(path)[:, 0]
+        if len(layers) != 1:
+            raise InputError(
+                f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
+            )
+        if (kind := pyogrio.read_info(path)["driver"]) not in VECTORS:
+            raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
+        with warnings.catch_warnings():
+            # What they warn of, rings that are not closed or numbers that are not finite, is refused.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            meta, _, wkb, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
+            polygons = shapely.from_wkb(wkb)
+    except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # pyogrio's own are of these kinds
+        why = (
+            "some text in it is not UTF-8"
+            if isinstance(error, UnicodeError)
+            else " ".join(str(error).split())[:LONGEST]
+        )
+        raise InputError(
+            f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
+        ) from error
+    polygons = polygons[~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)]
+    if not len(polygons) or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
+        raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
+    if meta["crs"] is None:
+        raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
+    with np.errstate(invalid="ignore"):  # of coordinates that are no numbers, which are refused below
+        west, south, east, north = shapely.total_bounds(polygons)
+    largest = max(east - west, north - south)
+    if not (0 < largest < WIDEST_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
+        raise InputError(
+            f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
+        )
+    polygons = shapely.segmentize(polygons, largest / EDGE_PIECES)
+    transformer = Transformer.from_crs(known_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
+    return np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
+
+
+def cells_inside(polygons: NDArray[Any], geobox: GeoBox) -> NDArray[np.bool_]:
+    """Which cells have their centre inside a polygon. (n,) polygons in the grid's CRS -> (r, c) bool."""
+    inside = rasterize(polygons, out_shape=tuple(geobox.shape), transform=geobox.transform, dtype="uint8")
+    return np.asarray(inside, bool)
+
+
+def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDArray[np.float32]:
+    """The first band on a grid, reading only the part under it. (r, c) float32, NaN where there is nothing.
+
+    crs : of the raster, without heights, which GDAL would try to convert.
+    """
+    out = np.full(tuple(geobox.shape), np.nan, np.float32)
+    bounds = transform_bounds(grid_crs(geobox).to_wkt(), crs.to_wkt(), *geobox.boundingbox.bbox)
+    if not np.isfinite(bounds).all():
+        return out
+    corners = [~source.transform * (x, y) for x in bounds[::2] for y in bounds[1::2]]
+    # Two cells more on each side, for the bilinear neighbours.
+    low = np.clip(np.floor(np.min(corners, axis=0)).astype(int) - 2, 0, (source.width, source.height))
+    high = np.clip(np.ceil(np.max(corners, axis=0)).astype(int) + 2, 0, (source.width, source.height))
+    if (high <= low).any():
+        return out
+    window = Window(low[0], low[1], high[0] - low[0], high[1] - low[1])
+    stored = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
+    stored[is_fill(stored)] = np.nan
+    heights = (stored * source.scales[0] + source.offsets[0]).astype(np.float32)
+    reproject(
+        heights, out, src_transform=source.window_transform(window), src_crs=crs.to_wkt(), src_nodata=np.nan,
+        dst_transform=geobox.transform, dst_crs=grid_crs(geobox).to_wkt(), dst_nodata=np.nan,
+        resampling=Resampling.bilinear,
+    )  # fmt: skip
+    return out
+
+
+def _extent(geobox: GeoBox) -> str:
+    xmin, ymin, xmax, ymax = geobox.boundingbox.bbox
+    return f"E {xmin:.0f} to {xmax:.0f} m, N {ymin:.0f} to {ymax:.0f} m"

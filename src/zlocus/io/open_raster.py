@@ -1,0 +1,300 @@
+"""One way to open a raster for reading: small caches, no noise, and errors as sentences."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import re
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio._err import CPLE_BaseError
+from rasterio.enums import Interleaving
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+from zlocus.core.errors import InputError
+from zlocus.core.scene import HeldPixels
+from zlocus.io.safe_text import shown
+from zlocus.io.tiff_blocks import held_in_blocks
+from zlocus.io.virtual_rasters import ARCHIVES, FIRST_BYTES, REMOTE, check_served, check_virtual, is_virtual
+
+BLOCK_CACHE_BYTES = 128 << 20
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# Its place in a TIFF alone.
+LEAST_BLOCK_BYTES = 4
+# Of a block, that is read whatever stands for it; beyond, as many times what the file holds.
+LARGE_BLOCK_BYTES, DENSEST = 256 << 20, 10_000
+# Of kinds that only GDAL has.
+PIXEL_BYTES = {"complex_int16": 4}
+KEPT_OPEN = 32  # rasters of a thread
+_GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
+# Rasters that are lists of other files or ask services, whatever their file is called. A virtual raster is read where
+# its name says that it is one.
+ELSEWHERE = frozenset((
+    "DERIVED", "ECRGTOC", "EEDA", "EEDAI", "ESRIC", "GTI", "HTTP", "KMLSUPEROVERLAY", "MRF", "PLMOSAIC", "RPFTOC",
+    "STACIT", "STACTA", "VRT", "WCS", "WMS", "WMTS",
+))  # fmt: skip
+# Formats whose pixels lie in a file as they are.
+PLAIN = frozenset(("BT", "EHdr", "ENVI", "ERS", "GTX", "ISCE", "KRO", "LAN", "PAux", "PNM", "ROI_PAC", "SAGA"))
+# `warnings.catch_warnings` swaps a global list, so two threads must not be inside it at once.
+_quiet = threading.Lock()
+
+
+def is_remote(path: Path) -> bool:
+    """Whether a path is one of GDAL's virtual files: `/vsicurl/` and an address, `/vsis3/bucket/key`."""
+    return str(path).startswith("/vsi")
+
+
+def gdal_name(path: Path) -> str:
+    """A path as GDAL takes it: `Path` makes one of the two slashes of an address within it."""
+    return re.sub(r"^(/vsi\w+/(?:\w+=[^/]*/)?https?:)/(?!/)", r"\1//", str(path))
+
+
+def existing_file(path: Path, what: str) -> Path:
+    """`path` if it is a file, or one of GDAL's virtual files, of which nothing is known before it is opened. `what`
+    names its role in the message ("image", "DEM").
+
+    Raises
+    ------
+    InputError
+        When there is no such file, it is a folder, or lies in an archive.
+    """
+    path = Path(path)
+    if is_remote(path):
+        if path.parts[1] not in REMOTE:
+            raise InputError(
+                f"{shown(str(path))} names a file in an archive or a stream, which is not followed. Unpack it, and "
+                f"give the {what} itself, or one on a server ({', '.join(f'/{name}/' for name in REMOTE[:3])}...)."
+            )
+        return path
+    try:
+        is_there, is_folder = path.exists(), path.is_dir()
+    except (OSError, ValueError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise InputError(f"There can be no {what} {shown(str(path))}: {why.lower()}. Check the path.") from error
+    if is_folder:
+        raise InputError(f"The {what} {path} is a folder. Give the files in it one by one.")
+    if not is_there:
+        raise InputError(f"There is no {what} {path}. Check the path.")
+    return path
+
+
+def file_state(path: Path) -> list[int]:
+    """Size of a file, bytes, and its time of change, ns; empty where it is not there, or on a server."""
+    if is_remote(path):
+        return []
+    try:
+        found = path.stat()
+    except OSError:
+        return []
+    return [found.st_size, found.st_mtime_ns]
+
+
+@contextmanager
+def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetReader]:
+    """An open rasterio dataset; what rasterio or GDAL cannot do inside the block becomes an `InputError`.
+
+    GDAL's block cache is held to `BLOCK_CACHE_BYTES`, siblings of the file are probed by name instead of listing the
+    folder, and the warning that an image lacks a georeference (true of every unrectified one) is not shown.
+    """
+    path = existing_file(path, what)
+    with rasterio.Env(**_GDAL), _opened(path) as dataset, _read_errors(path):
+        if dataset.driver in PLAIN and not is_remote(path):
+            _check_plain(dataset, path)
+        yield dataset
+
+
+@contextmanager
+def kept_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
+    """As `open_raster`, and the image stays open for this thread's next look at it, with the blocks that are in cache.
+
+    A file that has changed since is opened anew. GDAL's handles must not be shared, neither by threads nor by a process
+    and its fork.
+    """
+    path = existing_file(path, "image")
+    with rasterio.Env(**_GDAL):
+        dataset = _kept.dataset(path)
+        try:
+            with _read_errors(path):
+                yield dataset
+        except BaseException:
+            _kept.forget(path)
+            raise
+
+
+def _opened(path: Path) -> rasterio.DatasetReader:
+    is_list = path.suffix.lower() == ".vrt"
+    if is_list and not is_remote(path) and is_virtual(first_bytes(path)):
+        check_virtual(path)
+    try:
+        with _quiet, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            # `rasterio.open` takes one format only.
+            dataset = rasterio.DatasetReader(gdal_name(path), driver=_drivers(is_list))
+    except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
+        if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
+            raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
+        raise InputError(
+            f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
+            "GeoTIFF (or another format of GDAL)."
+        ) from error
+    if not is_remote(path):
+        _check_block(dataset, path)
+    elif dataset.driver == "VRT":
+        try:
+            check_served(path, dataset.tags(ns="xml:VRT")["xml:VRT"])
+        except BaseException:
+            dataset.close()
+            raise
+    return dataset
+
+
+def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
+    """A block of pixels is read as one, in memory, however few bytes stand for it."""
+    if source.driver not in ("GTiff", "COG") or not source.count:
+        return
+    bands = source.count if source.interleaving == Interleaving.pixel else 1
+    kind = source.dtypes[0]
+    pixel = PIXEL_BYTES[kind] if kind in PIXEL_BYTES else np.dtype(kind).itemsize
+    n_bytes, length = math.prod(source.block_shapes[0]) * bands * pixel, os.path.getsize(path)
+    if n_bytes > max(LARGE_BLOCK_BYTES, DENSEST * length):
+        source.close()
+        raise InputError(
+            f"{path} is damaged: it says that it has blocks of {n_bytes / 1e9:.1f} GB of pixels, in {length} bytes. "
+            "Copy it again from its source."
+        )
+
+
+@functools.cache
+def _drivers(virtual: bool) -> list[str]:
+    """GDAL's formats that are read. virtual : lists of other files too."""
+    with rasterio.Env() as gdal:
+        return [name for name in gdal.drivers() if name not in ELSEWHERE or (virtual and name == "VRT")]
+
+
+def first_bytes(path: Path) -> bytes:
+    """How a file begins; nothing where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(FIRST_BYTES)
+    except OSError:
+        return b""
+
+
+@contextmanager
+def _read_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path} cannot be read: {reason(error)}. It, or a file beside it that belongs to it, is damaged or "
+            "truncated; copy both again from their source."
+        ) from error
+
+
+@dataclass
+class _Kept(threading.local):
+    """Open rasters of one thread, the one used last at the end, with the state of the file when it was opened."""
+
+    datasets: OrderedDict[Path, tuple[tuple[int, ...], rasterio.DatasetReader]] = field(default_factory=OrderedDict)
+
+    def dataset(self, path: Path) -> rasterio.DatasetReader:
+        """The raster, opened where it is not open yet."""
+        state: tuple[int, ...] = (os.getpid(),)
+        if not is_remote(path):
+            file = os.stat(path)
+            state += (file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns)
+        known, dataset = self.datasets.get(path, (None, None))
+        if known != state or dataset is None:
+            self.forget(path)
+            dataset = _opened(path)
+            self.datasets[path] = state, dataset
+            if len(self.datasets) > KEPT_OPEN:
+                self.forget(next(iter(self.datasets)))
+        self.datasets.move_to_end(path)
+        return dataset
+
+    def forget(self, path: Path) -> None:
+        """Close a raster, unless the process it was opened by is another."""
+        state, dataset = self.datasets.pop(path, (None, None))
+        if state and dataset and state[0] == os.getpid():
+            dataset.close()
+
+
+_kept = _Kept()
+
+
+def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | None:
+    """Compare the offsets and sizes of all TIFF blocks, or of the chunks of a PNG, with the length of the file,
+    decoding nothing.
+
+    Other formats pass: GDAL itself finds them truncated, or `open_raster` does. So do files that are elsewhere. Returns
+    the parts whose pixels a sparse TIFF holds; None of all other files.
+
+    Raises
+    ------
+    InputError
+        When pixels lie behind the end of the file, or there are too many of them.
+    """
+    if is_remote(path):
+        return None
+    if source.driver == "PNG":
+        _check_png(path)
+    if source.driver not in ("GTiff", "COG"):
+        return None
+    length = os.path.getsize(path)
+    block_rows, block_cols = source.block_shapes[0]
+    n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
+    if n_down * n_across * LEAST_BLOCK_BYTES > length:
+        raise InputError(
+            f"{path} is damaged: it says that it has {n_down * n_across} blocks of pixels, which its {length} bytes "
+            "cannot list. Copy it again from its source."
+        )
+    return held_in_blocks(source, path)
+
+
+def _check_plain(source: rasterio.DatasetReader, path: Path) -> None:
+    """Of pixels as they are, GDAL reads those behind the end of the file as 0."""
+    sizes = {name: os.path.getsize(name) for name in source.files if os.path.isfile(name)}
+    largest = max(sizes, key=lambda name: sizes[name], default=None)
+    if largest is None or first_bytes(Path(largest)).startswith(tuple(ARCHIVES)):
+        return
+    item_bits = int(source.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", 8 * np.dtype(source.dtypes[0]).itemsize))
+    needed = source.count * source.height * source.width * item_bits // 8
+    if sizes[largest] < needed:
+        raise InputError(
+            f"{path} is truncated: {Path(largest).name} has {sizes[largest]} bytes, and its pixels take {needed}. Copy "
+            "it again from its source."
+        )
+
+
+def _check_png(path: Path) -> None:
+    """Follow the chunks of a PNG to its last one. Source: PNG specification (ISO/IEC 15948), 5.2 and 5.3."""
+    length, at, kind = os.path.getsize(path), len(PNG_SIGNATURE), b""
+    with path.open("rb") as file:
+        while kind != b"IEND":
+            file.seek(at)
+            head = file.read(8)
+            # Length and name before, and a checksum behind what the chunk holds.
+            at += 12 + int.from_bytes(head[:4], "big")
+            kind = head[4:]
+            if len(head) < 8 or at > length:
+                raise InputError(
+                    f"{path} is truncated: it has {length} bytes, and ends before its last chunk. Copy it again from "
+                    "its source."
+                )
+
+
+def reason(error: BaseException) -> str:
+    """GDAL's own words: those of the first error of the chain, without a full stop."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error).strip().rstrip(".") or type(error).__name__

@@ -1,0 +1,159 @@
+"""run.json: what was asked, with which inputs and versions, what was done and how long it took."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from zlocus.core.errors import InputError, OutputError
+from zlocus.core.options import RunConfig
+from zlocus.core.resources import peak_memory_mb
+from zlocus.io.atomic_write import whole_file
+from zlocus.io.config import config_as_dict
+from zlocus.io.open_raster import gdal_name, is_remote
+from zlocus.io.safe_documents import read_json
+
+SCHEMA = 1
+CHUNK_BYTES = 1 << 20
+LIBRARIES = (
+    "zlocus",
+    "numpy",
+    "numba",
+    "scipy",
+    "rasterio",
+    "pyproj",
+    "odc-geo",
+    "opencv-python-headless",
+    "laspy",
+    "lazrs",
+)
+
+
+@dataclass
+class Elsewhere:
+    """What a stage took in other processes. cpu_s : all of them together; peak_mb : most that one of them held."""
+
+    cpu_s: float = 0.0
+    peak_mb: float = 0.0
+
+
+@dataclass
+class Stopwatch:
+    """Wall time, CPU time and peak memory of each stage of a run."""
+
+    stages: list[dict[str, Any]] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Elsewhere]:
+        """Time a block; what is added to what it yields counts too."""
+        wall, cpu, elsewhere = time.perf_counter(), time.process_time(), Elsewhere()
+        yield elsewhere
+        self.stages.append(
+            {
+                "name": name,
+                "wall_s": round(time.perf_counter() - wall, 3),
+                "cpu_s": round(time.process_time() - cpu + elsewhere.cpu_s, 3),
+                "peak_mb": round(max(peak_memory_mb(), elsewhere.peak_mb), 1),
+            }
+        )
+
+
+def inputs_record(paths: Iterable[Path]) -> list[dict[str, str | None]]:
+    """Path and SHA-256 of every input file; None of those that are elsewhere, which are never read whole."""
+    records: list[dict[str, str | None]] = []
+    for path in paths:
+        if is_remote(path):
+            records.append({"path": gdal_name(path), "sha256": None})
+            continue
+        digest = hashlib.sha256()
+        with path.open("rb") as file:
+            while chunk := file.read(CHUNK_BYTES):
+                digest.update(chunk)
+        records.append({"path": str(path), "sha256": digest.hexdigest()})
+    return records
+
+
+def request_as_dict(request: Any) -> dict[str, Any]:
+    """A request, one of `zlocus.core.requests`, as JSON can hold it."""
+    record = {name: str(value) if isinstance(value, Path) else value for name, value in vars(request).items()}
+    return record | {"inputs": [str(path) for path in request.inputs]}
+
+
+def made_record(
+    request: Any, config: RunConfig, inputs: Sequence[Mapping[str, str | None]], watch: Stopwatch
+) -> dict[str, Any]:
+    """What was asked, of which versions and inputs, and how long it took, for run.json.
+
+    inputs : see `inputs_record`.
+    """
+    return {
+        "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
+        "versions": versions_record(),
+        "inputs": list(inputs),
+        "stages": watch.stages,
+    }
+
+
+def now() -> str:
+    """The time, as ISO 8601 in UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def versions_record() -> dict[str, str]:
+    """Versions of Python and of the libraries a height may depend on."""
+    return {"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}}
+
+
+def write_record(path: Path, record: dict[str, Any]) -> None:
+    """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
+    text = json.dumps(finite_only({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """A JSON object in a file of a result.
+
+    Raises
+    ------
+    InputError
+        It is damaged.
+    """
+    found = read_json(path, again="Make the surface again.")
+    if not isinstance(found, dict):
+        raise InputError(f"{path} holds no JSON object. Make the surface again.")
+    return found
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Write a file to a temporary name beside it, then rename it: whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        Where it cannot be written.
+    """
+    try:
+        with whole_file(path) as part:
+            write(part)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
+
+
+def finite_only(value: Any) -> Any:
+    """The same value with None for every number in it that is not finite."""
+    if isinstance(value, dict):
+        return {key: finite_only(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_only(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,198 @@
+"""Documents read with suspicion: JSON, XML and YAML without what could flood the memory or mean two things at once."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any, NoReturn
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+from xml.parsers import expat
+
+import yaml
+
+from zlocus.core.errors import InputError
+from zlocus.io.safe_text import AGAIN, check_ended, read_bytes, read_text, shown
+
+DEEPEST_XML = 64
+DEEPEST_YAML = 32
+TOO_DEEP = f"{{path}} is nested more than {DEEPEST_YAML} levels deep. Check its brackets."
+LARGEST_YAML = 64_000_000
+# What ten thousand cameras take. Aliases count as what they stand for.
+MOST_VALUES = 500_000
+# Of YAML 1.1, without whole numbers to other bases than 10, underscores within them, and yes and no for truth.
+BOOL, INT, FLOAT = (f"tag:yaml.org,2002:{kind}" for kind in ("bool", "int", "float"))
+PLAIN: dict[str, tuple[str, str]] = {
+    BOOL: (r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    INT: (r"[-+]?(?:0|[1-9][0-9]*)", "-+0123456789"),
+    FLOAT: (r"[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?|[-+]?\.(?:inf|nan)", "-+0123456789."),
+}
+
+
+def read_json(path: Path, start: str | None = None, again: str = AGAIN) -> Any:
+    """A JSON document, with finite numbers and different keys. start : letter before which anything may stand; again :
+    what to do where it is none.
+
+    Raises
+    ------
+    InputError
+        Where it is none.
+    """
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"it holds {constant}, which is no number")
+
+    def number(text: str) -> float:
+        return float(text) if math.isfinite(float(text)) else refuse(text)
+
+    def table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            keys = [key for key, _ in pairs]
+            raise ValueError(f"it holds {shown(next(key for key in keys if keys.count(key) > 1))} twice in one place")
+        return found
+
+    text = read_text(path)
+    if start is not None:
+        text = text[max(text.find(start), 0) :]
+    try:
+        return json.loads(text, parse_constant=refuse, parse_float=number, object_pairs_hook=table)
+    except (ValueError, RecursionError) as error:
+        what = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
+        raise InputError(f"{path} cannot be read as JSON: {what}. {again}") from error
+
+
+def read_xml(path: Path) -> Element:
+    """The root of an XML document that declares no document type, and so no entities.
+
+    Raises
+    ------
+    InputError
+        Where it does, is nested too deeply, or is not XML.
+    """
+    content, depth, n_elements = read_bytes(path), 0, 0
+
+    def refuse(*_: Any) -> NoReturn:
+        raise InputError(f"{path} declares a document type, which camera files do not and which is not read. {AGAIN}")
+
+    def deeper(*_: Any) -> None:
+        nonlocal depth, n_elements
+        depth, n_elements = depth + 1, n_elements + 1
+        if n_elements > MOST_VALUES:
+            raise InputError(f"{path} holds more than {MOST_VALUES} elements. Check that it is the right file.")
+        if depth > DEEPEST_XML:
+            raise InputError(f"{path} is nested more than {DEEPEST_XML} levels deep: no file of cameras. {AGAIN}")
+
+    def higher(*_: Any) -> None:
+        nonlocal depth
+        depth -= 1
+
+    check = expat.ParserCreate()
+    check.StartDoctypeDeclHandler, check.StartElementHandler, check.EndElementHandler = refuse, deeper, higher
+    try:
+        check.Parse(content, True)
+        return ElementTree.fromstring(content)
+    except (expat.ExpatError, ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{path} cannot be read as XML: {error}. {AGAIN}") from error
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """YAML in which a number is what it looks like."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own way)
+        first: [(tag, pattern) for tag, pattern in known if tag not in PLAIN]
+        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+for _tag, (_pattern, _first) in PLAIN.items():
+    _Loader.add_implicit_resolver(_tag, re.compile(rf"(?:{_pattern})\Z"), list(_first))
+
+
+def read_yaml(path: Path, most: int = LARGEST_YAML) -> Any:
+    """A YAML document: YAML 1.1 without its traps (see `PLAIN`), without tags, with different keys. most : bytes.
+
+    Raises
+    ------
+    InputError
+        Where it is none, stops within a value, holds a key twice, or more than a file of options ever does.
+    """
+    text = read_text(path, most)
+    try:
+        _Checked(path).look(text)
+        check_ended(text.rstrip(" \t"), path)
+        return yaml.load(text, _Loader)
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        if "nesting depth" in str(error):
+            # libyaml reads ahead, and has a limit of its own that it may reach first.
+            raise InputError(TOO_DEEP.format(path=path)) from error
+        raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
+
+
+class _Checked:
+    """A look at a YAML document before anything is made of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        # Of each open collection: its anchor, how many values came before it, and of a mapping its keys.
+        self.open: list[tuple[str | None, int, set[str] | None]] = []
+        self.is_key: list[bool] = []
+        self.n_values = 0
+        self.sizes: dict[str, int] = {}
+
+    def look(self, text: str) -> None:
+        """Refuse what is in the way; see `read_yaml`."""
+        for event in yaml.parse(text, _Loader):
+            if isinstance(event, yaml.CollectionEndEvent):
+                anchor, before, _ = self.open.pop()
+                self.is_key.pop()
+                self._remember(anchor, self.n_values - before)
+            elif isinstance(event, yaml.AliasEvent):
+                self._key(event)
+                self._add(self._size(event.anchor or ""))
+            elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
+                if event.tag is not None:
+                    raise InputError(f"{self.path} holds the tag {shown(event.tag)}, which is not read. Leave it out.")
+                self._key(event)
+                self._add(1)
+                self._begin(event)
+
+    def _begin(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
+        if isinstance(event, yaml.ScalarEvent):
+            self._remember(event.anchor, 1)
+            return
+        if len(self.open) == DEEPEST_YAML:
+            raise InputError(TOO_DEEP.format(path=self.path))
+        self.sizes.pop(event.anchor or "", None)
+        self.open.append(
+            (event.anchor, self.n_values - 1, set() if isinstance(event, yaml.MappingStartEvent) else None)
+        )
+        self.is_key.append(True)
+
+    def _key(self, event: yaml.NodeEvent) -> None:
+        """Of a mapping every second value is a key, and no two are the same."""
+        keys = self.open[-1][2] if self.open else None
+        if keys is None:
+            return
+        if self.is_key[-1] and isinstance(event, yaml.ScalarEvent):
+            if event.value in keys:
+                line = "" if event.start_mark is None else f", line {event.start_mark.line + 1}"
+                raise InputError(f"{self.path}{line}: the key {shown(event.value)} is there twice. Remove one.")
+            keys.add(event.value)
+        self.is_key[-1] = not self.is_key[-1]
+
+    def _size(self, anchor: str) -> int:
+        if anchor not in self.sizes:
+            raise InputError(f"{self.path} refers to {shown('*' + anchor)}, which is not complete there. Write it out.")
+        return self.sizes[anchor]
+
+    def _remember(self, anchor: str | None, size: int) -> None:
+        if anchor is not None:
+            self.sizes[anchor] = size
+
+    def _add(self, size: int) -> None:
+        self.n_values += size
+        if self.n_values > MOST_VALUES:
+            raise InputError(f"{self.path} holds more than {MOST_VALUES} values. Check that it is the right file.")

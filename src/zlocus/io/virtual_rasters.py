@@ -1,0 +1,172 @@
+"""What a virtual raster (VRT) may name: files of pixels on this machine, and no server, archive or code.
+
+A VRT is a list of other files, and GDAL opens whatever it names with all that GDAL has. It may come from people who are
+not trusted, so it is looked through before GDAL sees it.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element, fromstring
+
+from zlocus.core.errors import InputError
+from zlocus.io.safe_documents import read_xml
+from zlocus.io.safe_text import shown
+
+MARK = b"<vrtdataset"  # of a VRT, in small letters, within the bytes that GDAL looks at
+FIRST_BYTES = 1024
+# GDAL's virtual files that are read: those of servers, as they are. None within an archive.
+REMOTE = ("vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsihdfs", "vsiwebhdfs")
+# How files begin that hold other files.
+ARCHIVES = {b"PK\x03\x04": "ZIP", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7-Zip", b"Rar!": "RAR", b"BZh": "bzip2"}
+# Parts of a VRT whose words name no files, whatever they look like, with all that stands in them.
+NO_NAMES = frozenset((
+    "categorynames", "colortable", "description", "expression", "gcplist", "gdalrasterattributetable", "histograms",
+    "lut", "pixelfunctiontype", "srs", "unittype",
+))  # fmt: skip
+FILES = frozenset(("sourcefilename", "sourcedataset", "dempath", "x_dataset", "y_dataset"))
+# Of GDAL: virtual files, and names of anything that is no file, such as an address, WMS:..., or a document.
+NOT_A_FILE = re.compile(r"\s*(?:/vsi|[<{]|[A-Za-z][\w+.-]+:)")
+ADVICE = "Give the images themselves, or a list of plain files that lie on this machine."
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A word of a VRT. name : of its element or attribute, in small letters; inside : the element that it belongs to,
+    where GDAL looks for what else is said of it."""
+
+    name: str
+    text: str
+    inside: Element
+
+
+def is_virtual(first: bytes) -> bool:
+    """Whether GDAL takes a file for a VRT, by how it begins."""
+    return MARK in first[:FIRST_BYTES].lower()
+
+
+def check_virtual(path: Path) -> None:
+    """Refuse a VRT that names anything but files of pixels on this machine, or other such lists of them.
+
+    Raises
+    ------
+    InputError
+        It names a server, an archive or a service, holds code, takes bytes of any file for pixels, or is no XML.
+    """
+    state = path.stat()
+    _check(path, state.st_size, state.st_mtime_ns, ())
+
+
+def check_served(path: Path, text: str) -> None:
+    """Refuse a VRT on a server that names anything but files on servers. text : of it, as GDAL has read it.
+
+    Raises
+    ------
+    InputError
+        It names anything else, holds code, or takes bytes of any file for pixels.
+    """
+    servers = tuple(f"/{name}/" for name in REMOTE)
+    for entry in _entries(fromstring(text)):
+        if entry.name in FILES and not _is_relative(path, entry) and not entry.text.startswith(servers):
+            raise InputError(f"{path} lies on a server and names {shown(entry.text)}, which lies on none. {ADVICE}")
+        _refuse_code(path, entry)
+        if _is_raw(entry):
+            raise InputError(f"{path} lies on a server and takes the bytes of files for pixels. {ADVICE}")
+
+
+@functools.lru_cache(maxsize=1024)
+def _check(path: Path, size: int, time_ns: int, above: tuple[Path, ...]) -> None:
+    """size, time_ns : of the file, so that another content is looked at again; above : lists that name this one."""
+    root = read_xml(path)
+    for entry in _entries(root):
+        if NOT_A_FILE.match(entry.text):
+            raise InputError(f"{path} is a list of files and names {shown(entry.text)}, which is none. {ADVICE}")
+        if entry.name in FILES:
+            _check_source(path, _source(path, entry), above)
+        _refuse_code(path, entry)
+        if _is_raw(entry):
+            _check_raw(path, entry.inside)
+
+
+def _entries(element: Element, above: Element | None = None) -> Iterator[_Entry]:
+    """All that may be said in a VRT. To GDAL an attribute is as good as an element within."""
+    name = _name(element.tag)
+    if name in NO_NAMES or name.endswith("srs"):
+        return
+    if name == "mdi":
+        # Metadata say what they like, but for the files that places are taken from.
+        key = element.attrib.get("key", "").lower()
+        if key in FILES and element.text:
+            yield _Entry(key, element.text.strip(), element)
+        return
+    if text := (element.text or "").strip():
+        yield _Entry(name, text, element if above is None or name in FILES else above)
+    for key, value in element.attrib.items():
+        yield _Entry(_name(key), value.strip(), element)
+    for child in element:
+        yield from _entries(child, element)
+
+
+def _source(path: Path, entry: _Entry) -> Path:
+    """The file that an entry names. GDAL starts where the list itself lies, not a link to it."""
+    return path.resolve().parent / entry.text if _is_relative(path, entry) else Path(entry.text)
+
+
+def _is_relative(path: Path, entry: _Entry) -> bool:
+    """Whether the file that an entry names is looked for from where the list lies."""
+    said = next((e.text for e in _entries(entry.inside) if e.name == "relativetovrt"), "0")
+    if said not in ("0", "1"):
+        raise InputError(f"{path} is a list of files in which relativeToVRT is {shown(said)}, not 0 or 1. {ADVICE}")
+    return said == "1"
+
+
+def _is_raw(entry: _Entry) -> bool:
+    return entry.name == "subclass" and entry.text.lower() == "vrtrawrasterband"
+
+
+def _refuse_code(path: Path, entry: _Entry) -> None:
+    if entry.name == "pixelfunctionlanguage" and entry.text.lower() != "c":
+        raise InputError(f"{path} is a list of files and holds code, which is not run. {ADVICE}")
+
+
+def _check_source(path: Path, source: Path, above: tuple[Path, ...]) -> None:
+    """Refuse a file that GDAL would take for a service, an archive, or a list of yet other files that may not be."""
+    try:
+        with source.open("rb") as file:
+            first = file.read(FIRST_BYTES)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path} is a list of files and names {shown(str(source))}, which cannot be read. Check its paths."
+        ) from error
+    if is_virtual(first):
+        if source in above or source.resolve() == path.resolve():
+            raise InputError(f"{path} is a list of files that names itself. {ADVICE}")
+        state = source.stat()
+        _check(source, state.st_size, state.st_mtime_ns, (*above, path))
+        return
+    text = first.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if text.startswith((b"<", b"{", *ARCHIVES)) or ".gti." in source.name.lower():
+        raise InputError(
+            f"{path} is a list of files and names {shown(str(source))}, which holds no pixels itself. {ADVICE}"
+        )
+
+
+def _check_raw(path: Path, band: Element) -> None:
+    """Refuse a band whose pixels are the bytes of a file that does not lie beside the list or below it."""
+    for entry in _entries(band):
+        if entry.name == "sourcefilename":
+            source = _source(path, entry)
+            if not source.resolve().is_relative_to(path.resolve().parent):
+                raise InputError(
+                    f"{path} is a list of files and takes the bytes of {shown(str(source))} for pixels, which does not "
+                    f"lie beside it. {ADVICE}"
+                )
+
+
+def _name(tag: str) -> str:
+    """Name of an element or attribute as GDAL compares it: in small letters, without XML's name space."""
+    return str(tag).rpartition("}")[2].lower()

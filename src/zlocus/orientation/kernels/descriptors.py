@@ -1,0 +1,132 @@
+"""Nearest descriptors among the features that lie near a segment."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zlocus.core.jit import kernel
+
+CELL_PX = 64.0
+CORNER = 1.5
+SAME_PLACE_PX = 2.0  # a rival this near is another orientation of the same feature
+UNRELATED_DISTANCE = 0.9  # between RootSIFT descriptors of different ground; random pairs measure 0.9 to 1.2
+
+
+# (k) f4, (k) f4 -> f4
+@kernel
+def dot(a, b):
+    """Product of two vectors, summed in four parts so that no addition waits for the one before."""
+    one, two, three, four = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    whole = len(a) // 4 * 4
+    for k in range(0, whole, 4):
+        one += a[k] * b[k]
+        two += a[k + 1] * b[k + 1]
+        three += a[k + 2] * b[k + 2]
+        four += a[k + 3] * b[k + 3]
+    for k in range(whole, len(a)):
+        one += a[k] * b[k]
+    return (one + two) + (three + four)
+
+
+# (k,2) f8, (2) f8, i8, i8, (c) i8, (k) i8 -> None
+@kernel
+def sort_into_cells(xy, corner, rows, cols, start, order):
+    """Numbers of points (k, 2), one cell of a grid after the other: `start` (rows cols + 1) of each, `order` (k)."""
+    cell = np.empty(len(xy), np.int64)
+    start[:] = 0
+    for k in range(len(xy)):
+        col, row = int((xy[k, 0] - corner[0]) / CELL_PX), int((xy[k, 1] - corner[1]) / CELL_PX)
+        cell[k] = row * cols + col
+        start[cell[k] + 1] += 1
+    for c in range(rows * cols):
+        start[c + 1] += start[c]
+    filled = start[:-1].copy()
+    for k in range(len(xy)):
+        order[filled[cell[k]]] = k
+        filled[cell[k]] += 1
+
+
+# (2) f8, (2) f8, (2) f8, f8 -> b1
+@kernel
+def is_near(low, high, point, max_px):
+    """Whether a point lies within `max_px` along and across of a segment; one without length counts as level."""
+    by_x, by_y = high[0] - low[0], high[1] - low[1]
+    length = np.sqrt(by_x * by_x + by_y * by_y)
+    by_x, by_y = (by_x / length, by_y / length) if length > 1e-9 else (1.0, 0.0)
+    x, y = point[0] - low[0], point[1] - low[1]
+    along = x * by_x + y * by_y
+    return abs(x * by_y - y * by_x) <= max_px and -max_px <= along <= length + max_px
+
+
+# (2) f8, (2) f8, f8, f8 -> (2) f8
+@kernel
+def span_in_row(low, high, top, max_px):
+    """Least and largest x of what lies within `max_px` along and across of a segment, in a row of cells from y = `top`.
+
+    Beyond an end and beside it at once, a point is up to 1.4 times as far away.
+    """
+    reach = CORNER * max_px
+    x0, x1, by_y = low[0], high[0], high[1] - low[1]
+    if abs(by_y) > 1e-9:
+        one = min(max((top - reach - low[1]) / by_y, 0.0), 1.0)
+        other = min(max((top + CELL_PX + reach - low[1]) / by_y, 0.0), 1.0)
+        x0, x1 = low[0] + one * (high[0] - low[0]), low[0] + other * (high[0] - low[0])
+    return np.array([min(x0, x1) - reach, max(x0, x1) + reach])
+
+
+# (k,2) f8, (m) i8, (m) f4, i8, f8 -> b1
+@kernel
+def is_clear(xy, near, distance, n_near, ratio):
+    """Whether the nearest of some candidates clearly beats the best one at another place."""
+    best = np.argmin(distance[:n_near])
+    rival = np.float32(UNRELATED_DISTANCE)
+    for k in range(n_near):
+        away_x = abs(xy[near[k], 0] - xy[near[best], 0])
+        away_y = abs(xy[near[k], 1] - xy[near[best], 1])
+        if max(away_x, away_y) > SAME_PLACE_PX:
+            rival = min(rival, distance[k])
+    return distance[best] < ratio * rival
+
+
+# (n,2) f8, (n,2) f8, (n,d) f4, (k,2) f8, (k,d) f4, f8, f8, (n) i8, (k) i8 -> None
+@kernel
+def nearest_descriptors(low, high, in_a, xy, in_b, max_px, ratio, best_a, best_b):
+    """For each segment the feature near it of the nearest descriptor, and for each feature that of the segments.
+
+    low, high : (n, 2) px, NaN where there is no segment; in_a : (n, d), in_b : (k, d) descriptors of unit length; xy :
+    (k, 2) px of the features. best_a : (n,), -1 where none is near or the best one is not clear, see `is_clear`;
+    best_b : (k,), -1 where no segment is near.
+    """
+    best_a[:] = -1
+    best_b[:] = -1
+    if not len(xy):
+        return
+    corner = np.array([xy[:, 0].min(), xy[:, 1].min()])
+    cols, rows = int((xy[:, 0].max() - corner[0]) / CELL_PX) + 1, int((xy[:, 1].max() - corner[1]) / CELL_PX) + 1
+    start, order = np.empty(rows * cols + 1, np.int64), np.empty(len(xy), np.int64)
+    sort_into_cells(xy, corner, rows, cols, start, order)
+    closest = np.full(len(xy), np.inf, np.float32)
+    near, distance = np.empty(len(xy), np.int64), np.empty(len(xy), np.float32)
+    for i in range(len(low)):
+        if not (np.isfinite(low[i]).all() and np.isfinite(high[i]).all()):
+            continue
+        top = min(low[i, 1], high[i, 1]) - CORNER * max_px
+        bottom = max(low[i, 1], high[i, 1]) + CORNER * max_px
+        first, last = int(np.floor((top - corner[1]) / CELL_PX)), int(np.floor((bottom - corner[1]) / CELL_PX))
+        n_near = 0
+        for row in range(max(first, 0), min(last, rows - 1) + 1):
+            left, right = span_in_row(low[i], high[i], corner[1] + row * CELL_PX, max_px)
+            c0, c1 = int(np.floor((left - corner[0]) / CELL_PX)), int(np.floor((right - corner[0]) / CELL_PX))
+            if c1 < 0 or c0 >= cols:
+                continue
+            for at in range(start[row * cols + max(c0, 0)], start[row * cols + min(c1, cols - 1) + 1]):
+                j = order[at]
+                if not is_near(low[i], high[i], xy[j], max_px):
+                    continue
+                apart = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * dot(in_a[i], in_b[j]), np.float32(0.0)))
+                near[n_near], distance[n_near] = j, apart
+                n_near += 1
+                if apart < closest[j]:
+                    closest[j], best_b[j] = apart, i
+        if n_near and is_clear(xy, near, distance, n_near, ratio):
+            best_a[i] = near[np.argmin(distance[:n_near])]

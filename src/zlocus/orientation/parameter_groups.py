@@ -1,0 +1,211 @@
+"""What can be wrong with the cameras, as blocks of parameters by the kind of sensor, with what is known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from zlocus.core.options import OrientationOptions
+from zlocus.core.scene import View
+from zlocus.core.sensor_model import FloatArray, SensorModel
+from zlocus.sensors.correction import AffineModel, ShiftedModel
+from zlocus.sensors.frame import FrameModel
+from zlocus.sensors.linescan import LineScanModel, RectifiedModel
+from zlocus.sensors.trajectory import Drift
+
+Correct = Callable[[SensorModel, FloatArray], SensorModel]
+Scanner = LineScanModel | RectifiedModel
+
+# A direction of the parameters counts as seen when its information, per observation and in px2, exceeds this over the
+# number of images squared. Shifts: see `adjust.SEEN_INFORMATION`. Physical cameras have honest priors, which need no
+# help but where there is no information at all.
+SEEN_IN_IMAGE = 0.01
+SEEN_IN_SPACE = 1e-6
+SHIFT, AFFINE, POSE, FOCAL, DRIFT = "shift", "affine", "pose", "focal length", "drift"
+SHIFT_NAMES = ("column_px", "row_px")
+AFFINE_NAMES = ("column_by_column_px", "column_by_row_px", "row_by_column_px", "row_by_row_px")
+POSE_NAMES = ("x_m", "y_m", "z_m", "turn_x_deg", "turn_y_deg", "turn_z_deg")
+# By how many units an angle in radians is larger in what is reported.
+UNITS = {"deg": 180.0 / np.pi}
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Parameters that correct some images together.
+
+    kind : see above; views : numbers of the images; names : (k,) of the parameters, which end in their unit; sigma :
+    (k,) standard deviations beforehand, about zero, in m, rad and px; seen : see `SEEN_IN_IMAGE`; correct : a sensor
+    model of one of the images and values (k,) in the units of `sigma`, to the corrected model.
+    """
+
+    kind: str
+    views: tuple[int, ...]
+    names: tuple[str, ...]
+    sigma: FloatArray
+    seen: float
+    correct: Correct
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    def described(self, values: FloatArray) -> dict[str, float]:
+        """Values (k,) by name, in the units of the names."""
+        return {
+            name: float(value) * UNITS.get(name.rsplit("_", 1)[-1], 1.0)
+            for name, value in zip(self.names, values, strict=True)
+        }
+
+
+def kind_of(sensor: SensorModel) -> str:
+    """rpc, frame or linescan: the groups of the report. What is neither a frame camera nor a line scanner is corrected
+    in its image, as an RPC is."""
+    bare = uncorrected(sensor)
+    return "frame" if isinstance(bare, FrameModel) else "linescan" if isinstance(bare, Scanner) else "rpc"
+
+
+def uncorrected(sensor: SensorModel) -> SensorModel:
+    """The model under corrections of its image."""
+    while isinstance(sensor, ShiftedModel | AffineModel):
+        sensor = sensor.base
+    return sensor
+
+
+def needs_joint(views: Sequence[View]) -> bool:
+    """Whether a shift of each image is too little: some sensor knows its pose."""
+    return any(isinstance(view.sensor, FrameModel | Scanner) for view in views)
+
+
+def blocks_of(views: Sequence[View], options: OrientationOptions) -> tuple[Block, ...]:
+    """The blocks of a scene: for each image a shift (or affine map), or a pose; one drift for all images of a
+    trajectory; on request one focal length for all images of a camera."""
+    frames = [i for i, view in enumerate(views) if isinstance(view.sensor, FrameModel)]
+    scanners = [i for i, view in enumerate(views) if isinstance(view.sensor, Scanner)]
+    in_image = sorted(set(range(len(views))) - set(frames) - set(scanners))
+    image_block = affine_block if options.joint.rpc == "affine" else shift_block
+    blocks = [image_block(i, views[i], options) for i in in_image]
+    blocks += [pose_block(i, options) for i in frames]
+    blocks += [drift_block(group, views, options) for group in same(scanners, views, same_trajectory)]
+    if options.joint.sigma_focal_px is not None:
+        blocks += [focal_block(group, views, options.joint.sigma_focal_px) for group in same(frames, views, same_lens)]
+    return tuple(blocks)
+
+
+def shift_block(number: int, view: View, options: OrientationOptions) -> Block:
+    """A shift of the image."""
+
+    def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
+        return ShiftedModel(sensor, float(values[0]), float(values[1]))
+
+    return Block(SHIFT, (number,), SHIFT_NAMES, np.full(2, options.prior_px), SEEN_IN_IMAGE, correct)
+
+
+def affine_block(number: int, view: View, options: OrientationOptions) -> Block:
+    """A shift of the image's centre, and what it grows by towards the borders."""
+    rows, cols = view.image.shape
+    middle, half = np.array([(cols - 1) / 2, (rows - 1) / 2]), np.array([cols / 2, rows / 2])
+
+    def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
+        growth = values[2:].reshape(2, 2) / half
+        constant = values[:2] - growth @ middle
+        column, row = ((float(c), float(g[0]), float(g[1])) for c, g in zip(constant, growth, strict=True))
+        return AffineModel(sensor, column, row)
+
+    sigma = np.append(np.full(2, options.prior_px), np.full(4, options.joint.sigma_affine_px))
+    return Block(AFFINE, (number,), SHIFT_NAMES + AFFINE_NAMES, sigma, SEEN_IN_IMAGE, correct)
+
+
+def pose_block(number: int, options: OrientationOptions) -> Block:
+    """Position and attitude of a frame camera, along and about its axes."""
+
+    def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
+        assert isinstance(sensor, FrameModel), "blocks fit their sensors"
+        return sensor.corrected(values[:3], values[3:])
+
+    return Block(POSE, (number,), POSE_NAMES, pose_sigma(options), SEEN_IN_SPACE, correct)
+
+
+def focal_block(numbers: Sequence[int], views: Sequence[View], sigma_px: float) -> Block:
+    """The focal length of some frame cameras."""
+
+    def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
+        assert isinstance(sensor, FrameModel), "blocks fit their sensors"
+        return replace(sensor, focal=sensor.focal + float(values[0]))
+
+    return Block(FOCAL, tuple(numbers), ("focal_px",), np.array([sigma_px]), SEEN_IN_SPACE, correct)
+
+
+def drift_block(numbers: Sequence[int], views: Sequence[View], options: OrientationOptions) -> Block:
+    """A slow error of a trajectory while its images were exposed: even for short ones, a spline for long ones."""
+    ends = [raw(views[i].sensor).lines.times[[0, -1]] for i in numbers]
+    start, end = float(np.min(ends)), float(np.max(ends))
+    n_knots = 1 + int(np.ceil((end - start) / options.joint.drift_s))
+    drift = Drift.zero(start, end, n_knots)
+
+    def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
+        assert isinstance(sensor, Scanner), "blocks fit their sensors"
+        return sensor.corrected(drift.with_parameters(values))
+
+    names = tuple(f"knot{k}_{name}" for k in range(n_knots) for name in POSE_NAMES)
+    return Block(DRIFT, tuple(numbers), names, np.tile(pose_sigma(options), n_knots), SEEN_IN_SPACE, correct)
+
+
+def pose_sigma(options: OrientationOptions) -> FloatArray:
+    """(6,) m and rad."""
+    joint = options.joint
+    return np.array([joint.sigma_position_m] * 3 + [np.deg2rad(joint.sigma_attitude_deg)] * 3)
+
+
+def same(
+    numbers: Sequence[int], views: Sequence[View], are_same: Callable[[SensorModel, SensorModel], bool]
+) -> list[list[int]]:
+    """Images in groups that share something."""
+    groups: list[list[int]] = []
+    for i in numbers:
+        for group in groups:
+            if are_same(views[group[0]].sensor, views[i].sensor):
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    return groups
+
+
+def same_trajectory(one: SensorModel, other: SensorModel) -> bool:
+    """Whether two line scanners flew together: the three lines of a camera."""
+    assert isinstance(one, Scanner), "callers make sure"
+    assert isinstance(other, Scanner), "callers make sure"
+    first, second = raw(one).trajectory, raw(other).trajectory
+    return all(
+        np.array_equal(getattr(first, name), getattr(second, name)) for name in ("times", "centres", "rotations")
+    )
+
+
+def same_lens(one: SensorModel, other: SensorModel) -> bool:
+    """Whether two frame cameras have the same interior orientation."""
+    assert isinstance(one, FrameModel), "callers make sure"
+    assert isinstance(other, FrameModel), "callers make sure"
+    names = ("focal", "principal_point", "aspect", "skew", "distortion")
+    return all(getattr(one, name) == getattr(other, name) for name in names)
+
+
+def raw(sensor: SensorModel) -> LineScanModel:
+    """The line scanner of a raw or rectified image."""
+    assert isinstance(sensor, Scanner), "callers make sure"
+    return sensor.raw if isinstance(sensor, RectifiedModel) else sensor
+
+
+def corrected_sensors(
+    blocks: Sequence[Block], sensors: Sequence[SensorModel], parameters: FloatArray
+) -> tuple[SensorModel, ...]:
+    """The sensors with parameters (p,) of all blocks, one after the other, in units of their sigma; where they are
+    all zero, the sensor itself."""
+    corrected, first = list(sensors), 0
+    for block in blocks:
+        values = parameters[first : first + len(block)] * block.sigma
+        first += len(block)
+        if values.any():
+            for i in block.views:
+                corrected[i] = block.correct(corrected[i], values)
+    return tuple(corrected)

@@ -1,0 +1,98 @@
+"""The demo: the built-in scene rendered, matched, and judged by its truth."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from zlocus.core.errors import InputError, OutputError
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress
+from zlocus.core.requests import DEMO_ACCURACY, DEMO_BEGUN, FINISHED, DsmRequest, held_files
+from zlocus.io.run_record import read_record, versions_record, write_record
+from zlocus.pipeline.dsm import run_dsm
+from zlocus.pipeline.execution.checkpoint import FOLDER as TILES
+from zlocus.pipeline.execution.precompile import kernels_compiling
+from zlocus.pipeline.preparing import made_folder
+from zlocus.products.demo_figure import picture_beside_truth
+
+if TYPE_CHECKING:
+    from zlocus.evaluation.evaluate import Evaluation
+    from zlocus.synthetic.files import RenderedScene
+    from zlocus.synthetic.scenes import SceneSpec
+
+DEMO_WORKERS = 2
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """out : folder of the products; evaluations : against the truth, within two ground pixels and within 1 m."""
+
+    out: Path
+    evaluations: tuple[Evaluation, ...]
+
+
+def run_demo(out: Path, progress: Progress) -> DemoResult:
+    """Render the built-in block (line scanners, six images in two strips), match it, and compare it with its truth.
+
+    A demo that was stopped goes on with the scene and the tiles that are there; one that was finished starts anew.
+
+    Raises
+    ------
+    OutputError
+        Where `out` holds a scene that no demo has rendered.
+    """
+    from zlocus.evaluation.evaluate import evaluate
+    from zlocus.synthetic.scenes import LEVEL_1_M, demo_spec
+
+    spec = demo_spec()
+    rendered = _demo_scene(spec, out, progress)
+    request = DsmRequest(inputs=rendered.inputs, out=out, resolution=spec.gsd_m, workers=DEMO_WORKERS)
+    result = run_dsm(request, RunConfig(), progress)
+    evaluations = (
+        evaluate(
+            result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, margin_m=0.0, threshold_m=limit
+        )
+        for limit in (2 * LEVEL_1_M, 1.0)
+    )
+    picture_beside_truth(result.out / "dsm.tif", rendered.truth_dsm, result.out / "demo.png")
+    return DemoResult(result.out, tuple(evaluations))
+
+
+def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene:
+    """The scene of a demo which was stopped, whose tiles are then left as they are; else a new one."""
+    from zlocus.synthetic.files import render_scene, scene_files
+    from zlocus.synthetic.linescan import TrajectoryNoise
+
+    # The files say how the aircraft flew, which is what the images saw.
+    flown = TrajectoryNoise()
+    made_of = hashlib.sha256(repr((spec, flown, versions_record())).encode()).hexdigest()
+    folder, begun, finished = out / "scene", out / DEMO_BEGUN, out / DEMO_ACCURACY
+    if folder.exists() and not finished.exists():
+        if not begun.exists():
+            raise OutputError(f"{folder} is there already, and not the scene of a demo. Choose another folder with -o.")
+        if _is_scene_of(begun, made_of):
+            progress.note(f"The scene in {folder} is that of a demo which was stopped: it is not rendered again.")
+            return scene_files(spec, folder, is_linescan=True)
+    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
+        # From here on the folder is a demo's, whose scene is not complete.
+        write_record(begun, {})
+        finished.unlink(missing_ok=True)
+        for name in (FINISHED, *held_files(out)):
+            (out / name).unlink(missing_ok=True)
+        for old in (folder, out / TILES):
+            shutil.rmtree(old, ignore_errors=True)
+        rendered = render_scene(spec, folder, lambda step: stage.advance(), flown)
+        write_record(begun, {"scene_sha256": made_of})
+    return rendered
+
+
+def _is_scene_of(begun: Path, made_of: str) -> bool:
+    """Whether a demo that was begun has rendered its scene, and this one."""
+    with suppress(InputError):  # damaged
+        return bool(read_record(begun).get("scene_sha256") == made_of)
+    return False

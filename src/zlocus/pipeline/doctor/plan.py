@@ -1,0 +1,117 @@
+"""What a full run would take: cells, tiles, memory and time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shapely import box
+
+from zlocus.core.errors import GeometryError
+from zlocus.core.grid import grid_from_bounds
+from zlocus.core.options import RunConfig
+from zlocus.core.requests import DoctorRequest
+from zlocus.core.resources import WORKER_BYTES
+from zlocus.core.scene import Scene
+from zlocus.matching.ground_pixels import check_resolution, default_cell
+from zlocus.matching.match_scene import settle
+from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
+from zlocus.pipeline.doctor.ties import QuickTies
+from zlocus.pipeline.execution.plan import plan_tiles, tile_needs
+from zlocus.pipeline.preparing import area_to_match
+from zlocus.pipeline.required_space import check_room
+
+# Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
+ROUGHLY = 3.0
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """A run with the options given.
+
+    cell_m, shape : of the products; heights, step_m, n_steps : of the search; tile_bytes : memory of one tile;
+    workers : tiles at a time, as asked and as memory and tiles allow; machine_bytes : memory of this machine, None
+    where it does not say; view_cells : cells times images that see them; seconds : of matching, a rough estimate.
+    """
+
+    cell_m: float
+    shape: tuple[int, int]
+    heights: tuple[float, float]
+    step_m: float
+    n_steps: int
+    n_tiles: int
+    tile_bytes: int
+    workers: int
+    machine_bytes: int | None
+    view_cells: float
+    seconds: float
+
+
+def run_plan(
+    request: DoctorRequest, config: RunConfig, scene: Scene, ties: QuickTies, outlines: Sequence[Any]
+) -> RunPlan:
+    """The plan of a surface. scene : its cameras corrected; outlines : footprint of each view.
+
+    Raises
+    ------
+    ConfigError, GeometryError, OutputError
+        Where a run would stop for the same reason.
+    """
+    z_range, z = ties.z_range, sum(ties.z_range) / 2
+    cell = request.resolution or default_cell(scene, z)
+    check_resolution(cell, scene, z, "--resolution")
+    bounds = area_to_match(scene, ties.orientation, z_range)
+    grid = grid_from_bounds(bounds, cell, scene.crs)
+    found = ties.orientation
+    settled = settle(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.measured)
+    matched = grid.window.within(settled.seen)
+    if not (matched.rows and matched.cols):
+        raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
+    check_room(request.out or Path(), grid, settled, settled.has_colours)
+    tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
+    needs = tile_needs(settled, tiles, config)
+    tile_bytes = int(needs.n_bytes + WORKER_BYTES)
+    fit = request.workers if request.memory_gb is None else int(request.memory_gb * 1e9 / tile_bytes)
+    workers = max(min(request.workers, fit, len(tiles)), 1)
+    area = box(*bounds)
+    view_cells = sum(outline.intersection(area).area for outline in outlines) / cell**2
+    return RunPlan(
+        cell_m=cell,
+        shape=(grid.window.rows, grid.window.cols),
+        heights=z_range,
+        step_m=settled.step_m,
+        n_steps=settled.n_steps,
+        n_tiles=len(tiles),
+        tile_bytes=tile_bytes,
+        workers=workers,
+        machine_bytes=machine_memory_bytes(),
+        view_cells=view_cells,
+        seconds=needs.seconds / min(workers, os.cpu_count() or 1),
+    )
+
+
+def machine_memory_bytes() -> int | None:
+    """Memory of this machine; None where it does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def plan_findings(plan: RunPlan, memory_gb: float | None) -> list[Finding]:
+    """Whether memory will do, in sentences."""
+    tile_gb, needed = plan.tile_bytes / 1e9, plan.tile_bytes * plan.workers
+    smaller = "set a smaller pyramid.tile in --config"
+    if memory_gb is not None and tile_gb > memory_gb:
+        sentence = f"--memory {memory_gb:g} GB is too little for one tile, which needs about {tile_gb:.1f} GB."
+        return [Finding(STOPS, f"{sentence} Allow more, or {smaller}.")]
+    if plan.machine_bytes is not None and needed > plan.machine_bytes:
+        sentence = (
+            f"{plan.workers} tiles at a time need about {needed / 1e9:.1f} GB, and this machine has "
+            f"{plan.machine_bytes / 1e9:.1f} GB."
+        )
+        return [Finding(POOR, f"{sentence} Use fewer --workers, give --memory, or {smaller}.")]
+    return []

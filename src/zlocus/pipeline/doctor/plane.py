@@ -1,0 +1,62 @@
+"""The plane that most of a local frame's tie points lie on: a wall, which the frame's z should stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from zlocus.core.scene import Scene, is_local
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.scene_file import read_scene_file, turn_to_axes
+from zlocus.orientation.orientation import Orientation, supported
+from zlocus.pipeline.doctor.findings import POOR, Finding
+from zlocus.sensors.frame import FrameModel
+
+TRIPLES, SEED, FEWEST_TIES = 500, 0, 50
+ENOUGH_TIES = 2000  # that choose among the planes, about: up to twice as many
+# Distance from the plane, as a share of the ties' median distance from their middle, and share of the ties within it.
+NEAR_SHARE, LEAST_ON_PLANE = 0.02, 0.3
+# Cells that are tilted more than this against a wall see it at a slant.
+MOST_TILT_DEG = 15.0
+
+
+def plane_findings(scene: Scene, inputs: Sequence[Path], found: Orientation) -> list[Finding]:
+    """Whether another direction than the frame's would suit what the images show; named in the axes of the file."""
+    centres = [view.sensor.centre for view in scene.views if isinstance(view.sensor, FrameModel)]
+    ties = found.xyz[supported(found.xyz, found.sigma_z_m)]
+    if not is_local(scene.crs) or not centres or len(ties) < FEWEST_TIES:
+        return []
+    normal, share = main_plane(ties)
+    normal *= np.sign(normal @ (np.mean(centres, axis=0) - ties.mean(axis=0)))
+    tilt = float(np.rad2deg(np.arccos(np.clip(normal[2], -1.0, 1.0))))
+    if share < LEAST_ON_PLANE or tilt < MOST_TILT_DEG:
+        return []
+    frame = read_scene_file(inputs[0]).frame
+    if frame is not None and frame.up is not None:
+        normal = turn_to_axes(frame.up, frame.north).T @ normal
+    up = ", ".join(f"{v:.3f}" for v in normal + 0.0)
+    return [
+        Finding(
+            POOR,
+            f"{100 * share:.0f} % of the tie points lie on a plane that is tilted by {tilt:.0f} degrees against the "
+            f"frame's. If the surface of that plane is wanted, write frame: {{local: true, up: [{up}]}} in the scene "
+            "file.",
+        )
+    ]
+
+
+def main_plane(xyz: FloatArray) -> tuple[FloatArray, float]:
+    """Unit normal (3,) of the plane that most points (n, 3) are near, and their share: the best of planes through three
+    points each, fitted to those near it."""
+    triples = xyz[np.random.default_rng(SEED).integers(len(xyz), size=(TRIPLES, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals, starts = normals[length > 0] / length[length > 0, None], triples[length > 0, 0]
+    near = NEAR_SHARE * float(np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)))
+    few = xyz[:: max(len(xyz) // ENOUGH_TIES, 1)]
+    k = (np.abs(few @ normals.T - (starts * normals).sum(axis=1)) < near).sum(axis=0).argmax()
+    best = xyz[np.abs((xyz - starts[k]) @ normals[k]) < near]
+    normal = np.linalg.svd(best - best.mean(axis=0), full_matrices=False)[2][2]
+    return normal, float((np.abs((xyz - best.mean(axis=0)) @ normal) < near).mean())

@@ -1,0 +1,219 @@
+"""The diagnosis as text and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from zlocus.core.footprints import PairGeometry, ViewGeometry
+from zlocus.core.scene import View
+from zlocus.io.scene_file import Refused
+from zlocus.orientation.orientation import PairOrientation, ViewOrientation
+from zlocus.orientation.parameter_groups import kind_of
+from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding, worst
+from zlocus.pipeline.doctor.plan import ROUGHLY, RunPlan
+from zlocus.pipeline.doctor.quality import ImageQuality, percent
+from zlocus.pipeline.doctor.ties import QuickTies
+
+MOST_PAIRS = 30
+HEADINGS = {STOPS: "What will not work", POOR: "What may go wrong", NOTE: "Also"}
+VERDICT_WORDS = {STOPS: "fails", POOR: "doubtful", NOTE: "good"}
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All that was found, as far as the inputs let it be found.
+
+    views, quality : of the same length, None for an image that cannot be read; geometry : as long as views, or empty;
+    pairs : of views that share ground; refused : views that could not be opened.
+    """
+
+    views: tuple[View, ...]
+    quality: tuple[ImageQuality | None, ...]
+    geometry: tuple[ViewGeometry, ...]
+    pairs: tuple[PairGeometry, ...]
+    ties: QuickTies | None
+    plan: RunPlan | None
+    refused: tuple[Refused, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def will_fail(self) -> bool:
+        """Whether a run would stop."""
+        return worst(self.findings) == STOPS
+
+    @property
+    def names(self) -> list[str]:
+        """Of the views."""
+        return [view.name for view in self.views]
+
+    @property
+    def text(self) -> str:
+        """A report to be read."""
+        quick = (
+            "" if self.ties is None or not self.ties.is_quick else "Ties are of a quick pass: a run finds more of them."
+        )
+        parts = [_table("Images", _view_rows(self)), _table("Pairs", _pair_rows(self)), quick, *_plan_lines(self)]
+        for level, heading in HEADINGS.items():
+            told = [f"- {finding.sentence}" for finding in self.findings if finding.level == level]
+            parts.append("\n".join([heading, *told]) if told else "")
+        return "\n\n".join([part for part in parts if part] + [VERDICTS[worst(self.findings)]])
+
+    def as_dict(self) -> dict[str, Any]:
+        """For doctor.json."""
+        return {
+            "verdict": VERDICT_WORDS[worst(self.findings)],
+            "findings": [
+                {"level": finding.level, "views": list(finding.about), "sentence": finding.sentence}
+                for finding in self.findings
+            ],
+            "views": {view.name: self.view_record(i) for i, view in enumerate(self.views)},
+            "refused": {each.name: {"path": str(each.path), "reason": each.reason} for each in self.refused},
+            "pairs": [self.pair_record(pair) for pair in self.pairs],
+            "quick_ties": None if self.ties is None else self.ties.is_quick,
+            "plan": None if self.plan is None else _plan_record(self.plan),
+        }
+
+    def view_record(self, number: int) -> dict[str, Any]:
+        """What is known of a view."""
+        view, quality = self.views[number], self.quality[number]
+        record: dict[str, Any] = {
+            "path": str(view.path),
+            "sensor": kind_of(view.sensor),
+            "shape": list(view.image.shape),
+        }
+        if quality is not None:
+            record |= {
+                "nodata": _rounded(quality.nodata),
+                "saturated": _rounded(quality.saturated),
+                "black": _rounded(quality.black),
+                "edge_px": _rounded(quality.edge_px),
+            }
+        if self.geometry:
+            found = self.geometry[number]
+            record |= {
+                "ground_px_m": _rounded(found.ground_px_m),
+                "closing_px": _rounded(found.closing_px, 6),
+                "not_mapped": _rounded(found.lost),
+            }
+        oriented = self.oriented(number)
+        if oriented is not None:
+            record |= {
+                "n_ties": oriented.n_ties,
+                "shift_px": [_rounded(shift) for shift in oriented.shift_px],
+                "residual_before_px": oriented.before.as_dict(),
+                "residual_after_px": oriented.after.as_dict(),
+            }
+        return record
+
+    def pair_record(self, pair: PairGeometry) -> dict[str, Any]:
+        """What is known of a pair."""
+        found = self.tied(pair)
+        return {
+            "views": [self.names[i] for i in pair.views],
+            "overlap": _rounded(pair.overlap),
+            "base_to_height": _rounded(pair.base_to_height),
+            "n_ties": None if self.ties is None else 0 if found is None else found.n_ties,
+            "across_before_px": None if found is None else _rounded(found.across_before_px),
+            "across_after_px": None if found is None else _rounded(found.across_after_px),
+        }
+
+    def oriented(self, number: int) -> ViewOrientation | None:
+        """What the ties say of a view."""
+        return None if self.ties is None else self.ties.orientation.views[number]
+
+    def tied(self, pair: PairGeometry) -> PairOrientation | None:
+        """What the ties say of a pair; None without any."""
+        found = () if self.ties is None else self.ties.orientation.pairs
+        wanted = {self.names[i] for i in pair.views}
+        return next((each for each in found if set(each.views) == wanted), None)
+
+
+def _view_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
+    yield (
+        "name", "sensor", "rows x cols", "ground pixel", "nodata", "saturated", "black", "edges", "ties", "off before",
+        "off after",
+    )  # fmt: skip
+    greys: tuple[str, ...]
+    ties: tuple[str, ...]
+    for i, view in enumerate(found.views):
+        quality, oriented = found.quality[i], found.oriented(i)
+        greys = ("-",) * 4
+        if quality is not None:
+            shares = (percent(share) for share in (quality.nodata, quality.saturated, quality.black))
+            greys = (*shares, _unit(quality.edge_px, "px"))
+        ties = ("-",) * 3
+        if oriented is not None:
+            ties = (str(oriented.n_ties), *(_unit(each.median, "px") for each in (oriented.before, oriented.after)))
+        pixel = _unit(found.geometry[i].ground_px_m, "m") if found.geometry else "-"
+        rows, cols = view.image.shape
+        yield view.name, kind_of(view.sensor), f"{rows} x {cols}", pixel, *greys, *ties
+    for refused in found.refused:
+        yield (refused.name, "cannot be used", *("-",) * 9)
+
+
+def _pair_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
+    yield "pair", "overlap", "base-to-height", "ties", "off before", "off after"
+    largest = sorted(found.pairs, key=lambda pair: -pair.overlap)
+    for pair in largest[:MOST_PAIRS]:
+        tied = found.tied(pair)
+        ties = ("-" if found.ties is None else "0", "-", "-")
+        if tied is not None:
+            ties = (str(tied.n_ties), _unit(tied.across_before_px, "px"), _unit(tied.across_after_px, "px"))
+        names = " - ".join(found.names[i] for i in pair.views)
+        yield names, percent(pair.overlap), f"{pair.base_to_height:.2f}", *ties
+    if len(largest) > MOST_PAIRS:
+        yield f"and {len(largest) - MOST_PAIRS} pairs that overlap less (see doctor.json)", *("",) * 5
+
+
+def _plan_lines(found: Diagnosis) -> Iterator[str]:
+    plan = found.plan
+    if plan is None:
+        return
+    low, high = plan.heights
+    rows, cols = plan.shape
+    memory = f"{plan.tile_bytes * plan.workers / 1e9:.2f} GB"
+    machine = "" if plan.machine_bytes is None else f"; this machine has {plan.machine_bytes / 1e9:.1f} GB"
+    which = "A full run of the images that can be used" if found.refused else "A full run"
+    yield "\n".join(
+        [
+            which,
+            f"- searches heights from {low:.1f} to {high:.1f} m, {plan.n_steps} steps of {plan.step_m:.2g} m;",
+            f"- makes {rows} x {cols} cells of {plan.cell_m:g} m in {plan.n_tiles} tiles, {plan.workers} at a time;",
+            f"- needs about {memory} for its tiles{machine};",
+            f"- matches for about {duration(plan.seconds)}. This is a rough estimate, {plan.view_cells / 1e6:.2g} "
+            f"million cells times images at the rate of the benchmarks; it may be {ROUGHLY:g} times as long or short.",
+        ]
+    )
+
+
+def _plan_record(plan: RunPlan) -> dict[str, Any]:
+    record = {name: _rounded(value) if isinstance(value, float) else value for name, value in vars(plan).items()}
+    return record | {"shape": list(plan.shape), "heights": [_rounded(z) for z in plan.heights], "rough_factor": ROUGHLY}
+
+
+def _table(heading: str, rows: Iterator[Sequence[str]]) -> str:
+    """Rows of cells under a heading, columns aligned; nothing without a row."""
+    cells = list(rows)
+    if len(cells) < 2:
+        return ""
+    widths = [max(map(len, column)) for column in zip(*(row for row in cells if row[1]), strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    return "\n".join([heading, *(f"  {line}" for line in lines)])
+
+
+def _unit(value: float, unit: str) -> str:
+    return f"{value:.2f} {unit}" if math.isfinite(value) else "-"
+
+
+def duration(seconds: float) -> str:
+    """A rough time: 8 s, 5 min, 3.5 h."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _rounded(value: float, digits: int = 4) -> float | None:
+    return round(float(value), digits) if math.isfinite(value) else None

@@ -1,0 +1,192 @@
+"""The order of a look at the inputs: images, overlap, ties, geometry, plan. What fails is told, the rest goes on."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from zlocus.core.errors import ZlocusError, ZlocusWarning
+from zlocus.core.footprints import PairGeometry, ViewGeometry, pair_geometries, view_geometry
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress
+from zlocus.core.requests import DoctorRequest
+from zlocus.core.scene import Scene, check_overlap
+from zlocus.io.run_record import write_record
+from zlocus.io.scene_file import Usable, open_usable
+from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
+from zlocus.pipeline.doctor.geometry import geometry_findings
+from zlocus.pipeline.doctor.plan import plan_findings, run_plan
+from zlocus.pipeline.doctor.plane import plane_findings
+from zlocus.pipeline.doctor.quality import image_quality, quality_findings
+from zlocus.pipeline.doctor.report import Diagnosis
+from zlocus.pipeline.doctor.ties import QuickTies, quick_ties, tie_findings
+from zlocus.pipeline.preparing import asked_crs, made_folder, possible_heights
+from zlocus.pipeline.required_space import check_room_before_ties
+from zlocus.products.footprints import footprints_picture, write_footprints
+
+REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
+T = TypeVar("T")
+
+
+@dataclass
+class Told:
+    """Findings so far."""
+
+    findings: list[Finding] = field(default_factory=list)
+
+    @contextmanager
+    def warned(self) -> Iterator[None]:
+        """Keep what is warned of meanwhile."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", ZlocusWarning)
+            try:
+                yield
+            finally:
+                ours = [each.message for each in caught if issubclass(each.category, ZlocusWarning)]
+                self.findings += [Finding(POOR, str(message)) for message in ours]
+
+    def tried(self, step: Callable[[], T], about: tuple[str, ...] = ()) -> T | None:
+        """What a step gives; where it fails a run would too, and its sentence is kept."""
+        with self.warned():
+            try:
+                return step()
+            except ZlocusError as error:
+                self.findings.append(Finding(STOPS, str(error), about))
+                return None
+
+    def refuses(self, check: Callable[[], object]) -> bool:
+        """Whether a check fails, as a run would."""
+        before = len(self.findings)
+        self.tried(check)
+        return any(finding.level == STOPS for finding in self.findings[before:])
+
+
+def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) -> Diagnosis:
+    """Look at the inputs of a run, and write what was found to `request.out` where that is given.
+
+    Raises
+    ------
+    InputError, ConfigError, OutputError
+        Where nothing can be looked at, or written.
+    """
+    told = Told()
+    with progress.stage("Opening images"), told.warned():
+        usable = open_usable(request.inputs, asked_crs(request.crs))
+    told.findings += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
+    scene = usable.scene
+    if scene is None:
+        diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, tuple(told.findings))
+    else:
+        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+        diagnosis = examined(request, config, scene, usable, told, progress)
+    if request.out is not None:
+        write_diagnosis(request.out, diagnosis, scene)
+    return diagnosis
+
+
+def examined(
+    request: DoctorRequest, config: RunConfig, scene: Scene, usable: Usable, told: Told, progress: Progress
+) -> Diagnosis:
+    """All that can be found of the views that could be opened."""
+    names = [view.name for view in scene.views]
+    quality = []
+    with progress.stage("Image quality", len(names)) as stage:
+        for view in scene.views:
+            quality.append(told.tried(lambda view=view: image_quality(view.image), (view.name,)))  # type: ignore[misc]
+            stage.advance()
+    known = [(name, found) for name, found in zip(names, quality, strict=True) if found is not None]
+    told.findings += quality_findings([name for name, _ in known], [found for _, found in known])
+    geometry: tuple[ViewGeometry, ...] = ()
+    pairs: tuple[PairGeometry, ...] = ()
+    ties = plan = None
+    if len(names) < 2:
+        told.findings.append(Finding(STOPS, f"Only {names[0]} can be used, and a surface needs two images or more."))
+        levels = None
+    else:
+        asked = request.heights or scene.heights
+        levels = told.tried(lambda: possible_heights(scene, asked))
+    if levels is not None:
+        within = replace(scene, heights=asked)
+        room = partial(check_room_before_ties, request.out or Path(), within, request.resolution, None, None)
+        has_room = not told.refuses(room)
+        ties = found_ties(scene, levels, config, asked, told, progress) if all(quality) and has_room else None
+        corrected = scene if ties is None else ties.orientation.apply(scene)
+        z = ground_height(ties, levels)
+        geometry = tuple(view_geometry(view, z) for view in corrected.views)
+        pairs = tuple(pair_geometries(corrected.views, [each.outline for each in geometry], z))
+        told.findings += geometry_findings(names, geometry, pairs)
+        if ties is not None:
+            told.findings += tie_findings(names, ties.orientation, pairs, config.orientation)
+            told.findings += plane_findings(corrected, request.inputs, ties.orientation)
+            plan = planned(request, config, corrected, ties, geometry, told)
+    return Diagnosis(
+        scene.views, tuple(quality), geometry, pairs, ties, plan, usable.refused, tuple(dict.fromkeys(told.findings))
+    )
+
+
+def found_ties(
+    scene: Scene,
+    levels: list[float],
+    config: RunConfig,
+    asked: tuple[float, float] | None,
+    told: Told,
+    progress: Progress,
+) -> QuickTies | None:
+    """The quick pass over ties, where images overlap at all."""
+    if told.refuses(lambda: check_overlap(scene, levels)):
+        return None
+    return told.tried(lambda: quick_ties(scene, config, asked, progress))
+
+
+def ground_height(ties: QuickTies | None, levels: Sequence[float]) -> float:
+    """Where the ground is, m: the median of the ties, or else of the heights that are possible."""
+    if ties is not None and len(ties.orientation.xyz):
+        z = float(np.nanmedian(ties.orientation.xyz[:, 2]))
+        if np.isfinite(z):
+            return z
+    return float(np.median(levels))
+
+
+def planned(
+    request: DoctorRequest,
+    config: RunConfig,
+    corrected: Scene,
+    ties: QuickTies,
+    geometry: Sequence[ViewGeometry],
+    told: Told,
+) -> Any:
+    """The plan of a run, unless it would fail before."""
+    plan = told.tried(lambda: run_plan(request, config, corrected, ties, [each.outline for each in geometry]))
+    if plan is not None:
+        told.findings += plan_findings(plan, request.memory_gb)
+    return plan
+
+
+def write_diagnosis(out: Path, diagnosis: Diagnosis, scene: Scene | None) -> None:
+    """doctor.json, and footprints where they are known; those of an earlier look go.
+
+    Raises
+    ------
+    OutputError
+        Where they cannot be written.
+    """
+    with made_folder(out):
+        for name in (FOOTPRINTS, PICTURE):
+            (out / name).unlink(missing_ok=True)
+        if scene is not None and diagnosis.geometry:
+            outlines = [each.outline for each in diagnosis.geometry]
+            features = [
+                (outline, {"kind": "image", "name": view.name, **diagnosis.view_record(i)})
+                for i, (view, outline) in enumerate(zip(diagnosis.views, outlines, strict=True))
+            ]
+            features += [(pair.shared, {"kind": "overlap", **diagnosis.pair_record(pair)}) for pair in diagnosis.pairs]
+            write_footprints(out / FOOTPRINTS, features, scene.crs)
+            footprints_picture(out / PICTURE, outlines, diagnosis.names)
+        write_record(out / REPORT, diagnosis.as_dict())

@@ -1,0 +1,118 @@
+"""A quick pass over the tie points: fewer features than a run takes, the same adjustment and residuals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from zlocus.core.errors import GeometryError
+from zlocus.core.footprints import PairGeometry
+from zlocus.core.options import OrientationOptions, RunConfig
+from zlocus.core.progress import Progress
+from zlocus.core.scene import Scene, held_window
+from zlocus.orientation.orientation import Orientation
+from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding, poor
+from zlocus.pipeline.preparing import PAIR, heights_asked_for, heights_of_ties, oriented
+
+QUICK_FEATURES = 4000
+# Images above this size are reduced by twice as much as for a run.
+LARGE_MPX, LARGE_DETAIL = 4.0, 1.0 / 16.0
+# Limits of what is told.
+EXPECTED_OVERLAP = 0.2
+FEW_TIES = 30
+NEAR_LIMIT = 0.7
+
+
+@dataclass(frozen=True)
+class QuickTies:
+    """orientation : as a run finds it; z_range : heights (m) that a run would search; is_quick : with fewer features
+    than a run."""
+
+    orientation: Orientation
+    z_range: tuple[float, float]
+    is_quick: bool
+
+
+def quick_options(options: OrientationOptions, scene: Scene) -> OrientationOptions:
+    """The options with fewer features, and less detail of large images."""
+    largest = max(math.prod(held_window(view.image)[2:]) for view in scene.views) / 1e6
+    detail = options.full_detail_mpx * (LARGE_DETAIL if largest > LARGE_MPX else 1.0)
+    return replace(
+        options,
+        features_per_image=min(options.features_per_image, QUICK_FEATURES),
+        full_detail_mpx=max(detail, 1e-3),
+    )
+
+
+def quick_ties(scene: Scene, config: RunConfig, asked: tuple[float, float] | None, progress: Progress) -> QuickTies:
+    """Ties and the heights that a run would search; with all features where few tie not every image.
+
+    asked : heights (m) of the request or of the scene file.
+
+    Raises
+    ------
+    GeometryError
+        Where a run would find too few ties to go on.
+    """
+    quick = quick_options(config.orientation, scene)
+    if quick != config.orientation:
+        try:
+            found = _ties(scene, quick, asked, progress, is_quick=True)
+        except GeometryError:
+            pass
+        else:
+            if all(view.n_ties for view in found.orientation.views):
+                return found
+    return _ties(scene, config.orientation, asked, progress, is_quick=False)
+
+
+def _ties(
+    scene: Scene,
+    options: OrientationOptions,
+    asked: tuple[float, float] | None,
+    progress: Progress,
+    is_quick: bool,
+) -> QuickTies:
+    found = oriented(scene, options, asked, progress)
+    corrected = found.apply(scene)
+    z_range = heights_of_ties(corrected, found, options) if asked is None else heights_asked_for(scene, asked, progress)
+    return QuickTies(found, z_range, is_quick)
+
+
+def tie_findings(
+    names: Sequence[str], found: Orientation, pairs: Sequence[PairGeometry], options: OrientationOptions
+) -> list[Finding]:
+    """What the ties let expect, in sentences."""
+    findings = []
+    left_out = {each.name: each.reason for each in found.left_out}
+    for view in found.views:
+        moved = max(map(abs, view.shift_px))
+        if view.name in left_out:
+            sentence = f"it takes no part: {left_out[view.name]}"
+        elif view.n_ties < FEW_TIES:
+            sentence = f"only {view.n_ties} tie points hold its camera. Its correction may be off."
+        elif NEAR_LIMIT * options.max_pointing_px < moved <= options.max_pointing_px:
+            sentence = (
+                f"its camera is off by {moved:.0f} px, close to the {options.max_pointing_px:g} px within which ties "
+                "are looked for. Set a larger orientation.max_pointing_px in --config."
+            )
+        else:
+            continue
+        findings.append(poor(view.name, sentence))
+    if len(found.views) - len(left_out) < PAIR:
+        findings.append(Finding(STOPS, "No two images are held together by tie points: a run will match nothing."))
+    findings += [Finding(STOPS if doubt.is_grave else POOR, doubt.sentence) for doubt in found.doubts]
+    tied = {frozenset(pair.views) for pair in found.pairs}
+    for pair in pairs:
+        a, b = (names[i] for i in pair.views)
+        if pair.overlap > EXPECTED_OVERLAP and frozenset((a, b)) not in tied and not {a, b} & left_out.keys():
+            findings.append(
+                Finding(
+                    POOR,
+                    f"{a} and {b} share {100 * pair.overlap:.0f} % of their ground, but no tie point was found in "
+                    "both: they look too different (season, light, direction) to be matched well.",
+                    (a, b),
+                )
+            )
+    return findings

@@ -1,0 +1,159 @@
+"""Compiles the kernels ahead, in processes of their own, while something else runs: the cache on disk serves all.
+
+`python -m zlocus.pipeline.execution.precompile GROUP` runs one group of kernels on a scene of a few cells.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from zlocus.core.grid import CellWindow
+from zlocus.core.options import RunConfig
+from zlocus.core.scene import ImageWindow, View
+from zlocus.core.sensor_model import FloatArray
+from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.radiometry import GreyScale
+from zlocus.pipeline.execution.processes import kernel_cache
+
+GROUPS = ("orient", "match", "refine")
+FOR_ANOTHER = (
+    "import sys; from zlocus.pipeline.execution.precompile import warm_for_another; warm_for_another(sys.argv[1])"
+)
+SIDE = 96
+
+
+@contextmanager
+def kernels_compiling() -> Iterator[None]:
+    """Kernels compile while the block runs; at its end they are ready."""
+    running = []
+    try:
+        for group in GROUPS:
+            command = [sys.executable, "-c", FOR_ANOTHER, group]
+            # What it prints is not asked for; its input ends when this process does, and so does it.
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                env=os.environ | kernel_cache(),
+            )  # fmt: skip
+            running.append(process)
+        yield
+        for process in running:
+            process.wait()
+    finally:
+        for process in running:
+            process.kill()
+            process.communicate()
+
+
+@dataclass(frozen=True)
+class SlantedCamera:
+    """Parallel rays: column = E + by_height z, row = -N."""
+
+    by_height: float
+
+    def image_from_ground(self, xyz: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return np.column_stack([xyz[:, 0] + self.by_height * xyz[:, 2], -xyz[:, 1]])
+
+    def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
+        """See `SensorModel`."""
+        return np.column_stack([xy[:, 0] - self.by_height * z, -xy[:, 1], np.broadcast_to(z, len(xy))])
+
+    def height_bounds(self) -> tuple[float, float] | None:
+        """See `SensorModel`."""
+        return None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """An image of noise."""
+
+    seed: int
+    shape: tuple[int, int] = (SIDE, SIDE)
+    dtype: str = "float32"
+
+    def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+        """See `ImageSource`."""
+        pixels = np.random.default_rng(self.seed).normal(size=self.shape).astype(np.float32)
+        part = np.ascontiguousarray(pixels[row : row + rows, col : col + cols])
+        return ImageWindow(part, np.ones(part.shape, bool))
+
+
+def tiny_scene() -> MatchScene:
+    """Two images of noise over 96 x 96 cells."""
+    views = tuple(View(f"v{i}", Path(f"v{i}"), Noise(i), SlantedCamera(0.5 * i)) for i in range(2))
+    return MatchScene(
+        views=views, anchor=(0.0, 0.0), cell_m=1.0, origin_m=0.0, step_m=1.0, n_steps=16, levels=2,
+        seen=CellWindow(0, 0, SIDE, SIDE), grey=(GreyScale(0.0, 1.0),) * 2, ties=np.zeros((0, 3)),
+    )  # fmt: skip
+
+
+def warm_orientation(scene: MatchScene) -> None:
+    """Run the kernels of the orientation once."""
+    from zlocus.orientation.epipolar import Sightlines, trace
+    from zlocus.orientation.sift import DESCRIPTOR_LENGTH, Features
+    from zlocus.orientation.tie_refinement import sharpened
+    from zlocus.orientation.ties import match_near_loci
+    from zlocus.orientation.triangulate import Observations, ground_jacobian
+
+    sensors, options = [view.sensor for view in scene.views], RunConfig().orientation
+    xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
+    features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
+    loci = trace(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
+    for moved in (loci, loci.moved(np.zeros(2))):
+        match_near_loci(moved, features.only(point), features, options.inlier_px, options.match_ratio)
+    seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
+    ground = sensors[0].ground_from_image(xy, np.zeros(4))
+    sharpened(scene.views, seen, ground_jacobian(sensors, seen, ground), options)
+
+
+def warm(group: str) -> None:
+    """Run a group of kernels once: `orient` those of the orientation, `match` everything up to the finest level's
+    heights, `refine` what follows."""
+    from zlocus.matching import tile
+    from zlocus.matching.kernels.spline import spline_coefficients
+    from zlocus.matching.subpixel import refine
+    from zlocus.matching.tile_views import read_pixels, tile_views
+    from zlocus.matching.view_ranking import Samples
+
+    scene, config = tiny_scene(), RunConfig()
+    if group == "orient":
+        warm_orientation(scene)
+        return
+    if group == "match":
+        without = replace(config, refine=replace(config.refine, rounds=0))
+        tile.match_tile(scene, scene.seen, without)
+        return
+    pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey[0]) for view in scene.views]
+    shape, block = (SIDE, SIDE), config.pyramid.block
+    views = tile_views(pixels, 0, scene.transform(scene.seen, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
+    for view in pixels:
+        spline_coefficients(view.pixels[0])
+    Samples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(views, 0, slice(None))
+    seen = np.zeros((3, 2, *shape), np.int32)
+    seen[1] = 16
+    refine(views, views.pixels, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
+
+
+def _leave_after_input() -> None:
+    """End this process when the one that started it has ended, however that was."""
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def warm_for_another(group: str) -> None:
+    """Run a group of kernels once, unless the process that holds the input of this one ends before."""
+    threading.Thread(target=_leave_after_input, daemon=True).start()
+    warm(group)
+
+
+if __name__ == "__main__":
+    warm(sys.argv[1])

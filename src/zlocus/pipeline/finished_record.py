@@ -1,0 +1,120 @@
+"""finished.json: what a finished run depends on, and the checksum of each of its products."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from zlocus.core.errors import InputError
+from zlocus.core.requests import FINISHED
+from zlocus.io.run_record import finite_only, write_record
+from zlocus.io.safe_documents import read_json
+from zlocus.pipeline.execution.event_log import NAME as EVENTS
+from zlocus.products.stac_item import PRODUCTS
+
+ITEM = "item.json"
+SCHEMA = 1
+# The log of events is for watching a run: nothing depends on it.
+CHECKED = (*(product.name for product in PRODUCTS if product.name != EVENTS), ITEM)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run.
+
+    key : all that it depends on, by name, empty where the file is damaged; checksums : of each of its products, by the
+    name of the file; shortcoming : why it is no success unless that is accepted, "" where it is one.
+    """
+
+    key: dict[str, Any]
+    checksums: dict[str, str]
+    shortcoming: str = ""
+
+
+def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "") -> None:
+    """Say that the run in a folder is finished, with the checksums of all products that are there. key, shortcoming :
+    see `Finished`.
+
+    Raises
+    ------
+    OutputError
+        Where the file cannot be written.
+    """
+    checksums = {name: checksum(out / name) for name in CHECKED if (out / name).is_file()}
+    _write(out, Finished(dict(key), checksums, shortcoming))
+
+
+def read_finished(out: Path) -> Finished | None:
+    """What `write_finished` wrote; None where there is no such file."""
+    if not (out / FINISHED).exists():
+        return None
+    damaged = Finished({}, {})
+    try:
+        found = read_json(out / FINISHED)
+    except InputError:
+        return damaged
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        return damaged
+    key, checksums = found.get("key"), found.get("products")
+    if not isinstance(key, dict) or not isinstance(checksums, dict):
+        return damaged
+    known = {name: str(digest) for name, digest in checksums.items() if name in CHECKED}
+    return Finished(key, known, str(found.get("shortcoming", "")))
+
+
+def update_finished(out: Path, names: Iterable[str]) -> None:
+    """Take the checksums of products that were made again, if the folder holds a finished run; the others stay.
+
+    Raises
+    ------
+    OutputError
+        Where the file cannot be written.
+    """
+    found = read_finished(out)
+    if found is None or not found.key:
+        return
+    made = {name: checksum(out / name) for name in names if name in CHECKED and (out / name).is_file()}
+    _write(out, replace(found, checksums=found.checksums | made))
+
+
+def comparable(key: Mapping[str, Any]) -> dict[str, Any]:
+    """A key as it comes back from the file."""
+    return dict(json.loads(json.dumps(finite_only(dict(key)))))
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a product: of its bytes; of a GeoPackage that of its rows, for programs write to it that only look."""
+    if path.suffix == ".gpkg" and (found := _checksum_of_layers(path)):
+        return found
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _checksum_of_layers(path: Path) -> str:
+    """SHA-256 of the rows of all layers of a GeoPackage; "" where it cannot be read as one."""
+    digest = hashlib.sha256()
+    try:
+        # As it is, without looking for what another program is writing to it.
+        address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(address, uri=True)) as database:
+            layers = "SELECT table_name, srs_id FROM gpkg_contents WHERE data_type = 'features' ORDER BY table_name"
+            for layer, srs in database.execute(layers).fetchall():
+                name = str(layer).replace('"', '""')
+                rows = database.execute(f'SELECT * FROM "{name}" ORDER BY rowid')
+                digest.update(repr((layer, srs, [column[0] for column in rows.description])).encode())
+                for row in rows:
+                    digest.update(repr(row).encode())
+    except sqlite3.Error:
+        return ""
+    return digest.hexdigest()
+
+
+def _write(out: Path, finished: Finished) -> None:
+    record = {"key": finished.key, "products": finished.checksums, "shortcoming": finished.shortcoming}
+    write_record(out / FINISHED, {"schema": SCHEMA, **record})

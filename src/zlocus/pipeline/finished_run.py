@@ -1,0 +1,192 @@
+"""The same command given again after success: what is there is checked, and what is missing of it is made again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from zlocus.core.errors import OutputError
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress
+from zlocus.core.requests import FINISHED, DsmRequest, held_files
+from zlocus.io.run_record import read_record
+from zlocus.pipeline.execution.checkpoint import TileStore, difference
+from zlocus.pipeline.fingerprint import digest_of
+from zlocus.pipeline.finished_record import ITEM, Finished, checksum, comparable, read_finished, update_finished
+from zlocus.pipeline.preparing import oriented
+from zlocus.pipeline.setup import Opened, settled_run
+from zlocus.products.derived import FILES, link_all, make_maps
+from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
+from zlocus.products.tie_layers import write_ties
+from zlocus.products.tie_observations import OBSERVATIONS, read_observations, write_observations
+
+# Products that only matching makes.
+MATCHED = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", RANKING, RECORD)
+TIES = "ties.gpkg"
+# Products that are made of the tie points, which are kept, or found again.
+OF_TIES = (TIES, OBSERVATIONS, FOOTPRINTS, CURVES)
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Products of a finished run that are not there.
+
+    matched : names of the files that only matching makes; of_ties : of those that the tie points make; maps : of maps,
+    as --products has them; report, item : whether that is missing.
+    """
+
+    matched: tuple[str, ...]
+    of_ties: tuple[str, ...]
+    maps: tuple[str, ...]
+    report: bool
+    item: bool
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of all of them that can be made without matching."""
+        ends = (REPORT,) * self.report + (ITEM,) * self.item
+        return (*self.of_ties, *(FILES[name] for name in self.maps), *ends)
+
+
+def finished_run(request: DsmRequest, store: TileStore) -> Finished | None:
+    """The finished run that a request's folder holds, where it is the one asked for; None where it holds none, or may
+    be overwritten.
+
+    store : of the request; where it has tiles of the same run, that one was allowed to replace what is there.
+
+    Raises
+    ------
+    OutputError
+        Where the folder holds another run, or the same one that is not to be taken as it is.
+    """
+    out = request.out
+    if request.overwrite:
+        return None
+    found, held = read_finished(out), held_files(out)
+    if found is None:
+        if held and not store.is_of_this_run:
+            raise OutputError(
+                f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite."
+            )
+        return None
+    differs = difference(found.key, comparable(store.key)) if found.key else f"its {FINISHED} is damaged"
+    if differs:
+        if store.is_of_this_run:
+            return None
+        raise OutputError(f"{out} holds another run: {differs}. Choose another folder, or add --overwrite.")
+    if not request.resume:
+        raise OutputError(
+            f"{out} holds this run, already finished, which --no-resume asks not to take. Leave --no-resume out, or "
+            "add --overwrite to make it anew."
+        )
+    return found
+
+
+def missing_products(request: DsmRequest, found: Finished, progress: Progress) -> Missing:
+    """What is missing of a finished run, and of what is asked for now.
+
+    Raises
+    ------
+    OutputError
+        A product is not what the run wrote.
+    """
+    out, gone, other = request.out, set[str](), list[str]()
+    with progress.stage("Checking products", len(found.checksums)) as stage:
+        for name, digest in found.checksums.items():
+            if not (out / name).is_file():
+                gone.add(name)
+            elif checksum(out / name) != digest:
+                other.append(name)
+            stage.advance()
+    if other:
+        it, is_not = ("them", "are not") if len(other) > 1 else ("it", "is not")
+        raise OutputError(
+            f"{out} holds this run, already finished, but {', '.join(other)} {is_not} what the run wrote. Remove {it} "
+            f"to have {it} made again, or add --overwrite to make the whole run anew."
+        )
+    shown = {name for name in (REPORT, FOOTPRINTS, CURVES) if not (out / name).is_file()}
+    gone = gone | shown if request.report else gone - shown
+    return Missing(
+        matched=tuple(name for name in MATCHED if name in gone or (name != RANKING and not (out / name).is_file())),
+        of_ties=tuple(name for name in OF_TIES if name in gone),
+        maps=tuple(name for name in FILES if name in request.products and not (out / FILES[name]).is_file()),
+        report=REPORT in gone,
+        item=ITEM in gone,
+    )
+
+
+def whole_again(request: DsmRequest, found: Finished, missing: Missing, progress: Progress) -> DsmRequest:
+    """The request of a run that is made again because of what only matching makes, with the maps and the page that were
+    added later."""
+    progress.note(
+        f"The finished run in {request.out} lacks {', '.join(missing.matched)}, which only matching makes: it is made "
+        "again."
+    )
+    maps = tuple(name for name in FILES if name in request.products or FILES[name] in found.checksums)
+    return replace(request, products=maps, report=request.report or REPORT in found.checksums)
+
+
+def make_missing(
+    request: DsmRequest, config: RunConfig, opened: Opened, found: Finished, missing: Missing, progress: Progress
+) -> None:
+    """Make products of a finished run that are missing, and take their checksums; nothing else changes.
+
+    Raises
+    ------
+    InputError, ConfigError, OutputError
+        As the run, where a product cannot be made.
+    """
+    out = request.out
+    if not missing.files:
+        return
+    try:
+        if missing.of_ties:
+            _make_of_ties(request, config, opened, missing.of_ties, progress)
+        if missing.maps:
+            make_maps(out, missing.maps, config.products, progress)
+        if missing.report:
+            from zlocus.pipeline.report_inputs import try_report
+
+            try_report(out, progress)
+        if missing.item or set(missing.files) - set(found.checksums):
+            link_all(out, progress)
+    finally:
+        update_finished(out, (*missing.files, ITEM))
+    made = [name for name in missing.files if (out / name).is_file()]
+    if made:
+        progress.note(f"Made, for it was not there: {', '.join(made)}.")
+
+
+def _make_of_ties(
+    request: DsmRequest, config: RunConfig, opened: Opened, names: Sequence[str], progress: Progress
+) -> None:
+    """Make again what is made of the tie points; those are looked for again where they were not kept."""
+    from zlocus.pipeline.report_inputs import Matched, write_shown
+
+    out, scene, record = request.out, opened.scene, read_record(request.out / RECORD)
+    known = read_observations(out, len(scene.views))
+    orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
+    settled = settled_run(request, opened, orientation, config, progress)
+    if digest_of(settled.matching, orientation) != record.get("settled_sha256"):
+        raise OutputError(
+            f"{', '.join(names)} of {out} cannot be made again, for cameras and heights came out otherwise than in the "
+            "run, as they may on another machine. Add --overwrite to make the whole run anew."
+        )
+    if TIES in names:
+        write_ties(out / TIES, orientation, settled.scene, opened.vertical)
+    if OBSERVATIONS in names and orientation.ties is not None:
+        write_observations(out, orientation.ties)
+    if shown := [name for name in names if name in (FOOTPRINTS, CURVES)]:
+        matched = Matched(
+            settled.scene, settled.matching, settled.grid, orientation.xyz,
+            lambda xy: opened.vertical.undulation(xy, scene.crs),
+        )  # fmt: skip
+        with progress.stage("Match curves"):
+            write_shown(out, matched, config, _time_of_matching(record), progress, shown)
+
+
+def _time_of_matching(record: dict[str, Any]) -> float:
+    """How long matching took in a run, s."""
+    times = [stage["wall_s"] for stage in record.get("stages", []) if stage.get("name") == "match"]
+    return float(times[0]) if times else 0.0

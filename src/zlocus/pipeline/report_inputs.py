@@ -1,0 +1,251 @@
+"""What a run leaves for its report: footprints and pairs of the images, match curves of a few cells, and the page."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zlocus.core.errors import GeometryError, ZlocusError
+from zlocus.core.footprints import pair_geometries, view_geometry
+from zlocus.core.grid import CellWindow, Grid
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress
+from zlocus.core.scene import Scene
+from zlocus.core.sensor_model import FloatArray
+from zlocus.io.run_record import write_record
+from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.point_match import Place, cell_of, curves_at, height_nearby
+from zlocus.matching.tile import rank_tile
+from zlocus.matching.view_ranking import RankedPoints
+from zlocus.orientation.parameter_groups import kind_of
+from zlocus.products.footprints import write_footprints
+from zlocus.products.match_curve_figures import PointReport, mean_figure, point_record, svg_of
+from zlocus.products.report.example_cells import FAILED, RULE, ChosenCell, chosen_cells
+from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, REPORT
+from zlocus.products.report.page import write_report
+from zlocus.products.report.sampling import Survey, survey
+from zlocus.products.report.tables import MOST_MATRIX
+from zlocus.products.tie_layers import counted_pairs, label_counts
+
+# Pairs grow with the square of their number.
+MOST_VIEWS_PAIRED = 60
+# Curves are not begun after this share of the time that matching took, or this time where that is longer.
+TIME_SHARE, LEAST_TIME_S = 0.02, 10.0
+# Where a run ranked no images they are compared in so many places a side, each of so many blocks a side.
+SAMPLE_PLACES, SAMPLE_BLOCKS = 3, 2
+# Cells around one within which tie points are looked for.
+SHOWN_WITHIN_CELLS = 512
+NOT_SHOWN = "Fewer than two images show this cell, and the window around it, at the height looked at."
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What a surface was made of.
+
+    scene : oriented; ties : (n, 3) m; undulation : height of what dsm.tif's heights are above, over the ellipsoid, (n,)
+    m at ground points (n, 2).
+    """
+
+    scene: Scene
+    settled: MatchScene
+    grid: Grid
+    ties: FloatArray
+    undulation: Callable[[FloatArray], FloatArray] = lambda xy: np.zeros(len(xy))
+
+
+def write_shown(
+    out: Path,
+    matched: Matched,
+    config: RunConfig,
+    match_s: float,
+    progress: Progress,
+    names: Collection[str] = (FOOTPRINTS, CURVES),
+) -> None:
+    """footprints.geojson and curves.json, or a note. match_s : time that matching took, which bounds that of curves;
+    names : which of the two."""
+    most_s = max(LEAST_TIME_S, TIME_SHARE * match_s)
+    if FOOTPRINTS in names:
+        _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, matched), progress)
+    if CURVES in names:
+        _tried(CURVES, lambda: write_curves(out / CURVES, out, matched, config, most_s), progress)
+
+
+def try_report(out: Path, progress: Progress) -> None:
+    """report.html, or a note."""
+    with progress.stage("Report"):
+        _tried(REPORT, lambda: write_report(out), progress)
+
+
+def _tried(name: str, write: Callable[[], Any], progress: Progress) -> None:
+    """Write a file, or note why there is none: a surface that is complete does not fail for its report."""
+    try:
+        write()
+    except Exception as error:
+        progress.note(f"{name} was not made: {said(error)} The surface does not depend on it.")
+
+
+def write_views(path: Path, matched: Matched) -> None:
+    """Footprints at the median height of the ties, with what is known of each image and of each pair that overlaps."""
+    views = matched.scene.views
+    z = float(np.median(matched.ties[:, 2])) if len(matched.ties) else middle_height(matched.settled)
+    geometry = [view_geometry(view, z) for view in views]
+    features: list[tuple[Any, dict[str, Any]]] = [
+        (
+            found.outline,
+            {
+                "kind": "image", "name": view.name, "sensor": kind_of(view.sensor), "shape": list(view.image.shape),
+                "ground_px_m": rounded(found.ground_px_m),
+            },
+        )
+        for view, found in zip(views, geometry, strict=True)
+    ]  # fmt: skip
+    if len(views) <= MOST_VIEWS_PAIRED:
+        features += [
+            (
+                pair.shared,
+                {
+                    "kind": "overlap", "views": [views[i].name for i in pair.views], "overlap": rounded(pair.overlap),
+                    "base_to_height": rounded(pair.base_to_height),
+                },
+            )
+            for pair in pair_geometries(views, [each.outline for each in geometry], z)
+        ]  # fmt: skip
+    write_footprints(path, features, matched.scene.crs)
+
+
+def write_curves(path: Path, folder: Path, matched: Matched, config: RunConfig, most_s: float) -> None:
+    """Match curves of chosen cells of the surface in a folder; one that cannot be made leaves a sentence."""
+    found, start, cells = survey(folder), time.perf_counter(), []
+    chosen = chosen_cells(found)
+    for cell in chosen:
+        if time.perf_counter() - start > most_s:
+            break
+        cells.append(shown_cell(cell, found, matched, config))
+    record = {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells}
+    if not (folder / RANKING).exists() and len(matched.settled.views) <= MOST_MATRIX:
+        record["labels"] = tried_labels(matched, config, most_s)
+    write_record(path, record)
+
+
+def tried_labels(matched: Matched, config: RunConfig, most_s: float) -> dict[str, Any]:
+    """What curves.json says of the labels of pairs, with an error where none can be given."""
+    try:
+        return sampled_labels(matched, config, most_s)
+    except Exception as error:  # a table less, not a surface
+        return {"error": said(error)}
+
+
+def sampled_labels(matched: Matched, config: RunConfig, most_s: float) -> dict[str, Any]:
+    """Labels of every pair of images at the tie points in and around a few places, each point once.
+
+    As where images are chosen (`rank_tile`), which takes `selection.fewest_views`: with fewer images nothing else says
+    how well each pair of them matches. No place is begun after `most_s`.
+    """
+    settled, start = matched.settled, time.perf_counter()
+    is_new, parts = np.ones(len(settled.ties), bool), list[RankedPoints]()
+    for core in sample_cores(settled, SAMPLE_BLOCKS * config.pyramid.block):
+        if parts and time.perf_counter() - start > most_s:
+            break
+        found = rank_tile(settled, core, config)
+        if found is None:
+            continue
+        ranking, which = found
+        new = is_new[ranking.tie]
+        is_new[ranking.tie] = False
+        parts.append(RankedPoints(settled.ties[ranking.tie[new]], ranking.labels[new], np.array(which, np.int64)))
+    names = [view.name for view in settled.views]
+    n_points = sum(len(part.xyz) for part in parts)
+    return {"points": n_points, "pairs": counted_pairs(label_counts(parts, len(names)), names)}
+
+
+def sample_cores(settled: MatchScene, side: int) -> list[CellWindow]:
+    """Windows of `side` cells around tie points that are spread over the scene, each far from those before it."""
+    xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
+    first, size = (settled.seen.col, settled.seen.row), (settled.seen.cols, settled.seen.rows)
+    xy = xy[((xy >= first) & (xy < np.add(first, size))).all(axis=1) & np.isfinite(settled.ties[:, 2])]
+    if not len(xy):
+        return []
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    share = (np.arange(SAMPLE_PLACES) + 0.5) / SAMPLE_PLACES
+    places = low + np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * (high - low)
+    nearest = [int(np.hypot(*(xy - place).T).argmin()) for place in places]
+    # Whatever the time allows, the places are spread.
+    order = [nearest[len(nearest) // 2]]
+    while rest := [tie for tie in nearest if tie not in order]:
+        order.append(max(rest, key=lambda tie: min(float(np.hypot(*(xy[tie] - xy[old]))) for old in order)))
+    cells = np.floor(xy[order]).astype(int) - side // 2
+    return [CellWindow(int(row), int(col), side, side).within(settled.seen) for col, row in cells]
+
+
+def shown_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:
+    """What curves.json says of a cell, or of the first of the others that can be shown."""
+    first = tried_cell(cell, found, matched, config)
+    for row, col in cell.others if "error" in first else ():
+        other = tried_cell(replace(cell, row=row, col=col), found, matched, config)
+        if "error" not in other:
+            return other
+    return first
+
+
+def tried_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:
+    """What curves.json says of a cell, with an error where no curve can be made."""
+    x, y = found.transform * (cell.col + 0.5, cell.row + 0.5)
+    i, j = ((at - found.first) // found.stride for at in (cell.row, cell.col))
+    height_m = float(found.height[i, j])
+    record = {
+        "kind": cell.kind, "why": cell.why, "row": cell.row, "col": cell.col, "x": x, "y": y,
+        "height_m": height_m, "sigma_m": float(found.sigma[i, j]),
+        "quality": int(found.quality[i, j]),
+    }  # fmt: skip
+    try:
+        return record | curves_of(cell, np.array([x, y]), height_m, matched, config)
+    except GeometryError:
+        return record | {"error": NOT_SHOWN}
+    except Exception as error:  # a picture less, not a surface
+        return record | {"error": said(error)}
+
+
+def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matched, config: RunConfig) -> dict[str, Any]:
+    """Record and figure of a cell's curves."""
+    settled = matched.settled
+    asked = f"The cell at row {cell.row}, column {cell.col}"
+    looked = curves_at(asked, None, settled, place_of_cell(xy, height_m, matched), config, SHOWN_WITHIN_CELLS)
+    report = PointReport.of(asked, looked, settled, matched.scene.crs)
+    # Where no height was found all that could help is shown.
+    n_images = len(report.search) if cell.kind == FAILED else report.curves.n_used
+    figure = mean_figure(report, n_images, is_small=True)
+    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
+
+
+def place_of_cell(xy: FloatArray, height_m: float, matched: Matched) -> Place:
+    """A cell with middle (2,) m at its height in dsm.tif, or at that of the ties nearby where it has none."""
+    settled = matched.settled
+    if math.isfinite(height_m):
+        z, source = height_m + float(matched.undulation(xy[None])[0]), "that of the surface"
+    elif len(matched.ties):
+        z, source = height_nearby(xy, matched.ties), "that of the nearest tie points"
+    else:
+        z, source = middle_height(settled), "the middle of the heights searched"
+    return Place(np.array([*xy, z]), source, cell_of(xy, settled), xy)
+
+
+def middle_height(settled: MatchScene) -> float:
+    """The middle of the heights searched, m."""
+    return settled.origin_m + settled.n_steps * settled.step_m / 2
+
+
+def said(error: Exception) -> str:
+    """An error in a sentence."""
+    words = " ".join(str(error).split())
+    return words if isinstance(error, ZlocusError) else f"{type(error).__name__}: {words}".rstrip(": ") + "."
+
+
+def rounded(value: float) -> float | None:
+    """A number for JSON."""
+    return round(float(value), 4) if math.isfinite(value) else None

@@ -1,0 +1,421 @@
+"""The tiles of a run: planned, made by workers, kept on disk, and put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from zlocus.core.errors import ConfigError, StoppedError
+from zlocus.core.grid import CellWindow, Grid
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress, Stage, duration
+from zlocus.core.requests import DsmRequest
+from zlocus.core.resources import SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
+from zlocus.io.grid_inputs import cells_inside, read_dem
+from zlocus.io.run_record import Elsewhere
+from zlocus.io.vertical import VerticalDatum
+from zlocus.matching.fill import filled_from
+from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.quality import Quality
+from zlocus.matching.surface import Surface
+from zlocus.matching.tile import TileResult, match_tile
+from zlocus.matching.view_ranking import RankedPoints
+from zlocus.pipeline.execution.checkpoint import TileStore
+from zlocus.pipeline.execution.cluster import Cluster
+from zlocus.pipeline.execution.event_log import NAME, EventLog
+from zlocus.pipeline.execution.plan import Tile, tile_needs
+from zlocus.pipeline.execution.processes import Processes
+from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
+from zlocus.products.rasters import SurfaceRasters
+
+# Processes take about two seconds to start, and so are not worth it for less work than this, s.
+SHORT_S = 15.0
+NAMED = 3  # failed tiles in a message
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How tiles are worked on. slots : at a time; processes : in processes of their own, else here; tile_bytes : that
+    one needs at most, with its process; own_bytes : that the command needs itself; allowed_bytes : all together;
+    seconds : about, of one worker; scheduler : of a cluster that does it instead."""
+
+    n_tiles: int
+    slots: int
+    processes: bool
+    tile_bytes: float
+    own_bytes: float
+    allowed_bytes: float
+    seconds: float
+    scheduler: str | None = None
+
+    @property
+    def n_bytes(self) -> float:
+        """Of all together."""
+        return self.own_bytes + self.slots * self.tile_bytes
+
+    def __str__(self) -> str:
+        where = "in processes of their own" if self.processes else "in this process"
+        if self.scheduler is not None:
+            need = f"{self.tile_bytes / 1e9:.2g} GB of memory for each of its threads"
+            whole = f"{duration(self.seconds)} of one of them"
+            return f"Plan: {self.n_tiles} tiles by the cluster at {self.scheduler}, about {need}, and {whole}."
+        many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
+        return (
+            f"Plan: {many}, {self.slots} at a time {where}, about {self.n_bytes / 1e9:.2g} GB of memory (of "
+            f"{self.allowed_bytes / 1e9:.2g} GB) and {duration(self.seconds / self.slots)}."
+        )
+
+
+def planned(settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, request: DsmRequest) -> Plan:
+    """Tiles at a time: as asked, or as many as there are cores and work for; never more than memory allows. What was
+    found in image space holds too much for other processes.
+
+    Raises
+    ------
+    ConfigError
+        One tile needs more memory than it may take.
+    """
+    needs, own, memory_gb = tile_needs(settled, tiles, config), held_bytes(), request.memory_gb
+    allowed = own + SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
+    here = needs.n_bytes + TILE_CODE_BYTES
+    if memory_gb is not None and own + here > allowed:
+        raise ConfigError(
+            f"--memory {memory_gb:g} GB is too little for one tile, which needs about {here / 1e9:.2g} GB beside the "
+            f"{own / 1e9:.2g} GB of the command itself. Allow more, or set a smaller pyramid.tile in --config."
+        )
+    n_worked = sum(1 for tile in tiles if tile.core.rows and tile.core.cols)
+    wanted = request.workers or (cores() if needs.seconds > SHORT_S else 1)
+    there = needs.n_bytes + WORKER_BYTES
+    slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
+    processes = slots > 1 and request.method != "gc3-sgm"
+    each = there if processes or request.scheduler else here
+    # In image space the pixels of every image are matched before.
+    seconds = needs.seconds * (len(settled.views) if request.method == "gc3-sgm" else 1)
+    return Plan(len(tiles), slots, processes, each, own, allowed, seconds, request.scheduler)
+
+
+@dataclass
+class Tally:
+    """Counts over all tiles, cells inside the area asked for; ranked : tie points with labels, tile by tile."""
+
+    n_seen: int = 0
+    n_matched: int = 0
+    n_left_out: int = 0
+    evaluations: int = 0
+    all_images: int = 0
+    ranked: list[RankedPoints] = field(default_factory=list)
+
+    def add(self, product: TileProduct) -> None:
+        """Count a tile."""
+        quality = product.surface.quality
+        asked = (quality & np.uint16(Quality.OUTSIDE)) == 0
+        self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
+        is_matched = np.isfinite(product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
+        self.n_matched += int(is_matched.sum())
+        self.n_left_out += int((asked & ((quality & np.uint16(Quality.LEFT_OUT)) != 0)).sum())
+        self.evaluations += product.evaluations
+        self.all_images += product.all_images
+        if product.ranked is not None:
+            self.ranked.append(product.ranked)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the cells seen by two images or more whose height was matched."""
+        return self.n_matched / self.n_seen if self.n_seen else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """For run.json."""
+        return {
+            "evaluations": {"done": self.evaluations, "all_images": self.all_images},
+            "coverage": round(self.coverage, 6),
+            "left_out_cells": self.n_left_out,
+        }
+
+
+@dataclass(frozen=True)
+class Matching:
+    """What makes and keeps the tiles of a run."""
+
+    job: TileJob
+    tiles: Sequence[Tile]
+    store: TileStore
+    log: EventLog
+
+    @property
+    def n_there(self) -> int:
+        """Tiles that are finished; the store may keep others, of images."""
+        return sum(name_of(tile) in self.store.finished for tile in self.tiles)
+
+    def check(self, failed: Sequence[Outcome], partial: bool) -> None:
+        """End the run where tiles failed, unless what is there is wanted all the same; nothing never is.
+
+        Raises
+        ------
+        StoppedError
+            Tiles failed; or all of them, for no reason that the input explains.
+        ZlocusError
+            All of them failed, for this reason.
+        """
+        if not failed:
+            return
+        self.log.add("stopped", failed=len(failed))
+        if not self.n_there:
+            first = failed[0].failure
+            if first is not None and first.error is not None:
+                self.log.remove()
+                raise first.error
+            raise StoppedError(f"{self._not_all(failed)} Nothing was made.")
+        if not partial:
+            raise StoppedError(
+                f"{self._not_all(failed)} The others are kept in {self.store.folder}: give the same command again to "
+                "try those once more, or add --partial for a surface without them."
+            )
+
+    def end(self, failed: Sequence[Outcome], tally: Tally) -> None:
+        """The end of a run, in its log.
+
+        Raises
+        ------
+        StoppedError
+            Some failed, and are empty in it.
+        """
+        self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed))
+        if failed:
+            raise StoppedError(
+                f"{self._not_all(failed)} They are empty in the surface (FAILED in quality.tif): give the same command "
+                "again to try them once more."
+            )
+
+    def _not_all(self, failed: Sequence[Outcome]) -> str:
+        said = [
+            f"{place_of(self.job.settled, outcome.task.core)}: {_reason(outcome.failure)}" for outcome in failed[:NAMED]
+        ]
+        more = f"; and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
+        return f"{len(failed)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
+
+    def run(
+        self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: Elsewhere
+    ) -> list[Outcome]:
+        """Make every tile that is not there yet; the outcomes of those that failed. The log of a run that does not go
+        on is a new one.
+
+        Raises
+        ------
+        StoppedError
+            Tiles cannot be written.
+        """
+        worked = [tile for tile in self.tiles if tile.core.rows and tile.core.cols]
+        todo = [tile for tile in worked if not self.store.holds(name_of(tile))]
+        failed: list[Outcome] = []
+        with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
+            if not self.n_there:
+                self.log.remove()
+            self.log.add("began", **vars(plan), tiles_there=self.n_there)
+            if len(todo) < len(worked):
+                progress.note(f"{len(worked) - len(todo)} of {len(worked)} tiles are there already.")
+                self.log.add("resumed", tiles_there=len(worked) - len(todo))
+                stage.advance(len(worked) - len(todo))
+            if ready is not None:
+                for outcome in run_tasks(ready, todo):
+                    self._took(outcome, stage, elsewhere, is_elsewhere=not isinstance(ready, Here))
+                    if outcome.failure is not None and outcome.is_final:
+                        failed.append(outcome)
+        return failed
+
+    def _took(self, outcome: Outcome, stage: Stage, elsewhere: Elsewhere, is_elsewhere: bool) -> None:
+        tile: Tile = outcome.task
+        record = {
+            "tile": name_of(tile), "worker": outcome.worker, "attempt": outcome.attempt,
+            "wall_s": round(outcome.wall_s, 3), "cpu_s": round(outcome.cpu_s, 3), "peak_mb": round(outcome.peak_mb, 1),
+        }  # fmt: skip
+        if is_elsewhere:
+            elsewhere.cpu_s += outcome.cpu_s
+            elsewhere.peak_mb = max(elsewhere.peak_mb, outcome.peak_mb)
+        if outcome.failure is None:
+            self.store.keep(name_of(tile), outcome.result.arrays())
+            self.log.add("tile", **record)
+        else:
+            again = {} if outcome.is_final else {"again": True}
+            trace = {"trace": outcome.failure.trace} if outcome.failure.trace else {}
+            failure = {"cause": str(outcome.failure.cause), "reason": outcome.failure.reason}
+            self.log.add("tile failed", **record, **failure, **again, **trace)
+        if outcome.is_final:
+            stage.advance()
+        if outcome.peak_mb:
+            stage.tell(f"{outcome.peak_mb / 1e3:.1f} GB")
+
+    def tell_interrupted(self, progress: Progress) -> None:
+        """Say, after an interrupt, what is kept."""
+        self.log.add("interrupted", tiles_done=self.n_there)
+        if self.n_there and self.store.is_there:
+            done = f"{self.n_there} of {len(self.tiles)} tiles"
+            progress.note(f"{done} are finished and kept: {self.store.how_to_go_on}.")
+
+    def assemble(self, failed: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress) -> None:
+        """Write all tiles, those that failed as empty, in their order, so that nothing depends on that of making.
+
+        Raises
+        ------
+        StoppedError
+            A tile that was finished is damaged.
+        """
+        lost = {outcome.task for outcome in failed}
+        with progress.stage("Writing", len(self.tiles)) as stage:
+            for tile in self.tiles:
+                product = self._failed(tile) if tile in lost else self._finished(tile)
+                tally.add(product)
+                window = self.job.grid.window
+                rasters.write(tile.kept.row - window.row, tile.kept.col - window.col, product.surface)
+                stage.advance()
+
+    def _finished(self, tile: Tile) -> TileProduct:
+        if not (tile.core.rows and tile.core.cols):
+            return self.job.product(tile, TileResult(Surface.nothing(tile.core)))
+        arrays = self.store.load(name_of(tile))
+        if arrays is None:
+            raise StoppedError(
+                f"{self.store.folder / name_of(tile)}.npz was damaged since it was written. Give the same command "
+                "again: that tile is made anew."
+            )
+        return TileProduct.of(arrays)
+
+    def _failed(self, tile: Tile) -> TileProduct:
+        nothing = Surface.nothing(tile.kept)
+        failed = replace(nothing, quality=np.full_like(nothing.quality, Quality.FAILED))
+        return self.job.product(tile, TileResult(failed.part(tile.core, tile.kept)))
+
+
+def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress) -> AbstractContextManager[Workers]:
+    """Where the tiles of a plan are made.
+
+    Raises
+    ------
+    ConfigError
+        See `Cluster`.
+    """
+    if plan.scheduler is not None:
+        cluster = Cluster(make, plan.scheduler)
+        progress.note(f"Dask cluster at {plan.scheduler}; what it does is shown at {cluster.dashboard}")
+        return cluster
+    if plan.processes:
+        return Processes(make, plan.slots)
+    return nullcontext(Here(make))
+
+
+def name_of(tile: Tile) -> str:
+    """A tile's name: row and column of its first kept cell on the scene's lattice."""
+    return f"{tile.kept.row}_{tile.kept.col}"
+
+
+def place_of(settled: MatchScene, core: CellWindow) -> str:
+    """Where a tile lies."""
+    transform = settled.transform(core, 0)
+    (west, north), (east, south) = transform * (0, 0), transform * (core.cols, core.rows)
+    return f"E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
+
+
+def _reason(failure: Failure | None) -> str:
+    assert failure is not None, "of those that failed"
+    if failure.trace:
+        return f"{failure.reason} (a fault of zlocus, not of the input: report it with what {NAME} says of it)"
+    return failure.reason
+
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """Of the area asked for, (n,) of shapely's in the grid's CRS: cells outside `inside`, or inside `outside`, are not
+    asked for."""
+
+    inside: NDArray[Any] | None = None
+    outside: NDArray[Any] | None = None
+
+    def cut(self, surface: Surface, geobox: GeoBox) -> Surface:
+        """A surface on a grid with cells that are not asked for emptied."""
+        beyond = np.zeros(surface.height.shape, bool)
+        if self.inside is not None:
+            beyond |= ~cells_inside(self.inside, geobox)
+        if self.outside is not None:
+            beyond |= cells_inside(self.outside, geobox)
+        return surface.without(beyond) if beyond.any() else surface
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A terrain model whose heights fill what is empty. datum : what they are above."""
+
+    path: Path
+    datum: VerticalDatum
+
+
+@dataclass(frozen=True)
+class TileProduct:
+    """What a run keeps of a tile. surface : of its kept cells; evaluations, all_images : see `TileResult`; ranked : tie
+    points with their labels, None where there was nothing to choose."""
+
+    surface: Surface
+    evaluations: int = 0
+    all_images: int = 0
+    ranked: RankedPoints | None = None
+
+    def arrays(self) -> Arrays:
+        """All of it as arrays."""
+        surface = self.surface
+        found: Arrays = {
+            "height": surface.height, "sigma": surface.sigma, "quality": surface.quality, "views": surface.views,
+            "ortho": surface.ortho, "evaluations": np.array([self.evaluations, self.all_images], np.int64),
+        }  # fmt: skip
+        if self.ranked is not None:
+            found |= {"xyz": self.ranked.xyz, "labels": self.ranked.labels, "which": self.ranked.views}
+        return found
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> TileProduct:
+        """From what `arrays` gave."""
+        surface = Surface(*(arrays[name] for name in ("height", "sigma", "quality", "views", "ortho")))
+        done, every = (int(n) for n in arrays["evaluations"])
+        ranked = RankedPoints(*(arrays[name] for name in ("xyz", "labels", "which"))) if "xyz" in arrays else None
+        return cls(surface, done, every, ranked)
+
+
+@dataclass(frozen=True)
+class TileJob:
+    """Makes tiles of a settled scene; what it holds reaches each worker once.
+
+    method, use_visibility, fill : see `match_tile`; terrain : fills what is still empty, None does not.
+    """
+
+    settled: MatchScene
+    grid: Grid
+    config: RunConfig
+    method: str
+    use_visibility: bool
+    fill: str
+    area: Polygons = Polygons()
+    terrain: Terrain | None = None
+
+    def __call__(self, tile: Tile) -> TileProduct:
+        """The product of a tile."""
+        result = match_tile(self.settled, tile.core, self.config, self.method, self.use_visibility, self.fill)
+        return self.product(tile, result)
+
+    def product(self, tile: Tile, result: TileResult) -> TileProduct:
+        """What is kept of a tile that was matched."""
+        row, col = tile.kept.row - self.grid.window.row, tile.kept.col - self.grid.window.col
+        geobox = self.grid.geobox[row : row + tile.kept.rows, col : col + tile.kept.cols]
+        surface = self.area.cut(result.surface.part(tile.kept, tile.core), geobox)
+        if self.terrain is not None:
+            surface = filled_from(surface, read_dem(self.terrain.path, geobox, self.terrain.datum, may_miss=True))
+        ranked = None
+        if result.ranking is not None:
+            ranked = RankedPoints.of(*result.ranking, self.settled.ties, tile.core)
+        return TileProduct(surface, result.evaluations, result.all_images, ranked)

@@ -1,0 +1,160 @@
+"""Corrected cameras: RPC files, trajectories, and a `scene.yaml` that names them and the images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zlocus.core.errors import ConfigError
+from zlocus.core.scene import Scene, View, is_local
+from zlocus.core.sensor_model import SensorModel
+from zlocus.io.cameras.camera_entry import Camera
+from zlocus.io.cameras.camera_kinds import RpcCamera
+from zlocus.io.cameras.frame_camera import FrameCamera
+from zlocus.io.cameras.linescan import LineScanCamera
+from zlocus.io.cameras.linescan_files import write_trajectory
+from zlocus.io.cameras.rpc_text import write_rpc_txt
+from zlocus.io.scene_file import SCENE_SUFFIXES, SceneFile, ViewEntry, read_scene_file, write_scene_file
+from zlocus.products.point_cloud import file_names
+from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.earth_frame import EarthSpace
+from zlocus.sensors.frame import FrameModel, as_row, as_rows
+from zlocus.sensors.linescan import LineScanModel, RectifiedModel
+from zlocus.sensors.rpc import RpcCoefficients, RpcModel
+from zlocus.sensors.rpc_fit import fit_rpc
+
+FOLDER = "cameras"
+SCENE = "scene.yaml"
+
+
+@dataclass(frozen=True)
+class WrittenCamera:
+    """entry : for the scene file; fit_px : largest error of an RPC that was fitted, None where it is exact."""
+
+    entry: Camera
+    fit_px: float | None = None
+
+
+def write_cameras(out: Path, inputs: Sequence[Path], oriented: Scene) -> dict[str, Any]:
+    """Write the cameras of a corrected scene and a `scene.yaml` to a folder; what was written, by view.
+
+    inputs : of the scene; a scene file's cameras keep all that was not corrected.
+
+    Raises
+    ------
+    OutputError
+        Where the folder cannot be written.
+    ConfigError
+        For a shift of a line scanner's image, which its files cannot express.
+    """
+    entries = given_cameras(inputs)
+    (out / FOLDER).mkdir(exist_ok=True)
+    views, record = [], {}
+    for view, name in zip(oriented.views, file_names([v.name for v in oriented.views]), strict=True):
+        camera, folder = entries.get(view.name, (RpcCamera(), Path()))
+        written = write_camera(out, name, camera, folder, view, oriented)
+        image = relative(view.path, out)
+        views.append(ViewEntry(name=view.name, image=image, camera=written.entry, date=view.date))
+        record[view.name] = written.entry.model_dump(mode="json", exclude_none=True)
+        if written.fit_px is not None:
+            record[view.name]["rpc_fit_max_px"] = written.fit_px
+    frame = {"local": True} if is_local(oriented.crs) else {"crs": oriented.crs.to_string()}
+    area = None if oriented.bounds is None else {"bounds": oriented.bounds}
+    described = {"schema": 1, "frame": frame, "area": area, "heights": oriented.heights, "views": tuple(views)}
+    write_scene_file(out / SCENE, SceneFile.model_validate(described))
+    return record
+
+
+def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[Camera, Path]]:
+    """The cameras of a scene file by view, and the folder their paths start at; none of images alone."""
+    (first, *_) = inputs
+    if first.suffix.lower() not in SCENE_SUFFIXES:
+        return {}
+    return {view.name: (view.camera, first.parent) for view in read_scene_file(first).views}
+
+
+def write_camera(out: Path, name: str, camera: Camera, folder: Path, view: View, scene: Scene) -> WrittenCamera:
+    """Write the camera of a view. camera : as it was given, with paths from `folder`."""
+    if isinstance(camera, FrameCamera):
+        return WrittenCamera(frame_entry(camera, view.sensor, scene))
+    if isinstance(camera, LineScanCamera):
+        return WrittenCamera(write_scanner(out, name, camera, folder, view, scene))
+    rpc, fit_px = rpc_of(view, scene)
+    file = f"{FOLDER}/{name}_RPC.TXT"
+    write_rpc_txt(out / file, rpc)
+    return WrittenCamera(RpcCamera(file=file), fit_px)
+
+
+def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
+    """The corrected RPC of a view: exact where it is shifted, else fitted over the image and the RPC's heights, with
+    the largest error, px."""
+    sensor, shift = view.sensor, np.zeros(2)
+    while isinstance(sensor, ShiftedModel):
+        shift += [sensor.column, sensor.row]
+        sensor = sensor.base
+    if isinstance(sensor, RpcModel):
+        return sensor.rpc.moved(column=float(shift[0]), row=float(shift[1])), None
+    heights = view.sensor.height_bounds()
+    assert heights is not None, "an RPC knows its heights"
+    fit = fit_rpc(view.sensor, view.image.shape, scene.crs, heights)
+    return fit.rpc, fit.max_error_px
+
+
+def frame_entry(camera: FrameCamera, sensor: SensorModel, scene: Scene) -> FrameCamera:
+    """A frame camera in the scene's frame, its pose relative to the map's axes at its centre."""
+    while isinstance(sensor, ShiftedModel):
+        assert isinstance(sensor.base, FrameModel), "one shift is laid over a camera"
+        sensor = sensor.base.moved(sensor.column, sensor.row)
+    assert isinstance(sensor, FrameModel), "frame cameras stay frame cameras"
+    centre, rows = sensor.centre, sensor.camera_from_ground
+    if isinstance(sensor.space, EarthSpace):
+        on_map = sensor.space.ground_from_cartesian(np.array([centre]))[0]
+        _, axes = sensor.space.pose(scene.crs, on_map)
+        centre, rows = as_row(on_map), as_rows(sensor.rotation @ axes.T)
+    changed = {
+        "focal": (sensor.focal, sensor.focal * sensor.aspect), "principal_point": sensor.principal_point,
+        "centre": centre, "rotation": rows, "angles": None, "crs": None,
+    }  # fmt: skip
+    return camera.model_copy(update=changed)
+
+
+def write_scanner(
+    out: Path, name: str, camera: LineScanCamera, folder: Path, view: View, scene: Scene
+) -> LineScanCamera:
+    """A line scanner with its corrected trajectory, which is that of the projection centre and the camera's axes."""
+    sensor = view.sensor
+    if not isinstance(sensor, LineScanModel | RectifiedModel):
+        raise ConfigError(
+            f"The image of the line scanner {view.name} was shifted, which a trajectory cannot express. Set "
+            "orientation.model = joint in --config."
+        )
+    raw = sensor.raw if isinstance(sensor, RectifiedModel) else sensor
+    on_earth = camera.rays == "earth"
+    file = f"{FOLDER}/{name}_trajectory.csv"
+    write_trajectory(out / file, raw.trajectory, "s; m; corrected", quaternions=on_earth)
+    rectification = camera.rectification
+    if isinstance(sensor, RectifiedModel):
+        flawed = f"{FOLDER}/{name}_resampled.csv"
+        write_trajectory(out / flawed, sensor.over_plane.trajectory, "s; m; as resampled", quaternions=on_earth)
+        assert rectification is not None, "level 1 images say how they were resampled"
+        rectification = rectification.model_copy(update={"trajectory": flawed})
+    times = camera.times if not isinstance(camera.times, str) else relative(folder / camera.times, out)
+    changed = {
+        "calibration": relative(folder / camera.calibration, out), "trajectory": file, "times": times,
+        "crs": "EPSG:4978" if on_earth else camera.crs, "lever_arm": (0.0, 0.0, 0.0), "boresight": (0.0, 0.0, 0.0),
+        "rectification": rectification,
+    }  # fmt: skip
+    return camera.model_copy(update=changed)
+
+
+def relative(path: Path, folder: Path) -> str:
+    """A path from a folder, as a scene file names it; absolute where there is no way."""
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # another drive
+        return path.resolve().as_posix()

@@ -1,0 +1,172 @@
+"""The products of image space: a height map per image, and all points as LAZ and PLY."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+import laspy
+import numpy as np
+from affine import Affine
+from laspy.errors import LaspyException
+from laspy.vlrs.known import WktCoordinateSystemVlr
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from pyproj import CRS
+from rasterio.errors import NotGeoreferencedWarning
+
+from zlocus import __version__
+from zlocus.core.errors import OutputError
+from zlocus.core.scene import is_local
+from zlocus.io.rasters import write_cog
+
+LAZ_STEP_M = 0.001
+# Dimensions beside those of the format. Descriptions have 32 signs at most.
+SIGMA, VIEWS = "sigma_m", "n_images"
+LAZ_REACH_M = 2**31 * LAZ_STEP_M
+OFFSET_STEP_M = 1000.0
+PLY_POINT = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
+PLY_PROPERTIES = ("double x", "double y", "double z", "uchar red", "uchar green", "uchar blue")
+
+
+class PointCloud:
+    """cloud.laz and cloud.ply, written point by point; complete when the context ends, else not there.
+
+    n_points : how many will be written, which PLY wants to know first; crs : None where the frame is local.
+    """
+
+    def __init__(self, folder: Path, n_points: int, crs: CRS) -> None:
+        self._paths = (folder / "cloud.laz", folder / "cloud.ply")
+        self._parts = tuple(path.with_name(f".{path.name}.{os.getpid()}.part") for path in self._paths)
+        self._crs = None if is_local(crs) else crs
+        self._laz: laspy.LasWriter | None = None
+        self._ply: BinaryIO | None = None
+        self._n_points = n_points
+
+    def write(
+        self,
+        source: int,
+        xyz: NDArray[np.float64],
+        rgb: NDArray[np.uint16],
+        sigma_m: NDArray[np.floating],
+        n_images: NDArray[np.uint8],
+    ) -> None:
+        """Add points. source : number of the image they come from; xyz : (n, 3) m; rgb : (n, 3), white is 65535;
+        sigma_m : (n,) m, standard deviation; n_images : (n,), images used."""
+        try:
+            laz, ply = self._files(xyz)
+            points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=laz.header)
+            points.x, points.y, points.z = xyz.T
+            points.red, points.green, points.blue = rgb.T
+            points.return_number[:], points.number_of_returns[:] = 1, 1
+            points.point_source_id[:] = source
+            points[SIGMA], points[VIEWS] = sigma_m, n_images
+            laz.write_points(points)
+            records = np.empty(len(xyz), PLY_POINT)
+            records["xyz"], records["rgb"] = xyz, rgb >> 8
+            ply.write(records.tobytes())
+        except OverflowError as error:
+            raise OutputError(
+                f"{self._paths[0]} cannot hold points that lie further apart than {LAZ_REACH_M / 1000:.0f} km. Give "
+                "narrower --heights."
+            ) from error
+        except (OSError, LaspyException) as error:
+            raise self._failed(error) from error
+
+    def _files(self, xyz: NDArray[np.float64]) -> tuple[laspy.LasWriter, BinaryIO]:
+        """Both files, begun with the first points, which tell where the cloud is."""
+        if self._laz is None or self._ply is None:
+            header = laspy.LasHeader(point_format=7, version="1.4")
+            header.scales = np.full(3, LAZ_STEP_M)
+            header.offsets = np.floor(xyz.mean(axis=0) / OFFSET_STEP_M) * OFFSET_STEP_M if len(xyz) else np.zeros(3)
+            header.generating_software = f"zlocus {__version__}"
+            add_precision(header, "standard deviation along ray, m")
+            if self._crs is not None:
+                add_crs(header, self._crs)
+            self._laz = laspy.open(self._parts[0], "w", header=header, do_compress=True)
+            self._ply = self._parts[1].open("wb")
+            self._ply.write(ply_header(self._n_points, self._crs).encode("ascii"))
+        return self._laz, self._ply
+
+    def __enter__(self) -> PointCloud:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._files(np.empty((0, 3)))
+            for file in (self._laz, self._ply):
+                if file is not None:
+                    file.close()
+            if kind is None:
+                for part, path in zip(self._parts, self._paths, strict=True):
+                    os.replace(part, path)
+        except (OSError, LaspyException) as cause:
+            raise self._failed(cause) from cause
+        finally:
+            for part in self._parts:
+                with suppress(OSError):  # where it was not begun, or has its name
+                    part.unlink()
+
+    def _failed(self, error: Exception) -> OutputError:
+        reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
+        return OutputError(f"{self._paths[0]} cannot be written: {reason}. Check the folder and the space left.")
+
+
+def add_precision(header: laspy.LasHeader, of: str) -> None:
+    """Make room for a standard deviation and a number of images with every point. of : what it is of, 32 signs."""
+    header.add_extra_dims([
+        laspy.ExtraBytesParams(SIGMA, np.float32, of),
+        laspy.ExtraBytesParams(VIEWS, np.uint8, "images used"),
+    ])  # fmt: skip
+
+
+def add_crs(header: laspy.LasHeader, crs: CRS) -> None:
+    """Put a CRS into a header as LAS 1.4 has it: WKT of OGC 01-009, which is WKT 1 (laspy itself writes WKT 2)."""
+    header.vlrs.append(WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
+    header.global_encoding.wkt = True
+
+
+def ply_header(n_points: int, crs: CRS | None) -> str:
+    """What stands before the points of a binary PLY file."""
+    lines = ["ply", "format binary_little_endian 1.0", f"comment zlocus {__version__}"]
+    if crs is not None:
+        lines.append(f"comment crs {_plain(crs)}")
+    lines += [f"element vertex {n_points}", *(f"property {name}" for name in PLY_PROPERTIES), "end_header", ""]
+    return "\n".join(lines)
+
+
+def _plain(crs: CRS) -> str:
+    """A CRS in one line of ASCII: its code, or those of its horizontal and vertical parts, or else WKT."""
+    codes = [part.to_epsg() for part in crs.sub_crs_list or [crs]]
+    if None not in codes:
+        return "EPSG:" + "+".join(map(str, codes))
+    return crs.to_wkt().encode("ascii", "replace").decode("ascii")
+
+
+def write_map(path: Path, values: NDArray[np.generic], description: str, units: str = "") -> None:
+    """A raster of an image's pixels, (r, c), with no place on the ground; NaN where floating and empty."""
+    nodata = float("nan") if values.dtype.kind == "f" else None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        write_cog(path, values, GeoBox(values.shape, Affine.identity(), None), nodata=nodata,
+                  descriptions=(description,), units=units)  # fmt: skip
+
+
+def file_names(names: Sequence[str]) -> list[str]:
+    """What files of views are called: their names without signs that files may not have, all different."""
+    found: list[str] = []
+    for name in names:
+        plain = re.sub(r"[^\w.-]+", "_", name).strip(".") or "view"
+        tried = (plain if k == 1 else f"{plain}_{k}" for k in count(1))
+        found.append(next(new for new in tried if new.casefold() not in {old.casefold() for old in found}))
+    return found

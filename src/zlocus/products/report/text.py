@@ -1,0 +1,249 @@
+"""What the report says in words: reasons, stages, numbers with units, and the summary."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from pyproj import CRS, Transformer
+
+from zlocus.core.scene import is_local
+from zlocus.evaluation.evaluate import Evaluation
+from zlocus.matching.quality import EMPTY, Quality
+from zlocus.products.report.sampling import Survey
+
+# As docs/quality.md has them; a test keeps them the same.
+MEANINGS = {
+    Quality.OUTSIDE: "not asked for: outside the area, or inside a mask",
+    Quality.UNSEEN: "fewer than two images cover the cell at the ground's height, or support a height above it",
+    Quality.HIDDEN: "fewer than two images see the surface there, the others are behind it",
+    Quality.RANGE_END: "best match at an end of the height range: the true height may lie beyond it",
+    Quality.NO_MATCH: "images do not agree at any height, or heights at the border are noise",
+    Quality.FAILED: "its tile could not be processed",
+    Quality.UNCONFIRMED: "no other image finds the same height when matched back (image space only)",
+    Quality.IMPRECISE: "its standard deviation is larger than asked for (checks.most_sigma_m)",
+    Quality.WEAK: "images agree poorly",
+    Quality.AMBIGUOUS: "another height fits nearly as well",
+    Quality.JUMP: "next to a jump in height",
+    Quality.UNREFINED: "height to a fraction of a step only: sub-step refinement did not converge",
+    Quality.FILLED: "no match: interpolated from its neighbours",
+    Quality.DISPUTED: "two halves of the pairs of images find different heights around",
+    Quality.LEFT_OUT: "an image that may show the cell took no part: it sees it too obliquely for the tables",
+    Quality.PLANE: "too plain to be matched alone: height of a plane fitted to all of a plain segment",
+}
+# Why a cell has no height although its own match curve may have a high peak: see `zlocus.matching.height_checks`.
+DESPITE_PEAK = {
+    Quality.NO_MATCH: "the surface lies where the heights around it allow, which need not be at this peak; there, in "
+    "windows that follow its slope, the mean correlation of all pairs of images that see it is below {least_ncc:g} "
+    "(checks.least_ncc)",
+    Quality.RANGE_END: "with the heights around it taken into account the best height is the lowest or the highest of "
+    "those searched ({low:.1f} to {high:.1f} m)",
+    Quality.HIDDEN: "the curve does not know what stands in the way: at the height that the surface has here fewer "
+    "than two images see past what is around it",
+    Quality.UNCONFIRMED: "the curve is of one reference: the height found from an image was not found again from any "
+    "other",
+    Quality.IMPRECISE: "a peak may be high and yet wide or in doubt: its standard deviation is larger than asked for",
+}
+HIGH_PEAK = 0.5
+# What helps, where something does.
+ADVICE = {
+    Quality.UNSEEN: "add images, or ask for a smaller area",
+    Quality.HIDDEN: "add images from other directions",
+    Quality.RANGE_END: "give a wider --heights",
+    Quality.NO_MATCH: "usual on water, snow and other plain ground; --fill interpolate closes small gaps",
+    Quality.IMPRECISE: "add images at wider angles, or allow more in checks.most_sigma_m",
+    Quality.WEAK: "usual on vegetation, water and snow; check before use",
+    Quality.AMBIGUOUS: "usual on repeating patterns and plain ground; check before use",
+    Quality.DISPUTED: "holds most of the gross errors in towns; check before use",
+    Quality.LEFT_OUT: "give --heights closer to those of the ground",
+}
+STAGES = {
+    "open": "opening images and cameras",
+    "orient": "finding tie points and correcting the cameras",
+    "settle": "settling heights, grid and tiles",
+    "match": "matching and writing the rasters",
+    "points": "writing tie points and ranking",
+    "curves": "footprints and match curves for this page",
+    "record": "checksums of the inputs",
+    "products": "hillshade and what else was made of the surface",
+}
+SIDES = ("top", "upper right", "right", "lower right", "bottom", "lower left", "left", "upper left")
+NONE = "–"
+LEAST_SHARE = 0.0001
+
+
+@dataclass(frozen=True)
+class Reason:
+    """A row of the table of reasons. fate : whether a cell with it has its height; share : of the cells asked for."""
+
+    name: str
+    meaning: str
+    fate: str
+    advice: str
+    n: int
+    share: str
+
+
+def reasons(found: Survey) -> list[Reason]:
+    """The reasons that occur, those without a height first, the most common first."""
+    rows = []
+    for flag in Quality:
+        n = found.count(flag)
+        if n:
+            base = math.prod(found.shape) if flag is Quality.OUTSIDE else found.n_asked
+            row = Reason(str(flag.name), MEANINGS[flag], fate(flag), ADVICE.get(flag, ""), n, percent(n, base))
+            rows.append((flag not in EMPTY, -n, row))
+    return [row for _, _, row in sorted(rows, key=lambda each: each[:2])]
+
+
+def fate(flag: Quality) -> str:
+    """Whether a cell with a reason has its height."""
+    if flag in EMPTY:
+        return "none"
+    return "filled" if flag is Quality.FILLED else "kept"
+
+
+def percent(n: float, total: float) -> str:
+    """A share in percent: one that is not 0 never reads as 0, and one that is not all never as 100."""
+    if not total:
+        return NONE
+    share = n / total
+    if 0 < share < LEAST_SHARE:
+        return "< 0.01 %"
+    if 1 - LEAST_SHARE < share < 1:
+        return "> 99.99 %"
+    return f"{100 * share:.{2 if share < 0.1 or 0.999 <= share < 1 else 1}f} %"
+
+
+def whole_percent(n: int, total: int) -> str:
+    """A share in whole percent, without its sign; 0 and 100 only where it is none and all."""
+    if n in (0, total):
+        return "100" if n else "0"
+    return str(min(max(round(100 * n / total), 1), 99))
+
+
+def number(value: float | None, unit: str = "", digits: int = 2) -> str:
+    """A number with digits behind the point and its unit."""
+    return NONE if value is None or not math.isfinite(value) else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def size(value: float | None, unit: str = "") -> str:
+    """A positive number to two digits that count, with its unit: 0.083 m, 0.31 m, 12 m."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    decimals = 0 if value == 0 else max(1 - math.floor(math.log10(abs(value))), 0)
+    return f"{value:.{decimals}f} {unit}".rstrip()
+
+
+def seconds(value: float) -> str:
+    """A time: 0.03 s, 12.4 s, 3 min 20 s, 2 h 10 min."""
+    if value < 59.95:
+        return f"{value:.2f} s" if value < 1 else f"{value:.1f} s"
+    minutes, rest = divmod(round(value), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def when(created: str | None) -> str:
+    """A time of run.json, to the minute; "" where it has none."""
+    if not created:
+        return ""
+    return datetime.fromisoformat(created).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def sun(azimuth_deg: float, altitude_deg: float) -> str:
+    """Where the light of a map comes from, its first row being the north."""
+    side = SIDES[round(azimuth_deg / 45) % len(SIDES)]
+    return f"lit from the {side} (azimuth {azimuth_deg:g} degrees), {altitude_deg:g} degrees above the horizon"
+
+
+def corners(found: Survey, is_local: bool) -> list[str]:
+    """Coordinates of the map's corners: upper left, upper right, lower left, lower right."""
+    (rows, cols), names = found.shape, ("x", "y") if is_local else ("E", "N")
+    return [
+        ", ".join(f"{name} {value:.1f}" for name, value in zip(names, found.transform * corner, strict=True))
+        for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))
+    ]
+
+
+def despite_peak(why: Quality, rho1: float | None, run: Mapping[str, Any]) -> str:
+    """Why a cell is empty although its mean curve reaches a correlation, as a sentence; "" where it does not."""
+    if rho1 is None or rho1 < HIGH_PEAK or why not in DESPITE_PEAK:
+        return ""
+    low, high = run["heights"]["range_m"]
+    text = DESPITE_PEAK[why].format(least_ncc=run["config"]["options"]["checks"]["least_ncc"], low=low, high=high)
+    return f"No height in spite of the peak: {text}."
+
+
+def place(found: Survey, crs: CRS) -> tuple[str, str]:
+    """Where the middle of the surface lies, and its map, in words."""
+    x, y = found.transform * (found.shape[1] / 2, found.shape[0] / 2)
+    if is_local(crs):
+        return f"around x {x:.1f} m, y {y:.1f} m of a local frame, which has no place on the Earth", "local frame"
+    code = ":".join(authority) if (authority := crs.to_authority()) else "no code"
+    lon, lat = Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(x, y)
+    where = f"around {abs(lat):.4f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.4f}° {'E' if lon >= 0 else 'W'}"
+    return where, f"{crs.name}, {code}"
+
+
+def summary(found: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, float]) -> str:
+    """The whole run in one paragraph. quantiles : of the standard deviations, m, by percent."""
+    rows, cols = found.shape
+    where, frame = place(found, crs)
+    views = run["orientation"]["views"]
+    wide, high = cols * found.cell_m, rows * found.cell_m
+    what = "This is a digital surface model: the height of whatever is seen from above, roofs and treetops included."
+    if is_local(crs):
+        what = "This is a surface model: how far whatever the images show stands out along z."
+    said = [
+        f"{what} It covers {wide:.0f} m by {high:.0f} m {where} (map: {frame}), with a cell every "
+        f"{found.cell_m:g} m, and was made from {len(views)} images.",
+        f"Of the cells that two images or more cover, {percent(found.n_matched, found.n_seen)} have a height.",
+    ]
+    if found.n_heights:
+        said.append(f"Heights run from {found.lowest_m:.1f} to {found.highest_m:.1f} m ({found.above}).")
+    if 50 in quantiles:
+        said.append(
+            f"By its own estimate, which knows nothing of errors that all images share, the standard deviation of a "
+            f"height is {size(quantiles[50], 'm')} or better for half of the cells, and {size(quantiles[90], 'm')} or "
+            "better for nine in ten."
+        )
+    said += [what_is_missing(found), what_is_doubtful(found)]
+    return " ".join(sentence for sentence in said if sentence)
+
+
+def what_is_missing(found: Survey) -> str:
+    """How much has no height and why, in a sentence."""
+    n_missing = found.n_asked - found.n_heights
+    if n_missing <= 0:
+        return "No cell of the area lacks a height."
+    why = [(found.count(flag), MEANINGS[flag]) for flag in EMPTY if flag is not Quality.OUTSIDE]
+    common = sorted((each for each in why if each[0]), key=lambda each: -each[0])[:2]
+    reasons = "; ".join(f"{meaning} ({percent(n, found.n_asked)})" for n, meaning in common)
+    return f"{percent(n_missing, found.n_asked)} of the cells asked for have no height, mostly because: {reasons}."
+
+
+def what_is_doubtful(found: Survey) -> str:
+    """How much carries which warning, in a sentence."""
+    warnings = Quality.WEAK | Quality.AMBIGUOUS | Quality.DISPUTED
+    counts = sorted(((found.count(flag), str(flag.name)) for flag in warnings), key=lambda each: -each[0])
+    told = [f"{name} ({percent(n, found.n_asked)} of the cells asked for)" for n, name in counts if n]
+    return f"Heights to check before use carry a warning, explained below: {listed(told)}." if told else ""
+
+
+def against_reference(evaluation: Evaluation, reference: str) -> str:
+    """How the surface compares with a reference, in a sentence."""
+    figures = evaluation.all
+    moved = "" if evaluation.shift is None else ", once the shift between the two is removed"
+    return (
+        f"Against the reference {reference}{moved}: {percent(figures.completeness, 1)} of its cells have a height, "
+        f"{percent(figures.within, 1)} one that is right to {evaluation.threshold_m:g} m; the errors' median is "
+        f"{number(figures.median, 'm', 3)}, their spread (NMAD) {number(figures.nmad, 'm', 3)}."
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names with commas between, `none` without any."""
+    return ", ".join(names) or "none"

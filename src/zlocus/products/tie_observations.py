@@ -1,0 +1,37 @@
+"""observations.npz: where tie points were seen in the images, from which the cameras of a run come out again."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from zlocus.io.run_record import write_whole
+from zlocus.orientation.orientation import MeasuredTies
+
+OBSERVATIONS = "observations.npz"
+
+
+def write_observations(folder: Path, ties: MeasuredTies) -> None:
+    """Write the observations of a run into its folder.
+
+    Raises
+    ------
+    OutputError
+        Where the file cannot be written.
+    """
+    content = io.BytesIO()
+    np.savez_compressed(content, **ties.arrays())  # type: ignore[arg-type]
+    write_whole(folder / OBSERVATIONS, lambda part: part.write_bytes(content.getbuffer()))
+
+
+def read_observations(folder: Path, n_views: int) -> MeasuredTies | None:
+    """What `write_observations` wrote of a scene with so many views; None where it is missing or damaged."""
+    try:
+        with np.load(folder / OBSERVATIONS, allow_pickle=False) as file:
+            return MeasuredTies.of(dict(file), n_views)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+        return None

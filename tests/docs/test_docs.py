@@ -1,0 +1,144 @@
+"""What the documents say of the code."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import get_type_hints
+
+import pytest
+import typer.main
+
+import zlocus
+from places import ROOT
+from zlocus.cli.app import app
+from zlocus.core.requests import FINISHED
+from zlocus.io.importers.registry import IMPORTERS
+from zlocus.io.scene_file import read_scene_file
+from zlocus.io.vertical import KNOWN
+from zlocus.matching import quality as reasons
+from zlocus.matching.quality import EMPTY, Quality
+from zlocus.products.stac_item import PRODUCTS
+
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
+
+
+def fate(flag: Quality) -> str:
+    if flag in EMPTY:
+        return "none"
+    return "filled" if flag is Quality.FILLED else "kept"
+
+
+def test_the_table_of_quality_flags_is_that_of_the_code():
+    source = Path(reasons.__file__).read_text(encoding="utf-8")
+    said = dict(re.findall(r"^    ([A-Z_]+) = \d+  # (.+)$", source, re.MULTILINE))
+    expected = [(str(int(flag)), flag.name, said[flag.name], fate(flag)) for flag in Quality]
+    page = (ROOT / "docs" / "quality.md").read_text(encoding="utf-8")
+    rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in page.splitlines()]
+    assert [row for row in rows if row[0].isdigit()] == expected
+
+
+def test_the_scene_file_of_the_documents_is_valid(tmp_path):
+    page = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "scene.yaml").write_text(example, encoding="utf-8")
+    scene = read_scene_file(tmp_path / "scene.yaml")
+    assert [view.name for view in scene.views] == ["nadir", "forward"]
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/examples/*.yaml")), ids=lambda p: p.name)
+def test_the_examples_are_valid(path):
+    assert len(read_scene_file(path).views) == 2
+    assert f"examples/{path.name}" in (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+
+
+def test_every_importer_is_documented():
+    page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([a-z]+)` \|", page, re.MULTILINE) == list(IMPORTERS)
+    options = {name for importer in IMPORTERS.values() for name in importer.options} | {"images", "overwrite"}
+    assert all(f"--{name}" in page for name in options)
+    (argument,) = (p for p in typer.main.get_command(app).commands["import"].params if p.name == "kind")
+    assert argument.help == ", ".join(list(IMPORTERS)[:-1]) + f" or {list(IMPORTERS)[-1]}."
+
+
+def test_the_readme_lists_every_option_of_dsm():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    command = typer.main.get_command(app).commands["dsm"]
+    options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
+    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z-]+)", readme, re.MULTILINE))
+
+
+def test_the_page_of_vertical_datums_names_what_there_is():
+    page = (ROOT / "docs" / "vertical.md").read_text(encoding="utf-8")
+    for name, known in KNOWN.items():
+        assert f"| `{name}` | {', '.join(f'`{grid}`' for grid in known.grids)} |" in page
+        assert f"| `{name}` | {known.title}, " in page
+        assert f"horizontal + EPSG:{known.epsg} |" in page
+    commands = typer.main.get_command(app).commands
+    for line in re.findall(r"^zlocus .+$", page, re.MULTILINE):
+        _, name, *arguments = line.split()
+        # An option that there is not raises.
+        command = commands[name]
+        command.make_parser(command.context_class(command)).parse_args(arguments)
+
+
+def test_every_product_is_documented():
+    rows = re.findall(r"^\| `(\S+)` \|", (ROOT / "docs" / "products.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(rows) == sorted([*(product.name for product in PRODUCTS), "item.json", FINISHED])
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in readme for name in rows)
+
+
+STAGES = re.findall(
+    r"^\| [^|]+ \| `(zlocus(?:\.[a-z_]+)+)` \|", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE
+)
+# One or more sizes: (n,), (r, c), (4, r, c).
+SHAPE = re.compile(r"\((?:[a-z]|\d+)(?:,|(?:, (?:[a-z]|\d+))+)\)")
+
+
+def documented(path: str) -> list[str]:
+    """Docstrings of a function and of the classes of arrays that it takes and gives."""
+    if path.count(".") == 1:
+        found = getattr(zlocus, path.partition(".")[2])
+    else:
+        module, _, name = path.rpartition(".")
+        found = getattr(importlib.import_module(module), name)
+    assert callable(found)
+    classes = [each for each in get_type_hints(found).values() if is_dataclass(each)]
+    return [found.__doc__, *(each.__doc__ for each in classes if each.__module__ != "zlocus.core.options")]
+
+
+def test_stages_are_listed():
+    assert len(STAGES) == len(set(STAGES)) == 18
+    own = {path for path in STAGES if path.count(".") == 1}
+    assert own == {f"zlocus.{name}" for name in zlocus.__all__} - {
+        "zlocus.LocusStack", "zlocus.__version__", "zlocus.match", "zlocus.open_scene", "zlocus.open_surface",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("path", STAGES)
+def test_every_stage_can_be_had_and_says_its_shapes(path):
+    own, *of_classes = documented(path)
+    assert own, f"{path} has no docstring"
+    assert any(SHAPE.search(text) for text in (own, *of_classes)), f"{path} says no shape"
+
+
+def test_a_docstring_without_shapes_is_noticed():
+    assert SHAPE.findall("xyz : (n, 3) m; (4, r, c) uint16; (n,) float64") == ["(n, 3)", "(4, r, c)", "(n,)"]
+    assert not SHAPE.search("heights (m) above the ellipsoid (see `match`), (zmin, zmax) m")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_lead_to_files(page):
+    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_paths_named_in_the_method_exist():
+    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    named = re.findall(r"\(`([a-z_/]+(?:\.py|/))`\)", text)
+    assert len(named) == 19
+    for path in named:
+        assert (ROOT / "src" / "zlocus" / path).exists(), path

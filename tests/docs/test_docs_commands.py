@@ -1,0 +1,223 @@
+"""All commands of the documents are run; what takes hours, or would run these tests, is asked whether it takes them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import httpx
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from places import ROOT
+from docs_commands import INLINE, LAID_OUT, PROJ_GRIDS, Step, inline_commands, steps_of
+from zlocus.cli.app import app
+from zlocus.synthetic.__main__ import _parser
+
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
+COMMANDS = vars(typer.main.get_command(app))["commands"]
+# Per cent, of the figures in the tutorial.
+TOLD_TO = 0.5
+ENDS_WITHIN_S = 10.0
+# What stands for the inputs of a run in lines that tell the usage.
+INPUTS = "img_1.tif img_2.tif img_3.tif"
+
+
+def options_of(text: str) -> set[str]:
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]*|(?<![\w-])-o\b", text))
+
+
+def check_zlocus(text: str) -> None:
+    """The command and the options of a line of `zlocus` exist."""
+    name = text.split()[1]
+    assert name in COMMANDS or name == "--version", text
+    command = COMMANDS[name] if name in COMMANDS else typer.main.get_command(app)
+    known = {option for parameter in command.params for option in parameter.opts} | {"--help"}
+    assert options_of(text) <= known, text
+
+
+def check_synthetic(text: str) -> None:
+    known = set(_parser()._option_string_actions)
+    assert options_of(text) <= known, text
+
+
+def check_make(text: str) -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert re.search(rf"^{text.split()[1]}:", makefile, re.MULTILINE), text
+
+
+@cache
+def help_of(script: str) -> str:
+    """What a script says of itself."""
+    asked = [sys.executable, script, "--help"]
+    return subprocess.run(asked, capture_output=True, text=True, cwd=ROOT, check=True).stdout
+
+
+def check_benchmark(text: str) -> None:
+    """The script starts, and has the options."""
+    assert options_of(text) <= options_of(help_of(shlex.split(text)[1])), text
+
+
+def check_pytest(text: str) -> None:
+    """There is something to be run."""
+    words = [*shlex.split(text)[1:], "--collect-only", "-q", "-p", "no:cacheprovider"]
+    # Where these tests run in several processes, pytest-benchmark would believe that the benchmarks do so too.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_XDIST_WORKER"}
+    subprocess.run([sys.executable, *words], capture_output=True, cwd=ROOT, check=True, env=environment)
+
+
+# Not run, and why.
+ONLY_CHECKED = {
+    "make ": check_make,  # environments, this very test, hours of benchmarks
+    "python benchmarks/": check_benchmark,  # minutes to hours on one core
+    "python -m pytest benchmarks": check_pytest,  # times, which mean nothing beside other tests
+}
+
+
+def runnable(text: str) -> str:
+    """A line of usage as a command: what is in brackets left out, three images for INPUT."""
+    return re.sub(r"\s*\[-[^]]*\]", "", text).replace("INPUT...", INPUTS)
+
+
+def run(step: Step, folder: Path) -> None:
+    """Runs one step in a folder as a reader would; commands that are alternatives to others begin anew."""
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    environment["PROJ_USER_WRITABLE_DIRECTORY"] = str(folder / PROJ_GRIDS)
+    command = [sys.executable, "-c", step.text] if step.is_python else ["bash", "-c", runnable(step.text)]
+    words = [] if step.is_python else shlex.split(runnable(step.text))
+    out = folder / words[words.index("-o") + 1] if "-o" in words else folder / "scene.yaml"
+    if words[:2] == ["zlocus", "import"] or "-o" in words:
+        shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
+    if words[:2] == ["zlocus", "inspect"]:
+        check_page(words, folder, environment)
+        return
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{step.text}\n{done.stdout}\n{done.stderr}"
+
+
+def check_page(words: list[str], folder: Path, environment: dict[str, str]) -> None:
+    """A command that serves a page prints its address, which answers, and ends when it is told to: not by Ctrl-C, which
+    is ignored where the tests run in the background of a shell."""
+    with subprocess.Popen(words, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        assert httpx.get(address).status_code == 200
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(ENDS_WITHIN_S) == 143
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if steps_of(p)], ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_the_commands_of_a_page_work(page, tmp_path):
+    lay_out = LAID_OUT.get(page.name) if page.parent != ROOT / "benchmarks" else None
+    if lay_out:
+        lay_out(tmp_path)
+    for step in steps_of(page):
+        only_checked = [check for start, check in ONLY_CHECKED.items() if step.text.startswith(start)]
+        if only_checked:
+            only_checked[0](step.text)
+            continue
+        if step.text.startswith("zlocus "):
+            check_zlocus(step.text)
+        # Without a layout a page's files are not there: its command line alone is checked.
+        if lay_out:
+            run(step, tmp_path)
+    if page.name in TOLD:
+        TOLD[page.name](tmp_path)
+
+
+def check_tutorial(folder: Path) -> None:
+    """The figures that it tells are those of its surface, rounded as there; they change with the code."""
+    words = ["evaluate", "surface/dsm.tif", "scene/truth_dsm.tif", "--classes", "scene/truth_class.tif", "--json"]
+    done = CliRunner().invoke(app, [str(folder / word) if "/" in word else word for word in words])
+    found = json.loads(done.stdout)
+    told = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
+    numbers = re.search(
+        r"truth ([\d.]+) % lie within 1 m .*: ([\d.]+) % of the ground and of the roofs, ([\d.]+) %", told
+    )
+    assert numbers
+    everything, ground, trees = (float(each) for each in numbers.groups())
+    for name, share in (("all", everything), ("ground", ground), ("building", ground), ("tree", trees)):
+        assert abs(100 * found[name]["within"] - share) < TOLD_TO, name
+    coverage = json.loads((folder / "surface" / "run.json").read_text(encoding="utf-8"))["coverage"]
+    assert f"says that {100 * coverage:.0f} % of the cells" in told
+    # Another run of `zlocus dsm`, to which no products were added.
+    page = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    (section,) = re.findall(r"^## 3\..*?(?=^## 4\.)", page, re.DOTALL | re.MULTILINE)
+    first_columns = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    named = re.findall(r"`([a-z_]+\.[a-z]+)`", " ".join(first_columns))
+    assert sorted(named) == sorted(path.name for path in (folder / "again").iterdir())
+
+
+# After the commands of a page: whether what it says of them is so.
+TOLD = {"tutorial.md": check_tutorial}
+
+
+def test_commands_in_sentences_exist():
+    found = [(page, text) for page in PAGES for text in inline_commands(page)]
+    assert len(found) > 50
+    for _, text in found:
+        program = text.split()[0]
+        check = check_make if program == "make" else check_zlocus if program == "zlocus" else check_synthetic
+        check(text)
+
+
+def without_a_layout(pages: list[Path]) -> list[str]:
+    """Names of pages that tell a reader to run something for which no layout has the files: nothing would be run."""
+    told = [
+        page.name
+        for page in pages
+        if page.parent == ROOT / "benchmarks" or page.name not in LAID_OUT
+        if any(not step.text.startswith(tuple(ONLY_CHECKED)) for step in steps_of(page))
+    ]
+    return sorted(told)
+
+
+def test_every_page_with_commands_has_a_layout():
+    assert without_a_layout(PAGES) == []
+
+
+def test_a_page_without_a_layout_is_noticed(tmp_path):
+    texts = {
+        "new.md": "```\nzlocus doctor a.tif b.tif\n```\n",
+        "python.md": "```python\nimport zlocus\n```\n",
+        "figures.md": "```\nmake acceptance\n```\n\n    python benchmarks/speed.py --help\n",
+        "words.md": "```yaml\nviews: []\n```\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    assert without_a_layout([tmp_path / name for name in texts]) == ["new.md", "python.md"]
+
+
+def test_every_layout_has_its_page():
+    """No layout is left whose page has gone, or has no commands any more."""
+    laid_out = {page.name for page in PAGES if steps_of(page)} & set(LAID_OUT)
+    assert laid_out == set(LAID_OUT)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_usage_lines_name_all_options(page):
+    """A line that shows options in brackets shows all that there are."""
+    for step in steps_of(page):
+        if step.text.startswith("zlocus ") and "[--" in step.text:
+            command = COMMANDS[step.text.split()[1]]
+            known = {p.opts[0] for p in command.params if p.param_type_name == "option"}
+            assert options_of(step.text) >= known - {"--overwrite"}, step.text
+
+
+def test_blocks_of_commands_are_found():
+    """Of a page that is known: what is looked for is what stands there."""
+    steps = [step.text for step in steps_of(ROOT / "docs" / "import.md")]
+    assert steps[0] == "zlocus import colmap PROJECT -o scene.yaml"
+    assert steps[-1] == "zlocus dsm scene.yaml -o facade"
+    assert len(steps) == 8
+    assert len(steps_of(ROOT / "benchmarks" / "README.md")) == 27
+    assert INLINE.findall("as `zlocus dsm IN` says") == ["zlocus dsm IN"]

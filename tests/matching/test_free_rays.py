@@ -1,0 +1,119 @@
+"""Free rays: a height in free air costs more where images clearly see a surface behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from free_ray_scene import AIR, ANGLES_DEG, BLOCK, GROUND, N_STEPS, PATCH, SHAPE, level_ground, with_patch
+from kernel_scene import even_lattice, ragged_lattice
+from reference import free_rays as twin
+from zlocus.matching import free_rays as stage
+from zlocus.matching.free_rays import add_costs_of_rays, agreement_on, free_rays, pair_agreement
+from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
+from zlocus.matching.occlusion import coverage
+from zlocus.matching.slope_surface import BaseSurface
+
+HEIGHT_TOLERANCE_STEPS = 1e-3
+
+
+@pytest.mark.parametrize(
+    "direction", [(0.5, 0.0), (-0.5, 0.0), (0.0, 2.0), (0.0, -0.25), (1.0, 1.0), (0.7, -0.3), (-0.4, 0.9), (0.0, 0.0)]
+)
+def test_lowest_free_ray_against_its_slow_twin(direction):
+    rng = np.random.default_rng(3)
+    surface = (25 * rng.random((23, 31))).astype(np.float32)
+    supported = rng.random(surface.shape) < 0.2
+    found = np.empty_like(surface)
+    lowest_free_ray(surface, supported, *direction, found)
+    expected = twin.lowest_free_ray(surface, supported, *direction)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=HEIGHT_TOLERANCE_STEPS)
+    assert np.isfinite(expected).any() == (direction != (0.0, 0.0))
+
+
+@pytest.mark.parametrize("direction", [(0.7, 0.3), (-0.9, 0.2), (0.2, -1.3), (-0.4, -0.5), (0.0, 0.6)])
+def test_a_part_of_a_tile_has_the_rays_that_it_has_in_the_whole(direction):
+    rng = np.random.default_rng(0)
+    surface = (rng.random((90, 110)) * 20).astype(np.float32)
+    supported, highest = rng.random(surface.shape) < 0.3, 25.0
+    whole, part = np.empty_like(surface), (slice(32, 64), slice(64, 96))
+    lowest_free_ray(surface, supported, *direction, whole)
+    around, inside = stage._where_rays_come_from(part, direction, highest - float(surface.min()), surface.shape)
+    found = np.empty(surface[around].shape, np.float32)
+    lowest_free_ray(np.ascontiguousarray(surface[around]), np.ascontiguousarray(supported[around]), *direction, found)
+    matters = whole[part] <= highest
+    assert matters.mean() > 0.5
+    np.testing.assert_array_equal(found[inside][matters], whole[part][matters])
+    assert (found[inside][~matters] > highest).all()
+
+
+@pytest.mark.parametrize("lattice", [ragged_lattice(), even_lattice()], ids=["ragged", "even"])
+def test_costs_of_rays_against_their_slow_twin(lattice):
+    rng = np.random.default_rng(5)
+    base = rng.uniform(-3, 3, lattice.shape).astype(np.float32)
+    rays = rng.uniform(0, 40, (4, *lattice.shape)).astype(np.float32)
+    rays[rng.random(rays.shape) < 0.6] = np.inf
+    cost = rng.integers(0, 256, lattice.size).astype(np.uint8)
+    expected = twin.with_ray_costs(rays, base, lattice, 12, 30, cost)
+    add_ray_costs(rays, base, lattice.ranges, lattice.address, lattice.block, 12, 30, cost)
+    np.testing.assert_array_equal(cost, expected)
+
+
+def test_agreement_of_pairs_against_its_slow_twin():
+    rng = np.random.default_rng(7)
+    truth = gaussian_filter(rng.normal(size=(19, 22)), 1.0) * 3
+    truth[:8, :9] *= 0.02  # even ground
+    grey = np.stack([truth + rng.normal(scale=scale, size=truth.shape) for scale in (0.02, 0.05, 0.1, 1.0)])
+    grey, covers = grey.astype(np.float32), rng.random(grey.shape) < 0.9
+    found = pair_agreement(grey, covers)
+    textured, even = twin.agreeing_images(grey, covers, stage.WINDOW_CELLS, stage.LEAST_NCC, stage.ALIKE, stage.EVEN)
+    np.testing.assert_array_equal(found.textured, textured)
+    np.testing.assert_array_equal(found.even, even)
+    assert (textured >= 2).any()
+    assert (even >= 1).any()
+
+
+def test_images_agree_on_the_ground_and_not_in_free_air():
+    views, _ = level_ground()
+    agreement = agreement_on(views, with_patch(), np.ones((len(ANGLES_DEG), *SHAPE), bool))
+    inside = np.zeros(SHAPE, bool)
+    inside[PATCH] = True
+    assert agreement.supported[:, ~inside].mean() > 0.9
+    assert agreement.defended[:, inside].mean() < 0.05
+
+
+def test_rays_to_the_ground_pass_below_a_patch_in_free_air():
+    views, _ = level_ground()
+    rays = free_rays(views, with_patch(), np.ones((len(ANGLES_DEG), *SHAPE), bool), float(N_STEPS))
+    below = (rays < with_patch() - stage.MARGIN_STEPS).sum(axis=0)
+    # Of three images one looks straight down, and has no ray that passes beside the patch.
+    assert (below[PATCH] >= 2).mean() > 0.9
+    ground = np.ones(SHAPE, bool)
+    ground[PATCH] = False
+    assert not below[ground].any()
+    # What an image sees at its own height, it has no ray below, whatever lies behind.
+    assert np.isinf(rays[:, ground]).mean() > 0.9
+
+
+def test_a_height_in_free_air_becomes_more_expensive_than_the_ground():
+    views, lattice = level_ground()
+    base, cost = BaseSurface.level(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
+    seen = coverage(views, base, lattice)
+    assert add_costs_of_rays(cost, views, base, lattice, seen, with_patch(), level=0)
+    by_cell = cost.reshape(lattice.shape[0], -1)
+    for row, col in ((28, 38), (30, 40), (31, 41)):
+        b, d = row // BLOCK, col // BLOCK
+        start = lattice.address[0, b, 0] + (row - b * BLOCK) * lattice.address[1, b, 0]
+        start += lattice.address[2, b, d] + (col - d * BLOCK) * N_STEPS
+        of_cell = by_cell.ravel()[start : start + N_STEPS]
+        assert of_cell[int(GROUND)] == 50
+        assert of_cell[int(AIR)] >= 50 + 2 * stage.RAY_COST
+
+
+def test_two_images_have_no_free_rays():
+    views, lattice = level_ground(ANGLES_DEG[:2])
+    base, cost = BaseSurface.level(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
+    seen = coverage(views, base, lattice)
+    assert not add_costs_of_rays(cost, views, base, lattice, seen, with_patch(), level=0)
+    assert (cost == 50).all()

@@ -1,0 +1,86 @@
+"""Each reason, and nothing else, where it applies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from zlocus.core.options import CheckOptions
+from zlocus.matching.height_checks import judge
+from zlocus.matching.quality import Quality
+from zlocus.matching.semiglobal import SemiGlobalHeights
+from zlocus.matching.subpixel import RefinedHeights
+
+OPTIONS = CheckOptions(least_ncc=0.2, doubtful_ncc=0.5, rival_cost=64)
+AT = (3, 4)
+
+
+def judged(**changed):
+    """Reasons of 7 x 9 good cells, of which the one at AT differs."""
+    values = {
+        "best": 50,
+        "margin": 500,
+        "height": 50.2,
+        "ncc": 0.9,
+        "refined": True,
+        "covering": 3,
+        "seeing": 3,
+        "apart": 0.5,
+    }
+    arrays = {name: np.full((7, 9), value) for name, value in values.items()}
+    for name, value in changed.items():
+        arrays[name][AT] = value
+    best = arrays["best"].astype(np.int32)
+    heights = SemiGlobalHeights(best, best, arrays["margin"].astype(np.uint16), best.astype(np.float32))
+    height, nothing = arrays["height"].astype(np.float32), np.zeros((7, 9), np.float32)
+    refined = RefinedHeights(
+        height,
+        arrays["ncc"].astype(np.float32),
+        arrays["refined"].astype(bool),
+        height,
+        nothing,
+        nothing,
+        nothing,
+        nothing.astype(bool),
+    )
+    apart = arrays["apart"].astype(np.float32)
+    return judge(heights, refined, arrays["covering"], arrays["seeing"], apart, 99, OPTIONS)
+
+
+def test_good_cells_have_no_reason():
+    assert (judged() == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"covering": 1, "seeing": 1}, Quality.UNSEEN),
+        ({"seeing": 1}, Quality.HIDDEN),
+        ({"best": 0}, Quality.RANGE_END),
+        ({"best": 99}, Quality.RANGE_END),
+        ({"best": 110}, Quality.RANGE_END),
+        ({"ncc": 0.19}, Quality.NO_MATCH | Quality.WEAK),
+        ({"ncc": 0.49}, Quality.WEAK),
+        ({"apart": 1.01}, Quality.DISPUTED),
+        ({"margin": 63}, Quality.AMBIGUOUS),
+        ({"refined": False}, Quality.UNREFINED),
+    ],
+)
+def test_a_reason(changed, reason):
+    quality = judged(**changed)
+    assert quality[AT] == reason
+    quality[AT] = 0
+    assert (quality == 0).all()
+
+
+@pytest.mark.parametrize("changed", [{"best": 1}, {"best": 98}, {"ncc": 0.51}, {"margin": 64}, {"seeing": 2}])
+def test_just_good_enough(changed):
+    assert (judged(**changed) == 0).all()
+
+
+def test_cells_next_to_a_jump():
+    quality = judged(height=53.3)
+    near = np.zeros((7, 9), bool)
+    near[2:5, 3:6] = True
+    np.testing.assert_array_equal(quality == Quality.JUMP, near)
+    assert (judged(height=53.1) == 0).all()

@@ -1,0 +1,73 @@
+"""Of many views, those worth reading for a tile."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rendered_scenes import CENTRE
+from zlocus.core.options import SelectionOptions
+from zlocus.core.scene import View
+from zlocus.matching.view_selection import preselected
+from zlocus.sensors.frame import FrameModel
+from zlocus.synthetic.cameras import SatelliteCamera
+
+Z = 50.0
+
+
+@dataclass(frozen=True)
+class Blank:
+    shape: tuple[int, int] = (101, 121)
+    dtype: str = "uint8"
+
+
+def view(name, along=0.0, day=None, east=0.0):
+    sensor = SatelliteCamera((CENTRE[0] + east, CENTRE[1], Z), (60.0, 50.0), 0.5, along, 0.0)
+    date = None if day is None else datetime.date(2026, 1, 1) + datetime.timedelta(days=day)
+    return View(name, Path(name), Blank(), sensor, (), date)
+
+
+def corners():
+    return np.array([(CENTRE[0] + e, CENTRE[1] + n) for e in np.linspace(-10, 10, 5) for n in np.linspace(-8, 8, 5)])
+
+
+def chosen(views, n):
+    return [views[i].name for i in preselected(views, corners(), Z, SelectionOptions(candidates=n))]
+
+
+def test_a_hundred_images_leave_a_reference_and_its_candidates():
+    views = [view(f"v{i}", along=0.4 * i) for i in range(100)]
+    names = chosen(views, 6)
+    assert len(names) == 7
+    assert names[0] == "v0"
+    angles = [0.4 * int(name[1:]) for name in names[1:]]
+    assert np.abs(np.array(angles) - 20.0).max() < 2.0
+
+
+@pytest.mark.parametrize(
+    "other", [view("other", 20.0, day=300), view("other", 3.0, day=0), view("other", 20.0, day=0, east=30.0)],
+    ids=["a far date", "a small angle", "half of the ground"],
+)  # fmt: skip
+def test_worse_images_come_last(other):
+    good = [view(f"g{i}", 19.0 + i, day=2) for i in range(3)]
+    assert "other" not in chosen([view("nadir", day=0), other, *good], 3)
+    assert "other" in chosen([view("nadir", day=0), other, *good], 4)
+
+
+def test_directions_are_those_at_the_patch():
+    """All cameras look straight down; the patch is seen from the angle at which they stand aside."""
+    turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    views = []
+    for name, east in (("above", 0.0), ("near", 5.0), ("good", 36.0), ("far", 90.0)):
+        sensor = FrameModel((CENTRE[0] + east, CENTRE[1], Z + 100.0), turn, 50.0, (60.0, 50.0))
+        views.append(View(name, Path(name), Blank(), sensor))
+    assert chosen(views, 1) == ["above", "good"]
+
+
+def test_the_reference_shows_the_whole_ground():
+    names = chosen([view("beside", east=100.0), view("nadir", 1.0), view("fore", 20.0)], 2)
+    assert names == ["nadir", "fore"]

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orientation_scenes import hill_scene
+from zlocus.core.grid import CellWindow
+from zlocus.core.options import PyramidOptions, RunConfig
+from zlocus.matching.match_scene import settle
+from zlocus.pipeline.execution.plan import CELL_S, VIEW_CELL_S, TileNeeds, core_size, plan_tiles, tile_needs
+from zlocus.sensors.correction import ShiftedModel
+
+OPTIONS = PyramidOptions(tile=64, halo=8)
+SEEN = CellWindow(-100, 30, 300, 250)
+WINDOWS = st.builds(CellWindow, *[st.integers(-300, 300)] * 2, *[st.integers(1, 300)] * 2)
+
+
+@given(WINDOWS)
+def test_tiles_hold_each_cell_asked_for_once(asked):
+    count = np.zeros((asked.rows, asked.cols), int)
+    for tile in plan_tiles(asked, SEEN, OPTIONS):
+        assert tile.kept.within(asked) == tile.kept
+        assert tile.kept.rows * tile.kept.cols > 0
+        count[tile.kept.slices_in(asked)] += 1
+    assert (count == 1).all()
+
+
+@given(WINDOWS)
+def test_cores_do_not_depend_on_the_area(asked):
+    height, width = core_size(SEEN, OPTIONS)
+    everything = {(t.core.row, t.core.col): t.core for t in plan_tiles(SEEN, SEEN, OPTIONS)}
+    for tile in plan_tiles(asked, SEEN, OPTIONS):
+        assert tile.kept.rows <= height
+        assert tile.kept.cols <= width
+        if tile.core.rows and tile.core.cols:
+            assert tile.core == everything[tile.core.row, tile.core.col]
+
+
+def test_tiles_are_equal_whole_blocks_row_by_row():
+    tiles = plan_tiles(SEEN, SEEN, OPTIONS)
+    assert core_size(SEEN, OPTIONS) == (64, 64)
+    starts = [(-100 + 64 * i, 30 + 64 * j) for i in range(5) for j in range(4)]
+    assert [(t.core.row, t.core.col) for t in tiles] == starts
+
+
+@given(st.integers(1, 20000), st.integers(1, 20000), st.sampled_from([64, 512, 1024]))
+def test_cores_are_about_as_large_as_asked(rows, cols, tile):
+    options = PyramidOptions(tile=tile)
+    seen = CellWindow(7, -3, rows, cols)
+    for side, core in zip((rows, cols), core_size(seen, options), strict=True):
+        assert core <= 1.5 * tile + options.block
+        assert core >= min(side, tile * 2 / 3)
+    assert sum(t.core.rows * t.core.cols for t in plan_tiles(seen, seen, options)) == rows * cols
+
+
+def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):
+    """Images of the same ground, looking elsewhere, and one of ground far away."""
+    looks = [(0.05 * k, 0.0) for k in range(n_views - 1)]
+    scene = hill_scene([(0.0, 0.0)] * (n_views - 1), looks, size, [0.0] * (n_views - 1))
+    away = replace(scene.views[0], name="away", sensor=ShiftedModel(scene.views[0].sensor, 9000.0, 0.0))
+    return settle(
+        replace(scene, views=(*scene.views, away)), cell_m, (0.0, 0.0), z, np.empty((0, 3)), "view0", PyramidOptions()
+    )
+
+
+def needs_of(scene, tile=1024, candidates=12):
+    config = RunConfig(
+        pyramid=PyramidOptions(tile=tile), selection=replace(RunConfig().selection, candidates=candidates)
+    )
+    return tile_needs(scene, plan_tiles(scene.seen, scene.seen, config.pyramid), config)
+
+
+def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
+    plain = needs_of(scene_of(4)).n_bytes
+    assert needs_of(scene_of(4), tile=64).n_bytes < plain < needs_of(scene_of(4, size=500)).n_bytes
+    assert needs_of(scene_of(3)).n_bytes < plain < needs_of(scene_of(6)).n_bytes
+    assert needs_of(scene_of(4, z=(109.0, 111.0))).n_bytes < plain
+    # Images of other ground are none of its views, and of many of the same only some are compared.
+    assert needs_of(scene_of(4), candidates=2).n_bytes == plain
+    assert needs_of(scene_of(6), candidates=2).n_bytes < 0.9 * needs_of(scene_of(6)).n_bytes
+    # Coarse cells hold many pixels.
+    fine, coarse = scene_of(4), scene_of(4, cell_m=2.0)
+    per_cell = [needs_of(scene).n_bytes / (scene.seen.rows * scene.seen.cols) for scene in (fine, coarse)]
+    assert per_cell[1] > 2 * per_cell[0]
+
+
+def test_time_is_that_of_cells_and_views():
+    plain = needs_of(scene_of(4))
+    cells = scene_of(4).seen.rows * scene_of(4).seen.cols
+    assert plain.seconds == pytest.approx(cells * (CELL_S + 3 * VIEW_CELL_S))
+    assert needs_of(scene_of(4), tile=64).seconds == pytest.approx(plain.seconds, rel=0.05)
+    assert needs_of(scene_of(6)).seconds > 1.3 * plain.seconds
+
+
+def test_needs_of_no_tile():
+    assert tile_needs(scene_of(3), [], RunConfig()) == TileNeeds(0, 0.0)

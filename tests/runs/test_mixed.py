@@ -1,0 +1,76 @@
+"""One rendered ground seen by three kinds of sensor: exact cameras; a surface of all is no worse than of one."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import progress_for
+from zlocus.core.requests import DsmRequest
+from zlocus.evaluation.evaluate import evaluate
+from zlocus.io.scene_file import open_scene
+from zlocus.pipeline.dsm import run_dsm
+from zlocus.synthetic.__main__ import main
+from zlocus.synthetic.mixed import SENSORS, mixed_exposures, render_mixed_scene
+from zlocus.synthetic.scenes import demo_spec
+
+# What splines make of a shaken trajectory.
+EXACT_PX = 1e-3
+# Exact cameras need no correction; what is found is the noise of some hundred ties.
+SHIFT_PX = 0.05
+TWO_PIXELS_M = 0.42
+
+
+@pytest.fixture(scope="module")
+def spec():
+    whole = demo_spec()
+    return replace(whole, size=240, hill_m=0.0, objects=replace(whole.objects, towers_per_ha=0.0))
+
+
+@pytest.fixture(scope="module")
+def scenes(spec, tmp_path_factory) -> dict[str, Path]:
+    return render_mixed_scene(spec, tmp_path_factory.mktemp("mixed") / "scene")
+
+
+def test_every_sensor_is_read_as_it_was(spec, scenes):
+    seen_by = mixed_exposures(spec)
+    assert set(scenes) == {*SENSORS, "mixed"}
+    assert len(open_scene([scenes["mixed"]]).views) == 9
+    for kind, group in seen_by.items():
+        views = open_scene([scenes[kind]]).views
+        assert [view.name for view in views] == [exposure.view.name for exposure in group]
+        for view, exposure in zip(views, group, strict=True):
+            rows, cols = exposure.shape
+            assert view.image.shape == (rows, cols)
+            rng = np.random.default_rng(1)
+            xy = rng.uniform((0, 0), (cols, rows), (300, 2))
+            xyz = exposure.camera.ground_from_image(xy, rng.uniform(*spec.height_range, 300))
+            np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=EXACT_PX)
+
+
+def test_all_sensors_together_are_no_worse_than_the_best_alone(scenes, tmp_path):
+    nmad, within = {}, {}
+    for kind, scene in scenes.items():
+        run_dsm(
+            DsmRequest(inputs=(scene,), out=tmp_path / kind, resolution=0.2), RunConfig(), progress_for(io.StringIO())
+        )
+        truth, classes = (scene.parent / name for name in ("truth_dsm.tif", "truth_class.tif"))
+        found = evaluate(tmp_path / kind / "dsm.tif", truth, classes=classes, threshold_m=TWO_PIXELS_M)
+        nmad[kind], within[kind] = found.classes["ground"].nmad, found.all.within
+    assert nmad["mixed"] <= min(nmad[kind] for kind in SENSORS)
+    assert within["mixed"] >= max(within[kind] for kind in SENSORS)
+    views = json.loads((tmp_path / "mixed" / "run.json").read_text())["orientation"]["views"].values()
+    assert max(np.abs(view["shift_px"]).max() for view in views) < SHIFT_PX
+
+
+def test_the_command(tmp_path):
+    out = tmp_path / "scene"
+    assert main(["--kind", "mixed", "--size", "60", "-o", str(out)]) == 0
+    assert {path.name for path in out.glob("*.yaml")} == {"linescan.yaml", "frame.yaml", "rpc.yaml", "mixed.yaml"}
+    assert main(["--kind", "mixed", "--size", "60", "-o", str(out)]) == 2

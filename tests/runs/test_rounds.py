@@ -1,0 +1,50 @@
+"""The finest level is matched again with its own surface in the way of views, where there are views to spare."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rendered_scenes import SMALL_TILES, read, run
+from zlocus.core.options import RunConfig
+from zlocus.matching import tile
+
+TWO_ROUNDS, SMALL_TWICE = (
+    replace(config, pyramid=replace(config.pyramid, finest_rounds=2)) for config in (RunConfig(), SMALL_TILES)
+)
+
+
+@pytest.fixture
+def levels_matched(monkeypatch):
+    """(level, whether views may be hidden, cells by which obstacles are narrowed) of every level that is matched."""
+    calls, one = [], tile._match_level
+
+    def counted(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking):
+        calls.append((level, use_visibility, len(guide.obstacle) // 2))
+        return one(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
+
+    monkeypatch.setattr(tile, "_match_level", counted)
+    return calls
+
+
+def test_three_views_have_two_rounds_on_request(images, tmp_path, levels_matched):
+    run(images("step"), tmp_path / "out", TWO_ROUNDS)
+    assert [call for call in levels_matched if call[0] == 0] == [(0, True, 2), (0, True, 1)]
+
+
+def test_two_views_have_one_and_none_is_hidden(images, tmp_path, levels_matched):
+    run(images("step").inputs[:2], tmp_path / "out", TWO_ROUNDS)
+    assert [call for call in levels_matched if call[0] == 0] == [(0, False, 2)]
+
+
+def test_one_round_by_default_and_without_visibility(images, tmp_path, levels_matched):
+    run(images("step"), tmp_path / "a")
+    run(images("step"), tmp_path / "b", TWO_ROUNDS, views="all")
+    assert [call[2] for call in levels_matched if call[0] == 0] == [2, 2]
+
+
+def test_workers_change_nothing(images, tmp_path):
+    one, two = (run(images("step"), tmp_path / str(n), SMALL_TWICE, workers=n) for n in (1, 2))
+    np.testing.assert_array_equal(*(read(r.out / "dsm.tif")[0] for r in (one, two)))

@@ -1,0 +1,175 @@
+"""Commands of the documents: where they stand, and the files that they name."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.transform import from_origin
+
+import camera_files
+from facade_scene import axes_of_wall, photographed
+from geoids import write_geoid, write_proj_grid
+from rendered_scenes import CENTRE, GSD_M, UTM, rendered
+from zlocus.io.scene_file import open_scene
+from zlocus.io.vertical import KNOWN
+from zlocus.synthetic.terrain import analytic_height
+
+PROGRAMS = ("zlocus", "python", "make", "printf")
+BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```|((?:^ {4}[^\n]*\n)+)", re.DOTALL | re.MULTILINE)
+# Where a user's own grids of PROJ lie, below a page's folder.
+PROJ_GRIDS = "proj"
+INLINE = re.compile(r"`((?:zlocus|python -m zlocus\.synthetic|make) [^`]+)`")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing that a page tells the reader to do. is_python : a block of Python, else a line for the shell."""
+
+    text: str
+    is_python: bool = False
+
+
+def steps_of(page: Path) -> list[Step]:
+    """Commands and Python of a page's blocks, in their order."""
+    found = []
+    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        language, fenced, indented = block.groups()
+        if language == "python":
+            found.append(Step(fenced, is_python=True))
+            continue
+        lines = [line.partition("  #")[0].strip() for line in (indented if fenced is None else fenced).splitlines()]
+        lines = [line for line in lines if line]
+        if language in ("", None) and lines and lines[0].split()[0] in PROGRAMS:
+            found += map(Step, lines)
+    return found
+
+
+def inline_commands(page: Path) -> list[str]:
+    """Commands in the sentences and tables of a page."""
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    return [" ".join(each.split()) for each in INLINE.findall(text.replace("\\|", "|"))]
+
+
+def lay_out_images(folder: Path) -> None:
+    """Three images with RPC, and a reference: what README and others call theirs."""
+    images = rendered(folder / "rendered", "sine")
+    for number, path in enumerate(images.inputs, 1):
+        path.rename(folder / f"img_{number}.tif")
+    half = 40.0
+    n = round(2 * half / GSD_M)
+    along = (np.arange(n) + 0.5) * GSD_M - half
+    heights = analytic_height("sine", *np.meshgrid(along, -along)).astype(np.float32)
+    where = from_origin(CENTRE[0] - half, CENTRE[1] + half, GSD_M, GSD_M)
+    with rasterio.open(
+        folder / "reference.tif", "w", driver="GTiff", width=n, height=n, count=1, dtype="float32", crs="EPSG:32632",
+        transform=where,
+    ) as file:  # fmt: skip
+        file.write(heights, 1)
+
+
+def lay_out_cameras(folder: Path) -> None:
+    """Cameras of every program, by the names of the page on `zlocus import`; a photographed wall."""
+    for write in (camera_files.write_colmap, camera_files.write_opensfm, camera_files.write_bundler):
+        write(folder / "PROJECT")
+    # One folder for three programs: the images of each of them where the others have theirs.
+    for image in (folder / "PROJECT" / "images").glob("*.tif"):
+        shutil.copy(image, folder / "PROJECT")
+    metashape = camera_files.write_metashape(folder / "metashape").folder
+    (metashape / "cameras.xml").rename(folder / "cameras.xml")
+    shutil.move(metashape / "images" if (metashape / "images").is_dir() else metashape, folder / "photos")
+    table = camera_files.write_eo(folder / "eo").folder
+    (table / "eo.csv").rename(folder / "orientations.csv")
+    for image in table.glob("*.tif"):
+        image.rename(folder / image.name)
+    photographed(folder / "herzjesu_p8", "sine", axes_of_wall((-0.733, 0.68, 0.0), (0.0, 0.0, -1.0)))
+
+
+def lay_out_products(folder: Path) -> None:
+    """Three images, and a file of options."""
+    lay_out_images(folder)
+    (folder / "options.toml").write_text("[products]\n")
+
+
+def lay_out_comparison(folder: Path) -> None:
+    """Three images, a reference and its classes."""
+    lay_out_images(folder)
+    with rasterio.open(folder / "reference.tif") as reference:
+        profile = reference.profile | {"dtype": "uint8"}
+    with rasterio.open(folder / "classes.tif", "w", **profile) as file:
+        file.write(np.zeros((profile["height"], profile["width"]), np.uint8), 1)
+
+
+def lay_out_surfaces(folder: Path) -> None:
+    """A reference with classes, surfaces that are right and that lie elsewhere, and a geoid under them."""
+    side, shape = 0.5, (400, 400)
+    row, col = np.indices(shape)
+    z = (60 + 20 * np.sin(col / 37) * np.cos(row / 29)).astype(np.float32)
+    surfaces = {"reference": (z, 0.0), "dsm": (z + 0.1, 0.0), "moved": (z, 1.0), "classes": (0 * z, 0.0)}
+    for name, (values, east) in surfaces.items():
+        dtype = "uint8" if name == "classes" else "float32"
+        with rasterio.open(
+            folder / f"{name}.tif", "w", driver="GTiff", width=shape[1], height=shape[0], count=1, dtype=dtype,
+            crs="EPSG:32632", transform=from_origin(CENTRE[0] + east, CENTRE[1], side, side),
+        ) as file:  # fmt: skip
+            file.write(values.astype(dtype), 1)
+    write_geoid(folder / "geoid.tif", np.full((8, 8), 48.0, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
+
+
+def lay_out_datums(folder: Path) -> None:
+    """Three images, a geoid as a file and as PROJ has two, a terrain model and control points above it."""
+    lay_out_images(folder)
+    undulation_m, grid_m, half = 48.0, 2.0, 200.0
+    write_geoid(folder / "geoid.tif", np.full((8, 8), undulation_m, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
+    (folder / PROJ_GRIDS).mkdir()
+    for geoid in KNOWN.values():
+        write_proj_grid(folder / PROJ_GRIDS / geoid.grids[0], np.full((721, 1440), undulation_m, np.float32))
+    n = round(2 * half / grid_m)
+    along = (np.arange(n) + 0.5) * grid_m - half
+    heights = analytic_height("sine", *np.meshgrid(along, -along)) - undulation_m
+    with rasterio.open(
+        folder / "srtm.tif", "w", driver="GTiff", width=n, height=n, count=1, dtype="float32", crs="EPSG:32632",
+        transform=from_origin(CENTRE[0] - half, CENTRE[1] + half, grid_m, grid_m),
+    ) as file:  # fmt: skip
+        file.write(heights.astype(np.float32), 1)
+    views = open_scene([folder / "img_1.tif", folder / "img_2.tif"], UTM).views
+    rows = ["name,x,y,z,image,column,row"]
+    for name, (east, north) in {"p": (-10.0, -8.0), "q": (12.0, 3.0), "r": (0.0, 15.0)}.items():
+        x, y, z = CENTRE[0] + east, CENTRE[1] + north, float(analytic_height("sine", east, north))
+        for view in views:
+            column, row = view.sensor.image_from_ground(np.array([[x, y, z]]))[0]
+            rows.append(f"{name},{x},{y},{z - undulation_m:.4f},{view.name},{column:.3f},{row:.3f}")
+    (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def lay_out_surface(folder: Path) -> None:
+    """A flags raster, for what reads one."""
+    (folder / "surface").mkdir()
+    with rasterio.open(
+        folder / "surface" / "quality.tif", "w", driver="GTiff", width=2, height=1, count=1, dtype="uint16",
+        crs="EPSG:32632", transform=from_origin(*CENTRE, 1.0, 1.0),
+    ) as file:  # fmt: skip
+        file.write(np.array([[[16, 256]]], np.uint16))
+
+
+# What a page's commands find in the folder in which they are run.
+LAID_OUT = {
+    "README.md": lay_out_images,
+    "api.md": lay_out_images,
+    "rpc.md": lay_out_images,
+    "orientation.md": lay_out_images,
+    "doctor.md": lay_out_images,
+    "import.md": lay_out_cameras,
+    "quality.md": lay_out_surface,
+    "products.md": lay_out_products,
+    "large.md": lay_out_images,
+    "report.md": lay_out_comparison,
+    "inspect.md": lay_out_images,
+    "evaluate.md": lay_out_surfaces,
+    "vertical.md": lay_out_datums,
+    "tutorial.md": lambda folder: None,
+}

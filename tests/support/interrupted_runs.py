@@ -1,0 +1,70 @@
+"""Commands that are started, watched and interrupted."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+from rendered_scenes import HEIGHTS
+from zlocus.pipeline.execution.checkpoint import DONE, FOLDER
+
+
+def command(images, out, folder, *more):
+    """The same as a command line."""
+    options = folder / "options.toml"
+    options.write_text("[pyramid]\ntile = 64\n")
+    asked = ["--crs", "EPSG:32632", "--resolution", "0.5", "--heights", *map(str, HEIGHTS), "--no-report"]
+    words = ["dsm", *map(str, images.inputs), "-o", str(out), *asked, "--config", str(options), *more]
+    return [sys.executable, "-m", "zlocus", *words]
+
+
+def started(words):
+    """A command in a session of its own, which signals reach even where this process was started to ignore them."""
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=hears,
+    )  # fmt: skip
+
+
+def n_finished(out):
+    done = out / FOLDER / DONE
+    return len(done.read_bytes().splitlines()) if done.exists() else 0
+
+
+def wait_for_tiles(out, wanted, process):
+    wait_until(lambda: process.poll() is not None or n_finished(out) >= wanted)
+
+
+def check_end(status, number, said):
+    """Of a process that was sent a signal, unless it ended before."""
+    if number == signal.SIGKILL:
+        assert status in (0, -number)
+        return
+    assert status in (0, 128 + number), said
+    assert "Traceback" not in said
+    assert "xception" not in said
+    last = "Interrupted." if number == signal.SIGINT else f"Ended by {number.name}."
+    assert said.endswith(f"zlocus: {last}\n") == (status != 0)
+
+
+def same(out, straight):
+    return all((out / f"{name}.tif").read_bytes() == (straight / f"{name}.tif").read_bytes() for name in RASTERS)
+
+
+def hears():
+    for number in ENDING:
+        signal.signal(number, signal.SIG_DFL)
+
+
+def wait_until(condition, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited for too long"
+        time.sleep(0.01)
+
+
+RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
+STOPS_WITHIN_S = 5.0
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
