@@ -12,6 +12,7 @@ import yaml
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.options.option_fields import Checked, group, option
+from zlocus.core.options.renamed_keys import RENAMED_KEYS
 from zlocus.io import config as config_io
 from zlocus.io.config import config_as_dict, config_from_dict, read_config, write_config
 
@@ -160,3 +161,18 @@ def test_broken_files(tmp_path, name, content, says):
 
 def test_written_file_is_plain_toml():
     assert tomllib.loads(write_config(RunConfig()))["orientation"]["min_ties"] == RunConfig().orientation.min_ties
+
+
+@pytest.mark.parametrize("old", sorted(RENAMED_KEYS))
+def test_a_key_of_an_earlier_version_is_refused_with_its_new_name(tmp_path, old):
+    *groups, name = old.split(".")
+    (path := tmp_path / "c.toml").write_text(f"[{'.'.join(groups)}]\n{name} = 1\n" if groups else f"{name} = 1\n")
+    with pytest.raises(ConfigError, match=re.escape(f"{old} is now called {RENAMED_KEYS[old]}.")):
+        read_config(path)
+
+
+def test_every_new_name_of_a_renamed_key_is_a_key():
+    for new in RENAMED_KEYS.values():
+        value = RunConfig()
+        for name in new.split("."):
+            value = getattr(value, name)

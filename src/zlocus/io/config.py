@@ -15,6 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.options import RunConfig
+from zlocus.core.options.renamed_keys import RENAMED_KEYS
 from zlocus.io.safe_documents import read_yaml
 from zlocus.io.safe_text import check_ended, read_text
 
@@ -89,6 +90,7 @@ def _build(kind: type[T], values: Any, where: str, prefix: str) -> T:
     chosen: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
+            _check_renamed(f"{prefix}{name}", value, where)
             raise ConfigError(_unknown(str(name), list(known), where, prefix))
         if is_dataclass(types[name]):
             chosen[name] = _build(types[name], value, where, f"{prefix}{name}.")
@@ -108,6 +110,22 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
     except (ValidationError, TypeError) as error:
         reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else "Input should be a plain value"
         raise ConfigError(f"{where} = {value!r} is of the wrong type: {reason[0].lower()}{reason[1:]}.") from error
+
+
+def _check_renamed(key: str, value: Any, where: str) -> None:
+    """Refuse a key that earlier versions used, with the key that replaces it.
+
+    key : with the names of its groups; value : where it is a group, the first of its keys that was renamed is named.
+
+    Raises
+    ------
+    ConfigError
+        The key, or one inside it, was renamed.
+    """
+    inside = [f"{key}.{name}" for name in value] if isinstance(value, Mapping) else []
+    for old in (*inside, key):
+        if old in RENAMED_KEYS:
+            raise ConfigError(f"{where}: {old} is now called {RENAMED_KEYS[old]}. Rename it in the file.")
 
 
 def _unknown(name: str, known: list[str], where: str, prefix: str) -> str:
