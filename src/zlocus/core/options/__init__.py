@@ -4,13 +4,14 @@ Each field carries its unit and one sentence in its metadata. `zlocus config` wr
 outside the allowed range are refused with the name of the field, the value and the range.
 """
 
-from zlocus.core.options.cost_options import MeasureOptions, SemiGlobalOptions
+from zlocus.core.options.cost_options import MeasureOptions
 from zlocus.core.options.height_options import CheckOptions, PlaneOptions, RefineOptions
 from zlocus.core.options.orientation_options import JointOptions, OrientationOptions
 from zlocus.core.options.product_options import ProductOptions
 from zlocus.core.options.run_config import RunConfig
 from zlocus.core.options.search_options import PyramidOptions
 from zlocus.core.options.selection_options import SelectionOptions
+from zlocus.core.options.semiglobal_options import SemiGlobalOptions
 
 __all__ = [
     "CheckOptions",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zlocus.core.options.cost_options import MeasureOptions, SemiGlobalOptions
+from zlocus.core.options.cost_options import MeasureOptions
 from zlocus.core.options.height_options import CheckOptions, PlaneOptions, RefineOptions
 from zlocus.core.options.option_fields import Checked, group
 from zlocus.core.options.orientation_options import OrientationOptions
 from zlocus.core.options.product_options import ProductOptions
 from zlocus.core.options.search_options import PyramidOptions
 from zlocus.core.options.selection_options import SelectionOptions
+from zlocus.core.options.semiglobal_options import SemiGlobalOptions
 
 
 @dataclass(frozen=True)
