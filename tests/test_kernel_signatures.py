@@ -1,4 +1,7 @@
-"""The signature comment above each kernel: as many arguments as the function takes, and its result."""
+"""The signature comment above each kernel: as many arguments as the function takes, and its result.
+
+A record (`NamedTuple`) stands there with its name; the comments of its fields begin with their shapes and types.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ def all_kernels():
         loaded = importlib.import_module(name_of_module)
         source = inspect.getsource(loaded)
         for comment, name in re.findall(r"# (.*)\n@(?:parallel_)?kernel\ndef (\w+)\(", source):
-            found[name] = (getattr(loaded, name), comment)
+            found[name] = (getattr(loaded, name), comment, loaded)
         assert len(re.findall(r"\n@(?:parallel_)?kernel\n", source)) == source.count("kernel\ndef "), name_of_module
     return found
 
@@ -36,31 +39,43 @@ DTYPES = {"f4": types.float32, "f8": types.float64, "i4": types.int32, "i8": typ
           "b1": types.boolean}  # fmt: skip
 
 
-def promised(comment):
-    """Numba types of the arguments and of the result that a comment names."""
-    arguments, result = ([typed(*part) for part in re.findall(r"(?:\(([^)]*)\) )?(None|[fiubc]\d)", side)]
-                         for side in comment.split(" -> "))  # fmt: skip
+PART = r"(?:\(([^)]*)\) )?(None|[fiubc]\d|[A-Z]\w+)"
+
+
+def promised(comment, module):
+    """Numba types of the arguments and of the result that a comment in a module names."""
+    arguments, result = ([typed(*part, module) for part in re.findall(PART, side)] for side in comment.split(" -> "))
     return tuple(arguments), result[0]
 
 
-def typed(shape, kind):
-    """(r,c) f4 is a two-dimensional array of float32, f4 a number."""
+def record(kind):
+    """Numba type of a record: of each field the type with which its comment begins."""
+    lines = dict(re.findall(r"\n    (\w+): [^#\n]*# (.*)", inspect.getsource(kind)))
+    module = importlib.import_module(kind.__module__)
+    fields = [typed(*re.match(PART, lines[name]).groups(), module) for name in kind._fields]
+    return types.BaseTuple.from_types(fields, kind)
+
+
+def typed(shape, kind, module):
+    """(r,c) f4 is a two-dimensional array of float32, f4 a number, `Record` a record of that name."""
     if kind == "None":
         return types.none
-    places = [place for place in shape.split(",") if place]
+    if kind not in DTYPES:
+        return record(getattr(module, kind))
+    places = [place for place in (shape or "").split(",") if place]
     return types.Array(DTYPES[kind], len(places), "C") if places else DTYPES[kind]
 
 
 def test_every_kernel_has_a_comment():
     assert len(KERNELS) >= 20
-    odd = [name for name, (_, comment) in KERNELS.items() if " -> " not in comment and not comment.startswith("as ")]
+    odd = [name for name, (_, comment, _) in KERNELS.items() if " -> " not in comment and not comment.startswith("as ")]
     assert not odd
 
 
 @pytest.mark.parametrize("name", [name for name in KERNELS if not KERNELS[name][1].startswith("as ")])
 def test_comment_names_types_that_compile_to_its_result(name):
-    kernel, comment = KERNELS[name]
-    arguments, result = promised(comment)
+    kernel, comment, module = KERNELS[name]
+    arguments, result = promised(comment, module)
     assert len(arguments) == len(inspect.signature(kernel.py_func).parameters)
     kernel.compile(arguments)
     found = kernel.overloads[arguments].signature.return_type

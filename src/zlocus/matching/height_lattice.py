@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import PyramidOptions
+from zlocus.matching.kernels.shared_records import VolumeLayout
 
 IntArray = NDArray[np.int64]
 # Where a height step is more cells high than this, the base is narrow for the size of the cells.
@@ -58,6 +59,13 @@ class HeightLattice:
         )
 
     @cached_property
+    def layout(self) -> VolumeLayout:
+        """The search ranges and the address of every cell, as the kernels take them."""
+        block_row_start, row_length, block_start = self.address
+        first, count = self.ranges
+        return VolumeLayout(first, count, block_row_start, row_length, block_start, self.block)
+
+    @cached_property
     def size(self) -> int:
         """Cell-steps of the ragged volume."""
         rows, cols = self.shape
@@ -81,8 +89,8 @@ class HeightLattice:
 LANES = 4
 UNKNOWN = np.float32(1e9)
 SPIKE = np.ones((3, 3), np.uint8)
-# Equivalent disparity within which cells that found heights by themselves agree: crowns are round (docs/accuracy.md,
-# "Heights that cells find alone").
+# Equivalent disparity within which the winner-takes-all heights of neighbouring cells agree: tree crowns are round
+# (docs/development/experiments/heights_of_single_cells.md).
 ALIKE_PX = 4.0
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from zlocus.core.errors import GeometryError
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import Scanning, SensorModel, bare, capped, lowest_station
+from zlocus.matching.kernels.shared_records import ViewArrays
 from zlocus.matching.radiometry import GreyScale
 from zlocus.sensors.projection_table import (
     DEGREE,
@@ -88,6 +89,11 @@ class TileViews:
     heights: NDArray[np.float64]
     ends: NDArray[np.float64]
     block: int
+
+    @property
+    def arrays(self) -> ViewArrays:
+        """What the kernels read of them."""
+        return ViewArrays(self.pixels, self.layout, self.nodes, self.heights, self.block)
 
     @property
     def limits(self) -> NDArray[np.int64]:
