@@ -4,7 +4,7 @@
     python tests/support/fuzz.py --seconds 3600             # of all formats together
     python tests/support/fuzz.py scene-frame --seconds 600  # of one
 
-Formats are those of `damage_cases.CASES`. What a reader must do is what `test_damage` asks for: an answer or a
+Formats are those of `damage_cases.CASES`. What a reader must do is what `test_io_damaged_files` asks for: an answer or a
 `ZlocusError` of one sentence, in time and memory. Inputs that reach code of their own are kept, the smallest first, in
 `tests/fuzz_seeds/FORMAT`; those that fail too, as `fail-...`.
 """

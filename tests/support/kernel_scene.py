@@ -84,3 +84,9 @@ def even_lattice(count=16, shape=(37, 70), block=16, first=0):
 def at_all_heights(holds):
     """`TileViews.ends` of blocks (i, b, d) that hold at every height."""
     return np.broadcast_to((-np.inf, np.inf), (*holds.shape, 2))
+
+
+def rough_surface(shape, seed=0, high=25.0):
+    """(r, c) float32: half of the cells at 0, the others anywhere up to `high`."""
+    rng = np.random.default_rng(seed)
+    return (rng.integers(0, 2, shape) * high * rng.random(shape)).astype(np.float32)

@@ -449,3 +449,8 @@ def test_costs_whatever_index_heights_start_at():
     # The table's t of a height is rounded differently.
     assert np.abs(found.astype(int) - expected).max() <= 1
     assert (found != expected).mean() < 1e-3
+
+
+def test_rows_and_columns_of_a_block():
+    rows, cols = np.indices((3, 5))
+    np.testing.assert_array_equal(flat_cells((3, 5)), [rows.ravel(), cols.ravel()])
