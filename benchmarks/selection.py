@@ -33,11 +33,11 @@ from pyproj import CRS
 
 from judging import RENDERED_TOWN, judged, matched, rendered_scene, table_head, table_row, write_table
 from workplace import CannotRun, ended
-from zlocus.core.options import RunConfig, SelectionOptions
+from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.io.scene_file import open_scene
 from zlocus.matching import tile
 from zlocus.matching.match_curve import GOOD, ProgressiveMean, curve_peaks, quality_labels
-from zlocus.matching.match_scene import leading_first, nadir_offset
+from zlocus.matching.match_scene import reference_first, parallax_rate
 from zlocus.matching.occlusion import covers
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.view_directions import cells_per_step
@@ -83,8 +83,8 @@ def choices(names: list[str], by_geometry: list[str]) -> dict[str, Choice]:
 
 def ranked_by_geometry(images: dict[str, Path], crs: str, z: float) -> list[str]:
     """The most nadir view, then the others as `candidate_images` ranks them from angles; all overlap wholly here."""
-    views = leading_first(open_scene(tuple(images.values()), CRS.from_user_input(crs)), z, None)
-    rays = np.array([(*nadir_offset(view, z), 1.0) for view in views])
+    views = reference_first(open_scene(tuple(images.values()), CRS.from_user_input(crs)), z, None)
+    rays = np.array([(*parallax_rate(view, z), 1.0) for view in views])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     angle_deg = np.degrees(np.arccos(np.clip(rays[1:] @ rays[0], -1.0, 1.0)))
     unknown = np.full(len(angle_deg), np.nan)
@@ -120,7 +120,7 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
 
     The reference is the first (most nadir) view used at a cell.
     """
-    half, options = config.measure.large_window // 2, config.selection
+    half, options = large_window_side(config.cost) // 2, config.selection
     surface = smoothed(result.heights.vertex, config.refine.jump_steps)
     rows, cols = (np.arange(half + spacing // 2, n - half, spacing) for n in surface.shape)
     cells = np.stack([v.ravel() for v in np.meshgrid(rows, cols, indexing="ij")], axis=1)

@@ -147,7 +147,7 @@ def test_what_if_is_computed_by_the_same_functions(page, out, scene, asked, wind
     x, y = inspection.folder.middle_of(row, col)
     config = replace(scene.config, selection=replace(scene.config.selection, **selection))
     if window is not None:
-        config = replace(config, measure=replace(config.measure, large_window=window))
+        config = replace(config, cost=replace(config.cost, large_window=window))
     found = client.get("api/cell", params={"x": x, "y": y, **asked}).json()["match"]
     expected = report_of(scene, inspection.folder, row, col, config, reference, views)
     same_record(found, expected, config)

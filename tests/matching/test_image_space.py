@@ -11,7 +11,7 @@ from pyproj import CRS
 
 from rendered_scenes import UTM, camera
 from zlocus.core.errors import ConfigError, GeometryError
-from zlocus.core.options import MeasureOptions, OrientationOptions, PyramidOptions, RunConfig
+from zlocus.core.options import CostOptions, OrientationOptions, PyramidOptions, RunConfig, large_window_side
 from zlocus.core.scene import ImageWindow, Scene, View
 from zlocus.matching.image_space import (
     BORDER_PX,
@@ -24,7 +24,7 @@ from zlocus.matching.image_space import (
     hypotheses_of_heights,
     hypotheses_of_ties,
     image_space,
-    settle_image,
+    build_image_match_scene,
     shift_rates,
     widest_disparities,
 )
@@ -73,7 +73,7 @@ def test_disparities_are_those_of_the_longest_base():
 
 def test_a_step_is_half_a_pixel_in_the_most_sensitive_image():
     space = image_space(row_of_frames(0.0, 1.0, 3.0), "v0", (0.0, 0.0))
-    settled = settle_image(space, (4.0, 20.0), NO_TIES, PyramidOptions())
+    settled = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
     assert settled.step_m == pytest.approx(0.5)
     assert settled.origin_m == pytest.approx(4.0 - END_STEPS * 0.5)
     assert settled.n_steps == 32 + 2 * END_STEPS
@@ -88,7 +88,7 @@ def test_a_step_is_half_a_pixel_in_the_most_sensitive_image():
 def test_satellites_are_asked_for_heights_in_ground_pixels():
     space = image_space(satellites(), "nadir", (40.0, 60.0))
     assert hypotheses_of_heights(space, (40.0, 60.0)) == pytest.approx((-20.0, 20.0), rel=0.02)
-    settled = settle_image(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
+    settled = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
     # The aft image looks 18 degrees apart along the track and 7 across: a ground pixel of height shifts it so much.
     along, across = np.tan(np.deg2rad([1.0, -3.0])) - np.tan(np.deg2rad([-17.0, 4.0]))
     assert settled.step_m == pytest.approx(0.5 / np.hypot(along, across), rel=0.05)
@@ -96,7 +96,7 @@ def test_satellites_are_asked_for_heights_in_ground_pixels():
 
 def test_the_first_pixel_is_the_first_cell():
     space = image_space(satellites(), "fore", (40.0, 60.0))
-    settled = settle_image(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
+    settled = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
     x, y = settled.transform(settled.seen, 0) * (0.5, 0.5)
     np.testing.assert_allclose(settled.views[0].sensor.image_from_ground(np.array([[x, y, 3.0]])), BORDER_PX)
 
@@ -121,7 +121,7 @@ def test_ties_give_the_range_of_disparities():
 
 def test_the_added_steps_hold_no_heights():
     space = image_space(row_of_frames(0.0, 2.0), "v0", (0.0, 0.0))
-    settled = settle_image(space, (4.0, 20.0), NO_TIES, PyramidOptions())
+    settled = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
     heights = np.array([[3.0, 3.8, 4.0, 12.0, 20.2, 20.5, np.nan]], np.float32)
     np.testing.assert_array_equal(beyond_range(settled, heights), [[True, False, False, False, False, True, False]])
 
@@ -136,14 +136,14 @@ def test_borders_repeat_the_outermost_pixels():
 
 
 def test_turned_images_are_tabulated_in_smaller_blocks():
-    straight = settle_image(
+    straight = build_image_match_scene(
         image_space(row_of_frames(0.0, 2.0), "v0", (0.0, 0.0)), (4.0, 20.0), NO_TIES, PyramidOptions()
     )
     assert fitting_block([straight], 32) == 32
     turned = FrameModel((2.0, 0.0, 0.0), rotation_from_angles(180.0, 9.0, 0.0), 400.0, (40.0, 30.0))
     views = (row_of_frames(0.0).views[0], view("t", turned))
     space = image_space(Scene(views, UTM), "v0", (0.0, 0.0))
-    settled = settle_image(space, (10.0, 40.0), NO_TIES, PyramidOptions())
+    settled = build_image_match_scene(space, (10.0, 40.0), NO_TIES, PyramidOptions())
     assert fitting_block([settled], 32) in (8, 16)
     # Beyond what is in front of both cameras nothing helps.
     assert fitting_block([replace(settled, origin_m=-2000.0, n_steps=8000)], 32) is None
@@ -160,9 +160,22 @@ def test_options_that_were_changed_stay():
     plain = depth_options(RunConfig())
     for stage, values in BY_DEPTH.items():
         assert {name: getattr(getattr(plain, stage), name) for name in values} == values
-    mine = RunConfig(measure=MeasureOptions(hidden_excused=0.25))
-    assert depth_options(mine).measure.hidden_excused == 0.25
-    assert depth_options(mine).measure.large_window == BY_DEPTH["measure"]["large_window"]
+    mine = RunConfig(cost=CostOptions(occluded_pairs_excluded=0.25))
+    assert depth_options(mine).cost.occluded_pairs_excluded == 0.25
+    assert depth_options(mine).cost.large_window == BY_DEPTH["cost"]["large_window"]
+
+
+@pytest.mark.parametrize("side", [3, 5, 7])
+def test_a_large_window_that_the_user_set_stays_whatever_its_value(side):
+    assert depth_options(RunConfig(cost=CostOptions(large_window=side))).cost.large_window == side
+
+
+def test_an_unset_large_window_is_decided_by_the_method():
+    unset = RunConfig()
+    assert unset.cost.large_window is None
+    assert large_window_side(unset.cost) == 5, "on the ground grid"
+    assert large_window_side(depth_options(unset).cost) == 3, "for depths in image space"
+    assert large_window_side(CostOptions(large_window=7)) == 7
 
 
 def test_what_makes_no_image_space_is_refused():
@@ -172,4 +185,4 @@ def test_what_makes_no_image_space_is_refused():
         image_space(row_of_frames(0.0, 0.0), "v0", (0.0, 0.0))
     far = image_space(row_of_frames(0.0, 1.0), "v0", (0.0, 0.0))
     with pytest.raises(GeometryError, match=r"v0.*overlap"):
-        settle_image(far, (300.0, 400.0), NO_TIES, PyramidOptions())
+        build_image_match_scene(far, (300.0, 400.0), NO_TIES, PyramidOptions())

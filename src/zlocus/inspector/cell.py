@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError, GeometryError
-from zlocus.core.options import RunConfig
+from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.sensor_model import FloatArray
 from zlocus.inspector.folder import SurfaceFolder
 from zlocus.inspector.layers import reasons_of
@@ -59,9 +59,9 @@ class WhatIf:
         changed = replace(config, selection=replace(config.selection, **self.selection))
         if self.window is None:
             return changed
-        return replace(changed, measure=replace(changed.measure, large_window=self.window))
+        return replace(changed, cost=replace(changed.cost, large_window=self.window))
 
-    def scene(self, settled: MatchScene) -> MatchScene:
+    def scene(self, match_scene: MatchScene) -> MatchScene:
         """The scene without the images left out.
 
         Raises
@@ -69,14 +69,14 @@ class WhatIf:
         ConfigError
             An image that is not in it.
         """
-        names = [view.name for view in settled.views]
+        names = [view.name for view in match_scene.views]
         unknown = (self.left_out | ({self.reference} if self.reference else set())) - set(names)
         if unknown:
             raise ConfigError(f"This surface has no image {min(unknown)[:60]!r}.")
         if self.reference in self.left_out:
             raise ConfigError(f"{self.reference} is the reference, and switched off. Choose another reference.")
         kept = [i for i, name in enumerate(names) if name not in self.left_out]
-        return replace(settled, views=tuple(settled.views[i] for i in kept), grey=tuple(settled.grey[i] for i in kept))
+        return replace(match_scene, views=tuple(match_scene.views[i] for i in kept), grey=tuple(match_scene.grey[i] for i in kept))
 
 
 def cell_record(folder: SurfaceFolder, reference: Reference | None, row: int, col: int) -> dict[str, Any]:
@@ -108,14 +108,14 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     """
     matched, config = restored.matched, what_if.config(restored.config)
     place = place_of_cell(xy, height_m, matched)
-    settled = what_if.scene(matched.settled)
-    if len(settled.views) < 2:
+    match_scene = what_if.scene(matched.match_scene)
+    if len(match_scene.views) < 2:
         raise GeometryError("Two images are needed at least. Switch another one on.")
     try:
-        looked = curves_at("The cell", what_if.reference, settled, place, config, SHOWN_WITHIN_CELLS)
+        looked = curves_at("The cell", what_if.reference, match_scene, place, config, SHOWN_WITHIN_CELLS)
     except GeometryError as error:
         raise GeometryError(why_not_shown(what_if)) from error
-    report = PointReport.of("the cell", looked, settled, matched.scene.crs)
+    report = PointReport.of("the cell", looked, match_scene, matched.scene.crs)
     images = image_records(looked, loci(looked.views, report))
     below = float(matched.undulation(xy[None])[0])
     report = replace(
@@ -130,8 +130,8 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
         "sigma_m": (curves.sigma_steps * report.step_m).tolist(),
         "says": {"order": what_order_rests_on(report, options), "stop": where_it_stops(report, options)},
         "images": images,
-        "window": config.measure.large_window,
-        "neighbours": neighbour_records(looked, settled, config),
+        "window": large_window_side(config.cost),
+        "neighbours": neighbour_records(looked, match_scene, config),
     }
 
 
@@ -164,14 +164,14 @@ def image_records(looked: LookedAt, found: list[Locus]) -> list[dict[str, Any]]:
     return records
 
 
-def neighbour_records(looked: LookedAt, settled: MatchScene, config: RunConfig) -> dict[str, Any]:
+def neighbour_records(looked: LookedAt, match_scene: MatchScene, config: RunConfig) -> dict[str, Any]:
     """The tie points that order the images, on the ground, with their labels."""
     order, options = looked.curves.order, config.selection
-    xy = settled.anchor + order.xy * settled.cell_m * (1.0, -1.0)
+    xy = match_scene.anchor + order.xy * match_scene.cell_m * (1.0, -1.0)
     return {
-        "by": options.neighbours, "radius_m": options.radius_px * settled.cell_m,
+        "by": options.neighbours, "radius_m": options.radius_px * match_scene.cell_m,
         "points": [
-            {"x": float(x), "y": float(y), "distance_m": float(away * settled.cell_m), "labels": labels.tolist()}
+            {"x": float(x), "y": float(y), "distance_m": float(away * match_scene.cell_m), "labels": labels.tolist()}
             for (x, y), away, labels in zip(xy, order.distance, order.labels, strict=True)
         ],
     }  # fmt: skip

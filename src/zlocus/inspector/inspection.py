@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from zlocus.core.errors import ConfigError, GeometryError, InputError, ZlocusError
-from zlocus.core.options import RunConfig, SelectionOptions
+from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.parallel import submitted
 from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
@@ -219,10 +219,10 @@ class Inspection:
             ],
             "made": run.get("created", ""),
             "images": list(run["orientation"]["views"]), "method": run["config"]["request"]["method"],
-            "small_window": config.measure.small_window, "few_views": config.measure.few_views,
+            "small_window": config.cost.small_window, "max_images_for_large_window": config.cost.max_images_for_large_window,
             "fewest_views": config.selection.fewest_views, "views": run["config"]["request"]["views"],
             "options": options_record(config.selection),
-            "window": {"value": config.measure.large_window, "choices": list(WINDOWS)},
+            "window": {"value": large_window_side(config.cost), "choices": list(WINDOWS)},
             "cells": self._cells(),
         }  # fmt: skip
 

@@ -9,7 +9,7 @@ from dataclasses import Field, fields
 from typing import Any, get_type_hints
 
 from zlocus.core.errors import ConfigError
-from zlocus.core.options import MeasureOptions, SelectionOptions
+from zlocus.core.options import CostOptions, SelectionOptions
 from zlocus.inspector.cell import WhatIf
 from zlocus.inspector.folder import Patch
 
@@ -27,7 +27,7 @@ PATCH = ("row", "col", "rows", "cols", "height", "width")
 LONGEST_NUMBER = 40
 SELECTION = {f.name: f for f in fields(SelectionOptions)}
 KINDS = get_type_hints(SelectionOptions)
-WINDOWS: tuple[int, ...] = next(f for f in fields(MeasureOptions) if f.name == "large_window").metadata["choices"]
+WINDOWS: tuple[int, ...] = next(f for f in fields(CostOptions) if f.name == "large_window").metadata["choices"]
 
 
 class BadQuery(ConfigError):

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
-from zlocus.core.scene import ImageSource, ImageWindow, Scene, View, ground_sample_distance
+from zlocus.core.scene import ImageSource, ImageWindow, Scene, View
+from zlocus.core.footprints import ground_sample_distance
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.match_scene import MatchScene, levels_for, seen_window
 from zlocus.matching.radiometry import grey_scales
@@ -35,7 +36,7 @@ DISPARITY_MARGIN_PX = 8.0
 # What is farther is as good as infinitely far.
 LEAST_DISPARITY_PX = 0.5
 BY_DEPTH: dict[str, dict[str, Any]] = {
-    "measure": {"large_window": 3, "hidden_excused": 1.0, "hidden_margin_steps": 24.0, "grey_weight_two": 1.0},
+    "cost": {"large_window": 3, "occluded_pairs_excluded": 1.0, "occlusion_margin_steps": 24.0, "grey_weight_two_images": 1.0},
     "semiglobal": {
         "predecessors": 1,
         "p1": 20,
@@ -153,7 +154,7 @@ def depth_rays(view: View, others: list[View]) -> DepthRays:
     return DepthRays(sensor, sensor.focal * longest)
 
 
-def settle_image(
+def build_image_match_scene(
     space: ImageSpace,
     z_range: tuple[float, float],
     ties: FloatArray,
@@ -186,7 +187,7 @@ def settle_image(
 
 
 def beyond_range(scene: MatchScene, height: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where hypotheses lie in the steps added by `settle_image`. height : (r, c)."""
+    """Where hypotheses lie in the steps added by `build_image_match_scene`. height : (r, c)."""
     low = scene.origin_m + (END_STEPS - 0.5) * scene.step_m
     high = scene.origin_m + (scene.n_steps - END_STEPS + 0.5) * scene.step_m
     return np.asarray((height < low) | (height > high))

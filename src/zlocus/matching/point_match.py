@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError
 from zlocus.core.grid import CellWindow
-from zlocus.core.options import RunConfig, SelectionOptions
+from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.match_curve import (
@@ -30,13 +30,13 @@ from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.tile_views import TileViews, pixel_window, read_pixels, tile_views
 from zlocus.matching.view_directions import cells_per_step
 from zlocus.matching.view_ranking import (
-    Evidence,
+    OrderSource,
     FeaturePoints,
     NeighbourSearch,
-    Ranking,
+    PairLabels,
     Samples,
-    image_order,
-    rank_views,
+    order_images,
+    label_pairs,
 )
 from zlocus.matching.view_selection import order_views, preselected
 
@@ -48,8 +48,8 @@ class PointOrder:
     """The reference of a cell and the other views that show it, best first.
 
     reference : view; search : (j,) int64 views; accumulated : (j,) int64, their labels summed over the feature points
-    around; is_worth : (j,) bool, whether they help; evidence : what the order rests on; features : (f,) int64 feature
-    points, the nearest first; xy : (f, 2) float64, where they are, as `Ranking.xy`; distance : (f,) float64 cells;
+    around; is_worth : (j,) bool, whether they help; order_source : what the order rests on; features : (f,) int64 feature
+    points, the nearest first; xy : (f, 2) float64, where they are, as `PairLabels.xy`; distance : (f,) float64 cells;
     labels : (f, j) int8, of the search views there.
     """
 
@@ -57,7 +57,7 @@ class PointOrder:
     search: IntArray
     accumulated: IntArray
     is_worth: NDArray[np.bool_]
-    evidence: Evidence
+    order_source: OrderSource
     features: IntArray
     xy: FloatArray
     distance: FloatArray
@@ -116,16 +116,16 @@ def peak_of(index: FloatArray, curve: FloatArray) -> float:
     return float(index[peak] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
 
 
-def point_order(ranking: Ranking, share: FloatArray, at: FloatArray, options: SelectionOptions) -> PointOrder:
+def point_order(ranking: PairLabels, share: FloatArray, at: FloatArray, options: SelectionOptions) -> PointOrder:
     """Reference and order of the views at one place.
 
-    share : (i,) float64, 1 for views that show it and may be the reference; at : (2,) float64, as `Ranking.xy`.
+    share : (i,) float64, 1 for views that show it and may be the reference; at : (2,) float64, as `PairLabels.xy`.
     """
     found = order_views(ranking, share[:, None], at[None], options)
     reference, search = int(found.reference[0]), found.search[0]
     others = np.delete(np.arange(len(share)), reference)
     labels = ranking.labels[:, reference]
-    order = image_order(FeaturePoints(ranking.xy, labels[:, others]), at[None], options)
+    order = order_images(FeaturePoints(ranking.xy, labels[:, others]), at[None], options)
     accumulated = dict(zip(others.tolist(), order.accumulated[0].tolist(), strict=True))
     features = NeighbourSearch(ranking.xy, options).of(at[None]).index
     return PointOrder(
@@ -133,7 +133,7 @@ def point_order(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
         search=search,
         accumulated=np.array([accumulated[i] for i in search.tolist()], np.int64),
         is_worth=found.is_worth[0],
-        evidence=Evidence(int(order.evidence[0])),
+        order_source=OrderSource(int(order.order_source[0])),
         features=features,
         xy=ranking.xy[features],
         distance=np.hypot(*(ranking.xy[features] - at).T),
@@ -246,9 +246,9 @@ class LookedAt:
         return cell_windows(self.sampled, self.window, self.place.cell, self.index, side, reach)[self.kept]
 
 
-def cell_of(xy: FloatArray, settled: MatchScene) -> tuple[int, int]:
+def cell_of(xy: FloatArray, match_scene: MatchScene) -> tuple[int, int]:
     """Row and column of the finest lattice's cell that holds a ground point."""
-    col, row = (xy - settled.anchor) * (1.0, -1.0) / settled.cell_m
+    col, row = (xy - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
     return math.floor(row), math.floor(col)
 
 
@@ -265,15 +265,15 @@ def shows(view: View, xyz: FloatArray) -> bool:
     return bool(0 <= row <= rows - 1 and 0 <= col <= cols - 1)
 
 
-def check_shown(asked: str, reference: str | None, xyz: FloatArray, names: Sequence[str], settled: MatchScene) -> None:
+def check_shown(asked: str, reference: str | None, xyz: FloatArray, names: Sequence[str], match_scene: MatchScene) -> None:
     """Refuse a point that fewer than two views show, or a reference that is not among them.
 
     asked : the point as it was asked for, for messages.
     """
     what = f"{asked} (E {xyz[0]:.1f}, N {xyz[1]:.1f}, height {xyz[2]:.1f} m)"
     if len(names) < 2:
-        west, north = settled.transform(settled.seen, 0) * (0, 0)
-        east, south = settled.transform(settled.seen, 0) * (settled.seen.cols, settled.seen.rows)
+        west, north = match_scene.transform(match_scene.seen, 0) * (0, 0)
+        east, south = match_scene.transform(match_scene.seen, 0) * (match_scene.seen.cols, match_scene.seen.rows)
         fault = (
             f"is shown, with the window around it, by {names[0]} only, and two images are needed"
             if names
@@ -290,7 +290,7 @@ def check_shown(asked: str, reference: str | None, xyz: FloatArray, names: Seque
 def curves_at(
     asked: str,
     reference: str | None,
-    settled: MatchScene,
+    match_scene: MatchScene,
     place: Place,
     config: RunConfig,
     farthest: int = RANKED_WITHIN_CELLS,
@@ -305,31 +305,31 @@ def curves_at(
     GeometryError
         Fewer than two views show the place, or not the reference.
     """
-    names = [view.name for view in settled.views if shows(view, place.xyz)]
-    check_shown(asked, reference, place.xyz, names, settled)
-    options, side = config.selection, config.measure.large_window
-    index = (place.xyz[2] - settled.origin_m) / settled.step_m
+    names = [view.name for view in match_scene.views if shows(view, place.xyz)]
+    check_shown(asked, reference, place.xyz, names, match_scene)
+    options, side = config.selection, large_window_side(config.cost)
+    index = (place.xyz[2] - match_scene.origin_m) / match_scene.step_m
     radius, at = options.radius_px, np.array(place.cell[::-1]) + 0.5
-    near = () if options.neighbours == "tin" else ((radius, Evidence.NEIGHBOURS),)
-    for around, enough in (*near, (options.widest * radius, Evidence.NEAREST), (farthest, Evidence.SCENE)):
+    near = () if options.neighbours == "tin" else ((radius, OrderSource.NEIGHBOURS),)
+    for around, enough in (*near, (options.widest * radius, OrderSource.NEAREST), (farthest, OrderSource.SCENE)):
         halo = min(math.ceil(around), farthest)
-        window = CellWindow(*place.cell, 1, 1).at_level(0, halo).within(settled.seen)
+        window = CellWindow(*place.cell, 1, 1).at_level(0, halo).within(match_scene.seen)
         if not (window.rows and window.cols):
-            check_shown(asked, reference, place.xyz, [], settled)
-        numbers, views = views_of(settled, window, place, config)
+            check_shown(asked, reference, place.xyz, [], match_scene)
+        numbers, views = views_of(match_scene, window, place, config)
         windows = cell_windows(views, window, place.cell, index, side, options.reach_steps)
         kept = np.flatnonzero(~np.isnan(windows[:, options.reach_steps, 0]))
-        compared = tuple(settled.views[numbers[i]] for i in kept)
-        check_shown(asked, reference, place.xyz, [view.name for view in compared], settled)
-        ranking = ranked(settled, views, window, config)
+        compared = tuple(match_scene.views[numbers[i]] for i in kept)
+        check_shown(asked, reference, place.xyz, [view.name for view in compared], match_scene)
+        ranking = ranked(match_scene, views, window, config)
         ranking = replace(ranking, labels=ranking.labels[:, kept][:, :, kept])
         order = point_order(ranking, references(reference, compared), at, options)
-        if order.evidence <= enough:
+        if order.order_source <= enough:
             break
     step_px = steps_px(views, int(kept[order.reference]), kept[order.search])
     along = index + np.arange(-options.reach_steps, options.reach_steps + 1)
     curves = point_curves(windows[kept], order, step_px, along, options)
-    heights_m = settled.origin_m + along * settled.step_m
+    heights_m = match_scene.origin_m + along * match_scene.step_m
     return LookedAt(place, compared, curves, index, heights_m, views, window, kept)
 
 
@@ -338,49 +338,49 @@ def references(reference: str | None, views: Sequence[View]) -> FloatArray:
     return np.array([float(reference in (None, view.name)) for view in views])
 
 
-def views_of(settled: MatchScene, window: CellWindow, place: Place, config: RunConfig) -> tuple[list[int], TileViews]:
+def views_of(match_scene: MatchScene, window: CellWindow, place: Place, config: RunConfig) -> tuple[list[int], TileViews]:
     """The views worth comparing at the place, by number, and what they show of a window of cells around it."""
-    z = heights_around(settled, window, place, config.selection)
-    transform = settled.transform(window, 0)
+    z = heights_around(match_scene, window, place, config.selection)
+    transform = match_scene.transform(window, 0)
     across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
     corners = np.array([transform * (c, r) for c in across for r in down])
     numbers, found = [], []
-    which = [number for number, view in enumerate(settled.views) if shows(view, place.xyz)]
+    which = [number for number, view in enumerate(match_scene.views) if shows(view, place.xyz)]
     if len(which) > config.selection.candidates + 1:
-        shown = [settled.views[number] for number in which]
+        shown = [match_scene.views[number] for number in which]
         rows = preselected(shown, place.middle[None], float(place.xyz[2]), config.selection)
         which = [which[row] for row in rows]
     for number in which:
-        part = pixel_window(settled.views[number], corners, z, 1)
+        part = pixel_window(match_scene.views[number], corners, z, 1)
         if part is not None:
             numbers.append(number)
-            found.append(read_pixels(settled.views[number], part, 1, settled.grey[number]))
-    shape, lattice = (window.rows, window.cols), (settled.origin_m, settled.step_m)
-    half = config.measure.large_window // 2
+            found.append(read_pixels(match_scene.views[number], part, 1, match_scene.grey[number]))
+    shape, lattice = (window.rows, window.cols), (match_scene.origin_m, match_scene.step_m)
+    half = large_window_side(config.cost) // 2
     return numbers, tile_views(found, 0, transform, shape, config.pyramid.block, lattice, z, half)
 
 
 def heights_around(
-    settled: MatchScene, window: CellWindow, place: Place, options: SelectionOptions
+    match_scene: MatchScene, window: CellWindow, place: Place, options: SelectionOptions
 ) -> tuple[float, float]:
     """Between which heights, m, curves of the place and of the tie points in a window are looked at: of a scene's whole
     range projections would be tabulated several times as long."""
-    xy = ties_on_cells(settled)
+    xy = ties_on_cells(match_scene)
     first, size = np.array([window.col, window.row]), np.array([window.cols, window.rows])
-    inside = ((xy >= first) & (xy < first + size)).all(axis=1) & np.isfinite(settled.ties[:, 2])
-    heights = np.append(settled.ties[inside, 2], place.xyz[2])
-    reach = (options.reach_steps + 1) * settled.step_m
+    inside = ((xy >= first) & (xy < first + size)).all(axis=1) & np.isfinite(match_scene.ties[:, 2])
+    heights = np.append(match_scene.ties[inside, 2], place.xyz[2])
+    reach = (options.reach_steps + 1) * match_scene.step_m
     return float(heights.min()) - reach, float(heights.max()) + reach
 
 
-def ties_on_cells(settled: MatchScene) -> FloatArray:
+def ties_on_cells(match_scene: MatchScene) -> FloatArray:
     """Columns and rows of the finest lattice where the tie points lie, (n, 2)."""
-    return np.asarray((settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m)
+    return np.asarray((match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m)
 
 
-def ranked(settled: MatchScene, views: TileViews, window: CellWindow, config: RunConfig) -> Ranking:
+def ranked(match_scene: MatchScene, views: TileViews, window: CellWindow, config: RunConfig) -> PairLabels:
     """Labels of all pairs of views at the tie points of a window, on level ground."""
-    xy = ties_on_cells(settled)
-    index = (settled.ties[:, 2] - settled.origin_m) / settled.step_m
-    side, steps_per_cell, flat = config.measure.large_window, settled.cell_m / settled.step_m, np.zeros((len(xy), 2))
-    return rank_views(views, window, xy, index, flat, side, steps_per_cell, config.selection)
+    xy = ties_on_cells(match_scene)
+    index = (match_scene.ties[:, 2] - match_scene.origin_m) / match_scene.step_m
+    side, steps_per_cell, flat = large_window_side(config.cost), match_scene.cell_m / match_scene.step_m, np.zeros((len(xy), 2))
+    return label_pairs(views, window, xy, index, flat, side, steps_per_cell, config.selection)

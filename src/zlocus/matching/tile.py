@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow, on_cells
-from zlocus.core.options import PyramidOptions, RunConfig
+from zlocus.core.options import PyramidOptions, RunConfig, large_window_side
 from zlocus.matching.cost_volume import cost_volume
 from zlocus.matching.fill import filled
 from zlocus.matching.free_rays import add_costs_of_rays
@@ -24,12 +24,12 @@ from zlocus.matching.plane_fitting import PlanarHeights, with_planes
 from zlocus.matching.precision import sigma_steps, signs_of_precision, spread_around
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, counted_above, lone_heights, penalties
-from zlocus.matching.slope_surface import BaseSurface, CoarserBase
+from zlocus.matching.slope_surface import SlopeSurface, CoarserSlope
 from zlocus.matching.subpixel import refine, smoothed
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile_views import TileViews, ViewPixels, pixel_window, read_pixels, tile_views
 from zlocus.matching.true_ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
-from zlocus.matching.view_ranking import KnownGround, Ranking, ranked_at_ties
+from zlocus.matching.view_ranking import KnownGround, PairLabels, label_pairs_at_ties
 from zlocus.matching.view_selection import (
     Coarser,
     block_middles,
@@ -69,7 +69,7 @@ class LevelResult:
     level: int
     window: CellWindow
     views: TileViews
-    base: BaseSurface
+    base: SlopeSurface
     lattice: HeightLattice
     seen: NDArray[np.int32]
     heights: SemiGlobalHeights
@@ -89,7 +89,7 @@ class TileResult:
     surface: Surface
     evaluations: int = 0
     all_images: int = 0
-    ranking: tuple[Ranking, list[int]] | None = None
+    ranking: tuple[PairLabels, list[int]] | None = None
 
 
 def match_tile(
@@ -147,7 +147,7 @@ def match_tile(
 
 def _match_coarsest(
     scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, config: RunConfig, method: str, use_visibility: bool
-) -> tuple[LevelResult, Guide, Ranking | None]:
+) -> tuple[LevelResult, Guide, PairLabels | None]:
     """The coarsest level, a second time along what it found where that is steep; what guided it, and the ranking."""
     level = scene.levels - 1
     window = _level_window(scene, core, level, config)
@@ -159,7 +159,7 @@ def _match_coarsest(
         result = _match_level(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
         done, every = done + result.evaluations, every + result.all_views
         smooth = smoothed(result.heights.vertex, config.refine.jump_steps)
-        base = BaseSurface.along(smooth, config.pyramid.block)
+        base = SlopeSurface.along(smooth, config.pyramid.block)
         if known is not None or not base.is_steep(_own_cells(core, window, level)):
             return replace(result, base=base, evaluations=done, all_views=every), guide, ranking
         known = result
@@ -173,23 +173,23 @@ def _evaluations(seen: NDArray[np.int32], lattice: HeightLattice) -> int:
 
 def _ranking(
     scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, coarsest: LevelResult | None, config: RunConfig
-) -> Ranking | None:
+) -> PairLabels | None:
     """Labels of the views at the tie points in and around the tile; None where there are too few views to choose."""
     if len(pixels) < config.selection.fewest_views or len(pixels) - 1 <= config.selection.least_images:
         return None
     if coarsest is None:
-        return ranked_at_ties(scene, pixels, core, None, config)
+        return label_pairs_at_ties(scene, pixels, core, None, config)
     known = KnownGround(coarsest.heights.vertex, coarsest.level, coarsest.window)
-    return ranked_at_ties(scene, pixels, core, known, config)
+    return label_pairs_at_ties(scene, pixels, core, known, config)
 
 
-def rank_tile(scene: MatchScene, core: CellWindow, config: RunConfig) -> tuple[Ranking, list[int]] | None:
+def rank_tile(scene: MatchScene, core: CellWindow, config: RunConfig) -> tuple[PairLabels, list[int]] | None:
     """The ranking of the views that may see a tile's core, however few, and which of the scene's they are, before
     anything is matched; None where fewer than two see it."""
     if not (core.rows and core.cols):
         return None
     pixels, which = _read(scene, core, config, True)
-    return (ranked_at_ties(scene, pixels, core, None, config), which) if len(pixels) > 1 else None
+    return (label_pairs_at_ties(scene, pixels, core, None, config), which) if len(pixels) > 1 else None
 
 
 def _level_window(
@@ -253,12 +253,12 @@ class Guide:
     coarser: LevelResult | None = None
     obstacle: NDArray[np.uint8] = field(default_factory=lambda: OBSTACLE)
 
-    def base(self, window: CellWindow) -> CoarserBase | None:
+    def base(self, window: CellWindow) -> CoarserSlope | None:
         """The base surface of the coarser level, beneath the cells of a window."""
         if self.coarser is None:
             return None
         above = self.coarser.window
-        return CoarserBase(self.coarser.base, above.row - window.row / 2, above.col - window.col / 2)
+        return CoarserSlope(self.coarser.base, above.row - window.row / 2, above.col - window.col / 2)
 
 
 def _coarsest_guide(scene: MatchScene, window: CellWindow, surface: NDArray[np.float32] | None) -> Guide:
@@ -288,7 +288,7 @@ def _match_level(
     config: RunConfig,
     method: str,
     use_visibility: bool,
-    ranking: Ranking | None,
+    ranking: PairLabels | None,
 ) -> LevelResult:
     """One level: base surface, ranges, visibility, choice of views, costs, semi-global constraint."""
     shape = (window.rows, window.cols)
@@ -297,11 +297,11 @@ def _match_level(
     z = (scene.origin_m - 2 * step, scene.origin_m + (n_steps + 18) * step)
     views = tile_views(
         pixels, level, scene.transform(window, level), shape, config.pyramid.block, (scene.origin_m, step), z,
-        config.measure.large_window // 2, _needed_heights(scene, guide, z, level, config),
+        large_window_side(config.cost) // 2, _needed_heights(scene, guide, z, level, config),
     )  # fmt: skip
     block = views.block
     smooth = None if guide.surface is None else smoothed(guide.surface, config.refine.jump_steps)
-    base = BaseSurface.level(shape, block) if smooth is None else BaseSurface.along(smooth, block, guide.base(window))
+    base = SlopeSurface.level(shape, block) if smooth is None else SlopeSurface.along(smooth, block, guide.base(window))
     low, high = guide.low - base.cells, guide.high - base.cells
     lattice = ranges_nearby(low, high, scene.origin_m, step, shape, config.pyramid, block)
     along_base = base.shear(views)
@@ -309,7 +309,7 @@ def _match_level(
     covered = covers(seen)
     if guide.surface is not None and use_visibility:
         obstacle = cv2.erode(guide.surface, guide.obstacle)
-        hide(seen, views, obstacle, base.cells, config.measure.hidden_margin_steps)
+        hide(seen, views, obstacle, base.cells, config.cost.occlusion_margin_steps)
         spare_pairs(seen)
     used, worth, added, all_views = seen, seen, 0, _evaluations(seen, lattice)
     if ranking is not None:
@@ -317,7 +317,7 @@ def _match_level(
         used, worth, added = _choose(seen, ranking, lattice, window, level, ground, guide.coarser, config)
     done = _evaluations(used, lattice) + added
     is_pair = len(scene.views) == PAIR
-    cost = cost_volume(along_base, base, lattice, used, config.measure, is_pair)
+    cost = cost_volume(along_base, base, lattice, used, config.cost, is_pair)
     agrees = None if guide.coarser is None else guide.coarser.agrees
     if method == "mvll":
         heights = alone(cost, lattice)
@@ -353,7 +353,7 @@ def _needed_heights(
 
 def _choose(
     seen: NDArray[np.int32],
-    ranking: Ranking,
+    ranking: PairLabels,
     lattice: HeightLattice,
     window: CellWindow,
     level: int,
@@ -378,7 +378,7 @@ def _choose(
         below = np.clip((cells + offset[0]) // 2 - offset[1], 0, last)
         reach = max(options.reach_steps >> coarser.level, FEWEST_STEPS)
         surface = smoothed(coarser.heights.vertex, config.refine.jump_steps)
-        above = Coarser(coarser.views, coarser.seen, surface, config.measure.large_window, reach)
+        above = Coarser(coarser.views, coarser.seen, surface, large_window_side(config.cost), reach)
         match = images_needed(above, below, of_block, covering, order, options)
         needed = np.where(match.n_added > 0, np.minimum(match.n_added, options.most_images), every)
         evaluations = match.evaluations + len(cells) * (2 * reach + 1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
-from zlocus.core.options import RunConfig, SelectionOptions
+from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.kernels.locus_windows import line_windows
 from zlocus.matching.match_curve import GOOD, POOR, curve_labels
@@ -35,14 +35,14 @@ class KnownGround:
     window: CellWindow
 
 
-def ranked_at_ties(
+def label_pairs_at_ties(
     scene: MatchScene, pixels: list[ViewPixels], core: CellWindow, ground: KnownGround | None, config: RunConfig
-) -> Ranking:
+) -> PairLabels:
     """Labels of the views at the tie points in and around a tile's core; windows follow the slope of the ground, where
     that is known."""
     around = math.ceil(config.selection.radius_px)
     window = core.at_level(0, around).within(scene.seen)
-    side = config.measure.large_window
+    side = large_window_side(config.cost)
     reach = config.selection.reach_steps * scene.step_m
     z = (scene.origin_m - reach, scene.origin_m + scene.n_steps * scene.step_m + reach)
     transform, shape = scene.transform(window, 0), (window.rows, window.cols)
@@ -52,7 +52,7 @@ def ranked_at_ties(
     views = tile_views(pixels, 0, transform, shape, config.pyramid.block, lattice, z, side // 2, needed)
     steps_per_cell = scene.cell_m / scene.step_m
     slope = np.zeros((len(xy), 2)) if ground is None else _slopes(ground, xy, config)
-    return rank_views(views, window, xy, index, slope, side, steps_per_cell, config.selection)
+    return label_pairs(views, window, xy, index, slope, side, steps_per_cell, config.selection)
 
 
 def _slopes(ground: KnownGround, xy: NDArray[np.float64], config: RunConfig) -> NDArray[np.float64]:
@@ -76,7 +76,7 @@ def _heights_of_ties(
 
 
 @dataclass(frozen=True)
-class RankedPoints:
+class LabelledTies:
     """Tie points of one tile with the labels of its images.
 
     xyz : (n, 3) m; labels : (n, k, k) int8, of search image (last axis) against reference; views : (k,) int64, which of
@@ -88,7 +88,7 @@ class RankedPoints:
     views: NDArray[np.int64]
 
     @classmethod
-    def of(cls, ranking: Ranking, views: Sequence[int], ties: FloatArray, kept: CellWindow) -> RankedPoints:
+    def of(cls, ranking: PairLabels, views: Sequence[int], ties: FloatArray, kept: CellWindow) -> LabelledTies:
         """Those in a window of finest cells, so that no point of two tiles counts twice. ties : (n, 3) m, all."""
         first, size = np.array([kept.col, kept.row]), np.array([kept.cols, kept.rows])
         inside = ((ranking.xy >= first) & (ranking.xy < first + size)).all(axis=1)
@@ -139,7 +139,7 @@ TIE_POINTS = 40
 ROUNDING = 1e-9
 
 
-class Evidence(IntEnum):
+class OrderSource(IntEnum):
     """What the order of a cell rests on."""
 
     NEIGHBOURS = 0
@@ -164,27 +164,27 @@ class ImageOrder:
     """Search images of every cell, best first.
 
     images : (c, i) int64, indices of search images; accumulated : (c, i) int64, labels accumulated over the cell's
-    feature points, in the order of the labels; evidence : (c,) uint8 `Evidence`, where SCENE says that these are all.
+    feature points, in the order of the labels; order_source : (c,) uint8 `OrderSource`, where SCENE says that these are all.
     """
 
     images: IntArray
     accumulated: IntArray
-    evidence: NDArray[np.uint8]
+    order_source: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Neighbours:
     """Feature points of every cell, those of one cell after those of another, by growing distance, then index.
 
-    index : (p,) int64; start : (c + 1,) int64, where each cell's begin; evidence : (c,) uint8 `Evidence`.
+    index : (p,) int64; start : (c + 1,) int64, where each cell's begin; order_source : (c,) uint8 `OrderSource`.
     """
 
     index: IntArray
     start: IntArray
-    evidence: NDArray[np.uint8]
+    order_source: NDArray[np.uint8]
 
 
-def image_order(features: FeaturePoints, at: FloatArray, options: SelectionOptions) -> ImageOrder:
+def order_images(features: FeaturePoints, at: FloatArray, options: SelectionOptions) -> ImageOrder:
     """Order of the search images at cells.
 
     at : (c, 2) float64 px, positions of the cells, as those of the features. Images are ordered by accumulated labels;
@@ -200,7 +200,7 @@ def image_order(features: FeaturePoints, at: FloatArray, options: SelectionOptio
         for first in range(0, max(len(at), 1), CHUNK)
     ]
     return ImageOrder(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("images", "accumulated", "evidence"))
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("images", "accumulated", "order_source"))
     )
 
 
@@ -230,10 +230,10 @@ def _ordered(near: Neighbours, labels: NDArray[np.int8], scene: IntArray, option
             (digit, labels.astype(np.int64)),
         )
     )
-    accumulated[near.evidence == Evidence.SCENE] = scene
+    accumulated[near.order_source == OrderSource.SCENE] = scene
     last = np.broadcast_to(-scene, accumulated.shape)
     images = np.lexsort((last, -tie, -accumulated), axis=-1)
-    return ImageOrder(images.astype(np.int64), accumulated, near.evidence)
+    return ImageOrder(images.astype(np.int64), accumulated, near.order_source)
 
 
 class NeighbourSearch:
@@ -259,7 +259,7 @@ class NeighbourSearch:
         at = at - self.centre
         if not len(self.xy):
             return Neighbours(
-                np.zeros(0, np.int64), np.zeros(len(at) + 1, np.int64), np.full(len(at), Evidence.SCENE, np.uint8)
+                np.zeros(0, np.int64), np.zeros(len(at) + 1, np.int64), np.full(len(at), OrderSource.SCENE, np.uint8)
             )
         radius, n_nearest = self.options.radius_px, self.options.nearest
         # Infinite where there are fewer points.
@@ -267,10 +267,10 @@ class NeighbourSearch:
         simplex = np.full(len(at), -1) if self.triangles is None else self.triangles.find_simplex(at)
         is_close = simplex >= 0 if self.options.neighbours == "tin" else distance[:, 0] <= radius * (1 + ROUNDING)
         widest = self.options.widest * radius
-        evidence = np.where(
+        order_source = np.where(
             is_close,
-            Evidence.NEIGHBOURS,
-            np.where(distance[:, 0] <= widest * (1 + ROUNDING), Evidence.NEAREST, Evidence.SCENE),
+            OrderSource.NEIGHBOURS,
+            np.where(distance[:, 0] <= widest * (1 + ROUNDING), OrderSource.NEAREST, OrderSource.SCENE),
         ).astype(np.uint8)
         reach = np.where(is_close, radius, np.minimum(distance[:, -1], widest))
         cells, index = _within(self.tree, at, np.flatnonzero(simplex < 0), reach)
@@ -281,7 +281,7 @@ class NeighbourSearch:
         offset = at[cells] - self.xy[index]
         by_distance = np.lexsort((index, np.hypot(offset[:, 0], offset[:, 1]), cells))
         start = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=len(at)))])
-        return Neighbours(index[by_distance].astype(np.int64), start.astype(np.int64), evidence)
+        return Neighbours(index[by_distance].astype(np.int64), start.astype(np.int64), order_source)
 
 
 def triangulated(xy: FloatArray) -> Delaunay | None:
@@ -346,7 +346,7 @@ def candidate_images(geometry: SearchGeometry, options: SelectionOptions) -> Int
 
 
 @dataclass(frozen=True)
-class Ranking:
+class PairLabels:
     """What tie points say of a tile's views.
 
     tie : (n,) int64, numbers of the tie points; xy : (n, 2) float64, columns and rows of the finest level's cells;
@@ -391,10 +391,10 @@ class Samples:
         return out
 
 
-def rank_views(
+def label_pairs(
     views: TileViews, window: CellWindow, xy: FloatArray, index: FloatArray, slope: FloatArray, side: int,
     steps_per_cell: float, options: SelectionOptions,
-) -> Ranking:  # fmt: skip
+) -> PairLabels:  # fmt: skip
     """Labels of all pairs of views at tie points.
 
     views : of the finest level's cells `window`; xy : (n, 2) columns and rows of the tie points on that level; index :
@@ -426,4 +426,4 @@ def rank_views(
             curves = np.einsum("nhk,nhk->nh", seen[i], seen[j])
             labels[:, i, j] = labels[:, j, i] = curve_labels(curves, float(apart[i, j]), options)
     angle_deg = np.degrees(np.arctan(apart * steps_per_cell))
-    return Ranking(rows, xy[rows], labels, angle_deg, len(rows) * n_views * samples.n_heights)
+    return PairLabels(rows, xy[rows], labels, angle_deg, len(rows) * n_views * samples.n_heights)

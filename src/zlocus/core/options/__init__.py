@@ -4,7 +4,7 @@ Each field carries its unit and one sentence in its metadata. `zlocus config` wr
 outside the allowed range are refused with the name of the field, the value and the range.
 """
 
-from zlocus.core.options.cost_options import MeasureOptions
+from zlocus.core.options.cost_options import CostOptions, large_window_side
 from zlocus.core.options.height_options import CheckOptions, PlaneOptions, RefineOptions
 from zlocus.core.options.orientation_options import JointOptions, OrientationOptions
 from zlocus.core.options.product_options import ProductOptions
@@ -16,7 +16,7 @@ from zlocus.core.options.semiglobal_options import SemiGlobalOptions
 __all__ = [
     "CheckOptions",
     "JointOptions",
-    "MeasureOptions",
+    "CostOptions",
     "OrientationOptions",
     "PlaneOptions",
     "ProductOptions",
@@ -25,4 +25,5 @@ __all__ = [
     "RunConfig",
     "SelectionOptions",
     "SemiGlobalOptions",
+    "large_window_side",
 ]

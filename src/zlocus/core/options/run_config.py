@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zlocus.core.options.cost_options import MeasureOptions
+from zlocus.core.options.cost_options import CostOptions
 from zlocus.core.options.height_options import CheckOptions, PlaneOptions, RefineOptions
 from zlocus.core.options.option_fields import Checked, group
 from zlocus.core.options.orientation_options import OrientationOptions
@@ -20,7 +20,7 @@ class RunConfig(Checked):
 
     orientation: OrientationOptions = group(OrientationOptions, "Tie points and pointing corrections.")
     pyramid: PyramidOptions = group(PyramidOptions, "Levels, tiles and ranges of heights.")
-    measure: MeasureOptions = group(MeasureOptions, "How views are compared.")
+    cost: CostOptions = group(CostOptions, "Matching cost: how images are compared.")
     selection: SelectionOptions = group(SelectionOptions, "Which images a block is matched with.")
     semiglobal: SemiGlobalOptions = group(SemiGlobalOptions, "Semi-global constraint.")
     refine: RefineOptions = group(RefineOptions, "Sub-step refinement.")
