@@ -126,7 +126,7 @@ def report_of(out, folder, row, col, without=(), window=None) -> PointReport:
     scene = restored(out, folder.run)
     config, matching = scene.config, scene.matched.settled
     if window is not None:
-        config = replace(config, measure=replace(config.measure, large_window=window))
+        config = replace(config, cost=replace(config.cost, large_window=window))
     kept = [i for i, view in enumerate(matching.views) if view.name not in without]
     views, grey = (tuple(each[i] for i in kept) for each in (matching.views, matching.grey))
     matching = replace(matching, views=views, grey=grey)
