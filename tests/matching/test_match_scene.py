@@ -1,4 +1,4 @@
-"""What is settled before tiling: step, leading view, levels, extent."""
+"""What is match_scene before tiling: step, leading view, levels, extent."""
 
 from __future__ import annotations
 
@@ -15,15 +15,8 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions
 from zlocus.core.scene import Scene, View
 from zlocus.matching.ground_pixels import check_resolution, median_ground_pixel
-from zlocus.matching.match_scene import (
-    height_step,
-    leading_first,
-    levels_for,
-    nadir_offset,
-    seen_window,
-    settle,
-    shared_ground,
-)  # fmt: skip
+from zlocus.matching.match_scene import height_step, reference_first, levels_for, parallax_rate, seen_window, build_match_scene
+from zlocus.core.footprints import shared_ground
 from zlocus.matching.radiometry import grey_scales
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.scenes import ViewSpec, demo_spec, exposures, steady
@@ -44,26 +37,26 @@ def scene(*views):
 
 def test_the_most_nadir_view_leads():
     views = scene(view("aft", -20), view("mid", 3), view("fore", 12))
-    assert [v.name for v in leading_first(views, 50.0, None)] == ["mid", "fore", "aft"]
-    assert [v.name for v in leading_first(views, 50.0, "aft")] == ["aft", "mid", "fore"]
+    assert [v.name for v in reference_first(views, 50.0, None)] == ["mid", "fore", "aft"]
+    assert [v.name for v in reference_first(views, 50.0, "aft")] == ["aft", "mid", "fore"]
     with pytest.raises(ConfigError, match=r"--reference north .* aft, mid, fore"):
-        leading_first(views, 50.0, "north")
+        reference_first(views, 50.0, "north")
 
 
 def test_order_of_images_does_not_matter():
     a, b, c = view("a", 10), view("b", -10), view("c", 1)
-    assert leading_first(scene(a, b, c), 50.0, None) == leading_first(scene(c, b, a), 50.0, None)
+    assert reference_first(scene(a, b, c), 50.0, None) == reference_first(scene(c, b, a), 50.0, None)
 
 
 def test_the_nadir_offset_is_the_tangent_of_the_view():
-    east, north = nadir_offset(view("v", along=20, across=-10), 50.0)
+    east, north = parallax_rate(view("v", along=20, across=-10), 50.0)
     assert -north == pytest.approx(np.tan(np.deg2rad(20)), rel=1e-3)
     assert -east == pytest.approx(np.tan(np.deg2rad(-10)), rel=1e-3)
 
 
 def test_the_step_moves_the_most_sensitive_image_by_half_a_pixel():
     """Equivalent disparity: (tan 20 + tan 2) dz / 0.5 m = 0.5 px."""
-    views = leading_first(scene(view("n", 2), view("f", -20), view("m", -5)), 50.0, None)
+    views = reference_first(scene(view("n", 2), view("f", -20), view("m", -5)), 50.0, None)
     step = height_step(views, 50.0, 0.5, 0.5)
     assert step == pytest.approx(0.25 / (np.tan(np.deg2rad(20)) + np.tan(np.deg2rad(2))), rel=1e-3)
     assert height_step(views, 50.0, 0.5, 0.25) == pytest.approx(step / 2)
@@ -113,13 +106,13 @@ def test_the_seen_window_is_whole_coarsest_cells():
 def test_a_settled_scene():
     views = scene(view("n", 2), view("f", 20))
     ties = np.random.default_rng(1).uniform(-20, 20, (60, 3)) + np.array([*CENTRE, 60.0])
-    settled = settle(views, 0.5, (0.0, 0.0), (30.0, 90.0), ties, None, PyramidOptions())
-    assert settled.views[0].name == "n"
-    assert settled.n_steps == np.ceil(60 / settled.step_m)
-    assert settled.origin_m == 30.0
-    assert settled.grey == grey_scales(settled.views, ties)
-    assert settled.grey != grey_scales(settled.views, ties[:0])
-    transform = settled.transform(CellWindow(-4, 6, 3, 3), 2)
+    match_scene = build_match_scene(views, 0.5, (0.0, 0.0), (30.0, 90.0), ties, None, PyramidOptions())
+    assert match_scene.views[0].name == "n"
+    assert match_scene.n_steps == np.ceil(60 / match_scene.step_m)
+    assert match_scene.origin_m == 30.0
+    assert match_scene.grey == grey_scales(match_scene.views, ties)
+    assert match_scene.grey != grey_scales(match_scene.views, ties[:0])
+    transform = match_scene.transform(CellWindow(-4, 6, 3, 3), 2)
     assert transform * (0, 0) == (12.0, 8.0)
     assert transform.a == 2.0
     assert transform.e == -2.0
@@ -154,6 +147,6 @@ def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
         wide = replace(each, camera=camera, shape=(each.shape[0], 6001))
         image = image_of(np.zeros(wide.shape))
         views.append(View(each.view.name, Path(each.view.name), image, line_scanner(wide)))
-    assert np.hypot(*(nadir_offset(views[0], 438.0) - nadir_offset(views[1], 438.0))) < 0.02
+    assert np.hypot(*(parallax_rate(views[0], 438.0) - parallax_rate(views[1], 438.0))) < 0.02
     step = height_step(tuple(views), 438.0, 0.2, 0.5)
     assert step == pytest.approx(0.5 * 0.208 / (2.0 * np.tan(np.deg2rad(15.0))), rel=0.05)

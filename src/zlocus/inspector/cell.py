@@ -106,7 +106,7 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     ConfigError
         See `WhatIf`.
     """
-    matched, config = restored.matched, what_if.config(restored.config)
+    matched, config = restored.run, what_if.config(restored.config)
     place = place_of_cell(xy, height_m, matched)
     match_scene = what_if.scene(matched.match_scene)
     if len(match_scene.views) < 2:

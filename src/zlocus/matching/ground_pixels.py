@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError
-from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View, ground_sample_distance
+from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View
+from zlocus.core.footprints import ground_sample_distance
 from zlocus.sensors.correction import ReducedModel
 
 # Cells are not finer than this share of the finest image's ground pixel.

@@ -12,9 +12,10 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError, GeometryError
+from zlocus.core.footprints import footprint, ground_box, ground_sample_distance, shared_ground
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions
-from zlocus.core.scene import ColourSource, Scene, View, footprint, ground_box, ground_sample_distance, held_window
+from zlocus.core.scene import ColourSource, Scene, View, held_window
 from zlocus.core.sensor_model import Scanning, bare
 from zlocus.matching.ground_pixels import with_common_pixel
 from zlocus.matching.radiometry import GreyScale, grey_scales
@@ -83,7 +84,7 @@ class MatchScene:
         return Affine(side, 0.0, self.anchor[0] + window.col * side, 0.0, -side, self.anchor[1] - window.row * side)
 
 
-def nadir_offset(view: View, z: float, at: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+def parallax_rate(view: View, z: float, at: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """(dE, dN) that the ground point seen by a pixel, `at` (2,) px or the image's centre, moves per metre of height."""
     top, left, rows, cols = held_window(view.image)
     xy = np.array([[left + (cols - 1) / 2, top + (rows - 1) / 2] if at is None else at] * 2)
@@ -91,7 +92,7 @@ def nadir_offset(view: View, z: float, at: NDArray[np.float64] | None = None) ->
     return np.asarray((high - low)[:2] / 10.0)
 
 
-def leading_first(scene: Scene, z: float, reference: str | None) -> tuple[View, ...]:
+def reference_first(scene: Scene, z: float, reference: str | None) -> tuple[View, ...]:
     """The views, the one asked for or the most nadir first, the others by growing angle.
 
     Raises
@@ -102,34 +103,11 @@ def leading_first(scene: Scene, z: float, reference: str | None) -> tuple[View, 
     names = [view.name for view in scene.views]
     if reference is not None and reference not in names:
         raise ConfigError(f"--reference {reference} is not a view of this scene. Choose one of {', '.join(names)}.")
-    slant = [float(np.hypot(*nadir_offset(view, z))) for view in scene.views]
+    slant = [float(np.hypot(*parallax_rate(view, z))) for view in scene.views]
     order = sorted(range(len(names)), key=lambda i: (names[i] != reference, slant[i], names[i]))
     return tuple(scene.views[i] for i in order)
 
 
-def shared_ground(scene: Scene, z_range: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Bounds (xmin, ymin, xmax, ymax) of the ground that two views may see between two heights.
-
-    Raises
-    ------
-    GeometryError
-        When no two footprints overlap.
-    """
-    from shapely import MultiPoint
-
-    hulls = []
-    for view in scene.views:
-        points = np.concatenate([footprint(view, z) for z in z_range])
-        hulls.append(MultiPoint(points).convex_hull)
-    shared = [a.intersection(b) for a, b in combinations(hulls, 2)]
-    bounds = np.array([part.bounds for part in shared if part.area > 0])
-    if not len(bounds):
-        raise GeometryError(
-            f"No two images see the same ground at heights of {z_range[0]:.0f} to {z_range[1]:.0f} m. Check the RPCs, "
-            "or give other heights with --heights."
-        )
-    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: float) -> float:
@@ -159,11 +137,11 @@ def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: 
 
 def _rates_against_first(views: tuple[View, ...], z: float, cell_m: float) -> list[float]:
     """Equivalent disparity per metre, px, of each view against the leading one, as the middles of their images look."""
-    lead = nadir_offset(views[0], z)
+    lead = parallax_rate(views[0], z)
     rates = []
     for view in views[1:]:
         pixel = max(ground_sample_distance(view, z), cell_m)
-        rates.append(float(np.hypot(*(nadir_offset(view, z) - lead))) / pixel)
+        rates.append(float(np.hypot(*(parallax_rate(view, z) - lead))) / pixel)
     return rates
 
 
@@ -244,7 +222,7 @@ def seen_window(
     return CellWindow(int(row0) * unit, int(col0) * unit, int(row1 - row0) * unit, int(col1 - col0) * unit)
 
 
-def settle(
+def build_match_scene(
     scene: Scene,
     cell_m: float,
     anchor: tuple[float, float],
@@ -260,7 +238,7 @@ def settle(
     image that is much finer than all others is reduced, see `with_common_pixel`.
     """
     z = (z_range[0] + z_range[1]) / 2
-    views = with_common_pixel(leading_first(scene, z, reference), z)
+    views = with_common_pixel(reference_first(scene, z, reference), z)
     step = height_step(views, z, cell_m, options.max_shift_px)
     n_steps = max(int(np.ceil((z_range[1] - z_range[0]) / step)), 4)
     levels = levels_for(n_steps, options)

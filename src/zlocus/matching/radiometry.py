@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.core.scene import View, ground_box, held_window
+from zlocus.core.scene import View, held_window
+from zlocus.core.footprints import ground_box
 
 FloatArray = NDArray[np.float64]
 SAMPLE_ROWS = 12

@@ -32,11 +32,11 @@ STEEP_STEPS = 8.0
 
 
 @dataclass(frozen=True)
-class CoarserBase:
+class CoarserSlope:
     """The base of the level above, in its own cells and steps. row, col : of its window's first cell, less half of the
     finer one's."""
 
-    base: BaseSurface
+    base: SlopeSurface
     row: float
     col: float
 
@@ -50,7 +50,7 @@ class CoarserBase:
 
 
 @dataclass(frozen=True)
-class BaseSurface:
+class SlopeSurface:
     """Height indices (fractions too) of a continuous surface over the cells of a tile.
 
     patches : (p + 1, q + 1) float64, at the corners of patches of `patch` cells; shape : (r, c), cells of the tile;
@@ -63,12 +63,12 @@ class BaseSurface:
     block: int
 
     @classmethod
-    def level(cls, shape: tuple[int, int], block: int) -> BaseSurface:
+    def level(cls, shape: tuple[int, int], block: int) -> SlopeSurface:
         """No slope anywhere."""
         return cls(np.zeros((-(-shape[0] // block) + 1, -(-shape[1] // block) + 1)), block, shape, block)
 
     @classmethod
-    def along(cls, surface: NDArray[np.float32], block: int, coarser: CoarserBase | None = None) -> BaseSurface:
+    def along(cls, surface: NDArray[np.float32], block: int, coarser: CoarserSlope | None = None) -> SlopeSurface:
         """With the slopes of a smooth surface, (r, c) float32 height indices.
 
         coarser : the base of the level above, whose slopes are kept where they are longer than a few patches; None at
@@ -135,7 +135,7 @@ class BaseSurface:
     @cached_property
     def relief(self) -> NDArray[np.float32]:
         """(r, c) float32: the cells less the bilinear surface through the corners of their blocks."""
-        blocks = BaseSurface(self.nodes, self.block, self.shape, self.block)
+        blocks = SlopeSurface(self.nodes, self.block, self.shape, self.block)
         return np.asarray(self.cells - blocks.cells)
 
     def is_steep(self, part: tuple[slice, slice]) -> bool:

@@ -20,18 +20,18 @@ from zlocus.core.scene import View
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import HIDDEN
 from zlocus.matching.match_curve import ProgressiveMatch, SearchPlan, match_progressively
-from zlocus.matching.match_scene import nadir_offset
+from zlocus.matching.match_scene import parallax_rate
 from zlocus.matching.occlusion import NOTHING_HIDDEN, covers
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.view_directions import cells_per_step
 from zlocus.matching.view_ranking import (
     FeaturePoints,
-    Ranking,
+    PairLabels,
     Samples,
     SearchGeometry,
     candidate_images,
     closeness,
-    image_order,
+    order_images,
 )
 
 FloatArray = NDArray[np.float64]
@@ -73,8 +73,8 @@ def preselected(views: Sequence[View], corners: FloatArray, z: float, options: S
 
 
 def _slant_at(view: View, xyz: FloatArray, z: float) -> FloatArray:
-    """`nadir_offset` amid the points (n, 3) that a view sees: a wide lens looks another way at every place."""
-    return nadir_offset(
+    """`parallax_rate` amid the points (n, 3) that a view sees: a wide lens looks another way at every place."""
+    return parallax_rate(
         view, z, view.sensor.image_from_ground(xyz.mean(axis=0, keepdims=True))[0] if len(xyz) else None
     )
 
@@ -93,11 +93,11 @@ def _days_between(one: View, other: View) -> float:
     return float(abs((one.date - other.date).days))
 
 
-def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: SelectionOptions) -> ViewOrder:
+def order_views(ranking: PairLabels, share: FloatArray, at: FloatArray, options: SelectionOptions) -> ViewOrder:
     """Reference and order of the other views of blocks.
 
     share : (i, b) float64, of each block that each view covers, the views in the order in which they may be the
-    reference; at : (b, 2) float64, the blocks' middles, as `Ranking.xy`. The reference is the first view that shows the
+    reference; at : (b, 2) float64, the blocks' middles, as `PairLabels.xy`. The reference is the first view that shows the
     whole block and has a label above zero with another view around it; far from all tie points, at those of the whole
     tile. A view whose accumulated label is below `least_worth` of the best one's misleads more than it helps. Those
     that help come in the order of their angles, see `closeness`: labels are a matter of tens of points, and
@@ -113,7 +113,7 @@ def order_views(ranking: Ranking, share: FloatArray, at: FloatArray, options: Se
             if not len(rows):
                 continue
             others = np.delete(np.arange(n_views), view)
-            order = image_order(FeaturePoints(ranking.xy, ranking.labels[:, view][:, others]), at[rows], options)
+            order = order_images(FeaturePoints(ranking.xy, ranking.labels[:, view][:, others]), at[rows], options)
             value = np.take_along_axis(order.accumulated, order.images, axis=1)
             fits = last_resort | (value[:, 0] > 0) | (len(ranking.xy) == 0)
             rows, images, value = rows[fits], others[order.images[fits]], value[fits]

@@ -22,10 +22,10 @@ from pyproj import CRS
 from zlocus.core.options import SelectionOptions
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.run_record import write_record, write_whole
+from zlocus.io.run_record import write_record, write_atomically
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.point_match import JudgedCurves, LookedAt, PointCurves
-from zlocus.matching.view_ranking import Evidence
+from zlocus.matching.view_ranking import OrderSource
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,15 +86,15 @@ class PointReport:
     peak_m: float
 
     @classmethod
-    def of(cls, asked: str, looked: LookedAt, settled: MatchScene, crs: CRS) -> PointReport:
-        """Of a place whose curves are known. settled, crs : of the scene."""
+    def of(cls, asked: str, looked: LookedAt, match_scene: MatchScene, crs: CRS) -> PointReport:
+        """Of a place whose curves are known. match_scene, crs : of the scene."""
         place, curves = looked.place, looked.curves
         return cls(
             asked=asked, crs=crs.to_string().splitlines()[0], xyz=place.xyz, height_from=place.height_from,
-            middle=place.middle, cell_m=settled.cell_m, names=tuple(view.name for view in looked.views),
-            left_out=tuple(view.name for view in settled.views if view not in looked.views),
-            heights_m=looked.heights_m, curves=curves, peak_m=settled.origin_m + curves.peak_index * settled.step_m,
-            step_m=settled.step_m,
+            middle=place.middle, cell_m=match_scene.cell_m, names=tuple(view.name for view in looked.views),
+            left_out=tuple(view.name for view in match_scene.views if view not in looked.views),
+            heights_m=looked.heights_m, curves=curves, peak_m=match_scene.origin_m + curves.peak_index * match_scene.step_m,
+            step_m=match_scene.step_m,
         )  # fmt: skip
 
     @property
@@ -173,14 +173,14 @@ def point_text(report: PointReport, options: SelectionOptions) -> str:
 
 
 def what_order_rests_on(report: PointReport, options: SelectionOptions) -> str:
-    """The evidence of the order, in words."""
+    """The order_source of the order, in words."""
     order = report.curves.order
     n = len(order.features)
-    if order.evidence is Evidence.NEIGHBOURS:
+    if order.order_source is OrderSource.NEIGHBOURS:
         if options.neighbours == "tin":
             return f"the {n} corners of the triangle of tie points around it"
         return f"the {n} tie points within {options.radius_px * report.cell_m:g} m"
-    if order.evidence is Evidence.NEAREST:
+    if order.order_source is OrderSource.NEAREST:
         return f"the {n} nearest tie points (none is within {options.radius_px * report.cell_m:g} m)"
     return "the scene as a whole (no tie point is near)"
 
@@ -268,8 +268,8 @@ def write_point(folder: Path, report: PointReport, loci: Sequence[Locus], option
         "loci.png": loci_figure(loci),
     }
     for name, figure in figures.items():
-        write_whole(folder / name, partial(figure.savefig, format="png", dpi=DPI))
-    write_whole(folder / "curves.csv", lambda part: _write_csv(part, report))
+        write_atomically(folder / name, partial(figure.savefig, format="png", dpi=DPI))
+    write_atomically(folder / "curves.csv", lambda part: _write_csv(part, report))
     write_record(folder / "point.json", point_record(report, options))
 
 
@@ -308,7 +308,7 @@ def point_record(report: PointReport, options: SelectionOptions) -> dict[str, An
         "reference": report.reference,
         "not_compared": list(report.left_out),
         "order": {
-            "rests_on": order.evidence.name.lower(),
+            "rests_on": order.order_source.name.lower(),
             "tie_points": len(order.features),
             "images": [
                 {"image": name, "accumulated": int(order.accumulated[j]), "helps": bool(order.is_worth[j])}
