@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from os import PathLike
 from pathlib import Path
@@ -30,15 +30,15 @@ from zlocus.core.scene import ImageSource, Scene
 from zlocus.io import scene_file
 from zlocus.matching import true_ortho as ortho
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.match_scene import height_step, leading_first
+from zlocus.matching.match_scene import height_step, reference_first
 from zlocus.matching.occlusion import coverage
 from zlocus.matching.quality import Quality
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import pixel_window, read_pixels, tile_views
 from zlocus.orientation.orientation import Orientation
-from zlocus.pipeline.preparing import asked_crs, oriented
+from zlocus.pipeline.setup import orient_views, requested_crs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -71,8 +71,8 @@ def open_scene(*inputs: PathLikes, crs: str | CRS | None = None) -> Scene:
     InputError, ConfigError
         See `zlocus.io.scene_file.open_scene`.
     """
-    asked = crs if crs is None or isinstance(crs, CRS) else asked_crs(crs)
-    return scene_file.open_scene([Path(path) for path in inputs], asked)
+    requested = crs if crs is None or isinstance(crs, CRS) else requested_crs(crs)
+    return scene_file.open_scene([Path(path) for path in inputs], requested)
 
 
 def orient(
@@ -92,7 +92,8 @@ def orient(
     GeometryError
         Where images share too little ground, or their pointing is worse than can be corrected.
     """
-    return oriented(scene, options or OrientationOptions(), heights or scene.heights, progress or SilentProgress())
+    scene = replace(scene, heights=heights or scene.heights)
+    return orient_views(scene, options or OrientationOptions(), progress or SilentProgress())
 
 
 def match(
@@ -324,7 +325,7 @@ def true_ortho(
             "two or more each, and some heights."
         )
     cell_m, lowest, highest = float(x[1] - x[0]), float(np.nanmin(height)), float(np.nanmax(height))
-    leading = leading_first(scene, (lowest + highest) / 2, None)
+    leading = reference_first(scene, (lowest + highest) / 2, None)
     options = PyramidOptions()
     step_m = height_step(leading, (lowest + highest) / 2, cell_m, options.max_shift_px)
     origin_m, n_steps = lowest - step_m, int(np.ceil((highest - lowest) / step_m)) + 3
@@ -342,7 +343,7 @@ def true_ortho(
         origin_m, step_m, shape, views.block, np.zeros(blocks, np.int64), np.full(blocks, n_steps, np.int64)
     )
     index = ((np.where(np.isfinite(height), height, lowest) - origin_m) / step_m).astype(np.float32)
-    seen = coverage(views, BaseSurface.level(shape, views.block), lattice)
+    seen = coverage(views, SlopeSurface.flat(shape, views.block), lattice)
     shown = ortho.true_ortho(pixels, views, seen, index)
     shown[~np.isfinite(height)] = np.nan
     return shown

@@ -15,7 +15,7 @@ import yaml
 
 import zlocus.pipeline.dsm
 import zlocus.pipeline.open_run
-import zlocus.pipeline.preparing
+import zlocus.pipeline.setup
 import zlocus.pipeline.tile_run
 from rendered_scenes import HEIGHTS, PART, SMALL_TILES, run
 from zlocus.core.errors import OutputError, StoppedError
@@ -138,8 +138,8 @@ def test_an_image_that_changes_after_the_last_tile_ends_the_run(copied, elsewher
 
 
 def test_an_image_that_changes_while_tie_points_are_looked_for_leaves_nothing(copied, tmp_path, monkeypatch):
-    settle = zlocus.pipeline.dsm.settled_run
-    monkeypatch.setattr(zlocus.pipeline.dsm, "settled_run", lambda *given: [os.utime(copied[2]), settle(*given)][1])
+    settle = zlocus.pipeline.dsm.set_up_run
+    monkeypatch.setattr(zlocus.pipeline.dsm, "set_up_run", lambda *given: [os.utime(copied[2]), settle(*given)][1])
     with pytest.raises(StoppedError, match=rf"{copied[2].name} was replaced or written to"):
         asked(copied, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -150,14 +150,14 @@ def test_an_image_that_changes_while_others_are_opened_is_noticed(copied, elsewh
     views = [{"name": path.stem, "image": str(path), "camera": {"kind": "rpc"}} for path in copied]
     scene = tmp_path / "scene.yaml"
     scene.write_text(yaml.safe_dump({"schema": 1, "views": views}))
-    opened = zlocus.pipeline.open_run.opened
+    opened = zlocus.pipeline.open_run.open_inputs
 
     def opening(*given):
         found = opened(*given)
         rewrite(copied[0], elsewhere)
         return found
 
-    monkeypatch.setattr(zlocus.pipeline.open_run, "opened", opening)
+    monkeypatch.setattr(zlocus.pipeline.open_run, "open_inputs", opening)
     for inputs in ((scene,), copied):
         with pytest.raises(StoppedError, match=rf"{copied[0].name} was replaced"):
             asked(inputs, tmp_path / "out")
@@ -166,7 +166,7 @@ def test_an_image_that_changes_while_others_are_opened_is_noticed(copied, elsewh
 
 def test_the_checksum_is_that_of_the_image_that_was_matched(copied, elsewhere, tmp_path, monkeypatch):
     """Where it changes after that, the surface is right, and the page shows no curves of another image."""
-    digest, write = hashlib.sha256(copied[0].read_bytes()).hexdigest(), zlocus.pipeline.dsm._write_points
+    digest, write = hashlib.sha256(copied[0].read_bytes()).hexdigest(), zlocus.pipeline.dsm.write_points
 
     def writing(*given):
         rewrite(copied[0], elsewhere)
@@ -174,7 +174,7 @@ def test_the_checksum_is_that_of_the_image_that_was_matched(copied, elsewhere, t
 
     said = io.StringIO()
     monkeypatch.setattr("rendered_scenes.progress_for", lambda _: progress_for(said))
-    monkeypatch.setattr(zlocus.pipeline.dsm, "_write_points", writing)
+    monkeypatch.setattr(zlocus.pipeline.dsm, "write_points", writing)
     out = asked(copied, tmp_path / "out", report=True, bounds=PART).out
     assert hashlib.sha256(copied[0].read_bytes()).hexdigest() != digest
     (listed,) = (
@@ -202,8 +202,8 @@ def test_other_commands_write_nothing_of_inputs_that_changed(copied, tmp_path, m
         "ties": lambda: run_orient(OrientRequest(copied, out, cameras=False), RunConfig(), progress),
         "rank": lambda: run_rank(RankRequest(copied, out, resolution=4.0), RunConfig(), progress),
     }[stage]
-    orient = zlocus.pipeline.preparing.orient
-    monkeypatch.setattr(zlocus.pipeline.preparing, "orient", lambda *given: [os.utime(copied[0]), orient(*given)][1])
+    orient = zlocus.pipeline.setup.orient
+    monkeypatch.setattr(zlocus.pipeline.setup, "orient", lambda *given: [os.utime(copied[0]), orient(*given)][1])
     with pytest.raises(StoppedError, match=rf"{copied[0].name} was replaced or written to .* no result is written"):
         run_stage()
     assert not out.exists()

@@ -20,8 +20,8 @@ from zlocus.matching.image_space import ImageSpace, MatchedImage
 from zlocus.matching.kernels.rasterise import agreed_heights, draw_image
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.surface import Surface
-from zlocus.pipeline.execution.spill_arrays import Scratch
-from zlocus.pipeline.image_tiles import Area
+from zlocus.pipeline.execution.spill_arrays import SpillArrays
+from zlocus.pipeline.image_tiles import GroundArea
 from zlocus.sensors.distortion import FisheyeDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.image_rays import HeightRays
@@ -160,7 +160,7 @@ def test_a_lens_sees_the_area_beyond_the_corners_of_a_window(row):
     from zlocus.core.grid import CellWindow
 
     x, y, _ = FISHEYE.ground_from_image(np.array([[250.0, row]]), np.array([5.0]))[0]
-    area = Area((x - 1.0, y - 1.0, x + 1.0, y + 1.0), (0.0, 10.0))
+    area = GroundArea((x - 1.0, y - 1.0, x + 1.0, y + 1.0), (0.0, 10.0))
     assert area.may_show(fisheye_space(), CellWindow(0, 0, 1000, 250))
     assert not area.may_show(fisheye_space(), CellWindow(0, 750, 1000, 250))
 
@@ -184,7 +184,7 @@ def test_only_pixels_that_may_show_the_area_are_matched():
     from zlocus.core.grid import CellWindow
 
     space = flat_image(np.zeros((150, 150), np.float32), np.zeros((150, 150), np.uint16)).image.space
-    area = Area(PART, (45.0, 55.0))
+    area = GroundArea(PART, (45.0, 55.0))
     assert area.may_show(space, CellWindow(60, 60, 30, 30))
     assert not area.may_show(space, CellWindow(0, 0, 20, 150))
 
@@ -216,11 +216,11 @@ def test_without_room_in_memory_the_bytes_are_the_same(images, tmp_path, monkeyp
     made = []
 
     def no_room(beside, room_bytes):
-        made.append(Scratch(beside, 0.0))
+        made.append(SpillArrays(beside, 0.0))
         assert room_bytes > 0
         return made[0]
 
-    monkeypatch.setattr("zlocus.pipeline.dsm.Scratch", no_room)
+    monkeypatch.setattr("zlocus.pipeline.image_tiles.SpillArrays", no_room)
     out = run(images("step"), tmp_path / "out", SMALL_TILES, method="gc3-sgm", workers=2).out
     assert made[0].file_bytes > 0
     for name in ("dsm", "sigma", "quality", "views", "ortho"):

@@ -26,7 +26,8 @@ from zlocus.orientation.epipolar import Sightlines, trace
 from zlocus.orientation.orientation import linked_pairs, orient
 from zlocus.orientation.ties import find_ties, neighbours
 from zlocus.orientation.triangulate import Observations
-from zlocus.pipeline.preparing import MOST_NAMED, oriented, what_was_applied
+from zlocus.pipeline.messages import MOST_NAMED, what_was_applied
+from zlocus.pipeline.setup import orient_views
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 
 OPTIONS = OrientationOptions(features_per_mpx=20000)
@@ -166,7 +167,7 @@ class WatchedProgress(SilentProgress):
 
 def test_progress_only_grows(scene):
     watched = WatchedProgress()
-    oriented(scene, OPTIONS, None, watched, threads=2)
+    orient_views(scene, OPTIONS, watched, threads=2)
     assert min(watched.shares) >= 0.0
     assert 0.5 < sum(watched.shares) <= 1.0 + 1e-9
 

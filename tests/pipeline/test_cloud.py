@@ -318,7 +318,7 @@ def test_options_reach_the_run(monkeypatch, tmp_path):
 
 
 def test_the_page_lists_every_option():
-    page = (ROOT / "docs" / "cloud.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "cloud.md").read_text(encoding="utf-8")
     command = typer.main.get_command(app).commands["cloud"]
     options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
     assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z-]+)", page, re.MULTILINE))

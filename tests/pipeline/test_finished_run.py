@@ -18,6 +18,7 @@ import zlocus
 import zlocus.pipeline.dsm
 import zlocus.pipeline.fingerprint
 import zlocus.pipeline.finished_run
+import zlocus.pipeline.surface_products
 import zlocus.pipeline.tile_run
 from rendered_scenes import GSD_M, HEIGHTS, PART, SMALL_TILES, read, run
 from zlocus.cli.app import app
@@ -28,7 +29,6 @@ from zlocus.core.requests import FINISHED, CloudRequest, CurvesRequest, OrientRe
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileStore
 from zlocus.pipeline.finished_record import checksum
-from zlocus.pipeline.match_curves import run_point
 from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rank import run_rank
 from zlocus.products.stac_item import PRODUCTS
@@ -312,7 +312,7 @@ def test_a_run_that_was_killed_at_its_very_end(images, tmp_path, monkeypatch, wh
 
 
 def test_a_surface_with_too_few_heights_is_no_success_the_second_time(images, tmp_path, monkeypatch):
-    monkeypatch.setattr(zlocus.pipeline.dsm, "SUFFICIENT_COVERAGE", 1.1)
+    monkeypatch.setattr(zlocus.pipeline.surface_products, "SUFFICIENT_COVERAGE", 1.1)
     sentences = []
     for _ in range(2):
         with pytest.raises(CoverageError, match="of the cells seen by two images or more have a height") as refused:
@@ -323,7 +323,7 @@ def test_a_surface_with_too_few_heights_is_no_success_the_second_time(images, tm
     assert asked(images, tmp_path / "out", report=False, partial=True).was_finished
     # And one that was accepted is none when it is not.
     monkeypatch.undo()
-    monkeypatch.setattr(zlocus.pipeline.dsm, "SUFFICIENT_COVERAGE", 1.1)
+    monkeypatch.setattr(zlocus.pipeline.surface_products, "SUFFICIENT_COVERAGE", 1.1)
     assert not asked(images, tmp_path / "accepted", report=False, partial=True).was_finished
     with pytest.raises(CoverageError, match="of the cells seen by two images or more have a height"):
         asked(images, tmp_path / "accepted", report=False)

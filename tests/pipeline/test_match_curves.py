@@ -19,7 +19,7 @@ from rendered_scenes import CENTRE, HEIGHTS, LOOKS, SIZE_PX, camera, rendered
 from zlocus.cli.app import app
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.point_match import PointOrder, peak_of, point_curves, point_order
-from zlocus.matching.view_ranking import Evidence, Ranking
+from zlocus.matching.view_ranking import OrderSource, PairLabels
 from zlocus.synthetic.terrain import analytic_height
 
 KIND = "sine"
@@ -187,7 +187,7 @@ def windows_of(ncc: np.ndarray) -> np.ndarray:
 def order_of(n: int, worth: list[bool]) -> PointOrder:
     nothing = np.zeros(0, np.int64)
     return PointOrder(
-        0, np.arange(1, n + 1), np.zeros(n, np.int64), np.array(worth), Evidence.SCENE, nothing, np.zeros((0, 2)),
+        0, np.arange(1, n + 1), np.zeros(n, np.int64), np.array(worth), OrderSource.SCENE, nothing, np.zeros((0, 2)),
         np.zeros(0), np.zeros((0, n), np.int8),
     )  # fmt: skip
 
@@ -228,16 +228,16 @@ def test_the_peak_lies_between_samples():
 
 
 def test_an_order_without_any_tie_point():
-    ranking = Ranking(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3, 3), np.int8), np.ones((3, 3)))
+    ranking = PairLabels(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3, 3), np.int8), np.ones((3, 3)))
     order = point_order(ranking, np.array([0.0, 1.0, 0.0]), np.zeros(2), OPTIONS)
-    assert (order.reference, order.search.tolist(), order.evidence) == (1, [0, 2], Evidence.SCENE)
+    assert (order.reference, order.search.tolist(), order.order_source) == (1, [0, 2], OrderSource.SCENE)
     assert order.is_worth.all()
 
 
 def test_labels_follow_the_order():
     labels = np.zeros((2, 3, 3), np.int8)
     labels[0, 0], labels[1, 0] = [-1, 0, 1], [-1, -1, 1]
-    ranking = Ranking(np.arange(2), np.array([[9.0, 0.0], [3.0, 0.0]]), labels, np.ones((3, 3)))
+    ranking = PairLabels(np.arange(2), np.array([[9.0, 0.0], [3.0, 0.0]]), labels, np.ones((3, 3)))
     order = point_order(ranking, np.ones(3), np.zeros(2), OPTIONS)
     assert (order.reference, order.search.tolist()) == (0, [2, 1])
     assert order.accumulated.tolist() == [2, -1]
@@ -248,7 +248,7 @@ def test_labels_follow_the_order():
 
 
 def test_the_page_lists_every_option_and_its_default():
-    page = (ROOT / "docs" / "selection.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "curves.md").read_text(encoding="utf-8")
     command = typer.main.get_command(app).commands["curves"]
     options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
     assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z]+)", page, re.MULTILINE))

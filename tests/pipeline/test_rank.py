@@ -16,7 +16,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import RankRequest
 from zlocus.matching.match_curve import FAIR, GOOD, POOR
-from zlocus.matching.view_ranking import RankedPoints
+from zlocus.matching.view_ranking import LabelledTies
 from zlocus.pipeline.rank import label_counts, ranking_table, run_rank
 
 
@@ -77,9 +77,9 @@ def test_counts_of_labels():
     """Tiles that see other images, and two that see the same; a pair that no tile compared has no figure."""
     labels = np.array([[[POOR, GOOD], [GOOD, POOR]], [[POOR, FAIR], [FAIR, POOR]]], np.int8)
     parts = [
-        RankedPoints(np.zeros((2, 3)), labels, np.array([0, 2])),
-        RankedPoints(np.zeros((1, 3)), np.full((1, 2, 2), POOR, np.int8), np.array([2, 1])),
-        RankedPoints(np.zeros((1, 3)), labels[:1], np.array([0, 2])),
+        LabelledTies(np.zeros((2, 3)), labels, np.array([0, 2])),
+        LabelledTies(np.zeros((1, 3)), np.full((1, 2, 2), POOR, np.int8), np.array([2, 1])),
+        LabelledTies(np.zeros((1, 3)), labels[:1], np.array([0, 2])),
     ]
     counts = label_counts(parts, 3)
     assert counts[:, 0, 2].tolist() == counts[:, 2, 0].tolist() == [2, 1, 0]

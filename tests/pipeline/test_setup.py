@@ -11,11 +11,12 @@ from pyproj import CRS
 
 from orientation_scenes import image_of
 from zlocus.core.errors import GeometryError
+from zlocus.core.footprints import is_shared
 from zlocus.core.progress import SilentProgress
-from zlocus.core.scene import Scene, View, is_shared
+from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import capped, lowest_station
 from zlocus.orientation.ties import slabs
-from zlocus.pipeline.preparing import LOWEST_M, heights_asked_for, heights_below, possible_heights
+from zlocus.pipeline.height_range import LOWEST_M, heights_below_cameras, possible_heights, range_below_cameras
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -42,7 +43,7 @@ def scene(*sensors):
 @pytest.mark.parametrize("earth", [True, False])
 def test_ground_lies_where_two_footprints_meet(earth):
     """Two cameras 600 m apart that look straight down, 1.2 m wide per metre of depth: from 500 m below on."""
-    low, high = heights_below(scene(frame(0.0, earth=earth), frame(600.0, earth=earth)))
+    low, high = heights_below_cameras(scene(frame(0.0, earth=earth), frame(600.0, earth=earth)))
     assert low == pytest.approx(LOWEST_M, abs=1.0)
     # The next of the depths, 17 % further apart each.
     assert 1500.0 - 500.0 / 0.83 < high <= 1000.0 + 1.0
@@ -54,7 +55,7 @@ def test_ground_lies_where_two_footprints_meet(earth):
 def test_the_lowest_camera_counts_and_corrections_do_not_hide_it():
     sensors = frame(0.0, 1500.0), ShiftedModel(frame(600.0, 1300.0), 0.5, 0.5)
     assert lowest_station(sensors) == pytest.approx(1300.0, abs=1e-6)
-    assert heights_below(scene(*sensors))[1] < 1300.0
+    assert heights_below_cameras(scene(*sensors))[1] < 1300.0
     assert lowest_station([*sensors, SatelliteCamera((*PLACE, 0.0), (0.0, 0.0), 0.5, 5.0, 0.0, 0.0, 30_000.0)]) is None
     assert capped((0.0, 2000.0), 1300.0, 0.25) == (0.0, 975.0)
     assert capped((0.0, 500.0), 1300.0, 0.25) == (0.0, 500.0)
@@ -74,9 +75,9 @@ class Notes(SilentProgress):
 def test_heights_asked_for_are_searched_up_to_the_cameras():
     """Those well below the lowest camera untouched, in silence; those that reach it up to an eighth of the depth."""
     views, notes = scene(frame(0.0, 1500.0), frame(600.0, 1300.0)), Notes()
-    assert heights_asked_for(views, (100.0, 1140.0), notes) == (100.0, 1140.0)
+    assert range_below_cameras(views, (100.0, 1140.0), notes) == (100.0, 1140.0)
     assert notes.said == []
-    low, high = heights_asked_for(views, (100.0, 1250.0), notes)
+    low, high = range_below_cameras(views, (100.0, 1250.0), notes)
     assert (low, high) == (100.0, pytest.approx(1150.0, abs=1e-6))
     assert len(notes.said) == 1
     assert "100 to 1250 m" in notes.said[0]
@@ -86,12 +87,12 @@ def test_heights_asked_for_are_searched_up_to_the_cameras():
 
 def test_what_cannot_be_told_is_asked_for():
     with pytest.raises(GeometryError, match="--heights ZMIN ZMAX"):
-        heights_below(scene(frame(0.0), frame(600.0, phi=80.0)))  # sees the horizon
+        heights_below_cameras(scene(frame(0.0), frame(600.0, phi=80.0)))  # sees the horizon
     with pytest.raises(GeometryError, match=r"anywhere below the lowest camera, which is 1500 m high.*--heights"):
-        heights_below(scene(frame(0.0, phi=40.0), frame(600.0, phi=-40.0)))  # look away from each other
+        heights_below_cameras(scene(frame(0.0, phi=40.0), frame(600.0, phi=-40.0)))  # look away from each other
     satellite = SatelliteCamera((*PLACE, 0.0), (0.0, 0.0), 0.5, 5.0, 0.0, 0.0, 30_000.0)
     with pytest.raises(GeometryError, match="--heights ZMIN ZMAX"):
-        heights_below(scene(satellite, satellite))
+        heights_below_cameras(scene(satellite, satellite))
 
 
 def test_slabs_of_depth_cover_the_heights_and_overlap():

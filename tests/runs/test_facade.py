@@ -15,7 +15,7 @@ from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import JointOptions, OrientationOptions
 from zlocus.core.requests import ImportRequest
-from zlocus.io.scene_file import open_scene, turn_to_axes
+from zlocus.io.scene_file import open_scene, rotation_to_axes
 from zlocus.orientation.orientation import orient
 from zlocus.synthetic.terrain import analytic_height
 
@@ -115,9 +115,9 @@ def test_joint_corrections_are_made_where_they_are_asked_for(facade, tmp_path):
 
 
 def test_north_turns_the_frame_about_its_up():
-    rotation = turn_to_axes(tuple(OUT), tuple(ALONG + 0.7 * OUT))
+    rotation = rotation_to_axes(tuple(OUT), tuple(ALONG + 0.7 * OUT))
     np.testing.assert_allclose(rotation @ FILE_FROM_WALL, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(turn_to_axes((0.0, 0.0, 2.0), (0.0, 5.0, 1.0)), np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation_to_axes((0.0, 0.0, 2.0), (0.0, 5.0, 1.0)), np.eye(3), atol=1e-12)
 
 
 def test_doctor_names_the_wall(tmp_path):

@@ -156,9 +156,9 @@ AFTERWARDS = {
     "zlocus.pipeline.tile_run.Matching.assemble": (1, set()),
     # In the third of five rasters.
     "zlocus.io.rasters._check_written": (6, set()),
-    "zlocus.pipeline.dsm.write_observations": (1, {"dsm.tif", "ties.gpkg"}),
-    "zlocus.pipeline.dsm._show": (1, {"dsm.tif", "observations.npz"}),
-    "zlocus.pipeline.dsm.link_all": (1, {"dsm.tif", "run.json", "hillshade.tif"}),
+    "zlocus.pipeline.surface_products.write_observations": (1, {"dsm.tif", "ties.gpkg"}),
+    "zlocus.pipeline.dsm.write_report_inputs": (1, {"dsm.tif", "observations.npz"}),
+    "zlocus.pipeline.surface_products.link_all": (1, {"dsm.tif", "run.json", "hillshade.tif"}),
 }
 
 
@@ -411,9 +411,9 @@ GOES = {
         r"tiles has gone since the run began, with 3 finished tiles in it",
     ),
     "zlocus.io.rasters._check_written": (1, r"ortho\.tif cannot be written"),
-    "zlocus.pipeline.dsm.write_observations": (1, r"observations\.npz cannot be written: No such file"),
-    "zlocus.pipeline.dsm.make_maps": (1, r"run\.json cannot be written: No such file"),
-    "zlocus.pipeline.dsm.link_all": (1, r"There is no raster \S*dsm\.tif"),
+    "zlocus.pipeline.surface_products.write_observations": (1, r"observations\.npz cannot be written: No such file"),
+    "zlocus.pipeline.surface_products.make_maps": (1, r"run\.json cannot be written: No such file"),
+    "zlocus.pipeline.surface_products.link_all": (1, r"There is no raster \S*dsm\.tif"),
 }
 
 
@@ -443,7 +443,7 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
     """After some tiles there is no room for the next: those are kept, and the run goes on when there is."""
     import zlocus.pipeline.execution.checkpoint as store
 
-    write, written = store.write_whole, []
+    write, written = store.write_atomically, []
 
     def until_full(path, content):
         if path.suffix == ".npz" and path.name != BEFORE:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rendered_scenes import CENTRE, FIELD, GSD_M, SIZE_PX, UTM, read, run
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.sensors.rpc_fit import fit_rpc
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.files import write_image
@@ -66,6 +66,6 @@ def test_heights_of_a_hillside(hillside, tmp_path):
 
 def test_a_level_base_makes_stairs(hillside, tmp_path, monkeypatch):
     """What the base surface is for: without it the same bar is missed, by heights a step of the stairs away."""
-    monkeypatch.setattr(BaseSurface, "along", lambda surface, block, _=None: BaseSurface.level(surface.shape, block))
+    monkeypatch.setattr(SlopeSurface, "along", lambda surface, block, _=None: SlopeSurface.flat(surface.shape, block))
     error = errors_on(hillside, tmp_path / "out")
     assert (np.abs(error) < WITHIN_M).mean() < WITHIN

@@ -73,7 +73,7 @@ def surface(town, out, config=SMALL_BLOCKS, names=(*GOOD_VIEWS, SPOILED), **requ
     inputs = tuple(town.scene.images[name] for name in names)
     asked = {"bounds": town.bounds, "heights": (425.0, 470.0)} | request
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(zlocus.pipeline.setup, "taking_part", lambda scene, orientation: scene)
+        patch.setattr(zlocus.pipeline.setup, "supported_views", lambda scene, orientation: scene)
         return run(inputs, out, config, **asked).out
 
 
@@ -178,14 +178,14 @@ def test_of_three_images_none_is_left_out(town, tmp_path, blocks_used):
 
 
 def test_the_order_of_tie_points_changes_nothing(guided, town, tmp_path, monkeypatch):
-    settle = zlocus.pipeline.setup.settle
+    build = zlocus.pipeline.setup.build_match_scene
 
     def shuffled(*arguments):
-        settled = settle(*arguments)
-        order = np.random.default_rng(3).permutation(len(settled.ties))
-        return replace(settled, ties=settled.ties[order])
+        match_scene = build(*arguments)
+        order = np.random.default_rng(3).permutation(len(match_scene.ties))
+        return replace(match_scene, ties=match_scene.ties[order])
 
-    monkeypatch.setattr(zlocus.pipeline.setup, "settle", shuffled)
+    monkeypatch.setattr(zlocus.pipeline.setup, "build_match_scene", shuffled)
     again = surface(town, tmp_path / "out")
     for product in PRODUCTS:
         assert (again / product).read_bytes() == (guided[0] / product).read_bytes(), product

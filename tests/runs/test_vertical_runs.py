@@ -21,6 +21,7 @@ from joint_scenes import views_of
 from rendered_scenes import CENTRE, HEIGHTS, PART, SMALL_TILES, UTM, read, run
 from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError, GeometryError, InputError
+from zlocus.core.footprints import shared_ground
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress, progress_for
 from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest
@@ -29,12 +30,12 @@ from zlocus.io.control_points import read_control
 from zlocus.io.grid_inputs import dem_datum
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import vertical_datum
-from zlocus.matching.match_scene import shared_ground
-from zlocus.matching.view_ranking import RankedPoints
+from zlocus.matching.view_ranking import LabelledTies
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.dsm import run_dsm
+from zlocus.pipeline.height_range import with_heights
+from zlocus.pipeline.messages import note_dem
 from zlocus.pipeline.orient import control_datum, control_points, run_orient, terrain_heights
-from zlocus.pipeline.preparing import note_dem, with_heights
 from zlocus.products.tie_layers import write_ranking
 from zlocus.synthetic.terrain import analytic_height
 
@@ -124,7 +125,7 @@ def test_points_are_above_the_same(images, geoid, tmp_path, name):
 def test_points_where_a_geoid_has_no_value_are_left_out(tmp_path, geoid):
     east, north = CENTRE
     xyz = np.array([[east, north, 60.0], [east + 900.0, north, 60.0], [east + 5000.0, north, 60.0]])
-    ranked = RankedPoints(xyz, np.ones((3, 2, 2), np.int8), np.arange(2))
+    ranked = LabelledTies(xyz, np.ones((3, 2, 2), np.int8), np.arange(2))
     write_ranking(tmp_path / "ranking.gpkg", [ranked], ["a", "b"], UTM, vertical_datum(str(geoid)))
     found, _ = points_in(tmp_path / "ranking.gpkg")
     assert len(found) == 4  # two references each
@@ -293,7 +294,6 @@ def open_scene_of(views):
 def test_nothing_is_above_a_geoid_in_a_local_frame(geoid, tmp_path, monkeypatch):
     scene = open_scene_of(views_of([None, None], (100, 80)))
     monkeypatch.setattr("zlocus.pipeline.setup.open_scene", lambda *_: scene)
-    monkeypatch.setattr("zlocus.pipeline.cloud.open_scene", lambda *_: scene)
     inputs, above = (tmp_path / "scene.yaml",), str(geoid)
     says = r"frame is local, where no place is above the geoid of slope\.tif\. Leave --vertical out"
     with pytest.raises(GeometryError, match=says):

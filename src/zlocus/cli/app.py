@@ -105,13 +105,13 @@ def demo(
     """Render the built-in scene, run everything, and report the accuracy against its truth."""
     # A folder of an earlier demo may be used again, one of any other run not.
     check_output(out, overwrite=any((out / name).exists() for name in (DEMO_ACCURACY, DEMO_BEGUN)))
-    from zlocus.io.run_record import write_whole
+    from zlocus.io.run_record import write_atomically
     from zlocus.pipeline.demo import run_demo
 
     result = run_demo(out, progress_for(sys.stderr))
     accuracy = {f"within_{each.threshold_m:g}_m": each.as_dict() for each in result.evaluations}
     text = json.dumps(accuracy, indent=2) + "\n"
-    write_whole(out / DEMO_ACCURACY, lambda part: part.write_text(text, encoding="utf-8"))
+    write_atomically(out / DEMO_ACCURACY, lambda part: part.write_text(text, encoding="utf-8"))
     print(f"Accuracy of {result.out} against the rendered truth:")
     for evaluation in result.evaluations:
         print()
@@ -253,9 +253,9 @@ def curves(
     )  # fmt: skip
     check_output(out, overwrite)
     run_config = _run_config(config)
-    from zlocus.pipeline.match_curves import run_point
+    from zlocus.pipeline.match_curves import run_curves
 
-    print(run_point(request, run_config, progress_for(sys.stderr)))
+    print(run_curves(request, run_config, progress_for(sys.stderr)))
 
 
 @app.command()
@@ -411,7 +411,7 @@ def config(
 ) -> None:
     """Write a complete commented configuration."""
     from zlocus.core.options import RunConfig
-    from zlocus.io.atomic_write import whole_file
+    from zlocus.io.atomic_write import atomic_file
     from zlocus.io.config import write_config
 
     text = write_config(RunConfig())
@@ -421,7 +421,7 @@ def config(
     if out.exists():
         raise OutputError(f"{out} exists already and may hold your settings. Choose another name with -o.")
     try:
-        with whole_file(out) as part:
+        with atomic_file(out) as part:
             part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{out} cannot be written: {error.strerror}. Choose another name with -o.") from error

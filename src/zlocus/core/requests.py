@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from zlocus.core.errors import ConfigError, InputError, OutputError
@@ -120,6 +120,35 @@ class DsmRequest:
                 raise ConfigError(
                     f"--bounds {numbers} holds no area. Give XMIN YMIN XMAX YMAX, the smaller values first."
                 )
+
+
+@dataclass(frozen=True)
+class SetupRequest:
+    """The part of a request from which views, orientation, heights, grid and match scene follow.
+
+    Every command has some of these fields, with the meaning that they have in `DsmRequest`; the others keep the value of
+    "not given".
+    """
+
+    inputs: tuple[Path, ...]
+    crs: str | None = None
+    resolution: float | None = None
+    bounds: tuple[float, float, float, float] | None = None
+    like: Path | None = None
+    area: Path | None = None
+    mask: Path | None = None
+    heights: tuple[float, float] | None = None
+    dem: Path | None = None
+    dem_vertical: str | None = None
+    vertical: str = "ellipsoid"
+    reference: str | None = None
+    workers: int | None = None
+
+    @classmethod
+    def of(cls, request: object) -> SetupRequest:
+        """The fields that a command's request has, and "not given" for the others."""
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: getattr(request, name) for name in names if hasattr(request, name)})
 
 
 @dataclass(frozen=True)

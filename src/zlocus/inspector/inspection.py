@@ -116,7 +116,7 @@ class Inspection:
     def _open(self) -> Restored:
         found = restored(self.folder.out, self.folder.run, self._may_ask, self._told)
         # Kernels are compiled, or loaded, before anyone waits for them.
-        for xy in found.matched.ties[:: len(found.matched.ties) // WARM_PLACES + 1, :2]:
+        for xy in found.run.ties[:: len(found.run.ties) // WARM_PLACES + 1, :2]:
             try:
                 match_record(found, xy, math.nan, WhatIf())
                 break

@@ -12,13 +12,12 @@ from pydantic import TypeAdapter, ValidationError
 from zlocus.core.errors import InputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress, SilentProgress
-from zlocus.core.requests import DsmRequest
+from zlocus.core.requests import DsmRequest, SetupRequest
 from zlocus.io.config import config_from_dict
 from zlocus.io.open_raster import is_remote
 from zlocus.pipeline.fingerprint import digest_of
-from zlocus.pipeline.preparing import oriented
-from zlocus.pipeline.report_inputs import Matched
-from zlocus.pipeline.setup import opened, settled_run
+from zlocus.pipeline.report_inputs import ReportedRun
+from zlocus.pipeline.setup import open_inputs, orient_views, set_up_run
 from zlocus.products.report.file_names import RECORD
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations
 
@@ -34,7 +33,7 @@ class Restored:
     is_same : whether cameras, heights and grey values came out as in the run, None where it did not say.
     """
 
-    matched: Matched
+    run: ReportedRun
     config: RunConfig
     is_same: bool | None
 
@@ -58,22 +57,18 @@ def restored(out: Path, run: Mapping[str, Any], may_ask: bool = False, progress:
         raise InputError(
             f"The run read {elsewhere[0]} from a server, which is not asked again unbidden. Add --remote for curves."
         )
-    found = opened(request, progress)
-    ties = read_observations(out, len(found.scene.views))
+    opened = open_inputs(SetupRequest.of(request), progress)
+    ties = read_observations(out, len(opened.scene.views))
     if ties is None and run["orientation"].get("n_ties"):
         raise InputError(
             f"{out / OBSERVATIONS} is missing or damaged, without which the cameras of the run do not come out again. "
             "Make the surface again."
         )
-    orientation = oriented(found.scene, config.orientation, found.scene.heights, progress, known=ties)
-    settled = settled_run(request, found, orientation, config, progress)
-    matched = Matched(
-        settled.scene, settled.matching, settled.grid, orientation.xyz,
-        lambda xy: found.vertical.undulation(xy, found.scene.crs),
-    )  # fmt: skip
-    known = run.get("settled_sha256")
-    is_same = None if known is None else digest_of(settled.matching, orientation) == known
-    return Restored(matched, config, is_same)
+    orientation = orient_views(opened.scene, config.orientation, progress, known_ties=ties)
+    setup = set_up_run(SetupRequest.of(request), opened, orientation, config, progress)
+    known = run.get("setup_sha256")
+    is_same = None if known is None else digest_of(setup.match_scene, orientation) == known
+    return Restored(ReportedRun.of(setup, opened.vertical_datum), config, is_same)
 
 
 def config_of(out: Path, run: Mapping[str, Any]) -> RunConfig:

@@ -17,7 +17,7 @@ from zlocus.io.run_record import read_record, versions_record, write_record
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.pipeline.execution.checkpoint import FOLDER as TILES
 from zlocus.pipeline.execution.precompile import kernels_compiling
-from zlocus.pipeline.preparing import made_folder
+from zlocus.pipeline.output_folder import made_folder
 from zlocus.products.demo_figure import picture_beside_truth
 
 if TYPE_CHECKING:

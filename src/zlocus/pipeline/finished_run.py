@@ -1,4 +1,4 @@
-"""The same command given again after success: what is there is checked, and what is missing of it is made again."""
+"""The same command after success: its products are checked, and those that are missing are made again."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any
 from zlocus.core.errors import OutputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import FINISHED, DsmRequest, held_files
+from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest, held_files
 from zlocus.io.run_record import read_record
 from zlocus.pipeline.execution.checkpoint import TileStore, difference
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import ITEM, Finished, checksum, comparable, read_finished, update_finished
-from zlocus.pipeline.preparing import oriented
-from zlocus.pipeline.setup import Opened, settled_run
+from zlocus.pipeline.setup import OpenedInputs, orient_views, set_up_run
 from zlocus.products.derived import FILES, link_all, make_maps
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.tie_layers import write_ties
@@ -128,7 +127,7 @@ def whole_again(request: DsmRequest, found: Finished, missing: Missing, progress
 
 
 def make_missing(
-    request: DsmRequest, config: RunConfig, opened: Opened, found: Finished, missing: Missing, progress: Progress
+    request: DsmRequest, config: RunConfig, opened: OpenedInputs, found: Finished, missing: Missing, progress: Progress
 ) -> None:
     """Make products of a finished run that are missing, and take their checksums; nothing else changes.
 
@@ -159,31 +158,30 @@ def make_missing(
 
 
 def _make_of_ties(
-    request: DsmRequest, config: RunConfig, opened: Opened, names: Sequence[str], progress: Progress
+    request: DsmRequest, config: RunConfig, opened: OpenedInputs, names: Sequence[str], progress: Progress
 ) -> None:
     """Make again what is made of the tie points; those are looked for again where they were not kept."""
-    from zlocus.pipeline.report_inputs import Matched, write_shown
+    from zlocus.pipeline.report_inputs import ReportedRun, write_shown
 
-    out, scene, record = request.out, opened.scene, read_record(request.out / RECORD)
-    known = read_observations(out, len(scene.views))
-    orientation = oriented(scene, config.orientation, scene.heights, progress, threads=request.workers, known=known)
-    settled = settled_run(request, opened, orientation, config, progress)
-    if digest_of(settled.matching, orientation) != record.get("settled_sha256"):
+    out, record = request.out, read_record(request.out / RECORD)
+    known = read_observations(out, len(opened.scene.views))
+    orientation = orient_views(
+        opened.scene, config.orientation, progress, threads=request.workers, known_ties=known
+    )  # fmt: skip
+    setup = set_up_run(SetupRequest.of(request), opened, orientation, config, progress)
+    if digest_of(setup.match_scene, orientation) != record.get("setup_sha256"):
         raise OutputError(
             f"{', '.join(names)} of {out} cannot be made again, for cameras and heights came out otherwise than in the "
             "run, as they may on another machine. Add --overwrite to make the whole run anew."
         )
     if TIES in names:
-        write_ties(out / TIES, orientation, settled.scene, opened.vertical)
+        write_ties(out / TIES, orientation, setup.scene, opened.vertical_datum)
     if OBSERVATIONS in names and orientation.ties is not None:
         write_observations(out, orientation.ties)
     if shown := [name for name in names if name in (FOOTPRINTS, CURVES)]:
-        matched = Matched(
-            settled.scene, settled.matching, settled.grid, orientation.xyz,
-            lambda xy: opened.vertical.undulation(xy, scene.crs),
-        )  # fmt: skip
+        run = ReportedRun.of(setup, opened.vertical_datum)
         with progress.stage("Match curves"):
-            write_shown(out, matched, config, _time_of_matching(record), progress, shown)
+            write_shown(out, run, config, _time_of_matching(record), progress, shown)
 
 
 def _time_of_matching(record: dict[str, Any]) -> float:

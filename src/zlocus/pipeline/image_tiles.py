@@ -1,8 +1,13 @@
-"""Reference images matched in their own spaces and confirmed by each other, for clouds and for surfaces."""
+"""Matching in image space: every pixel of a reference image gets a height, for clouds and for surfaces.
+
+The steps, in order: `set_up_images` (orientation and height range), `image_scenes` (a match scene for each reference
+image), `match_images` (all tiles of all images), `cross_checked_images` (heights that other images contradict are
+removed), and for a surface `heights_for_grid` and `grid_tile` (the heights on the ground grid).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -10,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError, TileError, ZlocusError
+from zlocus.core.footprints import check_overlap, ground_sample_distance
 from zlocus.core.grid import CellWindow
-from zlocus.core.options import OrientationOptions, RunConfig
+from zlocus.core.options import RunConfig
 from zlocus.core.parallel import run_all
 from zlocus.core.progress import Progress
-from zlocus.core.scene import Scene, View, check_overlap, ground_sample_distance
+from zlocus.core.requests import DsmRequest
+from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.fill import filled
 from zlocus.matching.fusion import Cells, PixelHeights, gridded
@@ -23,6 +30,7 @@ from zlocus.matching.image_space import (
     ImageSpace,
     MatchedImage,
     beyond_range,
+    build_image_match_scene,
     confirm,
     depth_options,
     fitting_block,
@@ -30,7 +38,6 @@ from zlocus.matching.image_space import (
     hypotheses_of_ties,
     image_space,
     is_by_depth,
-    settle_image,
     widest_disparities,
 )
 from zlocus.matching.match_scene import FEWEST_LEVELS, MatchScene
@@ -40,29 +47,32 @@ from zlocus.matching.tile import TileResult, match_tile
 from zlocus.orientation.orientation import Orientation, supported
 from zlocus.pipeline.execution.checkpoint import TileStore
 from zlocus.pipeline.execution.plan import Tile, plan_tiles
-from zlocus.pipeline.execution.spill_arrays import Scratch
-from zlocus.pipeline.preparing import heights_of_ties, oriented, possible_heights, taking_part
-from zlocus.pipeline.tile_run import TileProduct
+from zlocus.pipeline.execution.spill_arrays import SpillArrays
+from zlocus.pipeline.height_range import possible_heights, range_from_ties
+from zlocus.pipeline.setup import RunSetup, orient_views, supported_views
+from zlocus.pipeline.tile_run import Plan, Tally, TileJob, TileProduct
 from zlocus.sensors.frame import FrameModel
 
-AGREE_PX = 1.0
+# Two images agree on a height where it moves the pixel by at most this much.
+MAX_DISAGREEMENT_PX = 1.0
 # A limit that no spread of heights reaches.
-ANY_SPREAD_STEPS = 1e4
-BESIDE_PX = 16
-# Along a side of a window of pixels, at which rays are followed: outlines are bent by lenses and by unsteady scanners.
-SAMPLES = 9
+NO_SPREAD_LIMIT_STEPS = 1e4
+# Margin around a window of pixels that may show an area.
+MARGIN_PX = 16
+# Rays followed along each side of a window of pixels: lenses and unsteady scanners bend its outline on the ground.
+N_RAYS = 9
 
 
 @dataclass(frozen=True)
-class Area:
-    """Ground that is asked for. bounds : (xmin, ymin, xmax, ymax) m; z_range : m."""
+class GroundArea:
+    """Ground to be matched. bounds : (xmin, ymin, xmax, ymax) m; z_range : lowest and highest height, m."""
 
     bounds: tuple[float, float, float, float]
     z_range: tuple[float, float]
 
     def may_show(self, space: ImageSpace, pixels: CellWindow) -> bool:
-        """Whether pixels of a reference image may show the area, between its heights and some pixels aside."""
-        col, row = (np.linspace(start - BESIDE_PX, start + n + BESIDE_PX, SAMPLES) for start, n in (
+        """Whether a window of pixels of a reference image, with a margin, may show the area between its two heights."""
+        col, row = (np.linspace(start - MARGIN_PX, start + n + MARGIN_PX, N_RAYS) for start, n in (
             (pixels.col, pixels.cols), (pixels.row, pixels.rows)))  # fmt: skip
         x, y, z = (v.ravel() for v in np.meshgrid(col, row, self.z_range))
         ground = space.reference.sensor.ground_from_image(np.column_stack([x, y]), z)[:, :2]
@@ -75,27 +85,56 @@ class Area:
 
 
 @dataclass(frozen=True)
-class OrientedScene:
-    """views with corrected sensors; ties : (n, 3) m, ground points; trusted : (n,) whether neighbours confirm them;
-    z_range : heights searched, m, None where each image takes its depths from the ties."""
+class ImageSetup:
+    """What the matching of images in their own spaces starts from.
+
+    scene : the views that take part, with corrected cameras; ties : (n, 3) m, ground points; is_supported : (n,)
+    whether the tie points around confirm them; z_range : heights searched, m, None where each image takes its range of
+    depths from the tie points.
+    """
 
     scene: Scene
     orientation: Orientation
     ties: FloatArray
-    trusted: NDArray[np.bool_]
+    is_supported: NDArray[np.bool_]
     z_range: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
-class Matched:
-    """A reference image: what was found for its pixels, in hypotheses.
+class ImageScene:
+    """A reference image: its image space, and the match scene of its tiles."""
+
+    space: ImageSpace
+    match_scene: MatchScene
+
+
+@dataclass(frozen=True)
+class ImageMatching:
+    """How reference images are matched.
+
+    config : options, with the blocks and levels that suit the images; use_visibility : see `match_tile`; workers :
+    tiles at a time; spill_arrays : makes the arrays of all pixels; area : tiles that cannot show it are left out, None
+    leaves none out; store : keeps finished tiles, and holds those of a run that is resumed, None keeps none.
+    """
+
+    config: RunConfig
+    use_visibility: bool
+    workers: int
+    spill_arrays: SpillArrays
+    area: GroundArea | None = None
+    store: TileStore | None = None
+
+
+@dataclass(frozen=True)
+class MatchedPixels:
+    """A reference image and what was found for its pixels, in hypotheses of its image space.
 
     surface : of the pixels; its heights are those of `image`, and its quality says why others are missing;
     evaluations, all_images : see `TileResult`.
     """
 
     image: MatchedImage
-    settled: MatchScene
+    match_scene: MatchScene
     surface: Surface
     evaluations: int = 0
     all_images: int = 0
@@ -105,156 +144,167 @@ class Matched:
         """(r, c), see `Quality`."""
         return self.surface.quality
 
-    def copied(self, scratch: Scratch) -> Matched:
-        """The image with heights and reasons of its own."""
-        height, quality = scratch.copied(self.image.height), scratch.copied(self.quality)
+    def copied(self, spill_arrays: SpillArrays) -> MatchedPixels:
+        """A copy whose heights and quality may be changed."""
+        height, quality = spill_arrays.copied(self.image.height), spill_arrays.copied(self.quality)
         surface = replace(self.surface, height=height, quality=quality)
         return replace(self, image=replace(self.image, height=height), surface=surface)
 
-    def leave_out(self, rows: slice, cells: NDArray[np.bool_], reason: Quality) -> None:
-        """Take the heights of some pixels of some rows away, which get a reason; changes the arrays. cells : (r, c)."""
-        self.image.height[rows][cells] = np.nan
-        self.quality[rows][cells] |= np.uint16(reason)
+    def remove_heights(self, rows: slice, pixels: NDArray[np.bool_], reason: Quality) -> None:
+        """Remove the heights of some pixels and set the reason; changes the arrays. pixels : (r, c) of those rows."""
+        self.image.height[rows][pixels] = np.nan
+        self.quality[rows][pixels] |= np.uint16(reason)
 
 
 @dataclass(frozen=True)
 class GridImages:
-    """images : to be put on a grid, in the order in which they give grey values; matched : all of them; evaluations,
-    all_images : see `TileResult`."""
+    """Matched images for a surface on the ground grid.
+
+    images : those whose heights are used, in the order in which they give grey values; all_matched : every matched
+    image; evaluations, all_images : see `TileResult`.
+    """
 
     images: list[PixelHeights]
-    matched: list[PixelHeights]
+    all_matched: list[PixelHeights]
     evaluations: int
     all_images: int
 
 
-def chosen_references(scene: Scene, asked: Sequence[str]) -> list[str]:
-    """Names of the views to be matched, in the scene's order."""
+def reference_names(scene: Scene, requested: Sequence[str]) -> list[str]:
+    """Names of the reference images in the scene's order; all of them where none is requested.
+
+    Raises
+    ------
+    ConfigError
+        A requested name is not a view of the scene.
+    """
     names = [view.name for view in scene.views]
-    for name in asked:
+    for name in requested:
         if name not in names:
             raise ConfigError(f"--reference {name} is not a view of this scene. Choose from {', '.join(names)}.")
-    return [name for name in names if not asked or name in asked]
+    return [name for name in names if not requested or name in requested]
 
 
-def orient_scene(
-    scene: Scene, heights: tuple[float, float] | None, options: OrientationOptions, progress: Progress
-) -> OrientedScene:
-    """Corrected sensors, ties, and the range of heights.
+def set_up_images(scene: Scene, config: RunConfig, progress: Progress) -> ImageSetup:
+    """Orient the views, and find the range of heights to search.
 
-    Frame cameras, which may look anywhere, are oriented over the pixels and disparities of the first image: a shift of
-    an image is the same there, and disparities, unlike heights, are linear along every locus.
+    Frame cameras may look in any direction. They are oriented over the pixels and disparities of the first image: a
+    shift of an image is the same there, and disparities, unlike heights, are linear along every epipolar line.
     """
+    options = config.orientation
     if not is_by_depth(scene):
-        check_overlap(scene, possible_heights(scene, heights))
-        found = oriented(scene, options, heights, progress)
-        trusted = supported(found.xyz, found.sigma_z_m)
-        z_range = heights or heights_of_ties(scene, found, options)
-        return OrientedScene(taking_part(found.apply(scene), found), found, found.xyz, trusted, z_range)
+        check_overlap(scene, possible_heights(scene, scene.heights))
+        orientation = orient_views(scene, options, progress)
+        is_supported = supported(orientation.xyz, orientation.sigma_z_m)
+        z_range = scene.heights or range_from_ties(scene, orientation, options)
+        used = supported_views(orientation.apply(scene), orientation)
+        return ImageSetup(used, orientation, orientation.xyz, is_supported, z_range)
     space = image_space(scene, scene.views[0].name, (0.0, 0.0))
-    given = None if heights is None else hypotheses_of_heights(space, heights)
-    found = oriented(Scene(space.views, scene.crs), options, given or widest_disparities(space), progress)
-    views = tuple(corrected(view, v.shift_px) for view, v in zip(scene.views, found.views, strict=True))
-    ground = space.rays.ground(found.xyz[:, :2] * [1.0, -1.0], found.xyz[:, 2])
-    trusted = supported(found.xyz, found.sigma_z_m) & np.isfinite(ground).all(axis=1)
-    return OrientedScene(taking_part(replace(scene, views=views), found), found, ground, trusted, heights)
+    given = None if scene.heights is None else hypotheses_of_heights(space, scene.heights)
+    in_first_image = Scene(space.views, scene.crs, heights=given or widest_disparities(space))
+    orientation = orient_views(in_first_image, options, progress)
+    views = tuple(shifted(view, v.shift_px) for view, v in zip(scene.views, orientation.views, strict=True))
+    ground = space.rays.ground(orientation.xyz[:, :2] * [1.0, -1.0], orientation.xyz[:, 2])
+    is_supported = supported(orientation.xyz, orientation.sigma_z_m) & np.isfinite(ground).all(axis=1)
+    used = supported_views(replace(scene, views=views), orientation)
+    return ImageSetup(used, orientation, ground, is_supported, scene.heights)
 
 
-def corrected(view: View, shift_px: tuple[float, float]) -> View:
-    """A view with a frame camera moved in its image."""
+def shifted(view: View, shift_px: tuple[float, float]) -> View:
+    """A view whose frame camera is moved by a shift in its image, px."""
     assert isinstance(view.sensor, FrameModel), "only frame cameras are matched by depth"
     return replace(view, sensor=view.sensor.moved(*shift_px))
 
 
-def settle_all(
-    ready: OrientedScene, references: Sequence[str], options: RunConfig
-) -> tuple[list[tuple[ImageSpace, MatchScene]], RunConfig]:
-    """Each reference image's space and lattice, and the options with blocks, and if need be levels, that suit them.
+def image_scenes(setup: ImageSetup, references: Sequence[str], config: RunConfig) -> tuple[list[ImageScene], RunConfig]:
+    """The match scene of every reference image, and the options with the blocks and levels that suit them.
 
-    Of frame cameras that look from very different directions, the projections of a coarse level's blocks are too bent
-    for the tables: then fewer levels search more steps at the coarsest.
+    Where frame cameras look from very different directions, projections bend too much within the blocks of a coarse
+    level for the projection tables: then there are fewer levels, and the coarsest one searches more steps.
     """
     while True:
-        settled = [settle(ready, name, options) for name in references]
-        block = fitting_block([scene for _, scene in settled], options.pyramid.block)
-        levels = max(scene.levels for _, scene in settled)
+        scenes = [image_scene(setup, name, config) for name in references]
+        block = fitting_block([one.match_scene for one in scenes], config.pyramid.block)
+        levels = max(one.match_scene.levels for one in scenes)
         if block is not None or levels <= FEWEST_LEVELS:
-            pyramid = replace(options.pyramid, block=block or options.pyramid.block)
-            return settled, replace(options, pyramid=pyramid)
-        options = replace(options, pyramid=replace(options.pyramid, max_levels=levels - 1))
+            pyramid = replace(config.pyramid, block=block or config.pyramid.block)
+            return scenes, replace(config, pyramid=pyramid)
+        config = replace(config, pyramid=replace(config.pyramid, max_levels=levels - 1))
 
 
-def settle(ready: OrientedScene, reference: str, options: RunConfig) -> tuple[ImageSpace, MatchScene]:
-    """A reference image's space, and the lattice that is searched there."""
-    space = image_space(ready.scene, reference, ready.z_range or (0.0, 0.0))
-    ties = space.frame_from_ground(ready.ties)
-    known = np.isfinite(ties).all(axis=1)
-    span = None if ready.z_range is None else hypotheses_of_heights(space, ready.z_range)
+def image_scene(setup: ImageSetup, reference: str, config: RunConfig) -> ImageScene:
+    """A reference image's space, and the match scene of its pixels."""
+    space = image_space(setup.scene, reference, setup.z_range or (0.0, 0.0))
+    ties = space.frame_from_ground(setup.ties)
+    is_known = np.isfinite(ties).all(axis=1)
+    span = None if setup.z_range is None else hypotheses_of_heights(space, setup.z_range)
     if span is None:
-        span = hypotheses_of_ties(space, ties[known & ready.trusted], options.orientation)
-    n_measured = ready.orientation.n_measured
-    ground = ties[:n_measured]
-    ground = ground[np.isfinite(ground).all(axis=1)]
-    return space, settle_image(space, span, ties[known], options.pyramid, ground)
+        span = hypotheses_of_ties(space, ties[is_known & setup.is_supported], config.orientation)
+    measured = ties[: setup.orientation.n_measured]
+    measured = measured[np.isfinite(measured).all(axis=1)]
+    return ImageScene(space, build_image_match_scene(space, span, ties[is_known], config.pyramid, measured))
 
 
-def match_images(
-    settled: Sequence[tuple[ImageSpace, MatchScene]],
-    options: RunConfig,
-    use_visibility: bool,
-    workers: int,
-    progress: Progress,
-    scratch: Scratch,
-    area: Area | None = None,
-    store: TileStore | None = None,
-) -> list[Matched]:
-    """Every tile of every reference image, or those that may show an area; of any precision, for there it is not in
-    metres. scratch : makes the arrays of all pixels; store : keeps tiles, and has those of a run that is taken on."""
-    options = replace(options, checks=replace(options.checks, most_sigma_m=None, most_spread_steps=ANY_SPREAD_STEPS))
-    images = [CellWindow(0, 0, *space.reference.image.shape) for space, _ in settled]
-    surfaces = [Surface.nothing(window, full=scratch.full) for window in images]
+def match_images(scenes: Sequence[ImageScene], how: ImageMatching, progress: Progress) -> list[MatchedPixels]:
+    """Match the tiles of every reference image.
+
+    Heights of any precision are kept: in image space they are not in metres, and the ground grid judges them later.
+    """
+    checks = replace(how.config.checks, most_sigma_m=None, most_spread_steps=NO_SPREAD_LIMIT_STEPS)
+    config = replace(how.config, checks=checks)
+    images = [CellWindow(0, 0, *one.space.reference.image.shape) for one in scenes]
+    surfaces = [Surface.nothing(window, full=how.spill_arrays.full) for window in images]
     tasks = [
         (number, tile)
-        for number, (_, scene) in enumerate(settled)
-        for tile in plan_tiles(images[number], scene.seen, options.pyramid)
-        if area is None or area.may_show(settled[number][0], tile.kept)
+        for number, one in enumerate(scenes)
+        for tile in plan_tiles(images[number], one.match_scene.seen, config.pyramid)
+        if how.area is None or how.area.may_show(one.space, tile.kept)
     ]
-    tallies = np.zeros((len(settled), 2), np.int64)
+    tallies = np.zeros((len(scenes), 2), np.int64)
 
     def work(task: tuple[int, Tile]) -> tuple[TileProduct, bool]:
-        """What was found for a tile, and whether it was found anew."""
-        space, scene = settled[task[0]]
-        core = task[1].core
-        known = None if store is None else store.load(tile_name(*task))
-        if known is not None:
-            return TileProduct.of(known), False
-        try:
-            result = match_tile(scene, core, options, use_visibility=use_visibility)
-        except ZlocusError:
-            raise
-        except Exception as error:
-            where = f"The pixels from row {core.row}, column {core.col} on of {space.reference.name}"
-            what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
-            raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
-        return TileProduct(result.surface.part(task[1].kept, core), result.evaluations, result.all_images), True
+        """The product of a tile, and whether it was matched now instead of loaded."""
+        arrays = None if how.store is None else how.store.load(tile_name(*task))
+        if arrays is not None:
+            return TileProduct.of(arrays), False
+        return matched_tile(scenes[task[0]], task[1], config, how.use_visibility), True
 
-    with progress.stage("Matching", len(tasks)) as stage, _interruption(store, tasks, progress):
-        for (number, tile), (product, is_new) in run_all(work, tasks, workers):
-            if store is not None and is_new:
-                store.keep(tile_name(number, tile), product.arrays())
-            to = tile.kept.slices_in(images[number])
-            for mine, theirs in zip(surfaces[number].arrays, product.surface.arrays, strict=True):
-                mine[to] = theirs
-            scratch.rest()
+    with progress.stage("Matching", len(tasks)) as stage, _interruption(how.store, tasks, progress):
+        for (number, tile), (product, is_new) in run_all(work, tasks, how.workers):
+            if how.store is not None and is_new:
+                how.store.keep(tile_name(number, tile), product.arrays())
+            kept = tile.kept.slices_in(images[number])
+            for of_image, of_tile in zip(surfaces[number].arrays, product.surface.arrays, strict=True):
+                of_image[kept] = of_tile
+            how.spill_arrays.rest()
             tallies[number] += product.evaluations, product.all_images
             stage.advance()
-    found = [matched_image(*one, surface) for one, surface in zip(settled, surfaces, strict=True)]
-    return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(found, tallies, strict=True)]
+    matched = [matched_pixels(one, surface) for one, surface in zip(scenes, surfaces, strict=True)]
+    return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(matched, tallies, strict=True)]
+
+
+def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, use_visibility: bool) -> TileProduct:
+    """One tile of a reference image.
+
+    Raises
+    ------
+    TileError
+        A fault of our own, with the tile in which it happened.
+    """
+    try:
+        result = match_tile(image.match_scene, tile.core, config, use_visibility=use_visibility)
+    except ZlocusError:
+        raise
+    except Exception as error:
+        where = f"The pixels from row {tile.core.row}, column {tile.core.col} on of {image.space.reference.name}"
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
+        raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
+    return TileProduct(result.surface.part(tile.kept, tile.core), result.evaluations, result.all_images)
 
 
 @contextmanager
 def _interruption(store: TileStore | None, tasks: Sequence[tuple[int, Tile]], progress: Progress) -> Iterator[None]:
-    """Says what is kept after an interrupt."""
+    """Say which finished tiles are kept after an interrupt."""
     try:
         yield
     except KeyboardInterrupt:
@@ -266,80 +316,128 @@ def _interruption(store: TileStore | None, tasks: Sequence[tuple[int, Tile]], pr
 
 
 def tile_name(number: int, tile: Tile) -> str:
-    """Of a tile of an image, where it is kept."""
+    """Name under which the tile of an image is kept."""
     return f"image{number}_{tile.core.row}_{tile.core.col}"
 
 
-def matched_image(space: ImageSpace, scene: MatchScene, surface: Surface) -> Matched:
-    """What the tiles of an image found, without heights beyond the range that was asked for."""
-    image = MatchedImage(space, surface.height, scene.origin_m + scene.n_steps * scene.step_m / 2)
-    found = Matched(image, scene, surface)
+def matched_pixels(image: ImageScene, surface: Surface) -> MatchedPixels:
+    """The surface of a reference image without the heights that lie beyond the requested range."""
+    match_scene = image.match_scene
+    middle = match_scene.origin_m + match_scene.n_steps * match_scene.step_m / 2
+    matched = MatchedPixels(MatchedImage(image.space, surface.height, middle), match_scene, surface)
     for row in range(0, len(surface.height), ROWS_AT_ONCE):
         rows = slice(row, row + ROWS_AT_ONCE)
-        found.leave_out(rows, beyond_range(scene, surface.height[rows]), Quality.RANGE_END)
-    return found
+        matched.remove_heights(rows, beyond_range(match_scene, surface.height[rows]), Quality.RANGE_END)
+    return matched
 
 
-def confirmed_images(matched: Sequence[Matched], progress: Progress, scratch: Scratch) -> list[Matched]:
-    """The images without the heights that no other one confirms; as they are where only one was matched."""
+def cross_checked_images(
+    matched: Sequence[MatchedPixels], progress: Progress, spill_arrays: SpillArrays
+) -> list[MatchedPixels]:
+    """The images without the heights that no other image confirms.
+
+    Where only one image was matched there is no other to check it: all its heights are kept, and a note says so.
+    """
     if len(matched) < 2:
         progress.note("Only one image was matched, so no other one could confirm its heights: all are kept.")
         return list(matched)
-    images, found = [m.image for m in matched], []
-    with progress.stage("Matching back", len(images)) as stage:
+    images, checked = [m.image for m in matched], []
+    with progress.stage("Checking across images", len(images)) as stage:
         for k, one in enumerate(matched):
-            kept = one.copied(scratch)
-            for rows, result in confirm(one.image, images[:k] + images[k + 1 :], AGREE_PX):
-                unsure = np.isfinite(one.image.height[rows]) & ~result.is_confirmed
-                kept.leave_out(rows, unsure, Quality.UNCONFIRMED)
-                scratch.rest()
-            found.append(kept)
+            kept = one.copied(spill_arrays)
+            for rows, result in confirm(one.image, images[:k] + images[k + 1 :], MAX_DISAGREEMENT_PX):
+                is_unconfirmed = np.isfinite(one.image.height[rows]) & ~result.is_confirmed
+                kept.remove_heights(rows, is_unconfirmed, Quality.UNCONFIRMED)
+                spill_arrays.rest()
+            checked.append(kept)
             stage.advance()
-    return found
+    return checked
 
 
-def match_for_grid(
-    ready: OrientedScene,
-    leading: Sequence[str],
-    area: Area,
-    config: RunConfig,
-    use_visibility: bool,
-    workers: int,
-    progress: Progress,
-    scratch: Scratch,
-    store: TileStore,
+def heights_for_grid(
+    setup: ImageSetup, references: Sequence[str], how: ImageMatching, progress: Progress
 ) -> GridImages:
-    """All views matched in their own spaces and confirmed by each other, for a surface. leading : names of those whose
-    heights it takes, in the order in which they give grey values; scratch, store : see `match_images`."""
-    options = depth_options(config) if is_by_depth(ready.scene) else config
-    settled, options = settle_all(ready, [view.name for view in ready.scene.views], options)
-    before = match_images(settled, options, use_visibility, workers, progress, scratch, area, store)
-    after = confirmed_images(before, progress, scratch)
-    z = sum(area.z_range) / 2
-    images = {one.image.space.reference.name: pixel_heights(one, b, z) for one, b in zip(after, before, strict=True)}
-    evaluations = sum(one.evaluations for one in before), sum(one.all_images for one in before)
-    return GridImages([images[name] for name in leading], list(images.values()), *evaluations)
+    """Match all views in their own spaces and check them against each other, for a surface.
+
+    references : names of the images whose heights the surface takes, in the order in which they give grey values.
+    """
+    assert how.area is not None, "a surface has an area"
+    config = depth_options(how.config) if is_by_depth(setup.scene) else how.config
+    scenes, config = image_scenes(setup, [view.name for view in setup.scene.views], config)
+    matched = match_images(scenes, replace(how, config=config), progress)
+    checked = cross_checked_images(matched, progress, how.spill_arrays)
+    z = sum(how.area.z_range) / 2
+    images = {
+        kept.image.space.reference.name: pixel_heights(kept, every, z)
+        for kept, every in zip(checked, matched, strict=True)
+    }
+    evaluations = sum(one.evaluations for one in matched), sum(one.all_images for one in matched)
+    return GridImages([images[name] for name in references], list(images.values()), *evaluations)
 
 
-def pixel_heights(one: Matched, before: Matched, z: float) -> PixelHeights:
-    """A matched image as a grid takes it. z : m, about where its ground pixel is measured."""
-    space, step, middle = one.image.space, one.settled.step_m, one.image.middle
-    rows, cols = one.image.height.shape
-    beside = np.array([[middle - step / 2], [middle + step / 2]], np.float32)
-    low, high = (space.ground(rows // 2, hypothesis[None], cols // 2)[0, 0, 2] for hypothesis in beside)
+def pixel_heights(checked: MatchedPixels, unchecked: MatchedPixels, z: float) -> PixelHeights:
+    """A matched image as the ground grid takes it. z : height (m) at which its ground pixel is measured."""
+    space, step, middle = checked.image.space, checked.match_scene.step_m, checked.image.middle
+    rows, cols = checked.image.height.shape
+    half_step = np.array([[middle - step / 2], [middle + step / 2]], np.float32)
+    low, high = (space.ground(rows // 2, hypothesis[None], cols // 2)[0, 0, 2] for hypothesis in half_step)
     pixel_m = ground_sample_distance(space.reference, z)
-    return PixelHeights(one.image, one.surface, before.surface, step, abs(float(high - low)), pixel_m)
+    return PixelHeights(checked.image, checked.surface, unchecked.surface, step, abs(float(high - low)), pixel_m)
 
 
-def grid_tile(matched: GridImages, scene: MatchScene, core: CellWindow, config: RunConfig, fill: str) -> TileResult:
-    """A tile of the ground grid from the pixels that fall on it. scene : its lattice of cells and heights."""
+def grid_tile(
+    grid_images: GridImages, match_scene: MatchScene, core: CellWindow, config: RunConfig, fill: str
+) -> TileResult:
+    """A tile of the ground grid from the heights of the pixels that fall on it."""
     if not (core.rows and core.cols):
         return TileResult(Surface.nothing(core))
     halo = config.pyramid.halo
     window = core.at_level(0, halo)
-    z_range = (scene.origin_m, scene.origin_m + scene.n_steps * scene.step_m)
-    cells = Cells((window.rows, window.cols), scene.transform(window, 0), z_range)
-    surface = gridded(matched.images, cells, matched.matched).precise(config.checks.most_sigma_m)
+    z_range = (match_scene.origin_m, match_scene.origin_m + match_scene.n_steps * match_scene.step_m)
+    cells = Cells((window.rows, window.cols), match_scene.transform(window, 0), z_range)
+    surface = gridded(grid_images.images, cells, grid_images.all_matched).precise(config.checks.most_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, halo // 2)
     return TileResult(surface.part(core, window))
+
+
+def tile_maker(
+    request: DsmRequest,
+    job: TileJob,
+    store: TileStore,
+    setup: RunSetup,
+    plan: Plan,
+    tally: Tally,
+    progress: Progress,
+) -> Callable[[Tile], TileProduct]:
+    """The function that makes a tile of a surface.
+
+    On the ground grid it is the job itself. In image space all images are matched and checked against each other first;
+    a tile is then made from their heights.
+    """
+    if request.method != "gc3-sgm":
+        return job
+    orientation, grid, match_scene = setup.orientation, job.grid, setup.match_scene
+    used = supported_views(setup.scene, orientation)
+    is_supported = supported(orientation.xyz, orientation.sigma_z_m)
+    image_setup = ImageSetup(used, orientation, orientation.xyz, is_supported, setup.z_range)
+    references = [view.name for view in match_scene.views if request.reference in (None, view.name)]
+    box, margin = grid.geobox.extent.boundingbox, job.config.pyramid.halo * grid.cell_m
+    bounds = (box.left - margin, box.bottom - margin, box.right + margin, box.top + margin)
+    spill_arrays = SpillArrays(request.out, plan.allowed_bytes - plan.n_bytes)
+    area = GroundArea(bounds, setup.z_range)
+    how = ImageMatching(job.config, job.use_visibility, plan.slots, spill_arrays, area, store)
+    grid_images = heights_for_grid(image_setup, references, how, progress)
+    tally.evaluations, tally.all_images = grid_images.evaluations, grid_images.all_images
+    if spill_arrays.file_bytes:
+        progress.note(
+            f"Memory has no room for the heights of all pixels: {spill_arrays.file_bytes / 1e9:.2g} GB of them lie on "
+            "disk."
+        )
+
+    def make(tile: Tile) -> TileProduct:
+        product = job.product(tile, grid_tile(grid_images, match_scene, tile.core, job.config, job.fill))
+        spill_arrays.rest()
+        return product
+
+    return make

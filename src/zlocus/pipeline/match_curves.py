@@ -1,8 +1,6 @@
-"""The order of a point's run: scene, orientation, the place on the ground, its match curves, and how they are shown."""
+"""`zlocus curves`: setup, the point on the ground, its match curves, and their figures, in this order."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -10,65 +8,49 @@ from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import CurvesRequest, check_output
-from zlocus.core.scene import Scene, check_overlap
+from zlocus.core.requests import CurvesRequest, SetupRequest, check_output
+from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.scene_file import open_scene
-from zlocus.matching.ground_pixels import check_resolution, default_cell
-from zlocus.matching.match_scene import MatchScene, settle
+from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.point_match import NEAREST_TIES, Place, cell_of, curves_at, height_nearby
 from zlocus.orientation.orientation import supported
-from zlocus.pipeline.preparing import (
-    asked_crs,
-    heights_of_ties,
-    made_folder,
-    note_orientation,
-    oriented,
-    possible_heights,
-    taking_part,
-)
+from zlocus.pipeline.messages import note_orientation
+from zlocus.pipeline.output_folder import made_folder
+from zlocus.pipeline.setup import open_inputs, orient_views, set_up_run, supported_views
 from zlocus.products.match_curve_figures import PointReport, loci, point_text, write_point
 
-ROUNDS, SETTLED_M = 20, 0.01
+# A pixel is followed to the ground in at most this many rounds, until its height changes by less than this.
+MAX_ROUNDS, HEIGHT_TOLERANCE_M = 20, 0.01
 
 
-def run_point(request: CurvesRequest, config: RunConfig, progress: Progress) -> str:
-    """What is to be said of a point; figures and tables are written to `request.out`.
+def run_curves(request: CurvesRequest, config: RunConfig, progress: Progress) -> str:
+    """Match one point, write figures and tables of its match curves to `request.out`, and return them as text.
 
     Raises
     ------
     InputError, ConfigError, GeometryError, OutputError
-        For what cannot be used, and a point that fewer than two images show.
+        An input that cannot be used, or a point that fewer than two images show.
     """
     check_output(request.out, request.overwrite)
+    setup_request = SetupRequest.of(request)
     with progress.stage("Opening images"):
-        scene = open_scene(request.inputs, asked_crs(request.crs))
-        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
-        check_views(request, scene)
-        heights = request.heights or scene.heights
-        check_overlap(scene, possible_heights(scene, heights))
-    orientation = oriented(scene, config.orientation, heights, progress)
+        opened = open_inputs(setup_request, progress)
+        check_views(request, opened.scene)
+    orientation = orient_views(opened.scene, config.orientation, progress)
     note_orientation(orientation, progress)
-    ready = taking_part(orientation.apply(scene), orientation)
-    z_range = heights or heights_of_ties(ready, orientation, config.orientation)
-    z = sum(z_range) / 2
-    cell_m = request.resolution or default_cell(ready, z)
-    check_resolution(cell_m, ready, z, "--resolution")
-    settled = settle(
-        ready, cell_m, (0.0, 0.0), z_range, orientation.xyz, request.reference, config.pyramid, orientation.measured
-    )
+    setup = set_up_run(setup_request, opened, orientation, config, progress)
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
-    place = located(request, ready, settled, ties)
+    place = requested_place(request, supported_views(setup.scene, orientation), setup.match_scene, ties)
     with progress.stage("Match curves"):
-        looked = curves_at(asked(request), request.reference, settled, place, config)
-    report = PointReport.of(asked(request), looked, settled, scene.crs)
+        curves = curves_at(requested_point(request), request.reference, setup.match_scene, place, config)
+    report = PointReport.of(requested_point(request), curves, setup.match_scene, setup.scene.crs)
     with made_folder(request.out), progress.stage("Drawing"):
-        write_point(request.out, report, loci(looked.views, report), config.selection)
+        write_point(request.out, report, loci(curves.views, report), config.selection)
     return point_text(report, config.selection)
 
 
-def asked(request: CurvesRequest) -> str:
-    """The point as it was asked for."""
+def requested_point(request: CurvesRequest) -> str:
+    """The point as the command line gives it."""
     if request.at is not None:
         return f"--at {request.at[0]:.12g} {request.at[1]:.12g}"
     assert request.pixel is not None
@@ -76,7 +58,13 @@ def asked(request: CurvesRequest) -> str:
 
 
 def check_views(request: CurvesRequest, scene: Scene) -> None:
-    """Refuse views that are not there, and pixels that their view does not have."""
+    """Refuse names that no view has, and pixels outside their image.
+
+    Raises
+    ------
+    ConfigError, GeometryError
+        Such a name or pixel is given.
+    """
     names = [view.name for view in scene.views]
     if request.reference is not None and request.reference not in names:
         raise ConfigError(
@@ -95,9 +83,10 @@ def check_views(request: CurvesRequest, scene: Scene) -> None:
         )
 
 
-def located(request: CurvesRequest, scene: Scene, settled: MatchScene, ties: FloatArray) -> Place:
-    """The point on the ground, at the height asked for, else at that of the ties around it. scene : with
-    corrected cameras of the images as they are; ties : (n, 3) m.
+def requested_place(request: CurvesRequest, scene: Scene, match_scene: MatchScene, ties: FloatArray) -> Place:
+    """The point on the ground, at the requested height or else at the height of the tie points around it.
+
+    scene : the views that take part, with corrected cameras; ties : (n, 3) m.
 
     Raises
     ------
@@ -105,7 +94,7 @@ def located(request: CurvesRequest, scene: Scene, settled: MatchScene, ties: Flo
         A pixel whose ray does not meet the ground, or a height that no tie tells.
     """
     if request.height is None and not len(ties):
-        raise GeometryError(f"No tie point tells the height of {asked(request)}. Give it with --height Z.")
+        raise GeometryError(f"No tie point tells the height of {requested_point(request)}. Give it with --height Z.")
     if request.at is not None:
         xy = np.array(request.at)
         z = height_nearby(xy, ties) if request.height is None else request.height
@@ -116,25 +105,33 @@ def located(request: CurvesRequest, scene: Scene, settled: MatchScene, ties: Flo
         away = float(np.hypot(*(ties[:, :2] - xy).T).min())
         n_ties = min(NEAREST_TIES, len(ties))
         source = f"the median of the {n_ties} nearest tie points, of which the first is {away:.1f} m away"
-    cell = cell_of(xy, settled)
-    middle = np.array(settled.transform(CellWindow(*cell, 1, 1), 0) * (0.5, 0.5))
+    cell = cell_of(xy, match_scene)
+    middle = np.array(match_scene.transform(CellWindow(*cell, 1, 1), 0) * (0.5, 0.5))
     return Place(np.array([*xy, z]), source, cell, middle)
 
 
 def pixel_on_ground(request: CurvesRequest, scene: Scene, ties: FloatArray) -> tuple[FloatArray, float]:
-    """Where a pixel meets the ground, (2,) m and its height: of the ties around the place, which the height moves."""
+    """Where the ray of a pixel meets the ground: position (2,) m, and height, m.
+
+    Without a requested height, the height is that of the tie points around the position, which itself depends on the
+    height: both are found in a few rounds.
+    """
     assert request.pixel is not None
     name, row, col = request.pixel
     (sensor,) = (view.sensor for view in scene.views if view.name == name)
     z = float(np.median(ties[:, 2])) if request.height is None else request.height
-    seen: list[float] = []
+    earlier: list[float] = []
     while True:
         xy = sensor.ground_from_image(np.array([[col, row]]), np.array([z]))[0, :2]
         if not np.isfinite(xy).all():
             raise GeometryError(
                 f"--pixel {name} {row:g} {col:g} does not meet the ground at {z:.1f} m. Give another --height."
             )
-        if request.height is not None or len(seen) >= ROUNDS or any(abs(z - old) < SETTLED_M for old in seen):
+        if (
+            request.height is not None
+            or len(earlier) >= MAX_ROUNDS
+            or any(abs(z - old) < HEIGHT_TOLERANCE_M for old in earlier)
+        ):
             return xy, z
-        seen.append(z)
+        earlier.append(z)
         z = height_nearby(xy, ties)

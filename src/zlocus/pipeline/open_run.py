@@ -1,4 +1,4 @@
-"""The beginning of a run: it opens what is named, compares what is there already, and refuses what cannot be done."""
+"""Start of `zlocus dsm`: inputs are opened, an earlier run in the folder is recognised, impossible runs are refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.grid import Grid
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import FINISHED, DsmRequest
+from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest
 from zlocus.core.scene import Scene
 from zlocus.io.grid_inputs import cells_inside, read_polygons
 from zlocus.io.input_files import InputFiles
@@ -23,17 +23,20 @@ from zlocus.pipeline.fingerprint import key_of
 from zlocus.pipeline.finished_record import Finished
 from zlocus.pipeline.finished_run import finished_run
 from zlocus.pipeline.required_space import check_room_before_ties, check_room_for_pixels
-from zlocus.pipeline.setup import Opened, Settled, opened
+from zlocus.pipeline.setup import OpenedInputs, RunSetup, open_inputs
 from zlocus.pipeline.tile_run import Polygons
 from zlocus.products.derived import FILES, check_maps
 
 
 @dataclass(frozen=True)
 class OpenRun:
-    """A run whose files are open. found : what the request names; inputs : all files, as they were; store : where its
-    tiles are, or will be; polygons : of the area asked for; finished : the same run, where it is there already."""
+    """A run whose files are open.
 
-    found: Opened
+    opened : what the request names; inputs : all files, with their states when the run began; store : finished tiles;
+    polygons : of the requested area; finished : the record of the same run, where it has finished already, else None.
+    """
+
+    opened: OpenedInputs
     inputs: InputFiles
     store: TileStore
     polygons: Polygons
@@ -41,30 +44,29 @@ class OpenRun:
 
 
 def open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> OpenRun:
-    """Open what a request names, and look at what an earlier run left in its folder.
+    """Open what a request names, and compare it with what an earlier run left in the folder.
 
     Raises
     ------
     InputError, ConfigError, GeometryError
-        For what cannot be used.
+        An input that cannot be used.
     OutputError
         The folder holds another run and may not be overwritten, or there is no room for the surface.
     """
     before = InputFiles.of(request.inputs)
-    found = opened(request, progress)
-    inputs = InputFiles.of(found.files, found.scene, before)
-    store = TileStore.of(
-        request.out, key_of(request, config, inputs), request.resume, request.overwrite, inputs.check
-    )  # fmt: skip
-    finished, polygons = finished_run(request, store), _area_polygons(request, found.scene.crs)
+    opened = open_inputs(SetupRequest.of(request), progress)
+    inputs = InputFiles.of(opened.files, opened.scene, before)
+    key = key_of(request, config, inputs)
+    store = TileStore.of(request.out, key, request.resume, request.overwrite, inputs.check)
+    finished, polygons = finished_run(request, store), _area_polygons(request, opened.scene.crs)
     if finished is None:
         check_maps(request.products, config.products)
-        _check_room_first(request, found, store)
-    return OpenRun(found, inputs, store, polygons, finished)
+        _check_room_first(request, opened, store)
+    return OpenRun(opened, inputs, store, polygons, finished)
 
 
 def may_have_terrain(request: DsmRequest) -> bool:
-    """Whether the folder may hold the terrain of this same run, finished."""
+    """Whether the folder may hold the terrain of this same run, which has finished."""
     return not request.overwrite and all((request.out / name).exists() for name in (FINISHED, FILES["dtm"]))
 
 
@@ -75,34 +77,40 @@ def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
     return Polygons(area, mask)
 
 
-def _check_room_first(request: DsmRequest, found: Opened, store: TileStore) -> None:
-    """Refuse, before the images are read, what memory and the disk have no room for."""
+def _check_room_first(request: DsmRequest, opened: OpenedInputs, store: TileStore) -> None:
+    """Refuse, before images are read, a run that memory or the disk has no room for."""
     if request.method == "gc3-sgm":
-        check_room_for_pixels(request.out, found.scene, [view.name for view in found.scene.views])
+        check_room_for_pixels(request.out, opened.scene, [view.name for view in opened.scene.views])
     if not store.finished:
-        like = None if found.like is None else found.like.shape.yx
-        check_room_before_ties(request.out, found.scene, request.resolution, request.bounds, like)
+        like = None if opened.like is None else opened.like.shape.yx
+        check_room_before_ties(request.out, opened.scene, request.resolution, request.bounds, like)
 
 
 def known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredTies | None:
-    """Tie points of the same run, where it was begun before."""
+    """Tie points that an interrupted run of the same command kept; None where there is none."""
     arrays = store.found_before()
     known = None if arrays is None else MeasuredTies.of(arrays, len(scene.views))
     if known is not None:
-        progress.note("Tie points are those of the run that is taken on.")
+        progress.note("The tie points of the interrupted run are used again.")
     return known
 
 
-def area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, float]:
-    """Bounds of the area asked for that two images see; refuses one without any."""
-    shared = grid.window.within(settled.seen)
+def area_matched(grid: Grid, match_scene: MatchScene) -> tuple[float, float, float, float]:
+    """Bounds (xmin, ymin, xmax, ymax), m, of the part of the requested area that two images see.
+
+    Raises
+    ------
+    GeometryError
+        Two images see none of it.
+    """
+    shared = grid.window.within(match_scene.seen)
     if shared.rows and shared.cols:
         (west, north), (east, south) = (
-            settled.transform(shared, 0) * corner for corner in ((0, 0), (shared.cols, shared.rows))
+            match_scene.transform(shared, 0) * corner for corner in ((0, 0), (shared.cols, shared.rows))
         )
         return west, south, east, north
-    west, north = settled.transform(settled.seen, 0) * (0, 0)
-    east, south = settled.transform(settled.seen, 0) * (settled.seen.cols, settled.seen.rows)
+    west, north = match_scene.transform(match_scene.seen, 0) * (0, 0)
+    east, south = match_scene.transform(match_scene.seen, 0) * (match_scene.seen.cols, match_scene.seen.rows)
     asked = grid.geobox.extent.boundingbox
     raise GeometryError(
         f"The area asked for (E {asked.left:.0f} to {asked.right:.0f} m, N {asked.bottom:.0f} to {asked.top:.0f} m) "
@@ -111,12 +119,18 @@ def area_matched(grid: Grid, settled: MatchScene) -> tuple[float, float, float, 
     )
 
 
-def check_polygons(request: DsmRequest, settled: Settled, area: NDArray[Any] | None) -> None:
-    """Refuse polygons of an area that hold no cell to be matched."""
+def check_polygons(request: DsmRequest, setup: RunSetup, area: NDArray[Any] | None) -> None:
+    """Refuse polygons of an area that contain no cell to be matched.
+
+    Raises
+    ------
+    GeometryError
+        They contain none.
+    """
     if area is None:
         return
-    grid = settled.grid
-    shared = grid.window.within(settled.matching.seen)
+    grid = setup.grid
+    shared = grid.window.within(setup.match_scene.seen)
     row, col = shared.row - grid.window.row, shared.col - grid.window.col
     if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
         raise GeometryError(

@@ -1,4 +1,4 @@
-"""The order of an orientation that stands alone: scene, ties, cameras, files."""
+"""`zlocus orient` and `zlocus ties`: inputs, tie points, cameras, and their files, in this order."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import GeometryError
+from zlocus.core.footprints import footprint, ground_sample_distance
 from zlocus.core.grid import grid_from_bounds
 from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import OrientRequest, check_output
-from zlocus.core.scene import Scene, footprint, ground_sample_distance, is_local
+from zlocus.core.requests import OrientRequest, SetupRequest, check_output
+from zlocus.core.scene import Scene, is_local
 from zlocus.io.control_points import read_control
 from zlocus.io.grid_inputs import dem_datum, read_dem
-from zlocus.io.input_files import InputFiles, files_of
-from zlocus.io.run_record import Stopwatch, made_record, write_record
+from zlocus.io.input_files import InputFiles
+from zlocus.io.run_record import Stopwatch, result_record, write_record
 from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation
-from zlocus.pipeline.preparing import made_folder, note_dem, note_orientation, opened_alone, oriented, possible_heights
+from zlocus.pipeline.height_range import possible_heights
+from zlocus.pipeline.messages import note_orientation, some_names
+from zlocus.pipeline.output_folder import made_folder
+from zlocus.pipeline.setup import open_inputs, orient_views
 from zlocus.products.corrected_cameras import SCENE, write_cameras
 from zlocus.products.orientation import orientation_record
 from zlocus.products.tie_layers import write_ties
@@ -29,12 +33,13 @@ from zlocus.products.tie_layers import write_ties
 # Cells of the terrain model are this many ground pixels, its own resolution being coarser.
 TERRAIN_PX = 16.0
 # Tie points that an orientation needs at least, all images together.
-FEWEST_TIES = 4
+MIN_TIES = 4
 
 
 def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) -> str:
-    """Find ties, correct the cameras where that is asked for, and write all products to `request.out`; a sentence on
-    what came out.
+    """Find tie points, correct the cameras where `request.cameras` is set, and write all products to `request.out`.
+
+    Returns a sentence that says what was written.
 
     Raises
     ------
@@ -46,49 +51,55 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     check_output(request.out, request.overwrite)
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
-        scene = opened_alone(request.inputs, request.crs, request.heights)
+        opened = open_inputs(SetupRequest.of(request), progress, "unless local")
+        scene = opened.scene
         control = None if request.control is None else control_points(request, scene)
         terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
-    inputs = InputFiles.of(files_read(request, scene), scene, before)
-    note_dem(request.dem, request.dem_vertical, progress)
+    inputs = InputFiles.of([*opened.files, *control_files(request)], scene, before)
     with watch.stage("orient"):
-        options = alone(config.orientation, request.cameras)
-        found = oriented(scene, options, scene.heights, progress, control, terrain)
-        check_ties(found, scene)
-        note_orientation(found, progress)
-    corrected, checksums = found.apply(scene), inputs.record()
+        options = options_of_command(config.orientation, request.cameras)
+        orientation = orient_views(scene, options, progress, control=control, terrain=terrain)
+        check_ties(orientation, scene)
+        note_orientation(orientation, progress)
+    corrected, checksums = orientation.apply(scene), inputs.record()
     with watch.stage("write"), made_folder(request.out):
-        write_ties(request.out / "ties.gpkg", found, corrected)
-        record: dict[str, Any] = orientation_record(found, scene)
+        write_ties(request.out / "ties.gpkg", orientation, corrected)
+        record: dict[str, Any] = orientation_record(orientation, scene)
         if request.cameras:
             record["cameras"] = write_cameras(request.out, request.inputs, corrected)
         write_record(request.out / "orientation.json", record)
-    write_record(request.out / "run.json", made_record(request, config, checksums, watch))
+    write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     if not request.cameras:
-        return f"{request.out / 'ties.gpkg'}: {len(found.xyz)} tie points."
-    return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(found.measured)} tie points."
+        return f"{request.out / 'ties.gpkg'}: {len(orientation.xyz)} tie points."
+    return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(orientation.measured)} tie points."
 
 
-def alone(options: OrientationOptions, cameras: bool) -> OrientationOptions:
-    """The options of a stage that stands alone: no correction for ties alone, all cameras jointly unless a file of
-    options says otherwise."""
+def options_of_command(options: OrientationOptions, cameras: bool) -> OrientationOptions:
+    """The options of the command: no correction for `zlocus ties`, a bundle adjustment for `zlocus orient` unless a
+    configuration file names another model."""
     if not cameras:
         return replace(options, model="none")
     return replace(options, model="joint") if options.model == "auto" else options
 
 
-def check_ties(found: Orientation, scene: Scene) -> None:
-    """Refuse an orientation that nothing holds together."""
-    if len(found.measured) < FEWEST_TIES:
+def check_ties(orientation: Orientation, scene: Scene) -> None:
+    """Refuse an orientation from too few tie points.
+
+    Raises
+    ------
+    GeometryError
+        There are fewer than `MIN_TIES`.
+    """
+    if len(orientation.measured) < MIN_TIES:
         raise GeometryError(
-            f"Only {len(found.measured)} tie points were found between {', '.join(v.name for v in scene.views)}, too "
-            f"few to orient the cameras ({FEWEST_TIES} are needed). Give --heights ZMIN ZMAX, or check that the images "
+            f"Only {len(orientation.measured)} tie points were found between {some_names([v.name for v in scene.views])}, "
+            f"too few to orient the cameras ({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check that the images "
             "overlap."
         )
 
 
 def control_datum(request: OrientRequest) -> VerticalDatum:
-    """What the heights of control points are above."""
+    """Vertical datum of the control points' heights."""
     return vertical_datum(request.control_vertical or ELLIPSOID, "--control-vertical")
 
 
@@ -134,10 +145,7 @@ def terrain_heights(dem: Path, scene: Scene, vertical: str | None = None) -> Ter
     return TerrainHeights(z, float(first[0]), float(first[1]), cell)
 
 
-def files_read(request: OrientRequest, scene: Scene) -> list[Path]:
-    """Every file whose content the result depends on."""
-    extra = [path for path in (request.control, request.dem) if path is not None]
-    extra += control_datum(request).files
-    if request.dem is not None:
-        extra += dem_datum(request.dem, request.dem_vertical).files
-    return [*request.inputs, *files_of(scene), *extra]
+def control_files(request: OrientRequest) -> list[Path]:
+    """Files that the control points are read from."""
+    given = [] if request.control is None else [request.control]
+    return [*given, *control_datum(request).files]

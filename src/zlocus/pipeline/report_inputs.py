@@ -1,4 +1,4 @@
-"""What a run leaves for its report: footprints and pairs of the images, match curves of a few cells, and the page."""
+"""What a run keeps for its report: footprints and pairs of images, match curves of a few cells, and the page itself."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ from zlocus.core.progress import Progress
 from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.run_record import write_record
+from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.point_match import Place, cell_of, curves_at, height_nearby
 from zlocus.matching.tile import rank_tile
-from zlocus.matching.view_ranking import RankedPoints
+from zlocus.matching.view_ranking import LabelledTies
 from zlocus.orientation.parameter_groups import kind_of
+from zlocus.pipeline.setup import RunSetup
 from zlocus.products.footprints import write_footprints
 from zlocus.products.match_curve_figures import PointReport, mean_figure, point_record, svg_of
 from zlocus.products.report.example_cells import FAILED, RULE, ChosenCell, chosen_cells
@@ -45,23 +47,32 @@ NOT_SHOWN = "Fewer than two images show this cell, and the window around it, at 
 
 
 @dataclass(frozen=True)
-class Matched:
-    """What a surface was made of.
+class ReportedRun:
+    """A run as its report shows it.
 
-    scene : oriented; ties : (n, 3) m; undulation : height of what dsm.tif's heights are above, over the ellipsoid, (n,)
-    m at ground points (n, 2).
+    scene : all views, with corrected cameras; ties : (n, 3) m, ground points; undulation : for ground points (n, 2),
+    the height (n,) m above the ellipsoid of the vertical datum of dsm.tif.
     """
 
     scene: Scene
-    settled: MatchScene
+    match_scene: MatchScene
     grid: Grid
     ties: FloatArray
     undulation: Callable[[FloatArray], FloatArray] = lambda xy: np.zeros(len(xy))
 
+    @classmethod
+    def of(cls, setup: RunSetup, vertical_datum: VerticalDatum) -> ReportedRun:
+        """The run with this setup, whose heights are above a vertical datum."""
+        scene = setup.scene
+        return cls(
+            scene, setup.match_scene, setup.grid, setup.orientation.xyz,
+            lambda xy: vertical_datum.undulation(xy, scene.crs),
+        )  # fmt: skip
+
 
 def write_shown(
     out: Path,
-    matched: Matched,
+    run: ReportedRun,
     config: RunConfig,
     match_s: float,
     progress: Progress,
@@ -71,9 +82,9 @@ def write_shown(
     names : which of the two."""
     most_s = max(LEAST_TIME_S, TIME_SHARE * match_s)
     if FOOTPRINTS in names:
-        _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, matched), progress)
+        _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, run), progress)
     if CURVES in names:
-        _tried(CURVES, lambda: write_curves(out / CURVES, out, matched, config, most_s), progress)
+        _tried(CURVES, lambda: write_curves(out / CURVES, out, run, config, most_s), progress)
 
 
 def try_report(out: Path, progress: Progress) -> None:
@@ -90,10 +101,10 @@ def _tried(name: str, write: Callable[[], Any], progress: Progress) -> None:
         progress.note(f"{name} was not made: {said(error)} The surface does not depend on it.")
 
 
-def write_views(path: Path, matched: Matched) -> None:
+def write_views(path: Path, run: ReportedRun) -> None:
     """Footprints at the median height of the ties, with what is known of each image and of each pair that overlaps."""
-    views = matched.scene.views
-    z = float(np.median(matched.ties[:, 2])) if len(matched.ties) else middle_height(matched.settled)
+    views = run.scene.views
+    z = float(np.median(run.ties[:, 2])) if len(run.ties) else middle_height(run.match_scene)
     geometry = [view_geometry(view, z) for view in views]
     features: list[tuple[Any, dict[str, Any]]] = [
         (
@@ -116,59 +127,59 @@ def write_views(path: Path, matched: Matched) -> None:
             )
             for pair in pair_geometries(views, [each.outline for each in geometry], z)
         ]  # fmt: skip
-    write_footprints(path, features, matched.scene.crs)
+    write_footprints(path, features, run.scene.crs)
 
 
-def write_curves(path: Path, folder: Path, matched: Matched, config: RunConfig, most_s: float) -> None:
+def write_curves(path: Path, folder: Path, run: ReportedRun, config: RunConfig, most_s: float) -> None:
     """Match curves of chosen cells of the surface in a folder; one that cannot be made leaves a sentence."""
     found, start, cells = survey(folder), time.perf_counter(), []
     chosen = chosen_cells(found)
     for cell in chosen:
         if time.perf_counter() - start > most_s:
             break
-        cells.append(shown_cell(cell, found, matched, config))
+        cells.append(shown_cell(cell, found, run, config))
     record = {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells}
-    if not (folder / RANKING).exists() and len(matched.settled.views) <= MOST_MATRIX:
-        record["labels"] = tried_labels(matched, config, most_s)
+    if not (folder / RANKING).exists() and len(run.match_scene.views) <= MOST_MATRIX:
+        record["labels"] = tried_labels(run, config, most_s)
     write_record(path, record)
 
 
-def tried_labels(matched: Matched, config: RunConfig, most_s: float) -> dict[str, Any]:
+def tried_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str, Any]:
     """What curves.json says of the labels of pairs, with an error where none can be given."""
     try:
-        return sampled_labels(matched, config, most_s)
+        return sampled_labels(run, config, most_s)
     except Exception as error:  # a table less, not a surface
         return {"error": said(error)}
 
 
-def sampled_labels(matched: Matched, config: RunConfig, most_s: float) -> dict[str, Any]:
+def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str, Any]:
     """Labels of every pair of images at the tie points in and around a few places, each point once.
 
     As where images are chosen (`rank_tile`), which takes `selection.fewest_views`: with fewer images nothing else says
     how well each pair of them matches. No place is begun after `most_s`.
     """
-    settled, start = matched.settled, time.perf_counter()
-    is_new, parts = np.ones(len(settled.ties), bool), list[RankedPoints]()
-    for core in sample_cores(settled, SAMPLE_BLOCKS * config.pyramid.block):
+    match_scene, start = run.match_scene, time.perf_counter()
+    is_new, parts = np.ones(len(match_scene.ties), bool), list[LabelledTies]()
+    for core in sample_cores(match_scene, SAMPLE_BLOCKS * config.pyramid.block):
         if parts and time.perf_counter() - start > most_s:
             break
-        found = rank_tile(settled, core, config)
+        found = rank_tile(match_scene, core, config)
         if found is None:
             continue
         ranking, which = found
         new = is_new[ranking.tie]
         is_new[ranking.tie] = False
-        parts.append(RankedPoints(settled.ties[ranking.tie[new]], ranking.labels[new], np.array(which, np.int64)))
-    names = [view.name for view in settled.views]
+        parts.append(LabelledTies(match_scene.ties[ranking.tie[new]], ranking.labels[new], np.array(which, np.int64)))
+    names = [view.name for view in match_scene.views]
     n_points = sum(len(part.xyz) for part in parts)
     return {"points": n_points, "pairs": counted_pairs(label_counts(parts, len(names)), names)}
 
 
-def sample_cores(settled: MatchScene, side: int) -> list[CellWindow]:
+def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     """Windows of `side` cells around tie points that are spread over the scene, each far from those before it."""
-    xy = (settled.ties[:, :2] - settled.anchor) * (1.0, -1.0) / settled.cell_m
-    first, size = (settled.seen.col, settled.seen.row), (settled.seen.cols, settled.seen.rows)
-    xy = xy[((xy >= first) & (xy < np.add(first, size))).all(axis=1) & np.isfinite(settled.ties[:, 2])]
+    xy = (match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
+    first, size = (match_scene.seen.col, match_scene.seen.row), (match_scene.seen.cols, match_scene.seen.rows)
+    xy = xy[((xy >= first) & (xy < np.add(first, size))).all(axis=1) & np.isfinite(match_scene.ties[:, 2])]
     if not len(xy):
         return []
     low, high = xy.min(axis=0), xy.max(axis=0)
@@ -180,20 +191,20 @@ def sample_cores(settled: MatchScene, side: int) -> list[CellWindow]:
     while rest := [tie for tie in nearest if tie not in order]:
         order.append(max(rest, key=lambda tie: min(float(np.hypot(*(xy[tie] - xy[old]))) for old in order)))
     cells = np.floor(xy[order]).astype(int) - side // 2
-    return [CellWindow(int(row), int(col), side, side).within(settled.seen) for col, row in cells]
+    return [CellWindow(int(row), int(col), side, side).within(match_scene.seen) for col, row in cells]
 
 
-def shown_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:
+def shown_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
     """What curves.json says of a cell, or of the first of the others that can be shown."""
-    first = tried_cell(cell, found, matched, config)
+    first = tried_cell(cell, found, run, config)
     for row, col in cell.others if "error" in first else ():
-        other = tried_cell(replace(cell, row=row, col=col), found, matched, config)
+        other = tried_cell(replace(cell, row=row, col=col), found, run, config)
         if "error" not in other:
             return other
     return first
 
 
-def tried_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunConfig) -> dict[str, Any]:
+def tried_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
     """What curves.json says of a cell, with an error where no curve can be made."""
     x, y = found.transform * (cell.col + 0.5, cell.row + 0.5)
     i, j = ((at - found.first) // found.stride for at in (cell.row, cell.col))
@@ -204,40 +215,40 @@ def tried_cell(cell: ChosenCell, found: Survey, matched: Matched, config: RunCon
         "quality": int(found.quality[i, j]),
     }  # fmt: skip
     try:
-        return record | curves_of(cell, np.array([x, y]), height_m, matched, config)
+        return record | curves_of(cell, np.array([x, y]), height_m, run, config)
     except GeometryError:
         return record | {"error": NOT_SHOWN}
     except Exception as error:  # a picture less, not a surface
         return record | {"error": said(error)}
 
 
-def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, matched: Matched, config: RunConfig) -> dict[str, Any]:
+def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
     """Record and figure of a cell's curves."""
-    settled = matched.settled
+    match_scene = run.match_scene
     asked = f"The cell at row {cell.row}, column {cell.col}"
-    looked = curves_at(asked, None, settled, place_of_cell(xy, height_m, matched), config, SHOWN_WITHIN_CELLS)
-    report = PointReport.of(asked, looked, settled, matched.scene.crs)
+    looked = curves_at(asked, None, match_scene, place_of_cell(xy, height_m, run), config, SHOWN_WITHIN_CELLS)
+    report = PointReport.of(asked, looked, match_scene, run.scene.crs)
     # Where no height was found all that could help is shown.
     n_images = len(report.search) if cell.kind == FAILED else report.curves.n_used
     figure = mean_figure(report, n_images, is_small=True)
     return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
 
 
-def place_of_cell(xy: FloatArray, height_m: float, matched: Matched) -> Place:
+def place_of_cell(xy: FloatArray, height_m: float, run: ReportedRun) -> Place:
     """A cell with middle (2,) m at its height in dsm.tif, or at that of the ties nearby where it has none."""
-    settled = matched.settled
+    match_scene = run.match_scene
     if math.isfinite(height_m):
-        z, source = height_m + float(matched.undulation(xy[None])[0]), "that of the surface"
-    elif len(matched.ties):
-        z, source = height_nearby(xy, matched.ties), "that of the nearest tie points"
+        z, source = height_m + float(run.undulation(xy[None])[0]), "that of the surface"
+    elif len(run.ties):
+        z, source = height_nearby(xy, run.ties), "that of the nearest tie points"
     else:
-        z, source = middle_height(settled), "the middle of the heights searched"
-    return Place(np.array([*xy, z]), source, cell_of(xy, settled), xy)
+        z, source = middle_height(match_scene), "the middle of the heights searched"
+    return Place(np.array([*xy, z]), source, cell_of(xy, match_scene), xy)
 
 
-def middle_height(settled: MatchScene) -> float:
+def middle_height(match_scene: MatchScene) -> float:
     """The middle of the heights searched, m."""
-    return settled.origin_m + settled.n_steps * settled.step_m / 2
+    return match_scene.origin_m + match_scene.n_steps * match_scene.step_m / 2
 
 
 def said(error: Exception) -> str:

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.core.errors import GeometryError, OutputError
+from zlocus.core.footprints import shared_ground
 from zlocus.core.grid import Grid
 from zlocus.core.resources import SHARE, free_bytes
 from zlocus.core.scene import ColourSource, Scene, is_local
 from zlocus.matching.ground_pixels import default_cell
-from zlocus.matching.match_scene import MatchScene, shared_ground
+from zlocus.matching.match_scene import MatchScene
 from zlocus.pipeline.execution.checkpoint import FOLDER
-from zlocus.pipeline.preparing import possible_heights
+from zlocus.pipeline.height_range import possible_heights
 from zlocus.products.rasters import COLOURS
 
 # Bytes of a cell in a finished tile: height and sigma (float32), quality (uint16), images used (uint8); and of each

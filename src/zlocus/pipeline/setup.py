@@ -1,157 +1,261 @@
-"""What is settled before the first tile of a surface: scene, cameras, heights, grid and lattice.
+"""Run setup: the one place where inputs become views, orientation, heights, grid and match scene.
 
-A run does it once; who looks at its surface afterwards does the same again with the ties that the run kept.
+Every command, the inspector and the Python interface start here, in this order:
+
+1. `open_inputs`: the scene that the request names, with its vertical datum and every file that the result depends on;
+2. `orient_views`: tie points and corrected cameras;
+3. `set_up_run`: the views that take part, the height range (`zlocus.pipeline.height_range`), the grid and the match
+   scene.
+
+Matching in image space needs no grid: `zlocus.pipeline.image_tiles` replaces the third step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
+import cv2
 import numpy as np
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
+from pyproj.exceptions import CRSError
 
-from zlocus.core.errors import GeometryError
+from zlocus.core.errors import ConfigError, CoverageError, GeometryError
+from zlocus.core.footprints import check_overlap, ground_sample_distance, shared_ground
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
-from zlocus.core.options import RunConfig
+from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import DsmRequest
-from zlocus.core.scene import Scene, check_overlap, is_local
+from zlocus.core.requests import SetupRequest
+from zlocus.core.resources import cores
+from zlocus.core.scene import Scene, is_local
+from zlocus.io.crs import checked_crs
 from zlocus.io.grid_inputs import dem_datum, read_dem, read_geobox
 from zlocus.io.input_files import files_of
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, vertical_datum
 from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
-from zlocus.matching.match_scene import MatchScene, settle, shared_ground
-from zlocus.orientation.orientation import Orientation, supported
+from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
+from zlocus.orientation.control import GroundControl, TerrainHeights
+from zlocus.orientation.orientation import RANGE_PERCENT, MeasuredTies, Orientation, orient, supported
 from zlocus.orientation.plausibility import Doubt
-from zlocus.pipeline.preparing import (
-    area_to_match,
-    asked_crs,
-    heights_asked_for,
-    heights_of_ties,
-    note_dem,
-    note_doubts,
-    possible_heights,
-    taking_part,
-    with_heights,
-)
+from zlocus.pipeline.height_range import heights_below_cameras, possible_heights, search_range, with_heights
+from zlocus.pipeline.messages import note_dem, note_doubts, some_names
 
-# Tie points that it takes to doubt a DEM, or the cameras.
-FEWEST_TO_COMPARE = 20
+# A height takes at least this many images.
+MIN_VIEWS = 2
+# Fewer tie points than this do not cast doubt on a terrain model.
+MIN_TIES_TO_COMPARE = 20
+# In a local frame the area is that of the tie points, extended on all sides by this share of their extent, where there
+# are at least this many of them.
+AREA_MARGIN, MIN_TIES_FOR_AREA = 0.05, 20
+# Progress of the stage "Tie points": where each step begins, and its share of the time.
+TIE_STEPS = {"features": (0.0, 0.4), "matches": (0.4, 0.35)}
+
+OverlapCheck = Literal["always", "unless local", "later"]
 
 
 @dataclass(frozen=True)
-class Opened:
-    """What a request names. like : grid of --like; files : whose content the result depends on."""
+class OpenedInputs:
+    """What a request names, opened.
+
+    scene : views sorted by name, with the heights asked for (ellipsoidal, m); vertical_datum : of the heights to be
+    written; like : grid of --like; files : every file whose content the result depends on.
+    """
 
     scene: Scene
-    vertical: VerticalDatum
+    vertical_datum: VerticalDatum
     like: GeoBox | None
     files: list[Path]
 
 
 @dataclass(frozen=True)
-class Settled:
-    """What all tiles share. scene : with corrected cameras; z_range : heights searched, m; matching : what a tile is
-    matched with; doubts : about the cameras."""
+class RunSetup:
+    """What all tiles of a surface share.
+
+    scene : all views, with corrected cameras; orientation : tie points and corrections; z_range : heights searched, m;
+    grid : of the products; match_scene : the views that take part, and everything that a tile is matched with; doubts :
+    about the cameras.
+    """
 
     scene: Scene
     orientation: Orientation
     z_range: tuple[float, float]
     grid: Grid
-    matching: MatchScene
+    match_scene: MatchScene
     doubts: tuple[Doubt, ...] = ()
 
 
-def opened(request: DsmRequest, progress: Progress) -> Opened:
-    """Everything that a request names, open, but for its polygons."""
-    like, vertical = read_geobox(request.like) if request.like else None, vertical_datum(request.vertical)
-    scene = _scene(request, like, vertical)
-    note_dem(request.dem, request.dem_vertical, progress)
-    return Opened(scene, vertical, like, _files(request, scene, vertical))
+def open_inputs(request: SetupRequest, progress: Progress, overlap_check: OverlapCheck = "always") -> OpenedInputs:
+    """Open everything that a request names, except polygons.
 
+    overlap_check : whether views must be found to overlap. "unless local" leaves the check out in a local frame without
+    heights, where cameras are oriented without them; "later" leaves it to the matching of frame images by depth.
 
-def settled_run(
-    request: DsmRequest, found: Opened, orientation: Orientation, config: RunConfig, progress: Progress
-) -> Settled:
-    """Heights, grid and lattice of a scene whose orientation is known."""
-    corrected = orientation.apply(found.scene)
-    scene = taking_part(corrected, orientation)
-    z_range = _searched_heights(request, scene, orientation, config, progress)
-    grid = _grid(request, found.like, scene, orientation, z_range)
-    matching = settle(
-        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
-        orientation.measured,
-    )  # fmt: skip
-    far = () if request.dem is None else ties_far_from_dem(request, scene, orientation, config)
-    note_doubts(far, progress)
-    matching = _with_dem(request, matching, scene.crs, config)
-    return Settled(corrected, orientation, z_range, grid, matching, (*orientation.doubts, *far))
-
-
-def _scene(request: DsmRequest, like: GeoBox | None, vertical: VerticalDatum) -> Scene:
-    """The scene, its views by name, so that the order of the inputs changes nothing, with the heights asked for."""
-    crs = asked_crs(request.crs) if like is None else CRS.from_wkt(like.crs.to_wkt())  # type: ignore[union-attr]
-    scene = open_scene(request.inputs, crs)
+    Raises
+    ------
+    InputError, ConfigError, GeometryError
+        An input that cannot be used, or views that do not overlap.
+    """
+    like = read_geobox(request.like) if request.like else None
+    datum = vertical_datum(request.vertical)
+    scene = open_scene(request.inputs, requested_crs(request.crs) if like is None else _crs_of(like))
     if is_local(scene.crs):
-        _check_local(request)
+        _refuse_maps_in_local_frame(request)
     bounds = request.bounds if like is None else like.boundingbox.bbox
-    scene = with_heights(scene, request.heights, vertical, bounds)
-    check_overlap(scene, possible_heights(scene, scene.heights))
+    scene = sorted_views(with_heights(scene, request.heights, datum, bounds))
+    is_unknown = is_local(scene.crs) and scene.heights is None
+    if overlap_check == "always" or (overlap_check == "unless local" and not is_unknown):
+        check_overlap(scene, possible_heights(scene, scene.heights))
+    note_dem(request.dem, request.dem_vertical, progress)
+    return OpenedInputs(scene, datum, like, _files_read(request, scene, datum))
+
+
+def requested_crs(text: str | None) -> CRS | None:
+    """The CRS of --crs; None where none is given.
+
+    Raises
+    ------
+    ConfigError
+        The CRS is not known, or not projected in metres.
+    """
+    if text is None:
+        return None
+    try:
+        return checked_crs(CRS.from_user_input(text))
+    except CRSError as error:
+        raise ConfigError(f"--crs {text} is not a known CRS. Give a projected one, such as EPSG:32632.") from error
+
+
+def sorted_views(scene: Scene) -> Scene:
+    """The scene with its views sorted by name, so that the order of the inputs changes nothing."""
     return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
 
 
-def _check_local(request: DsmRequest) -> None:
-    """Refuse what has a place on the Earth, in a local frame."""
-    for name in ("dem", "area", "mask"):
-        if path := getattr(request, name):
-            raise GeometryError(
-                f"The scene's frame is local, where {path} has no place. Leave --{name} out; --bounds and --heights "
-                "are in that frame."
-            )
+def orient_views(
+    scene: Scene,
+    options: OrientationOptions,
+    progress: Progress,
+    *,
+    control: GroundControl | None = None,
+    terrain: TerrainHeights | None = None,
+    threads: int | None = None,
+    known_ties: MeasuredTies | None = None,
+) -> Orientation:
+    """Find tie points and correct the cameras of a scene.
+
+    control, terrain, known_ties : see `orient`; threads : None uses every core.
+    """
+    heights = scene.heights
+    if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
+        heights = heights_below_cameras(scene)
+    with progress.stage("Tie points", 1.0) as stage:
+        done = 0.0
+
+        def report(step: str, share: float) -> None:
+            nonlocal done
+            start, length = TIE_STEPS[step]
+            stage.advance(start + length * share - done)
+            done = start + length * share
+
+        with opencv_in_one_thread():
+            return orient(scene, options, heights, report, control, terrain, threads or cores(), known_ties)
 
 
-def _searched_heights(
-    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
-) -> tuple[float, float]:
-    """Height range of the search: as asked for, else from the DEM, else from the ties."""
-    if scene.heights:
-        return heights_asked_for(scene, scene.heights, progress)
-    if request.dem is None:
-        return heights_of_ties(scene, orientation, config.orientation)
-    z = possible_heights(scene, None)
-    bounds = shared_ground(scene, (z[0], z[-1]))
-    cell = median_ground_pixel(scene, sum(z) / len(z)) * 16
-    geobox = grid_from_bounds(bounds, cell, scene.crs).geobox
-    heights = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
-    if not np.isfinite(heights).any():
-        raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
-    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
-    low, high = low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
-    return heights_asked_for(scene, (low, high), progress, f"The heights around {request.dem}")
+@contextmanager
+def opencv_in_one_thread() -> Iterator[None]:
+    """Let OpenCV use one thread, because several threads call it at the same time."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
-def _with_dem(request: DsmRequest, settled: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
-    """Limits from the DEM for the coarsest level."""
-    if request.dem is None:
-        return settled
-    level = settled.levels - 1
-    window = settled.seen.at_level(level, 0)
-    geobox = GeoBox((window.rows, window.cols), settled.transform(window, level), crs)
-    dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
-    limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
-    return replace(settled, prior=limits)
+def set_up_run(
+    request: SetupRequest, opened: OpenedInputs, orientation: Orientation, config: RunConfig, progress: Progress
+) -> RunSetup:
+    """Choose views, height range, grid and match scene of a scene whose orientation is known.
+
+    Raises
+    ------
+    CoverageError
+        Tie points support fewer than two views.
+    GeometryError, ConfigError
+        Heights, area or resolution that cannot be used.
+    """
+    corrected = orientation.apply(opened.scene)
+    scene = supported_views(corrected, orientation)
+    z_range = search_range(request, scene, orientation, config, progress)
+    grid = _grid(request, opened.like, scene, orientation, z_range)
+    match_scene = build_match_scene(
+        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
+        orientation.measured,
+    )  # fmt: skip
+    far = doubts_from_dem(request, scene, orientation, config)
+    note_doubts(far, progress)
+    match_scene = _limited_by_dem(request, match_scene, scene.crs, config)
+    return RunSetup(corrected, orientation, z_range, grid, match_scene, (*orientation.doubts, *far))
 
 
-def ties_far_from_dem(
-    request: DsmRequest, scene: Scene, orientation: Orientation, config: RunConfig
+def supported_views(scene: Scene, orientation: Orientation) -> Scene:
+    """The scene of the views that tie points support; the others take no part in the matching.
+
+    Raises
+    ------
+    CoverageError
+        Tie points support fewer than two views, so that nothing can be matched.
+    GeometryError
+        They do so because all images look along the same line.
+    """
+    excluded = {each.name for each in orientation.left_out}
+    views = tuple(view for view in scene.views if view.name not in excluded)
+    if len(views) >= MIN_VIEWS:
+        return replace(scene, views=views)
+    if all(view.sensor.height_bounds() is not None for view in scene.views):
+        levels = possible_heights(scene, scene.heights)
+        middle = levels[len(levels) // 2]
+        height_step(scene.views, middle, ground_sample_distance(scene.views[0], middle), 1.0)  # refuses such images
+    raise CoverageError(
+        f"No two images are held together by tie points (looked at: {some_names([v.name for v in scene.views])}), so "
+        "nothing was matched. Check that they show the same ground and that each camera belongs to its image; where "
+        "cameras may be far off, set a larger orientation.max_pointing_px in --config."
+    )
+
+
+def area_to_match(
+    scene: Scene, orientation: Orientation, z_range: tuple[float, float]
+) -> tuple[float, float, float, float]:
+    """Bounds (xmin, ymin, xmax, ymax) in metres of the area to match.
+
+    The area that the scene file gives, or else the ground that two views see between two heights. In a local frame that
+    ground is cut to the surroundings of the tie points, because cameras there may look at a wall from the side: what
+    two footprints share far behind the wall is many times the area of the wall.
+    """
+    if scene.bounds is not None:
+        return scene.bounds
+    shared = shared_ground(scene, z_range)
+    ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
+    if not is_local(scene.crs) or len(ties) < MIN_TIES_FOR_AREA:
+        return shared
+    low, high = np.percentile(ties[:, :2], RANGE_PERCENT, axis=0)
+    margin = AREA_MARGIN * (high - low)
+    low, high = np.maximum(low - margin, shared[:2]), np.minimum(high + margin, shared[2:])
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1])) if (low < high).all() else shared
+
+
+def doubts_from_dem(
+    request: SetupRequest, scene: Scene, orientation: Orientation, config: RunConfig
 ) -> tuple[Doubt, ...]:
-    """A doubt where the tie points lie farther from the DEM than is searched around it."""
-    assert request.dem is not None, "callers make sure"
+    """A doubt about the cameras where tie points lie farther from the DEM than is searched around it; else none."""
+    if request.dem is None:
+        return ()
     xyz = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
-    if len(xyz) < FEWEST_TO_COMPARE:
+    if len(xyz) < MIN_TIES_TO_COMPARE:
         return ()
     (west, south), (east, north) = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
     cell = median_ground_pixel(scene, float(np.median(xyz[:, 2]))) * 16
@@ -165,32 +269,68 @@ def ties_far_from_dem(
     return (
         Doubt(
             f"The tie points lie {np.median(above):+.0f} m from {request.dem} (median), beyond what is searched around "
-            "it. Check the cameras, and with --dem-vertical what the heights of the DEM are above.",
+            "it. Check the cameras, and with --dem-vertical the vertical datum of the DEM.",
             is_grave=True,
         ),
     )
 
 
 def _grid(
-    request: DsmRequest, like: GeoBox | None, scene: Scene, orientation: Orientation, z_range: tuple[float, float]
+    request: SetupRequest,
+    like: GeoBox | None,
+    scene: Scene,
+    orientation: Orientation,
+    z_range: tuple[float, float],
 ) -> Grid:
-    """The grid asked for: another raster's, or the area at a resolution, both with defaults."""
+    """The grid of the products: that of --like, or the area to match at the resolution asked for."""
     z = (z_range[0] + z_range[1]) / 2
     if like is not None:
         grid = grid_from_geobox(like, str(request.like))
         check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
         return grid
-    cell = request.resolution or default_cell(scene, z)
-    check_resolution(cell, scene, z, "--resolution")
+    cell_m = request.resolution or default_cell(scene, z)
+    check_resolution(cell_m, scene, z, "--resolution")
     bounds = request.bounds or area_to_match(scene, orientation, z_range)
-    return grid_from_bounds(bounds, cell, scene.crs)
+    return grid_from_bounds(bounds, cell_m, scene.crs)
 
 
-def _files(request: DsmRequest, scene: Scene, vertical: VerticalDatum) -> list[Path]:
-    """Every file whose content the result depends on."""
+def _limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
+    """The match scene with heights limited around the DEM at the coarsest level, where one is given."""
+    if request.dem is None:
+        return match_scene
+    level = match_scene.levels - 1
+    window = match_scene.seen.at_level(level, 0)
+    geobox = GeoBox((window.rows, window.cols), match_scene.transform(window, level), crs)
+    dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
+    limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
+    return replace(match_scene, prior=limits)
+
+
+def _crs_of(geobox: GeoBox) -> CRS:
+    """The CRS of a grid, as pyproj's."""
+    return CRS.from_wkt(geobox.crs.to_wkt())  # type: ignore[union-attr]
+
+
+def _refuse_maps_in_local_frame(request: SetupRequest) -> None:
+    """Refuse files with a place on the Earth where the scene's frame is local.
+
+    Raises
+    ------
+    GeometryError
+        Such a file is given.
+    """
+    for name in ("dem", "area", "mask"):
+        if path := getattr(request, name):
+            raise GeometryError(
+                f"The scene's frame is local, where {path} has no place. Leave --{name} out; --bounds and --heights "
+                "are in that frame."
+            )
+
+
+def _files_read(request: SetupRequest, scene: Scene, datum: VerticalDatum) -> list[Path]:
+    """Every file whose content the result depends on, each once."""
     extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
-    extra += vertical.files
+    extra += datum.files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    listed = list(request.inputs) + files_of(scene) + extra
-    return list(dict.fromkeys(listed))
+    return list(dict.fromkeys([*request.inputs, *files_of(scene), *extra]))

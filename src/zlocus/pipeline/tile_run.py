@@ -1,4 +1,4 @@
-"""The tiles of a run: planned, made by workers, kept on disk, and put together."""
+"""The tiles of a run: planned, matched by workers, kept on disk as checkpoints, and assembled into rasters."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress, Stage, duration
 from zlocus.core.requests import DsmRequest
 from zlocus.core.resources import SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
-from zlocus.io.grid_inputs import cells_inside, read_dem
-from zlocus.io.run_record import Elsewhere
+from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
+from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.fill import filled_from
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
-from zlocus.matching.view_ranking import RankedPoints
+from zlocus.matching.view_ranking import LabelledTies
 from zlocus.pipeline.execution.checkpoint import TileStore
 from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.event_log import NAME, EventLog
 from zlocus.pipeline.execution.plan import Tile, tile_needs
 from zlocus.pipeline.execution.processes import Processes
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
+from zlocus.pipeline.setup import RunSetup
 from zlocus.products.rasters import SurfaceRasters
 
 # Processes take about two seconds to start, and so are not worth it for less work than this, s.
@@ -42,9 +43,12 @@ NAMED = 3  # failed tiles in a message
 
 @dataclass(frozen=True)
 class Plan:
-    """How tiles are worked on. slots : at a time; processes : in processes of their own, else here; tile_bytes : that
-    one needs at most, with its process; own_bytes : that the command needs itself; allowed_bytes : all together;
-    seconds : about, of one worker; scheduler : of a cluster that does it instead."""
+    """How the tiles of a run are worked on.
+
+    slots : tiles at a time; processes : whether each runs in a process of its own; tile_bytes : memory of the largest
+    tile, with its process; own_bytes : memory of the command itself; allowed_bytes : memory that all may take together;
+    seconds : estimated time of one worker for all tiles; scheduler : address of the cluster that does the work instead.
+    """
 
     n_tiles: int
     slots: int
@@ -57,7 +61,7 @@ class Plan:
 
     @property
     def n_bytes(self) -> float:
-        """Of all together."""
+        """Memory of the command and all tiles that are worked on at a time."""
         return self.own_bytes + self.slots * self.tile_bytes
 
     def __str__(self) -> str:
@@ -73,16 +77,18 @@ class Plan:
         )
 
 
-def planned(settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, request: DsmRequest) -> Plan:
-    """Tiles at a time: as asked, or as many as there are cores and work for; never more than memory allows. What was
-    found in image space holds too much for other processes.
+def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, request: DsmRequest) -> Plan:
+    """Decide how many tiles are worked on at a time: as requested, or as many as there are cores and work for.
+
+    Memory limits their number. In image space all tiles stay in one process, because the heights of all pixels are too
+    large to be copied.
 
     Raises
     ------
     ConfigError
         One tile needs more memory than it may take.
     """
-    needs, own, memory_gb = tile_needs(settled, tiles, config), held_bytes(), request.memory_gb
+    needs, own, memory_gb = tile_needs(match_scene, tiles, config), held_bytes(), request.memory_gb
     allowed = own + SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
     here = needs.n_bytes + TILE_CODE_BYTES
     if memory_gb is not None and own + here > allowed:
@@ -97,23 +103,23 @@ def planned(settled: MatchScene, tiles: Sequence[Tile], config: RunConfig, reque
     processes = slots > 1 and request.method != "gc3-sgm"
     each = there if processes or request.scheduler else here
     # In image space the pixels of every image are matched before.
-    seconds = needs.seconds * (len(settled.views) if request.method == "gc3-sgm" else 1)
+    seconds = needs.seconds * (len(match_scene.views) if request.method == "gc3-sgm" else 1)
     return Plan(len(tiles), slots, processes, each, own, allowed, seconds, request.scheduler)
 
 
 @dataclass
 class Tally:
-    """Counts over all tiles, cells inside the area asked for; ranked : tie points with labels, tile by tile."""
+    """Counts over the cells of all tiles inside the requested area; ranked : labels of tie points, tile by tile."""
 
     n_seen: int = 0
     n_matched: int = 0
     n_left_out: int = 0
     evaluations: int = 0
     all_images: int = 0
-    ranked: list[RankedPoints] = field(default_factory=list)
+    ranked: list[LabelledTies] = field(default_factory=list)
 
     def add(self, product: TileProduct) -> None:
-        """Count a tile."""
+        """Add the counts of a tile."""
         quality = product.surface.quality
         asked = (quality & np.uint16(Quality.OUTSIDE)) == 0
         self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
@@ -131,7 +137,7 @@ class Tally:
         return self.n_matched / self.n_seen if self.n_seen else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """For run.json."""
+        """The counts as run.json holds them."""
         return {
             "evaluations": {"done": self.evaluations, "all_images": self.all_images},
             "coverage": round(self.coverage, 6),
@@ -140,8 +146,8 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Matching:
-    """What makes and keeps the tiles of a run."""
+class TileRun:
+    """The tiles of a run: what makes them, and where they are kept."""
 
     job: TileJob
     tiles: Sequence[Tile]
@@ -150,11 +156,11 @@ class Matching:
 
     @property
     def n_there(self) -> int:
-        """Tiles that are finished; the store may keep others, of images."""
+        """Number of finished tiles of the surface; the store may also hold tiles of images."""
         return sum(name_of(tile) in self.store.finished for tile in self.tiles)
 
     def check(self, failed: Sequence[Outcome], partial: bool) -> None:
-        """End the run where tiles failed, unless what is there is wanted all the same; nothing never is.
+        """Stop the run where tiles failed, unless an incomplete surface is accepted and there is at least one tile.
 
         Raises
         ------
@@ -179,12 +185,12 @@ class Matching:
             )
 
     def end(self, failed: Sequence[Outcome], tally: Tally) -> None:
-        """The end of a run, in its log.
+        """Write the end of the run to its log.
 
         Raises
         ------
         StoppedError
-            Some failed, and are empty in it.
+            Tiles failed; they are empty in the surface.
         """
         self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed))
         if failed:
@@ -195,16 +201,18 @@ class Matching:
 
     def _not_all(self, failed: Sequence[Outcome]) -> str:
         said = [
-            f"{place_of(self.job.settled, outcome.task.core)}: {_reason(outcome.failure)}" for outcome in failed[:NAMED]
+            f"{place_of(self.job.match_scene, outcome.task.core)}: {_reason(outcome.failure)}"
+            for outcome in failed[:NAMED]
         ]
         more = f"; and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
         return f"{len(failed)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
 
     def run(
-        self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: Elsewhere
+        self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: WorkerUsage
     ) -> list[Outcome]:
-        """Make every tile that is not there yet; the outcomes of those that failed. The log of a run that does not go
-        on is a new one.
+        """Make every tile that is not finished yet, and return the outcomes of those that failed.
+
+        A run that resumes none begins a new log.
 
         Raises
         ------
@@ -229,7 +237,7 @@ class Matching:
                         failed.append(outcome)
         return failed
 
-    def _took(self, outcome: Outcome, stage: Stage, elsewhere: Elsewhere, is_elsewhere: bool) -> None:
+    def _took(self, outcome: Outcome, stage: Stage, elsewhere: WorkerUsage, is_elsewhere: bool) -> None:
         tile: Tile = outcome.task
         record = {
             "tile": name_of(tile), "worker": outcome.worker, "attempt": outcome.attempt,
@@ -252,14 +260,14 @@ class Matching:
             stage.tell(f"{outcome.peak_mb / 1e3:.1f} GB")
 
     def tell_interrupted(self, progress: Progress) -> None:
-        """Say, after an interrupt, what is kept."""
+        """Say, after an interrupt, which tiles are kept."""
         self.log.add("interrupted", tiles_done=self.n_there)
         if self.n_there and self.store.is_there:
             done = f"{self.n_there} of {len(self.tiles)} tiles"
             progress.note(f"{done} are finished and kept: {self.store.how_to_go_on}.")
 
     def assemble(self, failed: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress) -> None:
-        """Write all tiles, those that failed as empty, in their order, so that nothing depends on that of making.
+        """Write all tiles in a fixed order, whatever the order in which they were made; failed tiles are empty.
 
         Raises
         ------
@@ -292,8 +300,18 @@ class Matching:
         return self.job.product(tile, TileResult(failed.part(tile.core, tile.kept)))
 
 
+def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: Polygons) -> TileJob:
+    """What makes the tiles of a request."""
+    terrain = None
+    if request.fill == "dem":
+        assert request.dem is not None, "a request that fills from a terrain model names it"
+        terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
+    use_visibility, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
+    return TileJob(setup.match_scene, setup.grid, config, request.method, use_visibility, fill, polygons, terrain)
+
+
 def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress) -> AbstractContextManager[Workers]:
-    """Where the tiles of a plan are made.
+    """The workers that make the tiles of a plan: a cluster, processes, or this process.
 
     Raises
     ------
@@ -310,13 +328,13 @@ def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progr
 
 
 def name_of(tile: Tile) -> str:
-    """A tile's name: row and column of its first kept cell on the scene's lattice."""
+    """Name of a tile: row and column of its first kept cell on the lattice of cells."""
     return f"{tile.kept.row}_{tile.kept.col}"
 
 
-def place_of(settled: MatchScene, core: CellWindow) -> str:
-    """Where a tile lies."""
-    transform = settled.transform(core, 0)
+def place_of(match_scene: MatchScene, core: CellWindow) -> str:
+    """Bounds of a tile on the ground, as text."""
+    transform = match_scene.transform(core, 0)
     (west, north), (east, south) = transform * (0, 0), transform * (core.cols, core.rows)
     return f"E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
 
@@ -333,14 +351,16 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Polygons:
-    """Of the area asked for, (n,) of shapely's in the grid's CRS: cells outside `inside`, or inside `outside`, are not
-    asked for."""
+    """Polygons of the requested area, (n,) shapely geometries in the grid's CRS.
+
+    Cells outside `inside`, or inside `outside`, are not requested.
+    """
 
     inside: NDArray[Any] | None = None
     outside: NDArray[Any] | None = None
 
     def cut(self, surface: Surface, geobox: GeoBox) -> Surface:
-        """A surface on a grid with cells that are not asked for emptied."""
+        """The surface on a grid, with the cells that are not requested emptied."""
         beyond = np.zeros(surface.height.shape, bool)
         if self.inside is not None:
             beyond |= ~cells_inside(self.inside, geobox)
@@ -351,7 +371,7 @@ class Polygons:
 
 @dataclass(frozen=True)
 class Terrain:
-    """A terrain model whose heights fill what is empty. datum : what they are above."""
+    """A terrain model whose heights fill empty cells. datum : its vertical datum."""
 
     path: Path
     datum: VerticalDatum
@@ -359,16 +379,19 @@ class Terrain:
 
 @dataclass(frozen=True)
 class TileProduct:
-    """What a run keeps of a tile. surface : of its kept cells; evaluations, all_images : see `TileResult`; ranked : tie
-    points with their labels, None where there was nothing to choose."""
+    """What a run keeps of a tile.
+
+    surface : of its kept cells; evaluations, all_images : see `TileResult`; ranked : tie points with their labels, None
+    where images were not chosen.
+    """
 
     surface: Surface
     evaluations: int = 0
     all_images: int = 0
-    ranked: RankedPoints | None = None
+    ranked: LabelledTies | None = None
 
     def arrays(self) -> Arrays:
-        """All of it as arrays."""
+        """The product as named arrays, for the checkpoint."""
         surface = self.surface
         found: Arrays = {
             "height": surface.height, "sigma": surface.sigma, "quality": surface.quality, "views": surface.views,
@@ -380,21 +403,21 @@ class TileProduct:
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> TileProduct:
-        """From what `arrays` gave."""
+        """The product from its named arrays."""
         surface = Surface(*(arrays[name] for name in ("height", "sigma", "quality", "views", "ortho")))
         done, every = (int(n) for n in arrays["evaluations"])
-        ranked = RankedPoints(*(arrays[name] for name in ("xyz", "labels", "which"))) if "xyz" in arrays else None
+        ranked = LabelledTies(*(arrays[name] for name in ("xyz", "labels", "which"))) if "xyz" in arrays else None
         return cls(surface, done, every, ranked)
 
 
 @dataclass(frozen=True)
 class TileJob:
-    """Makes tiles of a settled scene; what it holds reaches each worker once.
+    """Makes the tiles of a match scene; it is sent to each worker once.
 
-    method, use_visibility, fill : see `match_tile`; terrain : fills what is still empty, None does not.
+    method, use_visibility, fill : see `match_tile`; terrain : fills cells that are still empty, None fills none.
     """
 
-    settled: MatchScene
+    match_scene: MatchScene
     grid: Grid
     config: RunConfig
     method: str
@@ -405,11 +428,11 @@ class TileJob:
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        result = match_tile(self.settled, tile.core, self.config, self.method, self.use_visibility, self.fill)
+        result = match_tile(self.match_scene, tile.core, self.config, self.method, self.use_visibility, self.fill)
         return self.product(tile, result)
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:
-        """What is kept of a tile that was matched."""
+        """The product of a matched tile: cut to the requested cells, with gaps filled from the terrain model."""
         row, col = tile.kept.row - self.grid.window.row, tile.kept.col - self.grid.window.col
         geobox = self.grid.geobox[row : row + tile.kept.rows, col : col + tile.kept.cols]
         surface = self.area.cut(result.surface.part(tile.kept, tile.core), geobox)
@@ -417,5 +440,5 @@ class TileJob:
             surface = filled_from(surface, read_dem(self.terrain.path, geobox, self.terrain.datum, may_miss=True))
         ranked = None
         if result.ranking is not None:
-            ranked = RankedPoints.of(*result.ranking, self.settled.ties, tile.core)
+            ranked = LabelledTies.of(*result.ranking, self.match_scene.ties, tile.core)
         return TileProduct(surface, result.evaluations, result.all_images, ranked)

@@ -23,7 +23,7 @@ from zlocus.core.errors import InputError
 from zlocus.core.footprints import view_geometry
 from zlocus.core.options import OrientationOptions
 from zlocus.core.scene import View
-from zlocus.io.scene_file import open_scene, open_usable
+from zlocus.io.scene_file import open_scene, open_usable_views
 from zlocus.orientation.orientation import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.plausibility import Doubt, LeftOut
 from zlocus.orientation.triangulate import Observations
@@ -390,7 +390,7 @@ def test_a_scene_file_with_a_missing_view(good, tmp_path):
     assert status == 2
     assert list(report["refused"]) == ["gone"]
     assert report["plan"]["heights"] == [25.0, 80.0]
-    usable = open_usable([scene])
+    usable = open_usable_views([scene])
     assert [view.name for view in usable.scene.views] == list(good)
 
 
@@ -419,7 +419,7 @@ def test_a_scene_file_with_a_bad_entry(good, tmp_path, bad):
     """The others are opened all the same; the entry is named as a run names it."""
     entry, name, says = BAD_ENTRIES[bad]
     scene = scene_of(tmp_path, good, [entry])
-    usable = open_usable([scene])
+    usable = open_usable_views([scene])
     assert [view.name for view in usable.scene.views] == list(good)
     (refused,) = usable.refused
     assert refused.name == name

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from orientation_scenes import hill_scene
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions, RunConfig
-from zlocus.matching.match_scene import settle
+from zlocus.matching.match_scene import build_match_scene
 from zlocus.pipeline.execution.plan import CELL_S, VIEW_CELL_S, TileNeeds, core_size, plan_tiles, tile_needs
 from zlocus.sensors.correction import ShiftedModel
 
@@ -62,7 +62,7 @@ def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):
     looks = [(0.05 * k, 0.0) for k in range(n_views - 1)]
     scene = hill_scene([(0.0, 0.0)] * (n_views - 1), looks, size, [0.0] * (n_views - 1))
     away = replace(scene.views[0], name="away", sensor=ShiftedModel(scene.views[0].sensor, 9000.0, 0.0))
-    return settle(
+    return build_match_scene(
         replace(scene, views=(*scene.views, away)), cell_m, (0.0, 0.0), z, np.empty((0, 3)), "view0", PyramidOptions()
     )
 

@@ -17,12 +17,12 @@ from zlocus.core.requests import DoctorRequest
 from zlocus.core.resources import WORKER_BYTES
 from zlocus.core.scene import Scene
 from zlocus.matching.ground_pixels import check_resolution, default_cell
-from zlocus.matching.match_scene import settle
+from zlocus.matching.match_scene import build_match_scene
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
 from zlocus.pipeline.doctor.ties import QuickTies
 from zlocus.pipeline.execution.plan import plan_tiles, tile_needs
-from zlocus.pipeline.preparing import area_to_match
 from zlocus.pipeline.required_space import check_room
+from zlocus.pipeline.setup import area_to_match
 
 # Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
 ROUGHLY = 3.0
@@ -66,7 +66,7 @@ def run_plan(
     bounds = area_to_match(scene, ties.orientation, z_range)
     grid = grid_from_bounds(bounds, cell, scene.crs)
     found = ties.orientation
-    settled = settle(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.measured)
+    settled = build_match_scene(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.measured)
     matched = grid.window.within(settled.seen)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")

@@ -9,7 +9,7 @@ import numpy as np
 
 from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.scene_file import read_scene_file, turn_to_axes
+from zlocus.io.scene_file import read_scene_file, rotation_to_axes
 from zlocus.orientation.orientation import Orientation, supported
 from zlocus.pipeline.doctor.findings import POOR, Finding
 from zlocus.sensors.frame import FrameModel
@@ -35,7 +35,7 @@ def plane_findings(scene: Scene, inputs: Sequence[Path], found: Orientation) -> 
         return []
     frame = read_scene_file(inputs[0]).frame
     if frame is not None and frame.up is not None:
-        normal = turn_to_axes(frame.up, frame.north).T @ normal
+        normal = rotation_to_axes(frame.up, frame.north).T @ normal
     up = ", ".join(f"{v:.3f}" for v in normal + 0.0)
     return [
         Finding(

@@ -9,7 +9,7 @@ from typing import Any
 
 from zlocus.core.footprints import PairGeometry, ViewGeometry
 from zlocus.core.scene import View
-from zlocus.io.scene_file import Refused
+from zlocus.io.scene_file import RefusedView
 from zlocus.orientation.orientation import PairOrientation, ViewOrientation
 from zlocus.orientation.parameter_groups import kind_of
 from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding, worst
@@ -36,7 +36,7 @@ class Diagnosis:
     pairs: tuple[PairGeometry, ...]
     ties: QuickTies | None
     plan: RunPlan | None
-    refused: tuple[Refused, ...]
+    refused: tuple[RefusedView, ...]
     findings: tuple[Finding, ...]
 
     @property

@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from zlocus.core.errors import ZlocusError, ZlocusWarning
-from zlocus.core.footprints import PairGeometry, ViewGeometry, pair_geometries, view_geometry
+from zlocus.core.footprints import PairGeometry, ViewGeometry, check_overlap, pair_geometries, view_geometry
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DoctorRequest
-from zlocus.core.scene import Scene, check_overlap
+from zlocus.core.scene import Scene
 from zlocus.io.run_record import write_record
-from zlocus.io.scene_file import Usable, open_usable
+from zlocus.io.scene_file import UsableViews, open_usable_views
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
 from zlocus.pipeline.doctor.geometry import geometry_findings
 from zlocus.pipeline.doctor.plan import plan_findings, run_plan
@@ -27,8 +27,10 @@ from zlocus.pipeline.doctor.plane import plane_findings
 from zlocus.pipeline.doctor.quality import image_quality, quality_findings
 from zlocus.pipeline.doctor.report import Diagnosis
 from zlocus.pipeline.doctor.ties import QuickTies, quick_ties, tie_findings
-from zlocus.pipeline.preparing import asked_crs, made_folder, possible_heights
+from zlocus.pipeline.height_range import possible_heights
+from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.required_space import check_room_before_ties
+from zlocus.pipeline.setup import requested_crs, sorted_views
 from zlocus.products.footprints import footprints_picture, write_footprints
 
 REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
@@ -78,13 +80,13 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
     """
     told = Told()
     with progress.stage("Opening images"), told.warned():
-        usable = open_usable(request.inputs, asked_crs(request.crs))
+        usable = open_usable_views(request.inputs, requested_crs(request.crs))
     told.findings += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
     scene = usable.scene
     if scene is None:
         diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, tuple(told.findings))
     else:
-        scene = replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+        scene = sorted_views(scene)
         diagnosis = examined(request, config, scene, usable, told, progress)
     if request.out is not None:
         write_diagnosis(request.out, diagnosis, scene)
@@ -92,7 +94,7 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
 
 
 def examined(
-    request: DoctorRequest, config: RunConfig, scene: Scene, usable: Usable, told: Told, progress: Progress
+    request: DoctorRequest, config: RunConfig, scene: Scene, usable: UsableViews, told: Told, progress: Progress
 ) -> Diagnosis:
     """All that can be found of the views that could be opened."""
     names = [view.name for view in scene.views]

@@ -13,7 +13,8 @@ from zlocus.core.progress import Progress
 from zlocus.core.scene import Scene, held_window
 from zlocus.orientation.orientation import Orientation
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding, poor
-from zlocus.pipeline.preparing import PAIR, heights_asked_for, heights_of_ties, oriented
+from zlocus.pipeline.height_range import range_below_cameras, range_from_ties
+from zlocus.pipeline.setup import MIN_VIEWS, orient_views
 
 QUICK_FEATURES = 4000
 # Images above this size are reduced by twice as much as for a run.
@@ -74,9 +75,11 @@ def _ties(
     progress: Progress,
     is_quick: bool,
 ) -> QuickTies:
-    found = oriented(scene, options, asked, progress)
+    found = orient_views(replace(scene, heights=asked), options, progress)
     corrected = found.apply(scene)
-    z_range = heights_of_ties(corrected, found, options) if asked is None else heights_asked_for(scene, asked, progress)
+    z_range = (
+        range_from_ties(corrected, found, options) if asked is None else range_below_cameras(scene, asked, progress)
+    )
     return QuickTies(found, z_range, is_quick)
 
 
@@ -100,7 +103,7 @@ def tie_findings(
         else:
             continue
         findings.append(poor(view.name, sentence))
-    if len(found.views) - len(left_out) < PAIR:
+    if len(found.views) - len(left_out) < MIN_VIEWS:
         findings.append(Finding(STOPS, "No two images are held together by tie points: a run will match nothing."))
     findings += [Finding(STOPS if doubt.is_grave else POOR, doubt.sentence) for doubt in found.doubts]
     tied = {frozenset(pair.views) for pair in found.pairs}

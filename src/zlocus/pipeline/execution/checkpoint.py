@@ -138,9 +138,9 @@ class TileStore:
                     if not self.finished and path.name != LOCK:
                         path.unlink()
                 content, digest = _packed(before)
-                write_whole(self.folder / BEFORE, content)
+                write_atomically(self.folder / BEFORE, content)
                 manifest = {"schema": SCHEMA, "key": self.key, "settled": settled, "before": digest}
-                write_whole(self.folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+                write_atomically(self.folder / MANIFEST, json.dumps(manifest, indent=1).encode())
 
     def keep(self, name: str, arrays: Arrays) -> None:
         """Write a tile, whole or not at all, and its line; both are on the disk when this returns.
@@ -153,7 +153,7 @@ class TileStore:
         self.check(len(self.finished))
         content, digest = _packed(arrays)
         try:
-            write_whole(self._path(name), content)
+            write_atomically(self._path(name), content)
             with (self.folder / DONE).open("ab") as done:
                 done.write(json.dumps({"tile": name, "sha256": digest}).encode() + b"\n")
                 done.flush()
@@ -236,7 +236,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def write_whole(path: Path, content: bytes | memoryview) -> None:
+def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """Write a file to a temporary name beside it, to the disk, and rename it."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -10,7 +10,7 @@ from zlocus.core.options import PyramidOptions, RunConfig
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.tile import windows_of
 
-# Of a core, per cell, and more for each view that is compared (docs/large.md, "Growth").
+# Of a core, per cell, and more for each view that is compared (docs/development/experiments/growth.md).
 CELL_S, VIEW_CELL_S = 1.5e-6, 0.45e-6
 # Of a tile at its largest: per cell; per cell and step of heights; per cell and view that is compared; per pixel of
 # those views' windows.

@@ -19,7 +19,7 @@ PART_BYTES, FILE_BYTES = 64_000_000, 1 << 30
 ALIGNED = 64
 
 
-class Scratch:
+class SpillArrays:
     """Makes arrays: in memory while there is room, then in files that have no name and go with the process.
 
     Files are mapped: what is read and written of them counts as memory of the process until `rest` is called.

@@ -1,0 +1,90 @@
+"""What commands say of orientation, cameras and terrain models: notes on the way, and the last refusal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from zlocus.core.errors import CoverageError
+from zlocus.core.progress import Progress
+from zlocus.io.grid_inputs import lacks_vertical_datum
+from zlocus.orientation.orientation import Orientation
+from zlocus.orientation.plausibility import Doubt
+
+# A message names at most this many images or doubts.
+MAX_NAMED = 12
+
+
+def some_names(names: Sequence[str]) -> str:
+    """The first names, separated by commas, and how many more there are."""
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
+
+
+def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress) -> None:
+    """Say which vertical datum is assumed for a DEM where neither the request nor its file names one."""
+    if dem is not None and dem_vertical is None and lacks_vertical_datum(dem):
+        progress.note(
+            f"{dem} does not name its vertical datum: its heights are taken to be ellipsoidal. Where they are above a "
+            "geoid, as those of most terrain models, give it with --dem-vertical egm96|egm2008|FILE."
+        )
+
+
+def note_orientation(orientation: Orientation, progress: Progress) -> None:
+    """Say which corrections were applied, which images take no part, and which cameras are doubtful."""
+    progress.note(what_was_applied(orientation))
+    for left_out in orientation.left_out[:MAX_NAMED]:
+        progress.note(str(left_out))
+    if len(orientation.left_out) > MAX_NAMED:
+        progress.note(f"{len(orientation.left_out) - MAX_NAMED} more images take no part: see run.json.")
+    note_doubts(orientation.doubts, progress)
+
+
+def note_doubts(doubts: Sequence[Doubt], progress: Progress) -> None:
+    """Say which doubts there are about the cameras."""
+    for doubt in doubts[:MAX_NAMED]:
+        progress.note(doubt.sentence)
+    if len(doubts) > MAX_NAMED:
+        progress.note(f"There are {len(doubts) - MAX_NAMED} more doubts about the cameras: see run.json.")
+
+
+def check_doubts(doubts: Sequence[Doubt], product: Path) -> None:
+    """Refuse to call a run a success whose heights are likely to be wrong.
+
+    product : file that was written all the same.
+
+    Raises
+    ------
+    CoverageError
+        With the first of the grave doubts.
+    """
+    grave = [doubt for doubt in doubts if doubt.is_grave]
+    if grave:
+        raise CoverageError(
+            f"The heights in {product} are likely to be wrong. {grave[0].sentence} Accept them with --partial."
+        )
+
+
+def what_was_applied(orientation: Orientation) -> str:
+    """The corrections of the cameras, in one sentence."""
+    moved = [v for v in orientation.views if v.shift_px != (0.0, 0.0)]
+    if orientation.joint is not None and orientation.joint.solution.is_held.all():
+        return (
+            f"Cameras left as delivered: {len(orientation.measured)} tie points show no errors beyond their noise, "
+            f"{orientation.joint.solution.sigma0_px:.2f} px."
+        )
+    if not moved:
+        return "Pointing: no correction applied."
+    if len(moved) <= MAX_NAMED:
+        named = ", ".join(f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in moved)
+        by = f"px (column, row): {named}."
+    else:
+        farthest = max(moved, key=lambda v: math.hypot(*v.shift_px))
+        by = f"up to {math.hypot(*farthest.shift_px):.2f} px ({farthest.name})."
+    if orientation.joint is not None:
+        return (
+            f"Cameras corrected jointly from {len(orientation.measured)} tie points, to "
+            f"{orientation.joint.solution.sigma0_px:.2f} px; their images moved by, {by}"
+        )
+    return f"Pointing corrected from {len(orientation.xyz)} tie points, {by}"

@@ -1,0 +1,192 @@
+"""What `zlocus dsm` writes beside its tiles: rasters, points, run.json, the report's inputs and the maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pyproj import CRS
+
+from zlocus.core.errors import CoverageError, ZlocusError
+from zlocus.core.grid import Grid
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress
+from zlocus.core.requests import DsmRequest
+from zlocus.core.scene import Scene
+from zlocus.io.config import config_as_dict
+from zlocus.io.input_files import InputFiles
+from zlocus.io.run_record import Stopwatch, request_as_dict, utc_now, versions_record, write_record
+from zlocus.io.vertical import VerticalDatum
+from zlocus.matching.view_ranking import LabelledTies
+from zlocus.orientation.plausibility import Doubt
+from zlocus.pipeline.messages import check_doubts
+from zlocus.pipeline.setup import RunSetup
+from zlocus.pipeline.tile_run import Tally
+from zlocus.products.derived import link_all, make_maps
+from zlocus.products.rasters import SurfaceRasters
+from zlocus.products.report.file_names import CURVES
+from zlocus.products.tie_layers import write_ranking, write_ties
+from zlocus.products.tie_observations import write_observations
+
+# A surface with heights for a smaller share of the cells seen by two images is no success.
+SUFFICIENT_COVERAGE = 0.5
+
+
+def has_colours(request: DsmRequest, setup: RunSetup) -> bool:
+    """Whether the ortho-image of the surface has colours; that of image space is grey."""
+    return setup.match_scene.has_colours and request.method != "gc3-sgm"
+
+
+def surface_rasters(request: DsmRequest, setup: RunSetup, vertical_datum: VerticalDatum) -> SurfaceRasters:
+    """The rasters of the surface, to be written tile by tile."""
+    dtype = setup.match_scene.views[0].image.dtype
+    return SurfaceRasters(request.out, setup.grid.geobox, dtype, vertical_datum, has_colours(request, setup))
+
+
+def write_points(out: Path, setup: RunSetup, ranked: list[LabelledTies], vertical_datum: VerticalDatum) -> None:
+    """Write tie points (ties.gpkg), their image observations, and the ranking of images where there is one."""
+    orientation, scene = setup.orientation, setup.scene
+    write_ties(out / "ties.gpkg", orientation, scene, vertical_datum)
+    if orientation.ties is not None:
+        write_observations(out, orientation.ties)
+    if ranked:
+        names = [view.name for view in setup.match_scene.views]
+        write_ranking(out / "ranking.gpkg", ranked, names, scene.crs, vertical_datum)
+
+
+def write_report_inputs(
+    out: Path,
+    setup: RunSetup,
+    vertical_datum: VerticalDatum,
+    config: RunConfig,
+    watch: Stopwatch,
+    progress: Progress,
+) -> None:
+    """Write what the report shows and no other product holds: footprints, and match curves of a few cells."""
+    from zlocus.pipeline.report_inputs import ReportedRun, write_shown
+
+    run = ReportedRun.of(setup, vertical_datum)
+    (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
+    with watch.stage("curves"), progress.stage("Match curves"):
+        write_shown(out, run, config, match_s, progress)
+
+
+def remove_outdated_curves(out: Path, inputs: InputFiles, progress: Progress) -> None:
+    """Remove match curves that may show other images than those that were matched."""
+    if changed := inputs.changed():
+        (out / CURVES).unlink(missing_ok=True)
+        progress.note(
+            f"{CURVES} was not made: {changed[0]} has changed since the surface was matched. The surface does not "
+            "depend on it."
+        )
+
+
+def write_maps(
+    request: DsmRequest, config: RunConfig, watch: Stopwatch, record: dict[str, Any], progress: Progress
+) -> None:
+    """Write run.json, the maps, the report and the catalogue item, in this order.
+
+    run.json is written before the maps, which may fail, and again after them with the time that they took. The item
+    links all files, with or without the maps.
+
+    Raises
+    ------
+    ZlocusError
+        A map could not be made; everything else was written.
+    """
+    write_record(request.out / "run.json", record)
+    failed: ZlocusError | None = None
+    with watch.stage("products"):
+        try:
+            make_maps(request.out, request.products, config.products, progress)
+        except ZlocusError as error:
+            failed = error
+    write_record(request.out / "run.json", record)
+    if request.report:
+        from zlocus.pipeline.report_inputs import try_report
+
+        try_report(request.out, progress)
+    link_all(request.out, progress)
+    if failed is not None:
+        raise failed
+
+
+def run_record(
+    request: DsmRequest,
+    config: RunConfig,
+    setup: RunSetup,
+    vertical_datum: VerticalDatum,
+    inputs: Sequence[Mapping[str, Any]],
+    tally: Tally,
+) -> dict[str, Any]:
+    """The content of run.json, except the stages. inputs : path and checksum of each file."""
+    return {
+        **_request_record(request, config, setup.scene, inputs),
+        "orientation": setup.orientation.as_dict(),
+        "grid": _grid_record(setup.grid, setup.scene.crs),
+        "vertical": vertical_datum.as_dict(),
+        "heights": _heights_record(setup),
+        **tally.as_dict(),
+    }
+
+
+def _request_record(
+    request: DsmRequest, config: RunConfig, scene: Scene, inputs: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Request, options, time, versions, input files, and when the images were taken."""
+    return {
+        "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
+        "created": utc_now(),
+        "started_in": str(Path.cwd()),
+        "versions": versions_record(),
+        "inputs": list(inputs),
+        "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
+    }
+
+
+def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
+    """The products' grid."""
+    geobox = grid.geobox
+    return {"crs": crs.to_string(), "transform": list(geobox.transform)[:6], "shape": list(geobox.shape)}
+
+
+def _heights_record(setup: RunSetup) -> dict[str, Any]:
+    """The heights searched, and the reference image of the scene."""
+    return {
+        "range_m": [round(z, 3) for z in setup.z_range],
+        "step_m": setup.match_scene.step_m,
+        "levels": setup.match_scene.levels,
+        "reference_image": setup.match_scene.views[0].name,
+    }
+
+
+def shortcoming_of(tally: Tally, doubts: Sequence[Doubt], out: Path, progress: Progress) -> str:
+    """Why a complete surface is no success, unless --partial accepts it; "" where it is one."""
+    try:
+        check_coverage(tally, out, progress)
+        check_doubts(doubts, out / "dsm.tif")
+    except CoverageError as error:
+        return str(error)
+    return ""
+
+
+def check_coverage(tally: Tally, out: Path, progress: Progress) -> None:
+    """Note where images were excluded, and refuse to call a run a success that has few heights.
+
+    Raises
+    ------
+    CoverageError
+        Fewer than half of the cells seen by two images or more have a height.
+    """
+    if tally.n_left_out:
+        progress.note(
+            f"In {tally.n_left_out} cells an image that may show them took no part, for it sees them too obliquely "
+            "over the heights searched there (LEFT_OUT in quality.tif). Give --heights closer to those of the ground."
+        )
+    if tally.coverage < SUFFICIENT_COVERAGE:
+        raise CoverageError(
+            f"Only {100 * tally.coverage:.1f} % of the cells seen by two images or more have a height in "
+            f"{out / 'dsm.tif'}. See the reasons in quality.tif; give --heights or other images, or accept it "
+            "with --partial."
+        )
