@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -11,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.core.errors import OutputError
 from zlocus.core.options import OrientationOptions
 from zlocus.core.parallel import run_all
 from zlocus.core.scene import ImageSource, ImageWindow, held_pixels, held_window
 from zlocus.core.sensor_model import FloatArray
+from zlocus.core.unnamed_files import on_disk
 
 PART_PX = 1024
 HALO_PX = 16  # of the reduced image
@@ -90,28 +89,8 @@ def joined(several: Sequence[Features], held_bytes: int) -> Features:
     xy = np.concatenate([part.xy for part in several])
     descriptors = np.concatenate([part.descriptors for part in several])
     if held_bytes + descriptors.nbytes > HELD_BYTES and descriptors.size:
-        descriptors = on_disk(descriptors)
+        descriptors = on_disk(descriptors, "Features of the images")
     return Features(xy, descriptors)
-
-
-def on_disk(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same, in an unnamed file.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written.
-    """
-    try:
-        with tempfile.TemporaryFile() as file:
-            descriptors.tofile(file)
-            file.flush()
-            return np.asarray(np.memmap(file, np.float32, "r", shape=descriptors.shape))
-    except OSError as error:
-        raise OutputError(
-            f"Features of the images cannot be written to {tempfile.gettempdir()}: {error.strerror or error}. Make "
-            "room there, or set TMPDIR to another folder."
-        ) from error
 
 
 def detect_part(image: ImageSource, core: tuple[int, int, int, int], options: OrientationOptions) -> Features:
