@@ -32,11 +32,12 @@ from baselines import baselines
 from double_mapping import double_mapped
 from middlebury import CASES, judge
 from reprojection import Surface, reprojected
+from strecha import write_strecha_scene
 from workplace import RENDERED_VIEWS, ROOT, ZLOCUS, CannotRun, Figure, Workplace, render, rendered_images, run
 from zlocus.core.scene import Scene
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
-from zlocus.io.scene_file import open_scene, read_scene_file, write_scene_file
+from zlocus.io.scene_file import open_scene, write_scene_file
 from zlocus.synthetic.mixed import SENSORS
 from zlocus.synthetic.scenes import demo_spec
 
@@ -457,9 +458,7 @@ def herzjesu(at: Workplace) -> list[Figure]:
     """Eight photographs of a facade in a local frame: heights from every second one, seen by the others."""
     scene = at.scene("herzjesu_p8")
     at.out.mkdir(parents=True, exist_ok=True)
-    frame = ["--up", *FACADE_UP, "--north", *FACADE_NORTH]
-    run([ZLOCUS, "import", "strecha", scene, *frame, "-o", at.out / "scene.yaml", "--overwrite"])
-    written = read_scene_file(at.out / "scene.yaml")
+    written = write_strecha_scene(scene, at.out / "scene.yaml", FACADE_UP, FACADE_NORTH)
     write_scene_file(at.out / "half.yaml", written.model_copy(update={"views": written.views[::2]}))
     run([ZLOCUS, "dsm", at.out / "half.yaml", "-o", at.out / "dsm", "--overwrite"], accept=(0, COVERAGE_SHORT))
     record = json.loads((at.out / "dsm" / "run.json").read_text())

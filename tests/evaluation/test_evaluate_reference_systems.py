@@ -269,7 +269,7 @@ def test_a_surface_of_ours_says_that_it_is_ellipsoidal(tmp_path):
 
 def test_a_geoid_of_a_file_is_no_ellipsoid_whatever_its_name(tmp_path):
     name = geoid(tmp_path / "N_above_ellipsoid.tif")
-    crs = vertical_datum(str(name)).compound(pyproj.CRS(CRS)).to_wkt()
+    crs = vertical_datum(str(name)).compound_crs(pyproj.CRS(CRS)).to_wkt()
     with pytest.raises(InputError, match="are above the geoid of N_above_ellipsoid"):
         evaluate(flat(tmp_path / "d.tif", 100, crs), in_degrees(tmp_path / "r.tif", ELLIPSOIDAL))
 

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from rpc_fixtures import satellite_rpc
 from zlocus.cli.app import app
-from zlocus.io.atomic_write import whole_file
+from zlocus.io.atomic_write import atomic_file
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.cameras.rpc_text import write_rpc_txt
-from zlocus.io.number_table import write_numbers
+from zlocus.io.number_table import write_number_table
 from zlocus.io.run_record import write_record
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
 
@@ -21,7 +21,7 @@ VIEWS = tuple(ViewEntry(name=name, image=f"{name}.tif", camera=RpcCamera()) for 
 SCENE = SceneFile.model_validate({"schema": 1, "frame": {"crs": "EPSG:32632"}, "views": VIEWS})
 # What writes a file of text, by what it is.
 WRITERS = {
-    "table": lambda path: write_numbers(path, {"time": np.arange(9.0)}, "s"),
+    "table": lambda path: write_number_table(path, {"time": np.arange(9.0)}, "s"),
     "RPC": lambda path: write_rpc_txt(path, satellite_rpc()),
     "scene": lambda path: write_scene_file(path, SCENE),
     "record": lambda path: write_record(path, {"a": 1}),
@@ -56,5 +56,5 @@ def test_an_interrupt_leaves_nothing_half_written(tmp_path, monkeypatch, what):
 def test_a_folder_that_goes_meanwhile_is_no_second_error(tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
-    with pytest.raises(FileNotFoundError), whole_file(folder / "file"):
+    with pytest.raises(FileNotFoundError), atomic_file(folder / "file"):
         folder.rmdir()

@@ -28,7 +28,7 @@ from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.execution.checkpoint import FOLDER
 from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rank import run_rank
-from zlocus.pipeline.tile_run import Matching
+from zlocus.pipeline.tile_run import TileRun
 from zlocus.products.report.file_names import CURVES
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -119,13 +119,13 @@ def test_an_image_that_is_replaced_by_one_of_another_size_is_named(copied, elsew
 
 @pytest.mark.parametrize("change", ["replaced", "gone"])
 def test_an_image_that_changes_after_the_last_tile_ends_the_run(copied, elsewhere, tmp_path, monkeypatch, change):
-    check, out = Matching.check, tmp_path / "out"
+    check, out = TileRun.check, tmp_path / "out"
 
     def changing(self, *given):
         check(self, *given)
         rewrite(copied[1], elsewhere) if change == "replaced" else shutil.move(copied[1], elsewhere)
 
-    monkeypatch.setattr(Matching, "check", changing)
+    monkeypatch.setattr(TileRun, "check", changing)
     said = "was replaced or written to" if change == "replaced" else "disappeared"
     with pytest.raises(StoppedError, match=rf"{copied[1].name} {said} .* 9 finished tiles of before are kept"):
         asked(copied, out)

@@ -19,8 +19,8 @@ from rasterio.enums import MaskFlags
 from rio_cogeo.cogeo import cog_validate
 
 from zlocus.core.errors import OutputError
-from zlocus.io.block_buffer import WaitingCells
-from zlocus.io.rasters import RasterSink, compressing, write_cog
+from zlocus.io.block_buffer import BlockBuffer
+from zlocus.io.rasters import RasterSink, compression_threads, write_cog
 
 RNG = np.random.default_rng(5)
 GRID = GeoBox.from_bbox((500000, 4500000, 500350.5, 4500400), crs="EPSG:32631", resolution=0.5)
@@ -105,7 +105,7 @@ def test_threads_that_compress_change_no_byte(tmp_path, threads):
     cells[:1200, 700:2500] = 7.0
     write_cog(tmp_path / "one.tif", cells, grid, nodata=np.nan)
     for time in range(3):
-        with compressing(threads):
+        with compression_threads(threads):
             write_cog(tmp_path / f"{time}.tif", cells, grid, nodata=np.nan)
         assert (tmp_path / f"{time}.tif").read_bytes() == (tmp_path / "one.tif").read_bytes()
 
@@ -130,7 +130,7 @@ def test_waiting_cells_are_an_array_on_disk(data):
     side = data.draw(st.integers(1, 9))
     with (
         tempfile.TemporaryDirectory() as folder,
-        closing(WaitingCells(Path(folder) / "cells", shape, np.dtype(float), np.nan, side)) as waiting,
+        closing(BlockBuffer(Path(folder) / "cells", shape, np.dtype(float), np.nan, side)) as waiting,
     ):
         for number in range(data.draw(st.integers(0, 6))):
             row, col = (data.draw(st.integers(0, n - 1)) for n in shape[1:])

@@ -18,9 +18,9 @@ from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import (
     Stopwatch,
     inputs_record,
-    made_record,
     peak_memory_mb,
     request_as_dict,
+    result_record,
     versions_record,
     write_record,
 )
@@ -101,7 +101,7 @@ def test_files_are_named_once_with_their_checksums(tmp_path):
     with watch.stage("open"):
         pass
     inputs = InputFiles.of([*paths, paths[2]]).record()
-    record = made_record(RankRequest(tuple(paths[:2]), tmp_path / "out"), RunConfig(), inputs, watch)
+    record = result_record(RankRequest(tuple(paths[:2]), tmp_path / "out"), RunConfig(), inputs, watch)
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in paths]
     assert record["config"]["options"] == config_as_dict(RunConfig())
     assert (record["stages"], list(record)) == (watch.stages, ["config", "versions", "inputs", "stages"])

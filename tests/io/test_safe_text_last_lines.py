@@ -6,7 +6,7 @@ import pytest
 
 from zlocus.core.errors import InputError
 from zlocus.io.cameras.rpc_text import SCALARS, read_rpc_txt
-from zlocus.io.number_table import read_numbers
+from zlocus.io.number_table import read_number_table
 from zlocus.io.safe_text import written
 
 
@@ -42,14 +42,14 @@ def test_a_table_whose_last_column_is_written_alike_needs_none_either(tmp_path):
     path = tmp_path / "table.csv"
     table = "time,x\n0,12.250\n1,7.125\n2,-3.500"
     path.write_text(table)
-    assert read_numbers(path, "table", ("time", "x")).columns["x"].tolist() == [12.25, 7.125, -3.5]
+    assert read_number_table(path, "table", ("time", "x")).columns["x"].tolist() == [12.25, 7.125, -3.5]
     for cut in range(1, 4):
         path.write_text(table[:-cut])
         with pytest.raises(InputError, match="stops within line 4"):
-            read_numbers(path, "table", ("time", "x"))
+            read_number_table(path, "table", ("time", "x"))
     path.write_text(table.replace("7.125", "7.1"))
     with pytest.raises(InputError, match="stops within line 4"):
-        read_numbers(path, "table", ("time", "x"))
+        read_number_table(path, "table", ("time", "x"))
     path.write_text("time,x\n0,12\n1,7\n2,35")
     with pytest.raises(InputError, match="stops within line 4"):
-        read_numbers(path, "table", ("time", "x"))
+        read_number_table(path, "table", ("time", "x"))

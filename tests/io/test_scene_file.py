@@ -9,7 +9,7 @@ from pyproj import CRS
 
 from rpc_fixtures import dimap_rpc, satellite_rpc, write_image
 from zlocus.core.errors import ConfigError, GeometryError, InputError, OutputError, ZlocusWarning
-from zlocus.core.scene import check_overlap, footprint, ground_sample_distance
+from zlocus.core.footprints import check_overlap, footprint, ground_sample_distance
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.scene_file import SceneFile, ViewEntry, open_scene, read_scene_file, write_scene_file
 from zlocus.sensors.correction import ShiftedModel

@@ -17,7 +17,7 @@ from rendered_scenes import HEIGHTS, errors_of, read, run
 from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import ImageWindow
 from zlocus.io.images import check_grey_values, open_image, with_plateau
-from zlocus.io.usable_pixels import LEAST_SHARE, BorderPlateau, border_plateau
+from zlocus.io.usable_pixels import MIN_PLATEAU_SHARE, BorderPlateau, border_plateau
 
 # Heights beside a border of zeros were off by tens of metres while it was matched.
 GROSS_M = 3.0
@@ -88,7 +88,7 @@ def test_plateaus_that_are_small_or_not_at_the_border_are_grey_values(inside):
     if inside:
         pixels[400:600, 300:700] = 4095  # a saturated roof
     else:
-        side = int(np.sqrt(0.5 * LEAST_SHARE * pixels.size))
+        side = int(np.sqrt(0.5 * MIN_PLATEAU_SHARE * pixels.size))
         pixels[:side, :side] = 0  # a dark corner
     assert border_plateau(ArrayImage(pixels)) is None
 

@@ -20,7 +20,7 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.io import vertical
 from zlocus.io.grid_inputs import read_geobox
 from zlocus.io.rasters import write_cog
-from zlocus.io.vertical import ELLIPSOIDAL, KNOWN, check_heights, vertical_datum, vertical_datum_of
+from zlocus.io.vertical import ELLIPSOIDAL, KNOWN, check_heights, declared_vertical_datum, vertical_datum
 from zlocus.products.rasters import SurfaceRasters
 
 UTM = CRS.from_epsg(32631)
@@ -64,8 +64,8 @@ def test_the_ellipsoid_needs_nothing():
     assert (datum.crs, datum.files, datum.surface) == (None, (), "the ellipsoid")
     assert not datum.undulation(centres(GRID), UTM).any()
     heights = np.ones(GRID.shape, np.float32)
-    assert datum.of_cells(heights, GRID) is heights
-    assert datum.compound(UTM) == UTM
+    assert datum.heights_from_ellipsoidal(heights, GRID) is heights
+    assert datum.compound_crs(UTM) == UTM
     assert datum.as_dict() == {"heights_above": "the ellipsoid"}
     datum.check_covers((0, 0, 1, 1), UTM)
 
@@ -127,29 +127,29 @@ def test_cells_lose_the_undulation_of_their_centre(geoid):
     heights = np.random.default_rng(1).uniform(100, 500, GRID.shape).astype(np.float32)
     heights[3, 5:9] = np.nan
     datum = vertical_datum(str(geoid))
-    found = datum.of_cells(heights, GRID)
+    found = datum.heights_from_ellipsoidal(heights, GRID)
     undulation = datum.undulation(centres(GRID), UTM).reshape(GRID.shape)
     np.testing.assert_allclose(found, heights - undulation, rtol=0, atol=FLOAT_M)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(heights))
-    np.testing.assert_allclose(datum.ellipsoidal_of_cells(found, GRID), heights, rtol=0, atol=2 * FLOAT_M)
+    np.testing.assert_allclose(datum.ellipsoidal_from_heights(found, GRID), heights, rtol=0, atol=2 * FLOAT_M)
 
 
 def test_cells_are_the_same_however_they_are_cut(geoid):
     heights = np.random.default_rng(2).uniform(100, 500, GRID.shape).astype(np.float32)
     datum = vertical_datum(str(geoid))
-    whole = datum.of_cells(heights, GRID)
+    whole = datum.heights_from_ellipsoidal(heights, GRID)
     pieces = np.full_like(heights, np.nan)
     for row in range(0, 70, 13):
         for col in range(0, 90, 17):
             part = np.s_[row : row + 13, col : col + 17]
-            pieces[part] = datum.of_cells(heights[part], GRID, row, col)
+            pieces[part] = datum.heights_from_ellipsoidal(heights[part], GRID, row, col)
     assert pieces.tobytes() == whole.tobytes()
 
 
 def test_an_area_is_looked_at_before_the_work(geoid, tmp_path):
     datum = vertical_datum(str(geoid))
     xmin, ymin, xmax, ymax = GRID.boundingbox.bbox
-    low, high = datum.span((xmin, ymin, xmax, ymax), UTM)
+    low, high = datum.undulation_range((xmin, ymin, xmax, ymax), UTM)
     undulation = datum.undulation(centres(GRID), UTM)
     assert low <= undulation.min() < undulation.max() <= high
     with pytest.raises(InputError, match=r"my geoid\.tif does not cover"):
@@ -164,7 +164,7 @@ def test_an_area_is_looked_at_before_the_work(geoid, tmp_path):
 
 def test_the_datum_of_a_file_is_in_its_crs(proj_grid, tmp_path):
     def of(crs):
-        return vertical_datum_of(CRS.from_user_input(crs), tmp_path / "dem.tif", "--dem-vertical")
+        return declared_vertical_datum(CRS.from_user_input(crs), tmp_path / "dem.tif", "--dem-vertical")
 
     assert of("EPSG:32631") is ELLIPSOIDAL
     assert of("EPSG:4979") is ELLIPSOIDAL
@@ -187,7 +187,7 @@ def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
     datum = vertical_datum(str(geoid) if name == "file" else name)
     path = tmp_path / "out" / "dsm.tif"
     path.parent.mkdir()
-    write_cog(path, np.zeros(GRID.shape, np.float32), datum.of_map(GRID))
+    write_cog(path, np.zeros(GRID.shape, np.float32), datum.compound_geobox(GRID))
     assert [p.name for p in path.parent.iterdir()] == ["dsm.tif"]
     assert cog_validate(path, quiet=True) == (True, [], [])
     with rasterio.open(path) as file:
@@ -198,13 +198,13 @@ def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
     if name == "file":
         assert height.name == "height above the geoid of my geoid.tif"
         with pytest.raises(InputError, match="no geoid of"):
-            vertical_datum_of(crs, path, "--dem-vertical")
+            declared_vertical_datum(crs, path, "--dem-vertical")
     else:
         assert height.to_epsg() == KNOWN[name].epsg
-        assert vertical_datum_of(crs, path, "--dem-vertical").files == datum.files
+        assert declared_vertical_datum(crs, path, "--dem-vertical").files == datum.files
     assert read_geobox(path) == GRID
     with rasterio.open(path) as file:
-        assert GeoBox.from_rio(file).crs.proj.name == datum.of_map(GRID).crs.proj.name
+        assert GeoBox.from_rio(file).crs.proj.name == datum.compound_geobox(GRID).crs.proj.name
 
 
 def test_a_projected_crs_with_ellipsoidal_heights_needs_a_second_file(tmp_path):
@@ -226,7 +226,7 @@ def test_a_projected_crs_with_ellipsoidal_heights_needs_a_second_file(tmp_path):
 
 def test_names_that_geotiff_cannot_hold(tmp_path, geoid):
     datum = vertical_datum(str(geoid.rename(tmp_path / 'gé"oid|1.tif')))
-    write_cog(tmp_path / "dsm.tif", np.zeros(GRID.shape, np.float32), datum.of_map(GRID))
+    write_cog(tmp_path / "dsm.tif", np.zeros(GRID.shape, np.float32), datum.compound_geobox(GRID))
     with rasterio.open(tmp_path / "dsm.tif") as file:
         names = [part.name for part in CRS.from_user_input(file.crs).sub_crs_list]
     assert names == ["WGS 84 / UTM zone 31N", "height above the geoid of g__oid_1.tif"]

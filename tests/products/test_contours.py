@@ -19,7 +19,7 @@ from zlocus.core.errors import ConfigError
 from zlocus.core.options import ProductOptions
 from zlocus.io.crs import local_frame
 from zlocus.io.rasters import write_cog
-from zlocus.io.row_strips import ReadBand
+from zlocus.io.row_strips import BandReader
 from zlocus.products.contours import batched, contours, nice_interval, write_contours
 
 CELL_M, WEST, NORTH = 0.5, 500000.0, 4000000.0
@@ -168,7 +168,7 @@ def test_strips_leave_no_seam(tmp_path_factory, seed, holes, whole_metres):
     z = np.round(z) if whole_metres else z
     z[rng.random(z.shape) < holes] = np.nan
     path = written(tmp_path_factory.mktemp("waves"), z)
-    with ReadBand(path) as heights:
+    with BandReader(path) as heights:
         whole = list(contours(heights, 1.0, 1000))
         assert whole
         for rows in (1, 2, 7, 40):

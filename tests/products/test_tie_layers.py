@@ -16,7 +16,7 @@ from zlocus.core.errors import OutputError
 from zlocus.core.grid import CellWindow
 from zlocus.core.scene import Scene, View
 from zlocus.io.crs import local_frame
-from zlocus.matching.view_ranking import NOT_RANKED, RankedPoints, Ranking
+from zlocus.matching.view_ranking import NOT_RANKED, LabelledTies, PairLabels
 from zlocus.orientation.orientation import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.products import tie_layers as points
@@ -74,8 +74,8 @@ def test_ranking_has_a_row_per_point_and_reference(tmp_path):
     names, xyz = ["a", "b", "A"], np.array([[CENTRE[0] + GSD_M, CENTRE[1], 51.0], [*CENTRE, 50.0]])
     all_three = np.array([[[-1, 1, 0], [1, -1, -1], [0, -1, -1]]], np.int8)
     ranked = [
-        RankedPoints(xyz[:1], np.array([[[-1, 1], [1, -1]]], np.int8), np.array([2, 0])),
-        RankedPoints(xyz[1:], all_three, np.arange(3)),
+        LabelledTies(xyz[:1], np.array([[[-1, 1], [1, -1]]], np.int8), np.array([2, 0])),
+        LabelledTies(xyz[1:], all_three, np.arange(3)),
     ]
     write_ranking(tmp_path / "ranking.gpkg", ranked, names, UTM)
     assert [p.name for p in tmp_path.iterdir()] == ["ranking.gpkg"]
@@ -97,8 +97,8 @@ def test_labels_of_very_many_images_are_one_text(tmp_path, monkeypatch):
     names, xyz = ["a", "b,c", "A=1"], np.array([[CENTRE[0] + GSD_M, CENTRE[1], 51.0], [*CENTRE, 50.0]])
     all_three = np.array([[[-1, 1, 0], [1, -1, NOT_RANKED], [0, -1, -1]]], np.int8)
     ranked = [
-        RankedPoints(xyz[:1], np.array([[[-1, 1], [1, -1]]], np.int8), np.array([2, 0])),
-        RankedPoints(xyz[1:], all_three, np.arange(3)),
+        LabelledTies(xyz[:1], np.array([[[-1, 1], [1, -1]]], np.int8), np.array([2, 0])),
+        LabelledTies(xyz[1:], all_three, np.arange(3)),
     ]
     write_ranking(tmp_path / "ranking.gpkg", ranked, names, UTM)
     columns, at = columns_of(tmp_path / "ranking.gpkg", "ranking")
@@ -115,9 +115,9 @@ def test_labels_of_very_many_images_are_one_text(tmp_path, monkeypatch):
 def test_a_tile_keeps_the_points_of_its_own_cells():
     xy = np.array([[9.9, 20.0], [10.0, 20.0], [13.9, 22.9], [12.0, 23.0]])
     labels = np.arange(4, dtype=np.int8)[:, None, None] * np.ones((2, 2), np.int8)
-    ranking = Ranking(np.array([4, 0, 2, 1]), xy, labels, np.ones((2, 2)))
+    ranking = PairLabels(np.array([4, 0, 2, 1]), xy, labels, np.ones((2, 2)))
     ties = np.arange(15.0).reshape(5, 3)
-    found = RankedPoints.of(ranking, [3, 5], ties, CellWindow(20, 10, 3, 4))
+    found = LabelledTies.of(ranking, [3, 5], ties, CellWindow(20, 10, 3, 4))
     np.testing.assert_array_equal(found.xyz, ties[[0, 2]])
     assert found.labels[:, 0, 1].tolist() == [1, 2]
     assert found.views.tolist() == [3, 5]
@@ -129,7 +129,7 @@ def test_no_point_is_an_empty_layer(tmp_path):
 
 
 def test_a_local_frame_is_no_place_of_the_earth(tmp_path):
-    ranked = RankedPoints(np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 2, 2), np.int8), np.arange(2))
+    ranked = LabelledTies(np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 2, 2), np.int8), np.arange(2))
     write_ranking(tmp_path / "ranking.gpkg", [ranked], ["a", "b"], local_frame())
     _, xyz = columns_of(tmp_path / "ranking.gpkg", "ranking")
     np.testing.assert_allclose(xyz, [[1, 2, 3]] * 2)

@@ -20,7 +20,7 @@ DAMAGES = {
 }
 IMPORTED = {
     "colmap-text-cameras": "colmap", "colmap-text-images": "colmap", "opensfm": "opensfm", "metashape": "metashape",
-    "bundler": "bundler", "bundler-list": "bundler", "eo": "eo", "strecha": "strecha",
+    "bundler": "bundler", "bundler-list": "bundler", "eo": "eo",
     "colmap-binary-cameras": "colmap", "colmap-binary-images": "colmap",
 }  # fmt: skip
 

@@ -34,7 +34,7 @@ def command(*arguments):
 
 
 def imported(facade, out, *more):
-    result = command("import", "strecha", facade, "--up", *OUT, "-o", out, *more)
+    result = command("import", "colmap", facade, "--up", *OUT, "-o", out, *more)
     assert result.exit_code == 0, result.output
     return out
 
@@ -124,7 +124,7 @@ def test_doctor_names_the_wall(tmp_path):
     """A flat one. From a frame that is 30 degrees off, in the axes of the files; nothing where it is right."""
     facade = photographed(tmp_path / "flat", "plane")
     turned = np.cos(np.deg2rad(30.0)) * OUT - np.sin(np.deg2rad(30.0)) * np.cross(ALONG, OUT)
-    scene = command("import", "strecha", facade, "--up", *turned, "--north", *ALONG, "-o", tmp_path / "scene.yaml")
+    scene = command("import", "colmap", facade, "--up", *turned, "--north", *ALONG, "-o", tmp_path / "scene.yaml")
     assert scene.exit_code == 0
     command("doctor", tmp_path / "scene.yaml", "-o", tmp_path / "out")
     found = json.loads((tmp_path / "out" / "doctor.json").read_text())["findings"]
@@ -138,11 +138,11 @@ def test_doctor_names_the_wall(tmp_path):
 def test_norths_that_are_none(facade, tmp_path):
     for axes in ((OUT, 2 * OUT), (OUT, -OUT)):
         up, north = axes
-        result = command("import", "strecha", facade, "--up", *up, "--north", *north, "-o", tmp_path / "s.yaml")
+        result = command("import", "colmap", facade, "--up", *up, "--north", *north, "-o", tmp_path / "s.yaml")
         assert result.exit_code == 2
         assert "neither along up nor 0" in result.stderr
     for options, says in (({"north": (0.0, 1.0, 0.0)}, "Give --up too"), ({"up": (0.0, 0.0, 1.0), "north": (0.0,) * 3},
                           "--north 0 0 0 is no direction")):  # fmt: skip
         with pytest.raises(ConfigError, match=says):
-            ImportRequest("strecha", facade, tmp_path / "s.yaml", **options)
+            ImportRequest("colmap", facade, tmp_path / "s.yaml", **options)
     assert not (tmp_path / "s.yaml").exists()

@@ -172,32 +172,3 @@ def test_a_surface_of_aerial_images_without_heights(shared_data, tmp_path):
     error = error[np.isfinite(error)]
     assert abs(np.median(error)) < TERRAIN_M
     assert np.median(np.abs(error - np.median(error))) < TERRAIN_M
-
-
-def test_the_facade_stands_upright(shared_data, tmp_path):
-    """Rays of shared points meet; what is `up` lies towards the cameras."""
-    folder, out = shared_data / "herzjesu_p8", tmp_path / "scene.yaml"
-    import_scene(ImportRequest("strecha", folder, out, up=(-1.0, 0.0, 0.0)))
-    scene = open_scene([out])
-    assert len(scene.views) == 8
-    # All look down on the facade.
-    assert all(view.sensor.rotation[2, 2] < -0.5 for view in scene.views)
-    sift = cv2.SIFT_create(1500)
-    found = {}
-    for view in scene.views[3:5]:
-        pixels = view.image.read(0, 0, *view.image.shape).pixels.astype(np.uint8)
-        keys, found[view.name] = sift.detectAndCompute(cv2.resize(pixels, None, fx=0.5, fy=0.5), None)
-        found[view.name] = (2.0 * np.array([key.pt for key in keys]) + 0.5, found[view.name])
-    (here, one), (there, other) = found.values()
-    pairs = [(m.queryIdx, m.trainIdx) for m, n in cv2.BFMatcher().knnMatch(one, other, k=2)
-             if m.distance < 0.7 * n.distance]  # fmt: skip
-    here, there = here[[i for i, _ in pairs]], there[[j for _, j in pairs]]
-    first, second = (view.sensor for view in scene.views[3:5])
-    rays = first.ray_from_image(here), second.ray_from_image(there)
-    base = np.array(second.centre) - np.array(first.centre)
-    normal = np.cross(rays[0], rays[1])
-    # Distance of the rays in pixels of the depth at which they meet.
-    gap = np.abs(normal @ base) / np.linalg.norm(normal, axis=1)
-    depth = np.linalg.norm(np.cross(base, rays[1]), axis=1) / np.linalg.norm(normal, axis=1)
-    assert len(pairs) > 100
-    assert np.median(gap / depth * first.focal) < 1.0

@@ -153,7 +153,7 @@ def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, numbe
 
 # What is stopped after the matching, at which of its calls, and files that are complete then.
 AFTERWARDS = {
-    "zlocus.pipeline.tile_run.Matching.assemble": (1, set()),
+    "zlocus.pipeline.tile_run.TileRun.assemble": (1, set()),
     # In the third of five rasters.
     "zlocus.io.rasters._check_written": (6, set()),
     "zlocus.pipeline.surface_products.write_observations": (1, {"dsm.tif", "ties.gpkg"}),
@@ -197,7 +197,7 @@ def test_a_command_that_starts_anew_is_told_how_to_go_on(images, tmp_path, monke
 
     said, out = io.StringIO(), tmp_path / "out"
     monkeypatch.setattr("rendered_scenes.progress_for", lambda _: progress_for(said))
-    monkeypatch.setattr("zlocus.pipeline.tile_run.Matching.assemble", stop)
+    monkeypatch.setattr("zlocus.pipeline.tile_run.TileRun.assemble", stop)
     asked = {"overwrite": True} if option == "--overwrite" else {"resume": False}
     with pytest.raises(KeyboardInterrupt):
         run(images("sine"), out, SMALL_TILES, workers=1, report=False, **asked)

@@ -150,20 +150,6 @@ def write_bundler(folder):
     return Written(folder, project, ((1 - WIDE) / 2, (HIGH - 1) / 2), y_up=True)
 
 
-def write_strecha(folder):
-    images(folder / "images", ["a.tif", "b.tif", "c.tif"])
-    for i, name in enumerate(("a.tif", "b.tif", "c.tif")):
-        rows = [[70.0, 0.1, 31.0], [0.0, 71.0, 25.5], [0.0, 0.0, 1.0], [0.0] * 3, *rotation(i).T.tolist(), CENTRES[i]]
-        text = "\n".join(" ".join(map(repr, map(float, row))) for row in rows)
-        (folder / f"{name}.camera").write_text(f"{text}\n{WIDE} {HIGH}\n")
-
-    def project(i, xyz):
-        x, y = seen(i, xyz)
-        return np.column_stack([70.0 * x + 0.1 * y + 31.0, 71.0 * y + 25.5])
-
-    return Written(folder, project, (0.0, 0.0))
-
-
 def write_eo(folder, heading=False, delimiter=" "):
     images(folder, ["a.tif", "b.tif", "c.tif"])
     lines = ["# an orientation"]

@@ -401,7 +401,6 @@ CASES: dict[str, Case] = {
     "bundler-list": _import("bundler", files.write_bundler, "list.txt"),
     "eo": _import("eo", files.write_eo, "eo.csv", rows=True),
     "eo-interior": _import("eo", files.write_eo, "camera.yaml", rows=True, defaults=True),
-    "strecha": _import("strecha", files.write_strecha, "b.tif.camera"),
     "image-tiff": _picture(".tif", tiled=True, blockxsize=32, blockysize=32),
     "image-deflate": _picture(".tif", compress="deflate", blockysize=16),
     "image-envi": _picture(".img", driver="ENVI"),

@@ -1,9 +1,10 @@
-"""A wall photographed from the side: rendered images with the camera files of Strecha et al. (2008)."""
+"""A wall photographed from the side: rendered images, and their cameras as a text model of COLMAP."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from camera_files import quaternion
 from rendered_scenes import QUIET
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.files import write_image
@@ -40,21 +41,21 @@ def facing(station, aim):
 
 
 def photographed(folder, kind, file_from_wall=FILE_FROM_WALL):
-    """A folder of images and `.camera` files, as the benchmark of Strecha et al. has them.
+    """Render the wall into a folder of images with a COLMAP model, and return the folder.
 
     file_from_wall : (3, 3), columns are the wall's axes (along it, up it, out of it) in those of the camera files.
     """
     ground = analytic_ground(kind, MIDDLE, CELL_M, (1400, 1400), seed=8)
     (folder / "images").mkdir(parents=True)
+    u, v = ((n - 1) / 2 + 0.5 for n in SHAPE[::-1])  # COLMAP's (0.5, 0.5) is the centre of the first pixel
+    (folder / "cameras.txt").write_text(f"1 SIMPLE_PINHOLE {SHAPE[1]} {SHAPE[0]} {FOCAL} {u} {v}\n")
+    lines = []
     for number, (station, aim) in enumerate(zip(STATIONS, AIMS, strict=True)):
         model = facing(np.array(station), aim)
         grey = expose(render(ground, model, SHAPE, Sun(150.0, 50.0)), QUIET, np.random.default_rng([8, number]))
         write_image(folder / "images" / f"{number}.tif", grey, None)
-        u, v = model.principal_point
         rotation = model.camera_from_ground @ file_from_wall.T
-        rows = [
-            [FOCAL, 0, u], [0, FOCAL, v], [0, 0, 1], [0, 0, 0], *rotation.T, file_from_wall @ np.array(station),
-        ]  # fmt: skip
-        text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
-        (folder / f"{number}.tif.camera").write_text(f"{text}\n{SHAPE[1]} {SHAPE[0]}\n")
+        pose = [*quaternion(rotation), *(-rotation @ (file_from_wall @ np.array(station)))]
+        lines += [" ".join([str(number + 1), *(repr(float(value)) for value in pose), "1", f"{number}.tif"]), ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
     return folder

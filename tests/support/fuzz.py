@@ -4,9 +4,9 @@
     python tests/support/fuzz.py --seconds 3600             # of all formats together
     python tests/support/fuzz.py scene-frame --seconds 600  # of one
 
-Formats are those of `damage_cases.CASES`. What a reader must do is what `test_io_damaged_files` asks for: an answer or a
-`ZlocusError` of one sentence, in time and memory. Inputs that reach code of their own are kept, the smallest first, in
-`tests/fuzz_seeds/FORMAT`; those that fail too, as `fail-...`.
+Formats are those of `damage_cases.CASES`. A reader must do what `test_io_damaged_files` requires: return a result or
+raise a `ZlocusError` of one sentence, within limits of time and memory. Inputs that reach new code are stored in
+`tests/fuzz_seeds/FORMAT`, the smallest first; so are inputs that fail, under the name `fail-...`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from places import TESTS
 SEEDS = TESTS / "fuzz_seeds"
 TIMEOUT_S, MOST_MB = 20, 3000
 # Of a format, of a seed, and of all seeds of a format.
-MOST_SEEDS, LARGEST_SEED, MOST_BYTES = 40, 20_000, 24_000
+MOST_SEEDS, LARGEST_SEED, MAX_SEED_TOTAL_BYTES = 40, 20_000, 24_000
 MOST_TOKENS = 200
 FAILED = "fail-"
 
@@ -92,7 +92,7 @@ def fuzz(name: str, seconds: float) -> int:
             (p for p in corpus.iterdir() if p.stat().st_size <= LARGEST_SEED), key=lambda p: p.stat().st_size
         )
         sizes = accumulate(seed.stat().st_size for seed in chosen[:MOST_SEEDS])
-        for seed in (seed for seed, size in zip(chosen, sizes, strict=False) if size <= MOST_BYTES):
+        for seed in (seed for seed, size in zip(chosen, sizes, strict=False) if size <= MAX_SEED_TOTAL_BYTES):
             (kept / seed.name).write_bytes(seed.read_bytes())
         for artifact in artifacts.iterdir():
             (kept / f"{FAILED}{artifact.name[:40]}").write_bytes(artifact.read_bytes())

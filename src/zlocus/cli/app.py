@@ -362,7 +362,7 @@ def doctor(
 @app.command("import")
 @explained
 def import_cameras(
-    kind: Annotated[str, typer.Argument(help="colmap, opensfm, metashape, bundler, eo or strecha.", metavar="FORMAT")],
+    kind: Annotated[str, typer.Argument(help="colmap, opensfm, metashape, bundler or eo.", metavar="FORMAT")],
     source: Annotated[Path, typer.Argument(help="Folder of the cameras, or their file.", metavar="DIR")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Scene file to write.")] = Path("scene.yaml"),
     images: Annotated[

@@ -9,7 +9,7 @@ from zlocus.core.requests import EVALUATION_FILES
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.io.rasters import write_cog
-from zlocus.io.run_record import write_record, write_whole
+from zlocus.io.run_record import write_record, write_atomically
 
 NAMES = (FIGURES, ERROR_MAP, HISTOGRAM) = EVALUATION_FILES
 DPI = 120
@@ -41,5 +41,5 @@ def write_evaluation(out: Path, evaluation: Evaluation) -> None:
         descriptions=("height of the surface less that of the reference",), units="m",
     )  # fmt: skip
     figure = histogram_figure(evaluation)
-    write_whole(out / HISTOGRAM, lambda part: figure.savefig(part, format="png", dpi=DPI))
+    write_atomically(out / HISTOGRAM, lambda part: figure.savefig(part, format="png", dpi=DPI))
     write_record(out / FIGURES, evaluation.as_dict())

@@ -9,7 +9,7 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
-from zlocus.io.vertical import ELLIPSOID, OWN_ELLIPSOIDAL, check_heights, vertical_datum, vertical_part
+from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL_DESCRIPTION, check_heights, vertical_datum, vertical_part
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def datum_of(raster: HeightRaster) -> str | None:
             return ELLIPSOID if is_ellipsoid else vertical.name
         if len(crs.axis_info) == 3 and (crs.is_geographic or crs.is_projected):
             return ELLIPSOID
-    return ELLIPSOID if raster.description == OWN_ELLIPSOIDAL else None
+    return ELLIPSOID if raster.description == ELLIPSOIDAL_DESCRIPTION else None
 
 
 def _above(datum: str | None) -> str:
@@ -112,4 +112,4 @@ def _raised(raster: HeightRaster, geoid: Path) -> HeightRaster:
     if datum.geoid is None:
         raise ConfigError(f"--geoid {geoid} is no geoid. Give egm96, egm2008 or the raster of one, or leave it out.")
     geobox = GeoBox(raster.z.shape, raster.transform, raster.horizontal.to_wkt())
-    return replace(raster, z=datum.ellipsoidal_of_cells(raster.z, geobox))
+    return replace(raster, z=datum.ellipsoidal_from_heights(raster.z, geobox))

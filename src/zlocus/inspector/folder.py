@@ -21,7 +21,7 @@ from rasterio.windows import Window
 from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.open_raster import kept_raster
+from zlocus.io.open_raster import cached_raster
 from zlocus.products.report.file_names import RECORD
 from zlocus.products.report.page import run_record
 
@@ -101,7 +101,7 @@ class SurfaceFolder:
         """What the rasters say of one cell, by their names."""
         found = {}
         for name in NEEDED:
-            with kept_raster(self.path(name)) as file:
+            with cached_raster(self.path(name)) as file:
                 found[name] = file.read(1, window=Window(col, row, 1, 1))[0, 0].item()
         return found
 
@@ -179,10 +179,10 @@ def surface_folder(out: Path) -> SurfaceFolder:
     """
     run = checked_run(out)
     for name, kind in NEEDED.items():
-        with kept_raster(out / f"{name}.tif") as file:
+        with cached_raster(out / f"{name}.tif") as file:
             if file.shape != tuple(run["grid"]["shape"]) or file.dtypes != (kind,):
                 raise InputError(f"{out / name}.tif is not the one that run.json tells of. Make the surface again.")
-    with kept_raster(out / "dsm.tif") as file:
+    with cached_raster(out / "dsm.tif") as file:
         above = file.descriptions[0] or "height"
         crs = CRS.from_user_input(run["grid"]["crs"])
         above = "z of the local frame" if is_local(crs) else above
@@ -203,7 +203,7 @@ def read_patch(path: Path, patch: Patch, average: bool, like: SurfaceFolder | No
     average : the mean of the cells of a pixel, else one of them; like : surface on whose grid it is looked up, its own
     being another.
     """
-    with kept_raster(path) as file:
+    with cached_raster(path) as file:
         if like is None:
             return _patch_of(file, patch, average)
         with on_grid(file, like) as view:

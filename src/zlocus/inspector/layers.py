@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from zlocus.inspector.folder import Cells, Patch, SurfaceFolder, read_patch
 from zlocus.inspector.reference import Reference
-from zlocus.io.open_raster import kept_raster
+from zlocus.io.open_raster import cached_raster
 from zlocus.products.demo_figure import error_map
 from zlocus.products.hillshade import hillshade
 from zlocus.products.report import maps
@@ -165,7 +165,7 @@ def _sigma(folder: SurfaceFolder) -> Layer:
 
 def _views(folder: SurfaceFolder) -> Layer:
     # A count that is rare is not missed: the raster knows its largest.
-    with kept_raster(folder.path("views")) as file:
+    with cached_raster(folder.path("views")) as file:
         top = max(int(float(file.tags(1).get("STATISTICS_MAXIMUM", 0))), 1)
     used = np.unique([*sampled(folder, "views", average=False).values[0].ravel(), top])
     used = used[used > 0]

@@ -13,7 +13,7 @@ from rasterio.windows import Window
 from zlocus.core.sensor_model import FloatArray
 from zlocus.inspector.folder import SurfaceFolder, on_grid
 from zlocus.inspector.reference import Reference
-from zlocus.io.open_raster import kept_raster
+from zlocus.io.open_raster import cached_raster
 
 MOST_PLACES = 2000
 # Cells a side that are read at a time.
@@ -52,13 +52,13 @@ def cells_of(folder: SurfaceFolder, xy: FloatArray) -> NDArray[np.int64]:
 
 def values_at(folder: SurfaceFolder, name: str, cells: NDArray[np.int64]) -> FloatArray:
     """A raster's values at cells (n, 2), NaN outside the grid."""
-    with kept_raster(folder.path(name)) as file:
+    with cached_raster(folder.path(name)) as file:
         return picked(file, cells)
 
 
 def reference_at(folder: SurfaceFolder, reference: Reference, cells: NDArray[np.int64]) -> FloatArray:
     """Heights of the reference at cells (n, 2), NaN where it has none."""
-    with kept_raster(reference.path) as file, on_grid(file, folder) as view:
+    with cached_raster(reference.path) as file, on_grid(file, folder) as view:
         return picked(view, cells)
 
 

@@ -71,7 +71,7 @@ def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> Height
         # The surface's heights were raised to the ellipsoid: the reference's are lowered instead.
         geobox = GeoBox(heights.z.shape, heights.transform, heights.horizontal.to_wkt())
         datum = vertical_datum(str(comparison.geoid), "--geoid")
-        heights = replace(heights, z=datum.of_cells(heights.z.astype(np.float32), geobox).astype(np.float64))
+        heights = replace(heights, z=datum.heights_from_ellipsoidal(heights.z.astype(np.float32), geobox).astype(np.float64))
     if shift is not None:
         moved = heights.transform.translation(shift.east_m, shift.north_m) * heights.transform
         heights = replace(heights, z=heights.z + shift.up_m, transform=moved)

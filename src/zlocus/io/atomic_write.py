@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """Temporary name beside a file, under which it is to be written; at the end of the block it gets its own name.
 
     After an exception, a signal among them, nothing of it stays.

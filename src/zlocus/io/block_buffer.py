@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Slices = tuple[slice, slice]
 
 
-class WaitingCells:
+class BlockBuffer:
     """A plain file of square blocks, each written whole, in the order of their first cells; never held in memory.
 
     GDAL is no place to wait in: where a block is changed a second time while another thread reads any raster at all,

@@ -17,11 +17,11 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.options import RunConfig
 from zlocus.core.options.renamed_keys import RENAMED_KEYS
 from zlocus.io.safe_documents import read_yaml
-from zlocus.io.safe_text import check_ended, read_text
+from zlocus.io.safe_text import check_last_line_ended, read_text
 
 COMMENT_WIDTH = 100
 # Bytes of a file; a complete one has a tenth of it.
-LARGEST = 200_000
+MAX_CONFIG_BYTES = 200_000
 HEADING = "# Every option of zlocus. What is left out keeps its default; read with --config FILE."
 T = TypeVar("T")
 
@@ -60,15 +60,15 @@ def read_config(path: Path) -> RunConfig:
     """
     try:
         is_yaml = path.suffix.lower() in (".yaml", ".yml")
-        values = read_yaml(path, LARGEST) if is_yaml else _read_toml(path)
+        values = read_yaml(path, MAX_CONFIG_BYTES) if is_yaml else _read_toml(path)
     except InputError as error:
         raise ConfigError(f"{error} `zlocus config -o FILE` writes a complete one.") from error
     return config_from_dict({} if values is None else values, str(path))
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    text = read_text(path, LARGEST)
-    check_ended(text.rstrip(" \t"), path)
+    text = read_text(path, MAX_CONFIG_BYTES)
+    check_last_line_ended(text.rstrip(" \t"), path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:

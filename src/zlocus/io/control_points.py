@@ -1,4 +1,4 @@
-"""Ground control points from a table: a row per image point (see docs/orientation.md)."""
+"""Ground control points from a table: a row per image point (see docs/how-to/orient.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pyproj import CRS
 from zlocus.core.errors import InputError
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.number_table import NumberTable, read_numbers
+from zlocus.io.number_table import NumberTable, read_number_table
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.orientation.control import GroundControl
 from zlocus.orientation.triangulate import Observations
@@ -38,7 +38,7 @@ def read_control(
         of one point that contradict each other, a check point in one image only, or a point that the geoid does not
         cover.
     """
-    table = read_numbers(path, WHAT, NUMBERS, WORDS)
+    table = read_number_table(path, WHAT, NUMBERS, WORDS)
     for name in NEEDED:
         if name not in table.columns and name not in table.labels:
             raise InputError(f"The {WHAT} {path} has no column {name}. Name it in the header.")

@@ -11,7 +11,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
 from zlocus.core.errors import ConfigError, InputError
-from zlocus.io.safe_text import AGAIN, LARGEST, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, quoted
 from zlocus.sensors.earth_frame import WGS84, between
 
 LOCAL = (
@@ -19,8 +19,8 @@ LOCAL = (
     'LENGTHUNIT["metre",1]]'
 )
 # Semi-major axis, and by how much those of ellipsoids and spheres in use differ.
-EARTH_M, EARTHS_DIFFER_M = 6378137.0, 3e4
-LONGEST_NAME = 80
+EARTH_MAJOR_M, MAX_MAJOR_DIFFERENCE_M = 6378137.0, 3e4
+MAX_CRS_NAME_CHARACTERS = 80
 
 
 def local_frame() -> CRS:
@@ -28,7 +28,7 @@ def local_frame() -> CRS:
     return CRS.from_wkt(LOCAL)
 
 
-def named_crs(crs: CRS) -> str:
+def crs_label(crs: CRS) -> str:
     """A CRS for messages: its code, or else its name."""
     code = crs.to_2d().to_epsg()
     return crs.name if code is None else f"EPSG:{code}"
@@ -37,7 +37,7 @@ def named_crs(crs: CRS) -> str:
 def is_on_earth(crs: CRS) -> bool:
     """Whether coordinates in a CRS are places on the Earth: it has its size, and PROJ can convert them."""
     ellipsoid = crs.ellipsoid
-    if ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_M) > EARTHS_DIFFER_M:
+    if ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_MAJOR_M) > MAX_MAJOR_DIFFERENCE_M:
         return False
     try:
         between(crs.to_2d(), WGS84)
@@ -56,14 +56,14 @@ def checked_crs(crs: CRS) -> CRS:
     """
     flat = crs.to_2d()
     advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
-    named = f"The CRS {shown(crs.to_string())} ({crs.name[:LONGEST_NAME]})"
+    named = f"The CRS {quoted(crs.to_string())} ({crs.name[:MAX_CRS_NAME_CHARACTERS]})"
     if not flat.is_projected:
         kind = "geographic (degrees)" if flat.is_geographic else "not projected"
         raise ConfigError(f"{named} is {kind}. {advice}, or leave --crs out.")
     if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
         raise ConfigError(f"{named} is in {flat.axis_info[0].unit_name}. {advice}.")
     if not is_on_earth(flat):
-        raise ConfigError(f"The CRS {shown(crs.to_string())} cannot be converted to places on the Earth. {advice}.")
+        raise ConfigError(f"The CRS {quoted(crs.to_string())} cannot be converted to places on the Earth. {advice}.")
     return flat
 
 
@@ -83,14 +83,14 @@ def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:
     """
     transform = source.transform
     steps = (*transform[:6], *(~transform)[:6]) if transform.determinant else (math.nan,)
-    if not all(abs(step) <= LARGEST for step in steps):
-        raise InputError(f"The cells of {path} lie nowhere: its transform is {tuple(transform)[:6]}. {AGAIN}")
+    if not all(abs(step) <= MAX_MAGNITUDE for step in steps):
+        raise InputError(f"The cells of {path} lie nowhere: its transform is {tuple(transform)[:6]}. {EXPORT_AGAIN}")
     if source.crs is None:
         raise InputError(f"{path} has no CRS, so its place on the ground is unknown. Assign one (gdal_edit -a_srs).")
-    return known_crs(source.crs, path)
+    return file_crs(source.crs, path)
 
 
-def known_crs(given: Any, path: Path) -> CRS:
+def file_crs(given: Any, path: Path) -> CRS:
     """A file's CRS, in whatever form pyproj understands; see `raster_crs`."""
     try:
         crs = CRS.from_user_input(given)
@@ -100,6 +100,6 @@ def known_crs(given: Any, path: Path) -> CRS:
         ) from error
     if not is_on_earth(crs):
         raise InputError(
-            f"{path} has the CRS {shown(crs.name)}, which cannot be converted to places on the Earth. Assign another."
+            f"{path} has the CRS {quoted(crs.name)}, which cannot be converted to places on the Earth. Assign another."
         )
     return crs

@@ -13,15 +13,15 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.crs import named_crs, raster_crs
+from zlocus.io.crs import crs_label, raster_crs
 from zlocus.io.open_raster import check_complete, open_raster
 from zlocus.sensors.earth_frame import between
 
 # Between the lowest undulation of the Earth, -107 m, and the highest, 86 m, with room for local geoids.
-MOST_UNDULATION_M = 120.0
-METRES = ("", "m", "metre", "metres", "meter", "meters")
+MAX_UNDULATION_M = 120.0
+METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
 # A point this close to the outermost posts, of the distance between two, is on them.
-ROUNDING = 1e-6
+ON_POST_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class GeoidRaster:
                     f"The geoid {path} has {source.height} x {source.width} posts, too few to lie between. Give "
                     "another raster."
                 )
-            if (unit := (source.units[0] or "").lower()) not in METRES:
+            if (unit := (source.units[0] or "").lower()) not in METRE_UNITS:
                 raise InputError(f"The undulations of {path} are in {unit}. Convert them to metres.")
             transform, shape = source.transform, (source.height, source.width)
         turns = crs.is_geographic and transform.b == transform.d == 0
@@ -80,7 +80,7 @@ class GeoidRaster:
         if not np.isfinite(found).all():
             x, y = xy[np.argmin(np.isfinite(found))]
             raise InputError(
-                f"The geoid {self.path} has no value (nodata) around {x:.10g}, {y:.10g} ({named_crs(crs)}). Give one "
+                f"The geoid {self.path} has no value (nodata) around {x:.10g}, {y:.10g} ({crs_label(crs)}). Give one "
                 "that is whole where the heights are."
             )
         return found
@@ -120,15 +120,15 @@ class GeoidRaster:
         row, col = d * x + e * y + f - 0.5, a * x + b * y + c - 0.5
         if self.period is not None:
             with np.errstate(invalid="ignore"):  # of points that the CRS cannot express
-                col = np.mod(col + ROUNDING, self.period) - ROUNDING
+                col = np.mod(col + ON_POST_TOLERANCE, self.period) - ON_POST_TOLERANCE
         return np.column_stack([row, col])
 
     def _inside(self, cell: FloatArray) -> NDArray[np.bool_]:
         """Whether (row, col) (n, 2) lie between posts; (n,)."""
         last = np.array(self.shape) - 1
         if self._is_around:  # between the last post and the first
-            return np.asarray((cell[:, 0] >= -ROUNDING) & (cell[:, 0] <= last[0] + ROUNDING))
-        return np.asarray(((cell >= -ROUNDING) & (cell <= last + ROUNDING)).all(axis=1))
+            return np.asarray((cell[:, 0] >= -ON_POST_TOLERANCE) & (cell[:, 0] <= last[0] + ON_POST_TOLERANCE))
+        return np.asarray(((cell >= -ON_POST_TOLERANCE) & (cell <= last + ON_POST_TOLERANCE)).all(axis=1))
 
     def _between_posts(self, cell: FloatArray) -> FloatArray:
         """Undulations (n,) m at (row, col) (n, 2) inside, NaN beside posts without a value."""
@@ -159,7 +159,7 @@ class GeoidRaster:
 
     def _check(self, found: FloatArray) -> None:
         largest = found[np.argmax(np.abs(np.nan_to_num(found)))]
-        if abs(largest) > MOST_UNDULATION_M:
+        if abs(largest) > MAX_UNDULATION_M:
             raise InputError(
                 f"{self.path} is no geoid: it holds {largest:.1f} m, and undulations lie between -107 and 86 m "
                 "everywhere on the Earth. Give a raster of geoid heights above the ellipsoid."
@@ -169,7 +169,7 @@ class GeoidRaster:
         corners = self.transform * (0.5, 0.5), self.transform * (self.shape[1] - 0.5, self.shape[0] - 0.5)
         (west, east), (south, north) = (sorted(pair) for pair in zip(*corners, strict=True))
         return InputError(
-            f"The geoid {self.path} does not cover {xy[0]:.10g}, {xy[1]:.10g} ({named_crs(crs)}): its posts lie "
-            f"between {west:.10g} and {east:.10g}, {south:.10g} and {north:.10g} ({named_crs(self.crs)}). "
+            f"The geoid {self.path} does not cover {xy[0]:.10g}, {xy[1]:.10g} ({crs_label(crs)}): its posts lie "
+            f"between {west:.10g} and {east:.10g}, {south:.10g} and {north:.10g} ({crs_label(self.crs)}). "
             "Give one that covers the area."
         )

@@ -18,28 +18,28 @@ from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
 
 from zlocus.core.errors import ConfigError, InputError
-from zlocus.io.crs import checked_crs, known_crs, raster_crs
+from zlocus.io.crs import checked_crs, file_crs, raster_crs
 from zlocus.io.height_values import check_unit, is_fill
 from zlocus.io.open_raster import existing_file, first_bytes, is_remote, open_raster
 from zlocus.io.vertical import (
-    OWN_ELLIPSOIDAL,
+    ELLIPSOIDAL_DESCRIPTION,
     VerticalDatum,
     check_heights,
+    declared_vertical_datum,
     grid_crs,
     vertical_datum,
-    vertical_datum_of,
     vertical_part,
 )
 from zlocus.io.virtual_rasters import ARCHIVES
 
 # Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
-EDGE_PIECES = 200
-LONGEST = 300  # of what a library says, characters
+MIN_PIECES_PER_EXTENT = 200
+MAX_REASON_CHARACTERS = 300  # of what a library says, characters
 # Formats of vector files that hold their polygons themselves.
-VECTORS = ("ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
+VECTOR_DRIVERS = ("ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
            "OpenFileGDB", "SQLite", "TopoJSON")  # fmt: skip
 # No extent on the Earth, in any unit, is larger.
-WIDEST_EXTENT = 1e9
+MAX_EXTENT = 1e9
 
 
 def read_geobox(path: Path) -> GeoBox:
@@ -88,7 +88,7 @@ def read_dem(
         raise InputError(
             f"The DEM {path} has no height anywhere on the grid ({_extent(geobox)}). Give one that covers it."
         )
-    return (vertical or dem_datum(path)).ellipsoidal_of_cells(heights, geobox)
+    return (vertical or dem_datum(path)).ellipsoidal_from_heights(heights, geobox)
 
 
 def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
@@ -97,20 +97,20 @@ def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
     Raises
     ------
     InputError, ConfigError
-        See `vertical_datum` and `vertical_datum_of`.
+        See `vertical_datum` and `declared_vertical_datum`.
     """
     if given is not None:
         return vertical_datum(given, "--dem-vertical")
     with open_raster(path, "DEM") as source:
-        return vertical_datum_of(raster_crs(source, path), path, "--dem-vertical")
+        return declared_vertical_datum(raster_crs(source, path), path, "--dem-vertical")
 
 
-def says_nothing(path: Path) -> bool:
+def lacks_vertical_datum(path: Path) -> bool:
     """Whether neither the CRS of a DEM nor its band's description, where it was made here, says what its heights are
     above."""
     with open_raster(path, "DEM") as source:
         crs, description = raster_crs(source, path), source.descriptions[0]
-    return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != OWN_ELLIPSOIDAL
+    return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != ELLIPSOIDAL_DESCRIPTION
 
 
 def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
@@ -135,7 +135,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
             raise InputError(
                 f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
             )
-        if (kind := pyogrio.read_info(path)["driver"]) not in VECTORS:
+        if (kind := pyogrio.read_info(path)["driver"]) not in VECTOR_DRIVERS:
             raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
         with warnings.catch_warnings():
             # What they warn of, rings that are not closed or numbers that are not finite, is refused.
@@ -146,7 +146,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         why = (
             "some text in it is not UTF-8"
             if isinstance(error, UnicodeError)
-            else " ".join(str(error).split())[:LONGEST]
+            else " ".join(str(error).split())[:MAX_REASON_CHARACTERS]
         )
         raise InputError(
             f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
@@ -159,12 +159,12 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     with np.errstate(invalid="ignore"):  # of coordinates that are no numbers, which are refused below
         west, south, east, north = shapely.total_bounds(polygons)
     largest = max(east - west, north - south)
-    if not (0 < largest < WIDEST_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
+    if not (0 < largest < MAX_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
         raise InputError(
             f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
         )
-    polygons = shapely.segmentize(polygons, largest / EDGE_PIECES)
-    transformer = Transformer.from_crs(known_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
+    polygons = shapely.segmentize(polygons, largest / MIN_PIECES_PER_EXTENT)
+    transformer = Transformer.from_crs(file_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
     return np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
 
 

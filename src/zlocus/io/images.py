@@ -16,18 +16,25 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import HeldPixels, ImageWindow
-from zlocus.io.open_raster import PLAIN, check_complete, file_state, is_remote, kept_raster, open_raster
-from zlocus.io.usable_pixels import LARGEST_GREY, BorderPlateau, absurd_values, border_plateau, without
+from zlocus.io.open_raster import (
+    UNCOMPRESSED_DRIVERS,
+    cached_raster,
+    check_complete,
+    file_state,
+    is_remote,
+    open_raster,
+)
+from zlocus.io.usable_pixels import MAX_GREY_VALUE, BorderPlateau, border_plateau, count_too_large_values, drop_pixels
 
 # Source: ITU-R BT.601, luma of red, green, blue.
 LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}
 # What is read in search of something to match: pixels of a window, and of all windows before an image is refused.
-CHECKED_PX, MOST_CHECKED_PX = 1 << 20, 1 << 30
+CHECK_WINDOW_PX, MAX_CHECKED_PX = 1 << 20, 1 << 30
 # Four million a side; to look for tie points in more takes months.
-MOST_PX = 1 << 44
+MAX_IMAGE_PX = 1 << 44
 # Larger images, in pixels, are not read as a whole for what they should not hold: absurd values are left out all the
 # same, but not counted, and borders of one value are matched as they are.
-MOST_COUNTED = 2_000_000_000
+MAX_COUNTED_PX = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,7 @@ class RasterImage:
     sparse file never held. Beside that, an integer image that declares no nodata value is valid everywhere: 0 is a
     legal grey value.
 
-    The object is a plain value that threads and processes can share: open files are kept by thread, see `kept_raster`.
+    The object is a plain value that threads and processes can share: open files are kept by thread, see `cached_raster`.
 
     bands : 1-based indices of the bands that are read, with `weights`; plateau : pixels of one value at the border,
     which are not valid; see `with_plateau`. held : see `SparseSource`. state : of the file when it was opened, see
@@ -69,14 +76,14 @@ class RasterImage:
         """
         inside = 0 <= row <= row + rows <= self.shape[0] and 0 <= col <= col + cols <= self.shape[1]
         assert inside, f"window {row, col, rows, cols} leaves {self.path.name} of {self.shape}"
-        with kept_raster(self.path) as source:
+        with cached_raster(self.path) as source:
             if source.shape != self.shape:
                 raise InputError(f"{self.path} has changed its size since it was opened. Start again.")
             window = self._read(source, Window(col, row, cols, rows))
         missing = None if self.held is None else self.held.missing(row, col, rows, cols)
         if missing is not None:
-            window = without(window, missing)
-        return window if self.plateau is None else without(window, self.plateau.covers(row, col, rows, cols))
+            window = drop_pixels(window, missing)
+        return window if self.plateau is None else drop_pixels(window, self.plateau.covers(row, col, rows, cols))
 
     @property
     def has_colours(self) -> bool:
@@ -92,7 +99,7 @@ class RasterImage:
             When the file can no longer be read.
         """
         assert self.has_colours, f"{self.path.name} is grey"
-        with kept_raster(self.path) as source:
+        with cached_raster(self.path) as source:
             values = source.read(list(self.bands), window=Window(col, row, cols, rows), out_dtype=np.float32)
         return np.nan_to_num(np.asarray(values, np.float32), copy=False, posinf=0.0, neginf=0.0)
 
@@ -102,8 +109,8 @@ class RasterImage:
         for band, weight in zip(self.bands, self.weights, strict=True):
             stored = source.read(band, window=window)
             values = stored.astype(np.float32)
-            if may_be_absurd(stored.dtype):
-                is_grey = np.abs(values) <= LARGEST_GREY  # neither are NaN and infinities
+            if may_hold_too_large_values(stored.dtype):
+                is_grey = np.abs(values) <= MAX_GREY_VALUE  # neither are NaN and infinities
                 valid &= is_grey
                 values[~is_grey] = 0.0
             pixels += values if weight == 1.0 else np.float32(weight) * values
@@ -143,7 +150,7 @@ def open_image(path: Path) -> RasterImage:
             raise InputError(f"{path} holds complex numbers. Convert it to intensity first.")
         if source.colorinterp[0] == ColorInterp.palette:
             raise InputError(f"{path} holds colour numbers of a palette. Expand it: gdal_translate -expand gray.")
-        if source.height * source.width > MOST_PX:
+        if source.height * source.width > MAX_IMAGE_PX:
             raise InputError(
                 f"{path} is {source.height} x {source.width} px, more than can be matched. Cut out the part that is "
                 "wanted: gdal_translate -srcwin."
@@ -164,7 +171,7 @@ def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:
     """Files beside an image that its pixels are read from: those that a virtual raster lists, the header of pixels as
     they are, and a mask. Overviews and statistics are not read, and readers of cameras name their own files."""
     others = [Path(name) for name in source.files if Path(name) != path]
-    if source.driver == "VRT" or source.driver in PLAIN:
+    if source.driver == "VRT" or source.driver in UNCOMPRESSED_DRIVERS:
         return tuple(other for other in others if not other.name.endswith((".ovr", ".aux.xml")))
     return tuple(other for other in others if other.suffix == ".msk")
 
@@ -180,7 +187,7 @@ def check_content(image: RasterImage) -> None:
     """Refuse an image with nothing to match: all nodata, or one value everywhere.
 
     Read by windows until two different valid values are met, so that an ordinary image costs one window. Windows are
-    spread over what the file holds; beyond `MOST_CHECKED_PX` no more are read, so that an image of any size is refused
+    spread over what the file holds; beyond `MAX_CHECKED_PX` no more are read, so that an image of any size is refused
     within seconds.
 
     Raises
@@ -223,12 +230,12 @@ class _Windows:
     @classmethod
     def of(cls, image: RasterImage) -> _Windows:
         """About as wide as the blocks of the file, which are decoded whole."""
-        with kept_raster(image.path) as source:
+        with cached_raster(image.path) as source:
             block_cols = source.block_shapes[image.bands[0] - 1][1]
         regions = np.array([[0, 0, *image.shape]]) if image.held is None else image.held.regions
         rows, cols = (int(side.max()) for side in (regions[:, 2:] - regions[:, :2]).T)
-        width = min(max(block_cols, math.isqrt(CHECKED_PX)), CHECKED_PX, cols)
-        return cls(regions, (min(max(CHECKED_PX // width, 1), rows), width))
+        width = min(max(block_cols, math.isqrt(CHECK_WINDOW_PX)), CHECK_WINDOW_PX, cols)
+        return cls(regions, (min(max(CHECK_WINDOW_PX // width, 1), rows), width))
 
     def __iter__(self) -> Iterator[tuple[int, int, int, int]]:
         """First row, first column, rows and columns."""
@@ -247,7 +254,7 @@ class _Windows:
     @property
     def n_read(self) -> int:
         """How many of them are read."""
-        return min(self._n, max(MOST_CHECKED_PX // math.prod(self.size), 1))
+        return min(self._n, max(MAX_CHECKED_PX // math.prod(self.size), 1))
 
     @property
     def is_whole(self) -> bool:
@@ -264,7 +271,7 @@ class _Windows:
         return down * self._across * len(self.regions)
 
 
-def may_be_absurd(dtype: np.dtype[np.generic]) -> bool:
+def may_hold_too_large_values(dtype: np.dtype[np.generic]) -> bool:
     """Whether pixels of a type can hold numbers that are larger than any grey value."""
     return dtype.kind == "f" or dtype.itemsize > 4
 
@@ -277,22 +284,22 @@ def check_grey_values(image: RasterImage) -> None:
     InputError
         Where more than half of the values are too large.
     """
-    if not may_be_absurd(np.dtype(image.dtype)) or is_remote(image.path):
+    if not may_hold_too_large_values(np.dtype(image.dtype)) or is_remote(image.path):
         return
-    if image.shape[0] * image.shape[1] > MOST_COUNTED:
+    if image.shape[0] * image.shape[1] > MAX_COUNTED_PX:
         return
-    with kept_raster(image.path) as source:
+    with cached_raster(image.path) as source:
 
         def rows_of_first_band(row: int, count: int) -> NDArray[np.floating]:
             return np.asarray(source.read(image.bands[0], window=Window(0, row, image.shape[1], count)), np.float64)
 
-        found = absurd_values(image.shape, rows_of_first_band)
+        found = count_too_large_values(image.shape, rows_of_first_band)
     if not found.n_pixels or (image.nodata is not None and found.largest == abs(image.nodata)):
         return
     if 2 * found.n_pixels > found.n_known:
         raise InputError(
             f"{image.path} holds values up to {found.largest:.3g}, which cannot be grey values. Scale them to numbers "
-            f"below {LARGEST_GREY:.3g}, or declare them as nodata."
+            f"below {MAX_GREY_VALUE:.3g}, or declare them as nodata."
         )
     warnings.warn(
         f"{image.path}: {found.n_pixels} of its pixels hold values up to {found.largest:.3g}, which cannot be grey "
@@ -310,7 +317,7 @@ def with_plateau(image: RasterImage) -> RasterImage:
     InputError
         Where the image cannot be read.
     """
-    if image.shape[0] * image.shape[1] > MOST_COUNTED:
+    if image.shape[0] * image.shape[1] > MAX_COUNTED_PX:
         return image
     found = border_plateau(image)
     if found is None:

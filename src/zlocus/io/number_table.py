@@ -10,9 +10,9 @@ import numpy as np
 
 from zlocus.core.errors import InputError, OutputError
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.atomic_write import whole_file
+from zlocus.io.atomic_write import atomic_file
 from zlocus.io.open_raster import existing_file
-from zlocus.io.safe_text import AGAIN, LARGEST, LONGEST_LINE, decimal, shown, text_lines
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, MAX_MAGNITUDE, decimal, quoted, text_lines
 
 SEPARATORS = (",", ";")
 
@@ -62,7 +62,7 @@ class NumberTable:
             )
 
 
-def read_numbers(path: Path, what: str, allowed: Iterable[str], words: Sequence[str] = ()) -> NumberTable:
+def read_number_table(path: Path, what: str, allowed: Iterable[str], words: Sequence[str] = ()) -> NumberTable:
     """The table in a file. Lines that are empty or start with # are skipped; names are read in any case.
 
     what : the role of the file, for messages; allowed : names a column of numbers may have; words : those of columns of
@@ -85,7 +85,7 @@ def read_numbers(path: Path, what: str, allowed: Iterable[str], words: Sequence[
     for name in names:
         if name not in known:
             raise InputError(
-                f"The {what} {path} has the column {shown(name)} in its header. Allowed: {', '.join(known)}."
+                f"The {what} {path} has the column {quoted(name)} in its header. Allowed: {', '.join(known)}."
             )
         if names.count(name) > 1:
             raise InputError(f"The {what} {path} has the column {name} twice in its header. Remove one.")
@@ -106,7 +106,7 @@ def read_numbers(path: Path, what: str, allowed: Iterable[str], words: Sequence[
     return NumberTable(path, what, columns, by_name, tuple(number for number, _ in body))
 
 
-def write_numbers(
+def write_number_table(
     path: Path, columns: dict[str, FloatArray], comment: str, labels: dict[str, Sequence[str]] | None = None
 ) -> None:
     """Write a table with commas that reads back equal.
@@ -123,7 +123,7 @@ def write_numbers(
     rows = (",".join([*word, *map(repr, row)]) for word, row in zip(words, numbers, strict=True))
     text = "\n".join([f"# {comment}", ",".join([*(labels or ()), *columns]), *rows]) + "\n"
     try:
-        with whole_file(path) as part:
+        with atomic_file(path) as part:
             part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
@@ -133,8 +133,8 @@ def _rows(path: Path, what: str) -> list[tuple[int, str]]:
     """Lines that count, with their numbers from 1."""
     rows = []
     for number, line in text_lines(path):
-        if len(line) > LONGEST_LINE:
-            raise InputError(f"The {what} {path}, line {number}: {len(line)} letters are no row. {AGAIN}")
+        if len(line) > MAX_LINE_CHARACTERS:
+            raise InputError(f"The {what} {path}, line {number}: {len(line)} letters are no row. {EXPORT_AGAIN}")
         if line.strip() and not line.lstrip().startswith("#"):
             rows.append((number, line.strip()))
     return rows
@@ -145,9 +145,9 @@ def _numbers(cells: list[str], what: str, path: Path, line: int) -> list[float]:
     values: list[float] = []
     for cell in cells:
         value = decimal(cell)
-        if not abs(value) <= LARGEST:
+        if not abs(value) <= MAX_MAGNITUDE:
             raise InputError(
-                f"The {what} {path}, line {line}: {shown(cell.strip())} is not a finite number. Mend it there."
+                f"The {what} {path}, line {line}: {quoted(cell.strip())} is not a finite number. Mend it there."
             )
         values.append(value)
     return values

@@ -22,28 +22,30 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.core.errors import InputError
 from zlocus.core.scene import HeldPixels
-from zlocus.io.safe_text import shown
+from zlocus.io.safe_text import quoted
 from zlocus.io.tiff_blocks import held_in_blocks
 from zlocus.io.virtual_rasters import ARCHIVES, FIRST_BYTES, REMOTE, check_served, check_virtual, is_virtual
 
 BLOCK_CACHE_BYTES = 128 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Its place in a TIFF alone.
-LEAST_BLOCK_BYTES = 4
+MIN_BLOCK_ENTRY_BYTES = 4
 # Of a block, that is read whatever stands for it; beyond, as many times what the file holds.
-LARGE_BLOCK_BYTES, DENSEST = 256 << 20, 10_000
+LARGE_BLOCK_BYTES, MAX_COMPRESSION_RATIO = 256 << 20, 10_000
 # Of kinds that only GDAL has.
 PIXEL_BYTES = {"complex_int16": 4}
-KEPT_OPEN = 32  # rasters of a thread
+MAX_OPEN_RASTERS = 32  # rasters of a thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
 # Rasters that are lists of other files or ask services, whatever their file is called. A virtual raster is read where
 # its name says that it is one.
-ELSEWHERE = frozenset((
+INDIRECT_DRIVERS = frozenset((
     "DERIVED", "ECRGTOC", "EEDA", "EEDAI", "ESRIC", "GTI", "HTTP", "KMLSUPEROVERLAY", "MRF", "PLMOSAIC", "RPFTOC",
     "STACIT", "STACTA", "VRT", "WCS", "WMS", "WMTS",
 ))  # fmt: skip
 # Formats whose pixels lie in a file as they are.
-PLAIN = frozenset(("BT", "EHdr", "ENVI", "ERS", "GTX", "ISCE", "KRO", "LAN", "PAux", "PNM", "ROI_PAC", "SAGA"))
+UNCOMPRESSED_DRIVERS = frozenset(
+    ("BT", "EHdr", "ENVI", "ERS", "GTX", "ISCE", "KRO", "LAN", "PAux", "PNM", "ROI_PAC", "SAGA")
+)
 # `warnings.catch_warnings` swaps a global list, so two threads must not be inside it at once.
 _quiet = threading.Lock()
 
@@ -71,7 +73,7 @@ def existing_file(path: Path, what: str) -> Path:
     if is_remote(path):
         if path.parts[1] not in REMOTE:
             raise InputError(
-                f"{shown(str(path))} names a file in an archive or a stream, which is not followed. Unpack it, and "
+                f"{quoted(str(path))} names a file in an archive or a stream, which is not followed. Unpack it, and "
                 f"give the {what} itself, or one on a server ({', '.join(f'/{name}/' for name in REMOTE[:3])}...)."
             )
         return path
@@ -79,7 +81,7 @@ def existing_file(path: Path, what: str) -> Path:
         is_there, is_folder = path.exists(), path.is_dir()
     except (OSError, ValueError) as error:
         why = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise InputError(f"There can be no {what} {shown(str(path))}: {why.lower()}. Check the path.") from error
+        raise InputError(f"There can be no {what} {quoted(str(path))}: {why.lower()}. Check the path.") from error
     if is_folder:
         raise InputError(f"The {what} {path} is a folder. Give the files in it one by one.")
     if not is_there:
@@ -107,13 +109,13 @@ def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetRea
     """
     path = existing_file(path, what)
     with rasterio.Env(**_GDAL), _opened(path) as dataset, _read_errors(path):
-        if dataset.driver in PLAIN and not is_remote(path):
+        if dataset.driver in UNCOMPRESSED_DRIVERS and not is_remote(path):
             _check_plain(dataset, path)
         yield dataset
 
 
 @contextmanager
-def kept_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
+def cached_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     """As `open_raster`, and the image stays open for this thread's next look at it, with the blocks that are in cache.
 
     A file that has changed since is opened anew. GDAL's handles must not be shared, neither by threads nor by a process
@@ -143,7 +145,7 @@ def _opened(path: Path) -> rasterio.DatasetReader:
         if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
             raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
         raise InputError(
-            f"{path} cannot be opened as a raster: {reason(error)}. Check that it is a complete "
+            f"{path} cannot be opened as a raster: {gdal_message(error)}. Check that it is a complete "
             "GeoTIFF (or another format of GDAL)."
         ) from error
     if not is_remote(path):
@@ -165,7 +167,7 @@ def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
     kind = source.dtypes[0]
     pixel = PIXEL_BYTES[kind] if kind in PIXEL_BYTES else np.dtype(kind).itemsize
     n_bytes, length = math.prod(source.block_shapes[0]) * bands * pixel, os.path.getsize(path)
-    if n_bytes > max(LARGE_BLOCK_BYTES, DENSEST * length):
+    if n_bytes > max(LARGE_BLOCK_BYTES, MAX_COMPRESSION_RATIO * length):
         source.close()
         raise InputError(
             f"{path} is damaged: it says that it has blocks of {n_bytes / 1e9:.1f} GB of pixels, in {length} bytes. "
@@ -177,7 +179,7 @@ def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
 def _drivers(virtual: bool) -> list[str]:
     """GDAL's formats that are read. virtual : lists of other files too."""
     with rasterio.Env() as gdal:
-        return [name for name in gdal.drivers() if name not in ELSEWHERE or (virtual and name == "VRT")]
+        return [name for name in gdal.drivers() if name not in INDIRECT_DRIVERS or (virtual and name == "VRT")]
 
 
 def first_bytes(path: Path) -> bytes:
@@ -195,13 +197,13 @@ def _read_errors(path: Path) -> Iterator[None]:
         yield
     except (RasterioError, CPLE_BaseError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path} cannot be read: {reason(error)}. It, or a file beside it that belongs to it, is damaged or "
+            f"{path} cannot be read: {gdal_message(error)}. It, or a file beside it that belongs to it, is damaged or "
             "truncated; copy both again from their source."
         ) from error
 
 
 @dataclass
-class _Kept(threading.local):
+class _OpenRasters(threading.local):
     """Open rasters of one thread, the one used last at the end, with the state of the file when it was opened."""
 
     datasets: OrderedDict[Path, tuple[tuple[int, ...], rasterio.DatasetReader]] = field(default_factory=OrderedDict)
@@ -217,7 +219,7 @@ class _Kept(threading.local):
             self.forget(path)
             dataset = _opened(path)
             self.datasets[path] = state, dataset
-            if len(self.datasets) > KEPT_OPEN:
+            if len(self.datasets) > MAX_OPEN_RASTERS:
                 self.forget(next(iter(self.datasets)))
         self.datasets.move_to_end(path)
         return dataset
@@ -229,7 +231,7 @@ class _Kept(threading.local):
             dataset.close()
 
 
-_kept = _Kept()
+_kept = _OpenRasters()
 
 
 def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | None:
@@ -253,7 +255,7 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
     length = os.path.getsize(path)
     block_rows, block_cols = source.block_shapes[0]
     n_down, n_across = -(-source.height // block_rows), -(-source.width // block_cols)
-    if n_down * n_across * LEAST_BLOCK_BYTES > length:
+    if n_down * n_across * MIN_BLOCK_ENTRY_BYTES > length:
         raise InputError(
             f"{path} is damaged: it says that it has {n_down * n_across} blocks of pixels, which its {length} bytes "
             "cannot list. Copy it again from its source."
@@ -293,7 +295,7 @@ def _check_png(path: Path) -> None:
                 )
 
 
-def reason(error: BaseException) -> str:
+def gdal_message(error: BaseException) -> str:
     """GDAL's own words: those of the first error of the chain, without a full stop."""
     while error.__cause__ is not None:
         error = error.__cause__

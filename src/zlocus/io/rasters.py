@@ -22,8 +22,8 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError, OutputError
 from zlocus.io.band_statistics import BandStatistics, is_data
-from zlocus.io.block_buffer import WaitingCells
-from zlocus.io.open_raster import BLOCK_CACHE_BYTES, check_complete, open_raster, reason
+from zlocus.io.block_buffer import BlockBuffer
+from zlocus.io.open_raster import BLOCK_CACHE_BYTES, check_complete, gdal_message, open_raster
 
 BLOCK_SIZE = 512
 # Deflate is read everywhere. Heights, sigmas and grey values shrink by 1 % more at level 6, in nearly twice the time.
@@ -33,7 +33,7 @@ FLOAT_PREDICTOR, INTEGER_PREDICTOR = "FLOATING_POINT", "STANDARD"
 
 
 @contextmanager
-def compressing(threads: int) -> Iterator[None]:
+def compression_threads(threads: int) -> Iterator[None]:
     """Rasters that this thread closes meanwhile are compressed by so many; blocks are written in their order all the
     same, and so the same bytes."""
     token = _threads.set(threads)
@@ -82,7 +82,7 @@ class RasterSink:
         # Of the cells and of the mask.
         names = ("cells", "mask") if has_mask else ("cells",)
         self._paths = [self.path.with_name(f".{self.path.name}.{os.getpid()}.{name}") for name in names]
-        self._waiting: list[WaitingCells] = []
+        self._waiting: list[BlockBuffer] = []
         self._lock = threading.Lock()
         rows, cols = geobox.shape
         self._descriptions, self._units = descriptions, units
@@ -97,7 +97,7 @@ class RasterSink:
         try:
             with self._guard():
                 for path, (count, kind, empty) in zip(self._paths, kinds, strict=False):
-                    self._waiting.append(WaitingCells(path, (count, rows, cols), kind, empty, BLOCK_SIZE))
+                    self._waiting.append(BlockBuffer(path, (count, rows, cols), kind, empty, BLOCK_SIZE))
         except BaseException:
             self._remove()
             raise
@@ -178,7 +178,7 @@ class RasterSink:
         except (RasterioError, CPLE_BaseError, InputError, OSError, SystemError) as error:
             self._remove()
             raise OutputError(
-                f"{self.path} cannot be written: {reason(error)}. Check the folder, its permissions and the space left."
+                f"{self.path} cannot be written: {gdal_message(error)}. Check the folder, its permissions and the space left."
             ) from error
 
     def __enter__(self) -> RasterSink:

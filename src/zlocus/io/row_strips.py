@@ -46,7 +46,7 @@ def strips_of(n_rows: int, aside: int = 0, strip_rows: int = STRIP_ROWS) -> Iter
         yield Strip(row, rows, min(aside, row), min(aside, n_rows - row - rows))
 
 
-class ReadBand(AbstractContextManager["ReadBand"]):
+class BandReader(AbstractContextManager["BandReader"]):
     """The first band of a raster on a grid, open to be read by strips.
 
     Raises
@@ -73,7 +73,7 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         return None if self._file.crs is None else CRS.from_wkt(self._file.crs.to_wkt())
 
     @property
-    def flat_geobox(self) -> GeoBox:
+    def horizontal_geobox(self) -> GeoBox:
         """Its grid for what holds no heights: the CRS is that of x and y."""
         crs = self.crs
         return self.geobox if crs is None else GeoBox(self._file.shape, self._file.transform, crs.to_2d().to_wkt())
@@ -132,7 +132,7 @@ class ReadBand(AbstractContextManager["ReadBand"]):
         return Window(0, strip.row - strip.above, self._file.width, rows)
 
 
-def same_grid(bands: list[ReadBand]) -> None:
+def check_same_grid(bands: list[BandReader]) -> None:
     """Make sure that rasters of one result lie on one grid.
 
     Raises

@@ -18,7 +18,7 @@ from typing import Any
 from zlocus.core.errors import InputError, OutputError
 from zlocus.core.options import RunConfig
 from zlocus.core.resources import peak_memory_mb
-from zlocus.io.atomic_write import whole_file
+from zlocus.io.atomic_write import atomic_file
 from zlocus.io.config import config_as_dict
 from zlocus.io.open_raster import gdal_name, is_remote
 from zlocus.io.safe_documents import read_json
@@ -40,7 +40,7 @@ LIBRARIES = (
 
 
 @dataclass
-class Elsewhere:
+class WorkerUsage:
     """What a stage took in other processes. cpu_s : all of them together; peak_mb : most that one of them held."""
 
     cpu_s: float = 0.0
@@ -54,9 +54,9 @@ class Stopwatch:
     stages: list[dict[str, Any]] = field(default_factory=list)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[Elsewhere]:
+    def stage(self, name: str) -> Iterator[WorkerUsage]:
         """Time a block; what is added to what it yields counts too."""
-        wall, cpu, elsewhere = time.perf_counter(), time.process_time(), Elsewhere()
+        wall, cpu, elsewhere = time.perf_counter(), time.process_time(), WorkerUsage()
         yield elsewhere
         self.stages.append(
             {
@@ -89,7 +89,7 @@ def request_as_dict(request: Any) -> dict[str, Any]:
     return record | {"inputs": [str(path) for path in request.inputs]}
 
 
-def made_record(
+def result_record(
     request: Any, config: RunConfig, inputs: Sequence[Mapping[str, str | None]], watch: Stopwatch
 ) -> dict[str, Any]:
     """What was asked, of which versions and inputs, and how long it took, for run.json.
@@ -104,7 +104,7 @@ def made_record(
     }
 
 
-def now() -> str:
+def utc_now() -> str:
     """The time, as ISO 8601 in UTC."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
@@ -117,7 +117,7 @@ def versions_record() -> dict[str, str]:
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
     text = json.dumps(finite_only({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
-    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def read_record(path: Path) -> dict[str, Any]:
     return found
 
 
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file to a temporary name beside it, then rename it: whole or not at all.
 
     Raises
@@ -143,7 +143,7 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
         Where it cannot be written.
     """
     try:
-        with whole_file(path) as part:
+        with atomic_file(path) as part:
             write(part)
     except OSError as error:
         reason = error.strerror or str(error)

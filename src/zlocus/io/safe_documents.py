@@ -14,24 +14,24 @@ from xml.parsers import expat
 import yaml
 
 from zlocus.core.errors import InputError
-from zlocus.io.safe_text import AGAIN, check_ended, read_bytes, read_text, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, check_last_line_ended, quoted, read_bytes, read_text
 
-DEEPEST_XML = 64
-DEEPEST_YAML = 32
-TOO_DEEP = f"{{path}} is nested more than {DEEPEST_YAML} levels deep. Check its brackets."
-LARGEST_YAML = 64_000_000
+MAX_XML_DEPTH = 64
+MAX_YAML_DEPTH = 32
+TOO_DEEP = f"{{path}} is nested more than {MAX_YAML_DEPTH} levels deep. Check its brackets."
+MAX_YAML_BYTES = 64_000_000
 # What ten thousand cameras take. Aliases count as what they stand for.
-MOST_VALUES = 500_000
+MAX_VALUES = 500_000
 # Of YAML 1.1, without whole numbers to other bases than 10, underscores within them, and yes and no for truth.
 BOOL, INT, FLOAT = (f"tag:yaml.org,2002:{kind}" for kind in ("bool", "int", "float"))
-PLAIN: dict[str, tuple[str, str]] = {
+PLAIN_SCALARS: dict[str, tuple[str, str]] = {
     BOOL: (r"true|True|TRUE|false|False|FALSE", "tTfF"),
     INT: (r"[-+]?(?:0|[1-9][0-9]*)", "-+0123456789"),
     FLOAT: (r"[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?|[-+]?\.(?:inf|nan)", "-+0123456789."),
 }
 
 
-def read_json(path: Path, start: str | None = None, again: str = AGAIN) -> Any:
+def read_json(path: Path, start: str | None = None, again: str = EXPORT_AGAIN) -> Any:
     """A JSON document, with finite numbers and different keys. start : letter before which anything may stand; again :
     what to do where it is none.
 
@@ -51,7 +51,7 @@ def read_json(path: Path, start: str | None = None, again: str = AGAIN) -> Any:
         found = dict(pairs)
         if len(found) < len(pairs):
             keys = [key for key, _ in pairs]
-            raise ValueError(f"it holds {shown(next(key for key in keys if keys.count(key) > 1))} twice in one place")
+            raise ValueError(f"it holds {quoted(next(key for key in keys if keys.count(key) > 1))} twice in one place")
         return found
 
     text = read_text(path)
@@ -75,15 +75,19 @@ def read_xml(path: Path) -> Element:
     content, depth, n_elements = read_bytes(path), 0, 0
 
     def refuse(*_: Any) -> NoReturn:
-        raise InputError(f"{path} declares a document type, which camera files do not and which is not read. {AGAIN}")
+        raise InputError(
+            f"{path} declares a document type, which camera files do not and which is not read. {EXPORT_AGAIN}"
+        )
 
     def deeper(*_: Any) -> None:
         nonlocal depth, n_elements
         depth, n_elements = depth + 1, n_elements + 1
-        if n_elements > MOST_VALUES:
-            raise InputError(f"{path} holds more than {MOST_VALUES} elements. Check that it is the right file.")
-        if depth > DEEPEST_XML:
-            raise InputError(f"{path} is nested more than {DEEPEST_XML} levels deep: no file of cameras. {AGAIN}")
+        if n_elements > MAX_VALUES:
+            raise InputError(f"{path} holds more than {MAX_VALUES} elements. Check that it is the right file.")
+        if depth > MAX_XML_DEPTH:
+            raise InputError(
+                f"{path} is nested more than {MAX_XML_DEPTH} levels deep: no file of cameras. {EXPORT_AGAIN}"
+            )
 
     def higher(*_: Any) -> None:
         nonlocal depth
@@ -95,24 +99,24 @@ def read_xml(path: Path) -> Element:
         check.Parse(content, True)
         return ElementTree.fromstring(content)
     except (expat.ExpatError, ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(f"{path} cannot be read as XML: {error}. {AGAIN}") from error
+        raise InputError(f"{path} cannot be read as XML: {error}. {EXPORT_AGAIN}") from error
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """YAML in which a number is what it looks like."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own way)
-        first: [(tag, pattern) for tag, pattern in known if tag not in PLAIN]
+        first: [(tag, pattern) for tag, pattern in known if tag not in PLAIN_SCALARS]
         for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
 
-for _tag, (_pattern, _first) in PLAIN.items():
+for _tag, (_pattern, _first) in PLAIN_SCALARS.items():
     _Loader.add_implicit_resolver(_tag, re.compile(rf"(?:{_pattern})\Z"), list(_first))
 
 
-def read_yaml(path: Path, most: int = LARGEST_YAML) -> Any:
-    """A YAML document: YAML 1.1 without its traps (see `PLAIN`), without tags, with different keys. most : bytes.
+def read_yaml(path: Path, most: int = MAX_YAML_BYTES) -> Any:
+    """A YAML document: YAML 1.1 without its traps (see `PLAIN_SCALARS`), without tags, with different keys. most : bytes.
 
     Raises
     ------
@@ -122,7 +126,7 @@ def read_yaml(path: Path, most: int = LARGEST_YAML) -> Any:
     text = read_text(path, most)
     try:
         _Checked(path).look(text)
-        check_ended(text.rstrip(" \t"), path)
+        check_last_line_ended(text.rstrip(" \t"), path)
         return yaml.load(text, _Loader)
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         if "nesting depth" in str(error):
@@ -154,7 +158,7 @@ class _Checked:
                 self._add(self._size(event.anchor or ""))
             elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
                 if event.tag is not None:
-                    raise InputError(f"{self.path} holds the tag {shown(event.tag)}, which is not read. Leave it out.")
+                    raise InputError(f"{self.path} holds the tag {quoted(event.tag)}, which is not read. Leave it out.")
                 self._key(event)
                 self._add(1)
                 self._begin(event)
@@ -163,7 +167,7 @@ class _Checked:
         if isinstance(event, yaml.ScalarEvent):
             self._remember(event.anchor, 1)
             return
-        if len(self.open) == DEEPEST_YAML:
+        if len(self.open) == MAX_YAML_DEPTH:
             raise InputError(TOO_DEEP.format(path=self.path))
         self.sizes.pop(event.anchor or "", None)
         self.open.append(
@@ -179,13 +183,15 @@ class _Checked:
         if self.is_key[-1] and isinstance(event, yaml.ScalarEvent):
             if event.value in keys:
                 line = "" if event.start_mark is None else f", line {event.start_mark.line + 1}"
-                raise InputError(f"{self.path}{line}: the key {shown(event.value)} is there twice. Remove one.")
+                raise InputError(f"{self.path}{line}: the key {quoted(event.value)} is there twice. Remove one.")
             keys.add(event.value)
         self.is_key[-1] = not self.is_key[-1]
 
     def _size(self, anchor: str) -> int:
         if anchor not in self.sizes:
-            raise InputError(f"{self.path} refers to {shown('*' + anchor)}, which is not complete there. Write it out.")
+            raise InputError(
+                f"{self.path} refers to {quoted('*' + anchor)}, which is not complete there. Write it out."
+            )
         return self.sizes[anchor]
 
     def _remember(self, anchor: str | None, size: int) -> None:
@@ -194,5 +200,5 @@ class _Checked:
 
     def _add(self, size: int) -> None:
         self.n_values += size
-        if self.n_values > MOST_VALUES:
-            raise InputError(f"{self.path} holds more than {MOST_VALUES} values. Check that it is the right file.")
+        if self.n_values > MAX_VALUES:
+            raise InputError(f"{self.path} holds more than {MAX_VALUES} values. Check that it is the right file.")

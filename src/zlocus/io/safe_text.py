@@ -10,12 +10,12 @@ from typing import Any
 
 from zlocus.core.errors import InputError
 
-AGAIN = "Export it again, or copy it again from its source."
-LONGEST_SHOWN = 40
+EXPORT_AGAIN = "Export it again, or copy it again from its source."
+MAX_SHOWN_CHARACTERS = 40
 # Of a line that a person or a program writes a table in, with room to spare.
-LONGEST_LINE = 100_000
+MAX_LINE_CHARACTERS = 100_000
 # What is measured is smaller; larger numbers are damage, and would overflow.
-LARGEST = 1e15
+MAX_MAGNITUDE = 1e15
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # What ends a value for certain, where no line end does.
 CLOSING = ("]", "}", '"', "'")
@@ -48,7 +48,7 @@ def read_text(path: Path, most: int | None = None) -> str:
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text in UTF-8, from byte {error.start} on. {AGAIN}") from error
+        raise InputError(f"{path} is not text in UTF-8, from byte {error.start} on. {EXPORT_AGAIN}") from error
 
 
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -65,24 +65,24 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
                 words = WORD.findall(line)
-                last = written(words[-1]) if words else None
+                last = digits_written(words[-1]) if words else None
                 if not line.endswith("\n") and (last is None or {last} != above):
-                    raise stops_within(path, number)
+                    raise truncation_error(path, number)
                 if words and is_decimal(words[-1]):
                     above.add(last)
                 yield number, line.rstrip("\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text in UTF-8. {AGAIN}") from error
+        raise InputError(f"{path} is not text in UTF-8. {EXPORT_AGAIN}") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}. Check the path.") from error
 
 
-def stops_within(path: Path, line: int) -> InputError:
+def truncation_error(path: Path, line: int) -> InputError:
     """The error of a file whose last line has no end, so that its last number may be half of one."""
     return InputError(f"{path} stops within line {line}: it may be truncated. Copy it again, or end that line.")
 
 
-def written(number: str) -> tuple[int, int] | None:
+def digits_written(number: str) -> tuple[int, int] | None:
     """Digits behind the point and of the exponent; None where no digit is behind the point, or for no number.
 
     Where all numbers are written alike, one that was cut short is not.
@@ -92,7 +92,7 @@ def written(number: str) -> tuple[int, int] | None:
     return (digits, len(exponent.lstrip("+-"))) if digits and is_decimal(number) else None
 
 
-def check_ended(text: str, path: Path) -> None:
+def check_last_line_ended(text: str, path: Path) -> None:
     """Refuse options that stop within a value: the last line has an end, unless it closes a bracket or a quotation.
 
     Raises
@@ -101,7 +101,7 @@ def check_ended(text: str, path: Path) -> None:
         Naming the line.
     """
     if text and not text.endswith(("\n", "\r", *CLOSING)):
-        raise stops_within(path, text.count("\n") + 1)
+        raise truncation_error(path, text.count("\n") + 1)
 
 
 def decimal(text: str) -> float:
@@ -115,7 +115,7 @@ def is_decimal(text: str) -> bool:
     return DECIMAL.fullmatch(text) is not None
 
 
-def shown(value: Any) -> str:
+def quoted(value: Any) -> str:
     """A value for a message, shortened."""
     text = value if isinstance(value, str) else repr(value)
-    return repr(text if len(text) <= LONGEST_SHOWN else text[:LONGEST_SHOWN] + "...")
+    return repr(text if len(text) <= MAX_SHOWN_CHARACTERS else text[:MAX_SHOWN_CHARACTERS] + "...")

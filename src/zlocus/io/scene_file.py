@@ -31,20 +31,20 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import ConfigError, InputError, OutputError, ZlocusError
 from zlocus.core.scene import Scene, View, held_window, is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.atomic_write import whole_file
-from zlocus.io.cameras.camera_entry import Camera, CameraSource, Vector
+from zlocus.io.atomic_write import atomic_file
+from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
 from zlocus.io.cameras.camera_kinds import KINDS, RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
 from zlocus.io.images import RasterImage, check_content, check_grey_values, open_image, with_plateau
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_documents import read_yaml
-from zlocus.io.safe_text import shown
-from zlocus.io.schema import Number, StrictModel, validated
+from zlocus.io.safe_text import quoted
+from zlocus.io.schema import FiniteNumber, StrictModel, validate_document
 from zlocus.sensors.frame import FrameModel
 
 SCENE_SUFFIXES = (".yaml", ".yml")
-OPPOSITE, PARALLEL = 1e-12, 1e-6
+OPPOSITE_TOLERANCE, PARALLEL_TOLERANCE = 1e-12, 1e-6
 T = TypeVar("T")
 
 
@@ -78,7 +78,7 @@ class Frame(StrictModel):
 class Area(StrictModel):
     """The part of the ground asked for. bounds : xmin, ymin, xmax, ymax in the frame's CRS."""
 
-    bounds: tuple[Number, Number, Number, Number]
+    bounds: tuple[FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber]
 
     @model_validator(mode="after")
     def _ordered(self) -> Area:
@@ -93,7 +93,7 @@ class ViewEntry(StrictModel):
 
     name: str = Field(min_length=1)
     image: str
-    camera: SerializeAsAny[Camera]
+    camera: SerializeAsAny[CameraEntry]
     date: datetime.date | None = None
 
     @field_validator("name")
@@ -110,7 +110,7 @@ class SceneFile(StrictModel):
     schema_version: Literal[1] = Field(alias="schema")
     frame: Frame | None = None
     area: Area | None = None
-    heights: tuple[Number, Number] | None = None
+    heights: tuple[FiniteNumber, FiniteNumber] | None = None
     views: tuple[ViewEntry, ...]
 
     @model_validator(mode="after")
@@ -159,7 +159,7 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedView:
     """A view that cannot be used, and why."""
 
     name: str
@@ -168,14 +168,14 @@ class Refused:
 
 
 @dataclass(frozen=True)
-class Usable:
+class UsableViews:
     """The views that can be used, None where there is no single one, and the others."""
 
     scene: Scene | None
-    refused: tuple[Refused, ...]
+    refused: tuple[RefusedView, ...]
 
 
-def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
+def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableViews:
     """As `open_scene`, but a view that cannot be used, or whose entry is wrong, is named and the others are opened.
 
     Raises
@@ -184,15 +184,15 @@ def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
         Where nothing can be opened at all: a scene file that is wrong elsewhere, an image given twice, a CRS that does
         not suit.
     """
-    wrong: list[Refused] = []
+    wrong: list[RefusedView] = []
     asked = _asked(inputs, crs, wrong)
-    refused: dict[str, Refused] = {}
+    refused: dict[str, RefusedView] = {}
 
-    def tried(entry: _Entry, step: Callable[[], T]) -> list[T]:
+    def tried(entry: _ViewInput, step: Callable[[], T]) -> list[T]:
         try:
             return [step()]
         except ZlocusError as error:
-            refused[entry.name] = Refused(entry.name, entry.path, str(error))
+            refused[entry.name] = RefusedView(entry.name, entry.path, str(error))
             return []
 
     loaded = [each for entry in asked.entries for each in tried(entry, partial(_load, entry, asked.folder))]
@@ -202,10 +202,10 @@ def open_usable(inputs: Sequence[Path], crs: CRS | None = None) -> Usable:
         frame = _default_crs(loaded) if loaded else None
     views = [] if frame is None else [v for each in loaded for v in tried(each.entry, partial(each.view, frame))]
     scene = asked.scene(views, frame) if views and frame is not None else None
-    return Usable(scene, (*wrong, *(refused[entry.name] for entry in asked.entries if entry.name in refused)))
+    return UsableViews(scene, (*wrong, *(refused[entry.name] for entry in asked.entries if entry.name in refused)))
 
 
-def read_scene_file(path: Path, wrong: list[Refused] | None = None) -> SceneFile:
+def read_scene_file(path: Path, wrong: list[RefusedView] | None = None) -> SceneFile:
     """A `scene.yaml`, checked, its images and cameras unread. wrong : takes the views whose entries are, without which
     the file is read then.
 
@@ -222,24 +222,24 @@ def read_scene_file(path: Path, wrong: list[Refused] | None = None) -> SceneFile
     if isinstance(views, list):
         entries = [entry for i in range(len(views)) for entry in _view_entry(views, i, path, wrong)]
         document = document | {"views": entries}
-    return validated(SceneFile, document, path)
+    return validate_document(SceneFile, document, path)
 
 
-def _view_entry(views: list[Any], index: int, path: Path, wrong: list[Refused] | None) -> list[ViewEntry]:
+def _view_entry(views: list[Any], index: int, path: Path, wrong: list[RefusedView] | None) -> list[ViewEntry]:
     """One view of a scene file; none where its entry is noted as wrong."""
     view, where = views[index], f"views[{index}]"
     given = view if isinstance(view, dict) else {}
     try:
         if "camera" in given:
             view = given | {"camera": _camera(given["camera"], path, f"{where}.camera")}
-        return [validated(ViewEntry, view, path, where)]
+        return [validate_document(ViewEntry, view, path, where)]
     except InputError as error:
         if wrong is None:
             raise
         name, image = given.get("name"), given.get("image")
         alone = isinstance(name, str) and sum(isinstance(v, dict) and v.get("name") == name for v in views) == 1
         file = path.parent / image if isinstance(image, str) else path
-        wrong.append(Refused(name if isinstance(name, str) and alone else where, file, str(error)))
+        wrong.append(RefusedView(name if isinstance(name, str) and alone else where, file, str(error)))
         return []
 
 
@@ -253,25 +253,25 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
     """
     document = scene_file.model_dump(mode="json", by_alias=True, exclude_none=True)
     try:
-        with whole_file(path) as part:
+        with atomic_file(path) as part:
             part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
 
 
 @dataclass(frozen=True)
-class _Entry:
+class _ViewInput:
     name: str
     path: Path
-    camera: Camera
+    camera: CameraEntry
     date: datetime.date | None = None
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _SceneInput:
     """A scene before any image is opened. folder : where relative paths of cameras start; up, north : see `Frame`."""
 
-    entries: tuple[_Entry, ...]
+    entries: tuple[_ViewInput, ...]
     folder: Path
     crs: CRS | None
     bounds: tuple[float, float, float, float] | None = None
@@ -282,16 +282,16 @@ class _Asked:
     def scene(self, views: Sequence[View], crs: CRS) -> Scene:
         """The scene of some views in its frame."""
         scene = Scene(tuple(views), crs, self.bounds, self.heights)
-        return scene if self.up is None else _turned(scene, turn_to_axes(self.up, self.north))
+        return scene if self.up is None else _turned(scene, rotation_to_axes(self.up, self.north))
 
 
 @dataclass(frozen=True)
-class _Loaded:
+class _OpenedView:
     """An image and its camera, read, before the scene's CRS is known."""
 
-    entry: _Entry
+    entry: _ViewInput
     image: RasterImage
-    source: CameraSource
+    source: OpenedCamera
 
     def view(self, crs: CRS) -> View:
         """The view in the scene's frame."""
@@ -299,7 +299,7 @@ class _Loaded:
         return View(entry.name, entry.path, self.image, self.source.sensor(crs), self.source.files, entry.date)
 
 
-def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[Refused] | None = None) -> _Asked:
+def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[RefusedView] | None = None) -> _SceneInput:
     paths = [Path(path) for path in inputs]
     scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
     if scene_files and len(paths) > 1:
@@ -307,23 +307,23 @@ def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[Refused] | None 
     if scene_files:
         asked = _from_scene_file(scene_files[0], crs, wrong)
     else:
-        entries = [_Entry(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
-        asked = _Asked(tuple(entries), Path(), crs)
+        entries = [_ViewInput(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
+        asked = _SceneInput(tuple(entries), Path(), crs)
     if asked.crs is not None and not is_local(asked.crs):
         asked = replace(asked, crs=checked_crs(asked.crs))
     _check_distinct([entry.path for entry in asked.entries])
     return asked
 
 
-def _load(entry: _Entry, folder: Path) -> _Loaded:
+def _load(entry: _ViewInput, folder: Path) -> _OpenedView:
     image = open_image(entry.path)
     check_grey_values(image)
     check_content(image)
     image = with_plateau(image)
-    return _Loaded(entry, image, entry.camera.read(folder, entry.path))
+    return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
 
 
-def _from_scene_file(path: Path, crs: CRS | None, wrong: list[Refused] | None) -> _Asked:
+def _from_scene_file(path: Path, crs: CRS | None, wrong: list[RefusedView] | None) -> _SceneInput:
     scene_file = read_scene_file(path, wrong)
     frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
     if frame is not None and is_local(frame) and crs is not None:
@@ -332,11 +332,12 @@ def _from_scene_file(path: Path, crs: CRS | None, wrong: list[Refused] | None) -
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
     named = None if scene_file.frame is None else scene_file.frame.crs
     entries = tuple(
-        _Entry(view.name, path.parent / view.image, view.camera.given_in(named), view.date) for view in scene_file.views
+        _ViewInput(view.name, path.parent / view.image, view.camera.with_default_crs(named), view.date)
+        for view in scene_file.views
     )
     bounds = None if scene_file.area is None else scene_file.area.bounds
     axes = (None, None) if scene_file.frame is None else (scene_file.frame.up, scene_file.frame.north)
-    return _Asked(entries, path.parent, crs or frame, bounds, scene_file.heights, *axes)
+    return _SceneInput(entries, path.parent, crs or frame, bounds, scene_file.heights, *axes)
 
 
 def _turned(scene: Scene, rotation: FloatArray) -> Scene:
@@ -348,21 +349,21 @@ def _turned(scene: Scene, rotation: FloatArray) -> Scene:
     return replace(scene, views=tuple(views))
 
 
-def turn_to_z(up: tuple[float, float, float]) -> FloatArray:
+def rotation_to_z(up: tuple[float, float, float]) -> FloatArray:
     """The smallest rotation, (3, 3), that makes a direction the z axis; half a turn about x for minus z."""
     x, y, z = np.array(up) / np.max(np.abs(up))
     x, y, z = np.array([x, y, z]) / np.linalg.norm([x, y, z])
-    if z < -1.0 + OPPOSITE:
+    if z < -1.0 + OPPOSITE_TOLERANCE:
         return np.diag([1.0, -1.0, -1.0])
     # Rodrigues' formula about the axis up x z, with 1 + cosine = 1 + z.
     cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
 
 
-def turn_to_axes(up: tuple[float, float, float], north: tuple[float, float, float] | None) -> FloatArray:
+def rotation_to_axes(up: tuple[float, float, float], north: tuple[float, float, float] | None) -> FloatArray:
     """The rotation, (3, 3), that makes `up` the z axis and what of `north` is at right angles to it the y axis; without
     `north` the smallest one."""
-    rotation = turn_to_z(up)
+    rotation = rotation_to_z(up)
     if north is None:
         return rotation
     x, y, _ = rotation @ (np.array(north) / np.max(np.abs(north)))
@@ -375,7 +376,7 @@ def _is_along(up: tuple[float, float, float], north: tuple[float, float, float])
     if not any(north):
         return True
     one, other = (np.array(v) / np.max(np.abs(v)) for v in (up, north))
-    return bool(np.linalg.norm(np.cross(one, other)) < PARALLEL)
+    return bool(np.linalg.norm(np.cross(one, other)) < PARALLEL_TOLERANCE)
 
 
 def _frame_crs(frame: Frame, path: Path) -> CRS:
@@ -384,12 +385,12 @@ def _frame_crs(frame: Frame, path: Path) -> CRS:
     try:
         return checked_crs(CRS.from_user_input(frame.crs))
     except CRSError as error:
-        raise InputError(f"{path}: frame.crs {shown(frame.crs)} is no CRS. Write it as EPSG:n.") from error
+        raise InputError(f"{path}: frame.crs {quoted(frame.crs)} is no CRS. Write it as EPSG:n.") from error
     except ConfigError as error:
         raise ConfigError(f"{path}: frame.crs: {error}") from error
 
 
-def _default_crs(loaded: Sequence[_Loaded]) -> CRS:
+def _default_crs(loaded: Sequence[_OpenedView]) -> CRS:
     """The UTM zone of the mean of the images' centres (longitudes across the date line are neighbours)."""
     centres = []
     for each in loaded:
@@ -433,4 +434,4 @@ def _camera(value: Any, path: Path, where: str) -> Any:
     kind = value.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(f"{path}: {where}.kind is {kind!r}. Allowed: {', '.join(KINDS)}.")
-    return validated(KINDS[kind], value, path, where)
+    return validate_document(KINDS[kind], value, path, where)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from zlocus.core.errors import InputError
-from zlocus.io.safe_text import LARGEST, is_decimal, shown
+from zlocus.io.safe_text import MAX_MAGNITUDE, is_decimal, quoted
 
 
 def _plain(value: Any) -> Any:
@@ -19,8 +19,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-Number = Annotated[FiniteFloat, BeforeValidator(_plain), Field(ge=-LARGEST, le=LARGEST)]
-Whole = Annotated[int, BeforeValidator(_plain), Field(ge=-LARGEST, le=LARGEST)]
+FiniteNumber = Annotated[FiniteFloat, BeforeValidator(_plain), Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+WholeNumber = Annotated[int, BeforeValidator(_plain), Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 
 
 class StrictModel(BaseModel):
@@ -46,7 +46,7 @@ SHORT.maxlevel, SHORT.maxstring, SHORT.maxother = 2, 80, 80
 Document = TypeVar("Document", bound=StrictModel)
 
 
-def validated(model: type[Document], document: Any, path: Path, where: str = "") -> Document:
+def validate_document(model: type[Document], document: Any, path: Path, where: str = "") -> Document:
     """The model of a document read from `path`, of which it is the part called `where`.
 
     Raises
@@ -88,4 +88,4 @@ def _empty_key(document: Any) -> str | None:
 def _key(key: Any) -> str:
     """A key as a message shows it: in one line, and only the beginning of a long one."""
     text = str(key)
-    return text if text.isprintable() and len(text) <= SHORT.maxstring else shown(text)
+    return text if text.isprintable() and len(text) <= SHORT.maxstring else quoted(text)

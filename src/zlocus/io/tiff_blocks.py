@@ -27,9 +27,9 @@ VALUE_TYPES = {3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}
 # Values of a list that are in memory at a time.
 VALUES_AT_ONCE = 1 << 20
 # A longer list takes more than seconds to read: that of a million pixels a side in blocks of 64 is as long.
-MOST_BLOCKS = 1 << 28
+MAX_BLOCKS = 1 << 28
 # Along each axis of the image, cells of whole blocks that are told apart.
-MOST_CELLS = 1024
+MAX_CELLS_PER_AXIS = 1024
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ def held_in_blocks(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
     n_down, n_across = -(-source.height // rows), -(-source.width // cols)
     n_of_band = n_down * n_across
     n_blocks = n_of_band * (source.count if source.interleaving == Interleaving.band else 1)
-    if n_blocks > MOST_BLOCKS:
+    if n_blocks > MAX_BLOCKS:
         raise InputError(
-            f"{path} is cut into {n_blocks} blocks of pixels, and at most {MOST_BLOCKS} are read. Write it with larger "
+            f"{path} is cut into {n_blocks} blocks of pixels, and at most {MAX_BLOCKS} are read. Write it with larger "
             "blocks: gdal_translate -co TILED=YES."
         )
-    down, across = -(-n_down // MOST_CELLS), -(-n_across // MOST_CELLS)
+    down, across = -(-n_down // MAX_CELLS_PER_AXIS), -(-n_across // MAX_CELLS_PER_AXIS)
     held, is_sparse = np.zeros((-(-n_down // down), -(-n_across // across)), bool), False
     size = os.path.getsize(path)
     for first, offsets, lengths in _blocks(source, path, n_blocks):

@@ -12,13 +12,13 @@ from zlocus.core.scene import ImageSource, ImageWindow
 
 # No sensor has larger grey values: those of 32-bit integers end here. The square of a larger number, summed over an
 # image, leaves the range of float32.
-LARGEST_GREY = 2.0**32
+MAX_GREY_VALUE = 2.0**32
 # A border of one value is looked for at so many places along every side of an image, and is at least so many pixels
 # wide at one of them.
-PLACES, LEAST_WIDTH_PX = 24, 8
+PLACES_PER_SIDE, MIN_PLATEAU_WIDTH_PX = 24, 8
 # It fills at least this share of the image; less is a dark corner or a bright roof. And it holds at least this share of
 # the pixels of its value; else the value is a grey value that the image has elsewhere too, as a saturated one has.
-LEAST_SHARE, LEAST_SHARE_OF_VALUE = 1e-3, 0.5
+MIN_PLATEAU_SHARE, MIN_SHARE_OF_VALUE = 1e-3, 0.5
 BAND_ROWS = 256  # read at a time
 
 
@@ -48,7 +48,7 @@ class BorderPlateau:
     def n_pixels(self) -> int:
         """How many pixels belong to it."""
         n_cols = len(self.top)
-        return sum(int(self.covers(row, 0, rows, n_cols).sum()) for row, rows in bands(len(self.left)))
+        return sum(int(self.covers(row, 0, rows, n_cols).sum()) for row, rows in row_bands(len(self.left)))
 
 
 def border_plateau(image: ImageSource) -> BorderPlateau | None:
@@ -68,7 +68,7 @@ def border_plateau(image: ImageSource) -> BorderPlateau | None:
     left, right = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     first_other, last_other = np.full(cols, rows), np.full(cols, -1)
     n_of_value = 0
-    for row, count in bands(rows):
+    for row, count in row_bands(rows):
         window = image.read(row, 0, count, cols)
         n_of_value += int((window.valid & (window.pixels == value)).sum())
         is_other = window.valid & (window.pixels != value)
@@ -79,19 +79,21 @@ def border_plateau(image: ImageSource) -> BorderPlateau | None:
         first_other[here] = np.minimum(first_other[here], row + is_other[:, here].argmax(axis=0))
         last_other[here] = row + count - 1 - is_other[::-1, here].argmax(axis=0)
     found = BorderPlateau(value, left, right, first_other.astype(np.int64), (rows - 1 - last_other).astype(np.int64))
-    is_large = found.n_pixels >= LEAST_SHARE * rows * cols
-    return found if is_large and found.n_pixels >= LEAST_SHARE_OF_VALUE * n_of_value else None
+    is_large = found.n_pixels >= MIN_PLATEAU_SHARE * rows * cols
+    return found if is_large and found.n_pixels >= MIN_SHARE_OF_VALUE * n_of_value else None
 
 
 def _value_at_border(image: ImageSource) -> float | None:
     """The value of a plateau at the border, where several neighbours towards the inside have the same; None of none."""
     rows, cols = image.shape
-    depth = LEAST_WIDTH_PX
+    depth = MIN_PLATEAU_WIDTH_PX
     if min(rows, cols) < 4 * depth:
         return None
     votes: dict[float, int] = {}
-    across = [(int(row), col, 1, depth) for row in np.linspace(0, rows - 1, PLACES) for col in (0, cols - depth)]
-    down = [(row, int(col), depth, 1) for col in np.linspace(0, cols - 1, PLACES) for row in (0, rows - depth)]
+    across = [
+        (int(row), col, 1, depth) for row in np.linspace(0, rows - 1, PLACES_PER_SIDE) for col in (0, cols - depth)
+    ]
+    down = [(row, int(col), depth, 1) for col in np.linspace(0, cols - 1, PLACES_PER_SIDE) for row in (0, rows - depth)]
     for place in (*across, *down):
         window = image.read(*place)
         first = float(window.pixels.flat[0])
@@ -101,7 +103,7 @@ def _value_at_border(image: ImageSource) -> float | None:
 
 
 @dataclass(frozen=True)
-class AbsurdValues:
+class TooLargeValues:
     """Pixels whose value is larger than any grey value.
 
     n_pixels : how many, of `n_known` that hold a finite number; largest : the largest magnitude of all.
@@ -112,28 +114,28 @@ class AbsurdValues:
     largest: float
 
 
-def absurd_values(shape: tuple[int, int], read: Callable[[int, int], NDArray[np.floating]]) -> AbsurdValues:
-    """Count the values beyond `LARGEST_GREY`.
+def count_too_large_values(shape: tuple[int, int], read: Callable[[int, int], NDArray[np.floating]]) -> TooLargeValues:
+    """Count the values beyond `MAX_GREY_VALUE`.
 
     read : gives some rows, from the first of them and their number, (r, c) float.
     """
     n_pixels, n_known, largest = 0, 0, 0.0
-    for row, count in bands(shape[0]):
+    for row, count in row_bands(shape[0]):
         magnitude = np.abs(read(row, count))
         magnitude = magnitude[np.isfinite(magnitude)]
         n_known += magnitude.size
-        n_pixels += int((magnitude > LARGEST_GREY).sum())
+        n_pixels += int((magnitude > MAX_GREY_VALUE).sum())
         largest = max(largest, float(magnitude.max(initial=0.0)))
-    return AbsurdValues(n_pixels, n_known, largest)
+    return TooLargeValues(n_pixels, n_known, largest)
 
 
-def bands(n_rows: int) -> Iterator[tuple[int, int]]:
+def row_bands(n_rows: int) -> Iterator[tuple[int, int]]:
     """First row and number of rows of the parts in which an image is read as a whole."""
     for row in range(0, n_rows, BAND_ROWS):
         yield row, min(BAND_ROWS, n_rows - row)
 
 
-def without(window: ImageWindow, dropped: NDArray[np.bool_]) -> ImageWindow:
+def drop_pixels(window: ImageWindow, dropped: NDArray[np.bool_]) -> ImageWindow:
     """A window in which some pixels (r, c) are not valid."""
     if not dropped.any():
         return window

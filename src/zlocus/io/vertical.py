@@ -28,7 +28,7 @@ from zlocus.io.geoid import GeoidRaster
 Float = TypeVar("Float", np.float32, np.float64)
 ELLIPSOID = "ellipsoid"
 # Points a side at which the posts under an area are looked at.
-LEAST_POINTS, MOST_POINTS = 9, 513
+MIN_POINTS_PER_SIDE, MAX_POINTS_PER_SIDE = 9, 513
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,13 @@ class VerticalDatum:
         """Its height above the ellipsoid, (n,) m, at points (n, 2) of a CRS; see `GeoidRaster.undulation`."""
         return np.zeros(len(xy)) if self.geoid is None else self.geoid.undulation(xy, crs)
 
-    def of_points(self, xyz: FloatArray, crs: CRS) -> FloatArray:
+    def points_from_ellipsoidal(self, xyz: FloatArray, crs: CRS) -> FloatArray:
         """Points (n, 3) m of a CRS, ellipsoidal heights made heights above it; NaN where its raster has no value."""
         if self.geoid is None:
             return xyz
         return np.column_stack([xyz[:, :2], xyz[:, 2] - self.geoid.known_undulation(xyz[:, :2], crs)])
 
-    def of_cells(
+    def heights_from_ellipsoidal(
         self, ellipsoidal: NDArray[np.float32], geobox: GeoBox, row: int = 0, col: int = 0
     ) -> NDArray[np.float32]:
         """Heights above it of cells' centres, whose ellipsoidal heights are given.
@@ -92,8 +92,8 @@ class VerticalDatum:
         """
         return self._cells(ellipsoidal, geobox, row, col, -1.0)
 
-    def ellipsoidal_of_cells(self, heights: NDArray[Float], geobox: GeoBox) -> NDArray[Float]:
-        """Ellipsoidal heights of cells' centres, whose heights above it are given; (r, c) m, see `of_cells`."""
+    def ellipsoidal_from_heights(self, heights: NDArray[Float], geobox: GeoBox) -> NDArray[Float]:
+        """Ellipsoidal heights of cells' centres, whose heights above it are given; (r, c) m, see `heights_from_ellipsoidal`."""
         return self._cells(heights, geobox, 0, 0, 1.0)
 
     def _cells(self, heights: NDArray[Float], geobox: GeoBox, row: int, col: int, sign: float) -> NDArray[Float]:
@@ -117,9 +117,9 @@ class VerticalDatum:
         InputError
             See `GeoidRaster.undulation`.
         """
-        self.span(bounds, crs)
+        self.undulation_range(bounds, crs)
 
-    def span(self, bounds: tuple[float, float, float, float], crs: CRS) -> tuple[float, float]:
+    def undulation_range(self, bounds: tuple[float, float, float, float], crs: CRS) -> tuple[float, float]:
         """Lowest and highest undulation of an area, m; see `check_covers`."""
         if self.geoid is None:
             return 0.0, 0.0
@@ -127,14 +127,16 @@ class VerticalDatum:
         middle = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2])
         step = self.geoid.spacing_m(middle, crs) / 2
         n_x, n_y = (
-            int(np.clip(np.ceil(size / step) + 1, LEAST_POINTS, MOST_POINTS)) if np.isfinite(step) else LEAST_POINTS
+            int(np.clip(np.ceil(size / step) + 1, MIN_POINTS_PER_SIDE, MAX_POINTS_PER_SIDE))
+            if np.isfinite(step)
+            else MIN_POINTS_PER_SIDE
             for size in (xmax - xmin, ymax - ymin)
         )
         x, y = np.meshgrid(np.linspace(xmin, xmax, n_x), np.linspace(ymin, ymax, n_y))
         found = self.undulation(np.column_stack([x.ravel(), y.ravel()]), crs)
         return float(found.min()), float(found.max())
 
-    def compound(self, horizontal: CRS) -> CRS:
+    def compound_crs(self, horizontal: CRS) -> CRS:
         """The CRS of heights on a map: horizontal and vertical.
 
         Ellipsoidal heights keep the horizontal one: GeoTIFF has no projected CRS with ellipsoidal heights; GDAL (3.10)
@@ -146,11 +148,11 @@ class VerticalDatum:
         parts = CompoundCRS(name=f"{flat.name} + {self.crs.name}", components=[flat, self.crs])
         return CRS.from_wkt(parts.to_wkt())
 
-    def of_map(self, geobox: GeoBox) -> GeoBox:
+    def compound_geobox(self, geobox: GeoBox) -> GeoBox:
         """The same grid with the CRS of heights on it."""
         if self.crs is None:
             return geobox
-        return GeoBox(geobox.shape, geobox.transform, self.compound(grid_crs(geobox)))
+        return GeoBox(geobox.shape, geobox.transform, self.compound_crs(grid_crs(geobox)))
 
     def as_dict(self) -> dict[str, Any]:
         """As run.json has it."""
@@ -163,7 +165,7 @@ class VerticalDatum:
 
 ELLIPSOIDAL = VerticalDatum(ELLIPSOID)
 # What a surface made here says of its heights in its band's description, its CRS having no room for it.
-OWN_ELLIPSOIDAL = f"height above {ELLIPSOIDAL.surface}"
+ELLIPSOIDAL_DESCRIPTION = f"height above {ELLIPSOIDAL.surface}"
 
 
 def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
@@ -186,7 +188,7 @@ def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
     return VerticalDatum(given, geoid, _named(geoid.path))
 
 
-def vertical_datum_of(crs: CRS, path: Path, option: str) -> VerticalDatum:
+def declared_vertical_datum(crs: CRS, path: Path, option: str) -> VerticalDatum:
     """What the heights of a file are above by its CRS: the ellipsoid where that has no vertical part.
 
     option : that says it instead, for messages.

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element, fromstring
 
 from zlocus.core.errors import InputError
 from zlocus.io.safe_documents import read_xml
-from zlocus.io.safe_text import shown
+from zlocus.io.safe_text import quoted
 
 MARK = b"<vrtdataset"  # of a VRT, in small letters, within the bytes that GDAL looks at
 FIRST_BYTES = 1024
@@ -24,18 +24,18 @@ REMOTE = ("vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift",
 # How files begin that hold other files.
 ARCHIVES = {b"PK\x03\x04": "ZIP", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7-Zip", b"Rar!": "RAR", b"BZh": "bzip2"}
 # Parts of a VRT whose words name no files, whatever they look like, with all that stands in them.
-NO_NAMES = frozenset((
+ELEMENTS_WITHOUT_NAMES = frozenset((
     "categorynames", "colortable", "description", "expression", "gcplist", "gdalrasterattributetable", "histograms",
     "lut", "pixelfunctiontype", "srs", "unittype",
 ))  # fmt: skip
-FILES = frozenset(("sourcefilename", "sourcedataset", "dempath", "x_dataset", "y_dataset"))
+FILE_ELEMENTS = frozenset(("sourcefilename", "sourcedataset", "dempath", "x_dataset", "y_dataset"))
 # Of GDAL: virtual files, and names of anything that is no file, such as an address, WMS:..., or a document.
 NOT_A_FILE = re.compile(r"\s*(?:/vsi|[<{]|[A-Za-z][\w+.-]+:)")
 ADVICE = "Give the images themselves, or a list of plain files that lie on this machine."
 
 
 @dataclass(frozen=True)
-class _Entry:
+class _VrtText:
     """A word of a VRT. name : of its element or attribute, in small letters; inside : the element that it belongs to,
     where GDAL looks for what else is said of it."""
 
@@ -71,8 +71,8 @@ def check_served(path: Path, text: str) -> None:
     """
     servers = tuple(f"/{name}/" for name in REMOTE)
     for entry in _entries(fromstring(text)):
-        if entry.name in FILES and not _is_relative(path, entry) and not entry.text.startswith(servers):
-            raise InputError(f"{path} lies on a server and names {shown(entry.text)}, which lies on none. {ADVICE}")
+        if entry.name in FILE_ELEMENTS and not _is_relative(path, entry) and not entry.text.startswith(servers):
+            raise InputError(f"{path} lies on a server and names {quoted(entry.text)}, which lies on none. {ADVICE}")
         _refuse_code(path, entry)
         if _is_raw(entry):
             raise InputError(f"{path} lies on a server and takes the bytes of files for pixels. {ADVICE}")
@@ -84,51 +84,51 @@ def _check(path: Path, size: int, time_ns: int, above: tuple[Path, ...]) -> None
     root = read_xml(path)
     for entry in _entries(root):
         if NOT_A_FILE.match(entry.text):
-            raise InputError(f"{path} is a list of files and names {shown(entry.text)}, which is none. {ADVICE}")
-        if entry.name in FILES:
+            raise InputError(f"{path} is a list of files and names {quoted(entry.text)}, which is none. {ADVICE}")
+        if entry.name in FILE_ELEMENTS:
             _check_source(path, _source(path, entry), above)
         _refuse_code(path, entry)
         if _is_raw(entry):
             _check_raw(path, entry.inside)
 
 
-def _entries(element: Element, above: Element | None = None) -> Iterator[_Entry]:
+def _entries(element: Element, above: Element | None = None) -> Iterator[_VrtText]:
     """All that may be said in a VRT. To GDAL an attribute is as good as an element within."""
     name = _name(element.tag)
-    if name in NO_NAMES or name.endswith("srs"):
+    if name in ELEMENTS_WITHOUT_NAMES or name.endswith("srs"):
         return
     if name == "mdi":
         # Metadata say what they like, but for the files that places are taken from.
         key = element.attrib.get("key", "").lower()
-        if key in FILES and element.text:
-            yield _Entry(key, element.text.strip(), element)
+        if key in FILE_ELEMENTS and element.text:
+            yield _VrtText(key, element.text.strip(), element)
         return
     if text := (element.text or "").strip():
-        yield _Entry(name, text, element if above is None or name in FILES else above)
+        yield _VrtText(name, text, element if above is None or name in FILE_ELEMENTS else above)
     for key, value in element.attrib.items():
-        yield _Entry(_name(key), value.strip(), element)
+        yield _VrtText(_name(key), value.strip(), element)
     for child in element:
         yield from _entries(child, element)
 
 
-def _source(path: Path, entry: _Entry) -> Path:
+def _source(path: Path, entry: _VrtText) -> Path:
     """The file that an entry names. GDAL starts where the list itself lies, not a link to it."""
     return path.resolve().parent / entry.text if _is_relative(path, entry) else Path(entry.text)
 
 
-def _is_relative(path: Path, entry: _Entry) -> bool:
+def _is_relative(path: Path, entry: _VrtText) -> bool:
     """Whether the file that an entry names is looked for from where the list lies."""
     said = next((e.text for e in _entries(entry.inside) if e.name == "relativetovrt"), "0")
     if said not in ("0", "1"):
-        raise InputError(f"{path} is a list of files in which relativeToVRT is {shown(said)}, not 0 or 1. {ADVICE}")
+        raise InputError(f"{path} is a list of files in which relativeToVRT is {quoted(said)}, not 0 or 1. {ADVICE}")
     return said == "1"
 
 
-def _is_raw(entry: _Entry) -> bool:
+def _is_raw(entry: _VrtText) -> bool:
     return entry.name == "subclass" and entry.text.lower() == "vrtrawrasterband"
 
 
-def _refuse_code(path: Path, entry: _Entry) -> None:
+def _refuse_code(path: Path, entry: _VrtText) -> None:
     if entry.name == "pixelfunctionlanguage" and entry.text.lower() != "c":
         raise InputError(f"{path} is a list of files and holds code, which is not run. {ADVICE}")
 
@@ -140,7 +140,7 @@ def _check_source(path: Path, source: Path, above: tuple[Path, ...]) -> None:
             first = file.read(FIRST_BYTES)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path} is a list of files and names {shown(str(source))}, which cannot be read. Check its paths."
+            f"{path} is a list of files and names {quoted(str(source))}, which cannot be read. Check its paths."
         ) from error
     if is_virtual(first):
         if source in above or source.resolve() == path.resolve():
@@ -151,7 +151,7 @@ def _check_source(path: Path, source: Path, above: tuple[Path, ...]) -> None:
     text = first.removeprefix(b"\xef\xbb\xbf").lstrip()
     if text.startswith((b"<", b"{", *ARCHIVES)) or ".gti." in source.name.lower():
         raise InputError(
-            f"{path} is a list of files and names {shown(str(source))}, which holds no pixels itself. {ADVICE}"
+            f"{path} is a list of files and names {quoted(str(source))}, which holds no pixels itself. {ADVICE}"
         )
 
 
@@ -162,7 +162,7 @@ def _check_raw(path: Path, band: Element) -> None:
             source = _source(path, entry)
             if not source.resolve().is_relative_to(path.resolve().parent):
                 raise InputError(
-                    f"{path} is a list of files and takes the bytes of {shown(str(source))} for pixels, which does not "
+                    f"{path} is a list of files and takes the bytes of {quoted(str(source))} for pixels, which does not "
                     f"lie beside it. {ADVICE}"
                 )
 

@@ -91,10 +91,10 @@ def check_ties(orientation: Orientation, scene: Scene) -> None:
         There are fewer than `MIN_TIES`.
     """
     if len(orientation.measured) < MIN_TIES:
+        names = some_names([view.name for view in scene.views])
         raise GeometryError(
-            f"Only {len(orientation.measured)} tie points were found between {some_names([v.name for v in scene.views])}, "
-            f"too few to orient the cameras ({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check that the images "
-            "overlap."
+            f"Only {len(orientation.measured)} tie points were found between {names}, too few to orient the cameras "
+            f"({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check that the images overlap."
         )
 
 

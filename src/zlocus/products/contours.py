@@ -15,7 +15,7 @@ from zlocus.core.errors import ConfigError
 from zlocus.core.options import ProductOptions
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import local_frame
-from zlocus.io.row_strips import STRIP_ROWS, ReadBand, strips_of
+from zlocus.io.row_strips import STRIP_ROWS, BandReader, strips_of
 from zlocus.products.tie_layers import Batch, write_features
 
 # By default so many contours at most within two standard deviations of the mean height, and no nearer than this.
@@ -51,7 +51,7 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
     """
     from shapely import linestrings
 
-    with ReadBand(raster) as heights:
+    with BandReader(raster) as heights:
         interval = options.contour_interval_m or nice_interval(heights.statistic("STDDEV") or 0.0)
         _check_number(heights, interval, raster)
         transform, crs = heights.geobox.transform, heights.crs or local_frame()
@@ -138,7 +138,7 @@ class _Stitcher:
 
 
 def contours(
-    heights: ReadBand, interval_m: float, strip_rows: int = STRIP_ROWS, least_cells: float = 0.0
+    heights: BandReader, interval_m: float, strip_rows: int = STRIP_ROWS, least_cells: float = 0.0
 ) -> Iterator[tuple[int, FloatArray]]:
     """Heights in intervals, and lines (n, 2) as (column, row), (0, 0) the first cell's centre; from low to high, those
     of one height by their first points, from north to south; without closed ones shorter than `least_cells`.
@@ -222,7 +222,7 @@ def _on_map(line: FloatArray, transform: Affine) -> FloatArray:
     return np.column_stack([transform.a * col + transform.c, transform.e * row + transform.f])
 
 
-def _check_number(heights: ReadBand, interval_m: float, raster: Path) -> None:
+def _check_number(heights: BandReader, interval_m: float, raster: Path) -> None:
     low, high = heights.statistic("MINIMUM") or 0.0, heights.statistic("MAXIMUM") or 0.0
     if (high - low) / interval_m > MOST_LEVELS:
         raise ConfigError(

@@ -13,7 +13,7 @@ import numpy as np
 from zlocus.core.errors import ConfigError
 from zlocus.core.scene import Scene, View, is_local
 from zlocus.core.sensor_model import SensorModel
-from zlocus.io.cameras.camera_entry import Camera
+from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.cameras.linescan import LineScanCamera
@@ -36,7 +36,7 @@ SCENE = "scene.yaml"
 class WrittenCamera:
     """entry : for the scene file; fit_px : largest error of an RPC that was fitted, None where it is exact."""
 
-    entry: Camera
+    entry: CameraEntry
     fit_px: float | None = None
 
 
@@ -70,7 +70,7 @@ def write_cameras(out: Path, inputs: Sequence[Path], oriented: Scene) -> dict[st
     return record
 
 
-def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[Camera, Path]]:
+def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]:
     """The cameras of a scene file by view, and the folder their paths start at; none of images alone."""
     (first, *_) = inputs
     if first.suffix.lower() not in SCENE_SUFFIXES:
@@ -78,7 +78,7 @@ def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[Camera, Path]]:
     return {view.name: (view.camera, first.parent) for view in read_scene_file(first).views}
 
 
-def write_camera(out: Path, name: str, camera: Camera, folder: Path, view: View, scene: Scene) -> WrittenCamera:
+def write_camera(out: Path, name: str, camera: CameraEntry, folder: Path, view: View, scene: Scene) -> WrittenCamera:
     """Write the camera of a view. camera : as it was given, with paths from `folder`."""
     if isinstance(camera, FrameCamera):
         return WrittenCamera(frame_entry(camera, view.sensor, scene))

@@ -12,7 +12,7 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from zlocus.core.options import ProductOptions
-from zlocus.io.run_record import write_whole
+from zlocus.io.run_record import write_atomically
 from zlocus.products.hillshade import hillshade
 from zlocus.products.shade_kernel import BRIGHTEST, DARKEST
 
@@ -44,7 +44,7 @@ def picture_beside_truth(dsm: Path, truth: Path, path: Path, side: int = 480) ->
     ]
     gap = np.full((panels[0].shape[0], GAP, 3), 255, np.uint8)
     done, png = cv2.imencode(".png", np.hstack([panels[0], gap, panels[1], gap, panels[2]]))
-    write_whole(path, lambda part: part.write_bytes(png.tobytes() if done else b""))
+    write_atomically(path, lambda part: part.write_bytes(png.tobytes() if done else b""))
 
 
 def relief(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import ProductOptions
 from zlocus.io.rasters import RasterSink
-from zlocus.io.row_strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
+from zlocus.io.row_strips import STRIP_ROWS, BandReader, Strip, check_same_grid, strips_of
 from zlocus.matching.quality import Quality
 from zlocus.products.smrf import between_blocks, block_least, block_mean, membrane, outside_of, terrain
 
@@ -36,8 +36,8 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
     OutputError
         The terrain cannot be written.
     """
-    with ReadBand(dsm) as heights, ReadBand(quality) as flags:
-        same_grid([heights, flags])
+    with BandReader(dsm) as heights, BandReader(quality) as flags:
+        check_same_grid([heights, flags])
         side = _cells_of_a_block(heights, options)
         # Blocks lie within one strip.
         strip_rows = max(1, strip_rows // side) * side
@@ -70,13 +70,13 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
                 sink.write(strip.row, 0, np.where(gap, between_blocks(filled, side, strip.row, ground.shape), ground))
 
 
-def _cells_of_a_block(heights: ReadBand, options: ProductOptions) -> int:
+def _cells_of_a_block(heights: BandReader, options: ProductOptions) -> int:
     """Cells along the side of a block in which ground is looked for."""
     rows, cols = heights.geobox.shape
     return max(1, round(options.ground_cell_m / heights.cell_m), int(np.ceil(np.sqrt(rows * cols / MOST_CELLS))))
 
 
-def _by_blocks(heights: ReadBand, side: int, strip_rows: int) -> FloatImage:
+def _by_blocks(heights: BandReader, side: int, strip_rows: int) -> FloatImage:
     """Lowest height of each block, (r, c)."""
     strips = strips_of(heights.geobox.shape[0], 0, strip_rows)
     return np.concatenate([block_least(heights.read(strip), side) for strip in strips])

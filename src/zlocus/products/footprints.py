@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
 from zlocus.core.scene import is_local
-from zlocus.io.run_record import write_whole
+from zlocus.io.run_record import write_atomically
 
 SIDE_PX, RIM_PX, CAPTION_PX = 900, 24, 40
 INK, PAPER, ALONE = (40, 40, 40), (255, 255, 255), (225, 225, 225)
@@ -39,7 +39,7 @@ def write_footprints(path: Path, features: Sequence[Feature], crs: CRS) -> None:
         for polygon, properties in features
     ]
     text = json.dumps(collection, indent=1, allow_nan=False) + "\n"
-    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def footprints_picture(path: Path, outlines: Sequence[Any], names: Sequence[str]) -> None:
@@ -77,7 +77,7 @@ def footprints_picture(path: Path, outlines: Sequence[Any], names: Sequence[str]
     wide[:, :cols] = picture
     done, png = cv2.imencode(".png", np.vstack([strip, wide]))
     assert done, "memory is all it needs"
-    write_whole(path, lambda part: part.write_bytes(png.tobytes()))
+    write_atomically(path, lambda part: part.write_bytes(png.tobytes()))
 
 
 def overlap_colours(count: NDArray[np.int32]) -> NDArray[np.uint8]:

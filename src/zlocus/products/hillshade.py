@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import ProductOptions
 from zlocus.io.rasters import RasterSink
-from zlocus.io.row_strips import STRIP_ROWS, ReadBand, strips_of
+from zlocus.io.row_strips import STRIP_ROWS, BandReader, strips_of
 from zlocus.products.shade_kernel import shade_cells
 
 NO_SHADE = 0
@@ -29,9 +29,9 @@ def write_hillshade(dsm: Path, path: Path, options: ProductOptions, strip_rows: 
         The hillshade cannot be written.
     """
     with (
-        ReadBand(dsm) as heights,
+        BandReader(dsm) as heights,
         RasterSink(
-            path, heights.flat_geobox, "uint8", nodata=NO_SHADE, descriptions=("hillshade",), average=True
+            path, heights.horizontal_geobox, "uint8", nodata=NO_SHADE, descriptions=("hillshade",), average=True
         ) as sink,
     ):
         for strip in strips_of(heights.geobox.shape[0], 1, strip_rows):

@@ -1,4 +1,4 @@
-"""orientation.json: what the orientation found, per image, sensor and control point (see docs/orientation.md)."""
+"""orientation.json: what the orientation found, per image, sensor and control point (see docs/how-to/orient.md)."""
 
 from __future__ import annotations
 

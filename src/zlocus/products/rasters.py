@@ -46,7 +46,7 @@ class SurfaceRasters:
         with ExitStack() as undo:
             undo.push(self._stack)
             above = f"height above {vertical.surface}"
-            self._dsm = sink("dsm.tif", "float32", above, box=vertical.of_map(geobox), nodata=float("nan"), units="m")
+            self._dsm = sink("dsm.tif", "float32", above, box=vertical.compound_geobox(geobox), nodata=float("nan"), units="m")
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
             self._quality = sink("quality.tif", "uint16", "quality bit flags")
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
@@ -55,7 +55,7 @@ class SurfaceRasters:
 
     def write(self, row: int, col: int, surface: Surface) -> None:
         """Put a block of cells with its first cell at (row, col) of the grid."""
-        self._dsm.write(row, col, self._vertical.of_cells(surface.height, self._geobox, row, col))
+        self._dsm.write(row, col, self._vertical.heights_from_ellipsoidal(surface.height, self._geobox, row, col))
         self._sigma.write(row, col, surface.sigma)
         self._quality.write(row, col, surface.quality)
         self._views.write(row, col, surface.views)

@@ -15,10 +15,10 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS, Transformer
 
 from zlocus.core.scene import is_local
-from zlocus.io.crs import named_crs
+from zlocus.io.crs import crs_label
 from zlocus.io.open_raster import open_raster
-from zlocus.io.row_strips import ReadBand
-from zlocus.io.run_record import read_record, write_whole
+from zlocus.io.row_strips import BandReader
+from zlocus.io.run_record import read_record, write_atomically
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
@@ -77,7 +77,7 @@ def write_item(folder: Path) -> bool:
     # A fifth of a second.
     import pystac
 
-    with ReadBand(folder / "dsm.tif") as heights:
+    with BandReader(folder / "dsm.tif") as heights:
         geobox, crs, cell_m, what = heights.geobox, heights.crs, heights.cell_m, heights.description
     if crs is None or is_local(crs):
         return False
@@ -92,7 +92,7 @@ def write_item(folder: Path) -> bool:
         end_datetime=taken.last,
         properties={
             "title": "Digital surface model", "description": taken.description, "gsd": cell_m,
-            "created": _text(taken.made), "zlocus:crs": named_crs(crs), "zlocus:heights": what,
+            "created": _text(taken.made), "zlocus:crs": crs_label(crs), "zlocus:heights": what,
         },
     )  # fmt: skip
     for product in PRODUCTS:
@@ -102,7 +102,7 @@ def write_item(folder: Path) -> bool:
             item.add_asset(product.name.replace(".", "-"), asset)
     record = item.to_dict(include_self_link=False, transform_hrefs=False)
     text = json.dumps(record, indent=2, allow_nan=False) + "\n"
-    write_whole(folder / "item.json", lambda part: part.write_text(text, encoding="utf-8"))
+    write_atomically(folder / "item.json", lambda part: part.write_text(text, encoding="utf-8"))
     return True
 
 

@@ -14,7 +14,7 @@ from zlocus import __version__
 from zlocus.core.errors import OutputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.row_strips import STRIP_ROWS, ReadBand, Strip, same_grid, strips_of
+from zlocus.io.row_strips import STRIP_ROWS, BandReader, Strip, check_same_grid, strips_of
 from zlocus.products.point_cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, SIGMA, VIEWS, add_crs, add_precision
 
 # Grey values from which on points are white, in standard deviations above the mean; of 8 bits: all are shown.
@@ -39,10 +39,10 @@ def write_surface_points(folder: Path, path: Path, strip_rows: int = STRIP_ROWS)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with (
-            ReadBand(folder / SOURCES[0]) as heights, ReadBand(folder / SOURCES[1]) as sigmas,
-            ReadBand(folder / SOURCES[2]) as views, ReadBand(folder / SOURCES[3]) as ortho,
+            BandReader(folder / SOURCES[0]) as heights, BandReader(folder / SOURCES[1]) as sigmas,
+            BandReader(folder / SOURCES[2]) as views, BandReader(folder / SOURCES[3]) as ortho,
         ):  # fmt: skip
-            same_grid([heights, sigmas, views, ortho])
+            check_same_grid([heights, sigmas, views, ortho])
             white = _white_level(ortho)
             with laspy.open(part, "w", header=_header(heights), do_compress=True) as laz:
                 for strip in strips_of(heights.geobox.shape[0], 0, strip_rows):
@@ -72,7 +72,7 @@ def write_surface_points(folder: Path, path: Path, strip_rows: int = STRIP_ROWS)
     return n_points
 
 
-def _header(heights: ReadBand) -> laspy.LasHeader:
+def _header(heights: BandReader) -> laspy.LasHeader:
     """What stands before the points, the same for any run on a grid but for the day."""
     header = laspy.LasHeader(point_format=7, version="1.4")
     box = heights.geobox.extent.boundingbox
@@ -87,7 +87,7 @@ def _header(heights: ReadBand) -> laspy.LasHeader:
     return header
 
 
-def _centres(heights: ReadBand, strip: Strip) -> FloatArray:
+def _centres(heights: BandReader, strip: Strip) -> FloatArray:
     """Easting and northing of the cells of a strip, (2, r, c) m."""
     transform, cols = heights.geobox.transform, heights.geobox.shape[1]
     x = transform.c + transform.a * (np.arange(cols) + 0.5)
@@ -95,7 +95,7 @@ def _centres(heights: ReadBand, strip: Strip) -> FloatArray:
     return np.stack(np.broadcast_arrays(x, y[:, None]))
 
 
-def _white_level(ortho: ReadBand) -> float:
+def _white_level(ortho: BandReader) -> float:
     """The grey value that is shown white."""
     if ortho.dtype == "uint8":
         return 255.0
@@ -103,7 +103,7 @@ def _white_level(ortho: ReadBand) -> float:
     return max(min(largest, mean + WHITE_DEVIATIONS * deviation), 1e-6)
 
 
-def _colours(ortho: ReadBand, strip: Strip, white: float) -> NDArray[np.uint16]:
+def _colours(ortho: BandReader, strip: Strip, white: float) -> NDArray[np.uint16]:
     """Red, green and blue of the cells of a strip, (3, r, c), white 65535; black where the ortho-image has none."""
     bands, valid = ortho.read_bands(strip)
     rgb = bands[:3] if len(bands) >= 3 else np.repeat(bands[:1], 3, axis=0)

@@ -18,7 +18,7 @@ from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.match_curve import FAIR, GOOD
-from zlocus.matching.view_ranking import NOT_RANKED, RankedPoints
+from zlocus.matching.view_ranking import NOT_RANKED, LabelledTies
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.triangulate import project_points
 
@@ -53,18 +53,18 @@ def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: 
     order = np.lexsort((seen.view, seen.point))
     for point, view in zip(seen.point[order].tolist(), seen.view[order].tolist(), strict=True):
         names[point].append(oriented.views[view].name)
-    xyz = vertical.of_points(xyz, oriented.crs)
+    xyz = vertical.points_from_ellipsoidal(xyz, oriented.crs)
     kept = np.isfinite(xyz).all(axis=1)
     images = np.array([",".join(parts) for parts in names], dtype=object)
     columns: dict[str, NDArray[np.generic]] = {
         "height_m": xyz[:, 2], "sigma_z_m": orientation.sigma_z_m, "n_images": n_images, "images": images,
         "residual_px": residual,
     }  # fmt: skip
-    crs = vertical.compound(oriented.crs)
+    crs = vertical.compound_crs(oriented.crs)
     write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, crs)
 
 
-def label_counts(ranked: Sequence[RankedPoints], n_views: int) -> NDArray[np.int64]:
+def label_counts(ranked: Sequence[LabelledTies], n_views: int) -> NDArray[np.int64]:
     """How often each label was given, (3, i, i) int64: good, fair and poor, of the search image (last axis) against the
     reference; 0 where the two were not compared."""
     counts = np.zeros((3, n_views, n_views), np.int64)
@@ -89,7 +89,7 @@ def counted_pairs(counts: NDArray[np.int64], names: Sequence[str]) -> list[dict[
 
 
 def write_ranking(
-    path: Path, ranked: Sequence[RankedPoints], names: Sequence[str], crs: CRS, vertical: VerticalDatum = ELLIPSOIDAL
+    path: Path, ranked: Sequence[LabelledTies], names: Sequence[str], crs: CRS, vertical: VerticalDatum = ELLIPSOIDAL
 ) -> None:
     """Layer `ranking`: one 3-D point per ranked tie point and reference, from south-west to north-east.
 
@@ -108,7 +108,7 @@ def write_ranking(
     labels_of_none = np.zeros((0, len(names)), np.int16) if is_wide else np.zeros(0, object)
     nothing = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int32), labels_of_none)
     xyz, reference, n_good, labels = (np.concatenate(arrays) for arrays in zip(nothing, *parts, strict=True))
-    xyz = vertical.of_points(xyz, crs)
+    xyz = vertical.points_from_ellipsoidal(xyz, crs)
     order = np.lexsort((reference, xyz[:, 1], xyz[:, 0]))
     order = order[np.isfinite(xyz[order, 2])]
     xyz, reference, n_good, labels = xyz[order], reference[order], n_good[order], labels[order]
@@ -121,7 +121,7 @@ def write_ranking(
             columns[name], nulls[name] = labels[:, i].copy(), labels[:, i] == NOT_RANKED
     else:
         columns[TEXT] = labels
-    write_points(path, "ranking", xyz, columns, vertical.compound(crs), nulls)
+    write_points(path, "ranking", xyz, columns, vertical.compound_crs(crs), nulls)
 
 
 def labels_in(text: str) -> dict[str, int]:

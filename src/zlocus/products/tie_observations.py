@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.io.run_record import write_whole
+from zlocus.io.run_record import write_atomically
 from zlocus.orientation.orientation import MeasuredTies
 
 OBSERVATIONS = "observations.npz"
@@ -25,7 +25,7 @@ def write_observations(folder: Path, ties: MeasuredTies) -> None:
     """
     content = io.BytesIO()
     np.savez_compressed(content, **ties.arrays())  # type: ignore[arg-type]
-    write_whole(folder / OBSERVATIONS, lambda part: part.write_bytes(content.getbuffer()))
+    write_atomically(folder / OBSERVATIONS, lambda part: part.write_bytes(content.getbuffer()))
 
 
 def read_observations(folder: Path, n_views: int) -> MeasuredTies | None:

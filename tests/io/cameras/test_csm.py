@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from csm_states import COLUMNS, ROWS, state
 from rpc_fixtures import write_image
 from zlocus.core.errors import InputError
-from zlocus.io.cameras.csm import MODEL, convert_csm, lagrange, read_csm
+from zlocus.io.cameras.csm import MODEL, convert_csm, lagrange_interpolated, read_csm
 from zlocus.io.scene_file import open_scene
 from zlocus.sensors.earth_frame import MAJOR_M, MINOR_M, WGS84_EARTH, east_north_up
 
@@ -26,8 +26,8 @@ def usgscsm_sight(s, line, sample):
     """Centre and (unsigned) direction as UsgsAstroLsSensorModel::losToEcf has them, at CSM's line and sample."""
     piece = max(np.searchsorted(s["m_intTimeLines"], line, side="right") - 1, 0)
     time = s["m_intTimeStartTimes"][piece] + s["m_intTimes"][piece] * (line - s["m_intTimeLines"][piece] + 0.5)
-    centre = lagrange(np.reshape(s["m_positions"], (-1, 3)), s["m_t0Ephem"], s["m_dtEphem"], np.array([time]), 8)[0]
-    q = lagrange(np.reshape(s["m_quaternions"], (-1, 4)), s["m_t0Quat"], s["m_dtQuat"], np.array([time]), 8)[0]
+    centre = lagrange_interpolated(np.reshape(s["m_positions"], (-1, 3)), s["m_t0Ephem"], s["m_dtEphem"], np.array([time]), 8)[0]
+    q = lagrange_interpolated(np.reshape(s["m_quaternions"], (-1, 4)), s["m_t0Quat"], s["m_dtQuat"], np.array([time]), 8)[0]
     x, y, z, w = q / np.linalg.norm(q)
     body = np.array([
         [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -94,9 +94,9 @@ def test_lagrange_is_exact_for_polynomials_of_its_order():
     coefficients = rng.normal(size=(8, 2))
     nodes = np.arange(12)[:, None] ** np.arange(8)
     at = rng.uniform(3.0, 8.0, 50)
-    found = lagrange(nodes @ coefficients, 0.0, 1.0, at, 8)
+    found = lagrange_interpolated(nodes @ coefficients, 0.0, 1.0, at, 8)
     np.testing.assert_allclose(found, (at[:, None] ** np.arange(8)) @ coefficients, rtol=1e-7)
-    ends = lagrange((nodes @ coefficients)[:, :1], 0.0, 1.0, np.array([0.25]), 8)
+    ends = lagrange_interpolated((nodes @ coefficients)[:, :1], 0.0, 1.0, np.array([0.25]), 8)
     np.testing.assert_allclose(ends, 0.75 * coefficients[0, 0] + 0.25 * coefficients[:, 0].sum())
 
 

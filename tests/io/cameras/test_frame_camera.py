@@ -11,7 +11,7 @@ from places import ROOT
 from rpc_fixtures import write_image
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.cameras.frame_camera import FrameCamera
-from zlocus.io.scene_file import open_scene, read_scene_file, turn_to_z, write_scene_file
+from zlocus.io.scene_file import open_scene, read_scene_file, rotation_to_z, write_scene_file
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace
 from zlocus.sensors.frame import rotation_from_angles
@@ -140,7 +140,7 @@ def test_ups_that_are_none(tmp_path, up, says):
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (0, -1, 0), (1, 2, 3), (1e-9, 0, -1), (1e300, -1e300, 0)])
 def test_the_smallest_turn_to_z(up):
-    rotation = turn_to_z(up)
+    rotation = rotation_to_z(up)
     unit = np.array(up) / np.max(np.abs(up))
     unit /= np.linalg.norm(unit)
     np.testing.assert_allclose(rotation @ unit, [0.0, 0.0, 1.0], atol=1e-8)
@@ -157,7 +157,7 @@ def test_up_turns_the_cameras(tmp_path):
         for up in ({}, {"up": [0, -1, 0]})
     )
     xyz = np.array([[1.1, -1.0, 2.3], [0.0, 1.0, 1.0]])
-    rotation = turn_to_z((0, -1, 0))
+    rotation = rotation_to_z((0, -1, 0))
     seen = plain.turned(np.diag([1.0, 1.0, 1.0])).image_from_ground(-xyz)
     np.testing.assert_allclose(turned.image_from_ground(-xyz @ rotation.T), seen, atol=1e-9)
     np.testing.assert_allclose(turned.centre, rotation @ np.array(pose["centre"]))
@@ -165,7 +165,7 @@ def test_up_turns_the_cameras(tmp_path):
 
 def test_the_entry_of_the_documents(tmp_path):
 
-    page = (ROOT / "docs" / "frame.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "frame.md").read_text(encoding="utf-8")
     start = page.index("```\ncamera:") + 4
     entry = yaml.safe_load(page[start : page.index("```", start)])["camera"]
     camera = FrameCamera.model_validate(entry)

@@ -27,7 +27,7 @@ from zlocus.io.cameras.linescan_files import (
     write_calibration,
     write_trajectory,
 )
-from zlocus.io.number_table import read_numbers, write_numbers
+from zlocus.io.number_table import read_number_table, write_number_table
 from zlocus.io.scene_file import open_scene
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, east_north_up
 from zlocus.sensors.linescan import LineScanModel, RectifiedModel
@@ -96,7 +96,7 @@ def test_a_scene_of_line_scanners(folder):
 
 
 def test_the_documented_scene_is_read(folder):
-    page = (ROOT / "docs" / "linescan.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "linescan.md").read_text(encoding="utf-8")
     example = page.split("```yaml\n")[1].split("```")[0]
     entry = yaml.safe_load(example)["camera"]
     camera = LineScanCamera.model_validate(entry)
@@ -112,7 +112,7 @@ def earth_path(folder, names, place, turns, crs, **given):
     n = 4001
     time = (np.arange(n) - 1500.0) * INTERVAL_S
     values = np.column_stack([time, place, np.broadcast_to(turns, (n, len(np.atleast_2d(turns)[0])))])
-    write_numbers(folder.path / "earth.csv", dict(zip(names.split(","), values.T, strict=True)), "by hand")
+    write_number_table(folder.path / "earth.csv", dict(zip(names.split(","), values.T, strict=True)), "by hand")
     return read_trajectory(
         folder.path / "earth.csv", crs, "earth", **({"boresight_deg": NOTHING, "lever_arm": NOTHING} | given)
     )
@@ -170,7 +170,7 @@ def test_lever_arm_and_boresight(folder):
 def test_sparse_calibration_is_filled_in(folder):
     x = np.arange(0, 1201, 100.0)
     file = folder.path / "sparse.csv"
-    write_numbers(file, {"column": x, "x_mm": 0.0065 * x + 1e-9 * x**2, "y_mm": 1e-11 * x**3}, "every hundredth")
+    write_number_table(file, {"column": x, "x_mm": 0.0065 * x + 1e-9 * x**2, "y_mm": 1e-11 * x**3}, "every hundredth")
     line = read_calibration(file, None, FOCAL_MM)
     column = np.arange(1201)
     np.testing.assert_allclose(line.xy_mm[:, 0], 0.0065 * column + 1e-9 * column**2.0, rtol=0, atol=1e-10)
@@ -363,13 +363,13 @@ def test_damaged_files_give_one_sentence_or_the_whole_table(tmp_path, kind, data
 def test_what_is_written_reads_back_equal(tmp_path):
     rng = np.random.default_rng(0)
     columns = {"time": np.cumsum(rng.random(50)), "x": rng.normal(size=50) * 1e6}
-    write_numbers(tmp_path / "t.csv", columns, "a comment", {"word": ["a", "b"] * 25})
-    table = read_numbers(tmp_path / "t.csv", "table", columns, ("word",))
+    write_number_table(tmp_path / "t.csv", columns, "a comment", {"word": ["a", "b"] * 25})
+    table = read_number_table(tmp_path / "t.csv", "table", columns, ("word",))
     for name, values in columns.items():
         np.testing.assert_array_equal(table.columns[name], values)
     assert table.labels == {"word": ("a", "b") * 25}
     with pytest.raises(OutputError, match="cannot be written"):
-        write_numbers(tmp_path / "none" / "t.csv", columns, "")
+        write_number_table(tmp_path / "none" / "t.csv", columns, "")
 
 
 def test_what_is_asked_for_stays_asked_for_whatever_is_read_first():

@@ -36,7 +36,6 @@ LOCAL = {
     "colmap-text": ("colmap", files.write_colmap, {}),
     **{f"colmap-{m}": ("colmap", lambda f, m=m: files.write_colmap(f, m, binary=True), {}) for m in files.COLMAP},
     "bundler": ("bundler", files.write_bundler, {}),
-    "strecha": ("strecha", files.write_strecha, {}),
     "eo": ("eo", files.write_eo, {"camera": True}),
     "eo-heading": ("eo", lambda f: files.write_eo(f, heading=True, delimiter=";"), {"camera": True}),
     **{f"opensfm-{p}": ("opensfm", lambda f, p=p: files.write_opensfm(f, p), {"local": True}) for p in files.OPENSFM},
@@ -93,7 +92,7 @@ def test_projects_as_the_program_does_on_the_earth(case, tmp_path):
 
 FIRST = {
     "colmap": (0.5, 0.5), "opensfm": (-31.5, -23.5), "metashape": (0.5, 0.5), "bundler": (-31.5, 23.5),
-    "eo": (0.0, 0.0), "strecha": (0.0, 0.0),
+    "eo": (0.0, 0.0),
 }  # fmt: skip
 
 
@@ -145,13 +144,13 @@ def test_the_scene_file_is_relative_and_whole(tmp_path):
 
 
 def test_a_scene_file_is_not_replaced_without_leave(tmp_path):
-    written = files.write_strecha(tmp_path / "p")
+    written = files.write_colmap(tmp_path / "p")
     out = tmp_path / "scene.yaml"
     out.write_text("mine")
     with pytest.raises(OutputError, match="--overwrite"):
-        import_scene(ImportRequest("strecha", written.folder, out))
+        import_scene(ImportRequest("colmap", written.folder, out))
     assert out.read_text() == "mine"
-    import_scene(ImportRequest("strecha", written.folder, out, overwrite=True))
+    import_scene(ImportRequest("colmap", written.folder, out, overwrite=True))
     assert out.read_text() != "mine"
 
 
@@ -178,8 +177,8 @@ def test_a_focal_length_alone_has_the_centre_of_the_image(tmp_path):
 
 
 def test_up_becomes_z(tmp_path):
-    written = files.write_strecha(tmp_path / "p")
-    plain, turned = (imported("strecha", written, **options) for options in ({}, {"up": (1.0, 2.0, -3.0)}))
+    written = files.write_colmap(tmp_path / "p")
+    plain, turned = (imported("colmap", written, **options) for options in ({}, {"up": (1.0, 2.0, -3.0)}))
     up = np.array([1.0, 2.0, -3.0]) / np.sqrt(14.0)
     for one, other in zip(plain.views, turned.views, strict=True):
         ground = one.sensor.ground_from_image(np.array([[10.0, 20.0], [50.0, 5.0]]), np.zeros(2))
@@ -231,8 +230,6 @@ FAULTS = [
     ("metashape", files.write_metashape, "cameras.xml", 'label="unknown"', 'master_id="1"', "a rig of several sensors"),
     ("metashape", files.write_metashape, "cameras.xml", "GEOGCS", "WOGCS", "which is no CRS"),
     ("metashape", files.write_metashape, "cameras.xml", f"{files.SCALE}", "-1", "scale of the chunk is -1"),
-    ("strecha", files.write_strecha, "a.tif.camera", "0.0 0.0 0.0", "0.1 0.0 0.0", "has a distortion"),
-    ("strecha", files.write_strecha, "a.tif.camera", "0.0 0.0 1.0", "0.0 0.0 2.0", "no calibration matrix"),
 ]  # fmt: skip
 
 
@@ -248,12 +245,12 @@ def test_a_fault_is_named(tmp_path, kind, write, name, old, new, says):
 
 
 def test_options_that_say_nothing_are_refused(tmp_path):
-    folder = files.write_strecha(tmp_path / "p").folder
+    folder = files.write_colmap(tmp_path / "p").folder
     out = folder / "scene.yaml"
     for request, says in (
         (lambda: ImportRequest("kitti", folder, out), "Choose from colmap"),
-        (lambda: ImportRequest("strecha", folder, out, focal=3.0), "--focal says nothing"),
-        (lambda: ImportRequest("strecha", folder, out, local=True), "--local says nothing"),
+        (lambda: ImportRequest("colmap", folder, out, focal=3.0), "--focal says nothing"),
+        (lambda: ImportRequest("colmap", folder, out, local=True), "--local says nothing"),
         (lambda: ImportRequest("eo", folder, folder / "scene.json"), "no name of a scene file"),
         (lambda: ImportRequest("eo", folder, out, focal=0.0), "--focal 0"),
         (lambda: ImportRequest("eo", folder, out, earth="hollow"), "--earth hollow"),

@@ -32,7 +32,7 @@ from zlocus.core.options import RunConfig
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.table import evaluation_rows
 from zlocus.matching.quality import Quality
-from zlocus.matching.view_ranking import RankedPoints
+from zlocus.matching.view_ranking import LabelledTies
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
 from zlocus.products.report.comparison import shrunk_means
@@ -528,7 +528,7 @@ def test_labels_of_pairs(tmp_path, monkeypatch, most_columns):
     labels[:, 0, 1] = [1, 1, 1, -1]
     labels[:, 1, 0] = -1
     labels[:, 0, 2] = 1
-    ranked = RankedPoints(np.arange(12.0).reshape(4, 3), labels, np.arange(3))
+    ranked = LabelledTies(np.arange(12.0).reshape(4, 3), labels, np.arange(3))
     write_ranking(tmp_path / "ranking.gpkg", [ranked], names, CRS.from_epsg(32632))
     found = tables.label_matrix(tmp_path / "ranking.gpkg", ["aft", "fore", "nadir"])
     text = {(found.names[i], found.names[j]): found.rows[i][j].text for i in range(3) for j in range(3)}
@@ -541,14 +541,14 @@ def test_labels_of_pairs(tmp_path, monkeypatch, most_columns):
 
 
 def test_the_page_of_the_documents_lists_every_option():
-    text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "how-to" / "report.md").read_text(encoding="utf-8")
     command = typer.main.get_command(app).commands["report"]
     options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
     assert options == set(re.findall(r"^\| `(--[a-z]+)", text, re.MULTILINE))
 
 
 def test_reasons_are_said_as_the_documents_say_them():
-    page_text = (ROOT / "docs" / "quality.md").read_text(encoding="utf-8")
+    page_text = (ROOT / "docs" / "reference" / "quality.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page_text.splitlines()]
     said = {row[1]: (row[2], row[3]) for row in rows if row[0].isdigit()}
     assert said == {flag.name: (words.MEANINGS[flag], words.fate(flag)) for flag in Quality}

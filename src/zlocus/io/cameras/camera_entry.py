@@ -9,12 +9,12 @@ from typing import Protocol
 from pyproj import CRS
 
 from zlocus.core.sensor_model import SensorModel
-from zlocus.io.schema import Number, StrictModel
+from zlocus.io.schema import FiniteNumber, StrictModel
 
-Vector = tuple[Number, Number, Number]
+Vector = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
 
 
-class CameraSource(Protocol):
+class OpenedCamera(Protocol):
     """A camera that has been read, before the scene's CRS is known."""
 
     @property
@@ -31,13 +31,13 @@ class CameraSource(Protocol):
         ...
 
 
-class Camera(StrictModel, ABC):
+class CameraEntry(StrictModel, ABC):
     """The `camera` entry of a view: `kind` and what that kind needs."""
 
     @abstractmethod
-    def read(self, folder: Path, image: Path) -> CameraSource:
+    def read(self, folder: Path, image: Path) -> OpenedCamera:
         """The camera of an image; relative paths start at `folder`, that of the scene file."""
 
-    def given_in(self, crs: str | None) -> Camera:
+    def with_default_crs(self, crs: str | None) -> CameraEntry:
         """The camera whose coordinates, where it names no CRS of its own, are in that of the scene file's frame."""
         return self

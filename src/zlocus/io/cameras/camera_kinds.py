@@ -10,11 +10,11 @@ import numpy as np
 from pyproj import CRS
 
 from zlocus.core.sensor_model import SensorModel
-from zlocus.io.cameras.camera_entry import Camera
+from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.cameras.linescan import LineScanCamera
 from zlocus.io.cameras.rpc import find_sidecar, read_rpc
-from zlocus.io.schema import Number
+from zlocus.io.schema import FiniteNumber
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 
@@ -28,7 +28,7 @@ class RpcSource:
     files: tuple[Path, ...] = ()
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """See `CameraSource`; at the RPC's height offset."""
+        """See `OpenedCamera`; at the RPC's height offset."""
         xy = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
         # The CRS plays no part in the geographic direction.
         model = RpcModel(self.rpc, CRS.from_epsg(3857))
@@ -36,22 +36,22 @@ class RpcSource:
         return (float(lon[0]), float(lat[0])) if np.isfinite(lon[0]) else None
 
     def sensor(self, crs: CRS) -> SensorModel:
-        """See `CameraSource`."""
+        """See `OpenedCamera`."""
         model = RpcModel(self.rpc, crs)
         return model if self.shift is None else ShiftedModel(model, column=self.shift[0], row=self.shift[1])
 
 
-class RpcCamera(Camera):
+class RpcCamera(CameraEntry):
     """An RPC: from `file`, else found beside or in the image. shift: pixels (column, row) added to what it projects."""
 
     kind: Literal["rpc"] = "rpc"
     file: str | None = None
-    shift: tuple[Number, Number] | None = None
+    shift: tuple[FiniteNumber, FiniteNumber] | None = None
 
     def read(self, folder: Path, image: Path) -> RpcSource:
-        """See `Camera`."""
+        """See `CameraEntry`."""
         file = find_sidecar(image) if self.file is None else folder / self.file
         return RpcSource(read_rpc(image, file), self.shift, () if file is None else (file,))
 
 
-KINDS: dict[str, type[Camera]] = {"rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera}
+KINDS: dict[str, type[CameraEntry]] = {"rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera}

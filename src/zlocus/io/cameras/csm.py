@@ -17,10 +17,10 @@ from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.cameras.camera_entry import Vector
 from zlocus.io.cameras.linescan import LineScanCamera, RegularTimes
-from zlocus.io.cameras.linescan_files import MOST_COLUMNS, write_calibration, write_times, write_trajectory
+from zlocus.io.cameras.linescan_files import MAX_DETECTORS, write_calibration, write_times, write_trajectory
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_documents import read_json
-from zlocus.io.schema import Number, StrictModel, Whole, validated
+from zlocus.io.schema import FiniteNumber, StrictModel, WholeNumber, validate_document
 from zlocus.sensors.earth_frame import MAJOR_M, MINOR_M
 from zlocus.sensors.linescan import FocalLine, LineTimes
 from zlocus.sensors.rotation import from_quaternions
@@ -28,47 +28,47 @@ from zlocus.sensors.trajectory import Trajectory
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 RADIAL = 0
-BODY_M = 100.0
+MAX_AXIS_DIFFERENCE_M = 100.0
 # Samples of the converted trajectory: doubled until splines between them are this close to the state's own polynomials.
-SAMPLES = (256, 512, 1024, 2048, 4096, 8192, 16384)
+SAMPLE_COUNTS = (256, 512, 1024, 2048, 4096, 8192, 16384)
 TOLERANCE_PX = 1e-3
 # Of the image's time, before its first row and after its last.
-BEYOND = 0.1
-REGULAR_ROWS = 1e-6
+TIME_MARGIN = 0.1
+REGULAR_TOLERANCE_ROWS = 1e-6
 # Twice as many would take 500 MB.
-MOST_ROWS = 4_000_000
+MAX_ROWS = 4_000_000
 
 
 class CsmState(StrictModel):
     """The fields that are read; see UsgsAstroLsSensorModel in usgscsm for what they mean."""
 
     m_modelName: str
-    m_nLines: Whole = Field(gt=1, le=MOST_ROWS)
-    m_nSamples: Whole = Field(gt=1, le=MOST_COLUMNS)
-    m_platformFlag: Whole = 1
-    m_intTimeLines: tuple[Number, ...] = Field(min_length=1)
-    m_intTimeStartTimes: tuple[Number, ...]
-    m_intTimes: tuple[Number, ...]
-    m_detectorSampleSumming: Number = 1.0
-    m_startingDetectorSample: Number = 0.0
-    m_startingDetectorLine: Number = 0.0
-    m_detectorSampleOrigin: Number
-    m_detectorLineOrigin: Number
+    m_nLines: WholeNumber = Field(gt=1, le=MAX_ROWS)
+    m_nSamples: WholeNumber = Field(gt=1, le=MAX_DETECTORS)
+    m_platformFlag: WholeNumber = 1
+    m_intTimeLines: tuple[FiniteNumber, ...] = Field(min_length=1)
+    m_intTimeStartTimes: tuple[FiniteNumber, ...]
+    m_intTimes: tuple[FiniteNumber, ...]
+    m_detectorSampleSumming: FiniteNumber = 1.0
+    m_startingDetectorSample: FiniteNumber = 0.0
+    m_startingDetectorLine: FiniteNumber = 0.0
+    m_detectorSampleOrigin: FiniteNumber
+    m_detectorLineOrigin: FiniteNumber
     m_iTransS: Vector
     m_iTransL: Vector
-    m_focalLength: Number = Field(gt=0)
+    m_focalLength: FiniteNumber = Field(gt=0)
     m_zDirection: Literal[1, -1]
-    m_distortionType: Whole
-    m_opticalDistCoeffs: tuple[Number, ...]
-    m_majorAxis: Number
-    m_minorAxis: Number
-    m_t0Ephem: Number
-    m_dtEphem: Number = Field(gt=0)
-    m_positions: tuple[Number, ...] = Field(min_length=6)
-    m_t0Quat: Number
-    m_dtQuat: Number = Field(gt=0)
-    m_quaternions: tuple[Number, ...] = Field(min_length=8)
-    m_currentParameterValue: tuple[Number, ...] = ()
+    m_distortionType: WholeNumber
+    m_opticalDistCoeffs: tuple[FiniteNumber, ...]
+    m_majorAxis: FiniteNumber
+    m_minorAxis: FiniteNumber
+    m_t0Ephem: FiniteNumber
+    m_dtEphem: FiniteNumber = Field(gt=0)
+    m_positions: tuple[FiniteNumber, ...] = Field(min_length=6)
+    m_t0Quat: FiniteNumber
+    m_dtQuat: FiniteNumber = Field(gt=0)
+    m_quaternions: tuple[FiniteNumber, ...] = Field(min_length=8)
+    m_currentParameterValue: tuple[FiniteNumber, ...] = ()
 
     @field_validator("m_zDirection", mode="before")
     @classmethod
@@ -79,7 +79,10 @@ class CsmState(StrictModel):
     def _supported(self) -> CsmState:
         if self.m_modelName != MODEL:
             raise ValueError(f"m_modelName is {self.m_modelName!r}; only {MODEL} is read")
-        if abs(self.m_majorAxis - MAJOR_M) > BODY_M or abs(self.m_minorAxis - MINOR_M) > BODY_M:
+        if (
+            abs(self.m_majorAxis - MAJOR_M) > MAX_AXIS_DIFFERENCE_M
+            or abs(self.m_minorAxis - MINOR_M) > MAX_AXIS_DIFFERENCE_M
+        ):
             raise ValueError("m_majorAxis and m_minorAxis are not the Earth's in metres; other bodies are not read")
         coefficients = self.m_opticalDistCoeffs
         if any(coefficients) and (self.m_distortionType != RADIAL or len(coefficients) != 3):
@@ -155,7 +158,7 @@ def _state(path: Path) -> CsmState:
     document = read_json(path, start="{")
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a CSM model state: it must hold m_modelName: {MODEL}.")
-    return validated(CsmState, {key: document[key] for key in CsmState.model_fields if key in document}, path)
+    return validate_document(CsmState, {key: document[key] for key in CsmState.model_fields if key in document}, path)
 
 
 def _line_times(state: CsmState, path: Path) -> LineTimes:
@@ -171,7 +174,7 @@ def _line_times(state: CsmState, path: Path) -> LineTimes:
     if not (np.diff(starts) > 0).all() or not ((steps > 0).all() or (steps < 0).all()):
         raise InputError(f"{path}: the line times of the state do not run on. Get it from its source again.")
     straight = np.interp(rows, rows[[0, -1]], when[[0, -1]])
-    if np.abs(when - straight).max() < REGULAR_ROWS * np.abs(steps).mean():
+    if np.abs(when - straight).max() < REGULAR_TOLERANCE_ROWS * np.abs(steps).mean():
         return LineTimes(rows[[0, -1]], when[[0, -1]])
     return LineTimes(rows, when)
 
@@ -223,11 +226,11 @@ def _sampled(state: CsmState, lines: LineTimes, toward: FloatArray, line: FocalL
             f"{path}: rows were exposed from {first:.6f} to {last:.6f} s, but positions and quaternions are known from "
             f"{known[0]:.6f} to {known[1]:.6f} s only. Get a state that covers the image."
         )
-    beyond = BEYOND * (last - first)
+    beyond = TIME_MARGIN * (last - first)
     start, end = max(first - beyond, known[0]), min(last + beyond, known[1])
     pixel = np.linalg.norm(line.xy_mm[-1] - line.xy_mm[0]) / (len(line.xy_mm) - 1)
     height = np.linalg.norm(_positions(state, np.array([first]))) - MAJOR_M
-    for n in SAMPLES:
+    for n in SAMPLE_COUNTS:
         trajectory = _poses(state, np.linspace(start, end, n), toward)
         middle = (trajectory.times[1:] + trajectory.times[:-1]) / 2
         off = np.abs(trajectory.pose(middle) - _poses(state, middle, toward).pose(middle)).max(axis=1)
@@ -243,16 +246,16 @@ def _poses(state: CsmState, times: FloatArray, toward: FloatArray) -> Trajectory
 
 def _positions(state: CsmState, times: FloatArray) -> FloatArray:
     order = 8 if state.m_platformFlag else 4
-    return lagrange(np.reshape(state.m_positions, (-1, 3)), state.m_t0Ephem, state.m_dtEphem, times, order)
+    return lagrange_interpolated(np.reshape(state.m_positions, (-1, 3)), state.m_t0Ephem, state.m_dtEphem, times, order)
 
 
 def _quaternions(state: CsmState, times: FloatArray) -> FloatArray:
     # usgscsm counts the numbers, not the quaternions, so that only one would make it less than 8.
     order = 8 if state.m_platformFlag else 4
-    return lagrange(np.reshape(state.m_quaternions, (-1, 4)), state.m_t0Quat, state.m_dtQuat, times, order)
+    return lagrange_interpolated(np.reshape(state.m_quaternions, (-1, 4)), state.m_t0Quat, state.m_dtQuat, times, order)
 
 
-def lagrange(values: FloatArray, start: float, step: float, times: FloatArray, order: int) -> FloatArray:
+def lagrange_interpolated(values: FloatArray, start: float, step: float, times: FloatArray, order: int) -> FloatArray:
     """Values (k, v) at evenly spaced instants, interpolated at times (n,) by polynomials: (n, v).
 
     Through the 8 (or `order`) nearest samples, fewer near the ends (6, 4, 2), as usgscsm's lagrangeInterp does it.

@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 from zlocus.core.errors import InputError
 from zlocus.io.cameras.rpc_text import POLYNOMIALS, SCALARS, rpc_from_fields
 from zlocus.io.safe_documents import read_xml
-from zlocus.io.safe_text import AGAIN, LARGEST, decimal, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, decimal, quoted
 from zlocus.sensors.rpc import RpcCoefficients
 
 TILE = re.compile(r"_R(\d+)C(\d+)$", re.IGNORECASE)
@@ -84,15 +84,15 @@ def _whole(element: Element, name: str, path: Path) -> int:
     """An attribute that counts from 1."""
     text = element.attrib.get(name, "")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", text, re.ASCII):
-        raise InputError(f"{path}: {name} is {shown(text)}, not a whole number above 0. {AGAIN}")
+        raise InputError(f"{path}: {name} is {quoted(text)}, not a whole number above 0. {EXPORT_AGAIN}")
     return int(text)
 
 
 def _first_pixel(domain: Element, name: str, path: Path) -> float:
     """How the file counts the first pixel: 1 unless it says otherwise."""
     text = _child_text(domain, name, path) or "1"
-    if not abs(decimal(text)) <= LARGEST:
-        raise InputError(f"{path}: {name} is {shown(text)}, not a finite number. {AGAIN}")
+    if not abs(decimal(text)) <= MAX_MAGNITUDE:
+        raise InputError(f"{path}: {name} is {quoted(text)}, not a finite number. {EXPORT_AGAIN}")
     return decimal(text)
 
 
@@ -121,5 +121,5 @@ def _child_text(element: Element, name: str, path: Path) -> str:
     """What stands in a child, without blanks around it; empty where there is none."""
     found = {(child.text or "").strip() for child in element.findall(name)}
     if len(found) > 1:
-        raise InputError(f"{path} holds {name} twice, with different values. {AGAIN}")
+        raise InputError(f"{path} holds {name} twice, with different values. {EXPORT_AGAIN}")
     return found.pop() if found else ""

@@ -21,24 +21,24 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import SensorModel
-from zlocus.io.cameras.camera_entry import Camera, Vector
+from zlocus.io.cameras.camera_entry import CameraEntry, Vector
 from zlocus.io.crs import checked_crs
-from zlocus.io.safe_text import shown
-from zlocus.io.schema import Number, StrictModel
+from zlocus.io.safe_text import quoted
+from zlocus.io.schema import FiniteNumber, StrictModel
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.earth_frame import between
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 
-ORTHONORMAL = 1e-4
+ORTHONORMAL_TOLERANCE = 1e-4
 # What no camera on or above the Earth exceeds; larger numbers are damage, and would overflow.
-FARTHEST_M = 1e9
-LARGEST_PX = 1e7
+MAX_COORDINATE_M = 1e9
+MAX_CAMERA_PX = 1e7
 # What is less is taken for 0.
-LEAST_PX = 1e-6
+MIN_FOCAL_PX = 1e-6
 
-Coordinate = Annotated[Number, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
-Pixels = Annotated[Number, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
-FocalLength = Annotated[Number, Field(gt=LEAST_PX, le=LARGEST_PX)]
+Coordinate = Annotated[FiniteNumber, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
+Pixels = Annotated[FiniteNumber, Field(ge=-MAX_CAMERA_PX, le=MAX_CAMERA_PX)]
+FocalLength = Annotated[FiniteNumber, Field(gt=MIN_FOCAL_PX, le=MAX_CAMERA_PX)]
 
 
 def _pair(value: Any) -> Any:
@@ -69,14 +69,14 @@ class BrownEntry(Sparse):
     """See `BrownDistortion`; what is left out is 0."""
 
     kind: Literal["brown"] = "brown"
-    k1: Number = 0.0
-    k2: Number = 0.0
-    p1: Number = 0.0
-    p2: Number = 0.0
-    k3: Number = 0.0
-    k4: Number = 0.0
-    k5: Number = 0.0
-    k6: Number = 0.0
+    k1: FiniteNumber = 0.0
+    k2: FiniteNumber = 0.0
+    p1: FiniteNumber = 0.0
+    p2: FiniteNumber = 0.0
+    k3: FiniteNumber = 0.0
+    k4: FiniteNumber = 0.0
+    k5: FiniteNumber = 0.0
+    k6: FiniteNumber = 0.0
 
     def model(self) -> BrownDistortion | None:
         """The distortion; None where there is none."""
@@ -88,10 +88,10 @@ class FisheyeEntry(Sparse):
     """See `FisheyeDistortion`; what is left out is 0."""
 
     kind: Literal["fisheye"] = "fisheye"
-    k1: Number = 0.0
-    k2: Number = 0.0
-    k3: Number = 0.0
-    k4: Number = 0.0
+    k1: FiniteNumber = 0.0
+    k2: FiniteNumber = 0.0
+    k3: FiniteNumber = 0.0
+    k4: FiniteNumber = 0.0
 
     def model(self) -> FisheyeDistortion:
         """The distortion."""
@@ -108,7 +108,7 @@ class Interior(Sparse):
     distortion: Annotated[BrownEntry | FisheyeEntry, Field(discriminator="kind")] | None = None
 
 
-class FrameCamera(Camera, Interior):
+class FrameCamera(CameraEntry, Interior):
     """A frame camera; see `FrameModel`, and `rotation_from_angles` for `angles` (omega, phi, kappa).
 
     crs : of the centre, that of the scene's frame where it is not given. earth : `curved`, the default, has straight
@@ -128,12 +128,12 @@ class FrameCamera(Camera, Interior):
             raise ValueError("give either rotation, the rows of a matrix, or angles, omega, phi and kappa in degrees")
         if self.rotation is not None:
             matrix = np.clip(np.array(self.rotation), -2.0, 2.0)
-            if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < ORTHONORMAL and np.linalg.det(matrix) > 0):
+            if not (np.abs(matrix @ matrix.T - np.eye(3)).max() < ORTHONORMAL_TOLERANCE and np.linalg.det(matrix) > 0):
                 raise ValueError("the rows of a rotation are at right angles, of length 1, and right-handed")
         return self
 
     def read(self, folder: Path, image: Path) -> FrameSource:
-        """See `Camera`."""
+        """See `CameraEntry`."""
         rotation = self.rotation or rotation_from_angles(*(self.angles or (0.0, 0.0, 0.0)))
         model = FrameModel(
             self.centre, rotation, self.focal[0], self.principal_point, self.focal[1] / self.focal[0], self.skew,
@@ -141,8 +141,8 @@ class FrameCamera(Camera, Interior):
         )  # fmt: skip
         return FrameSource(model, image, None if self.crs is None else map_crs(self.crs, image), self.earth != "flat")
 
-    def given_in(self, crs: str | None) -> FrameCamera:
-        """See `Camera`."""
+    def with_default_crs(self, crs: str | None) -> FrameCamera:
+        """See `CameraEntry`."""
         return self if self.crs is not None or crs is None else self.model_copy(update={"crs": crs})
 
 
@@ -160,7 +160,7 @@ def map_crs(text: str, image: Path) -> CRS:
         return checked_crs(CRS.from_user_input(text))
     except CRSError as error:
         raise InputError(
-            f"The camera of {image} is given in {shown(text)}, which is no CRS. Write it as EPSG:n."
+            f"The camera of {image} is given in {quoted(text)}, which is no CRS. Write it as EPSG:n."
         ) from error
     except ConfigError as error:
         raise ConfigError(f"The camera of {image}: {error}") from error
@@ -177,14 +177,14 @@ class FrameSource:
     files: tuple[Path, ...] = ()
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """See `CameraSource`; below the centre of projection, whichever way it looks."""
+        """See `OpenedCamera`; below the centre of projection, whichever way it looks."""
         if self.given is None:
             return None
         lon, lat = between(self.given, CRS.from_epsg(4326)).transform(*self.model.centre[:2])
         return (float(lon), float(lat)) if np.isfinite(lon) and np.isfinite(lat) else None
 
     def sensor(self, crs: CRS) -> SensorModel:
-        """See `CameraSource`.
+        """See `OpenedCamera`.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The `linescan` camera of a `scene.yaml`: a line scanner, its focal plane and trajectory (see docs/linescan.md)."""
+"""The `linescan` camera of a `scene.yaml`: a line scanner, its focal plane and trajectory (see docs/reference/linescan.md)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import SensorModel
-from zlocus.io.cameras.camera_entry import Camera, Vector
+from zlocus.io.cameras.camera_entry import CameraEntry, Vector
 from zlocus.io.cameras.linescan_files import Rays, read_calibration, read_times, read_trajectory
 from zlocus.io.crs import is_on_earth
 from zlocus.io.open_raster import open_raster
-from zlocus.io.schema import Number, StrictModel, Whole
+from zlocus.io.schema import FiniteNumber, StrictModel, WholeNumber
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, FrameSpace, Space
 from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes, RectifiedModel
 from zlocus.sensors.trajectory import Trajectory
@@ -36,19 +36,19 @@ def _known(crs: str) -> str:
 
 
 # s, mm, or m2 of a pixel: what is less is taken for 0.
-LEAST = 1e-12
+MIN_POSITIVE = 1e-12
 CrsName = Annotated[str, AfterValidator(_known)]
 
 
 class RegularTimes(StrictModel):
     """Rows exposed every `interval` s, negative where row 0 is the last one flown; the middle of row 0 at `start` s."""
 
-    start: Number
-    interval: Number
+    start: FiniteNumber
+    interval: FiniteNumber
 
     @model_validator(mode="after")
     def _moving(self) -> RegularTimes:
-        if abs(self.interval) < LEAST:
+        if abs(self.interval) < MIN_POSITIVE:
             raise ValueError("interval is the time from row to row, which is not 0")
         return self
 
@@ -62,20 +62,20 @@ class Rectification(StrictModel):
     have the same crs, lever arm and boresight.
     """
 
-    height: Number
-    transform: tuple[Number, Number, Number, Number, Number, Number]
+    height: FiniteNumber
+    transform: tuple[FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber]
     crs: CrsName | None = None
-    rows: Whole = Field(gt=1)
+    rows: WholeNumber = Field(gt=1)
     trajectory: str | None = None
 
     @model_validator(mode="after")
     def _turns_back(self) -> Rectification:
-        if not abs(Affine(*self.transform).determinant) > LEAST:
+        if not abs(Affine(*self.transform).determinant) > MIN_POSITIVE:
             raise ValueError("transform flattens the image to a line; give a, b, c, d, e, f with a e - b d not 0")
         return self
 
 
-class LineScanCamera(Camera):
+class LineScanCamera(CameraEntry):
     """A line scanner. See `read_calibration`, `read_trajectory` and `read_times` for the files.
 
     line : name of the line in the calibration file; first_column : detector of the image's first column; rays : where
@@ -86,8 +86,8 @@ class LineScanCamera(Camera):
     kind: Literal["linescan"] = "linescan"
     calibration: str
     line: str | None = None
-    focal_mm: Number = Field(gt=LEAST)
-    first_column: Whole = Field(default=0, ge=0)
+    focal_mm: FiniteNumber = Field(gt=MIN_POSITIVE)
+    first_column: WholeNumber = Field(default=0, ge=0)
     trajectory: str
     crs: CrsName | None = None
     rays: Rays = "earth"
@@ -97,7 +97,7 @@ class LineScanCamera(Camera):
     rectification: Rectification | None = None
 
     def read(self, folder: Path, image: Path) -> LineScanSource:
-        """See `Camera`."""
+        """See `CameraEntry`."""
         files = [folder / self.calibration, folder / self.trajectory]
         with open_raster(image) as source:
             shape = (source.height, source.width)
@@ -118,8 +118,8 @@ class LineScanCamera(Camera):
         of_plane = others[0] if others else trajectory
         return LineScanSource(line, lines, trajectory, of_plane, self.rays, crs, self.rectification, tuple(files))
 
-    def given_in(self, crs: str | None) -> LineScanCamera:
-        """See `Camera`; on the Earth a trajectory names its own CRS."""
+    def with_default_crs(self, crs: str | None) -> LineScanCamera:
+        """See `CameraEntry`; on the Earth a trajectory names its own CRS."""
         takes = self.rays == "frame" and self.crs is None and crs is not None
         return self.model_copy(update={"crs": crs}) if takes else self
 
@@ -160,7 +160,7 @@ class LineScanSource:
     files: tuple[Path, ...]
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """See `CameraSource`; below the camera at the middle row. None where rays are straight in the frame."""
+        """See `OpenedCamera`; below the camera at the middle row. None where rays are straight in the frame."""
         if self.rays == "frame":
             return None
         middle = self.trajectory.pose(self.lines.time(self.lines.rows[[0, -1]].mean(keepdims=True)))[9:]
@@ -168,7 +168,7 @@ class LineScanSource:
         return float(lon), float(lat)
 
     def sensor(self, crs: CRS) -> SensorModel:
-        """See `CameraSource`.
+        """See `OpenedCamera`.
 
         Raises
         ------

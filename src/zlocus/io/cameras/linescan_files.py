@@ -1,4 +1,4 @@
-"""Files of line scanners: focal planes, trajectories and line times as tables of numbers (see docs/linescan.md)."""
+"""Files of line scanners: focal planes, trajectories and line times as tables of numbers (see docs/reference/linescan.md)."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from pyproj import CRS
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.number_table import NumberTable, read_numbers, write_numbers
+from zlocus.io.number_table import NumberTable, read_number_table, write_number_table
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, between, east_north_up
 from zlocus.sensors.linescan import FocalLine, LineTimes
 from zlocus.sensors.rotation import from_navigation, from_photogrammetric, from_quaternions, to_photogrammetric
 from zlocus.sensors.trajectory import LEAST_SAMPLES, Trajectory
 
 CALIBRATION, TRAJECTORY, TIMES = "focal plane calibration", "trajectory", "table of line times"
-PLACES = {"projected": ("x", "y", "z"), "geographic": ("lon", "lat", "height")}
+POSITION_COLUMNS = {"projected": ("x", "y", "z"), "geographic": ("lon", "lat", "height")}
 OMEGA_PHI_KAPPA, ROLL_PITCH_HEADING = ("omega", "phi", "kappa"), ("roll", "pitch", "heading")
 QUATERNION = ("qx", "qy", "qz", "qw")
-TURNS = (OMEGA_PHI_KAPPA, ROLL_PITCH_HEADING, QUATERNION)
+ROTATION_COLUMNS = (OMEGA_PHI_KAPPA, ROLL_PITCH_HEADING, QUATERNION)
 WGS84_GEOCENTRIC = CRS.from_epsg(4978)
 Rays = Literal["earth", "frame"]
 # Of the norm of a quaternion.
-UNIT = 1e-3
-MOST_COLUMNS = 1_000_000
+UNIT_LENGTH_TOLERANCE = 1e-3
+MAX_DETECTORS = 1_000_000
 # Above the ellipsoid: what lies outside is a mistake in units or CRS.
-LOWEST_M, HIGHEST_M = -2e4, 2e6
+MIN_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_M = -2e4, 2e6
 
 
 def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine:
@@ -40,7 +40,7 @@ def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine
     InputError
         For a malformed table, a line that is not there, or detectors that do not follow one another along a line.
     """
-    table = read_numbers(path, CALIBRATION, ("column", "x_mm", "y_mm"), ("line",))
+    table = read_number_table(path, CALIBRATION, ("column", "x_mm", "y_mm"), ("line",))
     _need(table, ("column", "x_mm", "y_mm"))
     table = _of_line(table, name)
     if len(table) < 2:
@@ -51,8 +51,8 @@ def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine
         raise table.refuse(0, "columns are whole numbers from 0 on; number them so")
     n = int(column[-1]) + 1
     if n > len(column):
-        if n > MOST_COLUMNS:
-            raise table.refuse(len(column) - 1, f"column {n - 1} is more than the {MOST_COLUMNS} a line may have")
+        if n > MAX_DETECTORS:
+            raise table.refuse(len(column) - 1, f"column {n - 1} is more than the {MAX_DETECTORS} a line may have")
         from scipy.interpolate import CubicSpline
 
         xy_mm = CubicSpline(column, xy_mm)(np.arange(n))
@@ -73,7 +73,7 @@ def read_times(path: Path, n_rows: int) -> LineTimes:
     InputError
         For a malformed table, or one that does not reach from the first row to the last.
     """
-    table = read_numbers(path, TIMES, ("row", "time"))
+    table = read_number_table(path, TIMES, ("row", "time"))
     _need(table, ("row", "time"))
     table.check_steps("row")
     table.check_steps("time", either=True)
@@ -103,17 +103,24 @@ def read_trajectory(
     InputError
         For a malformed table, times that do not increase, or places that are not in that CRS.
     """
-    names = ("time", *PLACES["projected"], *PLACES["geographic"], *OMEGA_PHI_KAPPA, *ROLL_PITCH_HEADING, *QUATERNION)
-    table = read_numbers(path, TRAJECTORY, names)
-    place = _one_of(table, tuple(PLACES.values()))
-    turn = _one_of(table, TURNS)
+    names = (
+        "time",
+        *POSITION_COLUMNS["projected"],
+        *POSITION_COLUMNS["geographic"],
+        *OMEGA_PHI_KAPPA,
+        *ROLL_PITCH_HEADING,
+        *QUATERNION,
+    )
+    table = read_number_table(path, TRAJECTORY, names)
+    place = _one_of(table, tuple(POSITION_COLUMNS.values()))
+    turn = _one_of(table, ROTATION_COLUMNS)
     _need(table, ("time", *place, *turn))
     if len(table) < LEAST_SAMPLES:
         raise InputError(f"The {TRAJECTORY} {path} has {len(table)} rows. At least {LEAST_SAMPLES} are needed.")
     table.check_steps("time")
     platform = _platform(table, turn)
     if rays == "frame":
-        if place != PLACES["projected"]:
+        if place != POSITION_COLUMNS["projected"]:
             raise InputError(f"The {TRAJECTORY} {path} has {', '.join(place)}, but rays: frame needs x, y, z.")
         places = table.stacked(place)
     else:
@@ -133,7 +140,7 @@ def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str, eve
     xy_mm = np.concatenate([line.xy_mm[columns[name]] for name, line in lines.items()])
     column = np.concatenate([*columns.values()]).astype(float)
     names = [name for name, held in columns.items() for _ in held]
-    write_numbers(path, {"column": column, "x_mm": xy_mm[:, 0], "y_mm": xy_mm[:, 1]}, comment, {"line": names})
+    write_number_table(path, {"column": column, "x_mm": xy_mm[:, 0], "y_mm": xy_mm[:, 1]}, comment, {"line": names})
 
 
 def write_trajectory(path: Path, trajectory: Trajectory, comment: str, quaternions: bool = False) -> None:
@@ -147,12 +154,12 @@ def write_trajectory(path: Path, trajectory: Trajectory, comment: str, quaternio
     else:
         turns = np.rad2deg(to_photogrammetric(trajectory.rotations.mT))
     values = np.column_stack([trajectory.times, trajectory.centres, turns])
-    write_numbers(path, dict(zip(("time", *PLACES["projected"], *turn), values.T, strict=True)), comment)
+    write_number_table(path, dict(zip(("time", *POSITION_COLUMNS["projected"], *turn), values.T, strict=True)), comment)
 
 
 def write_times(path: Path, lines: LineTimes, comment: str) -> None:
     """Write line times as `read_times` reads them."""
-    write_numbers(path, {"row": lines.rows, "time": lines.times}, comment)
+    write_number_table(path, {"row": lines.rows, "time": lines.times}, comment)
 
 
 def _need(table: NumberTable, names: tuple[str, ...]) -> None:
@@ -189,7 +196,7 @@ def _platform(table: NumberTable, turn: tuple[str, ...]) -> FloatArray:
     """Local axes from the platform's (n, 3, 3)."""
     if turn == QUATERNION:
         quaternions = table.stacked(turn)
-        wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > UNIT)
+        wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > UNIT_LENGTH_TOLERANCE)
         if len(wrong):
             raise table.refuse(int(wrong[0]), "the quaternion qx, qy, qz, qw is not of length 1; mend it")
         return from_quaternions(quaternions)
@@ -209,7 +216,7 @@ def _on_earth(
         height = WGS84_EARTH.geographic_from_cartesian(places)[:, 2]
     else:
         places = EarthSpace(crs, WGS84).cartesian_from_ground(given)
-    wrong = np.flatnonzero(~((height > LOWEST_M) & (height < HIGHEST_M)))
+    wrong = np.flatnonzero(~((height > MIN_CAMERA_HEIGHT_M) & (height < MAX_CAMERA_HEIGHT_M)))
     if len(wrong):
         raise table.refuse(int(wrong[0]), f"{', '.join(place)} are not a place in {crs.name}; check crs and the units")
     if turn == QUATERNION:
@@ -224,7 +231,7 @@ def _on_earth(
 
 def _checked(table: NumberTable, place: tuple[str, ...], crs: CRS | None) -> CRS:
     """The CRS of places: projected in metres or geocentric for x, y, z; geographic in degrees for lon, lat."""
-    if place == PLACES["geographic"]:
+    if place == POSITION_COLUMNS["geographic"]:
         crs = WGS84 if crs is None else crs
         fits = crs.is_geographic
     else:

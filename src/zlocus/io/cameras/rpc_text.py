@@ -10,8 +10,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from zlocus.core.errors import InputError, OutputError
-from zlocus.io.atomic_write import whole_file
-from zlocus.io.safe_text import BYTE_ORDER_MARK, LARGEST, decimal, is_decimal, read_bytes, shown, stops_within, written
+from zlocus.io.atomic_write import atomic_file
+from zlocus.io.safe_text import (
+    BYTE_ORDER_MARK,
+    MAX_MAGNITUDE,
+    decimal,
+    digits_written,
+    is_decimal,
+    quoted,
+    read_bytes,
+    truncation_error,
+)
 from zlocus.sensors.rpc import RpcCoefficients
 
 SCALARS = (
@@ -22,9 +31,9 @@ POLYNOMIALS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_C
 TXT_NAMES = {*SCALARS, *(f"{name}_{i}" for name in POLYNOMIALS for i in range(1, 21))}
 ADVICE = "Get the RPC from its source again."
 # Of a file; they have a hundredth of it.
-MOST_BYTES = 1_000_000
+MAX_RPC_BYTES = 1_000_000
 # What is less is taken for 0 where it divides.
-LEAST = 1e-12
+MIN_DIVISOR = 1e-12
 RPB_NAMES = {
     "lineOffset": "LINE_OFF", "sampOffset": "SAMP_OFF", "latOffset": "LAT_OFF", "longOffset": "LONG_OFF",
     "heightOffset": "HEIGHT_OFF", "lineScale": "LINE_SCALE", "sampScale": "SAMP_SCALE", "latScale": "LAT_SCALE",
@@ -43,10 +52,10 @@ def read_rpc_txt(path: Path) -> RpcCoefficients:
             words = rest.split()
             # A unit may follow the number, another number may not.
             fields.add(name.strip().upper(), " ".join(words if len(words) > 1 and is_decimal(words[1]) else words[:1]))
-            digits = written(words[0]) if words else None
+            digits = digits_written(words[0]) if words else None
             is_ended = number < len(lines) or len(words) > 1 or text.endswith(("\n", "\r"))
             if not is_ended and (digits is None or {digits} != above):
-                raise stops_within(path, number)
+                raise truncation_error(path, number)
             if "_COEFF" in name.upper():
                 above.add(digits)
     for name in POLYNOMIALS:
@@ -90,7 +99,7 @@ class Fields(dict[str, str]):
             Where it has another one already.
         """
         if self.setdefault(name, value) != value:
-            raise InputError(f"{self.path}: {shown(name)} of the RPC is there twice, with different values. {ADVICE}")
+            raise InputError(f"{self.path}: {quoted(name)} of the RPC is there twice, with different values. {ADVICE}")
 
 
 def _listed(value: str) -> str:
@@ -111,10 +120,10 @@ def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
     scalar = {name: _numbers(fields, name, 1, path)[0] for name in SCALARS}
     polynomial = {name: _numbers(fields, name, 20, path) for name in POLYNOMIALS}
     for name in SCALARS[5:]:
-        if abs(scalar[name]) < LEAST:
+        if abs(scalar[name]) < MIN_DIVISOR:
             raise InputError(f"{path}: {name} of the RPC is {scalar[name]:g}. {ADVICE}")
     for name in ("LINE_DEN_COEFF", "SAMP_DEN_COEFF"):
-        if abs(polynomial[name][0]) < LEAST:
+        if abs(polynomial[name][0]) < MIN_DIVISOR:
             raise InputError(f"{path}: {name}_1 of the RPC is {polynomial[name][0]:g}, a pole at its centre. {ADVICE}")
     return RpcCoefficients(
         line_off=scalar["LINE_OFF"], samp_off=scalar["SAMP_OFF"],
@@ -143,7 +152,7 @@ def write_rpc_txt(path: Path, rpc: RpcCoefficients) -> None:
     for name, terms in zip(POLYNOMIALS, (rpc.line_num, rpc.line_den, rpc.samp_num, rpc.samp_den), strict=True):
         lines += [f"{name}_{i}: {value!r}" for i, value in enumerate(terms, 1)]
     try:
-        with whole_file(path) as part:
+        with atomic_file(path) as part:
             part.write_text("\n".join(lines) + "\n", encoding="ascii")
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
@@ -157,11 +166,11 @@ def _numbers(fields: Mapping[str, str], name: str, count: int, path: Path) -> tu
     if len(text) != count:
         raise InputError(f"{path}: {name} of the RPC has {len(text)} numbers, not {count}. {ADVICE}")
     for number in text:
-        if not abs(decimal(number)) <= LARGEST:
-            raise InputError(f"{path}: {name} of the RPC holds {shown(number)}, not a finite number. {ADVICE}")
+        if not abs(decimal(number)) <= MAX_MAGNITUDE:
+            raise InputError(f"{path}: {name} of the RPC holds {quoted(number)}, not a finite number. {ADVICE}")
     return tuple(float(number) for number in text)
 
 
 def _text(path: Path) -> str:
-    content = read_bytes(path, MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
+    content = read_bytes(path, MAX_RPC_BYTES).removeprefix(BYTE_ORDER_MARK)
     return content.decode("ascii", errors="replace")

@@ -13,13 +13,13 @@ import numpy as np
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.open_raster import existing_file
-from zlocus.io.safe_text import AGAIN, LARGEST, decimal, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, decimal, quoted
 
-UNIT = 1e-3
+ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Exposure:
+class ImportedExposure:
     """One image and its camera, in zlocus's conventions.
 
     image : name in the file; interior : entries of a frame camera in `scene.yaml`, of which principal_point may be left
@@ -35,16 +35,16 @@ class Exposure:
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedCameras:
     """The cameras of a file. path : it; crs : of the centres, None for local axes; flat : they are Cartesian in it."""
 
     path: Path
-    exposures: tuple[Exposure, ...]
+    exposures: tuple[ImportedExposure, ...]
     crs: str | None = None
     flat: bool = False
 
 
-def found_file(source: Path, names: Sequence[str], what: str) -> Path:
+def find_camera_file(source: Path, names: Sequence[str], what: str) -> Path:
     """`source` itself if it is a file, else the first of `names` that is one in that folder.
 
     Raises
@@ -61,7 +61,7 @@ def found_file(source: Path, names: Sequence[str], what: str) -> Path:
     raise InputError(f"{source} holds no {what}: looked for {', '.join(names)}. Give its folder, or the file itself.")
 
 
-def number(value: Any, path: Path, where: str) -> float:
+def read_number(value: Any, path: Path, where: str) -> float:
     """A finite number, from text or from a number.
 
     Raises
@@ -74,33 +74,37 @@ def number(value: Any, path: Path, where: str) -> float:
         found = decimal(value) if isinstance(value, str) else math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
         found = math.nan
-    if not abs(found) <= LARGEST:
-        raise InputError(f"{path}: {where} is {shown(value)}, not a finite number. {AGAIN}")
+    if not abs(found) <= MAX_MAGNITUDE:
+        raise InputError(f"{path}: {where} is {quoted(value)}, not a finite number. {EXPORT_AGAIN}")
     return found
 
 
-def numbers(values: Any, count: int, path: Path, where: str) -> FloatArray:
+def read_numbers(values: Any, count: int, path: Path, where: str) -> FloatArray:
     """`count` finite numbers, (count,)."""
     values = values.split() if isinstance(values, str) else values
     if not isinstance(values, list | tuple) or len(values) != count:
         n = len(values) if isinstance(values, list | tuple) else 0
-        raise InputError(f"{path}: {where} has {n} numbers, not {count}. {AGAIN}")
-    return np.array([number(value, path, where) for value in values])
+        raise InputError(f"{path}: {where} has {n} numbers, not {count}. {EXPORT_AGAIN}")
+    return np.array([read_number(value, path, where) for value in values])
 
 
-def size(width: Any, height: Any, path: Path, where: str) -> tuple[int, int]:
+def image_size(width: Any, height: Any, path: Path, where: str) -> tuple[int, int]:
     """Columns and rows of an image."""
-    found = [number(value, path, f"the size of {where}") for value in (width, height)]
+    found = [read_number(value, path, f"the size of {where}") for value in (width, height)]
     if not all(v >= 1 and v == int(v) for v in found):
-        raise InputError(f"{path}: {where} has {found[0]:g} x {found[1]:g} pixels. {AGAIN}")
+        raise InputError(f"{path}: {where} has {found[0]:g} x {found[1]:g} pixels. {EXPORT_AGAIN}")
     return int(found[0]), int(found[1])
 
 
 def rotation_matrix(rows: FloatArray, path: Path, where: str) -> FloatArray:
     """(3, 3), found to be a rotation and freed of rounding."""
     rows = np.asarray(rows, float).reshape(3, 3)
-    usable = np.abs(rows).max() < 2 and np.abs(rows @ rows.T - np.eye(3)).max() < UNIT and np.linalg.det(rows) > 0
+    usable = (
+        np.abs(rows).max() < 2
+        and np.abs(rows @ rows.T - np.eye(3)).max() < ROTATION_TOLERANCE
+        and np.linalg.det(rows) > 0
+    )
     if not usable:
-        raise InputError(f"{path}: {where} has a matrix that is no rotation. {AGAIN}")
+        raise InputError(f"{path}: {where} has a matrix that is no rotation. {EXPORT_AGAIN}")
     u, _, v = np.linalg.svd(rows)
     return np.asarray(u @ v)

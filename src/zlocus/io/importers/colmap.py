@@ -18,8 +18,16 @@ import numpy as np
 from zlocus.core.errors import InputError
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.importers.base import UNIT, Exposure, Imported, found_file, number, numbers, size
-from zlocus.io.safe_text import AGAIN, read_bytes, shown, text_lines
+from zlocus.io.importers.base import (
+    ROTATION_TOLERANCE,
+    ImportedCameras,
+    ImportedExposure,
+    find_camera_file,
+    image_size,
+    read_number,
+    read_numbers,
+)
+from zlocus.io.safe_text import EXPORT_AGAIN, quoted, read_bytes, text_lines
 from zlocus.sensors.rotation import from_quaternions
 
 FOLDERS = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
@@ -41,13 +49,13 @@ ORIGIN_PX = 0.5
 
 
 @dataclass(frozen=True)
-class _Camera:
+class _ColmapCamera:
     interior: dict[str, Any]
     size: tuple[int, int]
 
 
-def read_colmap(request: ImportRequest) -> Imported:
-    """The registered images of a model. See `Exposure`; coordinates are local, or those of `--crs` taken as Cartesian.
+def read_colmap(request: ImportRequest) -> ImportedCameras:
+    """The registered images of a model. See `ImportedExposure`; coordinates are local, or those of `--crs` taken as Cartesian.
 
     Raises
     ------
@@ -55,16 +63,16 @@ def read_colmap(request: ImportRequest) -> Imported:
         For a file that is missing or damaged, or a camera model that is not supported.
     """
     names = [f"{folder}images.{suffix}" for folder in FOLDERS for suffix in ("bin", "txt")]
-    images = found_file(request.source, names, "COLMAP model")
-    cameras = found_file(images.parent, [f"cameras{images.suffix}"], "COLMAP cameras")
+    images = find_camera_file(request.source, names, "COLMAP model")
+    cameras = find_camera_file(images.parent, [f"cameras{images.suffix}"], "COLMAP cameras")
     if images.suffix == ".bin":
         exposures = _binary_images(images, _binary_cameras(cameras))
     else:
         exposures = _text_images(images, _text_cameras(cameras))
-    return Imported(images, tuple(exposures), request.crs, flat=True)
+    return ImportedCameras(images, tuple(exposures), request.crs, flat=True)
 
 
-def _camera(name: str, values: FloatArray, pixels: tuple[int, int]) -> _Camera:
+def _camera(name: str, values: FloatArray, pixels: tuple[int, int]) -> _ColmapCamera:
     kind, parameters = BY_NAME[name]
     given = dict(zip(parameters, map(float, values), strict=True))
     focal = given["f"] if "f" in given else [given["fx"], given["fy"]]
@@ -73,32 +81,36 @@ def _camera(name: str, values: FloatArray, pixels: tuple[int, int]) -> _Camera:
     if kind is not None:
         lens = {key: value for key, value in given.items() if key[0] in "kp"}
         interior["distortion"] = {"kind": kind, **lens}
-    return _Camera(interior, pixels)
+    return _ColmapCamera(interior, pixels)
 
 
-def _exposure(path: Path, name: str, pose: FloatArray, camera: int, cameras: dict[int, _Camera]) -> Exposure:
+def _exposure(
+    path: Path, name: str, pose: FloatArray, camera: int, cameras: dict[int, _ColmapCamera]
+) -> ImportedExposure:
     """From the quaternion (w, x, y, z) and the translation of camera from world."""
     if camera not in cameras:
-        raise InputError(f"{path}: {shown(name)} has camera {camera}, which is not in the file of cameras. {AGAIN}")
+        raise InputError(
+            f"{path}: {quoted(name)} has camera {camera}, which is not in the file of cameras. {EXPORT_AGAIN}"
+        )
     norm = float(np.linalg.norm(pose[:4]))
-    if not abs(norm - 1.0) < UNIT:
-        raise InputError(f"{path}: {shown(name)} has a quaternion of length {norm:g}, not 1. {AGAIN}")
+    if not abs(norm - 1.0) < ROTATION_TOLERANCE:
+        raise InputError(f"{path}: {quoted(name)} has a quaternion of length {norm:g}, not 1. {EXPORT_AGAIN}")
     rotation = from_quaternions(np.roll(pose[None, :4], -1, axis=1))[0]
     found = cameras[camera]
-    return Exposure(name, found.interior, -rotation.T @ pose[4:], rotation, found.size)
+    return ImportedExposure(name, found.interior, -rotation.T @ pose[4:], rotation, found.size)
 
 
 def _checked_model(name: str, path: Path) -> str:
     if name not in BY_NAME:
         raise InputError(
-            f"{path} has a camera of the model {shown(name)}, which is not read. Undistort the images in COLMAP "
+            f"{path} has a camera of the model {quoted(name)}, which is not read. Undistort the images in COLMAP "
             f"(image_undistorter), or use one of {', '.join(BY_NAME)}."
         )
     return name
 
 
-def _text_cameras(path: Path) -> dict[int, _Camera]:
-    cameras: dict[int, _Camera] = {}
+def _text_cameras(path: Path) -> dict[int, _ColmapCamera]:
+    cameras: dict[int, _ColmapCamera] = {}
     announced = None
     for line_number, line in text_lines(path):
         where = f"line {line_number}"
@@ -109,24 +121,24 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
         if not fields:
             continue
         if len(fields) < 4:
-            raise InputError(f"{path}: {where} has {len(fields)} fields, and a camera has 5 or more. {AGAIN}")
+            raise InputError(f"{path}: {where} has {len(fields)} fields, and a camera has 5 or more. {EXPORT_AGAIN}")
         count = len(BY_NAME[_checked_model(fields[1], path)][1])
-        pixels = size(fields[2], fields[3], path, where)
+        pixels = image_size(fields[2], fields[3], path, where)
         key = _whole(fields[0], path, where)
         _check_new(key, cameras, "camera", path)
-        cameras[key] = _camera(fields[1], numbers(fields[4:], count, path, where), pixels)
+        cameras[key] = _camera(fields[1], read_numbers(fields[4:], count, path, where), pixels)
     _check_count(announced, len(cameras), "cameras", path)
     return cameras
 
 
-def _text_images(path: Path, cameras: dict[int, _Camera]) -> list[Exposure]:
+def _text_images(path: Path, cameras: dict[int, _ColmapCamera]) -> list[ImportedExposure]:
     """Two lines an image: its pose, then its points, which are skipped."""
     exposures, announced, is_points = [], None, False
     for line_number, line in text_lines(path):
         if is_points:
             is_points = False
             if len(line.split()) % 3:
-                raise InputError(f"{path}: line {line_number} does not hold points in threes. {AGAIN}")
+                raise InputError(f"{path}: line {line_number} does not hold points in threes. {EXPORT_AGAIN}")
             continue
         if line.startswith("#"):
             announced = _announced(line, "images", announced)
@@ -136,8 +148,8 @@ def _text_images(path: Path, cameras: dict[int, _Camera]) -> list[Exposure]:
             continue
         where = f"line {line_number}"
         if len(fields) < 10:
-            raise InputError(f"{path}: {where} has {len(fields)} fields, and an image has 10. {AGAIN}")
-        pose = numbers(fields[1:8], 7, path, where)
+            raise InputError(f"{path}: {where} has {len(fields)} fields, and an image has 10. {EXPORT_AGAIN}")
+        pose = read_numbers(fields[1:8], 7, path, where)
         exposures.append(_exposure(path, fields[9].strip(), pose, _whole(fields[8], path, where), cameras))
         is_points = True
     _check_count(announced, len(exposures), "images", path)
@@ -152,21 +164,21 @@ def _announced(line: str, what: str, before: int | None) -> int | None:
 
 def _check_count(announced: int | None, count: int, what: str, path: Path) -> None:
     if announced is not None and announced != count:
-        raise InputError(f"{path} says that it holds {announced} {what}, and it holds {count}. {AGAIN}")
+        raise InputError(f"{path} says that it holds {announced} {what}, and it holds {count}. {EXPORT_AGAIN}")
 
 
-def _check_new(key: int, cameras: dict[int, _Camera], what: str, path: Path) -> None:
+def _check_new(key: int, cameras: dict[int, _ColmapCamera], what: str, path: Path) -> None:
     if key in cameras:
-        raise InputError(f"{path} holds {what} {key} twice. {AGAIN}")
+        raise InputError(f"{path} holds {what} {key} twice. {EXPORT_AGAIN}")
 
 
 def _whole(text: str, path: Path, where: str) -> int:
     if not re.fullmatch(r"\d{1,18}", text):
-        raise InputError(f"{path}: {where} has {shown(text)} where a whole number belongs. {AGAIN}")
+        raise InputError(f"{path}: {where} has {quoted(text)} where a whole number belongs. {EXPORT_AGAIN}")
     return int(text)
 
 
-class _Reader:
+class _BinaryReader:
     """Numbers of a little-endian binary file, one after the other; nothing is taken on trust."""
 
     def __init__(self, path: Path) -> None:
@@ -186,7 +198,7 @@ class _Reader:
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise InputError(f"{self.path} has a name at byte {self._at} that is not UTF-8. {AGAIN}") from error
+            raise InputError(f"{self.path} has a name at byte {self._at} that is not UTF-8. {EXPORT_AGAIN}") from error
 
     def skip(self, count: int, n_bytes: int) -> None:
         self._check(count * n_bytes)
@@ -194,36 +206,38 @@ class _Reader:
 
     def end(self) -> None:
         if self._at != len(self._content):
-            raise InputError(f"{self.path} has {len(self._content) - self._at} bytes too many at its end. {AGAIN}")
+            raise InputError(
+                f"{self.path} has {len(self._content) - self._at} bytes too many at its end. {EXPORT_AGAIN}"
+            )
 
     def _check(self, n_bytes: int) -> None:
         if n_bytes > len(self._content) - self._at:
             raise InputError(
                 f"{self.path} is truncated or damaged: at byte {self._at} it needs {n_bytes} more, and has "
-                f"{len(self._content) - self._at}. {AGAIN}"
+                f"{len(self._content) - self._at}. {EXPORT_AGAIN}"
             )
 
 
-def _binary_cameras(path: Path) -> dict[int, _Camera]:
-    reader = _Reader(path)
-    cameras: dict[int, _Camera] = {}
+def _binary_cameras(path: Path) -> dict[int, _ColmapCamera]:
+    reader = _BinaryReader(path)
+    cameras: dict[int, _ColmapCamera] = {}
     for _ in range(reader.values("Q")[0]):
         key, model, width, height = reader.values("IiQQ")
         name = _checked_model(NAME_OF.get(model, f"number {model}"), path)
         _check_new(key, cameras, "camera", path)
-        values = [number(v, path, f"camera {key}") for v in reader.values(f"{len(BY_NAME[name][1])}d")]
-        cameras[key] = _camera(name, np.array(values), size(width, height, path, f"camera {key}"))
+        values = [read_number(v, path, f"camera {key}") for v in reader.values(f"{len(BY_NAME[name][1])}d")]
+        cameras[key] = _camera(name, np.array(values), image_size(width, height, path, f"camera {key}"))
     reader.end()
     return cameras
 
 
-def _binary_images(path: Path, cameras: dict[int, _Camera]) -> list[Exposure]:
-    reader = _Reader(path)
+def _binary_images(path: Path, cameras: dict[int, _ColmapCamera]) -> list[ImportedExposure]:
+    reader = _BinaryReader(path)
     exposures = []
     for _ in range(reader.values("Q")[0]):
         key, *pose, camera = reader.values("I7dI")
         name = reader.name()
-        values = np.array([number(v, path, f"image {key}") for v in pose])
+        values = np.array([read_number(v, path, f"image {key}") for v in pose])
         exposures.append(_exposure(path, name, values, camera, cameras))
         reader.skip(reader.values("Q")[0], 24)  # x, y and the number of the point
     reader.end()

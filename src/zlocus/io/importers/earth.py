@@ -12,7 +12,7 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import checked_crs, utm_zone
-from zlocus.io.safe_text import shown
+from zlocus.io.safe_text import quoted
 from zlocus.sensors.earth_frame import EarthSpace, between
 
 
@@ -38,7 +38,7 @@ class MapPoses:
         found = np.array([*between(self.earth.crs, self.target).transform(lon, lat), height])
         if not np.isfinite(found).all():
             raise InputError(
-                f"{path}: {shown(where)} is at longitude {lon:.6g}, latitude {lat:.6g}, which is no place in "
+                f"{path}: {quoted(where)} is at longitude {lon:.6g}, latitude {lat:.6g}, which is no place in "
                 f"{self.target.to_string()}. Give another --crs."
             )
         _, axes = self.earth.pose(self.target, found)
@@ -57,10 +57,10 @@ def map_poses(geographic: CRS, crs: str | None, centre: FloatArray) -> MapPoses:
     if crs is None:
         lon, lat, _ = earth.ground_from_cartesian(centre[None])[0]
         return MapPoses(earth, utm_zone(float(lon), float(lat)))
-    return MapPoses(earth, asked_crs(crs))
+    return MapPoses(earth, parsed_crs(crs))
 
 
-def asked_crs(crs: str) -> CRS:
+def parsed_crs(crs: str) -> CRS:
     """The map that --crs names."""
     try:
         return checked_crs(CRS.from_user_input(crs))
@@ -68,7 +68,7 @@ def asked_crs(crs: str) -> CRS:
         raise ConfigError(f"--crs {crs} is no CRS. Write it as EPSG:n.") from error
 
 
-def crs_name(crs: CRS) -> str:
+def scene_file_crs(crs: CRS) -> str:
     """How a scene file names a CRS: by authority and number, else in full."""
     authority = crs.to_authority(min_confidence=100)
     return ":".join(authority) if authority else crs.to_wkt()

@@ -17,11 +17,11 @@ import numpy as np
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.requests import ImportRequest
 from zlocus.io.cameras.frame_camera import Interior
-from zlocus.io.importers.base import Exposure, Imported, found_file, number
+from zlocus.io.importers.base import ImportedCameras, ImportedExposure, find_camera_file, read_number
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_documents import read_yaml
-from zlocus.io.safe_text import AGAIN, LONGEST_LINE, decimal, shown, text_lines
-from zlocus.io.schema import validated
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, decimal, quoted, text_lines
+from zlocus.io.schema import validate_document
 from zlocus.sensors.frame import rotation_from_angles
 
 FILES = ("eo.csv", "eo.txt", "exterior.csv", "exterior.txt", "camera_pos_ori.txt", "odm_xyz_opk.csv")
@@ -34,13 +34,13 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "phi": ("phi", "ph"),
     "kappa": ("kappa", "ka"),
 }
-LARGEST_ANGLE = 1e4
+MAX_ANGLE_DEG = 1e4
 # Bytes.
-LONGEST_INTERIOR = 100_000
+MAX_INTERIOR_BYTES = 100_000
 
 
-def read_eo(request: ImportRequest) -> Imported:
-    """The images of the table. See `Exposure`; coordinates are those of `--crs`, or local.
+def read_eo(request: ImportRequest) -> ImportedCameras:
+    """The images of the table. See `ImportedExposure`; coordinates are those of `--crs`, or local.
 
     Raises
     ------
@@ -49,10 +49,10 @@ def read_eo(request: ImportRequest) -> Imported:
     ConfigError
         Where the interior orientation is not given.
     """
-    path = found_file(request.source, FILES, "table of exterior orientations")
+    path = find_camera_file(request.source, FILES, "table of exterior orientations")
     interior = _interior(request)
     order: dict[str, int] = {name: i for i, name in enumerate(COLUMNS)}
-    exposures: list[Exposure] = []
+    exposures: list[ImportedExposure] = []
     is_first, n_columns = True, 0
     for line_number, line in text_lines(path):
         fields = _fields(line, path, line_number)
@@ -67,20 +67,20 @@ def read_eo(request: ImportRequest) -> Imported:
         n_columns = n_columns or len(fields)
         if len(fields) != n_columns:
             raise InputError(
-                f"{path}: line {line_number} has {len(fields)} columns, and lines before it {n_columns}. {AGAIN}"
+                f"{path}: line {line_number} has {len(fields)} columns, and lines before it {n_columns}. {EXPORT_AGAIN}"
             )
-    return Imported(path, tuple(exposures), request.crs, flat=request.earth == "flat")
+    return ImportedCameras(path, tuple(exposures), request.crs, flat=request.earth == "flat")
 
 
 def _fields(line: str, path: Path, line_number: int) -> list[str]:
-    if len(line) > LONGEST_LINE:
-        raise InputError(f"{path}: line {line_number} has {len(line)} letters, too many for a row. {AGAIN}")
+    if len(line) > MAX_LINE_CHARACTERS:
+        raise InputError(f"{path}: line {line_number} has {len(line)} letters, too many for a row. {EXPORT_AGAIN}")
     delimiter = next((mark for mark in ",;\t" if mark in line), " ")
     quote = "'" if line.lstrip().startswith("'") else '"'
     try:
         rows = list(csv.reader([line], delimiter=delimiter, quotechar=quote, skipinitialspace=True))
     except csv.Error as error:
-        raise InputError(f"{path}: line {line_number} is no line of a table: {error}. {AGAIN}") from error
+        raise InputError(f"{path}: line {line_number} is no line of a table: {error}. {EXPORT_AGAIN}") from error
     fields = [field.strip().strip("'") for field in rows[0]] if rows else []
     return fields if delimiter != " " else [field for field in fields if field]
 
@@ -99,7 +99,7 @@ def _checked_heading(heading: Sequence[str], path: Path) -> dict[str, int]:
         found = [i for i, column in enumerate(heading) if column in spellings]
         if len(found) != 1:
             raise InputError(
-                f"{path} has {len(found) or 'no'} columns for {name} in its heading {shown(' '.join(heading))}. Name "
+                f"{path} has {len(found) or 'no'} columns for {name} in its heading {quoted(' '.join(heading))}. Name "
                 f"each of {', '.join(COLUMNS)} once, or leave the heading out."
             )
         order[name] = found[0]
@@ -108,15 +108,15 @@ def _checked_heading(heading: Sequence[str], path: Path) -> dict[str, int]:
 
 def _exposure(
     fields: Sequence[str], order: dict[str, int], interior: dict[str, Any], path: Path, where: str
-) -> Exposure:
+) -> ImportedExposure:
     if len(fields) <= max(order.values()):
-        raise InputError(f"{path}: {where} has {len(fields)} columns, not {max(order.values()) + 1}. {AGAIN}")
-    values = {name: number(fields[i], path, f"{name} in {where}") for name, i in order.items() if name != "name"}
+        raise InputError(f"{path}: {where} has {len(fields)} columns, not {max(order.values()) + 1}. {EXPORT_AGAIN}")
+    values = {name: read_number(fields[i], path, f"{name} in {where}") for name, i in order.items() if name != "name"}
     angles = [values[name] for name in ("omega", "phi", "kappa")]
-    if max(map(abs, angles)) > LARGEST_ANGLE:
-        raise InputError(f"{path}: {where} has an angle of {max(map(abs, angles)):g} degrees. {AGAIN}")
+    if max(map(abs, angles)) > MAX_ANGLE_DEG:
+        raise InputError(f"{path}: {where} has an angle of {max(map(abs, angles)):g} degrees. {EXPORT_AGAIN}")
     centre = np.array([values[name] for name in "xyz"])
-    return Exposure(fields[order["name"]], interior, centre, np.array(rotation_from_angles(*angles)))
+    return ImportedExposure(fields[order["name"]], interior, centre, np.array(rotation_from_angles(*angles)))
 
 
 def _interior(request: ImportRequest) -> dict[str, Any]:
@@ -127,9 +127,9 @@ def _interior(request: ImportRequest) -> dict[str, Any]:
                 "A table of exterior orientations holds no interior one. Give --focal in pixels, or --camera FILE."
             )
         return {"focal": request.focal}
-    document = read_yaml(existing_file(request.camera, "interior orientation"), LONGEST_INTERIOR)
+    document = read_yaml(existing_file(request.camera, "interior orientation"), MAX_INTERIOR_BYTES)
     given = document if isinstance(document, dict) else {}
     # The centre of the image stands in where the principal point is not given.
     filled = {"principal_point": [0.0, 0.0]} | given
-    entry = validated(Interior, filled, Path(request.camera)).model_dump(mode="json", exclude_unset=True)
+    entry = validate_document(Interior, filled, Path(request.camera)).model_dump(mode="json", exclude_unset=True)
     return {key: value for key, value in entry.items() if key in given}

@@ -21,10 +21,18 @@ from zlocus.core.errors import InputError
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import is_on_earth
-from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix, size
-from zlocus.io.importers.earth import crs_name, map_poses
+from zlocus.io.importers.base import (
+    ImportedCameras,
+    ImportedExposure,
+    find_camera_file,
+    image_size,
+    read_number,
+    read_numbers,
+    rotation_matrix,
+)
+from zlocus.io.importers.earth import map_poses, scene_file_crs
 from zlocus.io.safe_documents import read_xml
-from zlocus.io.safe_text import AGAIN, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, quoted
 
 FILES = ("cameras.xml", "metashape.xml", "agisoft.xml")
 LENSES = {
@@ -45,15 +53,15 @@ class _Similarity:
     scale: float
 
 
-def read_metashape(request: ImportRequest) -> Imported:
-    """The aligned cameras of the first chunk. See `Exposure`; in a map, or in local axes where the chunk has no CRS.
+def read_metashape(request: ImportRequest) -> ImportedCameras:
+    """The aligned cameras of the first chunk. See `ImportedExposure`; in a map, or in local axes where the chunk has no CRS.
 
     Raises
     ------
     InputError
         For a file that is missing or damaged, an unknown calibration, or a chunk without a place.
     """
-    path = found_file(request.source, FILES, "Metashape export of cameras")
+    path = find_camera_file(request.source, FILES, "Metashape export of cameras")
     root = read_xml(path)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
@@ -68,22 +76,22 @@ def read_metashape(request: ImportRequest) -> Imported:
     return _placed(exposures, chunk, request, path)
 
 
-def _placed(exposures: list[Exposure], chunk: Element, request: ImportRequest, path: Path) -> Imported:
+def _placed(exposures: list[ImportedExposure], chunk: Element, request: ImportRequest, path: Path) -> ImportedCameras:
     """In the map, where the chunk knows its place."""
     crs = _chunk_crs(chunk, path)
     if crs is None or not exposures:
         if request.crs is not None:
             raise InputError(f"{path} has local coordinates, which --crs cannot place on the Earth. Leave --crs out.")
-        return Imported(path, tuple(exposures))
+        return ImportedCameras(path, tuple(exposures))
     geographic = crs.geodetic_crs
     assert geographic is not None, "_chunk_crs sees to it"
-    own = request.crs or (crs_name(crs) if _is_metric_map(crs) else None)
+    own = request.crs or (scene_file_crs(crs) if _is_metric_map(crs) else None)
     poses = map_poses(geographic, own, exposures[0].centre)
     placed = []
     for shot in exposures:
         centre, rotation = poses.pose(shot.centre, shot.rotation, path, shot.image)
-        placed.append(Exposure(shot.image, shot.interior, centre, rotation, shot.size))
-    return Imported(path, tuple(placed), crs_name(poses.target))
+        placed.append(ImportedExposure(shot.image, shot.interior, centre, rotation, shot.size))
+    return ImportedCameras(path, tuple(placed), scene_file_crs(poses.target))
 
 
 def _chunk_crs(chunk: Element, path: Path) -> CRS | None:
@@ -94,12 +102,12 @@ def _chunk_crs(chunk: Element, path: Path) -> CRS | None:
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
-        raise InputError(f"{path} has the reference {shown(text)}, which is no CRS. {AGAIN}") from error
+        raise InputError(f"{path} has the reference {quoted(text)}, which is no CRS. {EXPORT_AGAIN}") from error
     if crs.is_engineering:
         return None
     geographic = crs.to_2d().geodetic_crs
     if geographic is None or not is_on_earth(geographic):
-        raise InputError(f"{path} has the reference {crs.name}, whose place on the Earth is not known. {AGAIN}")
+        raise InputError(f"{path} has the reference {crs.name}, whose place on the Earth is not known. {EXPORT_AGAIN}")
     return crs.to_2d()
 
 
@@ -107,18 +115,18 @@ def _is_metric_map(crs: CRS) -> bool:
     return crs.is_projected and all(abs(axis.unit_conversion_factor - 1) < 1e-9 for axis in crs.axis_info)
 
 
-def _exposure(entry: Element, sensors: dict[str | None, Element], chunk: Element, path: Path) -> Exposure:
+def _exposure(entry: Element, sensors: dict[str | None, Element], chunk: Element, path: Path) -> ImportedExposure:
     label = entry.get("label") or ""
-    where = f"camera {shown(label)}"
+    where = f"camera {quoted(label)}"
     sensor = sensors.get(entry.get("sensor_id"))
     if sensor is None:
-        raise InputError(f"{path}: {where} has a sensor that the file does not hold. {AGAIN}")
-    pose = numbers(entry.findtext("transform") or "", 16, path, f"transform of {where}").reshape(4, 4)
+        raise InputError(f"{path}: {where} has a sensor that the file does not hold. {EXPORT_AGAIN}")
+    pose = read_numbers(entry.findtext("transform") or "", 16, path, f"transform of {where}").reshape(4, 4)
     world = _similarity(entry, chunk, path)
     rotation = world.rotation @ rotation_matrix(pose[:3, :3], path, where)
     centre = world.scale * world.rotation @ pose[:3, 3] + world.translation
     interior, pixels = _interior(sensor, path, f"the sensor of {where}")
-    return Exposure(label, interior, centre, rotation.T, pixels)
+    return ImportedExposure(label, interior, centre, rotation.T, pixels)
 
 
 def _similarity(entry: Element, chunk: Element, path: Path) -> _Similarity:
@@ -130,14 +138,14 @@ def _similarity(entry: Element, chunk: Element, path: Path) -> _Similarity:
     found = chunk.find("transform") if found is None else found
     if found is None:
         if _chunk_crs(chunk, path) is not None:
-            raise InputError(f"{path} has no transform of the chunk, so its place is not known. {AGAIN}")
+            raise InputError(f"{path} has no transform of the chunk, so its place is not known. {EXPORT_AGAIN}")
         return _Similarity(np.eye(3), np.zeros(3), 1.0)
     parts = {key: (found.findtext(key) or "").strip() for key in ("rotation", "translation", "scale")}
-    scale = number(parts["scale"] or "1", path, "the scale of the chunk")
+    scale = read_number(parts["scale"] or "1", path, "the scale of the chunk")
     if not scale > 0:
-        raise InputError(f"{path}: the scale of the chunk is {scale:g}, and must be above 0. {AGAIN}")
-    rotation = numbers(parts["rotation"], 9, path, "the rotation of the chunk")
-    translation = numbers(parts["translation"], 3, path, "the translation of the chunk")
+        raise InputError(f"{path}: the scale of the chunk is {scale:g}, and must be above 0. {EXPORT_AGAIN}")
+    rotation = read_numbers(parts["rotation"], 9, path, "the rotation of the chunk")
+    translation = read_numbers(parts["translation"], 3, path, "the translation of the chunk")
     return _Similarity(rotation_matrix(rotation, path, "the chunk"), translation, scale)
 
 
@@ -152,15 +160,16 @@ def _interior(sensor: Element, path: Path, where: str) -> tuple[dict[str, Any], 
     kind = entry.get("type", sensor.get("type", "frame"))
     if kind not in LENSES:
         raise InputError(
-            f"{path}: {where} is of the type {shown(kind)}, which is not read. Undistort the photos, or use one of "
+            f"{path}: {where} is of the type {quoted(kind)}, which is not read. Undistort the photos, or use one of "
             f"{', '.join(LENSES)}."
         )
     resolution = entry.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     attributes = {} if resolution is None else resolution.attrib
-    pixels = size(attributes.get("width"), attributes.get("height"), path, where)
+    pixels = image_size(attributes.get("width"), attributes.get("height"), path, where)
     value = {
-        key: number((entry.findtext(key) or "0").strip(), path, f"{key} of {where}") for key in INTERIOR + COEFFICIENTS
+        key: read_number((entry.findtext(key) or "0").strip(), path, f"{key} of {where}")
+        for key in INTERIOR + COEFFICIENTS
     }
     distortion, names = LENSES[kind]
     unknown = [key for key in COEFFICIENTS if value[key] and key not in names]

@@ -16,10 +16,18 @@ import numpy as np
 from zlocus.core.errors import InputError
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.importers.base import Exposure, Imported, found_file, number, numbers, rotation_matrix, size
-from zlocus.io.importers.earth import crs_name, map_poses
+from zlocus.io.importers.base import (
+    ImportedCameras,
+    ImportedExposure,
+    find_camera_file,
+    image_size,
+    read_number,
+    read_numbers,
+    rotation_matrix,
+)
+from zlocus.io.importers.earth import map_poses, scene_file_crs
 from zlocus.io.safe_documents import read_json
-from zlocus.io.safe_text import AGAIN, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, quoted
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, east_north_up
 from zlocus.sensors.rotation import from_vectors
 
@@ -33,38 +41,41 @@ LENSES = {
     "fisheye": ("fisheye", ("k1", "k2")),
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
-LARGEST = 1e3  # radians, of an axis of rotation
+MAX_ROTATION_RAD = 1e3  # radians, of an axis of rotation
 
 
-def read_opensfm(request: ImportRequest) -> Imported:
-    """The shots of the reconstruction. See `Exposure`; in a map, or with `--local` in the tangent frame.
+def read_opensfm(request: ImportRequest) -> ImportedCameras:
+    """The shots of the reconstruction. See `ImportedExposure`; in a map, or with `--local` in the tangent frame.
 
     Raises
     ------
     InputError
         For a file that is missing or damaged, in several parts, of another projection, or without a place on the Earth.
     """
-    path = found_file(request.source, FILES, "OpenSfM reconstruction")
+    path = find_camera_file(request.source, FILES, "OpenSfM reconstruction")
     document = _only_part(read_json(path), path)
     cameras = {
-        name: _camera(entry, path, f"camera {shown(name)}") for name, entry in _table(document, "cameras", path).items()
+        name: _camera(entry, path, f"camera {quoted(name)}")
+        for name, entry in _table(document, "cameras", path).items()
     }
     exposures = [_exposure(name, entry, cameras, path) for name, entry in _table(document, "shots", path).items()]
     if request.local:
-        return Imported(path, tuple(exposures))
+        return ImportedCameras(path, tuple(exposures))
     reference = document.get("reference_lla")
     if not isinstance(reference, dict):
         raise InputError(f"{path} has no reference_lla, so its place on the Earth is not known. Give --local.")
-    lla = [number(reference.get(k), path, f"reference_lla.{k}") for k in ("longitude", "latitude", "altitude")]
+    lla = [read_number(reference.get(k), path, f"reference_lla.{k}") for k in ("longitude", "latitude", "altitude")]
     if not (abs(lla[0]) <= 360 and abs(lla[1]) <= 90 and abs(lla[2]) < 1e5):
-        raise InputError(f"{path}: reference_lla is no place on the Earth: {', '.join(f'{v:g}' for v in lla)}. {AGAIN}")
+        raise InputError(
+            f"{path}: reference_lla is no place on the Earth: {', '.join(f'{v:g}' for v in lla)}. {EXPORT_AGAIN}"
+        )
     origin, axes = _tangent(np.array(lla))
     poses = map_poses(WGS84, request.crs, origin)
     placed = []
     for shot in exposures:
         centre, rotation = poses.pose(origin + shot.centre @ axes, shot.rotation @ axes, path, shot.image)
-        placed.append(Exposure(shot.image, shot.interior, centre, rotation, shot.size))
-    return Imported(path, tuple(placed), crs_name(poses.target))
+        placed.append(ImportedExposure(shot.image, shot.interior, centre, rotation, shot.size))
+    return ImportedCameras(path, tuple(placed), scene_file_crs(poses.target))
 
 
 def _tangent(lla: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -76,7 +87,7 @@ def _tangent(lla: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _only_part(document: Any, path: Path) -> dict[str, Any]:
     parts = document if isinstance(document, list) else [document]
     if not parts or not all(isinstance(part, dict) for part in parts):
-        raise InputError(f"{path} is not an OpenSfM reconstruction: it must hold cameras and shots. {AGAIN}")
+        raise InputError(f"{path} is not an OpenSfM reconstruction: it must hold cameras and shots. {EXPORT_AGAIN}")
     if len(parts) > 1:
         raise InputError(
             f"{path} holds {len(parts)} parts that are not joined, each with a frame of its own. Keep one of them."
@@ -87,7 +98,7 @@ def _only_part(document: Any, path: Path) -> dict[str, Any]:
 def _table(document: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
     table = document.get(key)
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
-        raise InputError(f"{path} has no table of {key}. {AGAIN}")
+        raise InputError(f"{path} has no table of {key}. {EXPORT_AGAIN}")
     return table
 
 
@@ -95,32 +106,34 @@ def _camera(entry: dict[str, Any], path: Path, where: str) -> tuple[dict[str, An
     projection = entry.get("projection_type", "perspective")
     if not isinstance(projection, str) or projection not in LENSES:
         raise InputError(
-            f"{path}: {where} has the projection {shown(projection)}, which is not read. Use one of "
+            f"{path}: {where} has the projection {quoted(projection)}, which is not read. Use one of "
             f"{', '.join(LENSES)}, or undistort the images in OpenSfM."
         )
-    pixels = size(entry.get("width"), entry.get("height"), path, where)
+    pixels = image_size(entry.get("width"), entry.get("height"), path, where)
     side = max(pixels)
     both = entry.get("focal")
-    focal = [number(entry.get(key, both), path, f"{key} of {where}") * side for key in ("focal_x", "focal_y")]
+    focal = [read_number(entry.get(key, both), path, f"{key} of {where}") * side for key in ("focal_x", "focal_y")]
     point = [
-        number(entry.get(key, 0.0), path, f"{key} of {where}") * side + (n - 1) / 2
+        read_number(entry.get(key, 0.0), path, f"{key} of {where}") * side + (n - 1) / 2
         for key, n in zip(("c_x", "c_y"), pixels, strict=True)
     ]
     kind, names = LENSES[projection]
-    lens = {name: number(entry.get(name, 0.0), path, f"{name} of {where}") for name in names}
+    lens = {name: read_number(entry.get(name, 0.0), path, f"{name} of {where}") for name in names}
     interior = {"focal": focal, "principal_point": point, "distortion": {"kind": kind, **lens}}
     return interior, pixels
 
 
 def _exposure(
     name: str, entry: dict[str, Any], cameras: dict[str, tuple[dict[str, Any], tuple[int, int]]], path: Path
-) -> Exposure:
-    where = f"shot {shown(name)}"
+) -> ImportedExposure:
+    where = f"shot {quoted(name)}"
     camera = entry.get("camera")
     if not isinstance(camera, str) or camera not in cameras:
-        raise InputError(f"{path}: {where} has the camera {shown(camera)}, which the file does not hold. {AGAIN}")
-    axis = numbers(entry.get("rotation"), 3, path, f"rotation of {where}")
-    rotation = rotation_matrix(from_vectors(np.clip(axis, -LARGEST, LARGEST)[None])[0], path, where)
-    translation = numbers(entry.get("translation"), 3, path, f"translation of {where}")
+        raise InputError(
+            f"{path}: {where} has the camera {quoted(camera)}, which the file does not hold. {EXPORT_AGAIN}"
+        )
+    axis = read_numbers(entry.get("rotation"), 3, path, f"rotation of {where}")
+    rotation = rotation_matrix(from_vectors(np.clip(axis, -MAX_ROTATION_RAD, MAX_ROTATION_RAD)[None])[0], path, where)
+    translation = read_numbers(entry.get("translation"), 3, path, f"translation of {where}")
     interior, pixels = cameras[camera]
-    return Exposure(name, interior, -rotation.T @ translation, rotation, pixels)
+    return ImportedExposure(name, interior, -rotation.T @ translation, rotation, pixels)

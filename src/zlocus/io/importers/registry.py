@@ -6,20 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from zlocus.core.requests import ImportRequest
-from zlocus.io.importers.base import Imported
+from zlocus.io.importers.base import ImportedCameras
 from zlocus.io.importers.bundler import read_bundler
 from zlocus.io.importers.colmap import read_colmap
 from zlocus.io.importers.eo import read_eo
 from zlocus.io.importers.metashape import read_metashape
 from zlocus.io.importers.opensfm import read_opensfm
-from zlocus.io.importers.strecha import read_strecha
 
 
 @dataclass(frozen=True)
 class Importer:
     """Reads a format; options : those of `ImportRequest` that say something to it."""
 
-    read: Callable[[ImportRequest], Imported]
+    read: Callable[[ImportRequest], ImportedCameras]
     options: tuple[str, ...]
 
 
@@ -29,5 +28,4 @@ IMPORTERS = {
     "metashape": Importer(read_metashape, ("crs", "up", "north")),
     "bundler": Importer(read_bundler, ("crs", "up", "north")),
     "eo": Importer(read_eo, ("crs", "up", "north", "focal", "camera", "earth")),
-    "strecha": Importer(read_strecha, ("up", "north")),
 }

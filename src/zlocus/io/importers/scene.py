@@ -11,18 +11,18 @@ from typing import Any
 from zlocus.core.errors import ConfigError, InputError, OutputError
 from zlocus.core.requests import ImportRequest
 from zlocus.io.cameras.frame_camera import FrameCamera
-from zlocus.io.importers.base import Exposure, Imported
-from zlocus.io.importers.earth import asked_crs, crs_name
+from zlocus.io.importers.base import ImportedCameras, ImportedExposure
+from zlocus.io.importers.earth import parsed_crs, scene_file_crs
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.open_raster import open_raster
-from zlocus.io.safe_text import AGAIN, shown
+from zlocus.io.safe_text import EXPORT_AGAIN, quoted
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
-from zlocus.io.schema import validated
+from zlocus.io.schema import validate_document
 from zlocus.sensors.frame import as_row, as_rows
 
 FOLDERS = ("", "images", "../images", "../../images", "../../../images", "undistorted/images", "../visualize")
 SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg", ".png", ".jp2", ".vrt", ".img")
-FEWEST = 2
+MIN_IMAGES = 2
 
 
 def import_scene(request: ImportRequest) -> SceneFile:
@@ -50,19 +50,19 @@ def import_scene(request: ImportRequest) -> SceneFile:
     return scene
 
 
-def scene_of(imported: Imported, request: ImportRequest) -> SceneFile:
+def scene_of(imported: ImportedCameras, request: ImportRequest) -> SceneFile:
     """The scene file of cameras, with the paths of their images relative to it."""
     exposures = imported.exposures
-    if len(exposures) < FEWEST:
+    if len(exposures) < MIN_IMAGES:
         raise InputError(
-            f"{imported.path} holds {len(exposures)} oriented images, and a surface needs {FEWEST} or more. {AGAIN}"
+            f"{imported.path} holds {len(exposures)} oriented images, and a surface needs {MIN_IMAGES} or more. {EXPORT_AGAIN}"
         )
     image, times = Counter(exposure.image for exposure in exposures).most_common(1)[0]
     if times > 1:
-        raise InputError(f"{imported.path}: the image {shown(image)} is there twice. {AGAIN}")
+        raise InputError(f"{imported.path}: the image {quoted(image)} is there twice. {EXPORT_AGAIN}")
     paths = _image_paths(exposures, imported.path, request.images)
     folder = request.out.absolute().parent.resolve()
-    crs = None if imported.crs is None else crs_name(asked_crs(imported.crs))
+    crs = None if imported.crs is None else scene_file_crs(parsed_crs(imported.crs))
     earth = {"earth": "flat"} if crs is not None and imported.flat else {}
     views = [
         ViewEntry(name=name, image=_relative(path, folder), camera=_camera(exposure, path, imported.path, earth))
@@ -73,10 +73,10 @@ def scene_of(imported: Imported, request: ImportRequest) -> SceneFile:
         frame["up"] = request.up
     if request.north is not None:
         frame["north"] = request.north
-    return validated(SceneFile, {"schema": 1, "frame": frame, "views": views}, imported.path)
+    return validate_document(SceneFile, {"schema": 1, "frame": frame, "views": views}, imported.path)
 
 
-def _camera(exposure: Exposure, image: Path, path: Path, earth: dict[str, Any]) -> FrameCamera:
+def _camera(exposure: ImportedExposure, image: Path, path: Path, earth: dict[str, Any]) -> FrameCamera:
     """The entry of an exposure, for an image whose size is that of its camera."""
     with open_raster(image) as source:
         size = (source.width, source.height)
@@ -89,10 +89,10 @@ def _camera(exposure: Exposure, image: Path, path: Path, earth: dict[str, Any]) 
     centre = {"principal_point": [(size[0] - 1) / 2, (size[1] - 1) / 2]}
     pose = {"centre": as_row(exposure.centre), "rotation": as_rows(exposure.rotation)}
     entry = {"kind": "frame", **centre, **exposure.interior, **pose, **earth}
-    return validated(FrameCamera, entry, path, f"camera of {shown(exposure.image)}")
+    return validate_document(FrameCamera, entry, path, f"camera of {quoted(exposure.image)}")
 
 
-def _image_paths(exposures: Sequence[Exposure], path: Path, given: Path | None) -> list[Path]:
+def _image_paths(exposures: Sequence[ImportedExposure], path: Path, given: Path | None) -> list[Path]:
     """Where the images lie: in the folder that is given, else in or near that of the cameras."""
     base = path if path.is_dir() else path.parent
     folders = [given] if given is not None else [base / name for name in FOLDERS]
@@ -102,13 +102,13 @@ def _image_paths(exposures: Sequence[Exposure], path: Path, given: Path | None) 
             missing = [name for name, image in found.items() if image is None]
             if missing:
                 raise InputError(
-                    f"{folder} lacks {len(missing)} of {len(exposures)} images of {path}, first {shown(missing[0])}. "
+                    f"{folder} lacks {len(missing)} of {len(exposures)} images of {path}, first {quoted(missing[0])}. "
                     "Add them, or give another folder with --images."
                 )
             return [image for image in found.values() if image is not None]
     where = str(given) if given is not None else f"{base} and images beside it"
     raise InputError(
-        f"The image {shown(exposures[0].image)} of {path} is not in {where}. Give the folder with --images."
+        f"The image {quoted(exposures[0].image)} of {path} is not in {where}. Give the folder with --images."
     )
 
 
@@ -130,7 +130,7 @@ def _found(name: str, folder: Path) -> Path | None:
     return None
 
 
-def _names(exposures: Sequence[Exposure]) -> list[str]:
+def _names(exposures: Sequence[ImportedExposure]) -> list[str]:
     """A name per view: that of the image without suffix, in full where two would be equal."""
     stems = [Path(exposure.image).stem for exposure in exposures]
     times = Counter(stems)

@@ -15,7 +15,7 @@ from pyproj import CRS, Transformer
 from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.run_record import read_record, write_whole
+from zlocus.io.run_record import read_record, write_atomically
 from zlocus.matching.quality import Quality
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
@@ -64,7 +64,7 @@ def write_report(out: Path, comparison: Comparison | None = None) -> Path:
         Where it cannot be written.
     """
     text = rendered(context(out, comparison))
-    write_whole(out / REPORT, lambda part: part.write_text(text, encoding="utf-8"))
+    write_atomically(out / REPORT, lambda part: part.write_text(text, encoding="utf-8"))
     return out / REPORT
 
 

@@ -15,7 +15,7 @@ from zlocus.evaluation.evaluate import Evaluation
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.report.sampling import Survey
 
-# As docs/quality.md has them; a test keeps them the same.
+# As docs/reference/quality.md has them; a test keeps them the same.
 MEANINGS = {
     Quality.OUTSIDE: "not asked for: outside the area, or inside a mask",
     Quality.UNSEEN: "fewer than two images cover the cell at the ground's height, or support a height above it",
