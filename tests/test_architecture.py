@@ -1,4 +1,4 @@
-"""What the style guide asks of every module, checked on the source."""
+"""What holds for every module of the package and every file of tests, checked on the source."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from places import ROOT
+from annotated_names import annotated_names, class_definitions, wrongly_named
+from places import ROOT, TESTS
 
 SOURCE = ROOT / "src" / "zlocus"
 MODULES = sorted(SOURCE.rglob("*.py"))
@@ -17,9 +18,11 @@ MAX_FUNCTION_LINES = 60
 NETWORK = {
     "socket", "urllib", "http", "requests", "ftplib", "smtplib", "aiohttp", "httpx", "starlette", "uvicorn",
 }  # fmt: skip
-NO_FILES = ("kernels", "sensors", "matching", "surface")
-# It finds the folder of compiled kernels, which depends on the content of their sources.
-DECORATOR = "kernels/_jit.py"
+# Packages that only compute: they open no file, read no environment, and import neither Dask nor rasterio nor GDAL.
+NO_FILES = ("matching", "orientation", "sensors")
+# The decorator of the kernels finds the folder of compiled code, which depends on the content of the sources.
+DECORATOR = "core/jit.py"
+MAX_ROOT_ENTRIES = 16
 FILE_CALLS = {
     "open",
     "read_text",
@@ -77,6 +80,13 @@ def imported(module: Path) -> set[str]:
 
 def test_the_source_is_there():
     assert len(MODULES) > 20
+    assert all((SOURCE / name).is_dir() for name in NO_FILES)
+    assert (SOURCE / DECORATOR).is_file()
+
+
+def test_the_root_of_the_package_stays_small():
+    entries = sorted(p.name for p in SOURCE.iterdir() if p.name != "__pycache__")
+    assert len(entries) <= MAX_ROOT_ENTRIES, entries
 
 
 @every_module
@@ -98,7 +108,7 @@ def test_public_names_have_a_docstring(module):
     assert ast.get_docstring(tree) or not tree.body
 
 
-# Modules that answer on this machine, and what they need for it.
+# The inspector's modules answer requests from this machine; each may import these.
 LISTENS = {
     "inspector/serving.py": {"socket", "uvicorn"},
     "inspector/server.py": {"starlette"},
@@ -107,19 +117,19 @@ LISTENS = {
 
 
 @every_module
-def test_nothing_reaches_for_the_network(module):
+def test_no_module_reaches_for_the_network(module):
     listens = LISTENS.get(module.relative_to(SOURCE).as_posix(), set())
     assert imported(module) & NETWORK == listens
     addresses = re.findall(r"https?://[^\s\"'>)]+", module.read_text(encoding="utf-8"))
-    # The page's own address is made of names that are not known here.
+    # The address of the inspector's own page is put together from host and port.
     assert [each for each in addresses if not (listens and re.match(r"http://\{\w+", each))] == []
 
 
-INNER = [m for m in MODULES if m.relative_to(SOURCE).parts[0] in NO_FILES and name_of(m) != DECORATOR]
+COMPUTING = [m for m in MODULES if m.relative_to(SOURCE).parts[0] in NO_FILES]
 
 
-@pytest.mark.parametrize("module", INNER, ids=name_of)
-def test_inner_layers_open_no_file(module):
+@pytest.mark.parametrize("module", COMPUTING, ids=name_of)
+def test_packages_that_compute_open_no_file(module):
     assert called(module) & FILE_CALLS == set()
     assert imported(module) & {"os", "io", "rasterio", "osgeo", "dask", "pyogrio", "tempfile"} == set()
 
@@ -128,3 +138,140 @@ def test_inner_layers_open_no_file(module):
 def test_kernels_are_compiled_by_our_decorator_only(module):
     if name_of(module) != DECORATOR:
         assert not re.search(r"@(numba\.)?(n?jit|vectorize|guvectorize)\b", module.read_text(encoding="utf-8"))
+
+
+# The noun of each class that is not called by its own name in snake case, or by the same last words of it everywhere.
+NOUNS: dict[str, tuple[str, ...]] = {
+    "BrownEntry": ("distortion",),
+    "CellWindow": ("window",),
+    "CheckOptions": ("checks", "options"),
+    "DepthRays": ("rays",),
+    "EarthSpace": ("earth",),
+    "FeaturePoints": ("features",),
+    "FisheyeEntry": ("distortion",),
+    "FrameCamera": ("camera",),
+    "FrameModel": ("sensor",),
+    "GeoidRaster": ("geoid",),
+    "HeightRaster": ("surface", "reference", "raster"),
+    "HeightRays": ("rays",),
+    "ImageQuality": ("quality",),
+    "ImageSource": ("image",),
+    "InputFiles": ("inputs",),
+    "LineScanCamera": ("camera",),
+    "LineScanModel": ("sensor",),
+    "LineScanner": ("camera",),
+    "MatchScene": ("match_scene",),
+    "Observations": ("observations",),
+    "OpenedCamera": ("camera",),
+    "Orientation": ("orientation",),
+    "PlaneOptions": ("planes", "options"),
+    "Polygons": ("polygons", "area"),
+    "ProductOptions": ("products", "options"),
+    "Quality": ("quality", "flag"),
+    "RasterImage": ("image",),
+    "RectifiedScanner": ("camera",),
+    "RpcCoefficients": ("rpc",),
+    "RpcModel": ("sensor",),
+    "RunConfig": ("config",),
+    "Scene": ("scene",),
+    "SemiGlobalOptions": ("semiglobal", "options"),
+    "SensorModel": ("sensor",),
+    "Stopwatch": ("stopwatch",),
+    "Surface": ("surface",),
+    "TerrainHeights": ("terrain",),
+    "Tile": ("tile",),
+    "TileJob": ("tile_job",),
+    "TileViews": ("tile_views",),
+    "TruthBlocks": ("truth",),
+    "VerticalDatum": ("vertical_datum",),
+    "View": ("view",),
+    "ViewEntry": ("entry", "view"),
+    "ZlocusError": ("error",),
+    "_ColmapCamera": ("camera",),
+}
+# Class names that stand in two modules still, and the reason. Nothing may be added.
+CLASS_NAMES_TWICE: dict[str, str] = {}
+# Names of a class that are not its noun still, and the reason: (class, name). Nothing may be added.
+SECOND_NAMES: dict[tuple[str, str], str] = {}
+
+
+def test_a_class_name_occurs_once():
+    twice = {name: places for name, places in class_definitions(SOURCE).items() if len(places) > 1}
+    assert {name: places for name, places in twice.items() if name not in CLASS_NAMES_TWICE} == {}
+    assert set(CLASS_NAMES_TWICE) <= set(twice), "these occur once by now: take them off the list"
+
+
+def test_a_noun_has_one_variable_name():
+    wrong = wrongly_named(SOURCE, NOUNS)
+    assert [each for each in wrong if (each.class_name, each.name) not in SECOND_NAMES] == []
+    assert set(SECOND_NAMES) <= {(e.class_name, e.name) for e in wrong}, "these are mended: take them off the list"
+    assert set(NOUNS) <= set(class_definitions(SOURCE)), "these classes are gone: take them off the list"
+
+
+PLANTED = """
+class Scene: ...
+class MatchScene: ...
+class DsmRequest: ...
+class View:
+    def same_as(self, other: "View") -> bool: ...
+
+class Settled:
+    scene: Scene
+    oriented_scene: Scene | None
+    views: tuple[View, ...]
+    view_of_name: dict[str, View]
+
+def run(request: DsmRequest, match_scene: MatchScene, view_a: View) -> None: ...
+def again(order: DsmRequest, request: DsmRequest, scene: "MatchScene", settled: Scene, others: list[View]) -> None: ...
+"""
+
+
+def test_a_planted_second_name_is_seen(tmp_path):
+    (tmp_path / "planted.py").write_text(PLANTED)
+    (tmp_path / "more.py").write_text("class View: ...")
+    wrong = wrongly_named(tmp_path, {"MatchScene": ("match_scene",)})
+    found = {(each.class_name, each.name) for each in wrong}
+    assert found == {("DsmRequest", "order"), ("MatchScene", "scene"), ("Scene", "settled"), ("View", "others")}
+    assert len(annotated_names(tmp_path)) == 12
+    assert len(class_definitions(tmp_path)["View"]) == 2
+
+
+# Tests of whole runs, of the documentation and of the benchmarks belong to no single module.
+NOT_MIRRORED = ("runs", "docs", "benchmarks")
+# Tests of the whole package stand in the root of the tests.
+OF_THE_PACKAGE = {"test_architecture.py", "test_kernel_signatures.py"}
+
+
+def files_without_a_module(tests: Path, source: Path) -> list[str]:
+    """Files of tests that are not named after a module or package at the same place in the source.
+
+    The file begins with the name of its module: test_view_ranking_order.py holds tests of view_ranking.py.
+    """
+    lost = []
+    for file in sorted(tests.rglob("test_*.py")):
+        folder = file.relative_to(tests).parent
+        if folder.parts[:1] and folder.parts[0] in NOT_MIRRORED:
+            continue
+        mirrored = source / folder
+        names = {p.stem for p in mirrored.iterdir() if p.name != "__pycache__"} if mirrored.is_dir() else set()
+        names.add(mirrored.name)
+        if not any(f"{file.stem}_".startswith(f"test_{name}_") for name in names):
+            lost.append(file.relative_to(tests).as_posix())
+    return lost
+
+
+def test_files_of_tests_mirror_the_source():
+    lost = files_without_a_module(TESTS, SOURCE)
+    assert [name for name in lost if name not in OF_THE_PACKAGE] == []
+
+
+def test_a_planted_test_without_a_module_is_seen(tmp_path):
+    for path in ("source/io/images.py", "tests/io/test_images.py", "tests/io/test_images_remote.py",
+                 "tests/io/test_io_damage.py", "tests/io/test_imagery.py", "tests/runs/test_town.py",
+                 "tests/gone/test_images.py"):  # fmt: skip
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).touch()
+    assert files_without_a_module(tmp_path / "tests", tmp_path / "source") == [
+        "gone/test_images.py",
+        "io/test_imagery.py",
+    ]
