@@ -10,7 +10,8 @@ needed.
 One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
 the repeated image. CPU is that of all processes, from `run.json`; memory the most that one worker held, from
 `events.jsonl`. Measured rows are kept in `growth.csv`, or the table that `--table` names, in place of those of the same
-kind; `draw` shows them as docs/growth.png. `--period` makes the town, and the images of a block, smaller.
+kind; `draw` shows them as docs/development/experiments/growth.png. `--period` makes the town, and the images of a block,
+smaller.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from zlocus.synthetic.scenes import build_ground, city_spec, exposures, steady
 from zlocus.synthetic.terrain import SyntheticGround
 
 ROOT = Path(__file__).parents[1]
-KEPT, PICTURE = ROOT / "benchmarks" / "growth.csv", ROOT / "docs" / "growth.png"
+KEPT, PICTURE = ROOT / "benchmarks" / "growth.csv", ROOT / "docs" / "development" / "experiments" / "growth.png"
 PERIOD_PX, GSD_M = 1024, 0.5
 # So far away that rays are parallel over the largest scene, to a thousandth of a pixel.
 FAR_M = 1e9

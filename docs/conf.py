@@ -16,8 +16,6 @@ from pygments.lexers.special import TextLexer  # noqa: E402
 from reference_pages import (  # noqa: E402
     command_reference,
     option_reference,
-    result_pages,
-    unlisted_pages,
     with_listed_parameters,
 )
 from zlocus import __version__  # noqa: E402
@@ -34,8 +32,9 @@ extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
 # Quotation marks stand in code and in names of files.
 smartquotes = False
 myst_heading_anchors = 4
-# Equations would need a script from elsewhere: pages say them in words and plain formulae.
-myst_enable_extensions: list[str] = []
+# Definition lists, for the glossary. Equations would need a script from elsewhere: pages say them in words and plain
+# formulae.
+myst_enable_extensions = ["deflist"]
 
 # Notebooks are kept without outputs; `make docs` runs them.
 nb_execution_mode = "force"
@@ -57,32 +56,30 @@ html_copy_source = False
 html_show_sourcelink = False
 html_static_path: list[str] = []
 
-# What stands in a page in place of such a line is made from the code.
+# Each of these lines in a page is replaced by what its function makes from the code.
 GENERATED = {
     "<!-- generated: commands -->": command_reference,
     "<!-- generated: options -->": option_reference,
-    "<!-- generated: pages on results -->": lambda: result_pages(HERE),
-    "<!-- generated: other pages -->": lambda: unlisted_pages(HERE),
 }
 
 
 def fill_in(app: Sphinx, page: str, source: list[str]) -> None:
-    """Puts generated parts into a page as it is read."""
+    """Replace the marked lines of a page, as Sphinx reads it, by the generated parts."""
     for marker, make in GENERATED.items():
         if marker in source[0]:
             source[0] = source[0].replace(marker, make())
 
 
-def list_parameters(app: Sphinx, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
-    """Parameters of functions and classes as a list, whose docstrings have them in sentences."""
+def list_parameters(app: Sphinx, what: str, name: str, member: Any, options: Any, lines: list[str]) -> None:
+    """Rewrite a docstring so that the parameters of its function or class stand in a list."""
     if what in ("function", "method"):
-        lines[:] = with_listed_parameters(lines, inspect.signature(found).parameters)
-    elif what == "class" and is_dataclass(found):
-        lines[:] = with_listed_parameters(lines, [field.name for field in fields(found)])
+        lines[:] = with_listed_parameters(lines, inspect.signature(member).parameters)
+    elif what == "class" and is_dataclass(member):
+        lines[:] = with_listed_parameters(lines, [field.name for field in fields(member)])
 
 
 def setup(app: Sphinx) -> None:
-    """Called by Sphinx."""
+    """Connect the functions above; Sphinx calls this."""
     app.connect("source-read", fill_in)
     app.connect("autodoc-process-docstring", list_parameters)
     # Tables in text: Pygments has no lexer for them.

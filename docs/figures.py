@@ -1,4 +1,4 @@
-"""Figures of the method, made by the code: `python docs/figures.py [FOLDER]` renders a scene and draws them.
+"""Figures of the method page: `python docs/figures.py [FOLDER]` renders a scene, matches it and draws them.
 
 Everything comes from one rendered town with exact truth; the same code gives the same figures.
 """
@@ -74,7 +74,7 @@ class Town:
 
 
 def rendered_town(folder: Path) -> Town:
-    """Renders the scene into a new folder."""
+    """Render the scene into a new folder."""
     spec = replace(city_spec(SEED), size=SIZE_PX)
     scene = render_scene(replace(spec, views=tuple(view for view in spec.views if view.name in SIX)), folder)
     with rasterio.open(scene.truth_dsm) as source:
@@ -86,7 +86,7 @@ def rendered_town(folder: Path) -> Town:
 
 
 def locus(town: Town) -> Figure:
-    """A cell's vertical line in three images: every height is a place in each, and at one height they agree."""
+    """Figure of a cell's vertical line in three images."""
     scene, z = zlocus.open_scene(*town.images(THREE)), town.height(PLACE)
     figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.9), layout="constrained")
     heights = z + np.arange(-20.0, 20.1, 5.0)
@@ -110,8 +110,8 @@ def locus(town: Town) -> Figure:
 
 @dataclass(frozen=True)
 class PointCurves:
-    """What `zlocus curves` says of a place. table : columns of curves.csv, (h,) each, the heights first; judged : by
-    search image, as point.json has it."""
+    """Results of `zlocus curves` for a point. table : columns of curves.csv, (h,) each, the heights first; judged : the
+    entries of point.json, by search image."""
 
     table: dict[str, FloatArray]
     judged: dict[str, dict[str, Any]]
@@ -123,7 +123,7 @@ class PointCurves:
 
 
 def point_curves(town: Town, folder: Path) -> PointCurves:
-    """Match curves of a place against n1, of all images."""
+    """Match curves of all images against n1, at `PLACE`."""
     request = CurvesRequest(inputs=town.images(SIX), out=folder, at=PLACE, reference="img_n1", resolution=CELL_M)
     run_point(request, RunConfig(), SilentProgress())
     table = np.genfromtxt(folder / "curves.csv", delimiter=",", names=True, deletechars="")
@@ -132,7 +132,7 @@ def point_curves(town: Town, folder: Path) -> PointCurves:
 
 
 def curves(town: Town, point: PointCurves) -> Figure:
-    """Match curves of a cell with two search images: the largest value rho1, and its rival rho2."""
+    """Figure of the match curves of two search images: the peak rho1 and the secondary peak rho2."""
     figure, axes = plt.subplots(1, 2, figsize=(7.6, 2.7), sharey=True, layout="constrained")
     z = point.heights_m
     for name, ax in zip(("img_f1", "img_b1"), axes, strict=True):
@@ -153,7 +153,7 @@ def curves(town: Town, point: PointCurves) -> Figure:
 
 
 def means(town: Town, point: PointCurves) -> Figure:
-    """SNCC, the mean of the curves of the first 1, 2, ... search images."""
+    """Figure of SNCC, the mean of the match curves of the first 1, 2, ... search images."""
     figure, ax = plt.subplots(figsize=(7.6, 2.8), layout="constrained")
     columns = [name for name in point.table if name.startswith("sncc_")]
     for k, name in enumerate(columns):
@@ -172,7 +172,7 @@ def means(town: Town, point: PointCurves) -> Figure:
 
 
 def surface(town: Town, method: str) -> dict[str, FloatArray]:
-    """Height and sigma, (r, c) m on the cells of the truth, by three views."""
+    """Height and sigma from three views, (r, c) m on the cells of the truth."""
     options = {"bounds": town.bounds, "resolution": CELL_M, "method": method, "partial": True}
     with tempfile.TemporaryDirectory() as scratch:
         request = DsmRequest(inputs=town.images(THREE), out=Path(scratch) / "out", **options)
@@ -184,12 +184,12 @@ def surface(town: Town, method: str) -> dict[str, FloatArray]:
     return found
 
 
-def semiglobal(town: Town, alone: FloatArray, together: FloatArray) -> Figure:
-    """Cells that decide alone, and under the semi-global constraint, with their errors."""
+def semiglobal(town: Town, winner_takes_all: FloatArray, constrained: FloatArray) -> Figure:
+    """Figure of surfaces without and with the semi-global constraint, and of their errors."""
     figure, axes = plt.subplots(2, 3, figsize=(7.6, 5.0), layout="constrained")
     light = LightSource(315, 45)
     low, high = np.percentile(town.truth, (1, 99))
-    panels = (("each cell by itself", alone), ("semi-global constraint", together), ("truth", town.truth))
+    panels = (("winner takes all", winner_takes_all), ("semi-global constraint", constrained), ("truth", town.truth))
     for (title, height), (top, bottom) in zip(panels, axes.T, strict=True):
         shown = np.clip(np.where(np.isfinite(height), height, low), low, high)
         shaded = light.shade(shown, plt.cm.viridis, vmin=low, vmax=high, dx=CELL_M, dy=CELL_M, blend_mode="soft")
@@ -214,7 +214,7 @@ def _bare(ax: Axes) -> None:
 
 
 def precision(town: Town, found: dict[str, FloatArray]) -> Figure:
-    """Standard deviations against true errors: in each twentieth of the cells, by sigma."""
+    """Figure of true errors against standard deviations, in twenty groups of cells sorted by sigma."""
     error = np.abs(found["dsm"] - town.truth)
     known = np.isfinite(error) & np.isfinite(found["sigma"])
     error, sigma = error[known], found["sigma"][known]
@@ -236,7 +236,7 @@ def precision(town: Town, found: dict[str, FloatArray]) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a figure in 128 colours, a third of the size."""
+    """Write a figure as PNG with 128 colours, which takes a third of the space."""
     drawn = BytesIO()
     figure.savefig(drawn, format="png", metadata={"Software": None})
     plt.close(figure)
@@ -244,7 +244,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def make_figures(folder: Path) -> list[Path]:
-    """Draws all figures into a folder; returns their files."""
+    """Draw all figures into a folder and return their files."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch, plt.rc_context(STYLE):
         town = rendered_town(Path(scratch) / "scene")

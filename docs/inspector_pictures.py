@@ -1,7 +1,7 @@
 """Pictures of the inspector, taken in a browser: `python docs/inspector_pictures.py [FOLDER]`.
 
-Renders the scene of the demo, makes its surface, and looks at it beside its truth. Needs Chromium (from CHROMIUM or the
-PATH).
+Renders the scene of the demo, makes its surface, and opens it in the inspector beside its truth. Needs Chromium: the
+program that CHROMIUM names, or one on the PATH.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ SCROLLED = 390
 
 
 def main() -> None:
-    """Make the surface, and take the pictures."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else HERE
+    """Make the surface and take the pictures."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else HERE / "pictures"
     browser = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         sys.exit(f"There is no browser: set CHROMIUM, or install one of {', '.join(BROWSERS)}.")
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def take(address: str, browser: str, folder: Path) -> None:
-    """All views of a page, as files."""
+    """Write a picture of every view of a page."""
     with sync_playwright() as playwright:
         arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         chromium = playwright.chromium.launch(executable_path=browser, args=arguments)
@@ -66,7 +66,7 @@ def take(address: str, browser: str, folder: Path) -> None:
 
 
 def prepare(page: Any, view: str) -> None:
-    """Wait for all of a view, and scroll to what is to be seen."""
+    """Wait until a view is drawn, and scroll to the part that the picture shows."""
     if "tab=relief" in view:
         page.wait_for_selector("#relief-view[data-places]")
     else:

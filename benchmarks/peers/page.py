@@ -30,12 +30,12 @@ PLAIN = "{x:g}"
 PICTURES = ("peers_accuracy.png", "peers_cost.png")
 HEAD = """# Beside other programs
 
-<!-- Made by `python benchmarks/peers --page docs` from benchmarks/peers/results.json: change those, not this page. -->
+<!-- Made by `python benchmarks/peers --page docs/reference` from benchmarks/peers/results.json: change those, not this page. -->
 
     make peers                                                     # all of it, some hours: build/peers/peers.md
     python benchmarks/peers --scenes town --programs zlocus CARS   # one scene, two programs
     python benchmarks/peers --micmac /opt/micmac/bin/mm3d          # a program that no registry has
-    python benchmarks/peers --page docs                            # this page, from benchmarks/peers/results.json
+    python benchmarks/peers --page docs/reference                  # this page, from benchmarks/peers/results.json
 
 The same images, area, grid and cores for all. Programs are installed from the package registry into environments
 of their own; their configurations stand in `benchmarks/peers/configurations`, as their documents recommend them,

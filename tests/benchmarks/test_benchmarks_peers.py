@@ -92,7 +92,7 @@ def test_the_command_writes_the_page_of_results(tmp_path):
     done = subprocess.run(script, check=True, capture_output=True, text=True)
     assert done.stdout == f"{tmp_path}/peers.md\n"
     written = (tmp_path / "peers.md").read_bytes()
-    assert written == (BENCHMARKS.parent / "docs" / "peers.md").read_bytes()
+    assert written == (BENCHMARKS.parent / "docs" / "reference" / "peers.md").read_bytes()
 
 
 def test_scenes_asked_for_are_rendered(tmp_path, monkeypatch):

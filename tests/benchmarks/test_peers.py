@@ -381,11 +381,12 @@ def test_a_failure_stands_on_the_page():
 def test_the_page_of_the_documents_is_that_of_the_results(tmp_path):
     results = ROOT / "benchmarks" / "peers" / "results.json"
     page.write_page(results, tmp_path)
-    assert (tmp_path / "peers.md").read_text(encoding="utf-8") == (ROOT / "docs" / "peers.md").read_text(
+    assert (tmp_path / "peers.md").read_text(encoding="utf-8") == (ROOT / "docs" / "reference" / "peers.md").read_text(
         encoding="utf-8"
     )
     assert all(
-        (ROOT / "docs" / name).exists() for name in re.findall(r"\]\((\w+\.png)\)", page.page_of(results_of(zlocus=1)))
+        (ROOT / "docs" / "reference" / name).exists()
+        for name in re.findall(r"\]\((\w+\.png)\)", page.page_of(results_of(zlocus=1)))
     )
 
 

@@ -22,7 +22,7 @@ from zlocus.matching import quality as reasons
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.stac_item import PRODUCTS
 
-PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
+from docs_commands import PAGES
 
 
 def fate(flag: Quality) -> str:
@@ -35,27 +35,27 @@ def test_the_table_of_quality_flags_is_that_of_the_code():
     source = Path(reasons.__file__).read_text(encoding="utf-8")
     said = dict(re.findall(r"^    ([A-Z_]+) = \d+  # (.+)$", source, re.MULTILINE))
     expected = [(str(int(flag)), flag.name, said[flag.name], fate(flag)) for flag in Quality]
-    page = (ROOT / "docs" / "quality.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "quality.md").read_text(encoding="utf-8")
     rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in page.splitlines()]
     assert [row for row in rows if row[0].isdigit()] == expected
 
 
 def test_the_scene_file_of_the_documents_is_valid(tmp_path):
-    page = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "scene.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "scene.yaml").write_text(example, encoding="utf-8")
     scene = read_scene_file(tmp_path / "scene.yaml")
     assert [view.name for view in scene.views] == ["nadir", "forward"]
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/examples/*.yaml")), ids=lambda p: p.name)
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/reference/examples/*.yaml")), ids=lambda p: p.name)
 def test_the_examples_are_valid(path):
     assert len(read_scene_file(path).views) == 2
-    assert f"examples/{path.name}" in (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+    assert f"examples/{path.name}" in (ROOT / "docs" / "reference" / "scene.md").read_text(encoding="utf-8")
 
 
 def test_every_importer_is_documented():
-    page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "import.md").read_text(encoding="utf-8")
     assert re.findall(r"^\| `([a-z]+)` \|", page, re.MULTILINE) == list(IMPORTERS)
     options = {name for importer in IMPORTERS.values() for name in importer.options} | {"images", "overwrite"}
     assert all(f"--{name}" in page for name in options)
@@ -71,7 +71,7 @@ def test_the_readme_lists_every_option_of_dsm():
 
 
 def test_the_page_of_vertical_datums_names_what_there_is():
-    page = (ROOT / "docs" / "vertical.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "vertical.md").read_text(encoding="utf-8")
     for name, known in KNOWN.items():
         assert f"| `{name}` | {', '.join(f'`{grid}`' for grid in known.grids)} |" in page
         assert f"| `{name}` | {known.title}, " in page
@@ -85,14 +85,14 @@ def test_the_page_of_vertical_datums_names_what_there_is():
 
 
 def test_every_product_is_documented():
-    rows = re.findall(r"^\| `(\S+)` \|", (ROOT / "docs" / "products.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(r"^\| `(\S+)` \|", (ROOT / "docs" / "reference" / "products.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(rows) == sorted([*(product.name for product in PRODUCTS), "item.json", FINISHED])
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in readme for name in rows)
 
 
 STAGES = re.findall(
-    r"^\| [^|]+ \| `(zlocus(?:\.[a-z_]+)+)` \|", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE
+    r"^\| [^|]+ \| `(zlocus(?:\.[a-z_]+)+)` \|", (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"), re.MULTILINE
 )
 # One or more sizes: (n,), (r, c), (4, r, c).
 SHAPE = re.compile(r"\((?:[a-z]|\d+)(?:,|(?:, (?:[a-z]|\d+))+)\)")
@@ -137,7 +137,7 @@ def test_links_lead_to_files(page):
 
 
 def test_paths_named_in_the_method_exist():
-    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "explanation" / "method.md").read_text(encoding="utf-8")
     named = re.findall(r"\(`([a-z_/]+(?:\.py|/))`\)", text)
     assert len(named) == 19
     for path in named:

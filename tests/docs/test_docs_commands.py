@@ -19,11 +19,10 @@ import typer.main
 from typer.testing import CliRunner
 
 from places import ROOT
-from docs_commands import INLINE, LAID_OUT, PROJ_GRIDS, Step, inline_commands, steps_of
+from docs_commands import INLINE, LAID_OUT, PAGES, PROJ_GRIDS, Step, inline_commands, name_of, steps_of
 from zlocus.cli.app import app
 from zlocus.synthetic.__main__ import _parser
 
-PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
 COMMANDS = vars(typer.main.get_command(app))["commands"]
 # Per cent, of the figures in the tutorial.
 TOLD_TO = 0.5
@@ -117,7 +116,7 @@ def check_page(words: list[str], folder: Path, environment: dict[str, str]) -> N
 
 @pytest.mark.parametrize("page", [p for p in PAGES if steps_of(p)], ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_the_commands_of_a_page_work(page, tmp_path):
-    lay_out = LAID_OUT.get(page.name) if page.parent != ROOT / "benchmarks" else None
+    lay_out = LAID_OUT.get(name_of(page))
     if lay_out:
         lay_out(tmp_path)
     for step in steps_of(page):
@@ -130,8 +129,8 @@ def test_the_commands_of_a_page_work(page, tmp_path):
         # Without a layout a page's files are not there: its command line alone is checked.
         if lay_out:
             run(step, tmp_path)
-    if page.name in TOLD:
-        TOLD[page.name](tmp_path)
+    if name_of(page) in TOLD:
+        TOLD[name_of(page)](tmp_path)
 
 
 def check_tutorial(folder: Path) -> None:
@@ -139,7 +138,7 @@ def check_tutorial(folder: Path) -> None:
     words = ["evaluate", "surface/dsm.tif", "scene/truth_dsm.tif", "--classes", "scene/truth_class.tif", "--json"]
     done = CliRunner().invoke(app, [str(folder / word) if "/" in word else word for word in words])
     found = json.loads(done.stdout)
-    told = " ".join((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8").split())
+    told = " ".join((ROOT / "docs" / "tutorials" / "first_surface.md").read_text(encoding="utf-8").split())
     numbers = re.search(
         r"truth ([\d.]+) % lie within 1 m .*: ([\d.]+) % of the ground and of the roofs, ([\d.]+) %", told
     )
@@ -150,7 +149,7 @@ def check_tutorial(folder: Path) -> None:
     coverage = json.loads((folder / "surface" / "run.json").read_text(encoding="utf-8"))["coverage"]
     assert f"says that {100 * coverage:.0f} % of the cells" in told
     # Another run of `zlocus dsm`, to which no products were added.
-    page = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "tutorials" / "first_surface.md").read_text(encoding="utf-8")
     (section,) = re.findall(r"^## 3\..*?(?=^## 4\.)", page, re.DOTALL | re.MULTILINE)
     first_columns = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
     named = re.findall(r"`([a-z_]+\.[a-z]+)`", " ".join(first_columns))
@@ -158,7 +157,7 @@ def check_tutorial(folder: Path) -> None:
 
 
 # After the commands of a page: whether what it says of them is so.
-TOLD = {"tutorial.md": check_tutorial}
+TOLD = {"docs/tutorials/first_surface.md": check_tutorial}
 
 
 def test_commands_in_sentences_exist():
@@ -175,7 +174,7 @@ def without_a_layout(pages: list[Path]) -> list[str]:
     told = [
         page.name
         for page in pages
-        if page.parent == ROOT / "benchmarks" or page.name not in LAID_OUT
+        if name_of(page) not in LAID_OUT
         if any(not step.text.startswith(tuple(ONLY_CHECKED)) for step in steps_of(page))
     ]
     return sorted(told)
@@ -199,7 +198,7 @@ def test_a_page_without_a_layout_is_noticed(tmp_path):
 
 def test_every_layout_has_its_page():
     """No layout is left whose page has gone, or has no commands any more."""
-    laid_out = {page.name for page in PAGES if steps_of(page)} & set(LAID_OUT)
+    laid_out = {name_of(page) for page in PAGES if steps_of(page)} & set(LAID_OUT)
     assert laid_out == set(LAID_OUT)
 
 
@@ -215,7 +214,7 @@ def test_usage_lines_name_all_options(page):
 
 def test_blocks_of_commands_are_found():
     """Of a page that is known: what is looked for is what stands there."""
-    steps = [step.text for step in steps_of(ROOT / "docs" / "import.md")]
+    steps = [step.text for step in steps_of(ROOT / "docs" / "how-to" / "import.md")]
     assert steps[0] == "zlocus import colmap PROJECT -o scene.yaml"
     assert steps[-1] == "zlocus dsm scene.yaml -o facade"
     assert len(steps) == 8

@@ -14,11 +14,14 @@ from rasterio.transform import from_origin
 import camera_files
 from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
+from places import ROOT
 from rendered_scenes import CENTRE, GSD_M, UTM, rendered
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import KNOWN
 from zlocus.synthetic.terrain import analytic_height
 
+# Every page that a reader may be sent to, the notebooks aside.
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks" / "README.md"])
 PROGRAMS = ("zlocus", "python", "make", "printf")
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```|((?:^ {4}[^\n]*\n)+)", re.DOTALL | re.MULTILINE)
 # Where a user's own grids of PROJ lie, below a page's folder.
@@ -32,6 +35,11 @@ class Step:
 
     text: str
     is_python: bool = False
+
+
+def name_of(page: Path) -> str:
+    """The path of a page from the root of the repository; the name alone of a page that lies elsewhere."""
+    return page.relative_to(ROOT).as_posix() if page.is_relative_to(ROOT) else page.name
 
 
 def steps_of(page: Path) -> list[Step]:
@@ -86,7 +94,7 @@ def lay_out_cameras(folder: Path) -> None:
     (table / "eo.csv").rename(folder / "orientations.csv")
     for image in table.glob("*.tif"):
         image.rename(folder / image.name)
-    photographed(folder / "herzjesu_p8", "sine", axes_of_wall((-0.733, 0.68, 0.0), (0.0, 0.0, -1.0)))
+    photographed(folder / "WALL", "sine", axes_of_wall((-0.733, 0.68, 0.0), (0.0, 0.0, -1.0)))
 
 
 def lay_out_products(folder: Path) -> None:
@@ -158,18 +166,21 @@ def lay_out_surface(folder: Path) -> None:
 
 # What a page's commands find in the folder in which they are run.
 LAID_OUT = {
-    "README.md": lay_out_images,
-    "api.md": lay_out_images,
-    "rpc.md": lay_out_images,
-    "orientation.md": lay_out_images,
-    "doctor.md": lay_out_images,
-    "import.md": lay_out_cameras,
-    "quality.md": lay_out_surface,
-    "products.md": lay_out_products,
-    "large.md": lay_out_images,
-    "report.md": lay_out_comparison,
-    "inspect.md": lay_out_images,
-    "evaluate.md": lay_out_surfaces,
-    "vertical.md": lay_out_datums,
-    "tutorial.md": lambda folder: None,
+    "README.md": lay_out_readme,
+    "docs/explanation/orientation.md": lay_out_images,
+    "docs/how-to/cloud.md": lay_out_images,
+    "docs/how-to/curves.md": lay_out_images,
+    "docs/how-to/doctor.md": lay_out_images,
+    "docs/how-to/evaluate.md": lay_out_surfaces,
+    "docs/how-to/import.md": lay_out_cameras,
+    "docs/how-to/inspect.md": lay_out_images,
+    "docs/how-to/large.md": lay_out_images,
+    "docs/how-to/orient.md": lay_out_images,
+    "docs/how-to/report.md": lay_out_comparison,
+    "docs/how-to/vertical.md": lay_out_datums,
+    "docs/reference/api.md": lay_out_images,
+    "docs/reference/products.md": lay_out_products,
+    "docs/reference/quality.md": lay_out_surface,
+    "docs/reference/rpc.md": lay_out_images,
+    "docs/tutorials/first_surface.md": lambda folder: None,
 }
