@@ -22,11 +22,11 @@ from zlocus.core.jit import KernelCache, cache_folder
 
 @pytest.fixture
 def sources(tmp_path):
-    folder = tmp_path / "kernels"
-    folder.mkdir()
-    (folder / "a.py").write_text("ONE = 1\n")
-    (folder / "b.py").write_text("TWO = 2\n")
-    return folder
+    package = tmp_path / "package"
+    for path, content in (("stage/kernels/a.py", "ONE = 1\n"), ("other/kernels/b.py", "TWO = 2\n")):
+        (package / path).parent.mkdir(parents=True)
+        (package / path).write_text(content)
+    return package
 
 
 def test_beside_the_sources(sources):
@@ -39,11 +39,12 @@ def test_beside_the_sources(sources):
 def test_a_change_in_any_source_gives_another_folder(sources):
     """A kernel holds the code of the kernels it calls, so each file counts for all."""
     found = {cache_folder(sources)}
-    for name in ("a.py", "b.py", "new.py"):
+    for name in ("stage/kernels/a.py", "other/kernels/b.py", "other/kernels/new.py"):
         (sources / name).write_text("CHANGED = 3\n")
         found.add(cache_folder(sources))
     assert len(found) == 4
-    (sources / "notes.txt").write_text("no source")
+    (sources / "stage" / "kernels" / "notes.txt").write_text("no source")
+    (sources / "stage" / "no_kernel.py").write_text("THREE = 3\n")
     assert cache_folder(sources) in found
 
 
@@ -94,7 +95,7 @@ def test_the_folder_that_a_user_names_comes_first(sources, tmp_path, monkeypatch
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "mine"))
     found = cache_folder(sources)
     assert found.parent == tmp_path / "mine"
-    (sources / "a.py").write_text("CHANGED = 3\n")
+    (sources / "stage" / "kernels" / "a.py").write_text("CHANGED = 3\n")
     assert cache_folder(sources) not in (found, None)
 
 
@@ -162,10 +163,10 @@ def test_a_program_without_any_cache_folder(tmp_path):
     """Here files stand in the place of both folders: as root too, nothing can be written below them."""
     package = Path(zlocus.__file__).parent
     shutil.copytree(package, tmp_path / "zlocus", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "zlocus" / "kernels" / "__pycache__").write_text("no folder")
+    (tmp_path / "zlocus" / "__pycache__").write_text("no folder")
     here = [str(tmp_path), str(SUPPORT)]
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | {
-        "HOME": str(tmp_path / "zlocus" / "kernels" / "__pycache__" / "home"), "PYTHONPATH": os.pathsep.join(here),
+        "HOME": str(tmp_path / "zlocus" / "__pycache__" / "home"), "PYTHONPATH": os.pathsep.join(here),
     }  # fmt: skip
     # Short, for the socket of the workers lies in it too.
     with tempfile.TemporaryDirectory(prefix="z") as folder:

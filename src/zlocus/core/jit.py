@@ -17,40 +17,42 @@ from numba import config, njit
 from zlocus.core.errors import ZlocusWarning
 
 F = TypeVar("F", bound=Callable[..., Any])
-# A disk with less room than this takes no new folder of kernels: all of them have 12 MB.
-ROOM_BYTES = 50_000_000
+# A disk with less room than this takes no new folder of compiled kernels; all kernels together take 12 MB.
+MIN_FREE_BYTES = 50_000_000
+# Files of the package whose content compiled kernels depend on: Numba looks at a kernel's own file alone, but a kernel
+# contains the code of the kernels that it calls and the values of the constants that it uses.
+KERNEL_FILES = ("core/jit.py", "*/kernels/*.py", "products/shade_kernel.py", "synthetic/*.py")
 
 
-def cache_folder(sources: Path) -> Path | None:
-    """First folder that compiled kernels can be kept in, named by the content of their sources; None where there is no
-    such folder.
+def cache_folder(package: Path) -> Path | None:
+    """The first folder that compiled kernels can be kept in, named by the content of their sources; None without any.
 
-    It lies in NUMBA_CACHE_DIR where that is set, else beside the sources, else in the user's own cache. The content of
-    all sources counts, because Numba looks at the file of a kernel alone: a kernel holds the code of the kernels that
-    it calls, and a change in one file would leave stale copies in the others.
+    package : folder of the package. The cache lies in NUMBA_CACHE_DIR where that is set, else in the package, else in
+    the user's own cache.
     """
-    digest = digest_of(sources)
-    return next((place / digest for place in _places(sources) if _takes_kernels(place, digest)), None)
+    digest = kernels_digest(package)
+    return next((place / digest for place in _places(package) if _takes_kernels(place, digest)), None)
 
 
-def digest_of(sources: Path) -> str:
-    """Name of the folder for the kernels of these sources: another content, another name."""
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources.glob("*.py")))).hexdigest()[:16]
+def kernels_digest(package: Path) -> str:
+    """Name of the cache folder for the kernels of a package: another content gives another name."""
+    files = sorted({path for pattern in KERNEL_FILES for path in package.glob(pattern)})
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
 
 
-def _places(sources: Path) -> Iterator[Path]:
-    """Folders to keep kernels in, the preferred one first."""
+def _places(package: Path) -> Iterator[Path]:
+    """Folders in which kernels may be kept, the preferred one first."""
     if config.CACHE_DIR:  # type: ignore[attr-defined]
         yield Path(config.CACHE_DIR)  # type: ignore[attr-defined]
-    yield sources / "__pycache__"
+    yield package / "__pycache__"
     try:
         yield Path.home() / ".cache" / "zlocus"
-    except RuntimeError:  # a user of whom the system knows no home
+    except RuntimeError:  # the system knows no home of this user
         return
 
 
 def _takes_kernels(place: Path, digest: str) -> bool:
-    """Whether files can be written to a folder, and to what an earlier run made in it."""
+    """Whether files can be written to a folder, and to the folders that an earlier run made in it."""
     try:
         place.mkdir(parents=True, exist_ok=True)
         kept = place / digest
@@ -59,7 +61,7 @@ def _takes_kernels(place: Path, digest: str) -> bool:
                 # Only an attempt tells for sure: permission bits say nothing of read-only disks.
                 with tempfile.TemporaryFile(dir=folder):
                     pass
-        return kept.exists() or shutil.disk_usage(place).free >= ROOM_BYTES
+        return kept.exists() or shutil.disk_usage(place).free >= MIN_FREE_BYTES
     except OSError:
         return False
 
@@ -67,13 +69,13 @@ def _takes_kernels(place: Path, digest: str) -> bool:
 class KernelCache:
     """Where this process keeps compiled kernels.
 
-    folder : of the kernels; None where nothing can be written at all, and every process compiles for itself.
-    temporary : what it lies in, where that goes with this process; workers of the process should use it too, by
-    NUMBA_CACHE_DIR.
+    folder : of the kernels; None where nothing can be written at all, so that every process compiles for itself.
+    temporary : the temporary folder that holds them, where no lasting one can be written; it is removed when this
+    process ends. Workers of the process use it too, by NUMBA_CACHE_DIR.
     """
 
-    def __init__(self, sources: Path) -> None:
-        self.folder = cache_folder(sources)
+    def __init__(self, package: Path) -> None:
+        self.folder = cache_folder(package)
         self.temporary: Path | None = None
         if self.folder is not None:
             return
@@ -84,9 +86,9 @@ class KernelCache:
         else:
             atexit.register(self._removed.cleanup)
             self.temporary = Path(self._removed.name)
-            self.folder = self.temporary / digest_of(sources)
+            self.folder = self.temporary / kernels_digest(package)
             instead = f"They are kept in {self.temporary} until this process ends."
-        places = " or ".join(str(place) for place in _places(sources))
+        places = " or ".join(str(place) for place in _places(package))
         warnings.warn(
             f"Compiled kernels cannot be kept in {places}. {instead} Set NUMBA_CACHE_DIR to a folder that can be "
             "written, so that the next run need not compile them again.",
@@ -95,14 +97,16 @@ class KernelCache:
         )
 
     def remove_temporary(self) -> None:
-        """Remove what goes with the process, of one that ends without its usual clean-up."""
+        """Remove the temporary folder, for a process that ends without its usual clean-up."""
         if self.temporary is not None:
             self._removed.cleanup()
 
     @contextmanager
     def in_use(self) -> Iterator[bool]:
-        """Let Numba keep the functions that are decorated meanwhile here, and no others of this process; yields whether
-        it can keep any."""
+        """Let Numba keep the functions that are decorated inside the block in this cache, and restore its own folder.
+
+        Yields whether it can keep any.
+        """
         before = config.CACHE_DIR  # type: ignore[attr-defined]
         config.CACHE_DIR = "" if self.folder is None else str(self.folder)  # type: ignore[attr-defined]
         try:
@@ -111,16 +115,10 @@ class KernelCache:
             config.CACHE_DIR = before  # type: ignore[attr-defined]
 
 
-CACHE = KernelCache(Path(__file__).parent)
+CACHE = KernelCache(Path(__file__).parents[1])
 
 
 def kernel(function: F) -> F:
-    """Compiled on first use, cached on disk, releases the GIL, IEEE arithmetic."""
+    """Decorate a kernel: compiled on first use, cached on disk, releases the GIL, IEEE arithmetic."""
     with CACHE.in_use() as is_kept:
         return cast(F, njit(cache=is_kept, nogil=True, error_model="numpy")(function))
-
-
-def parallel_kernel(function: F) -> F:
-    """As `kernel`, with `prange` on the outermost loop."""
-    with CACHE.in_use() as is_kept:
-        return cast(F, njit(cache=is_kept, nogil=True, error_model="numpy", parallel=True)(function))
