@@ -15,15 +15,15 @@ from typer.testing import CliRunner
 
 from evaluation_rasters import NORTH, WEST, moved, rolling, write
 from places import ROOT
+from zlocus.cli import evaluate as command
 from zlocus.cli.app import app
-from zlocus.cli.app import evaluate as command
 from zlocus.evaluation import files
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.evaluation.slopes import SLOPE_EDGES_DEG
 
 N = 120
-PAGE = ROOT / "docs" / "evaluate.md"
+PAGE = ROOT / "docs" / "how-to" / "evaluate.md"
 
 
 @pytest.fixture

@@ -1,47 +1,57 @@
-"""`zlocus products`: maps of a surface that is there already."""
+"""`zlocus products`: maps of a finished surface."""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from zlocus.cli.shared_options import SurfaceFolder
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import ProductOptions
 from zlocus.core.progress import progress_for
 from zlocus.core.requests import PRODUCTS, check_output, product_names
 
-PRODUCTS_HELP = f"Made of the surface: {', '.join(PRODUCTS)} (with commas between them), or none."
+PRODUCTS_HELP = f"Maps to make: {', '.join(PRODUCTS)} (separated by commas), or none."
 
 
-def products(
-    out: Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")],
-    names: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(PRODUCTS),
+@dataclass(frozen=True)
+class ProductsOptions:
+    """Arguments and options of `zlocus products`."""
+
+    out: SurfaceFolder
+    names: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(PRODUCTS)
     config: Annotated[
-        Path | None, typer.Option(help="Options of every stage. Default: those of the run.", metavar="FILE")
-    ] = None,
-) -> None:
-    """Make maps of a surface that is there already; those of the same name are replaced."""
-    chosen = product_names(names)
-    check_output(out, overwrite=True)
+        Path | None,
+        typer.Option(help="File with options of every stage. Default: those of the run.", metavar="FILE"),
+    ] = None
+
+
+def products(options: ProductsOptions) -> None:
+    """Make maps of a finished surface; maps of the same name are replaced."""
+    chosen = product_names(options.names)
+    check_output(options.out, overwrite=True)
     from zlocus.io.config import read_config
     from zlocus.io.open_raster import existing_file
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import FILES, link_all, make_maps
 
-    existing_file(out / "dsm.tif", "surface")
-    options = run_options(out / "run.json") if config is None else read_config(config).products
+    existing_file(options.out / "dsm.tif", "surface")
+    product_options = (
+        run_options(options.out / "run.json") if options.config is None else read_config(options.config).products
+    )
     progress = progress_for(sys.stderr)
-    make_maps(out, chosen, options, progress)
-    link_all(out, progress)
-    update_finished(out, (*(FILES[name] for name in chosen), ITEM))
-    print(f"{out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")
+    make_maps(options.out, chosen, product_options, progress)
+    link_all(options.out, progress)
+    update_finished(options.out, (*(FILES[name] for name in chosen), ITEM))
+    print(f"{options.out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")
 
 
 def run_options(record: Path) -> ProductOptions:
-    """The options of products with which a run was made, by its run.json; where there is none, those by default.
+    """The product options with which a run was made, from its run.json; the default ones where there is none.
 
     Raises
     ------

@@ -1,62 +1,58 @@
-"""`zlocus report`: the page of a surface that is there."""
+"""`zlocus report`: report.html of a finished surface."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
-from zlocus.cli.evaluate import (
-    DEFAULT_SLOPES,
-    Align,
-    Classes,
-    Coregister,
-    Geoid,
-    Margin,
-    Slopes,
-    Thresholds,
-    judging,
-)
+from zlocus.cli.evaluate import ComparisonOptions
+from zlocus.cli.shared_options import Reference, SurfaceFolder
 from zlocus.core.errors import ConfigError
 
 
-def report(
-    out: Annotated[Path, typer.Argument(help="Folder of a surface.", metavar="OUT")],
-    reference: Annotated[Path | None, typer.Option(help="Reference heights to compare with.", metavar="RASTER")] = None,
-    classes: Classes = None,
-    align: Align = False,
-    coregister: Coregister = None,
-    margin: Margin = 10.0,
-    threshold: Thresholds = None,
-    slopes: Slopes = DEFAULT_SLOPES,
-    geoid: Geoid = None,
-) -> None:
-    """Make report.html of a surface again, with a reference where one is given."""
-    check_about(reference, {"--classes": classes, "--align": align, "--coregister": coregister, "--geoid": geoid})
-    judged_by = judging(classes, align, coregister, margin, threshold, slopes, geoid)
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions(ComparisonOptions):
+    """Arguments and options of `zlocus report`."""
+
+    out: SurfaceFolder
+    reference: Reference = None
+
+
+def report(options: ReportOptions) -> None:
+    """Make report.html of a surface again, with a comparison where a reference is given."""
+    check_reference(
+        options.reference,
+        {
+            "--classes": options.classes, "--align": options.align, "--coregister": options.coregister,
+            "--geoid": options.geoid,
+        },
+    )  # fmt: skip
+    arguments = options.arguments()
     from zlocus.core.progress import SilentProgress
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import link_all
     from zlocus.products.report.comparison import Comparison
     from zlocus.products.report.page import write_report
 
-    comparison = None if reference is None else Comparison(reference, **judged_by)
-    path = write_report(out, comparison)
-    link_all(out, SilentProgress())
-    update_finished(out, (path.name, ITEM))
+    comparison = None if options.reference is None else Comparison(options.reference, **arguments)
+    path = write_report(options.out, comparison)
+    link_all(options.out, SilentProgress())
+    update_finished(options.out, (path.name, ITEM))
     print(f"{path}: open it in a browser.")
 
 
-def check_about(reference: Path | None, about: dict[str, Any]) -> None:
-    """Refuse what says how to compare with a reference where there is none. about : values by option.
+def check_reference(reference: Path | None, options: dict[str, Any]) -> None:
+    """Refuse options that say how to compare with a reference where there is no reference.
+
+    options : values by name of the option.
 
     Raises
     ------
     ConfigError
-        One is given without a reference.
+        Such an option is given without a reference.
     """
-    given = [name for name, value in about.items() if value]
+    given = [name for name, value in options.items() if value]
     if reference is None and given:
         raise ConfigError(
             f"{given[0]} is about a reference, and none is given. Add --reference RASTER, or leave it out."

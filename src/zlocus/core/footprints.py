@@ -1,4 +1,8 @@
-"""How images lie on the ground: footprints, the ground that two of them share, and base-to-height."""
+"""How images lie on the ground: footprints, overlap, the area of interest, ground pixels and parallax rates.
+
+Every question of overlap and of the area to match is answered here. Heights are ellipsoidal metres in the frame of the
+scene; footprints move with the height, so each function says at which heights it asks.
+"""
 
 from __future__ import annotations
 
@@ -12,89 +16,30 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import GeometryError, ZlocusWarning
-from zlocus.core.scene import Scene, View, held_window
+from zlocus.core.grid import CellWindow, Grid
+from zlocus.core.scene import Scene, View, held_window, is_local
 from zlocus.core.sensor_model import FloatArray
 
-LEAN_M = 0.5
-PER_SIDE = 5
+Bounds = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax, m
 
-
-@dataclass(frozen=True)
-class ViewGeometry:
-    """One image on the ground. outline : polygon in the scene's frame, empty where its rays meet no ground;
-    ground_px_m : ground pixel at its middle; closing_px : greatest distance by which a pixel sent to the ground and
-    back misses itself; lost : share of pixels that the camera cannot map."""
-
-    outline: Any
-    ground_px_m: float
-    closing_px: float
-    lost: float
-
-
-@dataclass(frozen=True)
-class PairGeometry:
-    """Two images, by number. overlap : shared ground over the smaller footprint; base_to_height : by how much their
-    rays part per metre of height at the middle of `shared`, that ground."""
-
-    views: tuple[int, int]
-    overlap: float
-    base_to_height: float
-    shared: Any
-
-
-def view_geometry(view: View, z: float) -> ViewGeometry:
-    """An image's place on the ground at height z (m)."""
-    from shapely import MultiPoint  # a tenth of a second
-
-    top, left, rows, cols = held_window(view.image)
-    column, row = np.meshgrid(left + np.linspace(0, cols - 1, PER_SIDE), top + np.linspace(0, rows - 1, PER_SIDE))
-    xy = np.column_stack([column.ravel(), row.ravel()])
-    back = view.sensor.image_from_ground(view.sensor.ground_from_image(xy, np.full(len(xy), z)))
-    off = np.hypot(*(back - xy).T)
-    known = np.isfinite(off)
-    return ViewGeometry(
-        outline=MultiPoint(footprint(view, z)).convex_hull,
-        ground_px_m=ground_sample_distance(view, z),
-        closing_px=float(off[known].max()) if known.any() else math.nan,
-        lost=float(1.0 - known.mean()),
-    )
-
-
-def pair_geometries(views: Sequence[View], outlines: Sequence[Any], z: float) -> list[PairGeometry]:
-    """All pairs that share ground at height z (m)."""
-    from shapely import STRtree
-
-    first, second = STRtree(list(outlines)).query(list(outlines), predicate="intersects")
-    touching = {(int(i), int(j)) for i, j in zip(first, second, strict=True)}
-    pairs = []
-    for i, j in combinations(range(len(views)), 2):
-        shared = outlines[i].intersection(outlines[j]) if (i, j) in touching else None
-        if shared is None or not shared.area > 0:
-            continue
-        middle = np.array([shared.centroid.x, shared.centroid.y, z])
-        apart = float(np.hypot(*(lean(views[i], middle) - lean(views[j], middle))))
-        pairs.append(PairGeometry((i, j), shared.area / min(outlines[i].area, outlines[j].area), apart, shared))
-    return pairs
-
-
-def lean(view: View, xyz: FloatArray) -> FloatArray:
-    """(dE, dN) per metre of height along the ray through a ground point (3,) m."""
-    xy = view.sensor.image_from_ground(np.array([xyz, xyz]))
-    low, high = view.sensor.ground_from_image(xy, xyz[2] + np.array([-LEAN_M, LEAN_M]))
-    return np.asarray((high - low)[:2] / (2 * LEAN_M))
-
-# Along each side of an image, for the box around its footprint; and by how much of it that is widened, for sides are
-# curved in between.
-BOX_POINTS, BOX_ASIDE = 8, 0.02
+# Rays are compared over this height difference above and below a point.
+RAY_HALF_HEIGHT_M = 0.5
+# Points along each side of an image at which `view_geometry` tests its camera.
+CAMERA_TEST_POINTS = 5
+# Points along each side of an image for the box around its footprint, and the share by which the box is widened,
+# because the sides of a footprint are curved between the points.
+BOX_POINTS, BOX_MARGIN = 8, 0.02
+# In a local frame the area to match is that of the tie points between these percentiles, extended on all sides by this
+# share of their extent, where there are at least this many tie points.
+AREA_PERCENT, AREA_MARGIN, MIN_TIES_FOR_AREA = (0.5, 99.5), 0.05, 20
 
 
 def footprint(view: View, z: float, per_side: int = 8, margin_px: float = 0.0) -> FloatArray:
-    """The image's outline on the ground at height z (m, ellipsoidal), counter-clockwise or clockwise, not closed; of an
-    image in a sparse file, the outline of the part that the file holds.
+    """Outline of an image on the ground at height z (m), (4 * per_side, 2) m, clockwise or counter-clockwise, not closed.
 
-    Runs along the outer edges of the border pixels, or `margin_px` outside of them, `per_side` points a side, because
-    the sides of a line scanner's image are curves. Returns (4 * per_side, 2) m; points the sensor cannot map are left
-    out.
+    Of an image in a sparse file: the outline of the part that the file holds. The outline runs along the outer edges of
+    the border pixels, or `margin_px` outside of them. It has `per_side` points on each side, because the sides of a line
+    scanner's image are curves. Points that the sensor cannot map are left out.
     """
     top, left, rows, cols = held_window(view.image)
     t = np.arange(per_side) / per_side
@@ -106,21 +51,21 @@ def footprint(view: View, z: float, per_side: int = 8, margin_px: float = 0.0) -
 
 
 def ground_box(view: View, z_range: tuple[float, float], margin_px: float = 0.0) -> FloatArray:
-    """Least and greatest east and north (2, 2) m that an image may see between two heights (m), if it may lie
-    `margin_px` away from where its sensor model puts it; infinite where some ray at its border meets no ground.
+    """Smallest and largest easting and northing, (2, 2) m, that an image may see between two heights (m).
 
-    Rays are straight: at heights in between they stay in the box of both ends.
+    margin_px : by how much the image may lie away from where its sensor model puts it. Infinite where some ray at the
+    image's border meets no ground. Rays are straight: at heights in between they stay in the box of both ends.
     """
     outlines = [footprint(view, z, BOX_POINTS, margin_px) for z in z_range]
     if any(len(outline) < 4 * BOX_POINTS for outline in outlines):
         return np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
     xy = np.concatenate(outlines)
-    aside = BOX_ASIDE * np.ptp(xy, axis=0)
-    return np.stack([xy.min(axis=0) - aside, xy.max(axis=0) + aside])
+    margin = BOX_MARGIN * np.ptp(xy, axis=0)
+    return np.stack([xy.min(axis=0) - margin, xy.max(axis=0) + margin])
 
 
 def is_shared(scene: Scene, z: float) -> bool:
-    """Whether two views or more see the same ground at a height (m, ellipsoidal)."""
+    """Whether two views or more see the same ground at a height (m)."""
     from shapely import MultiPoint, STRtree
 
     hulls = [MultiPoint(footprint(view, z)).convex_hull for view in scene.views]
@@ -130,7 +75,7 @@ def is_shared(scene: Scene, z: float) -> bool:
 
 
 def ground_sample_distance(view: View, z: float) -> float:
-    """Metres on the ground at height z per pixel at the image's centre: geometric mean of both directions.
+    """Size of a pixel on the ground at height z (m), m, at the image's centre: geometric mean of both directions.
 
     NaN where the sensor cannot map the centre.
     """
@@ -143,15 +88,15 @@ def ground_sample_distance(view: View, z: float) -> float:
 
 
 def check_overlap(scene: Scene, heights: float | Sequence[float]) -> None:
-    """Refuse a scene without two views of the same ground; warn of views that share none.
+    """Refuse a scene in which no two views see the same ground; warn about views that overlap no other.
 
-    heights : m, ellipsoidal; views overlap when their footprints do at any of them (a footprint moves with the height,
-    so give several where the height of the ground is not known).
+    heights : m; views overlap where their footprints do at any of them. Give several where the height of the ground is
+    not known.
 
     Raises
     ------
     GeometryError
-        When no two footprints overlap; names the views and where they lie.
+        No two footprints overlap; the message says where each view lies.
     """
     # shapely costs 0.1 s to import, and only this check needs it.
     from shapely import MultiPoint, STRtree
@@ -188,14 +133,13 @@ def _extent(bounds: tuple[float, ...]) -> str:
     return f"E {xmin:.0f} to {xmax:.0f} m, N {ymin:.0f} to {ymax:.0f} m"
 
 
-
-def shared_ground(scene: Scene, z_range: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Bounds (xmin, ymin, xmax, ymax) of the ground that two views may see between two heights.
+def shared_ground(scene: Scene, z_range: tuple[float, float]) -> Bounds:
+    """Bounds (xmin, ymin, xmax, ymax), m, of the ground that two views or more may see between two heights (m).
 
     Raises
     ------
     GeometryError
-        When no two footprints overlap.
+        No two footprints overlap.
     """
     from shapely import MultiPoint
 
@@ -212,3 +156,117 @@ def shared_ground(scene: Scene, z_range: tuple[float, float]) -> tuple[float, fl
         )
     low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def area_to_match(scene: Scene, z_range: tuple[float, float], ties: FloatArray) -> Bounds:
+    """Bounds (xmin, ymin, xmax, ymax), m, of the area to match.
+
+    The area that the scene file gives, or else the ground that two views see between two heights (m). In a local frame
+    that ground is cut to the surroundings of the tie points, because cameras there may look at a wall from the side: what
+    two footprints share far behind the wall is many times the area of the wall.
+
+    ties : (n, 3) m, tie points that their neighbours support.
+    """
+    if scene.bounds is not None:
+        return scene.bounds
+    shared = shared_ground(scene, z_range)
+    if not is_local(scene.crs) or len(ties) < MIN_TIES_FOR_AREA:
+        return shared
+    low, high = np.percentile(ties[:, :2], AREA_PERCENT, axis=0)
+    margin = AREA_MARGIN * (high - low)
+    low, high = np.maximum(low - margin, shared[:2]), np.minimum(high + margin, shared[2:])
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1])) if (low < high).all() else shared
+
+
+def matched_area(grid: Grid, overlap_window: CellWindow) -> Bounds:
+    """Bounds (xmin, ymin, xmax, ymax), m, of the part of the requested area that two images see.
+
+    overlap_window : cells of the grid's lattice that two views may see.
+
+    Raises
+    ------
+    GeometryError
+        Two images see none of it.
+    """
+    shared = grid.window.within(overlap_window)
+    if shared.rows and shared.cols:
+        return grid.bounds(shared)
+    west, south, east, north = grid.bounds(overlap_window)
+    requested = grid.geobox.extent.boundingbox
+    raise GeometryError(
+        f"The area asked for (E {requested.left:.0f} to {requested.right:.0f} m, N {requested.bottom:.0f} to "
+        f"{requested.top:.0f} m) lies outside the ground that two images see (E {west:.0f} to {east:.0f} m, N "
+        f"{south:.0f} to {north:.0f} m). Check --bounds, --like and the CRS."
+    )
+
+
+@dataclass(frozen=True)
+class ViewGeometry:
+    """How one image lies on the ground.
+
+    outline : polygon of the footprint in the scene's frame, empty where the rays meet no ground; ground_px_m : ground
+    pixel at its middle, m; closing_px : largest distance by which a pixel that is projected to the ground and back misses
+    itself, NaN where the camera maps none; lost : share of pixels that the camera cannot map.
+    """
+
+    outline: Any
+    ground_px_m: float
+    closing_px: float
+    lost: float
+
+
+@dataclass(frozen=True)
+class PairGeometry:
+    """How two images overlap.
+
+    views : their numbers; overlap : area of the shared ground over that of the smaller footprint; base_to_height : by how
+    much their rays diverge for each metre of height, at the middle of the shared ground; shared : polygon of that ground.
+    """
+
+    views: tuple[int, int]
+    overlap: float
+    base_to_height: float
+    shared: Any
+
+
+def view_geometry(view: View, z: float) -> ViewGeometry:
+    """How an image lies on the ground at height z (m)."""
+    from shapely import MultiPoint  # a tenth of a second
+
+    top, left, rows, cols = held_window(view.image)
+    n = CAMERA_TEST_POINTS
+    column, row = np.meshgrid(left + np.linspace(0, cols - 1, n), top + np.linspace(0, rows - 1, n))
+    xy = np.column_stack([column.ravel(), row.ravel()])
+    back = view.sensor.image_from_ground(view.sensor.ground_from_image(xy, np.full(len(xy), z)))
+    error_px = np.hypot(*(back - xy).T)
+    known = np.isfinite(error_px)
+    return ViewGeometry(
+        outline=MultiPoint(footprint(view, z)).convex_hull,
+        ground_px_m=ground_sample_distance(view, z),
+        closing_px=float(error_px[known].max()) if known.any() else math.nan,
+        lost=float(1.0 - known.mean()),
+    )
+
+
+def pair_geometries(views: Sequence[View], outlines: Sequence[Any], z: float) -> list[PairGeometry]:
+    """All pairs of views that share ground at height z (m). outlines : polygon of each view's footprint."""
+    from shapely import STRtree
+
+    first, second = STRtree(list(outlines)).query(list(outlines), predicate="intersects")
+    touching = {(int(i), int(j)) for i, j in zip(first, second, strict=True)}
+    pairs = []
+    for i, j in combinations(range(len(views)), 2):
+        shared = outlines[i].intersection(outlines[j]) if (i, j) in touching else None
+        if shared is None or not shared.area > 0:
+            continue
+        middle = np.array([shared.centroid.x, shared.centroid.y, z])
+        ratio = float(np.hypot(*(parallax_rate_at(views[i], middle) - parallax_rate_at(views[j], middle))))
+        pairs.append(PairGeometry((i, j), shared.area / min(outlines[i].area, outlines[j].area), ratio, shared))
+    return pairs
+
+
+def parallax_rate_at(view: View, xyz: FloatArray) -> FloatArray:
+    """Parallax rate (dE, dN): metres that the ray through a ground point (3,) m moves for each metre of height."""
+    xy = view.sensor.image_from_ground(np.array([xyz, xyz]))
+    low, high = view.sensor.ground_from_image(xy, xyz[2] + np.array([-RAY_HALF_HEIGHT_M, RAY_HALF_HEIGHT_M]))
+    return np.asarray((high - low)[:2] / (2 * RAY_HALF_HEIGHT_M))

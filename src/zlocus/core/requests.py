@@ -126,8 +126,8 @@ class DsmRequest:
 class SetupRequest:
     """The part of a request from which views, orientation, heights, grid and match scene follow.
 
-    Every command has some of these fields, with the meaning that they have in `DsmRequest`; the others keep the value of
-    "not given".
+    Every command has some of these fields, with the meaning that they have in `DsmRequest`; the others keep the value
+    of "not given".
     """
 
     inputs: tuple[Path, ...]

@@ -15,8 +15,8 @@ from zlocus.core.options.semiglobal_options import SemiGlobalOptions
 
 __all__ = [
     "CheckOptions",
-    "JointOptions",
     "CostOptions",
+    "JointOptions",
     "OrientationOptions",
     "PlaneOptions",
     "ProductOptions",

@@ -1,0 +1,56 @@
+"""`zlocus curves`: the match curves of one point."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zlocus.cli.commands import config_of
+from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Overwrite, Resolution, TieHeights
+from zlocus.core.progress import progress_for
+from zlocus.core.requests import CurvesRequest, check_output
+
+
+@dataclass(frozen=True)
+class CurvesOptions:
+    """Arguments and options of `zlocus curves`."""
+
+    inputs: Inputs
+    at: Annotated[tuple[float, float] | None, typer.Option(help="Point on the ground, in the CRS.", metavar="X Y")] = (
+        None
+    )
+    pixel: Annotated[
+        tuple[str, float, float] | None,
+        typer.Option(help="Point in an image; (0, 0) is the centre of the first pixel.", metavar="VIEW ROW COL"),
+    ] = None
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for figures and tables.")] = Path("curves")
+    height: Annotated[
+        float | None,
+        typer.Option(help="Height around which is searched, m. Default: that of the nearest tie points.", metavar="Z"),
+    ] = None
+    resolution: Resolution = None
+    crs: Crs = None
+    heights: TieHeights = None
+    reference: Annotated[
+        str | None, typer.Option(help="Reference image. Default: chosen for the point.", metavar="VIEW")
+    ] = None
+    overwrite: Overwrite = False
+    config: ConfigFile = None
+
+
+def curves(options: CurvesOptions) -> None:
+    """Show the match curves of one point: their labels, the order of the images, and where matching stops."""
+    request = CurvesRequest(
+        inputs=tuple(options.inputs), out=options.out, at=options.at, pixel=options.pixel, height=options.height,
+        resolution=options.resolution, crs=options.crs, heights=options.heights, reference=options.reference,
+        overwrite=options.overwrite,
+    )  # fmt: skip
+    check_output(request.out, request.overwrite)
+    config = config_of(options.config)
+    from zlocus.pipeline.match_curves import run_curves
+
+    print(run_curves(request, config, progress_for(sys.stderr)))

@@ -1,0 +1,51 @@
+"""`zlocus doctor`: the inputs checked before a long run."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zlocus.cli.commands import config_of
+from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Resolution, TieHeights, Workers
+from zlocus.core.progress import progress_for
+from zlocus.core.requests import DoctorRequest, check_output
+
+EXIT_WILL_FAIL = 2
+
+
+@dataclass(frozen=True)
+class DoctorOptions:
+    """Arguments and options of `zlocus doctor`."""
+
+    inputs: Inputs
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for the report and footprints. Default: print only.")
+    ] = None
+    resolution: Resolution = None
+    crs: Crs = None
+    heights: TieHeights = None
+    workers: Workers = 1
+    memory: Annotated[float | None, typer.Option(help="Memory limit of the planned run, GB.", metavar="GB")] = None
+    config: ConfigFile = None
+
+
+def doctor(options: DoctorOptions) -> None:
+    """Check sensors, overlap, tie points and memory before a long run: what will fail, and why."""
+    request = DoctorRequest(
+        inputs=tuple(options.inputs), out=options.out, resolution=options.resolution, crs=options.crs,
+        heights=options.heights, workers=options.workers, memory_gb=options.memory,
+    )  # fmt: skip
+    if request.out is not None:
+        # No run writes a file of the same name, so the folder may hold a run.
+        check_output(request.out, overwrite=True)
+    config = config_of(options.config)
+    from zlocus.pipeline.doctor.run import run_doctor
+
+    diagnosis = run_doctor(request, config, progress_for(sys.stderr))
+    print(diagnosis.text)
+    if diagnosis.will_fail:
+        raise typer.Exit(EXIT_WILL_FAIL)

@@ -1,0 +1,42 @@
+"""`zlocus rank`: how well each pair of images matches."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zlocus.cli.commands import config_of
+from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Overwrite, Resolution, TieHeights, Workers
+from zlocus.core.progress import progress_for
+from zlocus.core.requests import RankRequest, check_output
+
+
+@dataclass(frozen=True)
+class RankOptions:
+    """Arguments and options of `zlocus rank`."""
+
+    inputs: Inputs
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the ranking.")]
+    resolution: Resolution = None
+    crs: Crs = None
+    heights: TieHeights = None
+    workers: Workers = 1
+    overwrite: Overwrite = False
+    config: ConfigFile = None
+
+
+def rank(options: RankOptions) -> None:
+    """Rank the images by how well each pair matches at the tie points."""
+    request = RankRequest(
+        tuple(options.inputs), options.out, options.resolution, options.crs, options.heights, options.workers,
+        options.overwrite,
+    )  # fmt: skip
+    check_output(request.out, request.overwrite)
+    config = config_of(options.config)
+    from zlocus.pipeline.rank import run_rank
+
+    print(run_rank(request, config, progress_for(sys.stderr)))

@@ -1,0 +1,43 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+VERTICAL_DATUMS = "ellipsoid|egm96|egm2008|FILE"
+
+Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")]
+ResultFolder = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")]
+Resolution = Annotated[float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")]
+Crs = Annotated[str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")]
+DemVertical = Annotated[
+    str | None,
+    typer.Option(help="Vertical datum of the DEM. Default: what its CRS says.", metavar=VERTICAL_DATUMS),
+]
+Vertical = Annotated[
+    str,
+    typer.Option(
+        help="Vertical datum of all heights, including --heights. FILE is a geoid raster.", metavar=VERTICAL_DATUMS
+    ),
+]
+TieHeights = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Height range in which tie points are searched, m. Default: found.", metavar="ZMIN ZMAX"),
+]
+SearchedHeights = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Height range to search, m. Default: found from tie points.", metavar="ZMIN ZMAX"),
+]
+Workers = Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")]
+Partial = Annotated[
+    bool, typer.Option("--partial", help="Accept a result that is incomplete or whose cameras are doubtful.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="File with options of every stage; see `zlocus config`.", metavar="FILE")
+]
+SurfaceFolder = Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")]
+Reference = Annotated[Path | None, typer.Option(help="Raster of reference heights to compare with.", metavar="RASTER")]
