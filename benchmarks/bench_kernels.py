@@ -24,7 +24,7 @@ from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.occlusion import lowest_visible
 from zlocus.matching.kernels.resample import resample_plane
-from zlocus.matching.kernels.sgm import least_costs, sweep, winners
+from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, tile_ortho, tile_profile
@@ -165,7 +165,7 @@ def sgm_case(count: int | None, side: int = SGM_SIDE) -> Case:
 
     def call():
         for sign in (1, -1):
-            sweep(cost, heights.ranges, heights.address, BLOCK, p2, np.uint16(20), sign, total)
+            sweep(cost, heights.layout, p2, np.uint16(20), sign, total)
 
     return Case(call, heights.size, "cell-step")
 
@@ -191,7 +191,7 @@ def winners_case(count: int | None, side: int = SGM_SIDE) -> Case:
     margin, vertex = np.empty(shape, np.uint16), np.empty(shape, np.float32)
 
     def call():
-        winners(total, heights.ranges, heights.address, BLOCK, best, second, margin, vertex)
+        winners(total, heights.layout, best, second, margin, vertex)
 
     return Case(call, heights.size, "cell-step")
 
@@ -204,7 +204,7 @@ def least_case(count: int | None, side: int = SGM_SIDE) -> Case:
     best, lone = (first + rng.integers(0, counts)).astype(np.int32), np.empty(heights.shape, np.int32)
 
     def call():
-        least_costs(cost, heights.ranges, heights.address, BLOCK, best, lone)
+        winner_takes_all(cost, heights.layout, best, lone)
 
     return Case(call, heights.size, "cell-step")
 

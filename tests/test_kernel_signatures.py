@@ -15,6 +15,7 @@ from numba.core import types
 
 import zlocus.matching.kernels
 import zlocus.orientation.kernels
+from zlocus.matching.kernels import shared_records
 
 
 def all_kernels():
@@ -61,7 +62,7 @@ def typed(shape, kind, module):
     if kind == "None":
         return types.none
     if kind not in DTYPES:
-        return record(getattr(module, kind))
+        return record(getattr(module, kind, None) or getattr(shared_records, kind))
     places = [place for place in (shape or "").split(",") if place]
     return types.Array(DTYPES[kind], len(places), "C") if places else DTYPES[kind]
 

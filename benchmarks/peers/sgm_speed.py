@@ -63,7 +63,7 @@ def zlocus(side: int, heights: int) -> Iterator[tuple[str, Callable[[], object]]
 
     def one() -> None:
         for sign in (1, -1):
-            sweep(cost, lattice.ranges, lattice.address, block, p2, np.uint16(P1), sign, total)
+            sweep(cost, lattice.layout, p2, np.uint16(P1), sign, total)
 
     def two() -> None:
         for turn in range(4):

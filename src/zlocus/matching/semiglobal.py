@@ -11,7 +11,7 @@ from zlocus.core.options import SemiGlobalOptions
 from zlocus.matching.height_lattice import NARROW_BASE, HeightLattice
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.penalties import jump_penalties
-from zlocus.matching.kernels.sgm import least_costs, sweep, winners
+from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
 from zlocus.matching.local_contrast import ALL, Part, edge_unit
 
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
@@ -88,7 +88,7 @@ def aggregate(
         return pick(more_global_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)
     for sign in (1, -1):
-        sweep(cost, lattice.ranges, lattice.address, lattice.block, p2, np.uint16(p1), sign, total)
+        sweep(cost, lattice.layout, p2, np.uint16(p1), sign, total)
     return pick(total, lattice)
 
 
@@ -103,7 +103,7 @@ def alone(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
 def lone_heights(cost: NDArray[np.uint8], lattice: HeightLattice, found: NDArray[np.int32]) -> NDArray[np.int32]:
     """Height indices (r, c) of the least costs, each cell by itself; of equals that of `found`, (r, c)."""
     lone = np.empty(lattice.shape, np.int32)
-    least_costs(cost, lattice.ranges, lattice.address, lattice.block, found, lone)
+    winner_takes_all(cost, lattice.layout, found, lone)
     return lone
 
 
@@ -125,5 +125,5 @@ def pick(total: NDArray[np.uint16], lattice: HeightLattice) -> SemiGlobalHeights
     """Heights of the least sums of a volume laid out as `HeightLattice.address` says."""
     best, second = np.empty(lattice.shape, np.int32), np.empty(lattice.shape, np.int32)
     margin, vertex = np.empty(lattice.shape, np.uint16), np.empty(lattice.shape, np.float32)
-    winners(total, lattice.ranges, lattice.address, lattice.block, best, second, margin, vertex)
+    winners(total, lattice.layout, best, second, margin, vertex)
     return SemiGlobalHeights(best, second, margin, vertex)

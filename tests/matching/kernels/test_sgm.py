@@ -9,7 +9,7 @@ import pytest
 
 from kernel_scene import even_lattice, ragged_lattice
 from reference.semiglobal import dense, path_sums, winner
-from zlocus.matching.kernels.sgm import least_costs, sweep, winners
+from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
 
 NO_RIVAL = 65535
 # A parabola through three whole numbers, in float32.
@@ -19,14 +19,14 @@ VERTEX = 1e-5
 def aggregated(cost, lattice, p1, p2):
     total = np.zeros(lattice.size, np.uint16)
     for sign in (1, -1):
-        sweep(cost, lattice.ranges, lattice.address, lattice.block, p2, np.uint16(p1), sign, total)
+        sweep(cost, lattice.layout, p2, np.uint16(p1), sign, total)
     return total
 
 
 def picked(total, lattice):
     best, second = np.empty(lattice.shape, np.int32), np.empty(lattice.shape, np.int32)
     margin, vertex = np.empty(lattice.shape, np.uint16), np.empty(lattice.shape, np.float32)
-    winners(total, lattice.ranges, lattice.address, lattice.block, best, second, margin, vertex)
+    winners(total, lattice.layout, best, second, margin, vertex)
     return best, second, margin, vertex
 
 
@@ -133,7 +133,7 @@ def test_least_costs(levels):
     cost = random_cost(lattice, high=levels)
     best = (first + rng.integers(0, count)).astype(np.int32)
     lone = np.empty(lattice.shape, np.int32)
-    least_costs(cost, lattice.ranges, lattice.address, lattice.block, best, lone)
+    winner_takes_all(cost, lattice.layout, best, lone)
     costs = dense(cost, lattice, np.inf)
     for r, c in np.ndindex(lattice.shape):
         mine = costs[r, c, first[r, c] : first[r, c] + count[r, c]]

@@ -1,32 +1,98 @@
-"""Semi-global aggregation over a volume whose cells have ranges of their own.
+"""Semi-global aggregation of a cost volume in which every block of cells has its own search range.
 
-Source: Hirschmueller (2008), eq. 13, along 8 paths, neighbours compared by height (an integer shift of their ranges).
-Two sweeps: down (paths from W, NW, N, NE), then up (from E, SE, S, SW). Inside a sweep everything is counted in its
-own order: `position` is a cell's place in its row as the sweep meets it, segments are the blocks of a row as it meets
-them, W ... NE are the neighbours behind; only the previous row of path costs is kept.
+Source: Hirschmueller (2008), eq. 13, along 8 paths. Neighbouring cells are compared at equal heights, so a neighbour
+with another search range is shifted by a whole number of heights.
 
-Why it is fast: every sum and minimum is cast back to uint16 (Numba widens integers to 64 bits and the lanes would be
-lost), and all addresses in `run_cells` grow evenly and upwards from cell to cell, so that the compiler checks once a
-run, not in every cell, that what is read and what is written are apart. Hence the copies: the up sweep turns its rows
-round, and a neighbour with another range is copied by the heights of the cell. A path from W cannot begin a cell
-before the one behind it is stored, and with few heights that wait is longer than the work; so the paths from W of some
-rows go side by side, ahead of the three others.
+There are two sweeps: down (paths that come from W, NW, N, NE), then up (from E, SE, S, SW). Within a sweep everything
+is counted in the order of the sweep: `position` is the place of a cell in its row, the segments of a row are its
+blocks, and W, NW, N, NE are the neighbours that the sweep has passed. Only the path costs of the previous row are kept.
+
+Why it is fast: every sum and minimum is cast back to uint16, because Numba widens integers to 64 bits, which would
+lose vector lanes. In `run_cells` all addresses grow evenly and upwards from cell to cell, so the compiler checks once a
+run, not in every cell, that what is read does not overlap what is written. This is why rows are copied in reverse for
+the sweep upwards, and why a neighbour with another range is copied to the heights of the cell. The path from W cannot
+begin a cell before the previous cell is stored, and with few heights this wait is longer than the work. Therefore the
+paths from W of several rows are computed side by side, ahead of the other three paths.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from zlocus.core.jit import kernel
 
+# Places kept free between the path costs of neighbouring cells.
 PAD = 2
+# Path cost of a height that is not searched: only a jump (P2) leads from there.
 FAR = np.uint16(16000)
-FIRST, COUNT, LEFT, PLACE, SHEET = 0, 1, 2, 3, 4
-NW, N, NE, BEHIND = 0, 1, 2, 3
-# Rows whose paths from W go side by side. Of their cells: two planes that swap, and one for copies of those behind.
-BESIDE, COPY = 4, 2
-NOBODY = -1
-NONE, LOWER = np.uint32(0xFFFFFFFF), np.uint32(0xFFFF)
+NW, N, NE, PATHS_FROM_ABOVE = 0, 1, 2, 3
+# Number of rows whose paths from W are computed side by side. Their path costs stand in two planes, which cells read
+# and write in turns; a third plane holds copies of a previous cell with another range.
+ROWS_SIDE_BY_SIDE, COPY_PLANE = 4, 2
+# Number of heights of the segments that stand for the outside of the volume.
+OUTSIDE = -1
+NO_MINIMUM, LOWER_16_BITS = np.uint32(0xFFFFFFFF), np.uint32(0xFFFF)
+
+
+class SweptVolume(NamedTuple):
+    """Costs and sums of path costs, cell after cell in the order of the sweep."""
+
+    cost: np.ndarray  # (v,) u1: matching costs
+    sums: np.ndarray  # (v,) u2: sums of path costs, written
+
+
+class RowSegment(NamedTuple):
+    """One block of a row, in the order of the sweep. Records are kept in the rows of an array, see `segment_at`."""
+
+    first: int  # i8: first height index
+    count: int  # i8: number of heights, OUTSIDE where there is no segment
+    position: int  # i8: position of its first cell in the row
+    end: int  # i8: position after its last cell
+    place: int  # i8: place of its first cell among the path costs of the row
+    reversed_place: int  # i8: place of its first cell in a reversed row
+
+
+class PathStore(NamedTuple):
+    """What the sweep knows of a row and of the previous row; even rows stand at 0 and odd rows at 1."""
+
+    segments: np.ndarray  # (k,e,n) i8: records `RowSegment`; segment e at e + 1, the first and the last are outside
+    costs: np.ndarray  # (l,) u2: path costs from NW, N and NE of both rows, and of neighbours that were copied
+    min_costs: np.ndarray  # (k,p,c) u2: their minima over the heights, of the cell at c - 1
+    width: int  # i8: number of path costs of a row and path
+    longest: int  # i8: number of path costs of a copied neighbour
+
+
+class CellRun(NamedTuple):
+    """Neighbouring cells of one row that have one range, and whose neighbours above have it too.
+
+    read_... and write_... : places of the path costs of the first cell's neighbours and of its own.
+    """
+
+    start: int  # i8: place of the first cell in the volume
+    n_heights: int  # i8
+    n_cells: int  # i8
+    position: int  # i8: position of the first cell in its row
+    read_nw: int  # i8
+    read_n: int  # i8
+    read_ne: int  # i8
+    write_nw: int  # i8
+    write_n: int  # i8
+    write_ne: int  # i8
+
+
+class WestRun(NamedTuple):
+    """Neighbouring cells of one range, at the same positions in several rows."""
+
+    start: int  # i8: place of the first cell of the first row in the volume
+    row_step: int  # i8: distance to the next row in the volume
+    n_heights: int  # i8
+    n_cells: int  # i8
+    n_rows: int  # i8
+    position: int  # i8: position of the first cell in its row
+    read: int  # i8: plane of path costs that the first cell reads
+    write: int  # i8: plane that it writes; from then on cells read and write the planes 0 and 1 in turns
 
 
 # u2, u2, u2, u2, u2, u2, u2 -> u2
@@ -37,55 +103,55 @@ def path_cost(same, down, up, p1, jump, least, cost):
     return np.uint16(np.uint16(min(best, jump) - least) + cost)
 
 
-# (v,) u1, (v,) u2, (2,) i8, (3,) i8, (3,r,l) u2, (2,) i8, (r,) u2, (r,4,c) u2, i8, u2 -> None
+# SweptVolume, WestRun, (3,r,l) u2, (r,) u2, (r,4,c) u2, u2 -> None
 @kernel
-def run_west(cost, sums, start, size, paths, spots, least, edges, position, p1):
-    """Path costs from W of neighbouring cells of one range, in some rows at once; they are written to `sums`.
+def run_west(volume, run, paths, min_costs, p2, p1):
+    """Write the path costs from W of neighbouring cells, in several rows at once, to `volume.sums`.
 
-    start : of the first cell in `cost` and `sums`, and the step to the next row; size : heights, cells and rows;
-    spots : planes of `paths` where the first cell reads and where it writes (0 or 1, from cell to cell in turns);
-    least : of the cells before; edges : P2.
+    paths : (3, r, l), see `WestRun`; min_costs : (r,), minimum path cost of the previous cell of each row, changed;
+    p2 : (r, 4, c), penalty of a jump into each cell.
 
-    Rows lie inside the planes: the compiler compares what all rows read with what all of them write.
+    Rows are the inner axis of `paths`: the compiler compares what all rows read with what all of them write.
     """
-    n, n_rows, step, one = np.uint64(size[0]), np.uint64(size[2]), np.uint64(start[1]), np.uint64(1)
+    cost, sums = volume.cost, volume.sums
+    n, n_rows, step, one = np.uint64(run.n_heights), np.uint64(run.n_rows), np.uint64(run.row_step), np.uint64(1)
     pad = np.uint64(PAD)
-    behind, ahead = np.uint64(spots[0]), np.uint64(spots[1])
-    for cell in range(np.uint64(size[1])):
-        s0, i = np.uint64(start[0]) + cell * n, np.uint64(position) + cell
+    behind, ahead = np.uint64(run.read), np.uint64(run.write)
+    for cell in range(np.uint64(run.n_cells)):
+        s0, i = np.uint64(run.start) + cell * n, np.uint64(run.position) + cell
         for row in range(n_rows):
             s, low = s0 + row * step, np.uint16(65535)
-            before = least[row]
-            jump = np.uint16(before + edges[row, 0, i])
+            before = min_costs[row]
+            jump = np.uint16(before + p2[row, 0, i])
             for k in range(n):
                 down, up = paths[behind, row, pad + k - one], paths[behind, row, pad + k + one]
                 here = path_cost(paths[behind, row, pad + k], down, up, p1, jump, before, np.uint16(cost[s + k]))
                 paths[ahead, row, pad + k] = here
                 sums[s + k] = here
                 low = min(low, here)
-            least[row] = low
+            min_costs[row] = low
         behind, ahead = ahead, one - ahead
 
 
-# (v,) u1, (v,) u2, i8, (2,) i8, (l,) u2, (2,3) i8, (3,c) u2, (3,c) u2, (4,c) u2, i8, u2 -> None
+# SweptVolume, CellRun, (l,) u2, (p,c) u2, (p,c) u2, (4,c) u2, u2 -> None
 @kernel
-def run_cells(cost, sums, start, size, paths, spots, behind, ahead, edge, position, p1):
-    """Path costs from NW, N and NE of neighbouring cells of one range, whose neighbours all share it, added to `sums`.
+def run_cells(volume, run, paths, above, here, p2, p1):
+    """Add the path costs from NW, N and NE of neighbouring cells to `volume.sums`.
 
-    start : of the first cell in `cost` and `sums`; size : heights and cells; spots : where the first cell's path costs
-    are read and written in `paths`; behind, ahead : (3, c + 2) uint16, least path costs of the previous and of this
-    row, cell i at i + 1; edge : (4, c) uint16, P2.
+    paths : costs of the `PathStore`, changed; above, here : minima of the path costs of the previous row and of this
+    one, the latter changed; p2 : (4, c), penalty of a jump into each cell.
     """
-    n, one, two = np.uint64(size[0]), np.uint64(1), np.uint64(2)
+    cost, sums = volume.cost, volume.sums
+    n, one, two = np.uint64(run.n_heights), np.uint64(1), np.uint64(2)
     wide = n + np.uint64(PAD)
-    nw_behind, n_behind, ne_behind = np.uint64(spots[0, NW]), np.uint64(spots[0, N]), np.uint64(spots[0, NE])
-    nw_ahead, n_ahead, ne_ahead = np.uint64(spots[1, NW]), np.uint64(spots[1, N]), np.uint64(spots[1, NE])
-    for cell in range(np.uint64(size[1])):
-        i, away, s = np.uint64(position) + cell, cell * wide, np.uint64(start) + cell * n
-        r1, r2, r3 = nw_behind + away, n_behind + away, ne_behind + away
-        a1, a2, a3 = nw_ahead + away, n_ahead + away, ne_ahead + away
-        l1, l2, l3 = behind[NW, i], behind[N, i + one], behind[NE, i + two]
-        j1, j2, j3 = np.uint16(l1 + edge[1, i]), np.uint16(l2 + edge[2, i]), np.uint16(l3 + edge[3, i])
+    nw_read, n_read, ne_read = np.uint64(run.read_nw), np.uint64(run.read_n), np.uint64(run.read_ne)
+    nw_write, n_write, ne_write = np.uint64(run.write_nw), np.uint64(run.write_n), np.uint64(run.write_ne)
+    for cell in range(np.uint64(run.n_cells)):
+        i, away, s = np.uint64(run.position) + cell, cell * wide, np.uint64(run.start) + cell * n
+        r1, r2, r3 = nw_read + away, n_read + away, ne_read + away
+        a1, a2, a3 = nw_write + away, n_write + away, ne_write + away
+        l1, l2, l3 = above[NW, i], above[N, i + one], above[NE, i + two]
+        j1, j2, j3 = np.uint16(l1 + p2[1, i]), np.uint16(l2 + p2[2, i]), np.uint16(l3 + p2[3, i])
         m1 = m2 = m3 = np.uint16(65535)
         for k in range(n):
             c = np.uint16(cost[s + k])
@@ -97,153 +163,174 @@ def run_cells(cost, sums, start, size, paths, spots, behind, ahead, edge, positi
             paths[a3 + k] = v3
             m1, m2, m3 = min(m1, v1), min(m2, v2), min(m3, v3)
             sums[s + k] = np.uint16(np.uint16(sums[s + k] + v1) + np.uint16(v2 + v3))
-        ahead[NW, i + one], ahead[N, i + one], ahead[NE, i + one] = m1, m2, m3
+        here[NW, i + one], here[N, i + one], here[NE, i + one] = m1, m2, m3
 
 
 # (l,) u2, i8, i8, (l,) u2, i8 -> None
 @kernel
-def shifted(behind, n_behind, shift, here, count):
-    """Copy a neighbour's path costs by the heights of this cell and one more at both ends; both begin at PAD.
+def copy_shifted(source, n_source, shift, target, count):
+    """Copy the path costs of a neighbour to the heights of this cell and one more at both ends; both begin at PAD.
 
-    shift = first index here less the neighbour's. Heights that it did not search are FAR: only a jump (P2) leads from
-    there. n_behind < 0: no neighbour, zeros (L = C).
+    shift : first height index of this cell minus that of the neighbour. Heights that the neighbour did not search are
+    FAR. n_source < 0 : there is no neighbour, and zeros are written (L = C).
     """
-    nothing = FAR if n_behind >= 0 else np.uint16(0)
+    nothing = FAR if n_source >= 0 else np.uint16(0)
     for k in range(PAD - 1, PAD + count + 1):
-        here[k] = nothing
-    low, high = max(-1, -shift), min(count + 1, n_behind - shift)
+        target[k] = nothing
+    low, high = max(-1, -shift), min(count + 1, n_source - shift)
     if low < high:
-        source, target = behind[PAD + shift + low : PAD + shift + high], here[PAD + low : PAD + high]
-        for k in range(source.shape[0]):
-            target[k] = source[k]
+        a, b = source[PAD + shift + low : PAD + shift + high], target[PAD + low : PAD + high]
+        for k in range(a.shape[0]):
+            b[k] = a[k]
 
 
-# (2,b,d) i8, i8, i8, i8, i8, (5,d) i8 -> None
+# (e,n) i8, i8 -> RowSegment
 @kernel
-def row_segments(ranges, block_row, block, n_cols, sign, segments):
-    """Segments of a row: FIRST, COUNT of heights, LEFT position, PLACE of its first cell among path costs, on a SHEET.
+def segment_at(segments, e):
+    """The record in row e of an array of segments."""
+    return RowSegment(
+        segments[e, 0], segments[e, 1], segments[e, 2], segments[e, 3], segments[e, 4], segments[e, 5]
+    )  # fmt: skip
 
-    segments : (5, d + 2) int64, segment e at e + 1; the count NOBODY stands where there is none.
+
+# (e,n) i8, i8, RowSegment -> None
+@kernel
+def put_segment(segments, e, segment):
+    """Write a record to row e of an array of segments."""
+    segments[e, 0], segments[e, 1], segments[e, 2] = segment.first, segment.count, segment.position
+    segments[e, 3], segments[e, 4], segments[e, 5] = segment.end, segment.place, segment.reversed_place
+
+
+# VolumeLayout, i8, i8, i8, (e,n) i8 -> i8
+@kernel
+def put_row_segments(layout, block_row, n_cols, sign, segments):
+    """Write the segments of the rows of a block row; returns the number of costs of a row.
+
+    sign : -1 where the sweep runs from the last column to the first.
     """
-    n_d = ranges.shape[2]
-    segments[COUNT] = NOBODY
-    left, place, sheet = 0, PAD, 0
+    n_d, block = layout.count.shape[1], layout.block
+    position, place, reversed_place = 0, PAD, 0
+    put_segment(segments, 0, RowSegment(OUTSIDE, OUTSIDE, OUTSIDE, 0, OUTSIDE, OUTSIDE))
     for e in range(n_d):
         d = e if sign > 0 else n_d - 1 - e
-        count = ranges[1, block_row, d]
-        segments[FIRST, e + 1], segments[COUNT, e + 1] = ranges[0, block_row, d], count
-        segments[LEFT, e + 1], segments[PLACE, e + 1], segments[SHEET, e + 1] = left, place, sheet
+        first, count = layout.first[block_row, d], layout.count[block_row, d]
         n_cells = min(block, n_cols - d * block)
-        left += n_cells
+        put_segment(segments, e + 1, RowSegment(first, count, position, position + n_cells, place, reversed_place))
+        position += n_cells
         place += n_cells * (count + PAD)
-        sheet += n_cells * count
-    segments[LEFT, n_d + 1], segments[SHEET, n_d + 1] = left, sheet
+        reversed_place += n_cells * count
+    put_segment(segments, n_d + 1, RowSegment(OUTSIDE, OUTSIDE, position, OUTSIDE, OUTSIDE, OUTSIDE))
+    return reversed_place
 
 
 # (4,r,c) u2, i8, i8, (4,c) u2 -> None
 @kernel
-def row_edges(p2, row, sign, edge):
-    """P2 of the steps into each cell of a row, by position; the up sweep takes the steps of `p2` the other way."""
+def penalties_of_row(p2, row, sign, out):
+    """Write the P2 of the steps into each cell of a row, by position; the sweep upwards takes steps the other way."""
     rows, cols = p2.shape[1], p2.shape[2]
     if sign > 0:
         # Plain loops: Numba takes five seconds to compile the shape check of an array assigned to a slice.
         for path in range(4):
             for c in range(cols):
-                edge[path, c] = p2[path, row, c]
+                out[path, c] = p2[path, row, c]
         return
-    behind = min(row + 1, rows - 1)
+    below = min(row + 1, rows - 1)
     for i in range(cols):
         c = cols - 1 - i
-        edge[0, i] = p2[0, row, min(c + 1, cols - 1)]
-        edge[1, i] = p2[1, behind, min(c + 1, cols - 1)]
-        edge[2, i] = p2[2, behind, c]
-        edge[3, i] = p2[3, behind, max(c - 1, 0)]
+        out[0, i] = p2[0, row, min(c + 1, cols - 1)]
+        out[1, i] = p2[1, below, min(c + 1, cols - 1)]
+        out[2, i] = p2[2, below, c]
+        out[3, i] = p2[3, below, max(c - 1, 0)]
 
 
-# (2,5,d) i8, i8, i8, i8, i8 -> b1
+# RowSegment, RowSegment -> b1
 @kernel
-def alike(segments, row, e, other, f):
-    """Whether two segments of two rows, even (0) or odd, search the same heights."""
-    same_count = segments[row, COUNT, e] == segments[other, COUNT, f]
-    return same_count and segments[row, FIRST, e] == segments[other, FIRST, f]
+def have_same_range(a, b):
+    """Whether two segments search the same heights."""
+    return a.count == b.count and a.first == b.first
 
 
-# (v,) u1, (v,) u2, (d,) i8, i8, (2,5,d) i8, i8, i8, (3,r,l) u2, (r,4,c) u2, u2 -> None
+# SweptVolume, (e,) i8, i8, (e,n) i8, (3,r,l) u2, i8, (r,4,c) u2, u2 -> None
 @kernel
-def sweep_west(cost, sums, starts, step, segments, now, n_rows, paths, edges, p1):
-    """Path costs from W of the cells of some rows, which have the same segments; they are written to `sums`.
+def sweep_west(volume, starts, row_step, segments, paths, n_rows, p2, p1):
+    """Write the path costs from W of all cells of several rows, which have the same segments, to `volume.sums`.
 
-    starts : of the segments of the first row; step : to the next row; paths : (3, r, l) uint16, of the last two cells
-    of each row, and copies.
+    starts : places of the segments of the first row in the volume; row_step : distance to the next row; segments :
+    records `RowSegment`; paths : (3, r, l), path costs of the last two cells of each row, and copies.
     """
     turn = 0
-    start, size, spots = np.empty(2, np.int64), np.empty(3, np.int64), np.empty(2, np.int64)
-    least = np.zeros(n_rows, np.uint16)
+    min_costs = np.zeros(n_rows, np.uint16)
     for e in range(1, starts.shape[0] - 1):
-        count, n_cells = segments[now, COUNT, e], segments[now, LEFT, e + 1] - segments[now, LEFT, e]
-        behind = turn
-        if not alike(segments, now, e, now, e - 1):
-            behind, shift = COPY, segments[now, FIRST, e] - segments[now, FIRST, e - 1]
+        segment, previous = segment_at(segments, e), segment_at(segments, e - 1)
+        count, n_cells = segment.count, segment.end - segment.position
+        read = turn
+        if not have_same_range(segment, previous):
+            read, shift = COPY_PLANE, segment.first - previous.first
             for row in range(n_rows):
-                shifted(paths[turn, row], segments[now, COUNT, e - 1], shift, paths[COPY, row], count)
+                copy_shifted(paths[turn, row], previous.count, shift, paths[COPY_PLANE, row], count)
                 paths[0, row, PAD + count] = paths[1, row, PAD + count] = FAR
-        start[0], start[1] = starts[e], step
-        size[0], size[1], size[2] = count, n_cells, n_rows
-        spots[0], spots[1] = behind, 1 - turn
-        run_west(cost, sums, start, size, paths, spots, least, edges, segments[now, LEFT, e], p1)
+        run = WestRun(starts[e], row_step, count, n_cells, n_rows, segment.position, read, 1 - turn)
+        run_west(volume, run, paths, min_costs, p2, p1)
         turn = (turn + n_cells) % 2
 
 
-# (l,) u2, (3,3) i8, (2,5,d) i8, i8, i8, i8, (2,3) i8 -> None
+# (l,) u2, RowSegment, RowSegment, i8, i8, i8 -> i8
 @kernel
-def find_neighbours(paths, planes, segments, now, e, position, spots):
-    """Where a cell reads and writes its path costs; neighbours of another range are copied to a place of their own.
+def neighbour_above(costs, segment, above, column, row_start, copied):
+    """Place of the path costs of a neighbour of a cell in the previous row.
 
-    planes : (3, 3) int64, start of the path costs of even and odd rows, and of copies.
+    costs : of the `PathStore`; segment, above : of the cell and of its neighbour; column : position of the neighbour;
+    row_start : place of the previous row's costs. A neighbour with another range is copied to the place `copied`, by
+    the heights of the cell.
     """
-    count, left, right = segments[now, COUNT, e], segments[now, LEFT, e], segments[now, LEFT, e + 1]
-    place, before = segments[now, PLACE, e] + (position - left) * (count + PAD), 1 - now
-    for path in range(BEHIND):
-        across = position + path - 1
-        f = e - 1 if across < left else (e + 1 if across >= right else e)
-        from_left = (across - segments[before, LEFT, f]) * (segments[before, COUNT, f] + PAD)
-        spots[0, path] = planes[before, path] + segments[before, PLACE, f] + from_left
-        spots[1, path] = planes[now, path] + place
-        if not alike(segments, now, e, before, f):
-            shift = segments[now, FIRST, e] - segments[before, FIRST, f]
-            here, there = paths[planes[2, path] - PAD :], paths[spots[0, path] - PAD :]
-            shifted(there, segments[before, COUNT, f], shift, here, count)
-            spots[0, path] = planes[2, path]
+    place = row_start + above.place + (column - above.position) * (above.count + PAD)
+    if have_same_range(segment, above):
+        return place
+    copy_shifted(costs[place - PAD :], above.count, segment.first - above.first, costs[copied - PAD :], segment.count)
+    return copied
 
 
-# (v,) u1, (v,) u2, i8, (l,) u2, (3,3) i8, (2,5,d) i8, i8, i8, (2,3,c) u2, (4,c) u2, u2, (2,3) i8, (2,) i8 -> None
+# SweptVolume, i8, PathStore, i8, i8, (4,c) u2, u2 -> None
 @kernel
-def sweep_segment(cost, sums, start, paths, planes, segments, now, e, least, edge, p1, spots, size):
-    """All cells of a segment: those at its ends and under another range one by one, the others in one run.
+def sweep_segment(volume, start, store, parity, e, p2, p1):
+    """Add the path costs from NW, N and NE of all cells of a segment, whose first cell is at `start` of the volume.
 
-    spots, size : where `run_cells` gets them.
+    Cells at its ends and below another range are computed one by one, the others in one run.
     """
-    left, right, count = segments[now, LEFT, e], segments[now, LEFT, e + 1], segments[now, COUNT, e]
-    run, end, before = left, right, 1 - now
-    if not alike(segments, now, e, before, e):
+    costs, width, longest = store.costs, store.width, store.longest
+    above, here = store.min_costs[1 - parity], store.min_costs[parity]
+    segment, others = segment_at(store.segments[parity], e), store.segments[1 - parity]
+    before, same, after = segment_at(others, e - 1), segment_at(others, e), segment_at(others, e + 1)
+    left, right, count = segment.position, segment.end, segment.count
+    first_write, first_read = parity * PATHS_FROM_ABOVE * width, (1 - parity) * PATHS_FROM_ABOVE * width
+    copied = 2 * PATHS_FROM_ABOVE * width + PAD
+    run, end = left, right
+    if not have_same_range(segment, same):
         run = right
-    elif not alike(segments, now, e, before, e - 1):
+    elif not have_same_range(segment, before):
         run = left + 1
-    if not alike(segments, now, e, before, e + 1):
+    if not have_same_range(segment, after):
         end = right - 1
-    behind, ahead = least[before], least[now]
     i = left
     while i < right:
-        size[0], size[1] = count, (end - i if run <= i < end else 1)
-        find_neighbours(paths, planes, segments, now, e, i, spots)
-        run_cells(cost, sums, start + (i - left) * count, size, paths, spots, behind, ahead, edge, i, p1)
-        i += size[1]
+        n_cells = end - i if run <= i < end else 1
+        nw, ne = before if i == left else same, after if i + 1 == right else same
+        write = first_write + segment.place + (i - left) * (count + PAD)
+        cells = CellRun(
+            start + (i - left) * count, count, n_cells, i,
+            neighbour_above(costs, segment, nw, i - 1, first_read, copied),
+            neighbour_above(costs, segment, same, i, first_read + width, copied + longest),
+            neighbour_above(costs, segment, ne, i + 1, first_read + 2 * width, copied + 2 * longest),
+            write, write + width, write + 2 * width,
+        )  # fmt: skip
+        run_cells(volume, cells, costs, above, here, p2, p1)
+        i += n_cells
 
 
 # (v,) u1, i8, i8, i8, (s,) u1 -> None
 @kernel
 def reverse_cells(source, start, count, n_cells, target):
-    """Copy cells of a volume in reverse order, the heights of each in their own."""
+    """Copy cells of a volume in reverse order; the heights of each cell keep their order."""
     for cell in range(n_cells):
         at = start + (n_cells - 1 - cell) * count
         a, b = source[at : at + count], target[cell * count : (cell + 1) * count]
@@ -254,7 +341,7 @@ def reverse_cells(source, start, count, n_cells, target):
 # (s,) u2, i8, i8, i8, (v,) u2 -> None
 @kernel
 def add_reversed(source, start, count, n_cells, total):
-    """Add what `reverse_cells` put in reverse order."""
+    """Add cells that stand in reverse order to a volume."""
     for cell in range(n_cells):
         at = start + (n_cells - 1 - cell) * count
         a, b = source[cell * count : (cell + 1) * count], total[at : at + count]
@@ -262,98 +349,110 @@ def add_reversed(source, start, count, n_cells, total):
             b[k] = np.uint16(b[k] + a[k])
 
 
-# (v,) u1, (v,) u2, (d,) i8, i8, (5,d) i8, i8, b1, (s,) u1, (s,) u2 -> None
+# (v,) u1, (e,) i8, i8, (e,n) i8, i8, (s,) u1 -> None
 @kernel
-def turn_rows(cost, total, starts, step, segments, n_rows, is_done, sheet_cost, sheet_sums):
-    """Lay the costs of some rows on a sheet, their cells in reverse order, or add the sums of the sheet to theirs."""
-    length = segments[SHEET, starts.shape[0] - 1]
-    for row in range(n_rows):
-        for e in range(1, starts.shape[0] - 1):
-            start, n_cells = starts[e] + row * step, segments[LEFT, e + 1] - segments[LEFT, e]
-            at, end = row * length + segments[SHEET, e], row * length + segments[SHEET, e + 1]
-            if is_done:
-                add_reversed(sheet_sums[at:end], start, segments[COUNT, e], n_cells, total)
-            else:
-                reverse_cells(cost, start, segments[COUNT, e], n_cells, sheet_cost[at:end])
-
-
-# i8, i8 -> (3,3) i8
-@kernel
-def path_planes(width, longest):
-    """Where the path costs of even and odd rows and copies of neighbours start, for NW, N, NE."""
-    planes = np.empty((3, BEHIND), np.int64)
-    for path in range(BEHIND):
-        planes[0, path], planes[1, path] = path * width, (BEHIND + path) * width
-        planes[2, path] = 2 * BEHIND * width + path * longest + PAD
-    return planes
-
-
-# (v,) u1, (v,) u2, (d,) i8, i8, (l,) u2, (3,3) i8, (2,5,d) i8, i8, b1, (2,3,c) u2, (4,c) u2, u2 -> None
-@kernel
-def sweep_row(cost, sums, starts, shift, paths, planes, segments, now, is_new, least, edge, p1):
-    """Paths from NW, N and NE of a row, whose segments start `shift` after `starts`.
-
-    is_new : with segments unlike those of the row before the last.
-    """
-    if is_new:
-        width = planes[0, 1]
-        paths[planes[now, 0] : planes[now, 0] + BEHIND * width] = FAR
-    spots, size = np.empty((2, BEHIND), np.int64), np.empty(2, np.int64)
+def reverse_row(cost, starts, shift, segments, place, out):
+    """Copy the costs of a row, whose segments start `shift` after `starts`, to `out` from `place` on, its cells in
+    reverse order."""
     for e in range(1, starts.shape[0] - 1):
-        sweep_segment(cost, sums, starts[e] + shift, paths, planes, segments, now, e, least, edge, p1, spots, size)
+        segment = segment_at(segments, e)
+        n_cells, at = segment.end - segment.position, place + segment.reversed_place
+        reverse_cells(cost, starts[e] + shift, segment.count, n_cells, out[at : at + n_cells * segment.count])
 
 
-# (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (4,r,c) u2, u2, i8, (v,) u2 -> None
+# (s,) u2, (e,) i8, i8, (e,n) i8, i8, (v,) u2 -> None
 @kernel
-def sweep(cost, ranges, address, block, p2, p1, sign, total):
+def add_reversed_row(sums, starts, shift, segments, place, total):
+    """Add the sums of a row that `reverse_row` put in reverse order to those of the volume."""
+    for e in range(1, starts.shape[0] - 1):
+        segment = segment_at(segments, e)
+        n_cells, at = segment.end - segment.position, place + segment.reversed_place
+        add_reversed(sums[at : at + n_cells * segment.count], starts[e] + shift, segment.count, n_cells, total)
+
+
+# VolumeLayout, i8 -> PathStore
+@kernel
+def new_path_store(layout, n_cols):
+    """Room for two rows of n_cols cells; all path costs are FAR, all segments are outside."""
+    width, longest = layout.row_length.max() + PAD * (n_cols + 2), layout.count.max() + 2 * PAD
+    segments = np.full((2, layout.count.shape[1] + 2, 6), OUTSIDE, np.int64)
+    costs = np.full(2 * PATHS_FROM_ABOVE * width + PATHS_FROM_ABOVE * longest, FAR, np.uint16)
+    return PathStore(segments, costs, np.zeros((2, PATHS_FROM_ABOVE, n_cols + 2), np.uint16), width, longest)
+
+
+# SweptVolume, (e,) i8, i8, PathStore, i8, b1, (4,c) u2, u2 -> None
+@kernel
+def sweep_row(volume, starts, shift, store, parity, has_new_segments, p2, p1):
+    """Add the path costs from NW, N and NE of a row, whose segments start `shift` after `starts` in the volume.
+
+    has_new_segments : whether its segments differ from those of the row before the last, whose room it takes.
+    """
+    if has_new_segments:
+        n = PATHS_FROM_ABOVE * store.width
+        store.costs[parity * n : (parity + 1) * n] = FAR
+    for e in range(1, starts.shape[0] - 1):
+        sweep_segment(volume, starts[e] + shift, store, parity, e, p2, p1)
+
+
+# VolumeLayout, i8, i8, (e,) i8 -> None
+@kernel
+def find_starts(layout, row, sign, starts):
+    """Write where the blocks of a row start in the volume, in the order of the sweep; block e stands at e + 1."""
+    n_d, b = layout.count.shape[1], row // layout.block
+    first = layout.block_row_start[b, 0] + (row - b * layout.block) * layout.row_length[b, 0]
+    for e in range(1, n_d + 1):
+        starts[e] = first + layout.block_start[b, e - 1 if sign > 0 else n_d - e]
+
+
+# (v,) u1, VolumeLayout, (4,r,c) u2, u2, i8, (v,) u2 -> None
+@kernel
+def sweep(cost, layout, p2, p1, sign, total):
     """Sums of four paths: sign = 1 sweeps down and writes `total`, -1 sweeps up and adds to it.
 
-    p2 : (4, r, c) uint16, penalty of the jump into a cell from W, NW, N, NE.
+    cost : (v,) uint8; p2 : (4, r, c) uint16, penalty of the jump into a cell from W, NW, N, NE; total : (v,) uint16.
     """
-    n_rows, n_cols, n_d = p2.shape[1], p2.shape[2], ranges.shape[2]
-    width, longest = address[1].max() + PAD * (n_cols + 2), ranges[1].max() + 2 * PAD
-    planes, paths = path_planes(width, longest), np.full(2 * BEHIND * width + BEHIND * longest, FAR, np.uint16)
-    west = np.full((3, BESIDE, longest), FAR, np.uint16)
-    least, edges = np.zeros((2, BEHIND, n_cols + 2), np.uint16), np.empty((BESIDE, 4, n_cols), np.uint16)
-    segments, starts = np.full((2, 5, n_d + 2), NOBODY, np.int64), np.empty(n_d + 2, np.int64)
-    n_sheet = 0 if sign > 0 else BESIDE * address[1].max()
-    sheet_cost, sheet_sums = np.empty(n_sheet, np.uint8), np.empty(n_sheet, np.uint16)
+    n_rows, n_cols, n_d, block = p2.shape[1], p2.shape[2], layout.count.shape[1], layout.block
+    store, starts = new_path_store(layout, n_cols), np.empty(n_d + 2, np.int64)
+    west_paths = np.full((3, ROWS_SIDE_BY_SIDE, store.longest), FAR, np.uint16)
+    row_p2 = np.empty((ROWS_SIDE_BY_SIDE, 4, n_cols), np.uint16)
+    n_reversed = 0 if sign > 0 else ROWS_SIDE_BY_SIDE * layout.row_length.max()
+    reversed_rows = SweptVolume(np.empty(n_reversed, np.uint8), np.empty(n_reversed, np.uint16))
     done = 0
     while done < n_rows:
         r = done if sign > 0 else n_rows - 1 - done
         br = r // block
-        n_beside = min(BESIDE, min((br + 1) * block, n_rows) - r if sign > 0 else r - br * block + 1)
-        here = segments[done % 2]
-        row_segments(ranges, br, block, n_cols, sign, here)
+        n_beside = min(ROWS_SIDE_BY_SIDE, min((br + 1) * block, n_rows) - r if sign > 0 else r - br * block + 1)
+        here = store.segments[done % 2]
+        length = put_row_segments(layout, br, n_cols, sign, here)
         for row in range(n_beside):
-            row_edges(p2, r + sign * row, sign, edges[row])
-        for e in range(1, n_d + 1):
-            d, first = (e - 1 if sign > 0 else n_d - e), address[0, br, 0] + (r - br * block) * address[1, br, 0]
-            starts[e] = first + address[2, br, d]
-        step, source, sums = address[1, br, 0], cost, total
+            penalties_of_row(p2, r + sign * row, sign, row_p2[row])
+        find_starts(layout, r, sign, starts)
+        step, swept, volume_starts = layout.row_length[br, 0], SweptVolume(cost, total), starts
         if sign < 0:
-            turn_rows(cost, total, starts, -step, here, n_beside, False, sheet_cost, sheet_sums)
-            source, sums = sheet_cost, sheet_sums
-            volume = starts.copy()
-            starts[:] = here[SHEET]
-        sweep_west(source, sums, starts, step, segments, done % 2, n_beside, west, edges, p1)
+            for row in range(n_beside):
+                reverse_row(cost, starts, -row * step, here, row * length, reversed_rows.cost)
+            swept, volume_starts = reversed_rows, starts.copy()
+            for e in range(1, n_d + 1):
+                starts[e] = segment_at(here, e).reversed_place
+        sweep_west(swept, starts, step, here, west_paths, n_beside, row_p2, p1)
         for row in range(n_beside):
-            now = (done + row) % 2
+            parity = (done + row) % 2
             if row == 1:
-                # From here on the row before has the same segments.
-                row_segments(ranges, br, block, n_cols, sign, segments[now])
-            is_new = done + row < 2 or br != (r - sign * (2 - row)) // block
-            sweep_row(source, sums, starts, row * step, paths, planes, segments, now, is_new, least, edges[row], p1)
+                # From here on the previous row has the same segments.
+                put_row_segments(layout, br, n_cols, sign, store.segments[parity])
+            has_new_segments = done + row < 2 or br != (r - sign * (2 - row)) // block
+            sweep_row(swept, starts, row * step, store, parity, has_new_segments, row_p2[row], p1)
         if sign < 0:
-            turn_rows(cost, total, volume, -step, here, n_beside, True, sheet_cost, sheet_sums)
+            for row in range(n_beside):
+                add_reversed_row(reversed_rows.sums, volume_starts, -row * step, here, row * length, total)
         done += n_beside
 
 
 # (h,) u2 -> u4
 @kernel
 def least_sum(sums):
-    """The least value and, in the lower 16 bits, its first index: one minimum over both, which vectorises."""
-    least = NONE
+    """The minimum and, in the lower 16 bits, its first index: one minimum over both, which vectorises."""
+    least = NO_MINIMUM
     for k in range(sums.shape[0]):
         least = min(least, np.uint32(np.uint32(np.uint32(sums[k]) << np.uint32(16)) | np.uint32(k)))
     return least
@@ -361,9 +460,9 @@ def least_sum(sums):
 
 # (h,) u2, i8 -> u4
 @kernel
-def other_minimum(sums, where):
-    """As `least_sum`, over local minima more than two indices from `where`, ends left out; NONE where there is none."""
-    least = NONE
+def secondary_minimum(sums, where):
+    """As `least_sum`, of the local minima more than two indices from `where`, both ends excluded; else NO_MINIMUM."""
+    least = NO_MINIMUM
     inner = max(sums.shape[0] - 2, 0)
     before, here, after = sums[:inner], sums[1 : 1 + inner], sums[2 : 2 + inner]
     centre = np.int32(where - 1)
@@ -371,32 +470,37 @@ def other_minimum(sums, where):
         key = np.uint32(np.uint32(np.uint32(here[k]) << np.uint32(16)) | np.uint32(k + 1))
         away = np.int32(np.int32(k) - centre)
         is_other = (here[k] <= before[k]) & (here[k] <= after[k]) & ((away < -2) | (away > 2))
-        least = min(least, key if is_other else NONE)
+        least = min(least, key if is_other else NO_MINIMUM)
     return least
 
 
-# (v,) u2, (2,b,d) i8, (3,b,d) i8, i8, (r,c) i4, (r,c) i4, (r,c) u2, (r,c) f4 -> None
+# (v,) u2, VolumeLayout, (r,c) i4, (r,c) i4, (r,c) u2, (r,c) f4 -> None
 @kernel
-def winners(total, ranges, address, block, best, second, margin, vertex):
+def winners(total, layout, best, second, uniqueness, vertex):
     """Height index of the least sum, and of the least other local minimum at least three indices away.
 
-    best, second : (r, c) int32, second = best where there is no other minimum; margin : (r, c) uint16, how much larger
-    the sum at `second` is (65535 where there is none); vertex : (r, c) float32, the parabola's minimum around `best`.
+    best, second : (r, c) int32, second = best where there is no other minimum; uniqueness : (r, c) uint16, by how much
+    the sum at `second` is larger (65535 where there is none); vertex : (r, c) float32, minimum of the parabola through
+    the sums around `best`. All are written.
     """
     n_rows, n_cols = best.shape
+    first_of, count_of, block = layout.first, layout.count, layout.block
+    block_row_start, row_length, block_start = layout.block_row_start, layout.row_length, layout.block_start
     for r in range(n_rows):
         b = r // block
         for c in range(n_cols):
             d = c // block
-            first, count = ranges[0, b, d], ranges[1, b, d]
-            start = address[0, b, d] + (r - b * block) * address[1, b, d] + address[2, b, d] + (c - d * block) * count
+            first, count = first_of[b, d], count_of[b, d]
+            row_start = block_row_start[b, d] + (r - b * block) * row_length[b, d]
+            start = row_start + block_start[b, d] + (c - d * block) * count
             sums = total[start : start + count]
             least = least_sum(sums)
-            low, where = np.uint16(least >> np.uint32(16)), np.int64(least & LOWER)
-            other = other_minimum(sums, where)
+            low, where = np.uint16(least >> np.uint32(16)), np.int64(least & LOWER_16_BITS)
+            other = secondary_minimum(sums, where)
+            has_other = other != NO_MINIMUM
             best[r, c] = first + where
-            second[r, c] = first + (where if other == NONE else np.int64(other & LOWER))
-            margin[r, c] = np.uint16(65535) if other == NONE else np.uint16(np.uint16(other >> np.uint32(16)) - low)
+            second[r, c] = first + (np.int64(other & LOWER_16_BITS) if has_other else where)
+            uniqueness[r, c] = np.uint16(np.uint16(other >> np.uint32(16)) - low) if has_other else np.uint16(65535)
             vertex[r, c] = first + where
             if 0 < where < count - 1:
                 left, right = np.float32(sums[where - 1] - low), np.float32(sums[where + 1] - low)
@@ -404,24 +508,28 @@ def winners(total, ranges, address, block, best, second, margin, vertex):
                     vertex[r, c] += np.float32(0.5) * (left - right) / (left + right)
 
 
-# (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (r,c) i4, (r,c) i4 -> None
+# (v,) u1, VolumeLayout, (r,c) i4, (r,c) i4 -> None
 @kernel
-def least_costs(cost, ranges, address, block, best, lone):
-    """Height index of the least cost of each cell by itself: of equals that of `best`, else the first. (r, c) int32."""
+def winner_takes_all(cost, layout, preferred, best):
+    """Height index of the least cost of each cell, written to `best`; of equal costs that of `preferred`, else the
+    first. preferred, best : (r, c) int32."""
     n_rows, n_cols = best.shape
+    first_of, count_of, block = layout.first, layout.count, layout.block
+    block_row_start, row_length, block_start = layout.block_row_start, layout.row_length, layout.block_start
     for r in range(n_rows):
         b = r // block
         for c in range(n_cols):
             d = c // block
-            first, count = ranges[0, b, d], ranges[1, b, d]
-            start = address[0, b, d] + (r - b * block) * address[1, b, d] + address[2, b, d] + (c - d * block) * count
+            first, count = first_of[b, d], count_of[b, d]
+            row_start = block_row_start[b, d] + (r - b * block) * row_length[b, d]
+            start = row_start + block_start[b, d] + (c - d * block) * count
             costs = cost[start : start + count]
             least = np.uint8(255)
             for k in range(count):
                 least = min(least, costs[k])
-            where = np.int64(best[r, c] - first)
+            where = np.int64(preferred[r, c] - first)
             if costs[where] != least:
                 where = np.int64(0)
                 while costs[where] != least:
                     where += 1
-            lone[r, c] = first + where
+            best[r, c] = first + where
