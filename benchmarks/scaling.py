@@ -1,5 +1,4 @@
-"""How time and memory grow with area, number of images and workers, on a rendered town that is repeated as often as
-needed.
+"""Growth of time and memory with area, number of images and workers, on a rendered town that is repeated as needed.
 
     python benchmarks/scaling.py area --million 4 16 100
     python benchmarks/scaling.py workers --million 16
@@ -8,10 +7,10 @@ needed.
     python benchmarks/scaling.py draw [--picture FILE]
 
 One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
-the repeated image. CPU is that of all processes, from `run.json`; memory the most that one worker held, from
-`events.jsonl`. Measured rows are kept in `growth.csv`, or the table that `--table` names, in place of those of the same
-kind; `draw` shows them as docs/development/experiments/growth.png. `--period` makes the town, and the images of a block,
-smaller.
+the repeated image. CPU is the CPU of all processes, from `run.json`; memory is the largest memory of one worker, from
+`events.jsonl`. Measured rows replace rows of the same kind in `growth.csv`, or in the table that `--table` names.
+`draw` plots them as docs/development/experiments/growth.png. `--period` sets the side of the town and of the images of
+a block.
 """
 
 from __future__ import annotations
@@ -51,18 +50,21 @@ from zlocus.synthetic.terrain import SyntheticGround
 ROOT = Path(__file__).parents[1]
 KEPT, PICTURE = ROOT / "benchmarks" / "growth.csv", ROOT / "docs" / "development" / "experiments" / "growth.png"
 PERIOD_PX, GSD_M = 1024, 0.5
-# So far away that rays are parallel over the largest scene, to a thousandth of a pixel.
+# Distance of the camera, at which rays are parallel to a thousandth of a pixel over the largest scene.
 FAR_M = 1e9
 UTM = CRS.from_epsg(32632)
 BLOCK = 256
-# Along and across, degrees: in pairs from all sides, the first straight down.
+# View angles along and across, degrees: the first image is vertical, the others come in pairs from all sides.
 LOOKS = (1.0, -1.0), (16.0, 2.0), (-16.0, -2.0), (8.0, 12.0), (-8.0, -12.0), (4.0, -18.0)
 IMAGES = (2, 4, 8, 16, 32, 64)
 
 
 @dataclass(frozen=True)
 class Town:
-    """A period of a town: ground that is repeated around it, and its place. period_px : its side, pixels of `GSD_M`."""
+    """One period of a repeated town: its ground with copies around it, and its position.
+
+    period_px : side in pixels of `GSD_M`.
+    """
 
     ground: SyntheticGround
     west_m: float
@@ -72,7 +74,7 @@ class Town:
 
 
 def town(period_px: int = PERIOD_PX) -> Town:
-    """One period of a rendered town, with the same town around it."""
+    """Render one period of a town, surrounded by copies of itself."""
     spec = replace(steady(city_spec(7)), size=period_px, gsd_m=GSD_M)
     ground = build_ground(spec, exposures(spec))
     n = round(period_px * GSD_M / ground.step)
@@ -87,13 +89,13 @@ def town(period_px: int = PERIOD_PX) -> Town:
 
 
 def looks(n_views: int) -> list[tuple[float, float]]:
-    """View angles (along, across), degrees, of as many images as asked for: those of `LOOKS`, then others between."""
+    """View angles (along, across) of n_views images, degrees: first those of `LOOKS`, then angles between them."""
     rng = np.random.default_rng(3)
     return [*LOOKS, *((float(a), float(b)) for a, b in rng.uniform(-18.0, 18.0, (max(n_views, 6) - 6, 2)))][:n_views]
 
 
 def write_views(folder: Path, at: Town, n_views: int, side: int) -> list[Path]:
-    """Images of the repeated town, so many pixels each way, all of the same ground."""
+    """Write images of the repeated town, `side` pixels along each side, all of the same ground."""
     paths = []
     for number, look in enumerate(looks(n_views)):
         paths.append(folder / f"v{number:02d}.tif")
@@ -102,12 +104,12 @@ def write_views(folder: Path, at: Town, n_views: int, side: int) -> list[Path]:
 
 
 def write_block(folder: Path, at: Town, side: int) -> list[Path]:
-    """A square block of side x side images, each of one period of the town and half over the next."""
+    """Write a block of side x side images; each shows one period of the town and overlaps its neighbours by half."""
     period, paths = at.period_px, []
     step = period // 2
     made = [pixels(at, look, number) for number, look in enumerate(LOOKS)]
     for row, col in product(range(side), range(side)):
-        # So that neighbours on all sides look elsewhere.
+        # Neighbours on all sides get different view angles.
         number = (row * 2 + col) % len(LOOKS)
         numbers = np.roll(made[number], (-step * (row % 2), -step * (col % 2)), (0, 1))
         paths.append(folder / f"b{row:02d}_{col:02d}.tif")
@@ -116,14 +118,14 @@ def write_block(folder: Path, at: Town, side: int) -> list[Path]:
 
 
 def camera(at: Town, look: tuple[float, float], first: tuple[int, int]) -> SatelliteCamera:
-    """The camera whose pixel (row, col) = first of the repeated town is its first."""
-    # The town's first corner at the same height is the centre of no pixel but a corner of one.
+    """The camera of an image that begins at pixel `first` (row, column) of the repeated town."""
+    # The first corner of the town is the corner of a pixel, not the centre of one.
     centre = (-0.5 - first[1], -0.5 - first[0])
     return SatelliteCamera((at.west_m, at.north_m, sum(at.z) / 2), centre, GSD_M, *look, altitude_m=FAR_M)
 
 
 def pixels(at: Town, look: tuple[float, float], number: int) -> NDArray[np.integer]:
-    """One period of the image of the repeated town, (`period_px`, `period_px`)."""
+    """One period of the image of the repeated town, (period_px, period_px)."""
     shape = (at.period_px, at.period_px)
     seen = render(at.ground, camera(at, look, (0, 0)), shape, exposures(steady(city_spec(7)))[0].view.sun)
     return expose(seen, Optics(), np.random.default_rng([5, number]))
@@ -135,7 +137,7 @@ def rpc_of(at: Town, look: tuple[float, float], first: tuple[int, int], side: in
 
 
 def write_repeated(path: Path, numbers: NDArray[np.integer], side: int, rpc: RpcCoefficients) -> None:
-    """An image (r, c), repeated to so many pixels each way, never whole in memory."""
+    """Write an image (r, c) repeated to `side` pixels along each side; it is never whole in memory."""
     tags = RPC(
         height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
         line_den_coeff=list(rpc.line_den), line_num_coeff=list(rpc.line_num), line_off=rpc.line_off,
@@ -143,7 +145,7 @@ def write_repeated(path: Path, numbers: NDArray[np.integer], side: int, rpc: Rpc
         samp_num_coeff=list(rpc.samp_num), samp_off=rpc.samp_off, samp_scale=rpc.samp_scale,
     )  # fmt: skip
     period = len(numbers)
-    # An image without a place of its own but for its RPC is what is wanted here.
+    # The image has no georeference except its RPC, on purpose.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         file = rasterio.open(
@@ -159,8 +161,11 @@ def write_repeated(path: Path, numbers: NDArray[np.integer], side: int, rpc: Rpc
 
 @dataclass(frozen=True)
 class Growth:
-    """What a run took. wall_s : all of it, and of stages; cpu_s : of all processes; worker_mb, command_mb : the most
-    that one worker, and the command itself, held."""
+    """Time and memory of a run.
+
+    wall_s, cpu_s : of the whole run with all processes; match_s, match_cpu_s : of the matching alone; worker_mb,
+    command_mb : largest memory of one worker, and of the command itself.
+    """
 
     million: float
     n_views: int
@@ -178,11 +183,11 @@ class Growth:
 
     @property
     def cpu_s_per_million(self) -> float:
-        """Of the whole run, per million cells."""
+        """CPU seconds of the whole run per million cells."""
         return self.cpu_s / self.million
 
     def row(self) -> str:
-        """Below `HEAD`."""
+        """A line of the table below `HEAD`."""
         cells = (
             f"{self.million:.1f}", self.n_views, self.workers, self.n_tiles, f"{self.wall_s:.0f}",
             f"{self.orient_s:.1f}", f"{self.match_s:.1f}", f"{self.products_s:.1f}",
@@ -199,7 +204,7 @@ HEAD = (
 
 
 def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) -> Growth:
-    """A run over all that the images show, with everything by default."""
+    """Run `zlocus dsm` with default options over the whole area of the images, and measure it."""
     words = [
         sys.executable, "-m", "zlocus", "dsm", *map(str, images), "-o", str(out), "--overwrite", "--crs", "EPSG:32632",
         "--resolution", str(GSD_M), "--workers", str(workers), "--memory", str(memory_gb),
@@ -220,10 +225,10 @@ def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) 
         orient_s=stages["orient"]["wall_s"],
         match_s=stages["match"]["wall_s"],
         products_s=sum(
-            stage["wall_s"] for name, stage in stages.items() if name not in ("open", "orient", "settle", "match")
+            stage["wall_s"] for name, stage in stages.items() if name not in ("open", "orient", "setup", "match")
         ),
         match_cpu_s=stages["match"]["cpu_s"],
-        # Of all processes, those of workers too.
+        # Processes of workers count too.
         cpu_s=sum(stage["cpu_s"] for stage in run["stages"]),
         worker_mb=max(event["peak_mb"] for event in tiles),
         command_mb=max(stage["peak_mb"] for name, stage in stages.items() if name != "match"),
@@ -232,7 +237,7 @@ def measured(images: Sequence[Path], out: Path, workers: int, memory_gb: float) 
 
 
 def kept(what: str, found: Sequence[Growth], path: Path = KEPT) -> None:
-    """Put rows of a kind into a table, in place of those that are there."""
+    """Replace the rows of a kind in a table."""
     rows = [] if not path.exists() else [row for row in read_kept(path) if row["what"] != what]
     rows += [{"what": what, **{name: f"{value:.6g}" for name, value in asdict(one).items()}} for one in found]
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -242,13 +247,13 @@ def kept(what: str, found: Sequence[Growth], path: Path = KEPT) -> None:
 
 
 def read_kept(path: Path = KEPT) -> list[dict[str, str]]:
-    """All rows of a table that `kept` wrote."""
+    """All rows of a table written by `kept`."""
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def draw(path: Path, table: Path = KEPT) -> None:
-    """Curves of what a table keeps: against area, and against the images of a growing block."""
+    """Plot the table: against area, and against the number of images of a block."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -296,12 +301,12 @@ def draw(path: Path, table: Path = KEPT) -> None:
 
 
 def record_of(out: Path) -> dict[str, Any]:
-    """What a run says of itself."""
+    """The run.json of a run."""
     return dict(json.loads((out / "run.json").read_text(encoding="utf-8")))
 
 
 def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
-    """Pixels along each image, images and workers of each run; of a block, images along each side."""
+    """Side in pixels, number of images and number of workers of each run; for a block, images along each side."""
     if asked.what == "block":
         yield from ((asked.period, side, asked.workers) for side in asked.side)
         return
@@ -316,7 +321,7 @@ def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
 
 
 def main() -> None:
-    """Measure what is asked for, and print a table."""
+    """Measure the runs that the command line names, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("area", "workers", "views", "block", "draw"))
     parser.add_argument("--million", type=float, nargs="+", default=[4.0], help="cells")

@@ -177,7 +177,7 @@ def test_run_json_holds_what_was_done(of_step):
     record = json.loads((of_step.out / "run.json").read_text())
     assert record["points"] == of_step.n_points
     assert set(record["images"]) == set(LOOKS)
-    assert [s["name"] for s in record["stages"]] == ["open", "orient", "settle", "match", "match back", "write"]
+    assert [s["name"] for s in record["stages"]] == ["open", "orient", "setup", "match", "cross-check", "write"]
     assert len(record["inputs"]) == 3
     assert sum(v["points"] for v in record["images"].values()) == of_step.n_points
 
@@ -230,7 +230,7 @@ def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypat
 
 def test_levels_are_left_out_where_no_block_fits(images, tmp_path, monkeypatch):
     offered = iter([None, 16])
-    monkeypatch.setattr(per_image, "FEWEST_LEVELS", 2)
+    monkeypatch.setattr(per_image, "MIN_LEVELS", 2)
     monkeypatch.setattr(per_image, "fitting_block", lambda scenes, block: next(offered))
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS, "references": ("nadir",)}
     result = run(images("plane").inputs, tmp_path / "out", **asked)

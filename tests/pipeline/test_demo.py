@@ -100,7 +100,7 @@ def stopped_and_taken_on(out, monkeypatch):
         patch.setattr(tiles.Matching, "assemble", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run_demo(out, LineProgress(said))
-    found = re.search(r"(\d) of \1 tiles are finished and kept: the same command goes on from there\.", said.getvalue())
+    found = re.search(r"(\d) of \1 tiles are finished and kept: the same command resumes from there\.", said.getvalue())
     with monkeypatch.context() as patch:
         patch.setattr(files, "render_scene", interrupt)
         result = run_demo(out, LineProgress(said))

@@ -155,7 +155,7 @@ def test_products(whole, images):
     assert dsm.crs.to_epsg() == 32632
 
 
-def test_ortho_image_is_the_leading_view_on_the_surface(whole, images):
+def test_ortho_image_is_the_reference_image_on_the_surface(whole, images):
     """Grey values of the nadir image where the cells' true surface points fall in it."""
     grey, source = read(whole / "ortho.tif")
     truth = truth_at("sine", source)
@@ -172,10 +172,10 @@ def test_ortho_image_is_the_leading_view_on_the_surface(whole, images):
 def test_record(whole, images):
     record = json.loads((whole / "run.json").read_text())
     assert set(record) >= {"schema", "config", "versions", "inputs", "stages", "evaluations", "coverage"}
-    assert record["schema"] == 1
+    assert record["schema"] == 2
     assert [entry["path"] for entry in record["inputs"]] == [str(path) for path in images("sine").inputs]
     assert all(len(entry["sha256"]) == 64 for entry in record["inputs"])
-    stages = ["open", "orient", "settle", "match", "record", "write", "points", "curves", "products"]
+    stages = ["open", "orient", "setup", "match", "record", "write", "points", "curves", "products"]
     assert [stage["name"] for stage in record["stages"]] == stages
     assert all(set(stage) == {"name", "wall_s", "cpu_s", "peak_mb"} for stage in record["stages"])
     assert record["evaluations"]["done"] <= record["evaluations"]["all_images"]
@@ -365,7 +365,7 @@ def test_heights_around_a_dem(images, tmp_path):
     assert json.loads((out / "run.json").read_text())["heights"]["range_m"] == [-20.0, 130.0]
 
 
-def test_ortho_image_where_the_leading_view_sees_nothing(images, tmp_path):
+def test_ortho_image_where_the_reference_image_sees_nothing(images, tmp_path):
     """The leading image, three times as bright, is cut off in the west: no cell shows another place's grey value, and
     grey values of another image are its own, or as bright as the leading one's."""
     paths = dict(images("plane").paths)
@@ -399,9 +399,9 @@ def test_without_the_semi_global_constraint(images, tmp_path):
     assert (np.abs(error[seen]) < BLUNDER_M).mean() > 0.8
 
 
-def test_leading_view(images, tmp_path):
+def test_reference_image(images, tmp_path):
     out = run(images("plane"), tmp_path / "out", reference="aft", views="all", bounds=PART).out
-    assert json.loads((out / "run.json").read_text())["heights"]["leading_view"] == "aft"
+    assert json.loads((out / "run.json").read_text())["heights"]["reference_image"] == "aft"
     grey, source = read(out / "ortho.tif")
     x, y = source.transform * (20.5, 15.5)
     xy = camera("aft").image_from_ground(np.array([[x, y, 50.0]]))[0]
@@ -465,7 +465,7 @@ def test_a_failing_tile_leaves_no_half_products(images, tmp_path, monkeypatch):
 @pytest.mark.parametrize("rounds", [1, 2])
 def test_tiny_pyramids(images, tmp_path, rounds):
     """One level and blocks of 8 cells, the least that the options allow."""
-    config = RunConfig(pyramid=PyramidOptions(max_levels=1, block=8, halo=8, tile=64, finest_rounds=rounds))
+    config = RunConfig(pyramid=PyramidOptions(max_levels=1, block=8, halo=8, tile=64, finest_level_rounds=rounds))
     out = run(images("plane"), tmp_path / "out", config, bounds=PART).out
     error, seen = errors_of(out, "plane")
     assert (np.abs(error[seen]) < BLUNDER_M).mean() > 0.95

@@ -27,7 +27,7 @@ from zlocus.core.options import ProductOptions, RunConfig
 from zlocus.core.progress import progress_for
 from zlocus.core.requests import FINISHED, CloudRequest, CurvesRequest, OrientRequest, RankRequest
 from zlocus.pipeline.cloud import run_cloud
-from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileStore
+from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileCheckpoint
 from zlocus.pipeline.finished_record import checksum
 from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rank import run_rank
@@ -300,7 +300,7 @@ def test_a_run_that_was_killed_at_its_very_end(images, tmp_path, monkeypatch, wh
 
     with monkeypatch.context() as patch:
         patch.setattr(
-            *((zlocus.pipeline.dsm, "write_finished") if "checksums" in where else (TileStore, "remove")), killed
+            *((zlocus.pipeline.dsm, "write_finished") if "checksums" in where else (TileCheckpoint, "remove")), killed
         )
         with pytest.raises(KeyboardInterrupt):
             asked(images, out, report=False)
@@ -352,7 +352,7 @@ def test_a_run_that_may_replace_another_goes_on_where_it_was_stopped(images, out
 
 def test_the_first_moments_of_another_run_do_not_open_a_folder(images, out):
     """Its manifest is there, and no tile yet: what is finished stays."""
-    with TileStore.of(out, {"request": "another"}, is_resumed=True, overwrite=True).open("s"):
+    with TileCheckpoint.of(out, {"request": "another"}, is_resumed=True, overwrite=True).open("s"):
         pass
     assert (out / FOLDER / MANIFEST).exists()
     before = state(out)
@@ -377,7 +377,7 @@ def test_functions_refuse_what_their_commands_refuse(images, out):
         (run_cloud, CloudRequest(inputs, out)),
         (run_orient, OrientRequest(inputs, out)),
         (run_rank, RankRequest(inputs, out)),
-        (run_point, CurvesRequest(inputs, out, at=(0.0, 0.0))),
+        (run_curves, CurvesRequest(inputs, out, at=(0.0, 0.0))),
     ):
         with pytest.raises(OutputError, match=r"holds another run .*add --overwrite"):
             run_stage(request, RunConfig(), progress)

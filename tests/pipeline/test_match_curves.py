@@ -18,8 +18,9 @@ from places import ROOT
 from rendered_scenes import CENTRE, HEIGHTS, LOOKS, SIZE_PX, camera, rendered
 from zlocus.cli.app import app
 from zlocus.core.options import SelectionOptions
+from zlocus.matching.pair_labels import PairLabels
 from zlocus.matching.point_match import PointOrder, peak_of, point_curves, point_order
-from zlocus.matching.view_ranking import OrderSource, PairLabels
+from zlocus.matching.view_ranking import OrderSource
 from zlocus.synthetic.terrain import analytic_height
 
 KIND = "sine"
@@ -203,7 +204,7 @@ def bump(at: int, height: float, n: int = 81) -> np.ndarray:
 )  # fmt: skip
 def test_the_match_ends_where_the_mean_is_good(worth, least, n_used, is_stopped):
     ncc = np.stack([np.maximum(bump(30, 0.85), bump(60, 0.8)), bump(30, 0.9), bump(50, 0.4)])
-    options = replace(OPTIONS, sigma_steps=1000.0, least_images=least)
+    options = replace(OPTIONS, max_sigma_steps=1000.0, min_images=least)
     found = point_curves(windows_of(ncc), order_of(3, worth), np.full(3, 0.5), np.arange(81.0), options)
     assert found.single.labels.tolist() == [0, 1, -1]
     assert found.mean.labels[:2].tolist() == [0, 1]
@@ -214,7 +215,7 @@ def test_the_match_ends_where_the_mean_is_good(worth, least, n_used, is_stopped)
 
 def test_an_imprecise_peak_does_not_stop():
     ncc = np.stack([bump(30, 0.9), bump(30, 0.9)])
-    options = replace(OPTIONS, sigma_steps=1e-3)
+    options = replace(OPTIONS, max_sigma_steps=1e-3)
     found = point_curves(windows_of(ncc), order_of(2, [True] * 2), np.full(2, 0.5), np.arange(81.0), options)
     assert (found.mean.labels == 1).all()
     assert not found.is_stopped
@@ -231,7 +232,7 @@ def test_an_order_without_any_tie_point():
     ranking = PairLabels(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3, 3), np.int8), np.ones((3, 3)))
     order = point_order(ranking, np.array([0.0, 1.0, 0.0]), np.zeros(2), OPTIONS)
     assert (order.reference, order.search.tolist(), order.order_source) == (1, [0, 2], OrderSource.SCENE)
-    assert order.is_worth.all()
+    assert order.is_helpful.all()
 
 
 def test_labels_follow_the_order():
@@ -241,7 +242,7 @@ def test_labels_follow_the_order():
     order = point_order(ranking, np.ones(3), np.zeros(2), OPTIONS)
     assert (order.reference, order.search.tolist()) == (0, [2, 1])
     assert order.accumulated.tolist() == [2, -1]
-    assert order.is_worth.tolist() == [True, False]
+    assert order.is_helpful.tolist() == [True, False]
     assert order.features.tolist() == [1, 0]
     assert order.distance.tolist() == [3.0, 9.0]
     assert order.labels.tolist() == [[1, -1], [1, 0]]

@@ -16,7 +16,7 @@ from rendered_scenes import CENTRE, LOOKS, SIZE_PX, camera, read, rendered, run
 from zlocus.cli.app import app
 from zlocus.core.options import OrientationOptions
 from zlocus.io.scene_file import open_scene
-from zlocus.pipeline.orient import alone, terrain_heights
+from zlocus.pipeline.orient import options_of_command, terrain_heights
 from zlocus.synthetic.terrain import analytic_height
 
 PLANTED = {"nadir": (1.5, -2.0), "fore": (-3.0, 1.0), "aft": (2.0, 2.5)}
@@ -149,9 +149,9 @@ def test_a_terrain_model_holds_the_heights(flawed, tmp_path):
 
 
 def test_what_stands_alone_is_joint_unless_it_is_said_otherwise():
-    assert alone(OrientationOptions(), True).model == "joint"
-    assert alone(OrientationOptions(model="shift"), True).model == "shift"
-    assert alone(OrientationOptions(), False).model == "none"
+    assert options_of_command(OrientationOptions(), True).model == "joint"
+    assert options_of_command(OrientationOptions(model="shift"), True).model == "shift"
+    assert options_of_command(OrientationOptions(), False).model == "none"
 
 
 def test_another_run_is_not_replaced(oriented, flawed):

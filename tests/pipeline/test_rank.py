@@ -16,7 +16,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import RankRequest
 from zlocus.matching.match_curve import FAIR, GOOD, POOR
-from zlocus.matching.view_ranking import LabelledTies
+from zlocus.matching.pair_labels import LabelledTies
 from zlocus.pipeline.rank import label_counts, ranking_table, run_rank
 
 

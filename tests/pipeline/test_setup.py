@@ -16,7 +16,7 @@ from zlocus.core.progress import SilentProgress
 from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import capped, lowest_station
 from zlocus.orientation.ties import slabs
-from zlocus.pipeline.height_range import LOWEST_M, heights_below_cameras, possible_heights, range_below_cameras
+from zlocus.pipeline.height_range import LOWEST_LAND_M, heights_below_cameras, possible_heights, range_below_cameras
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -44,7 +44,7 @@ def scene(*sensors):
 def test_ground_lies_where_two_footprints_meet(earth):
     """Two cameras 600 m apart that look straight down, 1.2 m wide per metre of depth: from 500 m below on."""
     low, high = heights_below_cameras(scene(frame(0.0, earth=earth), frame(600.0, earth=earth)))
-    assert low == pytest.approx(LOWEST_M, abs=1.0)
+    assert low == pytest.approx(LOWEST_LAND_M, abs=1.0)
     # The next of the depths, 17 % further apart each.
     assert 1500.0 - 500.0 / 0.83 < high <= 1000.0 + 1.0
     z = possible_heights(scene(frame(0.0), frame(600.0)), None)

@@ -348,7 +348,7 @@ def _read_colours(path: Path) -> Leaves:
     return {("bands",): bands, **_read_image(path)}
 
 
-RECORD = {"schema": 1, "grid": {"crs": "EPSG:32631", "shape": [12, 13]}, "stages": [{"name": "open", "wall_s": 0.25}]}
+RECORD = {"schema": 2, "grid": {"crs": "EPSG:32631", "shape": [12, 13]}, "stages": [{"name": "open", "wall_s": 0.25}]}
 
 
 def _write_record(folder: Path) -> Path:

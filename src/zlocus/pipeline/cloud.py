@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import CoverageError
+from zlocus.core.footprints import AREA_MARGIN
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import CloudRequest, SetupRequest, check_output
@@ -34,7 +35,7 @@ from zlocus.pipeline.messages import check_doubts, note_orientation
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.pixel_products import write_cloud, write_maps
 from zlocus.pipeline.required_space import check_room_for_pixels
-from zlocus.pipeline.setup import AREA_MARGIN, open_inputs
+from zlocus.pipeline.setup import open_inputs
 from zlocus.products.point_cloud import file_names
 from zlocus.sensors.image_rays import DepthRays
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zlocus.core.errors import CoverageError, OutputError, StoppedError
+from zlocus.core.footprints import matched_area
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DsmRequest, SetupRequest, check_output
@@ -28,7 +29,7 @@ from zlocus.pipeline.finished_record import write_finished
 from zlocus.pipeline.finished_run import Missing, make_missing, missing_products, whole_again
 from zlocus.pipeline.image_tiles import tile_maker
 from zlocus.pipeline.messages import note_orientation
-from zlocus.pipeline.open_run import OpenRun, area_matched, check_polygons, known_ties, may_have_terrain, open_run
+from zlocus.pipeline.open_run import OpenRun, check_polygons, known_ties, may_have_terrain, open_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
 from zlocus.pipeline.required_space import check_room
 from zlocus.pipeline.setup import RunSetup, orient_views, set_up_run
@@ -81,10 +82,10 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         with compression_threads(request.workers or cores()):
             return _run_stages(request, config, progress, started)
     except OutputError as error:
-        if not any(tile_run.store.finished and tile_run.store.is_there for tile_run in started):
+        if not any(tile_run.checkpoint.finished and tile_run.checkpoint.is_there for tile_run in started):
             raise
-        n, store = len(started[0].store.finished), started[0].store
-        raise StoppedError(f"{error} The {n} finished tiles are kept: {store.how_to_go_on}.") from error
+        n, checkpoint = len(started[0].checkpoint.finished), started[0].checkpoint
+        raise StoppedError(f"{error} The {n} finished tiles are kept: {checkpoint.how_to_resume}.") from error
     except KeyboardInterrupt:
         for tile_run in started:
             tile_run.tell_interrupted(progress)
@@ -104,34 +105,34 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, star
         if not missing.matched:
             return _already_finished(request, config, run, missing, progress)
         request = whole_again(request, run.finished, missing, progress)
-    opened, inputs, store, out, tally = run.opened, run.inputs, run.store, request.out, Tally()
+    opened, inputs, checkpoint, out, tally = run.opened, run.inputs, run.checkpoint, request.out, Tally()
     with watch.stage("orient"):
-        ties = known_ties(store, opened.scene, progress)
+        ties = known_ties(checkpoint, opened.scene, progress)
         orientation = orient_views(
             opened.scene, config.orientation, progress, threads=request.workers, known_ties=ties
         )  # fmt: skip
         note_orientation(orientation, progress)
     with watch.stage("setup"):
         setup = set_up_run(SetupRequest.of(request), opened, orientation, config, progress)
-        tiles = plan_tiles(setup.grid.window, setup.match_scene.seen, config.pyramid)
+        tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
         progress.note(str(plan))
     job, digest = tile_job(request, setup, config, run.polygons), digest_of(setup.match_scene, orientation)
-    tile_run = TileRun(job, tiles, store, EventLog(out))
-    with made_folder(out), store.open(digest, {} if orientation.ties is None else orientation.ties.arrays()):
+    tile_run = TileRun(job, tiles, checkpoint, EventLog(out))
+    with made_folder(out), checkpoint.open(digest, {} if orientation.ties is None else orientation.ties.arrays()):
         started.append(tile_run)
         with watch.stage("match") as elsewhere:
-            make = tile_maker(request, job, store, setup, plan, tally, progress)
+            make = tile_maker(request, job, checkpoint, setup, plan, tally, progress)
             failed = tile_run.run(plan, workers_for(plan, make, progress), progress, elsewhere)
-        inputs.check(len(store.finished), may_miss=bool(failed))
+        inputs.check(len(checkpoint.finished), may_miss=bool(failed))
         tile_run.check(failed, request.partial)
         with watch.stage("record"):
-            checksums = inputs.record(len(store.finished))
+            checksums = inputs.record(len(checkpoint.finished))
         with watch.stage("write"):
             remove_earlier_products(out)
             with surface_rasters(request, setup, opened.vertical_datum) as rasters:
                 tile_run.assemble(failed, rasters, tally, progress)
-                inputs.check(len(store.finished))  # a terrain model that fills gaps is read again here
+                inputs.check(len(checkpoint.finished))  # a terrain model that fills gaps is read again here
     with watch.stage("points"):
         write_points(out, setup, tally.ranked, opened.vertical_datum)
     if request.report:
@@ -141,8 +142,8 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, star
     write_maps(request, config, watch, record | {"setup_sha256": digest, "stages": watch.stages}, progress)
     tile_run.end(failed, tally)
     shortcoming = shortcoming_of(tally, setup.doubts, out, progress)
-    write_finished(out, store.key, shortcoming)
-    store.remove()
+    write_finished(out, checkpoint.key, shortcoming)
+    checkpoint.remove()
     return _accepted(request, DsmResult(out, tally.coverage), shortcoming)
 
 
@@ -150,7 +151,9 @@ def _checked_plan(request: DsmRequest, config: RunConfig, run: OpenRun, setup: R
     """How the tiles are worked on, after the checks that need the grid: disk space, geoid and polygons."""
     check_room(request.out, setup.grid, setup.match_scene, has_colours(request, setup))
     plan = planned(setup.match_scene, tiles, config, request)
-    run.opened.vertical_datum.check_covers(area_matched(setup.grid, setup.match_scene), run.opened.scene.crs)
+    run.opened.vertical_datum.check_covers(
+        matched_area(setup.grid, setup.match_scene.overlap_window), run.opened.scene.crs
+    )
     check_polygons(request, setup, run.polygons.inside)
     return plan
 
@@ -161,7 +164,7 @@ def _already_finished(
     """The result of a run whose surface is there already, after products that are missing were made."""
     assert run.finished is not None, "callers make sure"
     make_missing(request, config, run.opened, run.finished, missing, progress)
-    run.store.remove()  # where a run was stopped between its last file and its end
+    run.checkpoint.remove()  # where a run was stopped between its last file and its end
     coverage = float(read_record(request.out / RECORD)["coverage"])
     return _accepted(request, DsmResult(request.out, coverage, was_finished=True), run.finished.shortcoming)
 

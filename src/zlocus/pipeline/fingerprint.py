@@ -1,4 +1,4 @@
-"""What the tiles of a run depend on: two runs with the same of it have the same tiles."""
+"""Fingerprint of everything the tiles depend on. Equal fingerprints mean identical tiles."""
 
 from __future__ import annotations
 
@@ -18,16 +18,27 @@ from zlocus.io.run_record import versions_record
 from zlocus.matching.match_scene import MatchScene
 from zlocus.orientation.orientation import Orientation
 
-# What changes no tile.
-APART = ("out", "workers", "memory_gb", "scheduler", "partial", "overwrite", "resume", "products", "report", "inputs")
+# Fields of a request that change no tile.
+WITHOUT_EFFECT = (
+    "out",
+    "workers",
+    "memory_gb",
+    "scheduler",
+    "partial",
+    "overwrite",
+    "resume",
+    "products",
+    "report",
+    "inputs",
+)
 
 
 def key_of(request: DsmRequest, config: RunConfig, inputs: InputFiles) -> dict[str, Any]:
-    """Options, versions and inputs (size and time of change when the run began), by name.
+    """Options, versions and inputs (their size and time of change when the run began), by name.
 
-    The content of images is not read for it, which would take as long as matching; `run.json` has its checksum.
+    The content of images is not read for it, because that would take as long as matching; `run.json` holds checksums.
     """
-    asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in APART}
+    asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in WITHOUT_EFFECT}
     return {
         "versions": versions_record(),
         "request": {name: str(value) if isinstance(value, Path) else value for name, value in asked.items()},
@@ -36,15 +47,18 @@ def key_of(request: DsmRequest, config: RunConfig, inputs: InputFiles) -> dict[s
     }
 
 
-def digest_of(settled: MatchScene, orientation: Orientation) -> str:
-    """SHA-256 of all that was found before the first tile: corrections, lattice, grey values, tie points."""
-    found = {
-        "orientation": orientation.as_dict(), "names": [view.name for view in settled.views],
-        "lattice": [*settled.anchor, settled.cell_m, settled.origin_m, settled.step_m, settled.n_steps, settled.levels],
-        "seen": vars(settled.seen), "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in settled.grey],
-    }  # fmt: skip
-    digest = hashlib.sha256(json.dumps(found, sort_keys=True).encode())
-    for array in (settled.ties, settled.prior):
+def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:
+    """SHA-256 of the run setup: corrections of cameras, lattices, grey values and tie points."""
+    lattice = [*match_scene.anchor, match_scene.cell_m, match_scene.origin_m, match_scene.step_m]
+    setup = {
+        "orientation": orientation.as_dict(),
+        "names": [view.name for view in match_scene.views],
+        "lattice": [*lattice, match_scene.n_steps, match_scene.levels],
+        "overlap": vars(match_scene.overlap_window),
+        "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in match_scene.grey],
+    }
+    digest = hashlib.sha256(json.dumps(setup, sort_keys=True).encode())
+    for array in (match_scene.ties, match_scene.dem_limits):
         if array is not None:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

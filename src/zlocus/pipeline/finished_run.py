@@ -11,7 +11,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest, held_files
 from zlocus.io.run_record import read_record
-from zlocus.pipeline.execution.checkpoint import TileStore, difference
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint, difference
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import ITEM, Finished, checksum, comparable, read_finished, update_finished
 from zlocus.pipeline.setup import OpenedInputs, orient_views, set_up_run
@@ -48,11 +48,11 @@ class Missing:
         return (*self.of_ties, *(FILES[name] for name in self.maps), *ends)
 
 
-def finished_run(request: DsmRequest, store: TileStore) -> Finished | None:
+def finished_run(request: DsmRequest, checkpoint: TileCheckpoint) -> Finished | None:
     """The finished run that a request's folder holds, where it is the one asked for; None where it holds none, or may
     be overwritten.
 
-    store : of the request; where it has tiles of the same run, that one was allowed to replace what is there.
+    checkpoint : of the request; where it has tiles of the same run, that one was allowed to replace what is there.
 
     Raises
     ------
@@ -64,14 +64,14 @@ def finished_run(request: DsmRequest, store: TileStore) -> Finished | None:
         return None
     found, held = read_finished(out), held_files(out)
     if found is None:
-        if held and not store.is_of_this_run:
+        if held and not checkpoint.is_of_this_run:
             raise OutputError(
                 f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite."
             )
         return None
-    differs = difference(found.key, comparable(store.key)) if found.key else f"its {FINISHED} is damaged"
+    differs = difference(found.key, comparable(checkpoint.key)) if found.key else f"its {FINISHED} is damaged"
     if differs:
-        if store.is_of_this_run:
+        if checkpoint.is_of_this_run:
             return None
         raise OutputError(f"{out} holds another run: {differs}. Choose another folder, or add --overwrite.")
     if not request.resume:

@@ -40,12 +40,12 @@ from zlocus.matching.image_space import (
     is_by_depth,
     widest_disparities,
 )
-from zlocus.matching.match_scene import FEWEST_LEVELS, MatchScene
+from zlocus.matching.match_scene import MIN_LEVELS, MatchScene
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
 from zlocus.orientation.orientation import Orientation, supported
-from zlocus.pipeline.execution.checkpoint import TileStore
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.plan import Tile, plan_tiles
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
 from zlocus.pipeline.height_range import possible_heights, range_from_ties
@@ -112,17 +112,17 @@ class ImageScene:
 class ImageMatching:
     """How reference images are matched.
 
-    config : options, with the blocks and levels that suit the images; use_visibility : see `match_tile`; workers :
+    config : options, with the blocks and levels that suit the images; choose_images : see `match_tile`; workers :
     tiles at a time; spill_arrays : makes the arrays of all pixels; area : tiles that cannot show it are left out, None
-    leaves none out; store : keeps finished tiles, and holds those of a run that is resumed, None keeps none.
+    leaves none out; checkpoint : keeps finished tiles, and holds those of a run that is resumed, None keeps none.
     """
 
     config: RunConfig
-    use_visibility: bool
+    choose_images: bool
     workers: int
     spill_arrays: SpillArrays
     area: GroundArea | None = None
-    store: TileStore | None = None
+    checkpoint: TileCheckpoint | None = None
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def image_scenes(setup: ImageSetup, references: Sequence[str], config: RunConfig
         scenes = [image_scene(setup, name, config) for name in references]
         block = fitting_block([one.match_scene for one in scenes], config.pyramid.block)
         levels = max(one.match_scene.levels for one in scenes)
-        if block is not None or levels <= FEWEST_LEVELS:
+        if block is not None or levels <= MIN_LEVELS:
             pyramid = replace(config.pyramid, block=block or config.pyramid.block)
             return scenes, replace(config, pyramid=pyramid)
         config = replace(config, pyramid=replace(config.pyramid, max_levels=levels - 1))
@@ -257,22 +257,22 @@ def match_images(scenes: Sequence[ImageScene], how: ImageMatching, progress: Pro
     tasks = [
         (number, tile)
         for number, one in enumerate(scenes)
-        for tile in plan_tiles(images[number], one.match_scene.seen, config.pyramid)
+        for tile in plan_tiles(images[number], one.match_scene.overlap_window, config.pyramid)
         if how.area is None or how.area.may_show(one.space, tile.kept)
     ]
     tallies = np.zeros((len(scenes), 2), np.int64)
 
     def work(task: tuple[int, Tile]) -> tuple[TileProduct, bool]:
         """The product of a tile, and whether it was matched now instead of loaded."""
-        arrays = None if how.store is None else how.store.load(tile_name(*task))
+        arrays = None if how.checkpoint is None else how.checkpoint.load(tile_name(*task))
         if arrays is not None:
             return TileProduct.of(arrays), False
-        return matched_tile(scenes[task[0]], task[1], config, how.use_visibility), True
+        return matched_tile(scenes[task[0]], task[1], config, how.choose_images), True
 
-    with progress.stage("Matching", len(tasks)) as stage, _interruption(how.store, tasks, progress):
+    with progress.stage("Matching", len(tasks)) as stage, _interruption(how.checkpoint, tasks, progress):
         for (number, tile), (product, is_new) in run_all(work, tasks, how.workers):
-            if how.store is not None and is_new:
-                how.store.keep(tile_name(number, tile), product.arrays())
+            if how.checkpoint is not None and is_new:
+                how.checkpoint.keep(tile_name(number, tile), product.arrays())
             kept = tile.kept.slices_in(images[number])
             for of_image, of_tile in zip(surfaces[number].arrays, product.surface.arrays, strict=True):
                 of_image[kept] = of_tile
@@ -283,7 +283,7 @@ def match_images(scenes: Sequence[ImageScene], how: ImageMatching, progress: Pro
     return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(matched, tallies, strict=True)]
 
 
-def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, use_visibility: bool) -> TileProduct:
+def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, choose_images: bool) -> TileProduct:
     """One tile of a reference image.
 
     Raises
@@ -292,7 +292,7 @@ def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, use_visibilit
         A fault of our own, with the tile in which it happened.
     """
     try:
-        result = match_tile(image.match_scene, tile.core, config, use_visibility=use_visibility)
+        result = match_tile(image.match_scene, tile.core, config, choose_images=choose_images)
     except ZlocusError:
         raise
     except Exception as error:
@@ -303,15 +303,18 @@ def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, use_visibilit
 
 
 @contextmanager
-def _interruption(store: TileStore | None, tasks: Sequence[tuple[int, Tile]], progress: Progress) -> Iterator[None]:
+def _interruption(
+    checkpoint: TileCheckpoint | None, tasks: Sequence[tuple[int, Tile]], progress: Progress
+) -> Iterator[None]:
     """Say which finished tiles are kept after an interrupt."""
     try:
         yield
     except KeyboardInterrupt:
-        if store is not None:
-            done = sum(tile_name(*task) in store.finished for task in tasks)
+        if checkpoint is not None:
+            done = sum(tile_name(*task) in checkpoint.finished for task in tasks)
             if done:
-                progress.note(f"{done} of {len(tasks)} tiles of images are finished and kept: {store.how_to_go_on}.")
+                kept = f"{done} of {len(tasks)} tiles of images are finished and kept"
+                progress.note(f"{kept}: {checkpoint.how_to_resume}.")
         raise
 
 
@@ -404,7 +407,7 @@ def grid_tile(
 def tile_maker(
     request: DsmRequest,
     job: TileJob,
-    store: TileStore,
+    checkpoint: TileCheckpoint,
     setup: RunSetup,
     plan: Plan,
     tally: Tally,
@@ -426,7 +429,7 @@ def tile_maker(
     bounds = (box.left - margin, box.bottom - margin, box.right + margin, box.top + margin)
     spill_arrays = SpillArrays(request.out, plan.allowed_bytes - plan.n_bytes)
     area = GroundArea(bounds, setup.z_range)
-    how = ImageMatching(job.config, job.use_visibility, plan.slots, spill_arrays, area, store)
+    how = ImageMatching(job.config, job.choose_images, plan.slots, spill_arrays, area, checkpoint)
     grid_images = heights_for_grid(image_setup, references, how, progress)
     tally.evaluations, tally.all_images = grid_images.evaluations, grid_images.all_images
     if spill_arrays.file_bytes:

@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.core.errors import GeometryError
-from zlocus.core.grid import Grid
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest
 from zlocus.core.scene import Scene
 from zlocus.io.grid_inputs import cells_inside, read_polygons
 from zlocus.io.input_files import InputFiles
-from zlocus.matching.match_scene import MatchScene
 from zlocus.orientation.orientation import MeasuredTies
-from zlocus.pipeline.execution.checkpoint import TileStore
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.fingerprint import key_of
 from zlocus.pipeline.finished_record import Finished
 from zlocus.pipeline.finished_run import finished_run
@@ -32,13 +30,14 @@ from zlocus.products.derived import FILES, check_maps
 class OpenRun:
     """A run whose files are open.
 
-    opened : what the request names; inputs : all files, with their states when the run began; store : finished tiles;
-    polygons : of the requested area; finished : the record of the same run, where it has finished already, else None.
+    opened : what the request names; inputs : all files, with their states when the run began; checkpoint : finished
+    tiles; polygons : of the requested area; finished : the record of the same run, where it has finished already, else
+    None.
     """
 
     opened: OpenedInputs
     inputs: InputFiles
-    store: TileStore
+    checkpoint: TileCheckpoint
     polygons: Polygons
     finished: Finished | None
 
@@ -57,12 +56,12 @@ def open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> Open
     opened = open_inputs(SetupRequest.of(request), progress)
     inputs = InputFiles.of(opened.files, opened.scene, before)
     key = key_of(request, config, inputs)
-    store = TileStore.of(request.out, key, request.resume, request.overwrite, inputs.check)
-    finished, polygons = finished_run(request, store), _area_polygons(request, opened.scene.crs)
+    checkpoint = TileCheckpoint.of(request.out, key, request.resume, request.overwrite, inputs.check)
+    finished, polygons = finished_run(request, checkpoint), _area_polygons(request, opened.scene.crs)
     if finished is None:
         check_maps(request.products, config.products)
-        _check_room_first(request, opened, store)
-    return OpenRun(opened, inputs, store, polygons, finished)
+        _check_room_first(request, opened, checkpoint)
+    return OpenRun(opened, inputs, checkpoint, polygons, finished)
 
 
 def may_have_terrain(request: DsmRequest) -> bool:
@@ -77,46 +76,22 @@ def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
     return Polygons(area, mask)
 
 
-def _check_room_first(request: DsmRequest, opened: OpenedInputs, store: TileStore) -> None:
+def _check_room_first(request: DsmRequest, opened: OpenedInputs, checkpoint: TileCheckpoint) -> None:
     """Refuse, before images are read, a run that memory or the disk has no room for."""
     if request.method == "gc3-sgm":
         check_room_for_pixels(request.out, opened.scene, [view.name for view in opened.scene.views])
-    if not store.finished:
+    if not checkpoint.finished:
         like = None if opened.like is None else opened.like.shape.yx
         check_room_before_ties(request.out, opened.scene, request.resolution, request.bounds, like)
 
 
-def known_ties(store: TileStore, scene: Scene, progress: Progress) -> MeasuredTies | None:
+def known_ties(checkpoint: TileCheckpoint, scene: Scene, progress: Progress) -> MeasuredTies | None:
     """Tie points that an interrupted run of the same command kept; None where there is none."""
-    arrays = store.found_before()
+    arrays = checkpoint.arrays_before_tiles()
     known = None if arrays is None else MeasuredTies.of(arrays, len(scene.views))
     if known is not None:
         progress.note("The tie points of the interrupted run are used again.")
     return known
-
-
-def area_matched(grid: Grid, match_scene: MatchScene) -> tuple[float, float, float, float]:
-    """Bounds (xmin, ymin, xmax, ymax), m, of the part of the requested area that two images see.
-
-    Raises
-    ------
-    GeometryError
-        Two images see none of it.
-    """
-    shared = grid.window.within(match_scene.seen)
-    if shared.rows and shared.cols:
-        (west, north), (east, south) = (
-            match_scene.transform(shared, 0) * corner for corner in ((0, 0), (shared.cols, shared.rows))
-        )
-        return west, south, east, north
-    west, north = match_scene.transform(match_scene.seen, 0) * (0, 0)
-    east, south = match_scene.transform(match_scene.seen, 0) * (match_scene.seen.cols, match_scene.seen.rows)
-    asked = grid.geobox.extent.boundingbox
-    raise GeometryError(
-        f"The area asked for (E {asked.left:.0f} to {asked.right:.0f} m, N {asked.bottom:.0f} to {asked.top:.0f} m) "
-        f"lies outside the ground that two images see (E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m). "
-        "Check --bounds, --like and the CRS."
-    )
 
 
 def check_polygons(request: DsmRequest, setup: RunSetup, area: NDArray[Any] | None) -> None:
@@ -130,7 +105,7 @@ def check_polygons(request: DsmRequest, setup: RunSetup, area: NDArray[Any] | No
     if area is None:
         return
     grid = setup.grid
-    shared = grid.window.within(setup.match_scene.seen)
+    shared = grid.window.within(setup.match_scene.overlap_window)
     row, col = shared.row - grid.window.row, shared.col - grid.window.col
     if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
         raise GeometryError(

@@ -19,7 +19,7 @@ from zlocus.io.control_points import read_control
 from zlocus.io.grid_inputs import dem_datum, read_dem
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, result_record, write_record
-from zlocus.io.vertical import ELLIPSOID, VerticalDatum, vertical_datum
+from zlocus.io.vertical import ELLIPSOID, VerticalDatum, named_vertical_datum
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation
 from zlocus.pipeline.height_range import possible_heights
@@ -100,7 +100,7 @@ def check_ties(orientation: Orientation, scene: Scene) -> None:
 
 def control_datum(request: OrientRequest) -> VerticalDatum:
     """Vertical datum of the control points' heights."""
-    return vertical_datum(request.control_vertical or ELLIPSOID, "--control-vertical")
+    return named_vertical_datum(request.control_vertical or ELLIPSOID, "--control-vertical")
 
 
 def control_points(request: OrientRequest, scene: Scene) -> GroundControl:

@@ -14,8 +14,8 @@ from zlocus.core.progress import Progress
 from zlocus.core.requests import RankRequest, SetupRequest, check_output
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, result_record, write_record
+from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.tile import rank_tile
-from zlocus.matching.view_ranking import LabelledTies
 from zlocus.pipeline.execution.plan import plan_tiles
 from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.orient import check_ties
@@ -61,11 +61,11 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
 def rank_tiles(setup: RunSetup, workers: int, config: RunConfig, progress: Progress) -> list[LabelledTies]:
     """Labels of every pair of images at the tie points, tile by tile; tiles without tie points give none."""
     match_scene, ranked = setup.match_scene, []
-    tiles = plan_tiles(setup.grid.window, match_scene.seen, config.pyramid)
+    tiles = plan_tiles(setup.grid.window, match_scene.overlap_window, config.pyramid)
     with progress.stage("Ranking", len(tiles)) as stage:
-        for tile, ranking in run_all(lambda t: rank_tile(match_scene, t.core, config), tiles, workers):
-            if ranking is not None:
-                ranked.append(LabelledTies.of(*ranking, match_scene.ties, tile.core))
+        for tile, tile_labels in run_all(lambda t: rank_tile(match_scene, t.core, config), tiles, workers):
+            if tile_labels is not None:
+                ranked.append(LabelledTies.of(tile_labels, match_scene.ties, tile.core))
             stage.advance()
     return ranked
 

@@ -21,9 +21,9 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.run_record import write_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.point_match import Place, cell_of, curves_at, height_nearby
 from zlocus.matching.tile import rank_tile
-from zlocus.matching.view_ranking import LabelledTies
 from zlocus.orientation.parameter_groups import kind_of
 from zlocus.pipeline.setup import RunSetup
 from zlocus.products.footprints import write_footprints
@@ -155,21 +155,22 @@ def tried_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str
 def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str, Any]:
     """Labels of every pair of images at the tie points in and around a few places, each point once.
 
-    As where images are chosen (`rank_tile`), which takes `selection.fewest_views`: with fewer images nothing else says
-    how well each pair of them matches. No place is begun after `most_s`.
+    As where images are chosen (`rank_tile`), which takes `selection.min_images_for_choice`: with fewer images nothing
+    else says how well each pair of them matches. No place is begun after `most_s`.
     """
     match_scene, start = run.match_scene, time.perf_counter()
     is_new, parts = np.ones(len(match_scene.ties), bool), list[LabelledTies]()
     for core in sample_cores(match_scene, SAMPLE_BLOCKS * config.pyramid.block):
         if parts and time.perf_counter() - start > most_s:
             break
-        found = rank_tile(match_scene, core, config)
-        if found is None:
+        tile_labels = rank_tile(match_scene, core, config)
+        if tile_labels is None:
             continue
-        ranking, which = found
-        new = is_new[ranking.tie]
-        is_new[ranking.tie] = False
-        parts.append(LabelledTies(match_scene.ties[ranking.tie[new]], ranking.labels[new], np.array(which, np.int64)))
+        labels = tile_labels.pair_labels
+        new = is_new[labels.tie]
+        is_new[labels.tie] = False
+        view_numbers = np.array(tile_labels.view_numbers, np.int64)
+        parts.append(LabelledTies(match_scene.ties[labels.tie[new]], labels.labels[new], view_numbers))
     names = [view.name for view in match_scene.views]
     n_points = sum(len(part.xyz) for part in parts)
     return {"points": n_points, "pairs": counted_pairs(label_counts(parts, len(names)), names)}
@@ -178,7 +179,10 @@ def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[s
 def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     """Windows of `side` cells around tie points that are spread over the scene, each far from those before it."""
     xy = (match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
-    first, size = (match_scene.seen.col, match_scene.seen.row), (match_scene.seen.cols, match_scene.seen.rows)
+    first, size = (
+        (match_scene.overlap_window.col, match_scene.overlap_window.row),
+        (match_scene.overlap_window.cols, match_scene.overlap_window.rows),
+    )
     xy = xy[((xy >= first) & (xy < np.add(first, size))).all(axis=1) & np.isfinite(match_scene.ties[:, 2])]
     if not len(xy):
         return []
@@ -191,7 +195,7 @@ def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     while rest := [tie for tie in nearest if tie not in order]:
         order.append(max(rest, key=lambda tie: min(float(np.hypot(*(xy[tie] - xy[old]))) for old in order)))
     cells = np.floor(xy[order]).astype(int) - side // 2
-    return [CellWindow(int(row), int(col), side, side).within(match_scene.seen) for col, row in cells]
+    return [CellWindow(int(row), int(col), side, side).within(match_scene.overlap_window) for col, row in cells]
 
 
 def shown_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def check_room(out: Path, grid: Grid, matching: MatchScene, has_colours: bool) -
     OutputError
         It takes more than the disk has free.
     """
-    asked, matched = grid.window, grid.window.within(matching.seen)
+    asked, matched = grid.window, grid.window.within(matching.overlap_window)
     n_bytes = surface_bytes(
         asked.rows * asked.cols, matched.rows * matched.cols, matching.views[0].image.dtype, has_colours
     )

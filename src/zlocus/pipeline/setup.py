@@ -25,7 +25,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.core.errors import ConfigError, CoverageError, GeometryError
-from zlocus.core.footprints import check_overlap, ground_sample_distance, shared_ground
+from zlocus.core.footprints import area_to_match, check_overlap, ground_sample_distance
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import Progress
@@ -36,11 +36,11 @@ from zlocus.io.crs import checked_crs
 from zlocus.io.grid_inputs import dem_datum, read_dem, read_geobox
 from zlocus.io.input_files import files_of
 from zlocus.io.scene_file import open_scene
-from zlocus.io.vertical import VerticalDatum, vertical_datum
+from zlocus.io.vertical import VerticalDatum, named_vertical_datum
 from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.orientation import RANGE_PERCENT, MeasuredTies, Orientation, orient, supported
+from zlocus.orientation.orientation import MeasuredTies, Orientation, orient, supported
 from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.height_range import heights_below_cameras, possible_heights, search_range, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
@@ -49,9 +49,6 @@ from zlocus.pipeline.messages import note_dem, note_doubts, some_names
 MIN_VIEWS = 2
 # Fewer tie points than this do not cast doubt on a terrain model.
 MIN_TIES_TO_COMPARE = 20
-# In a local frame the area is that of the tie points, extended on all sides by this share of their extent, where there
-# are at least this many of them.
-AREA_MARGIN, MIN_TIES_FOR_AREA = 0.05, 20
 # Progress of the stage "Tie points": where each step begins, and its share of the time.
 TIE_STEPS = {"features": (0.0, 0.4), "matches": (0.4, 0.35)}
 
@@ -101,7 +98,7 @@ def open_inputs(request: SetupRequest, progress: Progress, overlap_check: Overla
         An input that cannot be used, or views that do not overlap.
     """
     like = read_geobox(request.like) if request.like else None
-    datum = vertical_datum(request.vertical)
+    datum = named_vertical_datum(request.vertical)
     scene = open_scene(request.inputs, requested_crs(request.crs) if like is None else _crs_of(like))
     if is_local(scene.crs):
         _refuse_maps_in_local_frame(request)
@@ -227,27 +224,6 @@ def supported_views(scene: Scene, orientation: Orientation) -> Scene:
     )
 
 
-def area_to_match(
-    scene: Scene, orientation: Orientation, z_range: tuple[float, float]
-) -> tuple[float, float, float, float]:
-    """Bounds (xmin, ymin, xmax, ymax) in metres of the area to match.
-
-    The area that the scene file gives, or else the ground that two views see between two heights. In a local frame that
-    ground is cut to the surroundings of the tie points, because cameras there may look at a wall from the side: what
-    two footprints share far behind the wall is many times the area of the wall.
-    """
-    if scene.bounds is not None:
-        return scene.bounds
-    shared = shared_ground(scene, z_range)
-    ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
-    if not is_local(scene.crs) or len(ties) < MIN_TIES_FOR_AREA:
-        return shared
-    low, high = np.percentile(ties[:, :2], RANGE_PERCENT, axis=0)
-    margin = AREA_MARGIN * (high - low)
-    low, high = np.maximum(low - margin, shared[:2]), np.minimum(high + margin, shared[2:])
-    return (float(low[0]), float(low[1]), float(high[0]), float(high[1])) if (low < high).all() else shared
-
-
 def doubts_from_dem(
     request: SetupRequest, scene: Scene, orientation: Orientation, config: RunConfig
 ) -> tuple[Doubt, ...]:
@@ -290,7 +266,8 @@ def _grid(
         return grid
     cell_m = request.resolution or default_cell(scene, z)
     check_resolution(cell_m, scene, z, "--resolution")
-    bounds = request.bounds or area_to_match(scene, orientation, z_range)
+    ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
+    bounds = request.bounds or area_to_match(scene, z_range, ties)
     return grid_from_bounds(bounds, cell_m, scene.crs)
 
 
@@ -299,11 +276,11 @@ def _limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, co
     if request.dem is None:
         return match_scene
     level = match_scene.levels - 1
-    window = match_scene.seen.at_level(level, 0)
+    window = match_scene.overlap_window.at_level(level, 0)
     geobox = GeoBox((window.rows, window.cols), match_scene.transform(window, level), crs)
     dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
     limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
-    return replace(match_scene, prior=limits)
+    return replace(match_scene, dem_limits=limits)
 
 
 def _crs_of(geobox: GeoBox) -> CRS:

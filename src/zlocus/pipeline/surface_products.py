@@ -18,7 +18,7 @@ from zlocus.io.config import config_as_dict
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, request_as_dict, utc_now, versions_record, write_record
 from zlocus.io.vertical import VerticalDatum
-from zlocus.matching.view_ranking import LabelledTies
+from zlocus.matching.pair_labels import LabelledTies
 from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.messages import check_doubts
 from zlocus.pipeline.setup import RunSetup

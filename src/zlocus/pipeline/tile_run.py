@@ -23,11 +23,11 @@ from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.fill import filled_from
 from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
-from zlocus.matching.view_ranking import LabelledTies
-from zlocus.pipeline.execution.checkpoint import TileStore
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.event_log import NAME, EventLog
 from zlocus.pipeline.execution.plan import Tile, tile_needs
@@ -151,13 +151,13 @@ class TileRun:
 
     job: TileJob
     tiles: Sequence[Tile]
-    store: TileStore
+    checkpoint: TileCheckpoint
     log: EventLog
 
     @property
     def n_there(self) -> int:
-        """Number of finished tiles of the surface; the store may also hold tiles of images."""
-        return sum(name_of(tile) in self.store.finished for tile in self.tiles)
+        """Number of finished tiles of the surface; the checkpoint may also hold tiles of images."""
+        return sum(name_of(tile) in self.checkpoint.finished for tile in self.tiles)
 
     def check(self, failed: Sequence[Outcome], partial: bool) -> None:
         """Stop the run where tiles failed, unless an incomplete surface is accepted and there is at least one tile.
@@ -180,8 +180,8 @@ class TileRun:
             raise StoppedError(f"{self._not_all(failed)} Nothing was made.")
         if not partial:
             raise StoppedError(
-                f"{self._not_all(failed)} The others are kept in {self.store.folder}: give the same command again to "
-                "try those once more, or add --partial for a surface without them."
+                f"{self._not_all(failed)} The others are kept in {self.checkpoint.folder}: give the same command again "
+                "to try those once more, or add --partial for a surface without them."
             )
 
     def end(self, failed: Sequence[Outcome], tally: Tally) -> None:
@@ -220,7 +220,7 @@ class TileRun:
             Tiles cannot be written.
         """
         worked = [tile for tile in self.tiles if tile.core.rows and tile.core.cols]
-        todo = [tile for tile in worked if not self.store.holds(name_of(tile))]
+        todo = [tile for tile in worked if not self.checkpoint.holds(name_of(tile))]
         failed: list[Outcome] = []
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
             if not self.n_there:
@@ -247,7 +247,7 @@ class TileRun:
             elsewhere.cpu_s += outcome.cpu_s
             elsewhere.peak_mb = max(elsewhere.peak_mb, outcome.peak_mb)
         if outcome.failure is None:
-            self.store.keep(name_of(tile), outcome.result.arrays())
+            self.checkpoint.keep(name_of(tile), outcome.result.arrays())
             self.log.add("tile", **record)
         else:
             again = {} if outcome.is_final else {"again": True}
@@ -262,9 +262,9 @@ class TileRun:
     def tell_interrupted(self, progress: Progress) -> None:
         """Say, after an interrupt, which tiles are kept."""
         self.log.add("interrupted", tiles_done=self.n_there)
-        if self.n_there and self.store.is_there:
+        if self.n_there and self.checkpoint.is_there:
             done = f"{self.n_there} of {len(self.tiles)} tiles"
-            progress.note(f"{done} are finished and kept: {self.store.how_to_go_on}.")
+            progress.note(f"{done} are finished and kept: {self.checkpoint.how_to_resume}.")
 
     def assemble(self, failed: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress) -> None:
         """Write all tiles in a fixed order, whatever the order in which they were made; failed tiles are empty.
@@ -286,10 +286,10 @@ class TileRun:
     def _finished(self, tile: Tile) -> TileProduct:
         if not (tile.core.rows and tile.core.cols):
             return self.job.product(tile, TileResult(Surface.nothing(tile.core)))
-        arrays = self.store.load(name_of(tile))
+        arrays = self.checkpoint.load(name_of(tile))
         if arrays is None:
             raise StoppedError(
-                f"{self.store.folder / name_of(tile)}.npz was damaged since it was written. Give the same command "
+                f"{self.checkpoint.folder / name_of(tile)}.npz was damaged since it was written. Give the same command "
                 "again: that tile is made anew."
             )
         return TileProduct.of(arrays)
@@ -306,8 +306,8 @@ def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: 
     if request.fill == "dem":
         assert request.dem is not None, "a request that fills from a terrain model names it"
         terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
-    use_visibility, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
-    return TileJob(setup.match_scene, setup.grid, config, request.method, use_visibility, fill, polygons, terrain)
+    choose_images, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
+    return TileJob(setup.match_scene, setup.grid, config, request.method, choose_images, fill, polygons, terrain)
 
 
 def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress) -> AbstractContextManager[Workers]:
@@ -414,21 +414,21 @@ class TileProduct:
 class TileJob:
     """Makes the tiles of a match scene; it is sent to each worker once.
 
-    method, use_visibility, fill : see `match_tile`; terrain : fills cells that are still empty, None fills none.
+    method, choose_images, fill : see `match_tile`; terrain : fills cells that are still empty, None fills none.
     """
 
     match_scene: MatchScene
     grid: Grid
     config: RunConfig
     method: str
-    use_visibility: bool
+    choose_images: bool
     fill: str
     area: Polygons = Polygons()
     terrain: Terrain | None = None
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        result = match_tile(self.match_scene, tile.core, self.config, self.method, self.use_visibility, self.fill)
+        result = match_tile(self.match_scene, tile.core, self.config, self.method, self.choose_images, self.fill)
         return self.product(tile, result)
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:
@@ -439,6 +439,6 @@ class TileJob:
         if self.terrain is not None:
             surface = filled_from(surface, read_dem(self.terrain.path, geobox, self.terrain.datum, may_miss=True))
         ranked = None
-        if result.ranking is not None:
-            ranked = LabelledTies.of(*result.ranking, self.match_scene.ties, tile.core)
+        if result.tile_labels is not None:
+            ranked = LabelledTies.of(result.tile_labels, self.match_scene.ties, tile.core)
         return TileProduct(surface, result.evaluations, result.all_images, ranked)

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 import zlocus.pipeline.execution.checkpoint as store_module
 from zlocus.core.errors import OutputError, StoppedError
-from zlocus.pipeline.execution.checkpoint import BEFORE, DONE, FOLDER, MANIFEST, TileStore, difference
+from zlocus.pipeline.execution.checkpoint import BEFORE, DONE, FOLDER, MANIFEST, TileCheckpoint, difference
 
 KEY = {"versions": {"zlocus": "1"}, "request": {"crs": None}, "options": {"a": {"b": 1}}, "inputs": {"i.tif": [5, 6]}}
 ARRAYS = {"height": np.arange(6, dtype=np.float32).reshape(2, 3), "views": np.ones((2, 3), np.uint8)}
 
 
 def store(out, key=None, **how):
-    return TileStore.of(out, key or KEY, **({"is_resumed": True, "overwrite": False} | how))
+    return TileCheckpoint.of(out, key or KEY, **({"is_resumed": True, "overwrite": False} | how))
 
 
 def filled(out, names=("0_0", "0_64"), settled="s", key=None):
@@ -52,17 +52,17 @@ def test_what_was_found_before_the_first_tile_is_there_for_the_same_run(tmp_path
         held.keep("0_0", ARRAYS)
     for _ in range(2):
         again = store(tmp_path)
-        found = again.found_before()
+        found = again.arrays_before_tiles()
         assert set(found) == set(ARRAYS)
         for name, array in ARRAYS.items():
             np.testing.assert_array_equal(found[name], array)
         with again.open("s", {"height": np.zeros(3)}):
             assert again.holds("0_0")
-    assert store(tmp_path, overwrite=True).found_before() is None
-    assert store(tmp_path, is_resumed=False).found_before() is None
+    assert store(tmp_path, overwrite=True).arrays_before_tiles() is None
+    assert store(tmp_path, is_resumed=False).arrays_before_tiles() is None
     (tmp_path / FOLDER / DONE).unlink()
-    assert set(store(tmp_path).found_before()) == set(ARRAYS)
-    assert store(tmp_path, KEY | {"inputs": {}}).found_before() is None
+    assert set(store(tmp_path).arrays_before_tiles()) == set(ARRAYS)
+    assert store(tmp_path, KEY | {"inputs": {}}).arrays_before_tiles() is None
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "changed"])
@@ -75,11 +75,11 @@ def test_what_was_found_before_is_whole_or_not_there(tmp_path, damage):
     else:
         path.write_bytes(content[:-1] if damage == "cut" else bytes([content[0] ^ 1]) + content[1:])
     held = store(tmp_path)
-    assert held.found_before() is None
+    assert held.arrays_before_tiles() is None
     assert held.holds("0_0")
     with held.open("s", ARRAYS):
         assert held.holds("0_0")
-    assert set(store(tmp_path).found_before()) == set(ARRAYS)
+    assert set(store(tmp_path).arrays_before_tiles()) == set(ARRAYS)
     assert store(tmp_path).holds("0_0")
 
 
@@ -178,7 +178,7 @@ def test_a_full_disk_keeps_what_is_there(tmp_path, monkeypatch):
 
     with held.open("s"):
         held.keep("0_0", ARRAYS)
-        monkeypatch.setattr(store_module, "write_whole", full)
+        monkeypatch.setattr(store_module, "write_atomically", full)
         with pytest.raises(
             StoppedError, match=r"No space left on device\. 1 finished tiles are kept; make room"
         ) as caught:

@@ -171,7 +171,7 @@ def test_a_signal_ends_the_command_and_not_the_cluster(images, straight, tmp_pat
         _, stderr = process.communicate(timeout=60)
         assert process.returncode == 143
         check_end(process.returncode, signal.SIGTERM, stderr)
-        assert "tiles are finished and kept: the same command goes on from there" in stderr
+        assert "tiles are finished and kept: the same command resumes from there" in stderr
         assert n_finished(out)
         again = subprocess.run(words, capture_output=True, text=True)
         assert again.returncode == 0, again.stderr

@@ -69,9 +69,9 @@ def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):
 
 def needs_of(scene, tile=1024, candidates=12):
     config = RunConfig(
-        pyramid=PyramidOptions(tile=tile), selection=replace(RunConfig().selection, candidates=candidates)
+        pyramid=PyramidOptions(tile=tile), selection=replace(RunConfig().selection, max_candidates=candidates)
     )
-    return tile_needs(scene, plan_tiles(scene.seen, scene.seen, config.pyramid), config)
+    return tile_needs(scene, plan_tiles(scene.overlap_window, scene.overlap_window, config.pyramid), config)
 
 
 def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
@@ -84,13 +84,13 @@ def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
     assert needs_of(scene_of(6), candidates=2).n_bytes < 0.9 * needs_of(scene_of(6)).n_bytes
     # Coarse cells hold many pixels.
     fine, coarse = scene_of(4), scene_of(4, cell_m=2.0)
-    per_cell = [needs_of(scene).n_bytes / (scene.seen.rows * scene.seen.cols) for scene in (fine, coarse)]
+    per_cell = [needs_of(scene).n_bytes / (scene.overlap_window.rows * scene.overlap_window.cols) for scene in (fine, coarse)]
     assert per_cell[1] > 2 * per_cell[0]
 
 
 def test_time_is_that_of_cells_and_views():
     plain = needs_of(scene_of(4))
-    cells = scene_of(4).seen.rows * scene_of(4).seen.cols
+    cells = scene_of(4).overlap_window.rows * scene_of(4).overlap_window.cols
     assert plain.seconds == pytest.approx(cells * (CELL_S + 3 * VIEW_CELL_S))
     assert needs_of(scene_of(4), tile=64).seconds == pytest.approx(plain.seconds, rel=0.05)
     assert needs_of(scene_of(6)).seconds > 1.3 * plain.seconds

@@ -11,6 +11,7 @@ from typing import Any
 from shapely import box
 
 from zlocus.core.errors import GeometryError
+from zlocus.core.footprints import area_to_match
 from zlocus.core.grid import grid_from_bounds
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import DoctorRequest
@@ -18,11 +19,11 @@ from zlocus.core.resources import WORKER_BYTES
 from zlocus.core.scene import Scene
 from zlocus.matching.ground_pixels import check_resolution, default_cell
 from zlocus.matching.match_scene import build_match_scene
+from zlocus.orientation.orientation import supported
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
 from zlocus.pipeline.doctor.ties import QuickTies
 from zlocus.pipeline.execution.plan import plan_tiles, tile_needs
 from zlocus.pipeline.required_space import check_room
-from zlocus.pipeline.setup import area_to_match
 
 # Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
 ROUGHLY = 3.0
@@ -63,15 +64,15 @@ def run_plan(
     z_range, z = ties.z_range, sum(ties.z_range) / 2
     cell = request.resolution or default_cell(scene, z)
     check_resolution(cell, scene, z, "--resolution")
-    bounds = area_to_match(scene, ties.orientation, z_range)
-    grid = grid_from_bounds(bounds, cell, scene.crs)
     found = ties.orientation
+    bounds = area_to_match(scene, z_range, found.xyz[supported(found.xyz, found.sigma_z_m)])
+    grid = grid_from_bounds(bounds, cell, scene.crs)
     settled = build_match_scene(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.measured)
-    matched = grid.window.within(settled.seen)
+    matched = grid.window.within(settled.overlap_window)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
     check_room(request.out or Path(), grid, settled, settled.has_colours)
-    tiles = plan_tiles(grid.window, settled.seen, config.pyramid)
+    tiles = plan_tiles(grid.window, settled.overlap_window, config.pyramid)
     needs = tile_needs(settled, tiles, config)
     tile_bytes = int(needs.n_bytes + WORKER_BYTES)
     fit = request.workers if request.memory_gb is None else int(request.memory_gb * 1e9 / tile_bytes)

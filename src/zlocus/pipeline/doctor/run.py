@@ -1,4 +1,7 @@
-"""The order of a look at the inputs: images, overlap, ties, geometry, plan. What fails is told, the rest goes on."""
+"""`zlocus doctor`: images, overlap, tie points, geometry and plan are checked in this order.
+
+A check that fails becomes a finding, and the other checks follow all the same.
+"""
 
 from __future__ import annotations
 
@@ -38,98 +41,98 @@ T = TypeVar("T")
 
 
 @dataclass
-class Told:
-    """Findings so far."""
+class Findings:
+    """The findings so far."""
 
-    findings: list[Finding] = field(default_factory=list)
+    entries: list[Finding] = field(default_factory=list)
 
     @contextmanager
     def warned(self) -> Iterator[None]:
-        """Keep what is warned of meanwhile."""
+        """Turn the warnings inside the block into findings."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", ZlocusWarning)
             try:
                 yield
             finally:
                 ours = [each.message for each in caught if issubclass(each.category, ZlocusWarning)]
-                self.findings += [Finding(POOR, str(message)) for message in ours]
+                self.entries += [Finding(POOR, str(message)) for message in ours]
 
     def tried(self, step: Callable[[], T], about: tuple[str, ...] = ()) -> T | None:
-        """What a step gives; where it fails a run would too, and its sentence is kept."""
+        """The result of a step; None where it fails, as a run would: its message becomes a finding."""
         with self.warned():
             try:
                 return step()
             except ZlocusError as error:
-                self.findings.append(Finding(STOPS, str(error), about))
+                self.entries.append(Finding(STOPS, str(error), about))
                 return None
 
     def refuses(self, check: Callable[[], object]) -> bool:
-        """Whether a check fails, as a run would."""
-        before = len(self.findings)
+        """Whether a check fails; its message becomes a finding."""
+        before = len(self.entries)
         self.tried(check)
-        return any(finding.level == STOPS for finding in self.findings[before:])
+        return any(finding.level == STOPS for finding in self.entries[before:])
 
 
 def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) -> Diagnosis:
-    """Look at the inputs of a run, and write what was found to `request.out` where that is given.
+    """Check the inputs of a run, and write the findings to `request.out` where that is given.
 
     Raises
     ------
     InputError, ConfigError, OutputError
-        Where nothing can be looked at, or written.
+        Nothing can be checked, or the findings cannot be written.
     """
-    told = Told()
-    with progress.stage("Opening images"), told.warned():
+    findings = Findings()
+    with progress.stage("Opening images"), findings.warned():
         usable = open_usable_views(request.inputs, requested_crs(request.crs))
-    told.findings += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
+    findings.entries += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
     scene = usable.scene
     if scene is None:
-        diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, tuple(told.findings))
+        diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, tuple(findings.entries))
     else:
         scene = sorted_views(scene)
-        diagnosis = examined(request, config, scene, usable, told, progress)
+        diagnosis = examined(request, config, scene, usable, findings, progress)
     if request.out is not None:
         write_diagnosis(request.out, diagnosis, scene)
     return diagnosis
 
 
 def examined(
-    request: DoctorRequest, config: RunConfig, scene: Scene, usable: UsableViews, told: Told, progress: Progress
+    request: DoctorRequest, config: RunConfig, scene: Scene, usable: UsableViews, findings: Findings, progress: Progress
 ) -> Diagnosis:
-    """All that can be found of the views that could be opened."""
+    """All findings about the views that could be opened."""
     names = [view.name for view in scene.views]
     quality = []
     with progress.stage("Image quality", len(names)) as stage:
         for view in scene.views:
-            quality.append(told.tried(lambda view=view: image_quality(view.image), (view.name,)))  # type: ignore[misc]
+            quality.append(findings.tried(lambda view=view: image_quality(view.image), (view.name,)))  # type: ignore[misc]
             stage.advance()
     known = [(name, found) for name, found in zip(names, quality, strict=True) if found is not None]
-    told.findings += quality_findings([name for name, _ in known], [found for _, found in known])
+    findings.entries += quality_findings([name for name, _ in known], [found for _, found in known])
     geometry: tuple[ViewGeometry, ...] = ()
     pairs: tuple[PairGeometry, ...] = ()
     ties = plan = None
     if len(names) < 2:
-        told.findings.append(Finding(STOPS, f"Only {names[0]} can be used, and a surface needs two images or more."))
+        findings.entries.append(Finding(STOPS, f"Only {names[0]} can be used, and a surface needs two images or more."))
         levels = None
     else:
         asked = request.heights or scene.heights
-        levels = told.tried(lambda: possible_heights(scene, asked))
+        levels = findings.tried(lambda: possible_heights(scene, asked))
     if levels is not None:
         within = replace(scene, heights=asked)
         room = partial(check_room_before_ties, request.out or Path(), within, request.resolution, None, None)
-        has_room = not told.refuses(room)
-        ties = found_ties(scene, levels, config, asked, told, progress) if all(quality) and has_room else None
+        has_room = not findings.refuses(room)
+        ties = found_ties(scene, levels, config, asked, findings, progress) if all(quality) and has_room else None
         corrected = scene if ties is None else ties.orientation.apply(scene)
         z = ground_height(ties, levels)
         geometry = tuple(view_geometry(view, z) for view in corrected.views)
         pairs = tuple(pair_geometries(corrected.views, [each.outline for each in geometry], z))
-        told.findings += geometry_findings(names, geometry, pairs)
+        findings.entries += geometry_findings(names, geometry, pairs)
         if ties is not None:
-            told.findings += tie_findings(names, ties.orientation, pairs, config.orientation)
-            told.findings += plane_findings(corrected, request.inputs, ties.orientation)
-            plan = planned(request, config, corrected, ties, geometry, told)
+            findings.entries += tie_findings(names, ties.orientation, pairs, config.orientation)
+            findings.entries += plane_findings(corrected, request.inputs, ties.orientation)
+            plan = planned(request, config, corrected, ties, geometry, findings)
     return Diagnosis(
-        scene.views, tuple(quality), geometry, pairs, ties, plan, usable.refused, tuple(dict.fromkeys(told.findings))
+        scene.views, tuple(quality), geometry, pairs, ties, plan, usable.refused, tuple(dict.fromkeys(findings.entries))
     )
 
 
@@ -138,17 +141,17 @@ def found_ties(
     levels: list[float],
     config: RunConfig,
     asked: tuple[float, float] | None,
-    told: Told,
+    findings: Findings,
     progress: Progress,
 ) -> QuickTies | None:
-    """The quick pass over ties, where images overlap at all."""
-    if told.refuses(lambda: check_overlap(scene, levels)):
+    """Tie points of a quick pass; None where the images do not overlap."""
+    if findings.refuses(lambda: check_overlap(scene, levels)):
         return None
-    return told.tried(lambda: quick_ties(scene, config, asked, progress))
+    return findings.tried(lambda: quick_ties(scene, config, asked, progress))
 
 
 def ground_height(ties: QuickTies | None, levels: Sequence[float]) -> float:
-    """Where the ground is, m: the median of the ties, or else of the heights that are possible."""
+    """Height of the ground, m: the median of the tie points, or else of the possible heights."""
     if ties is not None and len(ties.orientation.xyz):
         z = float(np.nanmedian(ties.orientation.xyz[:, 2]))
         if np.isfinite(z):
@@ -162,22 +165,22 @@ def planned(
     corrected: Scene,
     ties: QuickTies,
     geometry: Sequence[ViewGeometry],
-    told: Told,
+    findings: Findings,
 ) -> Any:
-    """The plan of a run, unless it would fail before."""
-    plan = told.tried(lambda: run_plan(request, config, corrected, ties, [each.outline for each in geometry]))
+    """The plan of a run; None where the run would fail before."""
+    plan = findings.tried(lambda: run_plan(request, config, corrected, ties, [each.outline for each in geometry]))
     if plan is not None:
-        told.findings += plan_findings(plan, request.memory_gb)
+        findings.entries += plan_findings(plan, request.memory_gb)
     return plan
 
 
 def write_diagnosis(out: Path, diagnosis: Diagnosis, scene: Scene | None) -> None:
-    """doctor.json, and footprints where they are known; those of an earlier look go.
+    """Write doctor.json, and footprints where they are known; footprints of an earlier check are removed.
 
     Raises
     ------
     OutputError
-        Where they cannot be written.
+        They cannot be written.
     """
     with made_folder(out):
         for name in (FOOTPRINTS, PICTURE):

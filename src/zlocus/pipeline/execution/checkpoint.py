@@ -1,4 +1,7 @@
-"""Finished tiles on disk: a run that was stopped goes on where it was, and never with tiles of another run."""
+"""Checkpoint of a run: its finished tiles on disk, with which an interrupted run resumes.
+
+Tiles of another run are never used: the checkpoint holds everything that the tiles depend on.
+"""
 
 from __future__ import annotations
 
@@ -19,30 +22,32 @@ from numpy.typing import NDArray
 from zlocus.core.errors import OutputError, StoppedError
 
 Arrays = Mapping[str, NDArray[Any]]
-# Below the folder of a run.
+# Names below the folder of a run.
 FOLDER, MANIFEST, DONE, LOCK = "tiles", "manifest.json", "done.jsonl", "lock"
-# What was found before the first tile.
+# Arrays that were computed before the first tile: the tie points.
 BEFORE = "before.npz"
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass
-class TileStore:
-    """Tiles of one run below its folder: a manifest of what they depend on, what was found before the first of them, a
-    line for every finished tile, and a file of each.
+class TileCheckpoint:
+    """The finished tiles of one run, in a folder below its results.
 
-    folder : holds them, made by `open`; key : all that the tiles depend on, by name; finished : SHA-256 of each tile
-    that is there, by its name; before : SHA-256 of what an earlier run of the same found before its first tile, "" of
-    nothing; starts_anew_by : the option by which the run takes on no tiles, "" where it does; is_of_this_run : whether
-    an earlier run of the same has begun here; check : ends the run, told how many tiles are kept, where a tile may be
-    made of what the key does not say.
+    The folder holds a manifest of everything that the tiles depend on, the arrays computed before the first tile, a
+    list with a line for every finished tile, and a file for each tile.
+
+    folder : made by `open`; key : everything that the tiles depend on, by name; finished : SHA-256 of each finished
+    tile, by the name of the tile; before : SHA-256 of the arrays that an earlier run of the same key computed before
+    its first tile, "" where there are none; fresh_start_option : the option by which the run does not resume, "" where
+    it does; is_of_this_run : whether an earlier run of the same key has begun here; check : called with the number of
+    finished tiles before a tile is kept; it raises where an input has changed, which the key does not show.
     """
 
     folder: Path
     key: dict[str, Any]
     finished: dict[str, str] = field(default_factory=dict)
     before: str = ""
-    starts_anew_by: str = ""
+    fresh_start_option: str = ""
     is_of_this_run: bool = False
     check: Callable[[int], None] = lambda n_kept: None
     _lock: BinaryIO | None = None
@@ -56,52 +61,51 @@ class TileStore:
         is_resumed: bool,
         overwrite: bool,
         check: Callable[[int], None] = lambda n_kept: None,
-    ) -> TileStore:
-        """The store of a run, with what an earlier one left of the same; looks only.
+    ) -> TileCheckpoint:
+        """The checkpoint of a run, with the tiles that an earlier run of the same key finished. Changes no file.
 
         Raises
         ------
         OutputError
-            It holds tiles of another run, and may not be overwritten.
+            The folder holds tiles of another run, and may not be overwritten.
         """
         store = cls(out / FOLDER, json.loads(json.dumps(key)), check=check)
-        store.starts_anew_by = "--overwrite" if overwrite else "" if is_resumed else "--no-resume"
+        store.fresh_start_option = "--overwrite" if overwrite else "" if is_resumed else "--no-resume"
         if overwrite or not (store.folder / MANIFEST).exists():
             return store
-        found = _read_object(store.folder / MANIFEST)
+        manifest = _read_object(store.folder / MANIFEST)
         listed = _finished_in(store.folder / DONE)
-        if found.get("schema") != SCHEMA or "key" not in found:
+        if manifest.get("schema") != SCHEMA or "key" not in manifest:
             differs = "its manifest is damaged, or of another version of zlocus"
         else:
-            differs = difference(found["key"], store.key)
+            differs = difference(manifest["key"], store.key)
         store.is_of_this_run = not differs
         if not is_resumed:
             return store
         if differs and listed:
             raise OutputError(
-                f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give what that run was "
-                "given, or add --overwrite to start anew."
+                f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give the same "
+                "options as that run, or add --overwrite to start anew."
             )
         if not differs:
-            store.finished, store.before = listed, str(found.get("before", ""))
+            store.finished, store.before = listed, str(manifest.get("before", ""))
         return store
 
-    def found_before(self) -> dict[str, NDArray[Any]] | None:
-        """What an earlier run of the same found before its first tile; None where it is missing, or not what was
-        written."""
+    def arrays_before_tiles(self) -> dict[str, NDArray[Any]] | None:
+        """The arrays that an earlier run of the same key computed before its first tile; None where they are missing or
+        damaged."""
         return _arrays(self.folder / BEFORE, self.before)
 
     @contextmanager
-    def open(self, settled: str, before: Arrays | None = None) -> Iterator[TileStore]:
-        """The store, begun, and locked against other runs.
+    def open(self, setup_digest: str, before: Arrays | None = None) -> Iterator[TileCheckpoint]:
+        """Make the folder, and lock it against other runs.
 
-        settled : digest of what was found before the first tile; before : the part of it that is to be kept.
+        setup_digest : SHA-256 of the run setup; before : arrays computed before the first tile, to be kept.
 
         Raises
         ------
         OutputError
-            Another run writes there, the cameras or heights came out otherwise than for the tiles that are there, or it
-            cannot be written.
+            Another run writes to the folder, its tiles belong to other cameras or heights, or it cannot be written.
         StoppedError
             See `check`.
         """
@@ -112,7 +116,7 @@ class TileStore:
         try:
             if not _locked(self._lock):
                 raise OutputError(f"Another run writes to {self.folder.parent}. Wait for it, or choose another folder.")
-            self._begin(settled, before or {})
+            self._begin(setup_digest, before or {})
             yield self
         except BaseException:
             if not self.finished and self._is_ours:
@@ -121,34 +125,34 @@ class TileStore:
         finally:
             self._lock.close()
 
-    def _begin(self, settled: str, before: Arrays) -> None:
+    def _begin(self, setup_digest: str, before: Arrays) -> None:
         self._is_ours = True
         if self.finished:
-            found = _read_object(self.folder / MANIFEST)
+            manifest = _read_object(self.folder / MANIFEST)
             # Another run may have written here since the store was looked at.
-            self.finished = _finished_in(self.folder / DONE) if found.get("key") == self.key else {}
-            if self.finished and found.get("settled") != settled:
+            self.finished = _finished_in(self.folder / DONE) if manifest.get("key") == self.key else {}
+            if self.finished and manifest.get("setup") != setup_digest:
                 raise OutputError(
-                    f"{self.folder} holds {len(self.finished)} finished tiles for which cameras and heights came out "
-                    "otherwise, as they may on another machine. Add --overwrite to start anew, or go on where it began."
+                    f"{self.folder} holds {len(self.finished)} finished tiles for other cameras and heights, as they "
+                    "may be found on another machine. Add --overwrite to start anew, or resume on the first machine."
                 )
-        if not self.finished or self.found_before() is None:
+        if not self.finished or self.arrays_before_tiles() is None:
             with _written(self.folder):
                 for path in self.folder.iterdir():
                     if not self.finished and path.name != LOCK:
                         path.unlink()
                 content, digest = _packed(before)
                 write_atomically(self.folder / BEFORE, content)
-                manifest = {"schema": SCHEMA, "key": self.key, "settled": settled, "before": digest}
+                manifest = {"schema": SCHEMA, "key": self.key, "setup": setup_digest, "before": digest}
                 write_atomically(self.folder / MANIFEST, json.dumps(manifest, indent=1).encode())
 
     def keep(self, name: str, arrays: Arrays) -> None:
-        """Write a tile, whole or not at all, and its line; both are on the disk when this returns.
+        """Write a finished tile, whole or not at all, and its line in the list; both are on disk when this returns.
 
         Raises
         ------
         StoppedError
-            It cannot be written, or see `check`: what was kept before stays.
+            The tile cannot be written, or see `check`; tiles kept earlier stay.
         """
         self.check(len(self.finished))
         content, digest = _packed(arrays)
@@ -166,31 +170,31 @@ class TileStore:
                 ) from error
             raise StoppedError(
                 f"{self.folder} cannot be written: {error.strerror or error}. {len(self.finished)} finished tiles are "
-                "kept; make room, and give the same command again to go on."
+                "kept; make room, and give the same command again to resume."
             ) from error
         self.finished[name] = digest
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """The arrays of a finished tile; None where its file is missing, or not what was written."""
+        """The arrays of a finished tile; None where its file is missing or damaged."""
         return _arrays(self._path(name), self.finished.get(name, ""))
 
     def holds(self, name: str) -> bool:
-        """Whether a finished tile is there, with the bytes that were written."""
+        """Whether a tile is finished and its file is undamaged."""
         return name in self.finished and self.load(name) is not None
 
     @property
     def is_there(self) -> bool:
-        """Whether the folder still is where `open` made it; somebody may have removed it."""
+        """Whether the folder still exists after `open`; somebody may have removed it."""
         return (self.folder / MANIFEST).exists()
 
     @property
-    def how_to_go_on(self) -> str:
-        """What a user is to do with the tiles of a run that was stopped, as a clause."""
-        without = f" without {self.starts_anew_by}" if self.starts_anew_by else ""
-        return f"the same command{without} goes on from there"
+    def how_to_resume(self) -> str:
+        """How the user resumes the run, as a clause."""
+        without = f" without {self.fresh_start_option}" if self.fresh_start_option else ""
+        return f"the same command{without} resumes from there"
 
     def remove(self) -> None:
-        """Remove all tiles: their surface is complete."""
+        """Remove all tiles, because their surface is complete."""
         self.finished.clear()
         shutil.rmtree(self.folder, ignore_errors=True)
 
@@ -199,14 +203,14 @@ class TileStore:
 
 
 def _packed(arrays: Arrays) -> tuple[memoryview, str]:
-    """The bytes of a file of arrays, and their SHA-256."""
+    """Content of a file with these arrays, and its SHA-256."""
     content = io.BytesIO()
     np.savez(content, **arrays)  # type: ignore[arg-type]
     return content.getbuffer(), hashlib.sha256(content.getbuffer()).hexdigest()
 
 
 def _arrays(path: Path, digest: str) -> dict[str, NDArray[Any]] | None:
-    """The arrays of a file; None where it is missing, or its SHA-256 is another."""
+    """The arrays of a file; None where it is missing or has another SHA-256."""
     try:
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != digest:
@@ -218,7 +222,7 @@ def _arrays(path: Path, digest: str) -> dict[str, NDArray[Any]] | None:
 
 
 def difference(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> str:
-    """The first thing in which two keys differ, as a clause; "" where they are the same."""
+    """The first entry in which two keys differ, as a clause; "" where they are equal."""
     for name in dict.fromkeys([*before, *now]):
         one, other = before.get(name), now.get(name)
         if one == other:
@@ -259,7 +263,7 @@ def _read_object(path: Path) -> dict[str, Any]:
 
 
 def _finished_in(path: Path) -> dict[str, str]:
-    """Tiles by their lines; a last line that was cut off, or one that is damaged, counts for nothing."""
+    """SHA-256 of each tile in the list; damaged lines, or a last line that was cut off, are skipped."""
     found: dict[str, str] = {}
     try:
         lines = path.read_bytes().splitlines()
@@ -273,7 +277,7 @@ def _finished_in(path: Path) -> dict[str, str]:
 
 
 def _locked(file: BinaryIO) -> bool:
-    """Whether a file could be locked; it is until it is closed, or its process ends. Without locks, yes."""
+    """Lock a file until it is closed or the process ends; False where another process holds it, True without locks."""
     try:
         import fcntl
     except ImportError:

@@ -1,4 +1,4 @@
-"""A Dask cluster whose workers do the tasks; needs `distributed` here and zlocus there."""
+"""Workers of a Dask cluster. `distributed` must be installed here, and zlocus on the workers."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from zlocus.pipeline.execution.processes import one_thread
 from zlocus.pipeline.execution.tasks import Cause, Failure, Outcome, attempted, failure_of
 
 CONNECT_S, WORKERS_S = 10.0, 120.0
-LOOK_S = 5.0  # between looks at whether there are workers
-# Tasks that wait at a worker, so that it does not while results travel.
-AHEAD = 1
-# What workers of this process do, by the names of runs.
+CHECK_INTERVAL_S = 5.0  # between two checks whether the cluster has workers
+# Tasks queued at each worker, so that it does not wait while results are sent.
+QUEUED_TASKS = 1
+# Functions of the runs that this worker takes part in, by the name of the run.
 _functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def begin(name: str, function: bytes) -> None:
-    """On a worker, before a run's first task."""
+    """Register the function of a run; called on a worker before its first task."""
     one_thread()
     _functions[name] = pickle.loads(function)
 
 
 def end(name: str) -> None:
-    """On a worker, at the end of a run."""
+    """Forget the function of a run; called on a worker when the run ends."""
     _functions.pop(name, None)
 
 
 def at_worker(name: str, task: Any) -> Outcome:
-    """One attempt at a task, on a worker."""
+    """Try a task once; called on a worker."""
     from distributed import get_worker
 
     return attempted(_functions[name], task, get_worker().address, time.thread_time(), time.thread_time)
 
 
 class Cluster:
-    """Workers of the cluster whose scheduler listens at an address.
+    """Workers of the Dask cluster whose scheduler listens at an address.
 
-    A worker that is lost costs its tasks only: the cluster gives them to others. Leaving the context takes the run's
-    tasks and function from the cluster, which goes on.
+    When a worker is lost, the cluster gives its tasks to others. Leaving the context removes the tasks and the function
+    of this run from the cluster, which keeps running.
 
     Raises
     ------
@@ -65,7 +65,7 @@ class Cluster:
         self._address, self._name = address, f"zlocus-{uuid.uuid4().hex}"
         try:
             self._client = Client(address, timeout=CONNECT_S)
-        except (OSError, ValueError) as error:  # those of timeouts are among the first
+        except (OSError, ValueError) as error:  # timeouts are among the first
             raise ConfigError(
                 f"--scheduler {address} does not answer: {str(error) or type(error).__name__}. Give the address that "
                 "the Dask scheduler prints, such as tcp://10.0.0.1:8786."
@@ -91,15 +91,15 @@ class Cluster:
 
     @property
     def dashboard(self) -> str:
-        """Address of a page that shows what the cluster does."""
+        """Address of the web page on which the cluster shows its work."""
         return str(self._client.dashboard_link)
 
     @property
     def slots(self) -> int:
-        """See `Workers`; grows and shrinks with the cluster."""
+        """See `Workers`; the number follows the size of the cluster."""
         with self._reached():
             threads = [int(n) for n in self._client.nthreads().values()]
-        return max(sum(threads) + AHEAD * len(threads), 1)
+        return max(sum(threads) + QUEUED_TASKS * len(threads), 1)
 
     def submit(self, task: Any) -> None:
         """See `Workers`."""
@@ -113,22 +113,22 @@ class Cluster:
         Raises
         ------
         StoppedError
-            The scheduler has gone, or all workers have and none came back.
+            The scheduler has gone, or the cluster has had no workers for some time.
         """
         from distributed import wait
 
-        alone_s = 0.0
+        without_workers_s = 0.0
         while True:
             with self._reached():
                 try:
-                    done = wait(list(self._futures), timeout=LOOK_S, return_when="FIRST_COMPLETED").done
+                    done = wait(list(self._futures), timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done
                     return [self._outcome(future, self._futures.pop(future)) for future in done]
                 except TimeoutError:
-                    alone_s = 0.0 if self._client.nthreads() else alone_s + LOOK_S
-            if alone_s >= WORKERS_S:
+                    without_workers_s = 0.0 if self._client.nthreads() else without_workers_s + CHECK_INTERVAL_S
+            if without_workers_s >= WORKERS_S:
                 raise StoppedError(
-                    f"The cluster at {self._address} has had no workers for {WORKERS_S:.0f} s. What is done is kept: "
-                    "give the same command again when it has some."
+                    f"The cluster at {self._address} has had no workers for {WORKERS_S:.0f} s. Finished tiles are "
+                    "kept: give the same command again when it has some."
                 )
 
     @contextmanager
@@ -139,8 +139,8 @@ class Cluster:
             raise
         except (OSError, CancelledError) as error:
             raise StoppedError(
-                f"The scheduler at {self._address} has gone. What is done is kept: give the same command again when it "
-                "is back, or without --scheduler."
+                f"The scheduler at {self._address} has gone. Finished tiles are kept: give the same command again "
+                "when it is back, or without --scheduler."
             ) from error
 
     def _outcome(self, future: Any, task: Any) -> Outcome:
@@ -156,7 +156,7 @@ class Cluster:
         return outcome
 
     def close(self) -> None:
-        """Take what is left of the run from the cluster."""
+        """Remove the remaining tasks of the run from the cluster."""
         with suppress(Exception):  # a scheduler that has gone has nothing left
             self._client.cancel(list(self._futures), force=True)
             self._client.unregister_worker_plugin(self._name)
@@ -173,7 +173,7 @@ class Cluster:
 
 
 def _plugin(name: str, function: bytes) -> Any:
-    """Brings a run's function to every worker of the cluster, those that join later too."""
+    """Plugin that sends the function of a run to every worker, also to those that join later."""
     from distributed import WorkerPlugin
 
     class Plugin(WorkerPlugin):

@@ -1,4 +1,4 @@
-"""events.jsonl: what happened in a run, a line of JSON each, for programs that watch it."""
+"""events.jsonl: the events of a run as lines of JSON, for programs that watch it."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ NAME = "events.jsonl"
 
 
 class EventLog:
-    """Appends to `NAME` in a folder. A line that cannot be written is no reason to stop: the log is for watching."""
+    """Appends events to `NAME` in a folder. A line that cannot be written is skipped, because the log only informs."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
 
     def remove(self) -> None:
-        """Forget what happened before."""
+        """Remove the log of an earlier run."""
         with suppress(OSError):
             self.path.unlink(missing_ok=True)
 
     def add(self, event: str, **more: Any) -> None:
-        """Add an event with the time and what belongs to it."""
+        """Add an event with the time and some details."""
         record = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **more}
         with suppress(OSError), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")

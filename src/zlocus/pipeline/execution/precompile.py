@@ -1,4 +1,4 @@
-"""Compiles the kernels ahead, in processes of their own, while something else runs: the cache on disk serves all.
+"""Compile the kernels in advance, in separate processes, while other work runs; the cache on disk serves all processes.
 
 `python -m zlocus.pipeline.execution.precompile GROUP` runs one group of kernels on a scene of a few cells.
 """
@@ -33,7 +33,7 @@ SIDE = 96
 
 @contextmanager
 def kernels_compiling() -> Iterator[None]:
-    """Kernels compile while the block runs; at its end they are ready."""
+    """Compile the kernels while the block runs; at its end they are ready."""
     running = []
     try:
         for group in GROUPS:
@@ -55,7 +55,7 @@ def kernels_compiling() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SlantedCamera:
-    """Parallel rays: column = E + by_height z, row = -N."""
+    """A sensor with parallel rays: column = E + by_height z, row = -N."""
 
     by_height: float
 
@@ -92,7 +92,7 @@ def tiny_scene() -> MatchScene:
     views = tuple(View(f"v{i}", Path(f"v{i}"), Noise(i), SlantedCamera(0.5 * i)) for i in range(2))
     return MatchScene(
         views=views, anchor=(0.0, 0.0), cell_m=1.0, origin_m=0.0, step_m=1.0, n_steps=16, levels=2,
-        seen=CellWindow(0, 0, SIDE, SIDE), grey=(GreyScale(0.0, 1.0),) * 2, ties=np.zeros((0, 3)),
+        overlap_window=CellWindow(0, 0, SIDE, SIDE), grey=(GreyScale(0.0, 1.0),) * 2, ties=np.zeros((0, 3)),
     )  # fmt: skip
 
 
@@ -116,13 +116,13 @@ def warm_orientation(scene: MatchScene) -> None:
 
 
 def warm(group: str) -> None:
-    """Run a group of kernels once: `orient` those of the orientation, `match` everything up to the finest level's
-    heights, `refine` what follows."""
+    """Run a group of kernels once: `orient` for the orientation, `match` for matching up to the heights of the finest
+    level, `refine` for the stages after it."""
     from zlocus.matching import tile
     from zlocus.matching.kernels.spline import spline_coefficients
+    from zlocus.matching.locus_windows import CurveSamples
     from zlocus.matching.subpixel import refine
     from zlocus.matching.tile_views import read_pixels, tile_views
-    from zlocus.matching.view_ranking import Samples
 
     scene, config = tiny_scene(), RunConfig()
     if group == "orient":
@@ -130,27 +130,29 @@ def warm(group: str) -> None:
         return
     if group == "match":
         without = replace(config, refine=replace(config.refine, rounds=0))
-        tile.match_tile(scene, scene.seen, without)
+        tile.match_tile(scene, scene.overlap_window, without)
         return
     pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey[0]) for view in scene.views]
     shape, block = (SIDE, SIDE), config.pyramid.block
-    views = tile_views(pixels, 0, scene.transform(scene.seen, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
+    views = tile_views(pixels, 0, scene.transform(scene.overlap_window, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
     for view in pixels:
         spline_coefficients(view.pixels[0])
-    Samples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(views, 0, slice(None))
+    CurveSamples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(
+        views, 0, slice(None)
+    )
     seen = np.zeros((3, 2, *shape), np.int32)
     seen[1] = 16
     refine(views, views.pixels, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
 
 
 def _leave_after_input() -> None:
-    """End this process when the one that started it has ended, however that was."""
+    """End this process as soon as the process that started it has ended for any reason."""
     sys.stdin.buffer.read()
     os._exit(1)
 
 
 def warm_for_another(group: str) -> None:
-    """Run a group of kernels once, unless the process that holds the input of this one ends before."""
+    """Run a group of kernels once, unless the starting process ends first."""
     threading.Thread(target=_leave_after_input, daemon=True).start()
     warm(group)
 

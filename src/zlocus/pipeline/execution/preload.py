@@ -1,4 +1,4 @@
-"""What workers need, imported once by the process that they are forked from."""
+"""Imports that all workers need, made once by the process that workers are forked from."""
 
 from zlocus.matching import tile
 

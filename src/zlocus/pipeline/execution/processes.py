@@ -1,4 +1,4 @@
-"""Local processes, one task at a time each: one that dies costs its task only, and another takes its place."""
+"""Workers in local processes, each with one task at a time. When one dies, only its task fails; another replaces it."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from zlocus.core.jit import CACHE
 from zlocus.core.signals import ENDING
 from zlocus.pipeline.execution.tasks import Cause, Failure, Outcome, attempted
 
-# Kernels use one core each, and so must the libraries below them: else n workers have n times the threads.
+# Each worker uses one core. Without these variables the libraries in n workers would start n times as many threads.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
-# Imported once, by the process that workers are forked from.
+# Modules imported once, by the process that workers are forked from.
 PRELOADED = ("zlocus.pipeline.execution.preload",)
 TIME_TO_STOP_S = 2.0
-# Signals to all processes of a run reach this one soon after they reach a worker.
+# A signal to all processes of a run reaches the main process at most this much later than a worker.
 SIGNALS_SPREAD_S = 0.3
 
 
@@ -41,13 +41,14 @@ class _Worker:
 class Processes:
     """Workers in processes of their own.
 
-    Processes are forked from one that has imported everything and does nothing (started anew where the system cannot
-    do that), never from this one, whose threads and open rasters must not be shared. Leaving the context stops all.
+    They are forked from an idle process that has imported everything; where the system cannot fork they are started
+    anew. They are never forked from the main process, whose threads and open rasters must not be shared. Leaving the
+    context stops all.
 
     >>> with Processes(function, 2) as workers:
     ...     outcomes = run_tasks(workers, tasks)
 
-    function : and what it holds must pickle; it reaches each process once.
+    function : sent to each process once; it must be picklable.
     """
 
     def __init__(self, function: Callable[[Any], Any], slots: int) -> None:
@@ -66,7 +67,7 @@ class Processes:
         worker = self._idle.pop() if self._idle else self._started()
         worker.task = task
         self._busy.append(worker)
-        # One that has died meanwhile is found by `wait`.
+        # `wait` finds a worker that has died in the meantime.
         with suppress(OSError):
             worker.connection.send(task)
 
@@ -86,7 +87,7 @@ class Processes:
         return outcomes
 
     def close(self) -> None:
-        """Stop all, whatever they do."""
+        """Stop all workers at once."""
         workers = self._idle + self._busy
         self._idle, self._busy = [], []
         for worker in workers:
@@ -100,13 +101,13 @@ class Processes:
 
     def _started(self) -> _Worker:
         self._number += 1
-        mine, theirs = self._context.Pipe()
+        own_end, worker_end = self._context.Pipe()
         name = f"worker {self._number}"
-        process = self._context.Process(target=work, args=(theirs, self._function, name), name=name, daemon=True)
-        with _environment_below(ONE_THREAD | kernel_cache()), _without_main(), _deaf_below():
+        process = self._context.Process(target=work, args=(worker_end, self._function, name), name=name, daemon=True)
+        with _environment_below(ONE_THREAD | kernel_cache()), _without_main(), _signals_blocked_below():
             process.start()
-        theirs.close()
-        return _Worker(process, mine)
+        worker_end.close()
+        return _Worker(process, own_end)
 
     def __enter__(self) -> Processes:
         return self
@@ -118,14 +119,13 @@ class Processes:
 
 
 def kernel_cache() -> dict[str, str]:
-    """Variables for the environment of processes that this one starts: they keep kernels where it does, if that is a
-    folder of its own."""
+    """Environment variables with which workers use the temporary kernel cache of this process, if it has one."""
     return {} if CACHE.temporary is None else {"NUMBA_CACHE_DIR": str(CACHE.temporary)}
 
 
 @contextmanager
 def _environment_below(variables: dict[str, str]) -> Iterator[None]:
-    """Processes that are started meanwhile find these variables in their environment."""
+    """Set environment variables for the processes that are started inside the block."""
     kept = {key: os.environ.get(key) for key in variables}
     os.environ.update(variables)
     try:
@@ -139,13 +139,15 @@ def _environment_below(variables: dict[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _deaf_below() -> Iterator[None]:
-    """Processes that are started meanwhile do not hear the signals that end a run, until they ask for them: of Ctrl-C
-    the whole group hears, and one that is still importing would print where it was."""
+def _signals_blocked_below() -> Iterator[None]:
+    """Block the signals that end a run in processes started inside the block, until these unblock them.
+
+    Ctrl-C reaches the whole process group, and a process that is still importing modules would print a trace.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    # It lets signals through when it is started, as the first process would make it.
+    # The resource tracker unblocks signals when it starts; started now, it does not do so inside the block.
     ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
@@ -156,7 +158,7 @@ def _deaf_below() -> Iterator[None]:
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """Processes that are started meanwhile do not run the script that runs here, which would begin all this again."""
+    """Keep processes started inside the block from importing the main script, which would start the run again."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -166,12 +168,12 @@ def _without_main() -> Iterator[None]:
 
 
 def work(connection: Connection, function: bytes, name: str) -> None:
-    """What a process does: tasks, until its other end is closed."""
-    _mind_signals()
+    """Work on tasks until the connection is closed; the main function of a worker process."""
+    _set_signals()
     one_thread()
     call = pickle.loads(function)
-    cpu_s = 0.0  # what it took to start counts too
-    # The other end may be gone, with its process, at any time.
+    cpu_s = 0.0  # the CPU time of the start is counted with the first task
+    # The main process, and with it the connection, may end at any time.
     with suppress(EOFError, OSError):
         while True:
             outcome = attempted(call, connection.recv(), name, cpu_s)
@@ -179,32 +181,32 @@ def work(connection: Connection, function: bytes, name: str) -> None:
             connection.send(outcome)
 
 
-def _mind_signals() -> None:
-    """Let this process end with the one that waits for its results, and when it is told to by itself."""
-    # Of Ctrl-C the whole group hears; who waits for the results decides.
+def _set_signals() -> None:
+    """End this process when the main process ends, or by a signal to this process alone."""
+    # Ctrl-C reaches the whole process group; the main process decides what happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_leave_after, args=(parent,), daemon=True).start()
+        threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
 
 
-def _leave_after(parent: BaseProcess) -> None:
-    """End this process when another has ended, however that was."""
+def _exit_with(parent: BaseProcess) -> None:
+    """End this process as soon as another process has ended for any reason."""
     parent.join()
     os._exit(1)
 
 
 def one_thread() -> None:
-    """Keep libraries of this process to one thread, as far as the environment cannot."""
+    """Limit those libraries of this process to one thread that no environment variable limits."""
     import cv2
 
     cv2.setNumThreads(1)
 
 
 def _lost(process: BaseProcess) -> Failure:
-    """What is known of a process that has gone."""
+    """Why a process ended, as a failure of its task."""
     process.join(TIME_TO_STOP_S)
     status = process.exitcode
     if status == -signal.SIGKILL:
@@ -213,6 +215,6 @@ def _lost(process: BaseProcess) -> Failure:
         )
     if status is not None and status < 0:
         if -status in ENDING:
-            time.sleep(SIGNALS_SPREAD_S)  # if it was not meant for the worker alone, this process ends here
+            time.sleep(SIGNALS_SPREAD_S)  # where the signal was meant for all, this process ends here
         return Failure(Cause.LOST, f"its process ended by signal {-status}")
     return Failure(Cause.LOST, f"its process ended with status {status}")

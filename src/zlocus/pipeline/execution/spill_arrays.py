@@ -1,4 +1,4 @@
-"""Arrays that memory may have no room for."""
+"""Arrays that spill to disk where memory has no room for them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from numpy.typing import DTypeLike, NDArray
 
 from zlocus.core.errors import OutputError
 
-# Written to a file at a time; and of a file at least, for each takes a descriptor of which there are few.
+# Bytes written to a file at a time; and the smallest file, because file descriptors are few.
 PART_BYTES, FILE_BYTES = 64_000_000, 1 << 30
 ALIGNED = 64
 
 
 class SpillArrays:
-    """Makes arrays: in memory while there is room, then in files that have no name and go with the process.
+    """Makes arrays in memory while there is room, and then in unnamed files that disappear with the process.
 
     Files are mapped: what is read and written of them counts as memory of the process until `rest` is called.
     """
 
     def __init__(self, beside: Path, room_bytes: float) -> None:
-        """beside : where files may be, or be made; room_bytes : that arrays may take in memory, all together."""
+        """beside : folder on whose disk files are made; room_bytes : memory that all arrays together may take."""
         self.folder = next(path for path in (beside, *beside.absolute().parents) if path.is_dir())
         self.room_bytes = room_bytes
         self.file_bytes = 0
@@ -34,7 +34,7 @@ class SpillArrays:
         self._used = 0
 
     def full(self, shape: tuple[int, ...], value: Any, dtype: DTypeLike) -> NDArray[Any]:
-        """As `numpy.full`.
+        """A new array filled with a value, as `numpy.full` makes it.
 
         Raises
         ------
@@ -44,11 +44,11 @@ class SpillArrays:
         return self._filled(np.broadcast_to(np.asarray(value, dtype), shape))
 
     def copied(self, values: NDArray[Any]) -> NDArray[Any]:
-        """A copy. Errors as those of `full`."""
+        """A copy of an array. Errors as of `full`."""
         return self._filled(values)
 
     def rest(self) -> None:
-        """Give back the memory that files take; what is in them stays."""
+        """Release the memory that mapped files take; their content stays."""
         if hasattr(mmap, "MADV_DONTNEED"):
             for held in self._maps:
                 held.madvise(mmap.MADV_DONTNEED)
@@ -67,8 +67,10 @@ class SpillArrays:
         return out
 
     def _mapped(self, n_bytes: int) -> tuple[mmap.mmap, int]:
-        """A file with room for so many bytes, and the first of them. The disk has that room: a file that grows when it
-        is written ends the process where it cannot."""
+        """A mapped file with room for n_bytes, and the offset of the first one.
+
+        The space is allocated now: writing to a mapped file for which the disk has no room would kill the process.
+        """
         self.file_bytes += n_bytes
         first = -(-self._used // ALIGNED) * ALIGNED
         if self._maps and first + n_bytes <= len(self._maps[-1]):

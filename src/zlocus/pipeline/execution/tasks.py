@@ -1,5 +1,5 @@
-"""Runs tasks wherever there are workers: what may fail for a passing reason is tried again, what fails for good is
-told, and all others are done."""
+"""Run tasks on workers of any kind. Tasks that failed for a reason that may pass are tried again; a failure stops no
+other task."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from typing import Any, Protocol
 from zlocus.core.errors import InputError, ZlocusError
 from zlocus.core.resources import peak_memory_mb
 
-ATTEMPTS = 3
+# Attempts at a task whose failure may pass.
+MAX_ATTEMPTS = 3
 
 
 class Cause(StrEnum):
@@ -28,9 +29,12 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class Failure:
-    """cause; reason : what happened, as a clause without its full stop; trace : of our own faults; error : where it
-    says all that there is to say; is_given_up : by workers that had tried again themselves, beside other tasks,
-    one of which may have been the culprit."""
+    """Why an attempt at a task failed.
+
+    reason : what happened, as a clause without a full stop; trace : Python's trace, for our own faults; error : the
+    exception, where its message is complete; is_given_up : whether the workers had tried the task several times
+    themselves, beside other tasks that may have been the cause.
+    """
 
     cause: Cause
     reason: str
@@ -40,16 +44,17 @@ class Failure:
 
     @property
     def may_pass(self) -> bool:
-        """Whether another attempt may end otherwise."""
+        """Whether another attempt may succeed."""
         return self.cause is not Cause.FAULT
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one attempt at a task.
+    """Result of one attempt at a task.
 
-    result : None after a failure. failure : None with a result. wall_s, cpu_s : of the attempt; peak_mb : most memory
-    that its worker has held so far; worker : that did it. attempt : 1 is the first. is_final : no other follows.
+    result : None after a failure; failure : None with a result; wall_s, cpu_s : time of the attempt; peak_mb : largest
+    memory that its worker has held so far; worker : name of the worker; attempt : number, from 1; is_final : whether no
+    other attempt follows.
     """
 
     task: Any
@@ -64,27 +69,28 @@ class Outcome:
 
 
 class Workers(Protocol):
-    """Where tasks are done."""
+    """What runs tasks: this process, other processes, or a cluster."""
 
     @property
     def slots(self) -> int:
-        """Tasks that it takes at a time, 1 or more; may change."""
+        """Number of tasks that may run at a time, 1 or more; it may change."""
         ...
 
     def submit(self, task: Any) -> None:
-        """Begin a task; never more than `slots` at a time."""
+        """Start a task. Callers never start more than `slots` tasks at a time."""
         ...
 
     def wait(self) -> list[Outcome]:
-        """Outcomes of one task or more that were begun, as soon as there is one."""
+        """Wait until at least one started task has ended; return the outcomes of all that have."""
         ...
 
 
 def run_tasks(workers: Workers, tasks: Iterable[Any]) -> Iterator[Outcome]:
-    """Outcomes as they come, of failed attempts too; each task has one final outcome.
+    """Outcomes of all attempts, in the order in which they end; each task has one final outcome.
 
-    A task that failed for a reason that may pass is tried again when all others are done, by itself, so that it has all
-    the memory; `ATTEMPTS` times in all, once more where workers had tried it again already. tasks : hashable.
+    A task that failed for a reason that may pass is tried again after all others, alone, so that all memory is free for
+    it. It is tried `MAX_ATTEMPTS` times in all; only once more where the workers had already tried it several times.
+    tasks : hashable.
     """
     waiting, again = deque(tasks), deque[Any]()
     attempts: Counter[Any] = Counter()
@@ -100,9 +106,9 @@ def run_tasks(workers: Workers, tasks: Iterable[Any]) -> Iterator[Outcome]:
             n_running -= 1
             attempts[outcome.task] += 1
             if outcome.failure is not None and outcome.failure.is_given_up:
-                attempts[outcome.task] = max(attempts[outcome.task], ATTEMPTS - 1)
+                attempts[outcome.task] = max(attempts[outcome.task], MAX_ATTEMPTS - 1)
             n = attempts[outcome.task]
-            is_final = outcome.failure is None or not outcome.failure.may_pass or n == ATTEMPTS
+            is_final = outcome.failure is None or not outcome.failure.may_pass or n == MAX_ATTEMPTS
             if not is_final:
                 again.append(outcome.task)
             yield replace(outcome, attempt=n, is_final=is_final)
@@ -115,7 +121,10 @@ def attempted(
     cpu_before_s: float,
     clock: Callable[[], float] = time.process_time,
 ) -> Outcome:
-    """One attempt at a task, in this process. cpu_before_s : from when on CPU time counts, by a clock of it."""
+    """Try a task once in this process.
+
+    cpu_before_s : reading of `clock` from which CPU time is counted.
+    """
     wall = time.perf_counter()
     result, failure = None, None
     try:
@@ -127,7 +136,7 @@ def attempted(
 
 
 def failure_of(error: Exception) -> Failure:
-    """An exception as a failure."""
+    """The failure that an exception means."""
     words = " ".join(str(error).split()).rstrip(".")
     if isinstance(error, MemoryError):
         return Failure(Cause.MEMORY, "it does not fit into memory")
@@ -142,7 +151,7 @@ def failure_of(error: Exception) -> Failure:
 
 
 class Here:
-    """This very process, one task at a time.
+    """This process as a worker, with one task at a time.
 
     >>> outcomes = run_tasks(Here(function), tasks)
     """
