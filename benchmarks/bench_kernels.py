@@ -1,7 +1,8 @@
-"""Speed of the kernels on one core, on made-up views of about the size of a small tile.
+"""Speed of the kernels on one core, on synthetic views of about the size of a small tile.
 
-Compiled before they are timed. `extra_info` has the figure of each in its own unit (ns per cell, step and image, or
-cell-steps a second), the machine and the threads; SGM runs beside OpenCV's StereoSGBM of the same pixels x disparities.
+Kernels are compiled before they are timed. `extra_info` holds the figure of each in its own unit (ns per cell, step and
+image, or cell-steps per second), the machine and the number of threads. SGM is compared with OpenCV's StereoSGBM on the
+same number of pixels x disparities.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ HIGHEST = 10_000
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel on a scene of its own. call : one pass; n : units of work of a pass; unit : what is counted."""
+    """A kernel on its scene. call : runs one pass; n : units of work of a pass; unit : name of the unit."""
 
     call: Callable[[], object]
     n: int
@@ -46,7 +47,7 @@ class Case:
 
 
 def processor() -> str:
-    """Name of the processor as the system gives it."""
+    """Name of the processor, from the system."""
     listed = Path("/proc/cpuinfo")
     lines = listed.read_text().splitlines() if listed.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -54,7 +55,7 @@ def processor() -> str:
 
 
 def timed(benchmark, case: Case) -> float:
-    """CPU seconds of the best of a few calls, after one that compiles; ns and units a second go to `extra_info`."""
+    """Time a case, after a call that compiles it; ns per unit and units per second go to `extra_info`."""
     case.call()
     seconds = []
 
@@ -72,7 +73,7 @@ def timed(benchmark, case: Case) -> float:
 
 
 def views(n_views: int, side: int = SIDE):
-    """Pixels, layout, nodes and heights of views about as wide as the grid, 64 heights of half a pixel between two."""
+    """Pixels, layout, nodes and heights of synthetic views; neighbouring heights are half a pixel apart."""
     rng = np.random.default_rng(7)
     px = side + 96
     corners = np.mgrid[: side // BLOCK + 1, : side // BLOCK + 1] * BLOCK
@@ -95,7 +96,7 @@ def all_seen(n_views: int, side: int = SIDE):
 
 
 def lattice(side: int, count: int | None) -> HeightLattice:
-    """One range for all blocks, or, as on real scenes, ranges of 16 to 64 heights that differ from block to block."""
+    """A height lattice with one range for all blocks, or, as on real scenes, with 16 to 64 heights by block."""
     rng = np.random.default_rng(3)
     blocks = (side // BLOCK, side // BLOCK)
     first = np.zeros(blocks, np.int64) if count else rng.integers(0, 41, blocks)
@@ -104,7 +105,7 @@ def lattice(side: int, count: int | None) -> HeightLattice:
 
 
 def city_lattice(side: int) -> HeightLattice:
-    """Ranges as the finest level of a town has them: multiples of 4 from 4 to 156, 25 on average, 16 at the median."""
+    """A height lattice as on the finest level of a town: multiples of 4 from 4 to 156 heights, mean 25, median 16."""
     rng = np.random.default_rng(3)
     blocks = (-(-side // BLOCK),) * 2
     count = np.clip(4 * np.rint(np.exp(rng.normal(np.log(16.0), 0.95, blocks)) / 4), 4, 156).astype(np.int64)
@@ -118,7 +119,7 @@ def rolling(side: int = SIDE) -> np.ndarray:
 
 
 def resample_case() -> Case:
-    """Bilinear samples of one view on the plane of a block and its border."""
+    """Bilinear samples of one view on the plane of a block and its margin."""
     pixels, layout, _, _ = views(1)
     side = BLOCK + 6
     grid = np.array([60.3, 60.7, 0.99, 0.01, -0.02, 1.01, 0.0, 0.0])
@@ -158,7 +159,7 @@ def sums_scene(side: int, heights: HeightLattice):
 
 
 def sgm_case(count: int | None, side: int = SGM_SIDE) -> Case:
-    """Eight paths, all cells with `count` heights, or ragged ranges."""
+    """Semi-global aggregation along eight paths, with `count` heights in all cells or ragged ranges."""
     side = side // 2 if count == 128 else side
     heights = lattice(side, count)
     cost, p2, total = sums_scene(side, heights)
@@ -171,19 +172,19 @@ def sgm_case(count: int | None, side: int = SGM_SIDE) -> Case:
 
 
 def mgm_case(count: int | str | None, side: int = SGM_SIDE) -> Case:
-    """Two predecessors, eight directions; as `sgm_case`, or with the ranges of a town."""
+    """Aggregation with two predecessors (MGM), eight directions; as `sgm_case`, or with the ranges of a town."""
     heights = city_lattice(side) if count == "city" else lattice(side, count)
     cost, p2, total = sums_scene(side, heights)
 
     def call():
         for turn in range(4):
-            sweep_quarter(cost, heights.ranges, heights.address, BLOCK, p2, np.uint16(20), turn, total)
+            sweep_quarter(cost, heights.layout, p2, np.uint16(20), turn, total)
 
     return Case(call, heights.size, "cell-step")
 
 
 def winners_case(count: int | None, side: int = SGM_SIDE) -> Case:
-    """Minima of sums."""
+    """Winners: heights with the least sum of path costs."""
     heights = lattice(side, count)
     total = np.random.default_rng(5).integers(100, 2000, heights.size).astype(np.uint16)
     shape = heights.shape
@@ -197,7 +198,7 @@ def winners_case(count: int | None, side: int = SGM_SIDE) -> Case:
 
 
 def least_case(count: int | None, side: int = SGM_SIDE) -> Case:
-    """Least costs, beside the minima of sums."""
+    """Heights with the least cost of a cell itself, beside the winners of the sums."""
     heights = lattice(side, count)
     rng, (first, counts) = np.random.default_rng(5), heights.cell_ranges()
     cost = rng.integers(0, 255, heights.size).astype(np.uint8)
@@ -210,7 +211,7 @@ def least_case(count: int | None, side: int = SGM_SIDE) -> Case:
 
 
 def profile_case(side: int = SIDE) -> Case:
-    """The measure at three offsets around a surface, cubic, 5 x 5 and 9 x 9, three views."""
+    """Correlations at three offsets around a surface, cubic resampling, windows 5 x 5 and 9 x 9, three views."""
     half, offsets = 4, np.linspace(-0.5, 0.5, 3).astype(np.float32)
     surface, seen, (pixels, *scene) = np.pad(rolling(side), half, mode="edge"), all_seen(3, side), views(3, side)
     out, windows = np.empty((2, 1, len(offsets), side, side), np.float32), np.array([2, half])
@@ -222,7 +223,7 @@ def profile_case(side: int = SIDE) -> Case:
 
 
 def smooth_case(side: int = SIDE) -> Case:
-    """One pass of 25 taps, two cells apart."""
+    """Smoothing of a surface: one pass of 25 taps, two cells apart."""
     surface = rolling(side)
     by_row, by_col, out = np.empty_like(surface), np.empty_like(surface), np.empty_like(surface)
     slopes(surface, 8, by_row, by_col)
@@ -230,21 +231,21 @@ def smooth_case(side: int = SIDE) -> Case:
 
 
 def visibility_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) -> Case:
-    """What hides a surface from a view; the sweep goes by column where the view looks rather along rows."""
+    """Occlusion of a surface in one view; by_col, by_row : parallax rate, which decides the direction of the sweep."""
     surface = rolling(side)
     out = np.empty_like(surface)
     return Case(lambda: lowest_visible(surface, by_col, by_row, out), surface.size, "cell")
 
 
 def free_ray_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) -> Case:
-    """The lowest ray of a view to a surface of which it clearly sees two thirds."""
+    """The lowest ray of a view to a surface of which the view sees two thirds."""
     surface, out = rolling(side), np.empty((side, side), np.float32)
     supported = np.random.default_rng(2).random(surface.shape) < 0.67
     return Case(lambda: lowest_free_ray(surface, supported, by_col, by_row, out), surface.size, "cell")
 
 
 def ray_costs_case(side: int = SIDE, n_views: int = 6, count: int = 32) -> Case:
-    """Costs of rays on a volume, in a tenth of whose cells two views have a ray below some of the heights."""
+    """Costs of free rays on a volume; in a tenth of the cells two views have a ray below some of the heights."""
     rng = np.random.default_rng(3)
     blocks = (-(-side // BLOCK), -(-side // BLOCK))
     lattice = HeightLattice(0.0, 1.0, (side, side), BLOCK, np.zeros(blocks, np.int64), np.full(blocks, count, np.int64))
@@ -260,14 +261,14 @@ def ray_costs_case(side: int = SIDE, n_views: int = 6, count: int = 32) -> Case:
 
 
 def agreement_case(n_views: int = 6, side: int = SIDE) -> Case:
-    """How many images agree with each other on a surface, all pairs of them."""
+    """Agreement of the images on a surface, all pairs of images."""
     grey = np.random.default_rng(4).normal(size=(n_views, side, side)).astype(np.float32)
     covers = np.ones(grey.shape, np.bool_)
     return Case(lambda: pair_agreement(grey, covers), side * side * n_views * (n_views - 1) // 2, "cell and pair")
 
 
 def reach_case() -> Case:
-    """A block that the borders of three views cross at every one of 64 heights, so that each is judged cell by cell."""
+    """Visible height range of a block that the borders of three images cross at each of 64 heights (the slow case)."""
     pixels, layout, nodes, heights = views(3)
     layout[:, 2] = 48 + BLOCK // 2
     span, limits = np.array([0, 64]), np.array([[-1] * 3, [64] * 3])
@@ -283,13 +284,13 @@ def reach_case() -> Case:
 
 
 def spline_case() -> Case:
-    """Coefficients of an image."""
+    """Spline coefficients of an image."""
     image = np.random.default_rng(7).normal(size=(1200, 1000)).astype(np.float32)
     return Case(lambda: spline_coefficients(image), image.size, "pixel")
 
 
 def ortho_case(side: int = SIDE) -> Case:
-    """One view on a surface, bilinear."""
+    """Ortho-image of one view on a surface, bilinear."""
     surface, scene, out = rolling(side), views(1, side), np.empty((side, side), np.float32)
     return Case(lambda: tile_ortho(*scene, surface, 0, BLOCK, out), out.size, "cell")
 
@@ -325,7 +326,7 @@ def test_mgm(benchmark, side, count):
 
 
 def opencv_speed(side: int, n_disparities: int) -> float:
-    """Pixels x disparities a second of StereoSGBM over 8 paths, its cost included, on a pair with `side`^2 matches."""
+    """Pixels x disparities per second of StereoSGBM over 8 paths, with its cost, on a pair with `side`^2 matches."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     right = np.random.default_rng(2).integers(0, 256, (side, side + n_disparities)).astype(np.uint8)
@@ -379,7 +380,7 @@ def test_agreement(benchmark, side):
 
 
 def test_shade(benchmark, side):
-    """Shaded as hillshade.tif is, a cell in a hundred empty."""
+    """Hillshade as in hillshade.tif, with one empty cell in a hundred."""
     surface = rolling(side or SIDE)
     surface[np.random.default_rng(1).random(surface.shape) < 0.01] = np.nan
     timed(benchmark, Case(lambda: hillshade(surface, 0.5, 315.0, 45.0), surface.size, "cell"))

@@ -67,7 +67,7 @@ def zlocus(side: int, heights: int) -> Iterator[tuple[str, Callable[[], object]]
 
     def two() -> None:
         for turn in range(4):
-            sweep_quarter(cost, lattice.ranges, lattice.address, block, p2, np.uint16(P1), turn, total)
+            sweep_quarter(cost, lattice.layout, p2, np.uint16(P1), turn, total)
 
     yield "one predecessor (sgm)", one
     yield "two predecessors (mgm, the default)", two

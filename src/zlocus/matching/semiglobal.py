@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import SemiGlobalOptions
-from zlocus.matching.height_lattice import NARROW_BASE, HeightLattice
+from zlocus.matching.height_lattice import NARROW_BASE_STEP_CELLS, HeightLattice
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.penalties import jump_penalties
 from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
@@ -84,7 +84,7 @@ def aggregate(
     twice the time; with a narrow base there is little to find (a step is as high as a storey).
     """
     p1 = options.p1_two if is_pair else options.p1
-    if (options.predecessors or (1 if step_cells > NARROW_BASE else 2)) == 2:
+    if (options.predecessors or (1 if step_cells > NARROW_BASE_STEP_CELLS else 2)) == 2:
         return pick(more_global_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)
     for sign in (1, -1):
@@ -117,7 +117,7 @@ def more_global_sums(
     """
     total = np.zeros(lattice.size, np.uint16)
     for turn in range(4):
-        sweep_quarter(cost, lattice.ranges, lattice.address, lattice.block, p2, np.uint16(p1), turn, total)
+        sweep_quarter(cost, lattice.layout, p2, np.uint16(p1), turn, total)
     return total
 
 

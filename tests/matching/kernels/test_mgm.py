@@ -78,10 +78,7 @@ def test_what_lies_beyond_the_volume_has_no_effect_and_stays():
         longer = np.concatenate([cost, np.full(64, value, np.uint8)])
         total = np.concatenate([np.zeros(lattice.size, np.uint16), beyond])
         for turn in range(4):
-            sweep_quarter(
-                longer[: lattice.size], lattice.ranges, lattice.address, lattice.block, p2, np.uint16(28), turn,
-                total[: lattice.size],
-            )  # fmt: skip
+            sweep_quarter(longer[: lattice.size], lattice.layout, p2, np.uint16(28), turn, total[: lattice.size])
         np.testing.assert_array_equal(total[lattice.size :], beyond)
         sums.append(total[: lattice.size])
     np.testing.assert_array_equal(sums[0], sums[1])

@@ -1,53 +1,116 @@
-"""More-global aggregation: every path cost draws on two neighbours, one along its direction and one across it.
+"""More-global aggregation: every path cost depends on two neighbours, one along its direction and one across it.
 
 Source: Facciolo, de Franchis, Meinhardt (2015), "MGM: a significantly more global matching for stereovision", the
-recursion with two predecessors, in eight directions; penalties, ranges and sums as in `sgm.py`. Unlike there, the mean
-of the two arrivals is rounded down, for path costs are uint16; and a cell with one of the two neighbours takes it
-alone.
+recursion with two predecessors, in eight directions. Penalties, ranges and sums are those of `sgm.py`. Differences from
+the paper: the mean of the two arrivals is rounded down, because path costs are uint16; and a cell that has only one of
+the two neighbours takes the arrival from that one.
 
-Four sweeps, each the first one turned by a quarter: its lines are rows (or columns), and a cell's neighbours are the
-one before it on its line (W) and three on the line before (N, NW, NE). W and N make one path cost, NW and NE another.
-Everything is counted in the order of the sweep: `position` is a cell's place in its line, segments are the blocks of a
-line.
+There are four sweeps; each is the first one turned by a quarter. The lines of a sweep are rows or columns. A cell has
+four neighbours: the previous one on its line (W) and three on the previous line (N, NW, NE). W and N give one path cost
+("along"), NW and NE give another ("across"). Everything is counted in the order of the sweep: `position` is the place
+of a cell in its line, and the segments of a line are its blocks.
 
-Why it is fast: what a neighbour offers is worked out once, when its own path costs are known,
+Why it is fast: what a neighbour offers is computed once, as soon as its own path costs are known,
 
     offer(q, k) = min(L(q, k), L(q, k - 1) + P1, L(q, k + 1) + P1) - min L(q),
 
-and each of the cells that draw on it needs no more than min(offer, P2). Offers of a line stand cell after cell; each
-segment has a place more at both ends, for its neighbours in other segments by its own heights, so that all cells of a
-segment are alike. Heights are padded to whole vectors (costs there are FAR), so that no loop has a remainder. Costs are
-copied to a sheet in the order of the sweep, sums replace them there: addresses grow evenly and upwards from cell to
-cell, so that the compiler checks once a segment that what is read and what is written are apart; and a sheet of the
-columns of a block reads the volume row by row, not a few bytes here and there.
+and each cell that depends on it needs only min(offer, P2). The offers of a line stand cell after cell. Each segment has
+room for one more cell at both ends, for its neighbours in other segments by its own heights, so that all cells of a
+segment are treated alike. The heights are padded to whole vectors (their costs are FAR), so that no loop has a
+remainder. Costs are copied to a sheet in the order of the sweep, and sums replace them there. So addresses grow evenly
+and upwards from cell to cell, and the compiler checks once a segment that what is read does not overlap what is
+written; and the sheet of the columns of a block reads the volume row by row, not a few bytes here and there.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from zlocus.core.jit import kernel
 from zlocus.matching.kernels.sgm import FAR
 
+# Heights come in whole vectors of 16.
 LANE_BITS = 4
 LANES = 1 << LANE_BITS
-ALONG, ACROSS, KINDS, NEIGHBOURS = 0, 1, 2, 4
+ALONG, ACROSS, N_KINDS, N_NEIGHBOURS = 0, 1, 2, 4
 W, N, NW, NE = 0, 1, 2, 3
-# Of a sweep: whether its lines are columns, their order, and that of the cells on a line; how many there are.
-BY_COLUMN, LINE_SIGN, SIGN, N_LINES, N_CELLS = 0, 1, 2, 3, 4
-# Of a segment: heights, padded ones, first position and the one after the last; offset of the place before its first
-# cell among the offers of a line, and of its first cell in a line of a sheet.
-FIRST, COUNT, WIDE, LEFT, END, PLACE, SHEET = 0, 1, 2, 3, 4, 5, 6
-# Of the cells of a segment on a sheet: where they start in the volume and on the sheet; steps from row to row and from
-# cell to cell there; how many there are.
-SOURCE, SOURCE_ROW, TARGET, TARGET_ROW, TARGET_CELL, ROWS, CELLS = 0, 1, 2, 3, 4, 5, 6
-NOTHING, ONE = np.uint16(0), np.uint16(1)
+ZERO, ONE = np.uint16(0), np.uint16(1)
+
+
+class SweepDirection(NamedTuple):
+    """The order of one of the four sweeps."""
+
+    is_by_column: bool  # b1: whether its lines are columns
+    line_sign: int  # i8: -1 where the last row (or column) comes first
+    cell_sign: int  # i8: -1 where the last cell of a line comes first
+    n_lines: int  # i8
+    n_cells: int  # i8: cells of a line
+    row_offsets: np.ndarray  # (k,) i8: rows from a cell to its neighbours W, N, NW, NE
+    col_offsets: np.ndarray  # (k,) i8: columns from a cell to these neighbours
+
+
+class LineSegment(NamedTuple):
+    """One block of a line. Records are kept in the rows of an array, see `line_segment_at`."""
+
+    first: int  # i8: first height index
+    count: int  # i8: number of heights
+    width: int  # i8: number of heights with those that fill the last vector
+    position: int  # i8: position of its first cell in the line
+    end: int  # i8: position after its last cell
+    place: int  # i8: place of its room before the first cell, among the offers of a line
+    sheet_place: int  # i8: place of its first cell in a line of the sheet
+
+
+class SheetPatch(NamedTuple):
+    """Cells of one block in the volume and on a sheet. Records are kept in the rows of an array, see `patch_at`."""
+
+    source: int  # i8: place of the first cell in the volume
+    source_row: int  # i8: distance from row to row in the volume
+    target: int  # i8: place of the first cell on the sheet
+    target_row: int  # i8: distance from row to row on the sheet
+    target_cell: int  # i8: distance from cell to cell of a row on the sheet
+    n_rows: int  # i8
+    n_cells: int  # i8: cells of a row
+
+
+class LineOffers(NamedTuple):
+    """The segments of a line, and where its offers start."""
+
+    segments: np.ndarray  # (e,n) i8: records `LineSegment`; the last one has only the length of a line in its places
+    along: int  # i8: place of the offers of path costs from W and N
+    across: int  # i8: place of the offers of path costs from NW and NE
+
+
+class LineBuffers(NamedTuple):
+    """Arrays of one line."""
+
+    paths: (
+        np.ndarray
+    )  # (l,) u2: path costs of a segment, cell after cell; along in the first half, across in the second
+    min_costs: np.ndarray  # (k,n) u2: their minima over the heights, by kind and cell
+    ends: np.ndarray  # (k,e,c) u2: what each cell offers one height below its first and one above its last, by kind
+    p2: np.ndarray  # (k,c) u2: penalty of a jump into each cell, by neighbour
+
+
+class SegmentRun(NamedTuple):
+    """All cells of a segment; places of the offers of the first cell's neighbours."""
+
+    sheet_place: int  # i8: place of the first cell on the sheet
+    n_vectors: int  # i8: vectors of heights
+    n_cells: int  # i8
+    position: int  # i8: position of the first cell in its line
+    w: int  # i8
+    n: int  # i8
+    nw: int  # i8
+    ne: int  # i8
 
 
 # i8, i8, i8 -> i8
 @kernel
 def in_order(at, n, sign):
-    """Place in one order of what has the place `at` of n in the other; sign < 0 turns round."""
+    """Place in one order of what has the place `at` of n in the other; sign < 0 reverses the order."""
     return at if sign > 0 else n - 1 - at
 
 
@@ -65,22 +128,22 @@ def offered(same, down, up, p1, least):
     return np.uint16(min(same, np.uint16(min(down, up) + p1)) - least)
 
 
-# (s,) u2, i8, (o,) u2, (4,) i8, (3,) i8, (l,) u2, (2,b) u2, (4,c) u2, u2 -> None
+# (s,) u2, (o,) u2, SegmentRun, (l,) u2, (k,n) u2, (k,c) u2, u2 -> None
 @kernel
-def run_along(sheet, at, offers, spots, size, paths, least, edge, p1):
-    """Path costs of the cells of a segment, and the offers of those from W and N, which take the place of N's.
+def run_along(sheet, offers, run, paths, min_costs, p2, p1):
+    """Compute both path costs of the cells of a segment, and write their offers along to the place of N's offers.
 
-    at : of the first cell on the sheet; spots : of its neighbours' offers; size : vectors of heights, cells, and the
-    position of the first one; paths : both path costs, cell after cell, each kind in a half; least : their minima.
+    paths, min_costs, p2 : see `LineBuffers`; the first two are written.
     """
-    wide, one = np.uint64(size[0]) << np.uint64(LANE_BITS), np.uint64(1)
-    w0, n0, nw0, ne0 = np.uint64(spots[W]), np.uint64(spots[N]), np.uint64(spots[NW]), np.uint64(spots[NE])
-    s0, to0, half, position = np.uint64(at), w0 + wide, np.uint64(paths.shape[0] // KINDS), np.uint64(size[2])
-    for cell in range(np.uint64(size[1])):
+    wide, one = np.uint64(run.n_vectors) << np.uint64(LANE_BITS), np.uint64(1)
+    w0, n0, nw0, ne0 = np.uint64(run.w), np.uint64(run.n), np.uint64(run.nw), np.uint64(run.ne)
+    s0, to0, half = np.uint64(run.sheet_place), w0 + wide, np.uint64(paths.shape[0] // N_KINDS)
+    position = np.uint64(run.position)
+    for cell in range(np.uint64(run.n_cells)):
         i = position + cell
         x, y = cell * wide, one + cell * (wide + one)
         s, w, n, nw, ne, to, z = s0 + x, w0 + x, n0 + x, nw0 + x, ne0 + x, to0 + x, half + y
-        jump_w, jump_n, jump_nw, jump_ne = edge[W, i], edge[N, i], edge[NW, i], edge[NE, i]
+        jump_w, jump_n, jump_nw, jump_ne = p2[W, i], p2[N, i], p2[NW, i], p2[NE, i]
         low = low_across = np.uint16(65535)
         for k in range(wide):
             cost = sheet[s + k]
@@ -89,146 +152,198 @@ def run_along(sheet, at, offers, spots, size, paths, least, edge, p1):
             paths[y + k] = here
             paths[z + k] = across
             low, low_across = min(low, here), min(low_across, across)
-        least[ALONG, cell], least[ACROSS, cell] = low, low_across
+        min_costs[ALONG, cell], min_costs[ACROSS, cell] = low, low_across
         for k in range(wide):
             offers[to + k] = offered(paths[y + k], paths[y + k - one], paths[y + k + one], p1, low)
 
 
-# (s,) u2, i8, (o,) u2, i8, (3,) i8, (l,) u2, (2,b) u2, u2 -> None
+# (s,) u2, (o,) u2, SegmentRun, i8, (l,) u2, (k,n) u2, u2 -> None
 @kernel
-def run_across(sheet, at, offers, spot, size, paths, least, p1):
-    """Offers of the cells of a segment to the next line, from `spot` on; sums of both path costs to the sheet."""
-    wide, one = np.uint64(size[0]) << np.uint64(LANE_BITS), np.uint64(1)
-    s0, to0, half = np.uint64(at), np.uint64(spot), np.uint64(paths.shape[0] // KINDS)
-    for cell in range(np.uint64(size[1])):
+def run_across(sheet, offers, run, target, paths, min_costs, p1):
+    """Write the offers across of the cells of a segment to `target` of the offers, and both path costs' sums to the
+    sheet."""
+    wide, one = np.uint64(run.n_vectors) << np.uint64(LANE_BITS), np.uint64(1)
+    s0, to0, half = np.uint64(run.sheet_place), np.uint64(target), np.uint64(paths.shape[0] // N_KINDS)
+    for cell in range(np.uint64(run.n_cells)):
         x, y = cell * wide, one + cell * (wide + one)
-        s, to, z, low = s0 + x, to0 + x, half + y, least[ACROSS, cell]
+        s, to, z, low = s0 + x, to0 + x, half + y, min_costs[ACROSS, cell]
         for k in range(wide):
             offers[to + k] = offered(paths[z + k], paths[z + k - one], paths[z + k + one], p1, low)
             sheet[s + k] = np.uint16(paths[y + k] + paths[z + k])
 
 
-# (l,) u2, i8, i8, i8, i8, i8, i8, (2,b) u2, u2, (2,2,c) u2 -> None
+# LineSegment, i8, (l,) u2, (k,n) u2, u2, (k,e,c) u2 -> None
 @kernel
-def keep_ends(paths, count, wide, left, first, step, n_cells, least, p1, ends):
-    """What cells first, first + step, ... of a segment offer one height below theirs and one above."""
-    for kind in range(KINDS):
-        for cell in range(first, n_cells, step):
-            at = kind * (paths.shape[0] // KINDS) + 1 + cell * (wide + 1)
-            ends[kind, 0, left + cell] = np.uint16(np.uint16(paths[at] + p1) - least[kind, cell])
-            ends[kind, 1, left + cell] = np.uint16(np.uint16(paths[at + count - 1] + p1) - least[kind, cell])
+def keep_ends(segment, stride, paths, min_costs, p1, ends):
+    """Write what every stride-th cell of a segment offers one height below its first one and one above its last."""
+    for kind in range(N_KINDS):
+        for cell in range(0, segment.end - segment.position, stride):
+            at = kind * (paths.shape[0] // N_KINDS) + 1 + cell * (segment.width + 1)
+            i = segment.position + cell
+            ends[kind, 0, i] = np.uint16(np.uint16(paths[at] + p1) - min_costs[kind, cell])
+            ends[kind, 1, i] = np.uint16(np.uint16(paths[at + segment.count - 1] + p1) - min_costs[kind, cell])
 
 
-# (o,) u2, i8, (7,t) i8, i8, (2,2,c) u2, i8, i8, i8, (7,t) i8, i8 -> None
+# (o,) u2, i8, LineSegment, i8, (e,c) u2, i8, LineSegment -> None
 @kernel
-def restate(offers, source, segments, e, ends, kind, position, target, others, f):
-    """Copy what the cell at `position` of segment e offers to `target`, by the heights of segment f of another line.
+def copy_offers(offers, source, segment, position, ends, target, other):
+    """Copy what a cell offers to another line or segment, by the heights of the segment `other` there.
 
-    source, target : of the line's offers of this kind; heights out of reach are FAR, only a jump (P2) leads there.
-    The copy goes to the place of that position on a line, which is one more at both ends of a segment.
+    segment, position : of the cell; source, target : places of the offers of both lines, of one kind; ends : see
+    `LineBuffers`, of that kind. Heights that the cell did not search are FAR: only a jump (P2) leads there. The copy
+    goes to the place of that position on a line, which is the room at the end of a segment for cells beyond it.
     """
-    shift, wide = others[FIRST, f] - segments[FIRST, e], others[WIDE, f]
-    count, last = segments[COUNT, e], segments[COUNT, e] - shift
-    here = source + segments[PLACE, e] + (1 + position - segments[LEFT, e]) * segments[WIDE, e] + shift
-    there = target + others[PLACE, f] + (1 + position - others[LEFT, f]) * wide
+    shift, wide = other.first - segment.first, other.width
+    count, last = segment.count, segment.count - shift
+    here = source + segment.place + (1 + position - segment.position) * segment.width + shift
+    there = target + other.place + (1 + position - other.position) * wide
     for k in range(wide):
         offers[there + k] = FAR
     for k in range(max(0, -shift), min(wide, count - shift)):
         offers[there + k] = offers[here + k]
     if 0 <= -1 - shift < wide:
-        offers[there - 1 - shift] = ends[kind, 0, position]
+        offers[there - 1 - shift] = ends[0, position]
     if 0 <= last < wide:
-        offers[there + last] = ends[kind, 1, position]
+        offers[there + last] = ends[1, position]
 
 
-# (2,b,d) i8, i8, (5,) i8, i8, (7,t) i8, (t,v) u2 -> None
+# (e,n) i8, i8 -> LineSegment
 @kernel
-def line_segments(ranges, b, way, block, segments, pads):
-    """Segments of the lines of block row (or column) b, and what is added to costs at each: FAR above the last height.
+def line_segment_at(segments, e):
+    """The record in row e of an array of segments."""
+    return LineSegment(
+        segments[e, 0], segments[e, 1], segments[e, 2], segments[e, 3], segments[e, 4], segments[e, 5], segments[e, 6]
+    )
 
-    The last but one of t has only the length of a line, as PLACE of its offers and on a SHEET.
+
+# (e,n) i8, i8, LineSegment -> None
+@kernel
+def put_line_segment(segments, e, segment):
+    """Write a record to row e of an array of segments."""
+    segments[e, 0], segments[e, 1], segments[e, 2] = segment.first, segment.count, segment.width
+    segments[e, 3], segments[e, 4] = segment.position, segment.end
+    segments[e, 5], segments[e, 6] = segment.place, segment.sheet_place
+
+
+# VolumeLayout, i8, SweepDirection, (e,n) i8, (t,v) u2 -> None
+@kernel
+def put_line_segments(layout, b, direction, segments, pads):
+    """Write the segments of the lines of block row (or column) b, and what is added to the costs of each.
+
+    pads : 0 for its heights, FAR for those that fill the last vector. After the segments stands a record whose places
+    are the lengths of a line.
     """
-    n = segments.shape[1] - 1
-    left, place, sheet = 0, 0, 0
+    n, block = segments.shape[0] - 1, layout.block
+    position, place, sheet_place = 0, 0, 0
     for e in range(n):
-        d = in_order(e, n, way[SIGN])
-        br, bc = (d, b) if way[BY_COLUMN] else (b, d)
-        count, n_cells = ranges[1, br, bc], min(block, way[N_CELLS] - d * block)
+        d = in_order(e, n, direction.cell_sign)
+        br, bc = (d, b) if direction.is_by_column else (b, d)
+        count, n_cells = layout.count[br, bc], min(block, direction.n_cells - d * block)
         wide = -(-count // LANES) * LANES
-        segments[FIRST, e], segments[COUNT, e], segments[WIDE, e] = ranges[0, br, bc], count, wide
-        segments[LEFT, e], segments[END, e] = left, left + n_cells
-        segments[PLACE, e], segments[SHEET, e] = place, sheet
-        left, place, sheet = left + n_cells, place + (n_cells + 2) * wide, sheet + n_cells * wide
+        put_line_segment(
+            segments, e,
+            LineSegment(layout.first[br, bc], count, wide, position, position + n_cells, place, sheet_place),
+        )  # fmt: skip
+        position, place, sheet_place = position + n_cells, place + (n_cells + 2) * wide, sheet_place + n_cells * wide
         for k in range(pads.shape[1]):
             pads[e, k] = 0 if k < count else FAR
-    segments[PLACE, n], segments[SHEET, n] = place, sheet
+    put_line_segment(segments, n, LineSegment(0, 0, 0, 0, 0, place, sheet_place))
 
 
-# (4,r,c) u2, i8, (5,) i8, b1, (4,) i8, (4,) i8, (4,p) u2 -> None
+# (4,r,c) u2, i8, SweepDirection, b1, (k,c) u2 -> None
 @kernel
-def line_edges(p2, line, way, is_first, rows, cols, edge):
-    """P2 of the steps from the neighbours (row and column offsets) into each cell of a line, in the order of the sweep.
+def penalties_of_line(p2, line, direction, is_first, out):
+    """Write the P2 of the steps from the neighbours into each cell of a line, in the order of the sweep.
 
-    `p2` has the steps from W, NW, N and NE; those from the other side are stored at the cell they come from. A
-    neighbour that is missing has the P2 of its partner, two have 0: nothing is added to the costs.
+    `p2` has the steps from W, NW, N and NE; those from the other side are stored at the cell that they come from. A
+    neighbour that is missing has the P2 of its partner; where both are missing P2 is 0, and nothing is added to the
+    costs.
     """
-    n, flat = edge.shape[1], p2.ravel()
-    for path in range(NEIGHBOURS):
-        dr, dc = rows[path], cols[path]
-        is_behind = dr < 0 or (dr == 0 and dc < 0)
-        plane = 0 if dr == 0 else 2 + (dc if is_behind else -dc)
-        from_r, from_c = (0, 0) if is_behind else (dr, dc)
+    n, flat, sign = out.shape[1], p2.ravel(), direction.cell_sign
+    for path in range(N_NEIGHBOURS):
+        dr, dc = direction.row_offsets[path], direction.col_offsets[path]
+        is_stored_here = dr < 0 or (dr == 0 and dc < 0)
+        plane = 0 if dr == 0 else 2 + (dc if is_stored_here else -dc)
+        from_r, from_c = (0, 0) if is_stored_here else (dr, dc)
         low, high = 1 if path in (W, NW) else 0, n - 1 if path == NE else n
         if is_first and path != W:
             low, high = 0, 0
-        at = in_order(0, n, way[SIGN])
-        r, c = (at, line) if way[BY_COLUMN] else (line, at)
+        at = in_order(0, n, sign)
+        r, c = (at, line) if direction.is_by_column else (line, at)
         start = (plane * p2.shape[1] + r + from_r) * p2.shape[2] + c + from_c
-        step = way[SIGN] * (p2.shape[2] if way[BY_COLUMN] else 1)
+        step = sign * (p2.shape[2] if direction.is_by_column else 1)
         for i in range(n):
-            edge[path, i] = 0
+            out[path, i] = 0
         for i in range(low, high):
-            edge[path, i] = flat[np.uint64(start + i * step)]
-    edge[W, 0], edge[NW, 0], edge[NE, n - 1] = edge[N, 0], edge[NE, 0], edge[NW, n - 1]
+            out[path, i] = flat[np.uint64(start + i * step)]
+    out[W, 0], out[NW, 0], out[NE, n - 1] = out[N, 0], out[NE, 0], out[NW, n - 1]
     if is_first:
         for i in range(n):
-            edge[N, i] = edge[W, i]
+            out[N, i] = out[W, i]
 
 
-# (3,b,d) i8, i8, i8, (5,) i8, (2,) i8, (7,t) i8, (7,t) i8 -> None
+# (e,n) i8, i8 -> SheetPatch
 @kernel
-def find_patches(address, block, line, way, shape, segments, patches):
-    """The cells of each segment, and of all lines of its block where lines are columns, in the volume and on a sheet.
+def patch_at(patches, e):
+    """The record in row e of an array of patches."""
+    return SheetPatch(
+        patches[e, 0], patches[e, 1], patches[e, 2], patches[e, 3], patches[e, 4], patches[e, 5], patches[e, 6]
+    )
+
+
+# (e,n) i8, i8, SheetPatch -> None
+@kernel
+def put_patch(patches, e, patch):
+    """Write a record to row e of an array of patches."""
+    patches[e, 0], patches[e, 1], patches[e, 2], patches[e, 3] = (
+        patch.source, patch.source_row, patch.target, patch.target_row
+    )  # fmt: skip
+    patches[e, 4], patches[e, 5], patches[e, 6] = patch.target_cell, patch.n_rows, patch.n_cells
+
+
+# VolumeLayout, i8, SweepDirection, (k,) i8, (e,n) i8, (e,n) i8 -> None
+@kernel
+def put_patches(layout, line, direction, shape, segments, patches):
+    """Write a patch for each segment: its cells on a line, or on all lines of its block where the lines are columns.
 
     shape : rows and columns of the volume.
     """
-    n = segments.shape[1] - 1
+    n, block = segments.shape[0] - 1, layout.block
+    line_length = line_segment_at(segments, n).sheet_place
     for e in range(n):
-        d, b = in_order(e, n, way[SIGN]), line // block
-        br, bc = (d, b) if way[BY_COLUMN] else (b, d)
-        top, wide = br * block if way[BY_COLUMN] else line, way[SIGN] * segments[WIDE, e]
-        n_rows, n_cells = min(block, shape[0] - top) if way[BY_COLUMN] else 1, min(block, shape[1] - bc * block)
-        by_row, by_cell = (wide, way[LINE_SIGN] * segments[SHEET, n]) if way[BY_COLUMN] else (0, wide)
-        patches[SOURCE, e] = address[0, br, bc] + (top - br * block) * address[1, br, bc] + address[2, br, bc]
-        patches[SOURCE_ROW, e] = address[1, br, bc]
-        patches[TARGET, e] = segments[SHEET, e] - min(0, by_row) * (n_rows - 1) - min(0, by_cell) * (n_cells - 1)
-        patches[TARGET_ROW, e], patches[TARGET_CELL, e] = by_row, by_cell
-        patches[ROWS, e], patches[CELLS, e] = n_rows, n_cells
+        segment = line_segment_at(segments, e)
+        d, b = in_order(e, n, direction.cell_sign), line // block
+        br, bc = (d, b) if direction.is_by_column else (b, d)
+        top = br * block if direction.is_by_column else line
+        along, across = direction.cell_sign * segment.width, direction.line_sign * line_length
+        n_rows = min(block, shape[0] - top) if direction.is_by_column else 1
+        n_cells = min(block, shape[1] - bc * block)
+        by_row, by_cell = (along, across) if direction.is_by_column else (0, along)
+        row_start = layout.block_row_start[br, bc] + (top - br * block) * layout.row_length[br, bc]
+        put_patch(
+            patches, e,
+            SheetPatch(
+                row_start + layout.block_start[br, bc], layout.row_length[br, bc],
+                segment.sheet_place - min(0, by_row) * (n_rows - 1) - min(0, by_cell) * (n_cells - 1),
+                by_row, by_cell, n_rows, n_cells,
+            ),
+        )  # fmt: skip
 
 
-# (v,) u1, (7,t) i8, i8, i8, (v,) u2, (b,) i8, (s,) u2 -> None
+# (v,) u1, SheetPatch, i8, (v,) u2, (b,) i8, (s,) u2 -> None
 @kernel
-def lay_costs(cost, patches, e, count, pad, steps, sheet):
-    """Copy the costs of cells to a sheet, with FAR above the last height; steps : from the first cell of a row to each.
+def lay_costs(cost, patch, count, pad, steps, sheet):
+    """Copy the costs of the cells of a patch to a sheet, with FAR above the last height.
 
-    Steps are read from a table: were they computed, the compiler would take height after height where they may lead
+    count : number of heights; pad : see `put_line_segments`; steps : distance from the first cell of a row to each.
+    The steps are read from a table: if they were computed, the compiler would not vectorise where they may lead
     downwards.
     """
     wide = np.uint64(pad.shape[0] >> LANE_BITS) << np.uint64(LANE_BITS)
-    for row in range(patches[ROWS, e]):
-        source = patches[SOURCE, e] + row * patches[SOURCE_ROW, e]
-        target = patches[TARGET, e] + row * patches[TARGET_ROW, e]
-        for cell in range(patches[CELLS, e]):
+    for row in range(patch.n_rows):
+        source = patch.source + row * patch.source_row
+        target = patch.target + row * patch.target_row
+        for cell in range(patch.n_cells):
             s, to = np.uint64(source + cell * count), np.uint64(target + steps[cell])
             if source + cell * count + pad.shape[0] <= cost.shape[0]:
                 for k in range(wide):
@@ -238,143 +353,173 @@ def lay_costs(cost, patches, e, count, pad, steps, sheet):
                     sheet[to + k] = np.uint16(cost[s + k]) if k < np.uint64(count) else FAR
 
 
-# (s,) u2, (7,t) i8, i8, i8, (v,) u2, (b,) i8, (v,) u2 -> None
+# (s,) u2, SheetPatch, i8, (v,) u2, (b,) i8, (v,) u2 -> None
 @kernel
-def add_sums(sheet, patches, e, count, pad, steps, total):
-    """Add the sums of cells on a sheet, as `lay_costs` laid it; nothing is added to the next cell's heights."""
+def add_sums(sheet, patch, count, pad, steps, total):
+    """Add the sums on a sheet, laid out as by `lay_costs`, to those of the volume; the next cell's heights do not
+    change."""
     wide = np.uint64(pad.shape[0] >> LANE_BITS) << np.uint64(LANE_BITS)
-    for row in range(patches[ROWS, e]):
-        source = patches[SOURCE, e] + row * patches[SOURCE_ROW, e]
-        target = patches[TARGET, e] + row * patches[TARGET_ROW, e]
-        for cell in range(patches[CELLS, e]):
+    for row in range(patch.n_rows):
+        source = patch.source + row * patch.source_row
+        target = patch.target + row * patch.target_row
+        for cell in range(patch.n_cells):
             s, to = np.uint64(source + cell * count), np.uint64(target + steps[cell])
             if source + cell * count + pad.shape[0] <= total.shape[0]:
                 for k in range(wide):
                     here = sheet[to + k]
-                    total[s + k] = np.uint16(total[s + k] + (here if pad[k] == NOTHING else NOTHING))
+                    total[s + k] = np.uint16(total[s + k] + (here if pad[k] == ZERO else ZERO))
             else:
                 for k in range(np.uint64(count)):
                     total[s + k] = np.uint16(total[s + k] + sheet[to + k])
 
 
-# (v,) u1, (v,) u2, (7,t) i8, (7,t) i8, (t,v) u2, b1, (s,) u2 -> None
+# SheetPatch, (b,) i8 -> None
 @kernel
-def exchange(cost, total, patches, segments, pads, is_done, sheet):
-    """Lay the costs of all segments on a sheet, or add what the sweep has made of them."""
-    steps = np.empty(patches[CELLS].max(), np.int64)
-    for e in range(patches.shape[1] - 1):
-        for cell in range(patches[CELLS, e]):
-            steps[cell] = cell * patches[TARGET_CELL, e]
-        pad = pads[e, : segments[WIDE, e]]
-        if is_done:
-            add_sums(sheet, patches, e, segments[COUNT, e], pad, steps, total)
-        else:
-            lay_costs(cost, patches, e, segments[COUNT, e], pad, steps, sheet)
+def find_steps(patch, steps):
+    """Write the distance on the sheet from the first cell of a row to each."""
+    for cell in range(patch.n_cells):
+        steps[cell] = cell * patch.target_cell
 
 
-# (o,) u2, (2,) i8, (7,t) i8, (2,) i8, (7,t) i8, (2,2,c) u2, b1 -> None
+# (v,) u1, (e,n) i8, (e,n) i8, (t,v) u2, (b,) i8, (s,) u2 -> None
 @kernel
-def meet_line(offers, before, others, now, segments, ends, is_new):
-    """What the cells of the line before offer, by the heights of the segments of this one.
+def lay_sheet(cost, patches, segments, pads, steps, sheet):
+    """Copy the costs of all segments to a sheet. steps : (b,), room for those of a row of a block."""
+    for e in range(patches.shape[0] - 1):
+        patch, segment = patch_at(patches, e), line_segment_at(segments, e)
+        find_steps(patch, steps)
+        lay_costs(cost, patch, segment.count, pads[e, : segment.width], steps, sheet)
 
-    before, now : where the offers of a line start, by kind. If this line has other segments (`is_new`) all are copied,
-    else those at the borders of the segments. Offers of a missing neighbour are those of its partner.
+
+# (s,) u2, (e,n) i8, (e,n) i8, (t,v) u2, (b,) i8, (v,) u2 -> None
+@kernel
+def add_sheet(sheet, patches, segments, pads, steps, total):
+    """Add the sums of all segments on a sheet to those of the volume."""
+    for e in range(patches.shape[0] - 1):
+        patch, segment = patch_at(patches, e), line_segment_at(segments, e)
+        find_steps(patch, steps)
+        add_sums(sheet, patch, segment.count, pads[e, : segment.width], steps, total)
+
+
+# (o,) u2, LineOffers, LineOffers, (k,e,c) u2, b1 -> None
+@kernel
+def copy_from_previous_line(offers, previous, line, ends, has_new_segments):
+    """Copy what the cells of the previous line offer, by the heights of the segments of this line.
+
+    If this line has other segments all offers are copied, else only those at the ends of the segments. The offers of a
+    missing neighbour are those of its partner.
     """
-    n = segments.shape[1] - 1
+    n = line.segments.shape[0] - 1
+    ends_along, ends_across = ends[ALONG], ends[ACROSS]
     for e in range(n):
-        if is_new:
-            for kind in range(KINDS):
-                for position in range(others[LEFT, e], others[END, e]):
-                    restate(offers, before[kind], others, e, ends, kind, position, now[kind], segments, e)
+        other, segment = line_segment_at(previous.segments, e), line_segment_at(line.segments, e)
+        if has_new_segments:
+            for i in range(other.position, other.end):
+                copy_offers(offers, previous.along, other, i, ends_along, line.along, segment)
+            for i in range(other.position, other.end):
+                copy_offers(offers, previous.across, other, i, ends_across, line.across, segment)
         if e > 0:
-            restate(offers, before[ACROSS], others, e, ends, ACROSS, others[LEFT, e], now[ACROSS], segments, e - 1)
+            target = line_segment_at(line.segments, e - 1)
+            copy_offers(offers, previous.across, other, other.position, ends_across, line.across, target)
         if e < n - 1:
-            restate(offers, before[ACROSS], others, e, ends, ACROSS, others[END, e] - 1, now[ACROSS], segments, e + 1)
-    for k in range(segments[WIDE, 0]):
-        offers[now[ALONG] + k] = offers[now[ALONG] + segments[WIDE, 0] + k]
-        offers[now[ACROSS] + k] = offers[now[ACROSS] + 2 * segments[WIDE, 0] + k]
-    after, wide = now[ACROSS] + segments[PLACE, n] - segments[WIDE, n - 1], segments[WIDE, n - 1]
-    for k in range(wide):
-        offers[after + k] = offers[after - 2 * wide + k]
+            target = line_segment_at(line.segments, e + 1)
+            copy_offers(offers, previous.across, other, other.end - 1, ends_across, line.across, target)
+    width = line_segment_at(line.segments, 0).width
+    for k in range(width):
+        offers[line.along + k] = offers[line.along + width + k]
+        offers[line.across + k] = offers[line.across + 2 * width + k]
+    width = line_segment_at(line.segments, n - 1).width
+    after = line.across + line_segment_at(line.segments, n).place - width
+    for k in range(width):
+        offers[after + k] = offers[after - 2 * width + k]
 
 
-# (s,) u2, i8, (o,) u2, (2,) i8, (7,t) i8, b1, b1, (l,) u2, (2,b) u2, (4,c) u2, u2, (2,2,c) u2 -> None
+# (s,) u2, i8, (o,) u2, LineOffers, b1, b1, LineBuffers, u2 -> None
 @kernel
-def run_line(sheet, at, offers, now, segments, is_first, is_last, paths, least, edge, p1, ends):
-    """Path costs and offers of a line, whose costs start at `at` of the sheet; their sums take the place of the costs.
+def run_line(sheet, sheet_place, offers, line, is_first, is_last, buffers, p1):
+    """Compute path costs and offers of a line, whose costs start at `sheet_place`; sums replace the costs there.
 
-    is_first : no line is before it; is_last : the next one may have other segments.
+    is_first : whether there is no previous line; is_last : whether the next line may have other segments.
     """
-    spots, size = np.empty(NEIGHBOURS, np.int64), np.empty(3, np.int64)
-    half = paths.shape[0] // KINDS
-    for e in range(segments.shape[1] - 1):
-        left, count, wide = segments[LEFT, e], segments[COUNT, e], segments[WIDE, e]
-        n_cells = segments[END, e] - left
+    paths, min_costs, ends, p2 = buffers.paths, buffers.min_costs, buffers.ends, buffers.p2
+    half, segments, ends_along = paths.shape[0] // N_KINDS, line.segments, ends[ALONG]
+    for e in range(segments.shape[0] - 1):
+        segment = line_segment_at(segments, e)
+        wide, n_cells = segment.width, segment.end - segment.position
         if e > 0:
-            restate(offers, now[ALONG], segments, e - 1, ends, ALONG, left - 1, now[ALONG], segments, e)
+            before = line_segment_at(segments, e - 1)
+            copy_offers(offers, line.along, before, segment.position - 1, ends_along, line.along, segment)
         for cell in range(n_cells + 1):
             paths[cell * (wide + 1)], paths[half + cell * (wide + 1)] = FAR, FAR
-        spots[W], spots[NW] = now[ALONG] + segments[PLACE, e], now[ACROSS] + segments[PLACE, e]
-        spots[N], spots[NE] = spots[W] + (0 if is_first else wide), spots[NW] + 2 * wide
-        size[0], size[1], size[2] = wide >> LANE_BITS, n_cells, left
-        start = at + segments[SHEET, e]
-        run_along(sheet, start, offers, spots, size, paths, least, edge, p1)
-        run_across(sheet, start, offers, spots[NW] + wide, size, paths, least, p1)
-        keep_ends(paths, count, wide, left, 0, 1 if is_last else max(1, n_cells - 1), n_cells, least, p1, ends)
+        w, nw = line.along + segment.place, line.across + segment.place
+        run = SegmentRun(
+            sheet_place + segment.sheet_place, wide >> LANE_BITS, n_cells, segment.position,
+            w, w + (0 if is_first else wide), nw, nw + 2 * wide,
+        )  # fmt: skip
+        run_along(sheet, offers, run, paths, min_costs, p2, p1)
+        run_across(sheet, offers, run, nw + wide, paths, min_costs, p1)
+        keep_ends(segment, 1 if is_last else max(1, n_cells - 1), paths, min_costs, p1, ends)
 
 
-# i8, i8, i8, (4,) i8, (4,) i8 -> (5,) i8
+# i8, i8, i8 -> SweepDirection
 @kernel
-def turned(turn, n_rows, n_cols, rows, cols):
-    """The sweep after some quarter turns; row and column offsets of the neighbours are turned with it."""
-    by_column = turn % 2 == 1
+def turned(turn, n_rows, n_cols):
+    """The order of the sweep after some quarter turns clockwise. The first one goes down, its lines to the right."""
+    rows, cols = np.array([0, -1, -1, -1]), np.array([-1, 0, -1, 1])
+    is_by_column = turn % 2 == 1
     for _ in range(turn):
-        for path in range(NEIGHBOURS):
+        for path in range(N_NEIGHBOURS):
             rows[path], cols[path] = cols[path], -rows[path]
-    way = np.empty(5, np.int64)
-    way[BY_COLUMN] = 1 if by_column else 0
-    way[LINE_SIGN] = -cols[N] if by_column else -rows[N]
-    way[SIGN] = -rows[W] if by_column else -cols[W]
-    way[N_LINES], way[N_CELLS] = (n_cols, n_rows) if by_column else (n_rows, n_cols)
-    return way
+    line_sign = -cols[N] if is_by_column else -rows[N]
+    cell_sign = -rows[W] if is_by_column else -cols[W]
+    n_lines, n_cells = (n_cols, n_rows) if is_by_column else (n_rows, n_cols)
+    return SweepDirection(is_by_column, line_sign, cell_sign, n_lines, n_cells, rows, cols)
 
 
-# (v,) u1, (2,b,d) i8, (3,b,d) i8, i8, (4,r,c) u2, u2, i8, (v,) u2 -> None
+# i8, i8, i8 -> LineBuffers
 @kernel
-def sweep_quarter(cost, ranges, address, block, p2, p1, turn, total):
+def new_buffers(n_cells, block, widest):
+    """Arrays of a line of n_cells. widest : heights of a segment, at most."""
+    return LineBuffers(
+        np.full(N_KINDS * (1 + block * (widest + 1)), FAR, np.uint16), np.zeros((N_KINDS, block), np.uint16),
+        np.zeros((N_KINDS, 2, n_cells), np.uint16), np.zeros((N_NEIGHBOURS, n_cells), np.uint16),
+    )  # fmt: skip
+
+
+# (v,) u1, VolumeLayout, (4,r,c) u2, u2, i8, (v,) u2 -> None
+@kernel
+def sweep_quarter(cost, layout, p2, p1, turn, total):
     """Add the path costs of two directions to `total`. turn : quarter turns clockwise from (W, N) and (NW, NE).
 
-    p2 : (4, r, c) uint16, penalty of the jump into a cell from W, NW, N, NE.
+    cost : (v,) uint8; p2 : (4, r, c) uint16, penalty of the jump into a cell from W, NW, N, NE; total : (v,) uint16.
     """
-    rows, cols, shape = np.array([0, -1, -1, -1]), np.array([-1, 0, -1, 1]), np.array(p2.shape[1:])
-    way = turned(turn, shape[0], shape[1], rows, cols)
-    n_lines, n_cells = way[N_LINES], way[N_CELLS]
-    n_segments, widest = -(-n_cells // block), -(-ranges[1].max() // LANES) * LANES
+    shape, block = np.array(p2.shape[1:]), layout.block
+    direction = turned(turn, shape[0], shape[1])
+    n_lines, n_cells = direction.n_lines, direction.n_cells
+    n_segments, widest = -(-n_cells // block), -(-layout.count.max() // LANES) * LANES
     length = (n_cells + 2 * n_segments) * widest
-    offers, starts = np.zeros(2 * KINDS * length, np.uint16), (np.arange(2 * KINDS) * length).reshape((2, KINDS))
-    paths = np.full(KINDS * (1 + block * (widest + 1)), FAR, np.uint16)
-    least, ends = np.zeros((KINDS, block), np.uint16), np.zeros((KINDS, 2, n_cells), np.uint16)
-    edge, pads = np.zeros((NEIGHBOURS, n_cells), np.uint16), np.zeros((n_segments, widest), np.uint16)
-    segments, patches = np.zeros((2, 7, n_segments + 1), np.int64), np.zeros((7, n_segments + 1), np.int64)
-    sheet = np.empty((block if way[BY_COLUMN] else 1) * n_cells * widest, np.uint16)
-    now = at = np.int64(0)
+    offers, buffers = np.zeros(2 * N_KINDS * length, np.uint16), new_buffers(n_cells, block, widest)
+    pads, steps = np.zeros((n_segments, widest), np.uint16), np.empty(block, np.int64)
+    segments, patches = np.zeros((2, n_segments + 1, 7), np.int64), np.zeros((n_segments + 1, 7), np.int64)
+    sheet = np.empty((block if direction.is_by_column else 1) * n_cells * widest, np.uint16)
+    now = place = np.int64(0)
     for i in range(n_lines):
-        line, before = in_order(i, n_lines, way[LINE_SIGN]), now
-        is_new = i == 0 or line // block != (line - way[LINE_SIGN]) // block
-        is_last = i == n_lines - 1 or line // block != (line + way[LINE_SIGN]) // block
+        line, before = in_order(i, n_lines, direction.line_sign), now
+        is_new = i == 0 or line // block != (line - direction.line_sign) // block
+        is_last = i == n_lines - 1 or line // block != (line + direction.line_sign) // block
         if is_new:
             now = 1 - now
-            line_segments(ranges, line // block, way, block, segments[now], pads)
-        if is_new or not way[BY_COLUMN]:
-            at = np.int64(0)
-            find_patches(address, block, line, way, shape, segments[now], patches)
-            exchange(cost, total, patches, segments[now], pads, False, sheet)
-        line_edges(p2, line, way, i == 0, rows, cols, edge)
+            put_line_segments(layout, line // block, direction, segments[now], pads)
+        if is_new or not direction.is_by_column:
+            place = np.int64(0)
+            put_patches(layout, line, direction, shape, segments[now], patches)
+            lay_sheet(cost, patches, segments[now], pads, steps, sheet)
+        penalties_of_line(p2, line, direction, i == 0, buffers.p2)
+        here = LineOffers(segments[now], 2 * now * length, (2 * now + 1) * length)
         if i > 0:
-            meet_line(offers, starts[before], segments[before], starts[now], segments[now], ends, is_new)
-        run_line(
-            sheet, at, offers, starts[now], segments[now], i == 0, is_last, paths, least, edge, p1, ends
-        )  # fmt: skip
-        at += segments[now, SHEET, n_segments]
-        if is_last or not way[BY_COLUMN]:
-            exchange(cost, total, patches, segments[now], pads, True, sheet)
+            previous = LineOffers(segments[before], 2 * before * length, (2 * before + 1) * length)
+            copy_from_previous_line(offers, previous, here, buffers.ends, is_new)
+        run_line(sheet, place, offers, here, i == 0, is_last, buffers, p1)
+        place += line_segment_at(segments[now], n_segments).sheet_place
+        if is_last or not direction.is_by_column:
+            add_sheet(sheet, patches, segments[now], pads, steps, total)
