@@ -84,11 +84,9 @@ class LineOffers(NamedTuple):
 
 
 class LineBuffers(NamedTuple):
-    """Arrays of one line."""
+    """Arrays of one line. The path costs along stand in the first half of `paths`, those across in the second."""
 
-    paths: (
-        np.ndarray
-    )  # (l,) u2: path costs of a segment, cell after cell; along in the first half, across in the second
+    paths: np.ndarray  # (l,) u2: path costs of a segment, cell after cell
     min_costs: np.ndarray  # (k,n) u2: their minima over the heights, by kind and cell
     ends: np.ndarray  # (k,e,c) u2: what each cell offers one height below its first and one above its last, by kind
     p2: np.ndarray  # (k,c) u2: penalty of a jump into each cell, by neighbour
