@@ -10,7 +10,7 @@ import gc, sys
 from zlocus.core import startup
 startup.prepare()
 import zlocus.pipeline.dsm, pyogrio.raw
-print(gc.isenabled(), gc.get_threshold()[0] == startup.NEW_OBJECTS, sys.modules["pandas"], sys.modules["dask"])
+print(gc.isenabled(), gc.get_threshold()[0] == startup.OBJECTS_PER_COLLECTION, sys.modules["pandas"], sys.modules["dask"])
 heavy = {"matplotlib", "scipy.ndimage", "zlocus.pipeline.report_inputs", "zlocus.evaluation.evaluate"}
 print(*sorted(heavy & set(sys.modules)))
 """
@@ -21,7 +21,7 @@ from zlocus.core import startup
 try:
     cli.main(["config"])
 except SystemExit:
-    print(gc.get_threshold()[0] == startup.NEW_OBJECTS, sys.modules.get("pandas", "there"), file=sys.stderr)
+    print(gc.get_threshold()[0] == startup.OBJECTS_PER_COLLECTION, sys.modules.get("pandas", "there"), file=sys.stderr)
 """
 LIBRARY = """
 import gc, sys

@@ -1,10 +1,10 @@
-"""One family of errors: every message says what, where and what to do next."""
+"""The errors of zlocus: every message says what happened, where, and what to do next."""
 
 from __future__ import annotations
 
 
 class ZlocusError(Exception):
-    """Anything zlocus can explain in one sentence; `exit_status` is what the command line returns."""
+    """An error that one sentence explains. `exit_status` : status with which the command line ends."""
 
     exit_status = 1
 
@@ -34,20 +34,20 @@ class OutputError(ZlocusError):
 
 
 class CoverageError(ZlocusError):
-    """Too little was matched to call the run a success; what is done is kept."""
+    """Too little was matched to call the run a success; the results are kept."""
 
     exit_status = 3
 
 
 class StoppedError(ZlocusError):
-    """A run that ended before its surface was whole; what is done is kept."""
+    """A run that stopped before its surface was complete; finished tiles are kept."""
 
     exit_status = 3
 
 
 class TileError(ZlocusError):
-    """A part of an image that failed for no reason the input explains."""
+    """A tile of an image that failed for a reason that the input does not explain."""
 
 
 class ZlocusWarning(UserWarning):
-    """Something the user should know, that does not stop the run."""
+    """A fact that the user should know and that does not stop the run."""

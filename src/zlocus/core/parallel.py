@@ -1,4 +1,4 @@
-"""Runs a function over tasks in threads of this process; kernels, GDAL and OpenCV release the interpreter lock."""
+"""Run a function over tasks in threads of this process. Kernels, GDAL and OpenCV release the interpreter lock."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# What threads are working on.
+# Calls that threads are working on.
 _running: set[Future[Any]] = set()
 
 
 def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[tuple[Task, Result]]:
-    """Results as they come, at most `workers` tasks at a time and no result waiting while tasks pile up.
+    """Pairs of task and result in the order in which the tasks end, with at most `workers` tasks at a time.
 
-    An exception in a task, or an interrupt, ends the run: tasks not begun are dropped; after an interrupt those that
-    run are not waited for, see `is_busy`.
+    An exception in a task, or an interrupt, ends the run: tasks that have not started are dropped. After an interrupt,
+    running tasks are not waited for, see `is_busy`.
     """
     remaining = iter(tasks)
     if workers == 1:
@@ -28,19 +28,19 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
     pool = ThreadPoolExecutor(workers)
     running: dict[Future[Result], Task] = {}
 
-    def begin(task: Task) -> None:
+    def start(task: Task) -> None:
         running[submitted(pool, function, task)] = task
 
     try:
         for task in islice(remaining, workers):
-            begin(task)
+            start(task)
         while running:
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 task = running.pop(future)
                 result = future.result()
                 for following in islice(remaining, 1):
-                    begin(following)
+                    start(following)
                 yield task, result
     except KeyboardInterrupt:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -52,7 +52,7 @@ def run_all(function: Callable[[Task], Result], tasks: Iterable[Task], workers: 
 
 
 def submitted(pool: ThreadPoolExecutor, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
-    """A call that a pool is to make, which `is_busy` knows of."""
+    """Submit a call to a thread pool, so that `is_busy` counts it."""
     future = pool.submit(function, *arguments)
     _running.add(future)
     future.add_done_callback(_running.discard)
@@ -61,7 +61,7 @@ def submitted(pool: ThreadPoolExecutor, function: Callable[..., Result], *argume
 
 @contextmanager
 def busy() -> Iterator[None]:
-    """A call of a thread of somebody else's, which `is_busy` knows of meanwhile."""
+    """Count the block, which runs in a thread of another library, in `is_busy`."""
     call: Future[Any] = Future()
     _running.add(call)
     try:
@@ -71,5 +71,5 @@ def busy() -> Iterator[None]:
 
 
 def is_busy() -> bool:
-    """Whether threads are at work, as after an interrupt: the process would wait for them at its end."""
+    """Whether threads are still working, as after an interrupt; the process would wait for them at its end."""
     return bool(_running)

@@ -1,4 +1,4 @@
-"""Where a run stands: bars with the time left on a terminal, plain lines elsewhere, or nothing."""
+"""Progress of a run: bars with the remaining time on a terminal, plain lines elsewhere, or nothing."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ LINE_INTERVAL_S = 10.0
 
 
 class Stage(Protocol):
-    """A part of a run that knows how much of it is done."""
+    """A part of a run whose progress is counted in steps."""
 
     def advance(self, n: float = 1) -> None:
         """Count n more steps as done."""
         ...
 
     def tell(self, text: str) -> None:
-        """Something to stand beside the steps from now on, such as the memory that they take."""
+        """Show a text beside the steps from now on, such as the memory in use."""
         ...
 
 
 class Progress(Protocol):
-    """What a run reports to.
+    """Receiver of the progress of a run.
 
     >>> with progress.stage("Matching", total=len(tiles)) as stage:
     ...     stage.advance()
     """
 
     def stage(self, name: str, total: float | None = None) -> AbstractContextManager[Stage]:
-        """A stage of `total` steps (None: not known), done when its block ends."""
+        """A stage of `total` steps (None: unknown), which ends with the block."""
         ...
 
     def note(self, sentence: str) -> None:
-        """Something the user should know, such as the corrections applied."""
+        """Print a sentence for the user, such as the corrections that were applied."""
         ...
 
 
 class SilentProgress:
-    """Reports nothing."""
+    """Shows nothing."""
 
     @contextmanager
     def stage(self, name: str, total: float | None = None) -> Iterator[Stage]:
@@ -66,7 +66,7 @@ class _SilentStage:
 
 @dataclass
 class LineProgress:
-    """One line when a stage ends, and one every ten seconds of a long one: for logs."""
+    """Prints one line when a stage ends, and one every ten seconds of a long stage: for logs."""
 
     stream: TextIO
 
@@ -109,7 +109,7 @@ class _LineStage:
 
 @dataclass
 class BarProgress:
-    """Bars with the time left, one per stage; stages may be nested."""
+    """Shows a bar with the remaining time for each stage; stages may be nested."""
 
     _bars: RichBars | None = field(default=None, init=False)
     _depth: int = field(default=0, init=False)
@@ -173,7 +173,7 @@ def _new_bars() -> RichBars:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as a person says them: 4.2 s, 3 min 5 s, 2 h 10 min."""
+    """A duration as people write it: 4.2 s, 3 min 5 s, 2 h 10 min."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -183,5 +183,5 @@ def duration(seconds: float) -> str:
 
 
 def progress_for(stream: TextIO) -> Progress:
-    """Bars where `stream` is a terminal, lines elsewhere."""
+    """The progress for a stream: bars where it is a terminal, lines elsewhere."""
     return BarProgress() if stream.isatty() else LineProgress(stream)

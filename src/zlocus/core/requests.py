@@ -1,4 +1,4 @@
-"""What one run is asked to do: inputs, grid, heights, views, and where the result goes."""
+"""Requests of the commands: inputs, grid, heights, views, and the folder of the result."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from zlocus.core.errors import ConfigError, InputError, OutputError
 
 SCENE_SUFFIXES = (".yaml", ".yml")
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
-# Of a demo: that its folder is one's, and how its surface compares with the truth, which ends it.
+# Files of a demo: the first marks its folder; the last holds the accuracy against the truth and ends the demo.
 DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
-# What a finished surface depends on, and the checksums of its products.
+# The record of a finished surface: everything that it depends on, and the checksums of its products.
 FINISHED = "finished.json"
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
-# Or the file of a geoid.
+# Names of vertical datums; the file of a geoid raster may be given instead.
 VERTICALS = ("ellipsoid", "egm96", "egm2008")
 FILLS = ("none", "interpolate", "dem")
 PRODUCTS = ("hillshade", "contours", "dtm", "laz")
-# The first thing anyone looks at, at the cost of a second per million cells; the others take a choice.
+# The hillshade is what everyone looks at first and takes a second per million cells; the others are made on request.
 DEFAULT_PRODUCTS = ("hillshade",)
 EARTHS = ("curved", "flat")
 
@@ -34,10 +34,10 @@ class DsmRequest:
     inputs : two or more images with a camera, or one scene file.
     resolution : cell size, m. crs : grid's CRS. bounds : (xmin, ymin, xmax, ymax) in the grid's CRS, m.
     like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
-    heights : (zmin, zmax), m, above what `vertical` says. dem : raster the heights are searched around; dem_vertical :
-    what its heights are above, as `vertical`, None is what its CRS says.
-    reference : name of the view that leads; with gc3-sgm, of that whose pixels alone give heights.
-    vertical : what the heights written are above: one of `VERTICALS`, in capitals too, or the file of a geoid.
+    heights : (zmin, zmax), m, in the vertical datum `vertical`. dem : raster around whose heights is searched;
+    dem_vertical : its vertical datum, None takes the one of its CRS.
+    reference : name of the reference image; with gc3-sgm only the pixels of this image are matched.
+    vertical : vertical datum of all heights: one of `VERTICALS` in upper or lower case, or the file of a geoid raster.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
     scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
     together, GB; None: 60 % of what is free. overwrite : whether another run in `out` is replaced. resume : whether
@@ -232,8 +232,9 @@ class OrientRequest:
     """Tie points to be found, and with `cameras` the cameras to be corrected. `None` means: not given.
 
     inputs, crs, heights (above the ellipsoid), overwrite : as in `DsmRequest`. control : table of ground control and
-    check points; dem : raster of heights that the ties should have. control_vertical, dem_vertical : what their heights
-    are above, as in `DsmRequest`; None is the ellipsoid of control, and of a DEM what its CRS says.
+    check points; dem : raster of heights that the ties should have. control_vertical, dem_vertical :
+    their vertical datums, as in `DsmRequest`; None is the ellipsoid for control points, and the datum of the CRS for a
+    DEM.
 
     Raises
     ------
@@ -431,7 +432,7 @@ def _check_vertical(name: str, value: str) -> None:
 
 
 def _check_vertical_of(name: str, of: Path | None, value: str | None) -> None:
-    """What the heights of a file are above, which makes sense with the file only."""
+    """Check the vertical datum of a file, which needs the file itself."""
     if value is None:
         return
     if of is None:
@@ -454,22 +455,23 @@ def _check_positive(name: str, value: float | None, unit: str) -> None:
 
 
 def held_files(out: Path, files: Sequence[str] = RUN_FILES) -> list[str]:
-    """Names of those of some files, by default of runs, that are in a folder."""
+    """Names of the given files, by default those of runs, that exist in a folder."""
     return [name for name in files if (out / name).exists()]
 
 
 def check_output(
     out: Path, overwrite: bool, files: Sequence[str] = RUN_FILES, what: str = "run", may_be_same: bool = False
 ) -> None:
-    """Make sure, before any work, that a run may write to `out`; leaves the disk as it was.
+    """Check, before any work, that a command may write to the folder `out`. Changes nothing on disk.
 
-    files : that tell of another one; what : it is, for messages; may_be_same : whether one that was stopped, or is
-    finished, is compared with this one later, see `zlocus.pipeline.finished_run.finished_run`.
+    files : names of files by which another result is recognised; what : kind of that result, for messages; may_be_same
+    : whether an interrupted or finished run in the folder is compared with this one later, see
+    `zlocus.pipeline.finished_run.finished_run`.
 
     Raises
     ------
     OutputError
-        `out` is a file, cannot be written, or holds another one and `overwrite` is False.
+        `out` is a file, cannot be written, or holds another result and `overwrite` is False.
     """
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file, and the output must be a folder. Choose another name with -o.")

@@ -1,4 +1,4 @@
-"""How much memory a run may take."""
+"""Memory and cores that a run may use."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-# Of what is free.
-SHARE = 0.6
-# What the first tile brings into a process, beside its own: compiled kernels, GDAL's cache of blocks; and that with
-# what a worker holds before, Python and libraries.
+# Share of the free memory that a run takes by default.
+DEFAULT_MEMORY_SHARE = 0.6
+# Memory that the first tile adds to a process beside its own: compiled kernels and GDAL's block cache. And the memory
+# of a worker before its first tile, Python and libraries included.
 TILE_CODE_BYTES, WORKER_BYTES = 160e6, 280e6
 CGROUP = Path("/sys/fs/cgroup")
 STATUS = Path("/proc/self/status")
 
 
 def free_bytes() -> float:
-    """Memory that may still be used: of the machine, or of the container where that is less."""
+    """Free memory of the machine, or of the container where that is less."""
     import psutil
 
     return float(min(psutil.virtual_memory().available, *_left_in_container()))
@@ -32,7 +32,7 @@ def held_bytes() -> float:
 
 
 def _left_in_container() -> list[float]:
-    """What limits of control groups (version 2, then 1) leave; empty without any."""
+    """Memory left by the limits of control groups (version 2, then 1); empty without limits."""
     found = []
     for limit, used in (
         ("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
@@ -47,7 +47,7 @@ def _left_in_container() -> list[float]:
 def peak_memory_mb() -> float:
     """Most memory this process has held so far, MB."""
     with suppress(OSError):  # where there is no /proc
-        # The kernel's own count for `getrusage` begins with what the process held that started this one.
+        # The count of `getrusage` starts with the memory of the parent process.
         for line in STATUS.read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmHWM:"):
                 return float(line.split()[1]) * 1.024e-3

@@ -1,4 +1,4 @@
-"""SIGINT (Ctrl-C), SIGTERM and SIGHUP end a command alike: its work stops, what is done is kept, one sentence says so.
+"""SIGINT (Ctrl-C), SIGTERM and SIGHUP end a command in the same way: it stops, keeps finished work, and says so.
 
 Only the command line asks for this (`handle_signals`). In a process of somebody else, such as a notebook, signals do
 what they did before.
@@ -20,16 +20,16 @@ from typing import Any, NoReturn, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
-# What ends a command, where the system has it.
+# The signals that end a command, as far as the system has them.
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-# A command that was told to end has so long to tidy up; the next signal after that ends it at once.
+# Time that a command has to clean up after a signal; another signal after that time ends it at once.
 TIDYING_S = 5.0
 AGAIN_S = 0.05
 STDERR = 2
 
 
 class Ended(KeyboardInterrupt):
-    """A signal that ends the command. Whatever handles Ctrl-C handles this. number : of the signal."""
+    """Raised when a signal ends the command, and handled like Ctrl-C. number : of the signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -38,8 +38,11 @@ class Ended(KeyboardInterrupt):
 
 @dataclass
 class _Command:
-    """What the handlers know. is_running : between the first and the last line of a command; ended : by this, since
-    since_s on the monotonic clock."""
+    """State of the signal handlers.
+
+    is_running : a command is between its first and its last line; ended : exception by which it was ended, since
+    `since_s` on the monotonic clock.
+    """
 
     is_running: bool = False
     ended: Ended | None = None
@@ -50,19 +53,21 @@ _command = _Command()
 
 
 def handle_signals() -> None:
-    """Let signals end the command of this process. Those that were ignored when it began, as SIGHUP is below nohup,
-    stay ignored."""
+    """Let signals end the command of this process.
+
+    Signals that were ignored at its start stay ignored, such as SIGHUP below nohup.
+    """
     if threading.current_thread() is not threading.main_thread():
         return  # where Python lets nobody set them
     for number in ENDING:
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, _on_signal)
-    # The first to be registered is the last to be called.
+    # The function that is registered first is called last.
     atexit.register(_ignore_signals)
     show = sys.unraisablehook
 
     def show_unraisable(unraisable: Any) -> None:
-        """An exception that nobody can catch is shown, unless it is a signal, which then comes again."""
+        """Show an exception that no code can catch; a signal among them is sent again instead."""
         if isinstance(unraisable.exc_value, Ended):
             threading.Thread(target=_again, args=(unraisable.exc_value.number,), daemon=True).start()
         else:
@@ -72,8 +77,11 @@ def handle_signals() -> None:
 
 
 def ended_by_signals(command: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """Result of a command, in which signals raise `Ended`. Whatever else comes out of it after a signal was a
-    consequence, such as an error of a terminal that has gone, and becomes that `Ended`."""
+    """Run a command in which signals raise `Ended`.
+
+    Any other exception after a signal is a consequence of it, such as an error of a terminal that has gone, and is
+    replaced by that `Ended`.
+    """
     try:
         _command.is_running = True
         return command(*args, **kwargs)
@@ -86,17 +94,17 @@ def ended_by_signals(command: Callable[P, R], *args: P.args, **kwargs: P.kwargs)
 
 
 def exit_status(number: int) -> int:
-    """Exit status of a command that a signal ended, as shells count: 130, 143 and 129."""
+    """Exit status of a command that a signal ended, as shells count it: 130, 143 or 129."""
     return 128 + number
 
 
 def sentence_of(number: int) -> str:
-    """What a command says that a signal ended."""
+    """The sentence that a command prints when a signal has ended it."""
     return "Interrupted." if number == signal.SIGINT else f"Ended by {signal.Signals(number).name}."
 
 
 def leave(status: int) -> NoReturn:
-    """End this process without waiting for its threads, once what would outlive it is gone."""
+    """End this process without waiting for its threads, after removing what would outlive it."""
     end_children()
     jit = sys.modules.get("zlocus.core.jit")
     if jit is not None:
@@ -108,7 +116,7 @@ def leave(status: int) -> NoReturn:
 
 
 def end_children() -> None:
-    """Kill the processes below this one: workers, and what starts them. A browser has a session of its own."""
+    """Kill the child processes: workers, and the process that starts them. A browser has its own session and stays."""
     if not hasattr(os, "getsid"):
         return
     import psutil
@@ -120,7 +128,7 @@ def end_children() -> None:
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    """Raise `Ended` in the command; before and after it, and where it tidies up for too long, end the process."""
+    """Raise `Ended` inside a command; outside of it, or where it cleans up for too long, end the process."""
     ended, is_running = _command.ended, _command.is_running
     if ended is None:
         ended = _command.ended = Ended(number)
@@ -140,19 +148,19 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
 
 def _say_ended(ended: Ended) -> None:
     with suppress(OSError):
-        # Not by sys.stderr, which may be in the middle of a sentence.
+        # Not through sys.stderr, which may be in the middle of a line.
         os.write(STDERR, f"zlocus: {sentence_of(ended.number)}\n".encode())
 
 
 def _ignore_signals() -> None:
-    """Let signals change nothing any more: all is done, and Python is about to drop the handlers."""
+    """Ignore further signals: the work is done, and Python is about to remove the handlers."""
     for number in ENDING:
         if signal.getsignal(number) is _on_signal:
             signal.signal(number, signal.SIG_IGN)
 
 
 def _is_handled(ended: Ended) -> bool:
-    """Whether a block that tidies up after an exception is what runs now; if not, the exception was swallowed."""
+    """Whether a block that handles an exception runs now; if not, the exception was lost."""
     error = sys.exc_info()[1]
     while error is not None and error is not ended:
         error = error.__context__
@@ -160,7 +168,7 @@ def _is_handled(ended: Ended) -> bool:
 
 
 def _again(number: int) -> None:
-    """Send this process a signal once more, when the code that could not raise it has ended."""
+    """Send this process a signal again after the code that could not raise it has ended."""
     time.sleep(AGAIN_S)
     main = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and main is not None:

@@ -14,7 +14,7 @@ from zlocus.core.footprints import AREA_MARGIN
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import CloudRequest, SetupRequest, check_output
-from zlocus.core.resources import SHARE, free_bytes
+from zlocus.core.resources import DEFAULT_MEMORY_SHARE, free_bytes
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, result_record, write_record
 from zlocus.io.vertical import VerticalDatum
@@ -82,7 +82,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         scenes, config = image_scenes(setup, references, config)
         check_geoid(vertical, setup)
     with watch.stage("match"):
-        spill_arrays = SpillArrays(request.out, SHARE * free_bytes())
+        spill_arrays = SpillArrays(request.out, DEFAULT_MEMORY_SHARE * free_bytes())
         matched = match_images(scenes, ImageMatching(config, True, request.workers, spill_arrays), progress)
     with watch.stage("cross-check"):
         matched = cross_checked_images(matched, progress, spill_arrays)

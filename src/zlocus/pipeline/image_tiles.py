@@ -350,7 +350,7 @@ def cross_checked_images(
             kept = one.copied(spill_arrays)
             for rows, result in confirm(one.image, images[:k] + images[k + 1 :], MAX_DISAGREEMENT_PX):
                 is_unconfirmed = np.isfinite(one.image.height[rows]) & ~result.is_confirmed
-                kept.remove_heights(rows, is_unconfirmed, Quality.UNCONFIRMED)
+                kept.remove_heights(rows, is_unconfirmed, Quality.INCONSISTENT)
                 spill_arrays.rest()
             checked.append(kept)
             stage.advance()

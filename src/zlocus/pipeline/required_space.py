@@ -13,7 +13,7 @@ import numpy as np
 from zlocus.core.errors import GeometryError, OutputError
 from zlocus.core.footprints import shared_ground
 from zlocus.core.grid import Grid
-from zlocus.core.resources import SHARE, free_bytes
+from zlocus.core.resources import DEFAULT_MEMORY_SHARE, free_bytes
 from zlocus.core.scene import ColourSource, Scene, is_local
 from zlocus.matching.ground_pixels import default_cell
 from zlocus.matching.match_scene import MatchScene
@@ -100,7 +100,7 @@ def check_room_for_pixels(out: Path, scene: Scene, references: Sequence[str]) ->
         They take more than both have free.
     """
     n_pixels = sum(math.prod(view.image.shape) for view in scene.views if view.name in references)
-    needed, room = float(n_pixels) * (TILE_CELL_BYTES + TILE_BAND_BYTES), SHARE * free_bytes()
+    needed, room = float(n_pixels) * (TILE_CELL_BYTES + TILE_BAND_BYTES), DEFAULT_MEMORY_SHARE * free_bytes()
     disk = _disk_of(out)
     if needed < LEAST_REFUSED_BYTES or disk is None or needed <= room + disk.free_bytes:
         return

@@ -182,7 +182,7 @@ def check_coverage(tally: Tally, out: Path, progress: Progress) -> None:
     if tally.n_left_out:
         progress.note(
             f"In {tally.n_left_out} cells an image that may show them took no part, for it sees them too obliquely "
-            "over the heights searched there (LEFT_OUT in quality.tif). Give --heights closer to those of the ground."
+            "over the heights searched there (IMAGE_EXCLUDED in quality.tif). Give --heights closer to those of the ground."
         )
     if tally.coverage < SUFFICIENT_COVERAGE:
         raise CoverageError(

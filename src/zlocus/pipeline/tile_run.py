@@ -17,7 +17,7 @@ from zlocus.core.grid import CellWindow, Grid
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress, Stage, duration
 from zlocus.core.requests import DsmRequest
-from zlocus.core.resources import SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
+from zlocus.core.resources import DEFAULT_MEMORY_SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
 from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
@@ -89,7 +89,7 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
         One tile needs more memory than it may take.
     """
     needs, own, memory_gb = tile_needs(match_scene, tiles, config), held_bytes(), request.memory_gb
-    allowed = own + SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
+    allowed = own + DEFAULT_MEMORY_SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
     here = needs.n_bytes + TILE_CODE_BYTES
     if memory_gb is not None and own + here > allowed:
         raise ConfigError(
@@ -125,7 +125,7 @@ class Tally:
         self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
         is_matched = np.isfinite(product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
         self.n_matched += int(is_matched.sum())
-        self.n_left_out += int((asked & ((quality & np.uint16(Quality.LEFT_OUT)) != 0)).sum())
+        self.n_left_out += int((asked & ((quality & np.uint16(Quality.IMAGE_EXCLUDED)) != 0)).sum())
         self.evaluations += product.evaluations
         self.all_images += product.all_images
         if product.ranked is not None:

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any
 
 from zlocus.core.errors import ConfigError, StoppedError
-from zlocus.core.startup import let_in
+from zlocus.core.startup import allow_import
 from zlocus.pipeline.execution.processes import one_thread
 from zlocus.pipeline.execution.tasks import Cause, Failure, Outcome, attempted, failure_of
 
@@ -55,7 +55,7 @@ class Cluster:
     """
 
     def __init__(self, function: Callable[[Any], Any], address: str) -> None:
-        let_in("dask")
+        allow_import("dask")
         try:
             from distributed import Client
         except ImportError as error:
