@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from affine import Affine
@@ -18,48 +20,49 @@ from zlocus.io.crs import local_frame
 from zlocus.io.row_strips import STRIP_ROWS, BandReader, strips_of
 from zlocus.products.tie_layers import Batch, write_features
 
-# By default so many contours at most within two standard deviations of the mean height, and no nearer than this.
-WANTED, CLOSEST_M = 25, 0.1
-MOST_LEVELS = 20000
-# Lines run so much above their height: none then goes exactly through a cell's centre, where its way is ambiguous, for
-# no float32 below 10 km is this number away from a multiple of a useful interval.
-ABOVE_M = 1.234567e-6
-# Coordinates keep so many digits of a cell; a strip gives the same points to far more.
-DIGITS = 4
-ON_ROW = 1e-9
+# The default interval gives at most this many contours within two standard deviations of the mean height.
+MAX_DEFAULT_CONTOURS = 25
+MIN_DEFAULT_INTERVAL_M = 0.1
+MAX_CONTOUR_HEIGHTS = 20000
+# Every line is traced this much above its nominal height. A line through a cell's centre would be ambiguous, and no
+# float32 height below 10 km is exactly this far from a multiple of a useful interval.
+TRACED_ABOVE_M = 1.234567e-6
+# Coordinates are rounded to this many decimals of a cell.
+COORDINATE_DECIMALS = 4
+# Tolerance, in cells, within which an end of a line lies on the first or last row of its strip.
+ON_ROW_CELLS = 1e-9
 BATCH_POINTS, POINT_BYTES = 1_000_000, 16
-# Line ends that wait for their continuation: row, level and the column before it.
-Place = tuple[int, int, int]
 
 
 def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows: int = STRIP_ROWS) -> None:
-    """Layer `contours`: 2-D lines with their `elevation_m`, from low to high, higher ground on their right; the CRS
-    says what that is above as far as the raster's does.
+    """Write the contours of a raster of heights as a GeoPackage.
 
-    Lines are straight between the lines that join cells' centres, where heights are linear; they end at holes and at
-    the rim. Short closed ones, of which noise and trees make thousands, are left out. raster : of heights; strip_rows :
-    rows worked on at a time, which change no line.
+    Its layer `contours` holds 2-D lines with their `elevation_m`, from low to high, with the higher ground on their
+    right. The CRS names the vertical datum where the raster's CRS does. Between the centres of cells heights are
+    linear. Lines end at cells without a height and at the edge of the raster. Closed lines shorter than
+    `contour_least_cells` are left out, because noise and trees make thousands of them. strip_rows : rows that are
+    traced at a time; they change no line.
 
     Raises
     ------
     InputError
         The raster of heights is missing or damaged.
     ConfigError
-        The interval asked for is too small for the relief.
+        The interval is too small for the range of heights.
     OutputError
         The file cannot be written.
     """
     from shapely import linestrings
 
-    with BandReader(raster) as heights:
-        interval = options.contour_interval_m or nice_interval(heights.statistic("STDDEV") or 0.0)
-        _check_number(heights, interval, raster)
-        transform, crs = heights.geobox.transform, heights.crs or local_frame()
+    with BandReader(raster) as reader:
+        interval = options.contour_interval_m or nice_interval(reader.statistic("STDDEV") or 0.0)
+        _check_number(reader, interval, raster)
+        transform, crs = reader.geobox.transform, reader.crs or local_frame()
 
         def batches() -> Iterator[Batch]:
-            for levels, lines in batched(contours(heights, interval, strip_rows, options.contour_least_cells)):
-                geometries = np.array([linestrings(_on_map(line, transform)) for line in lines], dtype=object)
-                # Counted in steps, then multiplied: a sum of steps would drift.
+            for levels, lines in batched(contours(reader, interval, strip_rows, options.contour_least_cells)):
+                geometries = np.array([linestrings(_map_coordinates(line, transform)) for line in lines], dtype=object)
+                # A product of number and interval, since a sum of intervals would drift.
                 yield geometries, {"elevation_m": _rounded(np.array(levels, np.float64) * interval)}
 
         write_features(path, "contours", "LineString", batches(), crs)
@@ -67,130 +70,113 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
 
 def nice_interval(deviation_m: float) -> float:
     """1, 2 or 5 times a power of ten, m: 10 to 25 contours within two standard deviations of the mean height."""
-    least = max(4.0 * deviation_m / WANTED, CLOSEST_M)
+    least = max(4.0 * deviation_m / MAX_DEFAULT_CONTOURS, MIN_DEFAULT_INTERVAL_M)
     power = math.floor(math.log10(least) + 1e-9)
     candidates = [float(f"{digit}e{p}") for p in (power, power + 1) for digit in (1, 2, 5)]
     return next(value for value in candidates if value >= least * (1 - 1e-9))
 
 
-@dataclass(eq=False)
-class _Chain:
-    """A line that may go on at both ends. pieces : (n, 2) each, the last point of one is the first of the next."""
+class StoredLine(NamedTuple):
+    """Where a line is stored. first_row, first_col : its first point, in cells; n_points; offset : bytes."""
 
-    pieces: list[FloatArray]
-    head: Place | None
-    tail: Place | None
-    is_closed: bool = False
-
-    def points(self) -> FloatArray:
-        """All of it, (n, 2), rounded; a closed line starts at its first point from the north-west."""
-        parts = [self.pieces[0], *(piece[1:] for piece in self.pieces[1:])]
-        line = np.asarray(np.round(np.concatenate(parts), DIGITS), np.float64)
-        if self.is_closed:
-            line[-1] = line[0]
-        line = line[np.r_[True, (np.diff(line, axis=0) != 0).any(axis=1)]]
-        if len(line) > 2 and (line[0] == line[-1]).all():
-            first = int(np.lexsort((line[:-1, 0], line[:-1, 1]))[0])
-            line = np.concatenate([line[first:-1], line[: first + 1]])
-        return line
+    first_row: float
+    first_col: float
+    n_points: int
+    offset: int
 
 
 @dataclass
-class _Stitcher:
-    """Lines of strips become whole ones; those that cannot go on are handed out, with their height in intervals."""
+class _LineStore:
+    """Lines on disk, so that memory holds only their places. level : height of a line, in intervals."""
 
-    live: dict[_Chain, int] = field(default_factory=dict)
-    heads: dict[Place, _Chain] = field(default_factory=dict)
-    tails: dict[Place, _Chain] = field(default_factory=dict)
+    file: BinaryIO
+    whole: dict[int, list[StoredLine]] = field(default_factory=lambda: defaultdict(list))
+    pieces: dict[int, list[StoredLine]] = field(default_factory=lambda: defaultdict(list))
 
-    def add(self, level: int, line: FloatArray, head: Place | None, tail: Place | None) -> None:
-        """A piece, (n, 2), and the places on shared rows where it starts and ends."""
-        before = self.tails.pop(head) if head in self.tails else None
-        if before is None:
-            chain = _Chain([line], head, tail)
-            self.live[chain] = level
-        else:
-            chain = before
-            chain.pieces.append(line)
-            chain.tail = tail
-        after = self.heads.pop(tail) if tail in self.heads else None
-        if after is chain:
-            chain.is_closed, chain.head, chain.tail = True, None, None
-            return
-        if after is not None:
-            chain.pieces.extend(after.pieces)
-            chain.tail = after.tail
-            del self.live[after]
-        if chain.head is not None and before is None:
-            self.heads[chain.head] = chain
-        if chain.tail is not None:
-            self.tails[chain.tail] = chain
+    def put(self, line: FloatArray) -> StoredLine:
+        """Write a line (n, 2) at the end of the file."""
+        stored = StoredLine(line[0, 1], line[0, 0], len(line), self.file.seek(0, 2))
+        self.file.write(np.ascontiguousarray(line).tobytes())
+        return stored
 
-    def finished(self, row: int) -> Iterator[tuple[int, FloatArray]]:
-        """The lines, (n, 2), that no strip from a row on can lengthen."""
-        for chain in [c for c in self.live if not any(end is not None and end[0] >= row for end in (c.head, c.tail))]:
-            level = self.live.pop(chain)
-            for end, ends in ((chain.head, self.heads), (chain.tail, self.tails)):
-                if end is not None:
-                    ends.pop(end, None)
-            if len(line := chain.points()) > 1:
-                yield level, line
+    def get(self, stored: StoredLine) -> FloatArray:
+        """Read a line (n, 2)."""
+        self.file.seek(stored.offset)
+        return np.frombuffer(self.file.read(stored.n_points * POINT_BYTES)).reshape(-1, 2)
+
+    def levels(self) -> list[int]:
+        """Heights that have a line, in intervals, from low to high."""
+        return sorted(self.whole.keys() | self.pieces.keys())
 
 
 def contours(
-    heights: BandReader, interval_m: float, strip_rows: int = STRIP_ROWS, least_cells: float = 0.0
+    reader: BandReader, interval_m: float, strip_rows: int = STRIP_ROWS, min_ring_cells: float = 0.0
 ) -> Iterator[tuple[int, FloatArray]]:
-    """Heights in intervals, and lines (n, 2) as (column, row), (0, 0) the first cell's centre; from low to high, those
-    of one height by their first points, from north to south; without closed ones shorter than `least_cells`.
+    """Yield the height of each contour, in intervals, and its line (n, 2) as (column, row).
 
-    Lines wait on disk until all are known: held are those that still grow, and where the others are.
+    (0, 0) is the centre of the first cell. Lines come from low to high; lines of one height are ordered by their first
+    points, from north to south. Closed lines shorter than `min_ring_cells` are left out.
+
+    The raster is traced in strips that share one row. Lines that end on a shared row are joined afterwards, height by
+    height, and all lines wait on disk: memory holds one strip, then the unjoined lines of one height.
     """
-    stitcher = _Stitcher()
-    n_rows, n_cols = heights.geobox.shape
-    with TemporaryFile(dir=heights.path.parent) as waiting:
-        # Height, first point's row and column, length, place in the file.
-        index: list[tuple[int, float, float, int, int]] = []
-
-        def keep(row: int) -> None:
-            for level, line in stitcher.finished(row):
-                if _is_ring_below(line, least_cells):
-                    continue
-                index.append((level, line[0, 1], line[0, 0], len(line), waiting.tell()))
-                waiting.write(line.tobytes())
-
+    n_rows, n_cols = reader.geobox.shape
+    with TemporaryFile(dir=reader.path.parent) as file:
+        store = _LineStore(file)
         for strip in strips_of(n_rows - 1, 0, strip_rows) if n_cols > 1 else ():
-            # And the first row of the next one, which both share.
-            z = heights.read_rows(strip.row, strip.rows + 1).astype(np.float64)
+            # One row more, which is the first row of the next strip.
+            z = reader.read_rows(strip.row, strip.rows + 1).astype(np.float64)
             for level, line in _traced(z, interval_m):
-                ends = [_place(point, strip.row, strip.rows, level) for point in (line[0], line[-1])]
-                is_whole = (line[0] == line[-1]).all()
-                head, tail = (None, None) if is_whole else ends
-                stitcher.add(level, line + np.array([0.0, strip.row]), head, tail)
-            keep(strip.row + strip.rows)
-        keep(n_rows)
-        for level, _, _, n, at in sorted(index):
-            waiting.seek(at)
-            yield level, np.frombuffer(waiting.read(n * POINT_BYTES)).reshape(n, 2)
+                is_closed = (line[0] == line[-1]).all()
+                is_cut = not is_closed and _snap_ends(line, z, level * interval_m + TRACED_ABOVE_M)
+                line += (0.0, strip.row)
+                if is_cut:
+                    store.pieces[level].append(store.put(line))
+                else:
+                    _keep(store, level, line, min_ring_cells)
+        for level in store.levels():
+            pieces = store.pieces.pop(level, [])
+            for line in _joined([store.get(piece) for piece in pieces]):
+                _keep(store, level, line, min_ring_cells)
+            for stored in sorted(store.whole.pop(level, [])):
+                yield level, store.get(stored)
+
+
+def _keep(store: _LineStore, level: int, line: FloatArray, min_ring_cells: float) -> None:
+    """Store a whole line (n, 2), normalised, unless it is a point or a short ring."""
+    line = _normalised(line)
+    if len(line) > 1 and not _is_ring_below(line, min_ring_cells):
+        store.whole[level].append(store.put(line))
+
+
+def _joined(pieces: list[FloatArray]) -> Iterator[FloatArray]:
+    """Lines (n, 2) of pieces whose ends have equal coordinates, in the direction of the pieces."""
+    from shapely import get_coordinates, get_parts, line_merge, multilinestrings
+    from shapely import linestrings as lines_of
+
+    if pieces:
+        merged = line_merge(multilinestrings([lines_of(piece) for piece in pieces]), directed=True)
+        yield from (get_coordinates(line) for line in get_parts(merged))
 
 
 def batched(lines: Iterable[tuple[int, FloatArray]]) -> Iterator[tuple[list[int], list[FloatArray]]]:
-    """The same by as many lines as hold `BATCH_POINTS`; one batch at least."""
+    """Group lines into batches of about `BATCH_POINTS` points; at least one batch, which may be empty."""
     levels: list[int] = []
-    held: list[FloatArray] = []
+    waiting: list[FloatArray] = []
     n_points, is_any = 0, False
     for level, line in lines:
         levels.append(level)
-        held.append(line)
+        waiting.append(line)
         n_points += len(line)
         if n_points >= BATCH_POINTS:
-            yield levels, held
-            levels, held, n_points, is_any = [], [], 0, True
+            yield levels, waiting
+            levels, waiting, n_points, is_any = [], [], 0, True
     if levels or not is_any:
-        yield levels, held
+        yield levels, waiting
 
 
 def _traced(z: FloatArray, interval_m: float) -> Iterator[tuple[int, FloatArray]]:
-    """Lines of a strip, their first row 0, and their heights in intervals."""
+    """Heights in intervals, and lines (n, 2) of a strip (r, c) as (column, row)."""
     from contourpy import contour_generator
 
     known = np.isfinite(z)
@@ -198,39 +184,58 @@ def _traced(z: FloatArray, interval_m: float) -> Iterator[tuple[int, FloatArray]
         return
     generator = contour_generator(z=np.ma.array(z, mask=~known), corner_mask=False, name="serial")
     low, high = float(z[known].min()), float(z[known].max())
-    for level in range(math.ceil((low - ABOVE_M) / interval_m), math.floor((high - ABOVE_M) / interval_m) + 1):
-        for line in generator.lines(level * interval_m + ABOVE_M):
-            yield level, np.asarray(line, np.float64)
+    first, last = (low - TRACED_ABOVE_M) / interval_m, (high - TRACED_ABOVE_M) / interval_m
+    for level in range(math.ceil(first), math.floor(last) + 1):
+        for line in generator.lines(level * interval_m + TRACED_ABOVE_M):
+            yield level, np.array(line, np.float64)
 
 
-def _is_ring_below(line: FloatArray, least_cells: float) -> bool:
-    """Whether a line (n, 2) is closed and shorter than so many cells."""
-    return bool((line[0] == line[-1]).all()) and float(np.hypot(*np.diff(line, axis=0).T).sum()) < least_cells
+def _snap_ends(line: FloatArray, z: FloatArray, height_m: float) -> bool:
+    """Compute ends of a line (n, 2) on the first and last row of its strip z (r, c) anew; return whether there are any.
+
+    Both strips that share a row then have exactly equal ends, since both compute them from the same two heights.
+    """
+    is_cut = False
+    for end in (0, -1):
+        row = round(line[end, 1])
+        if row in (0, len(z) - 1) and abs(line[end, 1] - row) < ON_ROW_CELLS:
+            col = min(int(line[end, 0]), z.shape[1] - 2)
+            left, right = z[row, col], z[row, col + 1]
+            line[end] = col + (height_m - left) / (right - left), row
+            is_cut = True
+    return is_cut
 
 
-def _place(point: FloatArray, row: int, rows: int, level: int) -> Place | None:
-    """Where the end of a line lies on the first or last row of its strip; None elsewhere."""
-    for shared in (0, rows):
-        if abs(point[1] - shared) < ON_ROW:
-            return row + shared, level, int(point[0])
-    return None
+def _normalised(line: FloatArray) -> FloatArray:
+    """A line (n, 2) rounded, without repeated points; a closed line starts at its northernmost, then westernmost point."""
+    line = np.asarray(np.round(line, COORDINATE_DECIMALS), np.float64)
+    line = line[np.r_[True, (np.diff(line, axis=0) != 0).any(axis=1)]]
+    if len(line) > 2 and (line[0] == line[-1]).all():
+        first = int(np.lexsort((line[:-1, 0], line[:-1, 1]))[0])
+        line = np.concatenate([line[first:-1], line[: first + 1]])
+    return line
 
 
-def _on_map(line: FloatArray, transform: Affine) -> FloatArray:
-    """Columns and rows of cells' centres as coordinates. (n, 2) each."""
+def _is_ring_below(line: FloatArray, min_cells: float) -> bool:
+    """Whether a line (n, 2) is closed and shorter than `min_cells`."""
+    return bool((line[0] == line[-1]).all()) and float(np.hypot(*np.diff(line, axis=0).T).sum()) < min_cells
+
+
+def _map_coordinates(line: FloatArray, transform: Affine) -> FloatArray:
+    """Map coordinates (n, 2) of columns and rows (n, 2), which count from the first cell's centre."""
     col, row = line[:, 0] + 0.5, line[:, 1] + 0.5
     return np.column_stack([transform.a * col + transform.c, transform.e * row + transform.f])
 
 
-def _check_number(heights: BandReader, interval_m: float, raster: Path) -> None:
-    low, high = heights.statistic("MINIMUM") or 0.0, heights.statistic("MAXIMUM") or 0.0
-    if (high - low) / interval_m > MOST_LEVELS:
+def _check_number(reader: BandReader, interval_m: float, raster: Path) -> None:
+    low, high = reader.statistic("MINIMUM") or 0.0, reader.statistic("MAXIMUM") or 0.0
+    if (high - low) / interval_m > MAX_CONTOUR_HEIGHTS:
         raise ConfigError(
             f"Contours every {interval_m:g} m of {raster}, whose heights go from {low:.1f} to {high:.1f} m, are more "
-            f"than {MOST_LEVELS} heights. Give a larger products.contour_interval_m."
+            f"than {MAX_CONTOUR_HEIGHTS} heights. Give a larger products.contour_interval_m."
         )
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    """Without the digits that multiplying by a decimal fraction brings."""
+    """Values without the digits that multiplication by a decimal fraction brings."""
     return np.asarray(np.round(values, 6), np.float64)
