@@ -18,10 +18,11 @@ from shapely.geometry import shape
 
 from zlocus.core.errors import InputError
 from zlocus.io.crs import local_frame
+from zlocus.io.open_raster import open_raster
 from zlocus.io.rasters import write_cog
 from zlocus.products.stac_item import PRODUCTS, bands_of, footprint_of, write_item
 
-# 1e-7 degrees, to which coordinates are rounded.
+# Coordinates are rounded to 1e-7 degrees.
 PLACE_DEG = 1e-7
 CELL_M = 2.0
 SCHEMA = "https://schemas.stacspec.org/v1.1.0/item-spec/json-schema/item.json"
@@ -123,23 +124,29 @@ def test_images_without_a_date_are_counted(tmp_path):
 
 
 @pytest.mark.parametrize("run", [RUN | {"image_dates": [None, None]}, {"created": RUN["created"]}])
-def test_without_dates_it_is_that_of_the_run_and_says_so(tmp_path, run):
+def test_without_dates_the_time_is_that_of_the_run(tmp_path, run):
     times = item_of(result(tmp_path, run=run))["properties"]
     assert times["datetime"] == times["created"] == "2026-05-17T08:09:10Z"
     assert "start_datetime" not in times
     assert "not known: datetime is that of the run" in times["description"]
 
 
-def test_without_a_record_it_is_that_of_the_file(tmp_path):
+def test_without_a_record_the_time_is_that_of_the_surface_file(tmp_path):
     result(tmp_path)
     made = datetime(2024, 2, 29, 12, tzinfo=UTC)
     os.utime(tmp_path / "dsm.tif", (made.timestamp(),) * 2)
     assert item_of(tmp_path)["properties"]["datetime"] == "2024-02-29T12:00:00Z"
 
 
-def test_the_footprint_is_the_grid_in_degrees():
-    box = grid(cell_m=500.0)
-    geometry, bbox = footprint_of(box, CRS("EPSG:32632"))
+def footprint(folder, box):
+    """The footprint of a raster on a grid."""
+    write_cog(folder / "flat.tif", np.ones((30, 40), np.uint8), box)
+    with open_raster(folder / "flat.tif", "raster") as file:
+        return footprint_of(file)
+
+
+def test_the_footprint_is_the_grid_in_degrees(tmp_path):
+    geometry, bbox = footprint(tmp_path, grid(cell_m=500.0))
     outline, to_degrees = shape(geometry), Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
     corners = np.array(to_degrees.transform([500000, 520000, 520000, 500000], [4000000, 4000000, 3985000, 3985000])).T
     ring = np.array(outline.exterior.coords)
@@ -152,7 +159,7 @@ def test_the_footprint_is_the_grid_in_degrees():
     assert outline.is_valid
 
 
-def test_across_the_date_line_it_is_cut(tmp_path):
+def test_a_footprint_across_the_date_line_is_cut(tmp_path):
     folder = result(tmp_path, grid(820000.0, 200000.0, "EPSG:32660", cell_m=1000.0))
     item = item_of(folder)
     west, south, east, north = item["bbox"]
@@ -167,19 +174,18 @@ def test_across_the_date_line_it_is_cut(tmp_path):
     assert first.area + second.area == pytest.approx(40 * 30 / 111.3**2, rel=0.01)
 
 
-def test_a_compound_crs_lies_where_its_map_lies():
-    plain = footprint_of(grid(), CRS("EPSG:32632"))
-    assert footprint_of(grid(), CRS("EPSG:32632+5773")) == plain
+def test_a_compound_crs_lies_where_its_map_lies(tmp_path):
+    assert footprint(tmp_path, grid(crs=CRS("EPSG:32632+5773").to_wkt())) == footprint(tmp_path, grid())
 
 
 @pytest.mark.parametrize("crs", [None, local_frame().to_wkt()])
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_no_place_on_the_earth_no_item(tmp_path, crs):
+def test_a_local_frame_gets_no_item(tmp_path, crs):
     result(tmp_path, grid(crs=crs))
     assert not write_item(tmp_path)
     assert not (tmp_path / "item.json").exists()
 
 
-def test_no_surface(tmp_path):
+def test_a_folder_without_a_surface_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"There is no raster .*dsm\.tif"):
         write_item(tmp_path)

@@ -207,7 +207,10 @@ def _snap_ends(line: FloatArray, z: FloatArray, height_m: float) -> bool:
 
 
 def _normalised(line: FloatArray) -> FloatArray:
-    """A line (n, 2) rounded, without repeated points; a closed line starts at its northernmost, then westernmost point."""
+    """A line (n, 2), rounded and without repeated points.
+
+    A closed line starts at its northernmost point; of several, at the westernmost of these.
+    """
     line = np.asarray(np.round(line, COORDINATE_DECIMALS), np.float64)
     line = line[np.r_[True, (np.diff(line, axis=0) != 0).any(axis=1)]]
     if len(line) > 2 and (line[0] == line[-1]).all():

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from odc.geo.geobox import GeoBox
-from pyproj import CRS, Transformer
+from rasterio import DatasetReader
 
 from zlocus.core.scene import is_local
 from zlocus.io.crs import crs_label
@@ -23,15 +22,17 @@ from zlocus.io.run_record import read_record, write_atomically
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
 HTML, GEOJSON = "text/html", "application/geo+json"
-# Pieces of each side of the grid, whose straight sides are curves in degrees; a centimetre on the ground.
-PIECES, DEGREE_DIGITS = 16, 7
+# Each side of the grid is cut into this many pieces, because straight sides on the map are curves in degrees.
+PIECES_PER_SIDE = 16
+# Coordinates are rounded to 1e-7 degrees, a centimetre on the ground.
+DEGREE_DECIMALS = 7
 STATISTICS = {"MINIMUM": "minimum", "MAXIMUM": "maximum", "MEAN": "mean", "STDDEV": "stddev",
               "VALID_PERCENT": "valid_percent"}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Product:
-    """A file of a result, its title, media type and roles; those of rasters say more of themselves."""
+    """A file of a result: its name, title, media type and roles. Rasters also describe their bands."""
 
     name: str
     title: str
@@ -43,29 +44,36 @@ PRODUCTS = (
     Product("dsm.tif", "Surface: height at each cell's centre", COG, ("data",)),
     Product("sigma.tif", "Standard deviation of the height", COG, ("data", "metadata")),
     Product("quality.tif", "Why a cell is empty or doubtful: bit flags", COG, ("data", "metadata")),
-    Product("views.tif", "Images used", COG, ("data", "metadata")),
+    Product("views.tif", "Number of images used", COG, ("data", "metadata")),
     Product("ortho.tif", "Ortho-image", COG, ("data", "visual")),
     Product("hillshade.tif", "Hillshade of the surface", COG, ("visual", "overview")),
     Product("dtm.tif", "Terrain: the ground without buildings and trees", COG, ("data",)),
     Product("contours.gpkg", "Contours", GEOPACKAGE, ("data",)),
     Product("surface.laz", "The surface's cells as coloured points", LAZ, ("data",)),
     Product("ties.gpkg", "Tie points", GEOPACKAGE, ("metadata",)),
-    Product("observations.npz", "Where tie points were seen in the images", "application/zip", ("metadata",)),
-    Product("ranking.gpkg", "What tie points say of the images", GEOPACKAGE, ("metadata",)),
-    Product("report.html", "All of it for people, on one page", HTML, ("overview", "metadata")),
-    Product("footprints.geojson", "Outlines and pairs of the images", GEOJSON, ("metadata",)),
+    Product("observations.npz", "Positions of the tie points in the images", "application/zip", ("metadata",)),
+    Product("ranking.gpkg", "How well pairs of images match at the tie points", GEOPACKAGE, ("metadata",)),
+    Product("report.html", "Report of the run on one page", HTML, ("overview", "metadata")),
+    Product("footprints.geojson", "Footprints and overlaps of the images", GEOJSON, ("metadata",)),
     Product("curves.json", "Match curves of some cells", JSON, ("metadata",)),
-    Product("events.jsonl", "What happened when", "application/x-ndjson", ("metadata",)),
-    Product("run.json", "What was asked, versions, inputs, times", JSON, ("metadata",)),
+    Product("events.jsonl", "Events of the run with their times", "application/x-ndjson", ("metadata",)),
+    Product("run.json", "Request, options, versions, inputs and times of the run", JSON, ("metadata",)),
 )
 
 
-def write_item(folder: Path) -> bool:
-    """An item that links every product in a folder; False, and no file, where the grid has no place on the Earth.
+class Footprint(NamedTuple):
+    """Outline of a grid on the Earth. geometry : GeoJSON, in degrees; bbox : west, south, east and north, degrees."""
 
-    Its time is that of the images, as far as `run.json` knows their dates, else that of the run, which the description
-    then says. Raster information is that of STAC's core (bands); extensions are not used, so the CRS and what heights
-    are above stand in properties of our own.
+    geometry: dict[str, Any]
+    bbox: list[float]
+
+
+def write_item(folder: Path) -> bool:
+    """Write an item that links every product in a folder; return False, and write nothing, in a local frame.
+
+    The item's time is that of the images, as far as `run.json` knows their dates. Otherwise it is that of the run, and
+    the description says so. Rasters are described by the bands of STAC's core. No extension is used, because the
+    schemas of extensions are on the network only; the CRS and the vertical datum are properties with our prefix.
 
     Raises
     ------
@@ -74,25 +82,26 @@ def write_item(folder: Path) -> bool:
     OutputError
         The file cannot be written.
     """
-    # A fifth of a second.
+    # The import takes a fifth of a second, which commands that write no item are spared.
     import pystac
 
-    with BandReader(folder / "dsm.tif") as heights:
-        geobox, crs, cell_m, what = heights.geobox, heights.crs, heights.cell_m, heights.description
+    with BandReader(folder / "dsm.tif") as reader:
+        crs, cell_m, height_description = reader.crs, reader.cell_m, reader.description
     if crs is None or is_local(crs):
         return False
-    geometry, bbox = footprint_of(geobox, crs)
-    taken = _times(folder)
+    with open_raster(folder / "dsm.tif", "raster") as file:
+        footprint = footprint_of(file)
+    times = _times(folder)
     item = pystac.Item(
         id=folder.resolve().name or "surface",
-        geometry=geometry,
-        bbox=bbox,
-        datetime=taken.when,
-        start_datetime=taken.first,
-        end_datetime=taken.last,
+        geometry=footprint.geometry,
+        bbox=footprint.bbox,
+        datetime=times.single,
+        start_datetime=times.first,
+        end_datetime=times.last,
         properties={
-            "title": "Digital surface model", "description": taken.description, "gsd": cell_m,
-            "created": _text(taken.made), "zlocus:crs": crs_label(crs), "zlocus:heights": what,
+            "title": "Digital surface model", "description": times.description, "gsd": cell_m,
+            "created": _rfc3339(times.created), "zlocus:crs": crs_label(crs), "zlocus:heights": height_description,
         },
     )  # fmt: skip
     for product in PRODUCTS:
@@ -106,41 +115,34 @@ def write_item(folder: Path) -> bool:
     return True
 
 
-def footprint_of(geobox: GeoBox, crs: CRS) -> tuple[dict[str, Any], list[float]]:
-    """The grid's outline in degrees as GeoJSON has it, and its bounds (west, south, east, north).
+def footprint_of(file: DatasetReader) -> Footprint:
+    """Outline of a raster on the Earth, counter-clockwise.
 
-    Across the date line the outline is cut in two, and west is larger than east. Source: RFC 7946, 3.1.9 and 5.2.
+    An outline that crosses the date line is cut in two, and its west is larger than its east. Source: RFC 7946, 3.1.6,
+    3.1.9 and 5.2.
     """
-    from shapely import box
-    from shapely.affinity import translate
-    from shapely.geometry import MultiPolygon, Polygon, mapping
-    from shapely.geometry.polygon import orient
+    from rio_stac.stac import get_dataset_geom
 
-    rows, cols = geobox.shape
-    steps = np.arange(PIECES) / PIECES
-    col = np.concatenate([steps, np.ones(PIECES), 1 - steps, np.zeros(PIECES)]) * cols
-    row = np.concatenate([np.zeros(PIECES), steps, np.ones(PIECES), 1 - steps]) * rows
-    t = geobox.transform
-    to_degrees = Transformer.from_crs(crs.to_2d(), "EPSG:4326", always_xy=True)
-    lon, lat = to_degrees.transform(t.c + t.a * col, t.f + t.e * row)
-    is_cut = np.ptp(lon) > 180.0
-    lon = np.round(np.where((lon < 0) & is_cut, lon + 360.0, lon), DEGREE_DIGITS)
-    lat = np.round(lat, DEGREE_DIGITS)
-    outline = orient(Polygon(np.column_stack([lon, lat])))
-    west, south, east, north = outline.bounds
-    if is_cut:
-        parts = [outline & box(0, -90, 180, 90), translate(outline & box(180, -90, 360, 90), -360.0)]
-        outline, east = MultiPolygon([orient(part) for part in parts]), east - 360.0
-    return json.loads(json.dumps(mapping(outline))), [west, south, round(east, DEGREE_DIGITS), north]
+    geometry = get_dataset_geom(file, densify_pts=PIECES_PER_SIDE, precision=DEGREE_DECIMALS)["footprint"]
+    parts = geometry["coordinates"] if geometry["type"] == "MultiPolygon" else [geometry["coordinates"]]
+    low, high = (np.array([end(part[0], axis=0) for part in parts]) for end in (np.min, np.max))
+    # The eastern hemisphere's part has the larger longitudes, and the box begins in it.
+    bbox = (low[:, 0].max(), low[:, 1].min(), high[:, 0].min(), high[:, 1].max())
+    return Footprint(geometry, [float(degrees) for degrees in bbox])
 
 
 def bands_of(path: Path) -> list[dict[str, Any]]:
-    """What a raster's bands hold, as STAC's common metadata has it (names, data types, units, statistics)."""
+    """What the bands of a raster hold, as STAC's common metadata: names, data types, units and statistics.
+
+    The statistics are those that the file keeps of all its cells. (rio-stac computes them anew, from a reduced copy.)
+    """
     with open_raster(path, "raster") as file:
         bands = []
         for number in file.indexes:
             tags = file.tags(number)
-            found = {STATISTICS[name]: float(tags[key]) for name in STATISTICS if (key := f"STATISTICS_{name}") in tags}
+            statistics = {
+                STATISTICS[name]: float(tags[key]) for name in STATISTICS if (key := f"STATISTICS_{name}") in tags
+            }
             band: dict[str, Any] = {"name": f"band-{number}", "data_type": file.dtypes[number - 1]}
             if description := file.descriptions[number - 1]:
                 band["description"] = description
@@ -148,44 +150,44 @@ def bands_of(path: Path) -> list[dict[str, Any]]:
                 band["nodata"] = "nan" if math.isnan(file.nodata) else file.nodata
             if unit := file.units[number - 1]:
                 band["unit"] = unit
-            bands.append(band | ({"statistics": found} if found else {}))
+            bands.append(band | ({"statistics": statistics} if statistics else {}))
     return bands
 
 
 @dataclass(frozen=True)
-class _Times:
-    """When the images were taken: from first to last, or a single time; made : when the result was."""
+class _ItemTimes:
+    """Times of an item. single : the only one, or None where there is a range from first to last; created : of the
+    result; description : of the item, which says where the times are from."""
 
-    when: datetime | None
+    single: datetime | None
     first: datetime | None
     last: datetime | None
-    made: datetime
+    created: datetime
     description: str
 
 
-def _times(folder: Path) -> _Times:
-    """From run.json; of a result without one, the time at which the surface was written."""
+def _times(folder: Path) -> _ItemTimes:
+    """Times from run.json; without one, the time at which the surface was written."""
     record: dict[str, Any] = {}
     if (path := folder / "run.json").is_file():
         record = read_record(path)
     if "created" in record:
-        made = datetime.fromisoformat(record["created"])
+        created = datetime.fromisoformat(record["created"])
     else:
-        made = datetime.fromtimestamp(int((folder / "dsm.tif").stat().st_mtime), UTC)
+        created = datetime.fromtimestamp(int((folder / "dsm.tif").stat().st_mtime), UTC)
     listed: Sequence[str | None] = record.get("image_dates", [])
     dates = sorted(date.fromisoformat(text) for text in listed if text)
-    what = "Heights from overlapping images, by zlocus."
+    description = "Heights from overlapping images, by zlocus."
     if not dates:
-        return _Times(
-            made, None, None, made, f"{what} The dates of the images are not known: datetime is that of the run."
-        )
+        description += " The dates of the images are not known: datetime is that of the run."
+        return _ItemTimes(created, None, None, created, description)
     first = datetime.combine(dates[0], time(0, 0, 0), UTC)
     last = datetime.combine(dates[-1], time(23, 59, 59), UTC)
     if len(dates) < len(listed):
-        what += f" The dates of {len(listed) - len(dates)} of {len(listed)} images are not known."
-    return _Times(None, first, last, made, what)
+        description += f" The dates of {len(listed) - len(dates)} of {len(listed)} images are not known."
+    return _ItemTimes(None, first, last, created, description)
 
 
-def _text(when: datetime) -> str:
-    """RFC 3339, in UTC."""
+def _rfc3339(when: datetime) -> str:
+    """A time in UTC as RFC 3339 writes it."""
     return when.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
