@@ -19,7 +19,7 @@ from zlocus.evaluation.frame import frame_of, in_metres, points_on
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.table import evaluation_table
 from zlocus.evaluation.truth import truth_blocks
-from zlocus.io.vertical import vertical_datum
+from zlocus.io.vertical import named_vertical_datum
 
 N = 240
 # Two ways through PROJ, and the curvature of a map over ten metres.
@@ -269,7 +269,7 @@ def test_a_surface_of_ours_says_that_it_is_ellipsoidal(tmp_path):
 
 def test_a_geoid_of_a_file_is_no_ellipsoid_whatever_its_name(tmp_path):
     name = geoid(tmp_path / "N_above_ellipsoid.tif")
-    crs = vertical_datum(str(name)).compound_crs(pyproj.CRS(CRS)).to_wkt()
+    crs = named_vertical_datum(str(name)).compound_crs(pyproj.CRS(CRS)).to_wkt()
     with pytest.raises(InputError, match="are above the geoid of N_above_ellipsoid"):
         evaluate(flat(tmp_path / "d.tif", 100, crs), in_degrees(tmp_path / "r.tif", ELLIPSOIDAL))
 

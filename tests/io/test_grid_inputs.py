@@ -18,7 +18,7 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.io import vertical
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem, read_geobox, read_polygons
 from zlocus.io.rasters import write_cog
-from zlocus.io.vertical import grid_crs, vertical_datum
+from zlocus.io.vertical import grid_crs, named_vertical_datum
 
 GRID = GeoBox.from_bbox((690000, 4790000, 690400, 4790300), crs="EPSG:32631", resolution=2)
 DEGREE_PLANE_M = 0.02
@@ -113,7 +113,7 @@ def test_heights_above_a_geoid_become_ellipsoidal(tmp_path):
     path, _ = degree_plane(tmp_path / "dem.tif")
     geoid, _ = degree_plane(tmp_path / "geoid.tif", slope_lon=10.0, slope_lat=0.0)
     lon, _ = geographic_centres()
-    difference = read_dem(path, GRID, vertical_datum(str(geoid))) - read_dem(path, GRID)
+    difference = read_dem(path, GRID, named_vertical_datum(str(geoid))) - read_dem(path, GRID)
     np.testing.assert_allclose(difference, 10 * lon, atol=DEGREE_PLANE_M)
 
 
@@ -175,7 +175,7 @@ def test_srtm_under_the_ventoux_pair(shared_data):
     srtm = reference / "srtm3_v2_egm96_heights.tif"
     assert read_dem(srtm, grid)[0, 0] == pytest.approx(464.7, abs=0.2)
     # EGM96 is +50.9 m here (README of the data).
-    geoid = vertical_datum(str(reference / "geoid_egm96_15min.tif"))
+    geoid = named_vertical_datum(str(reference / "geoid_egm96_15min.tif"))
     assert read_dem(srtm, grid, geoid)[0, 0] == pytest.approx(464.7 + 50.9, abs=0.3)
 
 

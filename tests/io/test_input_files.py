@@ -127,7 +127,7 @@ def test_an_image_that_changes_after_the_last_tile_ends_the_run(copied, elsewher
 
     monkeypatch.setattr(TileRun, "check", changing)
     said = "was replaced or written to" if change == "replaced" else "disappeared"
-    with pytest.raises(StoppedError, match=rf"{copied[1].name} {said} .* 9 finished tiles of before are kept"):
+    with pytest.raises(StoppedError, match=rf"{copied[1].name} {said} .* 9 finished tiles are kept"):
         asked(copied, out)
     assert names(out) == ["events.jsonl", FOLDER]
     monkeypatch.undo()

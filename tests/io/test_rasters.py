@@ -20,7 +20,7 @@ from rio_cogeo.cogeo import cog_validate
 
 from zlocus.core.errors import OutputError
 from zlocus.io.block_buffer import BlockBuffer
-from zlocus.io.rasters import RasterSink, compression_threads, write_cog
+from zlocus.io.rasters import RasterBands, RasterSink, compression_threads, write_cog
 
 RNG = np.random.default_rng(5)
 GRID = GeoBox.from_bbox((500000, 4500000, 500350.5, 4500400), crs="EPSG:32631", resolution=0.5)
@@ -78,14 +78,14 @@ def test_same_cells_same_bytes_however_they_come(tmp_path):
     assert (tmp_path / "again.tif").read_bytes() == expected
     starts = [(row, col) for row in range(0, GRID.shape[0], 130) for col in range(0, GRID.shape[1], 170)]
     RNG.shuffle(starts)
-    with RasterSink(tmp_path / "blocks.tif", GRID, "float32", nodata=np.nan) as sink:
+    with RasterSink(tmp_path / "blocks.tif", GRID, RasterBands("float32", nodata=np.nan)) as sink:
         for row, col in starts:
             sink.write(row, col, HEIGHTS[row : row + 130, col : col + 170])
     assert (tmp_path / "blocks.tif").read_bytes() == expected
 
 
 def test_blocks_from_threads(tmp_path):
-    with RasterSink(tmp_path / "a.tif", GRID, "float32", nodata=np.nan) as sink:
+    with RasterSink(tmp_path / "a.tif", GRID, RasterBands("float32", nodata=np.nan)) as sink:
         threads = [
             threading.Thread(target=sink.write, args=(row, 0, HEIGHTS[row : row + 50])) for row in range(0, 800, 50)
         ]
@@ -116,7 +116,7 @@ def test_gdal_sees_no_cell_before_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr(
         rasterio, "open", lambda *args, open=rasterio.open, **kw: opened.append(args) or open(*args, **kw)
     )
-    with RasterSink(tmp_path / "a.tif", GRID, "uint8", has_mask=True) as sink:
+    with RasterSink(tmp_path / "a.tif", GRID, RasterBands("uint8", has_mask=True)) as sink:
         sink.write(0, 0, np.ones((5, 6), np.uint8))
         assert not opened
     assert opened
@@ -124,7 +124,7 @@ def test_gdal_sees_no_cell_before_the_end(tmp_path, monkeypatch):
 
 @settings(max_examples=100, deadline=None)
 @given(data=st.data())
-def test_waiting_cells_are_an_array_on_disk(data):
+def test_a_block_buffer_is_an_array_on_disk(data):
     shape = tuple(data.draw(st.integers(1, most)) for most in (3, 23, 23))
     expected, came = np.full(shape, np.nan), np.zeros(shape[1:], bool)
     side = data.draw(st.integers(1, 9))
@@ -175,7 +175,7 @@ def test_statistics_count_cells_that_were_never_written(tmp_path):
     whole = np.zeros(GRID.shape, np.uint8)
     whole[20:320, 90:490] = block
     for nodata, valid in ((None, whole.astype(float)), (0, block.astype(float))):
-        with RasterSink(tmp_path / "a.tif", GRID, "uint8", nodata=nodata) as sink:
+        with RasterSink(tmp_path / "a.tif", GRID, RasterBands("uint8", nodata=nodata)) as sink:
             sink.write(20, 90, block)
         expected = expected_statistics(valid, whole.size)
         np.testing.assert_allclose(statistics_of(tmp_path / "a.tif"), [expected], rtol=DIGITS)
@@ -197,7 +197,7 @@ def test_no_statistics_of_nothing(tmp_path):
 
 @pytest.mark.parametrize(("nodata", "dtype"), [(np.nan, "float32"), (0, "uint8"), (None, "uint16")])
 def test_cells_never_written_are_nodata(tmp_path, nodata, dtype: str):
-    with RasterSink(tmp_path / "a.tif", GRID, dtype, nodata=nodata) as sink:
+    with RasterSink(tmp_path / "a.tif", GRID, RasterBands(dtype, nodata=nodata)) as sink:
         sink.write(10, 20, np.ones((5, 6), dtype))
     with rasterio.open(tmp_path / "a.tif") as file:
         cells = file.read(1)
@@ -209,7 +209,7 @@ def test_cells_never_written_are_nodata(tmp_path, nodata, dtype: str):
 
 def test_nothing_is_there_before_the_end_or_after_a_failure(tmp_path):
     def fail():
-        with RasterSink(tmp_path / "a.tif", GRID, "uint8") as sink:
+        with RasterSink(tmp_path / "a.tif", GRID, RasterBands("uint8")) as sink:
             sink.write(0, 0, np.ones((5, 6), np.uint8))
             assert not (tmp_path / "a.tif").exists()
             raise KeyError("a fault in the middle")
@@ -223,7 +223,7 @@ def test_an_older_product_stays_until_the_new_one_is_whole(tmp_path):
     path = tmp_path / "a.tif"
     write_cog(path, HEIGHTS, GRID)
     older = path.read_bytes()
-    sink = RasterSink(path, GRID, "float32")
+    sink = RasterSink(path, GRID, RasterBands("float32"))
     sink.write(0, 0, HEIGHTS * 2)
     assert path.read_bytes() == older
     sink.close()
@@ -243,13 +243,13 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 from pathlib import Path
 from zlocus.core.errors import OutputError
-from zlocus.io.rasters import compressing, write_cog
+from zlocus.io.rasters import compression_threads, write_cog
 grid = GeoBox.from_bbox((0, 0, 1024, 1024), crs="EPSG:32631", resolution=1)
 cells = np.random.default_rng(0).normal(size=(1024, 1024)).astype(np.float32)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 try:
-    with compressing(int(sys.argv[3])):
+    with compression_threads(int(sys.argv[3])):
         write_cog(Path(sys.argv[1]) / "a.tif", cells, grid)
 except OutputError as error:
     print(error)
@@ -271,7 +271,7 @@ def test_full_disk(tmp_path, limit: int, threads: int):
 def test_large_rasters_are_not_held_in_memory(tmp_path):
     grid = GeoBox.from_bbox((0, 0, 3000, 3000), crs="EPSG:32631", resolution=1)
     tracemalloc.start()
-    with RasterSink(tmp_path / "a.tif", grid, "float32", nodata=np.nan) as sink:
+    with RasterSink(tmp_path / "a.tif", grid, RasterBands("float32", nodata=np.nan)) as sink:
         for row in range(0, 3000, 300):
             sink.write(row, 0, np.full((300, 3000), row, np.float32))
     peak = tracemalloc.get_traced_memory()[1]

@@ -7,7 +7,7 @@ import pytest
 from zlocus.core.errors import InputError
 from zlocus.io.cameras.rpc_text import SCALARS, read_rpc_txt
 from zlocus.io.number_table import read_number_table
-from zlocus.io.safe_text import written
+from zlocus.io.safe_text import digits_written
 
 
 @pytest.mark.parametrize(
@@ -15,7 +15,7 @@ from zlocus.io.safe_text import written
     [("12.500", (3, 0)), ("-1.25E-007", (2, 3)), ("+.5e1", (1, 1)), ("12", None), ("12.", None), ("1.2e", None)],
 )
 def test_how_a_number_is_written(number, digits):
-    assert written(number) == digits
+    assert digits_written(number) == digits
 
 
 def rpc_text(form):

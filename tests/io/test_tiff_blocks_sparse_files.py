@@ -185,7 +185,7 @@ def test_a_file_that_holds_all_its_blocks_says_nothing(images):
 
 
 def test_many_blocks_are_told_apart_in_cells_of_several(tmp_path, monkeypatch):
-    monkeypatch.setattr("zlocus.io.tiff_blocks.MOST_CELLS", 4)
+    monkeypatch.setattr("zlocus.io.tiff_blocks.MAX_CELLS_PER_AXIS", 4)
     path = tmp_path / "a.tif"
     with rasterio.open(
         path, "w", driver="GTiff", width=160, height=96, count=1, dtype=np.uint8, SPARSE_OK="TRUE", tiled=True,
@@ -240,7 +240,7 @@ def test_features_are_looked_for_where_the_file_holds_pixels(images, tmp_path):
 
 def test_an_image_of_any_size_without_content_is_refused_after_some_windows(tmp_path, monkeypatch):
     """Most of them are not read; of an image that is not larger than those, all are."""
-    monkeypatch.setattr(images_module, "CHECKED_PX", 64 * 64)
+    monkeypatch.setattr(images_module, "CHECK_WINDOW_PX", 64 * 64)
     path = tmp_path / "a.tif"
     with warnings.catch_warnings(action="ignore"), rasterio.open(
         path, "w", driver="GTiff", width=1024, height=640, count=1, dtype=np.uint8, tiled=True, blockxsize=64,
@@ -259,7 +259,7 @@ def test_an_image_of_any_size_without_content_is_refused_after_some_windows(tmp_
         seen[row : row + rows, col : col + cols] += 1
     assert (seen == 1).all()
     read.clear()
-    monkeypatch.setattr(images_module, "MOST_CHECKED_PX", 20 * 64 * 64)
+    monkeypatch.setattr(images_module, "MAX_CHECKED_PX", 20 * 64 * 64)
     with pytest.raises(InputError, match=r"value 9 in all of 20 windows spread over its 640 x 1024 px: "):
         check_content(image)
     assert len(read) == 20

@@ -20,7 +20,7 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.io import vertical
 from zlocus.io.grid_inputs import read_geobox
 from zlocus.io.rasters import write_cog
-from zlocus.io.vertical import ELLIPSOIDAL, KNOWN, check_heights, declared_vertical_datum, vertical_datum
+from zlocus.io.vertical import ELLIPSOIDAL, KNOWN, check_heights, declared_vertical_datum, named_vertical_datum
 from zlocus.products.rasters import SurfaceRasters
 
 UTM = CRS.from_epsg(32631)
@@ -59,7 +59,7 @@ def centres(geobox):
 
 
 def test_the_ellipsoid_needs_nothing():
-    datum = vertical_datum("ellipsoid")
+    datum = named_vertical_datum("ellipsoid")
     assert datum == ELLIPSOIDAL
     assert (datum.crs, datum.files, datum.surface) == (None, (), "the ellipsoid")
     assert not datum.undulation(centres(GRID), UTM).any()
@@ -74,7 +74,7 @@ def test_the_ellipsoid_needs_nothing():
 def test_a_grid_that_is_missing_is_no_guess(no_grids, name):
     """Also where a file of that name would be found by PROJ over the network."""
     with pytest.raises(ConfigError) as error:
-        vertical_datum(name)
+        named_vertical_datum(name)
     message = str(error.value)
     grid = KNOWN[name].grids[0]
     assert f"--vertical {name} needs PROJ's grid {grid}, which is not in {no_grids}" in message
@@ -99,9 +99,9 @@ def test_proj_names_the_same_grids(name):
 
 
 def test_a_grid_that_is_there_is_what_proj_uses(proj_grid):
-    datum = vertical_datum("egm96")
-    assert vertical_datum("EGM96") == vertical_datum("Egm96") == datum
-    assert vertical_datum("Ellipsoid") is ELLIPSOIDAL
+    datum = named_vertical_datum("egm96")
+    assert named_vertical_datum("EGM96") == named_vertical_datum("Egm96") == datum
+    assert named_vertical_datum("Ellipsoid") is ELLIPSOIDAL
     xy = centres(GRID)
     lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(*xy.T)
     by_proj = Transformer.from_pipeline(
@@ -120,13 +120,13 @@ def test_grids_are_looked_for_where_proj_does(tmp_path, monkeypatch):
     (tmp_path / "b").mkdir()
     write_proj_grid(tmp_path / "b" / "us_nga_egm08_25.tif")
     if not any((folder / "us_nga_egm08_25.tif").is_file() for folder in folders if folder != tmp_path / "b"):
-        assert vertical_datum("egm2008").files == (tmp_path / "b" / "us_nga_egm08_25.tif",)
+        assert named_vertical_datum("egm2008").files == (tmp_path / "b" / "us_nga_egm08_25.tif",)
 
 
 def test_cells_lose_the_undulation_of_their_centre(geoid):
     heights = np.random.default_rng(1).uniform(100, 500, GRID.shape).astype(np.float32)
     heights[3, 5:9] = np.nan
-    datum = vertical_datum(str(geoid))
+    datum = named_vertical_datum(str(geoid))
     found = datum.heights_from_ellipsoidal(heights, GRID)
     undulation = datum.undulation(centres(GRID), UTM).reshape(GRID.shape)
     np.testing.assert_allclose(found, heights - undulation, rtol=0, atol=FLOAT_M)
@@ -136,7 +136,7 @@ def test_cells_lose_the_undulation_of_their_centre(geoid):
 
 def test_cells_are_the_same_however_they_are_cut(geoid):
     heights = np.random.default_rng(2).uniform(100, 500, GRID.shape).astype(np.float32)
-    datum = vertical_datum(str(geoid))
+    datum = named_vertical_datum(str(geoid))
     whole = datum.heights_from_ellipsoidal(heights, GRID)
     pieces = np.full_like(heights, np.nan)
     for row in range(0, 70, 13):
@@ -147,7 +147,7 @@ def test_cells_are_the_same_however_they_are_cut(geoid):
 
 
 def test_an_area_is_looked_at_before_the_work(geoid, tmp_path):
-    datum = vertical_datum(str(geoid))
+    datum = named_vertical_datum(str(geoid))
     xmin, ymin, xmax, ymax = GRID.boundingbox.bbox
     low, high = datum.undulation_range((xmin, ymin, xmax, ymax), UTM)
     undulation = datum.undulation(centres(GRID), UTM)
@@ -159,7 +159,7 @@ def test_an_area_is_looked_at_before_the_work(geoid, tmp_path):
     posts[50, 333] = np.nan
     holed = write_geoid(tmp_path / "holed.tif", posts, from_origin(690_000, 4_798_000, 10, 10), "EPSG:32631")
     with pytest.raises(InputError, match=r"holed\.tif has no value \(nodata\) around 6933"):
-        vertical_datum(str(holed)).check_covers((690_010, 4_794_010, 693_990, 4_797_990), UTM)
+        named_vertical_datum(str(holed)).check_covers((690_010, 4_794_010, 693_990, 4_797_990), UTM)
 
 
 def test_the_datum_of_a_file_is_in_its_crs(proj_grid, tmp_path):
@@ -172,7 +172,7 @@ def test_the_datum_of_a_file_is_in_its_crs(proj_grid, tmp_path):
     assert of("EPSG:32631+5773").files == (proj_grid,)
     with pytest.raises(ConfigError, match=r"dem\.tif has EGM2008 heights by its CRS, which needs PROJ's grid us_nga_"):
         of("EPSG:4326+3855")
-    with pytest.raises(InputError, match=r"no geoid of \(NAVD88 height, by its CRS\)\. Give its geoid with --dem-vert"):
+    with pytest.raises(InputError, match=r"no geoid for \(NAVD88 height, by its CRS\)\. Give its geoid with --dem-vert"):
         of("EPSG:4269+5703")
     for crs, says in (("EPSG:4326+6360", "in US survey foot"), ("EPSG:32631+5831", "go down")):
         with pytest.raises(InputError, match=says):
@@ -184,7 +184,7 @@ def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
     """The CRS comes back from the GeoTIFF alone, is a valid COG, and the grid is one for --like."""
     if name != "file":
         write_proj_grid(no_grids / KNOWN[name].grids[0])
-    datum = vertical_datum(str(geoid) if name == "file" else name)
+    datum = named_vertical_datum(str(geoid) if name == "file" else name)
     path = tmp_path / "out" / "dsm.tif"
     path.parent.mkdir()
     write_cog(path, np.zeros(GRID.shape, np.float32), datum.compound_geobox(GRID))
@@ -197,7 +197,7 @@ def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
     (height,) = [part for part in crs.sub_crs_list if part.is_vertical]
     if name == "file":
         assert height.name == "height above the geoid of my geoid.tif"
-        with pytest.raises(InputError, match="no geoid of"):
+        with pytest.raises(InputError, match="no geoid for"):
             declared_vertical_datum(crs, path, "--dem-vertical")
     else:
         assert height.to_epsg() == KNOWN[name].epsg
@@ -225,7 +225,7 @@ def test_a_projected_crs_with_ellipsoidal_heights_needs_a_second_file(tmp_path):
 
 
 def test_names_that_geotiff_cannot_hold(tmp_path, geoid):
-    datum = vertical_datum(str(geoid.rename(tmp_path / 'gé"oid|1.tif')))
+    datum = named_vertical_datum(str(geoid.rename(tmp_path / 'gé"oid|1.tif')))
     write_cog(tmp_path / "dsm.tif", np.zeros(GRID.shape, np.float32), datum.compound_geobox(GRID))
     with rasterio.open(tmp_path / "dsm.tif") as file:
         names = [part.name for part in CRS.from_user_input(file.crs).sub_crs_list]
@@ -233,7 +233,7 @@ def test_names_that_geotiff_cannot_hold(tmp_path, geoid):
 
 
 def test_of_the_rasters_only_heights_are_above_something(tmp_path, geoid):
-    datum = vertical_datum(str(geoid))
+    datum = named_vertical_datum(str(geoid))
     (tmp_path / "out").mkdir()
     with SurfaceRasters(tmp_path / "out", GRID, "uint8", datum):
         pass

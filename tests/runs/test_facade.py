@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from facade_scene import ALONG, FILE_FROM_WALL, KIND, OUT, STATIONS, photographed
 from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError
-from zlocus.core.options import JointOptions, OrientationOptions
+from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.requests import ImportRequest
 from zlocus.io.scene_file import open_scene, rotation_to_axes
 from zlocus.orientation.orientation import orient
@@ -110,7 +110,7 @@ def test_a_local_frame_has_no_place_on_the_earth(facade, surface, tmp_path):
 def test_joint_corrections_are_made_where_they_are_asked_for(facade, tmp_path):
     scene = open_scene([imported(facade, tmp_path / "scene.yaml")])
     assert orient(scene, OrientationOptions(), (40.0, 60.0)).model == "none"
-    asked = OrientationOptions(model="joint", joint=JointOptions(sigma_position_m=0.01))
+    asked = OrientationOptions(model="joint", joint=BundleAdjustmentOptions(sigma_position_m=0.01))
     assert orient(scene, asked, (40.0, 60.0)).model == "joint"
 
 

@@ -32,7 +32,7 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.grid_inputs import read_dem, read_polygons
 from zlocus.io.images import open_image
 from zlocus.io.scene_file import open_scene
-from zlocus.pipeline.execution.checkpoint import DONE, FOLDER, TileStore
+from zlocus.pipeline.execution.checkpoint import DONE, FOLDER, TileCheckpoint
 
 NAMES = (
     "../../escaped",
@@ -256,7 +256,7 @@ def test_tiles_are_not_unpickled(images, tmp_path):
     """Whoever can write into OUT can make tiles, with their checksums, but none that runs."""
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TileStore, "remove", lambda self: None)
+        patch.setattr(TileCheckpoint, "remove", lambda self: None)
         run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     lines = (out / FOLDER / DONE).read_text().splitlines()
     made, content = tmp_path / "made", io.BytesIO()
@@ -268,7 +268,7 @@ def test_tiles_are_not_unpickled(images, tmp_path):
         (out / FOLDER / f"{name}.npz").write_bytes(evil)
         changed = json.dumps({"tile": name, "sha256": hashlib.sha256(evil).hexdigest()})
         (out / FOLDER / DONE).write_text("\n".join([changed, *lines[1:]]) + "\n")
-        store = TileStore(out / FOLDER, {}, {name: hashlib.sha256(evil).hexdigest()})
+        store = TileCheckpoint(out / FOLDER, {}, {name: hashlib.sha256(evil).hexdigest()})
         assert store.load(name) is None
         assert not made.exists()
 
@@ -277,7 +277,7 @@ def test_tiles_are_not_unpickled(images, tmp_path):
 def test_names_of_tiles_lead_nowhere(tmp_path, name):
     (tmp_path / "out" / FOLDER).mkdir(parents=True)
     (tmp_path / "escaped.npz").write_bytes(b"PK")
-    store = TileStore(tmp_path / "out" / FOLDER, {}, {name: "0" * 64})
+    store = TileCheckpoint(tmp_path / "out" / FOLDER, {}, {name: "0" * 64})
     assert store.load(name) is None
 
 

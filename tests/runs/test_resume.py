@@ -115,7 +115,7 @@ def test_a_signal_stops_within_seconds_and_is_taken_on(images, straight, tmp_pat
     check_end(process.returncode, number, stderr)
     _, alive = psutil.wait_procs(children, STOPS_WITHIN_S)
     assert not [one for one in alive if one.status() != psutil.STATUS_ZOMBIE]
-    assert "tiles are finished and kept: the same command goes on from there" in stderr
+    assert "tiles are finished and kept: the same command resumes from there" in stderr
     n = n_finished(out)
     again = subprocess.run(command(images("sine"), out, tmp_path), capture_output=True, text=True, check=True)
     assert f"{n} of " in again.stderr
@@ -180,7 +180,7 @@ def test_what_is_stopped_after_the_matching_keeps_its_tiles(images, straight, tm
     asked = {"workers": 1, "report": step.endswith("_show")}
     with pytest.raises(KeyboardInterrupt):
         run(images("sine"), out, SMALL_TILES, **asked)
-    assert "9 of 9 tiles are finished and kept: the same command goes on from there.\n" in said.getvalue()
+    assert "9 of 9 tiles are finished and kept: the same command resumes from there.\n" in said.getvalue()
     found = {path.name for path in out.iterdir() if path.is_file()}
     assert complete | {"events.jsonl"} <= found
     assert {f"{name}.tif" for name in RASTERS} <= found if complete else found == {"events.jsonl"}
@@ -201,7 +201,7 @@ def test_a_command_that_starts_anew_is_told_how_to_go_on(images, tmp_path, monke
     asked = {"overwrite": True} if option == "--overwrite" else {"resume": False}
     with pytest.raises(KeyboardInterrupt):
         run(images("sine"), out, SMALL_TILES, workers=1, report=False, **asked)
-    assert f"finished and kept: the same command without {option} goes on from there." in said.getvalue()
+    assert f"finished and kept: the same command without {option} resumes from there." in said.getvalue()
 
 
 def events_of(out):
@@ -284,7 +284,7 @@ def test_ties_are_not_looked_for_again(images, straight, tmp_path, monkeypatch):
     def looked_for(*_):
         raise AssertionError("ties are looked for again")
 
-    for name in ("find_ties", "sharpened"):
+    for name in ("find_ties", "refined_ties"):
         monkeypatch.setattr(f"zlocus.orientation.orientation.{name}", looked_for)
     run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     assert same(out, straight)
@@ -406,7 +406,7 @@ def test_an_image_that_disappears(images, tmp_path, monkeypatch):
 
 # When the folder of results is removed, by the call that notices it.
 GOES = {
-    "zlocus.pipeline.execution.checkpoint.write_whole": (
+    "zlocus.pipeline.execution.checkpoint.write_atomically": (
         6,
         r"tiles has gone since the run began, with 3 finished tiles in it",
     ),
@@ -453,7 +453,7 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
                     full.write(content)
         write(path, content)
 
-    monkeypatch.setattr(store, "write_whole", until_full)
+    monkeypatch.setattr(store, "write_atomically", until_full)
     with pytest.raises(StoppedError, match=r"No space left on device\. 4 finished tiles are kept; make room"):
         run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
     assert n_finished(tmp_path / "out") == 4

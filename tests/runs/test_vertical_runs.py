@@ -29,8 +29,8 @@ from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.control_points import read_control
 from zlocus.io.grid_inputs import dem_datum
 from zlocus.io.scene_file import open_scene
-from zlocus.io.vertical import vertical_datum
-from zlocus.matching.view_ranking import LabelledTies
+from zlocus.io.vertical import named_vertical_datum
+from zlocus.matching.pair_labels import LabelledTies
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.pipeline.height_range import with_heights
@@ -43,7 +43,7 @@ from zlocus.synthetic.terrain import analytic_height
 AT_CENTRE_M, EAST_SLOPE, NORTH_SLOPE = 48.0, 8e-3, -4e-3
 POST_M = 100.0
 # Three images are ranked too.
-RANKED = replace(SMALL_TILES, selection=replace(SMALL_TILES.selection, fewest_views=3, least_images=1))
+RANKED = replace(SMALL_TILES, selection=replace(SMALL_TILES.selection, min_images_for_choice=3, min_images=1))
 EXACT_M = 1e-9
 # float32 heights, of which an undulation is taken.
 FLOAT_M = 2e-5
@@ -126,7 +126,7 @@ def test_points_where_a_geoid_has_no_value_are_left_out(tmp_path, geoid):
     east, north = CENTRE
     xyz = np.array([[east, north, 60.0], [east + 900.0, north, 60.0], [east + 5000.0, north, 60.0]])
     ranked = LabelledTies(xyz, np.ones((3, 2, 2), np.int8), np.arange(2))
-    write_ranking(tmp_path / "ranking.gpkg", [ranked], ["a", "b"], UTM, vertical_datum(str(geoid)))
+    write_ranking(tmp_path / "ranking.gpkg", [ranked], ["a", "b"], UTM, named_vertical_datum(str(geoid)))
     found, _ = points_in(tmp_path / "ranking.gpkg")
     assert len(found) == 4  # two references each
     np.testing.assert_allclose(found[::2, 2], 60.0 - undulation(*xyz[:2, :2].T), rtol=0, atol=EXACT_M)
@@ -164,7 +164,7 @@ def test_heights_asked_for_are_above_the_same(images, geoid, tmp_path):
 
 
 def test_heights_asked_for_hold_wherever_two_views_see_the_ground(images, geoid):
-    scene, datum = open_scene(images("sine").inputs, UTM), vertical_datum(str(geoid))
+    scene, datum = open_scene(images("sine").inputs, UTM), named_vertical_datum(str(geoid))
     asked = (HEIGHTS[0] - AT_CENTRE_M, HEIGHTS[1] - AT_CENTRE_M)
     west, south, east, north = shared_ground(scene, asked)
     spans = {
@@ -181,7 +181,7 @@ def test_heights_asked_for_hold_wherever_two_views_see_the_ground(images, geoid)
         if bounds == PART:
             assert with_heights(replace(scene, bounds=PART), asked, datum).heights == found
     assert with_heights(scene, None, datum) is scene
-    assert with_heights(scene, asked, vertical_datum("ellipsoid")).heights == asked
+    assert with_heights(scene, asked, named_vertical_datum("ellipsoid")).heights == asked
 
 
 def write_dem(path, geoid_too, crs):
@@ -273,7 +273,7 @@ def test_control_points_above_a_geoid(geoid, tmp_path):
         f"name,x,y,z,image,column,row\np,{x},{y},5.25,view0,4,5\np,{x},{y},5.25,view1,4,5\nq,{x},{y + 50},6,view0,9,9\n"
     )
     views = views_of([None, None], (100, 80))
-    found = read_control(table, views, vertical_datum(str(geoid)), UTM)
+    found = read_control(table, views, named_vertical_datum(str(geoid)), UTM)
     assert found.names == ("p", "q")
     expected = [5.25 + undulation(x, y), 6.0 + undulation(x, y + 50)]
     np.testing.assert_allclose(found.xyz[:, 2], expected, rtol=0, atol=1e-9)

@@ -9,7 +9,7 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.evaluation.heights import HeightRaster
-from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL_DESCRIPTION, check_heights, vertical_datum, vertical_part
+from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL_DESCRIPTION, check_heights, named_vertical_datum, vertical_part
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _raised(raster: HeightRaster, geoid: Path) -> HeightRaster:
     """The same heights above the ellipsoid."""
     if raster.horizontal is None:
         raise InputError(f"{raster.path} has no CRS, so no geoid can be added to it. Assign one (gdal_edit -a_srs).")
-    datum = vertical_datum(str(geoid), "--geoid")
+    datum = named_vertical_datum(str(geoid), "--geoid")
     if datum.geoid is None:
         raise ConfigError(f"--geoid {geoid} is no geoid. Give egm96, egm2008 or the raster of one, or leave it out.")
     geobox = GeoBox(raster.z.shape, raster.transform, raster.horizontal.to_wkt())

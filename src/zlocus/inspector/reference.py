@@ -12,8 +12,8 @@ from zlocus.evaluation.evaluate import Shift, check_options, evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.vertical import same_heights
 from zlocus.io.open_raster import existing_file, open_raster
-from zlocus.io.rasters import RasterSink
-from zlocus.io.vertical import vertical_datum
+from zlocus.io.rasters import RasterBands, RasterSink
+from zlocus.io.vertical import named_vertical_datum
 from zlocus.products.report.comparison import Comparison, full_colour_m
 from zlocus.products.report.text import against_reference
 
@@ -43,7 +43,7 @@ def check_comparison(comparison: Comparison) -> None:
     existing_file(comparison.reference, "reference")
     check_options(comparison.margin_m, (comparison.threshold_m,), comparison.align, comparison.coregister)
     if comparison.geoid is not None:
-        vertical_datum(str(comparison.geoid), "--geoid")
+        named_vertical_datum(str(comparison.geoid), "--geoid")
 
 
 def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference:
@@ -58,7 +58,7 @@ def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference
     heights = comparable(dsm, comparison, evaluation.shift)
     crs = None if heights.horizontal is None else heights.horizontal.to_wkt()
     path, geobox = scratch / "reference.tif", GeoBox(heights.z.shape, heights.transform, crs)
-    with RasterSink(path, geobox, "float32", nodata=float("nan"), units="m") as sink:
+    with RasterSink(path, geobox, RasterBands("float32", float("nan"), units="m")) as sink:
         sink.write(0, 0, heights.z.astype(np.float32))
     return Reference(path, name, full_colour_m(evaluation), against_reference(evaluation, name))
 
@@ -70,8 +70,9 @@ def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> Height
     if compared.converted == dsm and heights.horizontal is not None:
         # The surface's heights were raised to the ellipsoid: the reference's are lowered instead.
         geobox = GeoBox(heights.z.shape, heights.transform, heights.horizontal.to_wkt())
-        datum = vertical_datum(str(comparison.geoid), "--geoid")
-        heights = replace(heights, z=datum.heights_from_ellipsoidal(heights.z.astype(np.float32), geobox).astype(np.float64))
+        datum = named_vertical_datum(str(comparison.geoid), "--geoid")
+        z = datum.heights_from_ellipsoidal(heights.z.astype(np.float32), geobox).astype(np.float64)
+        heights = replace(heights, z=z)
     if shift is not None:
         moved = heights.transform.translation(shift.east_m, shift.north_m) * heights.transform
         heights = replace(heights, z=heights.z + shift.up_m, transform=moved)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: they have a temporary name until all is written."""
+"""Write files atomically: a file has a temporary name until all of it is written."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Temporary name beside a file, under which it is to be written; at the end of the block it gets its own name.
+    """Yield a temporary path beside `path` to write to; at the end of the block the file is renamed to `path`.
 
-    After an exception, a signal among them, nothing of it stays.
+    After an exception, including those that signals raise, the temporary file is removed.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part
         os.replace(part, path)
     finally:
-        with suppress(OSError):  # where it could not be made, or its folder has gone
+        with suppress(OSError):  # the file was never created, or its folder is gone
             part.unlink(missing_ok=True)

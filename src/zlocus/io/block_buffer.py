@@ -1,4 +1,4 @@
-"""Cells of a raster that come in any order, waiting on disk."""
+"""Keep the cells of a raster on disk while its blocks come in any order."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ Slices = tuple[slice, slice]
 
 
 class BlockBuffer:
-    """A plain file of square blocks, each written whole, in the order of their first cells; never held in memory.
+    """A plain file of square blocks, in the order in which each block got its first cell. Memory: one block.
 
-    GDAL is no place to wait in: where a block is changed a second time while another thread reads any raster at all,
-    its shared cache now and then loses the first change (3.10, one raster in a hundred under a cache of 2 MB).
+    A GDAL dataset cannot do this. If a block is changed a second time while another thread reads any raster, GDAL's
+    shared cache sometimes loses the first change (3.10: one raster in a hundred with a cache of 2 MB).
 
-    shape : (bands, r, c); dtype : of the cells; nodata : value of cells never written; side : cells of a block.
+    shape : (bands, r, c) of the raster; dtype : type of the cells; nodata : value of cells that were never written;
+    side : rows and columns of a block.
     """
 
     def __init__(self, path: Path, shape: tuple[int, int, int], dtype: np.dtype[Any], nodata: float, side: int) -> None:
         self._shape, self._side, self._nodata = shape, side, nodata
         self._block = np.empty((shape[0], side, side), dtype)
-        # Where in the file, counted in blocks; -1 where none of its cells has come yet.
+        # Number of each block within the file; -1 for a block without any cell yet.
         self._place = np.full((-(-shape[1] // side), -(-shape[2] // side)), -1)
         self._n_begun = 0
         self._file = path.open("w+b")
 
     def put(self, row: int, col: int, cells: NDArray[Any]) -> None:
-        """Keep cells (bands, r, c), the first of them at (row, col)."""
+        """Store cells (bands, r, c), the first of them at (row, col) of the raster."""
         for r, c in product(self._blocks(row, cells.shape[1]), self._blocks(col, cells.shape[2])):
             block = self._read(r, c)
             to, of = self._common(r, row, cells.shape[1]), self._common(c, col, cells.shape[2])
@@ -44,7 +45,7 @@ class BlockBuffer:
         self._file.flush()
 
     def __iter__(self) -> Iterator[tuple[Slices, NDArray[Any]]]:
-        """Rows and columns, and cells (bands, r, c), of each block with a cell that has come; valid until the next."""
+        """Yield rows and columns, and cells (bands, r, c), of each block that has cells. The array is reused."""
         for r, c in np.argwhere(self._place >= 0):
             rows, cols = (
                 slice(n * self._side, min((n + 1) * self._side, size))
@@ -53,7 +54,7 @@ class BlockBuffer:
             yield (rows, cols), self._read(r, c)[:, : rows.stop - rows.start, : cols.stop - cols.start]
 
     def close(self) -> None:
-        """Close the file; the cells cannot be had any more."""
+        """Close the file. The cells can no longer be read."""
         self._file.close()
 
     def _read(self, r: int, c: int) -> NDArray[Any]:
@@ -68,6 +69,6 @@ class BlockBuffer:
         return range(first // self._side, math.ceil((first + n) / self._side))
 
     def _common(self, number: int, first: int, n: int) -> Slices:
-        """The cells of a range that lie in a block, counted from the block's first and from the range's."""
+        """The overlap of a range of cells with a block, counted from the block's first cell and from the range's."""
         low, high = max(number * self._side, first), min((number + 1) * self._side, first + n)
         return slice(low - number * self._side, high - number * self._side), slice(low - first, high - first)

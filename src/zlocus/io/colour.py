@@ -1,4 +1,4 @@
-"""Colours of image pixels: red, green and blue where a file declares them, else grey."""
+"""Read the colours of an image: red, green and blue where the file declares them, otherwise grey."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ CHANNELS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 
 
 def read_colours(path: Path, row: int, rows: int) -> NDArray[np.float32]:
-    """Whole rows of an image, (rows, c, 3) float32, in the file's own numbers.
+    """The colours of whole rows of an image, (rows, c, 3) float32, in the file's own numbers.
 
     Raises
     ------
     InputError
-        When the file can no longer be read.
+        The file can no longer be read.
     """
     with open_raster(path) as source:
         index = {meaning: band for band, meaning in zip(source.indexes, source.colorinterp, strict=True)}

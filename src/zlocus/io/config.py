@@ -1,4 +1,4 @@
-"""The configuration file: a complete commented TOML out, strict TOML or YAML in."""
+"""The configuration file: written as complete commented TOML, read from strict TOML or YAML."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from zlocus.io.safe_documents import read_yaml
 from zlocus.io.safe_text import check_last_line_ended, read_text
 
 COMMENT_WIDTH = 100
-# Bytes of a file; a complete one has a tenth of it.
+# A complete configuration has a tenth of this.
 MAX_CONFIG_BYTES = 200_000
 HEADING = "# Every option of zlocus. What is left out keeps its default; read with --config FILE."
 T = TypeVar("T")
 
 
 def config_as_dict(config: Any) -> dict[str, Any]:
-    """The options as nested plain values, every one present (None: unset), as `run.json` keeps them."""
+    """All options as nested plain values, as `run.json` holds them. None means unset."""
     values: dict[str, Any] = {}
     for f in fields(config):
         value = getattr(config, f.name)
@@ -38,25 +38,25 @@ def config_as_dict(config: Any) -> dict[str, Any]:
 
 
 def config_from_dict(values: Mapping[str, Any], where: str) -> RunConfig:
-    """The configuration that `values` describe; what they leave out keeps its default.
+    """The configuration with these values; options that they leave out keep their defaults.
 
-    where : what the values come from, for messages.
+    where : source of the values, for messages.
 
     Raises
     ------
     ConfigError
-        An unknown key, a value of the wrong type or out of range.
+        A key is unknown, or a value is of the wrong type or out of range.
     """
     return _build(RunConfig, values, where, prefix="")
 
 
 def read_config(path: Path) -> RunConfig:
-    """The configuration in a TOML file, or a YAML file where the name ends in .yaml or .yml.
+    """The configuration in a TOML file, or in a YAML file if its name ends in .yaml or .yml.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or see `config_from_dict`.
+        The file cannot be read; see also `config_from_dict`.
     """
     try:
         is_yaml = path.suffix.lower() in (".yaml", ".yml")
@@ -76,12 +76,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def write_config(config: RunConfig) -> str:
-    """Every option as commented TOML; `read_config` gives back an equal configuration."""
+    """All options as commented TOML text. `read_config` returns an equal configuration for it."""
     return "\n".join([HEADING, *_lines(config, prefix="")]) + "\n"
 
 
 def _build(kind: type[T], values: Any, where: str, prefix: str) -> T:
-    """An options class from plain values, its stages first."""
+    """An options class from plain values, the groups of options inside it first."""
     if not isinstance(values, Mapping):
         name = f"{where}: {prefix.rstrip('.')}" if prefix else where
         raise ConfigError(f"{name} must hold named options, not {values!r}. See `zlocus config`.")
@@ -103,9 +103,9 @@ def _build(kind: type[T], values: Any, where: str, prefix: str) -> T:
 
 
 def _typed(kind: Any, value: Any, where: str) -> Any:
-    """`value` as the option's type: an integer passes for a float, a list for a tuple, nothing else is converted."""
+    """`value` as the type of its option. An integer is accepted for a float and a list for a tuple, nothing else."""
     try:
-        # As JSON, pydantic's strict mode knows lists but no tuples: just what TOML and YAML can say.
+        # For JSON, pydantic's strict mode accepts lists for tuples, which is what TOML and YAML can express.
         return TypeAdapter(kind).validate_json(json.dumps(value), strict=True)
     except (ValidationError, TypeError) as error:
         reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else "Input should be a plain value"
@@ -135,7 +135,7 @@ def _unknown(name: str, known: list[str], where: str, prefix: str) -> str:
 
 
 def _lines(options: Any, prefix: str) -> Iterator[str]:
-    """Lines of one stage: its own options first, as TOML wants it, then the stages inside it."""
+    """The lines of a group of options: its own options first, as TOML requires, then the groups inside it."""
     stages = [f for f in fields(options) if is_dataclass(getattr(options, f.name))]
     for f in fields(options):
         if f not in stages:
@@ -158,7 +158,7 @@ def _comment(text: str) -> list[str]:
 
 
 def _allowed(meta: Mapping[str, Any]) -> str:
-    """Range and unit of an option in brackets; empty where it has neither."""
+    """Range and unit of an option, in brackets; empty where it has neither."""
     low, high, unit, choices = meta.get("low"), meta.get("high"), meta.get("unit", ""), meta.get("choices")
     limits = ""
     if choices is not None:

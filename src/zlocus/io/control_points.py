@@ -24,19 +24,19 @@ CONTROL, CHECK = "control", "check"
 
 
 def read_control(
-    path: Path, views: Sequence[View], vertical: VerticalDatum = ELLIPSOIDAL, crs: CRS | None = None
+    path: Path, views: Sequence[View], vertical_datum: VerticalDatum = ELLIPSOIDAL, crs: CRS | None = None
 ) -> GroundControl:
-    """Control and check points: `name`, `x`, `y`, `z` in the scene's frame, `image`, `column`, `row`, and where given
-    `sigma` (m, of each coordinate), `sigma_z` (m, of z alone) and `role` (control or check).
+    """The control and check points of a table, with ellipsoidal heights.
 
-    image : name of a view, or of its file. vertical : what z is above; crs : of x and y, needed above a geoid.
+    Columns: `name`, `x`, `y`, `z` in the scene's frame, `image` (name of a view or of its file), `column`, `row`;
+    optional are `sigma` (m, of each coordinate), `sigma_z` (m, of z alone) and `role` (control or check).
+    vertical_datum : datum of z; crs : of x and y, needed where the datum is a geoid.
 
     Raises
     ------
     InputError
-        For a malformed table, an image that is not in the scene, an image point outside its image or given twice, rows
-        of one point that contradict each other, a check point in one image only, or a point that the geoid does not
-        cover.
+        The table is malformed; an image is not in the scene; an image point lies outside its image or is given twice;
+        rows of one point contradict each other; a check point is in one image only; the geoid does not cover a point.
     """
     table = read_number_table(path, WHAT, NUMBERS, WORDS)
     for name in NEEDED:
@@ -59,20 +59,22 @@ def read_control(
             )  # fmt: skip
     ground = xyz[first]
     if crs is not None:
-        ground = np.column_stack([ground[:, :2], ground[:, 2] + vertical.undulation(ground[:, :2], crs)])
-    found = GroundControl(tuple(map(str, names)), ground, sigma[first], is_check[first], Observations(view, point, xy))
-    alone = found.is_check & (np.bincount(point) < 2)
-    if alone.any():
-        which = int(np.flatnonzero(alone)[0])
+        ground = np.column_stack([ground[:, :2], ground[:, 2] + vertical_datum.undulation(ground[:, :2], crs)])
+    control = GroundControl(
+        tuple(map(str, names)), ground, sigma[first], is_check[first], Observations(view, point, xy)
+    )
+    in_one_image = control.is_check & (np.bincount(point) < 2)
+    if in_one_image.any():
+        which = int(np.flatnonzero(in_one_image)[0])
         raise table.refuse(
             int(first[which]), f"the check point {names[which]} is seen in one image only, which does not fix it; "
             "add another, or leave it out",
         )  # fmt: skip
-    return found
+    return control
 
 
 def _views(table: NumberTable, views: Sequence[View]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """The number of each row's image."""
+    """Index of the view of each row, (n,)."""
     number = {view.path.name: i for i, view in enumerate(views)} | {view.name: i for i, view in enumerate(views)}
     for row, name in enumerate(table.labels["image"]):
         if name not in number:
@@ -94,18 +96,18 @@ def _check_inside(table: NumberTable, views: Sequence[View], view: np.ndarray, x
 
 
 def _check_once(table: NumberTable, view: np.ndarray, point: np.ndarray) -> None:
-    seen: dict[tuple[int, int], int] = {}
+    first_row: dict[tuple[int, int], int] = {}
     for row, key in enumerate(zip(view.tolist(), point.tolist(), strict=True)):
-        if key in seen:
+        if key in first_row:
             raise table.refuse(
                 row, f"the point {table.labels['name'][row]} is given in {table.labels['image'][row]} on line "
-                f"{table.lines[seen[key]]} already; remove one",
+                f"{table.lines[first_row[key]]} already; remove one",
             )  # fmt: skip
-        seen[key] = row
+        first_row[key] = row
 
 
 def _sigmas(table: NumberTable) -> FloatArray:
-    """(n, 3) m; NaN where they are not given."""
+    """Standard deviations of x, y and z, (n, 3) m; NaN where the table has none."""
     flat = table.columns.get("sigma", np.full(len(table), np.nan))
     sigma = np.column_stack([flat, flat, table.columns.get("sigma_z", flat)])
     wrong = np.flatnonzero((sigma <= 0).any(axis=1))
@@ -115,7 +117,7 @@ def _sigmas(table: NumberTable) -> FloatArray:
 
 
 def _checks(table: NumberTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Whether each row is that of a check point."""
+    """Whether each row belongs to a check point, (n,)."""
     roles = table.labels.get("role", (CONTROL,) * len(table))
     for row, role in enumerate(roles):
         if role not in (CONTROL, CHECK):

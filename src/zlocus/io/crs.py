@@ -1,4 +1,4 @@
-"""Which coordinate reference systems a grid may have, and the one it has by default."""
+"""Coordinate reference systems: which ones a grid may have, its default, and the CRS of a file."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ LOCAL = (
     'ENGCRS["Local Cartesian frame, z up",EDATUM["Local"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
     'LENGTHUNIT["metre",1]]'
 )
-# Semi-major axis, and by how much those of ellipsoids and spheres in use differ.
+# Semi-major axis of the Earth, and the largest difference from it of ellipsoids and spheres in use.
 EARTH_MAJOR_M, MAX_MAJOR_DIFFERENCE_M = 6378137.0, 3e4
 MAX_CRS_NAME_CHARACTERS = 80
 
 
 def local_frame() -> CRS:
-    """Cartesian axes in metres, z up, at no known place of the Earth."""
+    """The CRS of a local frame: Cartesian axes in metres, z up, with no known position on the Earth."""
     return CRS.from_wkt(LOCAL)
 
 
 def crs_label(crs: CRS) -> str:
-    """A CRS for messages: its code, or else its name."""
+    """A CRS for messages: its EPSG code, or its name where it has none."""
     code = crs.to_2d().to_epsg()
     return crs.name if code is None else f"EPSG:{code}"
 
 
 def is_on_earth(crs: CRS) -> bool:
-    """Whether coordinates in a CRS are places on the Earth: it has its size, and PROJ can convert them."""
+    """Whether a CRS is one of the Earth: its ellipsoid has the right size, and PROJ can convert its coordinates."""
     ellipsoid = crs.ellipsoid
     if ellipsoid is None or abs(ellipsoid.semi_major_metre - EARTH_MAJOR_M) > MAX_MAJOR_DIFFERENCE_M:
         return False
@@ -52,7 +52,7 @@ def checked_crs(crs: CRS) -> CRS:
     Raises
     ------
     ConfigError
-        For any other CRS, saying what to use instead.
+        The CRS is not projected in metres; the message says what to use instead.
     """
     flat = crs.to_2d()
     advice = "Use a projected one in metres, for example the UTM zone EPSG:326nn (north) or EPSG:327nn (south)"
@@ -68,18 +68,18 @@ def checked_crs(crs: CRS) -> CRS:
 
 
 def utm_zone(lon: float, lat: float) -> CRS:
-    """The WGS84 UTM zone of a place (degrees), the 6-degree bands without the exceptions of Norway and Svalbard."""
+    """The WGS84 UTM zone of a place (degrees), without the exceptions for Norway and Svalbard."""
     zone = int((lon + 180.0) % 360.0 // 6.0) + 1
     return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
 
 
 def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:
-    """The CRS of an open raster, whose cells lie somewhere in it.
+    """The CRS of an open raster, whose transform is checked too.
 
     Raises
     ------
     InputError
-        Where it has none, or one that is no place on the Earth, or cells have no place or no size.
+        The raster has no CRS or one that is not of the Earth, or its transform is not usable.
     """
     transform = source.transform
     steps = (*transform[:6], *(~transform)[:6]) if transform.determinant else (math.nan,)
@@ -91,7 +91,13 @@ def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:
 
 
 def file_crs(given: Any, path: Path) -> CRS:
-    """A file's CRS, in whatever form pyproj understands; see `raster_crs`."""
+    """The CRS of a file. given : in any form that pyproj understands.
+
+    Raises
+    ------
+    InputError
+        PROJ does not know the CRS, or it is not of the Earth.
+    """
     try:
         crs = CRS.from_user_input(given)
     except CRSError as error:

@@ -1,4 +1,4 @@
-"""Geoids: rasters of undulations, looked up at points."""
+"""Geoid rasters: undulations, interpolated at points."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from zlocus.sensors.earth_frame import between
 # Between the lowest undulation of the Earth, -107 m, and the highest, 86 m, with room for local geoids.
 MAX_UNDULATION_M = 120.0
 METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
-# A point this close to the outermost posts, of the distance between two, is on them.
+# A point this close to the outermost posts, as a share of their spacing, counts as lying on them.
 ON_POST_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
 class GeoidRaster:
-    """Undulations, m above the ellipsoid, on a grid of posts: the centres of a raster's cells.
+    """Undulations, m above the ellipsoid, on a grid of posts: the centres of the cells of a raster.
 
-    crs : horizontal; transform, shape : of the raster; period : columns once around the Earth, None on a map or where
-    longitude does not run along the rows.
+    crs : horizontal CRS; transform, shape : of the raster; period : number of columns around the whole Earth, None for
+    a projected CRS or where longitude does not run along the rows.
     """
 
     path: Path
@@ -40,12 +40,12 @@ class GeoidRaster:
 
     @classmethod
     def open(cls, path: Path) -> GeoidRaster:
-        """The raster of a file; undulations are read when they are asked for.
+        """Open the geoid raster of a file. Undulations are read when they are needed.
 
         Raises
         ------
         InputError
-            For a file that is no raster, has no CRS, no two rows and columns, or values that are not in metres.
+            The file is no raster, has no CRS, has fewer than two rows or columns, or its values are not in metres.
         """
         with open_raster(path, "geoid") as source:
             check_complete(source, path)
@@ -65,41 +65,41 @@ class GeoidRaster:
     def undulation(self, xy: FloatArray, crs: CRS) -> FloatArray:
         """Undulations (n,) m at points (n, 2) of a CRS, x or longitude first; bilinear between the four posts around.
 
-        The same for a point whatever the others are. Memory: of the posts between the outermost points.
+        The result of a point does not depend on the other points. Memory: the posts between the outermost points.
 
         Raises
         ------
         InputError
-            Where a point lies outside the posts or beside one without a value, or values are no undulations.
+            A point lies outside the posts or beside a post without a value, or the values are no undulations.
         """
         cell = self._cells(xy, crs)
         inside = self._inside(cell)
         if not inside.all():
             raise self._not_covered(xy[np.argmin(inside)], crs)
-        found = self._between_posts(cell)
-        if not np.isfinite(found).all():
-            x, y = xy[np.argmin(np.isfinite(found))]
+        undulation = self._interpolated(cell)
+        if not np.isfinite(undulation).all():
+            x, y = xy[np.argmin(np.isfinite(undulation))]
             raise InputError(
                 f"The geoid {self.path} has no value (nodata) around {x:.10g}, {y:.10g} ({crs_label(crs)}). Give one "
                 "that is whole where the heights are."
             )
-        return found
+        return undulation
 
     def known_undulation(self, xy: FloatArray, crs: CRS) -> FloatArray:
-        """As `undulation`, but NaN where the raster has none.
+        """As `undulation`, but NaN where the raster has no value.
 
         Raises
         ------
         InputError
-            Where values are no undulations.
+            The values are no undulations.
         """
         cell = self._cells(xy, crs)
-        inside, found = self._inside(cell), np.full(len(xy), np.nan)
-        found[inside] = self._between_posts(cell[inside])
-        return found
+        inside, undulation = self._inside(cell), np.full(len(xy), np.nan)
+        undulation[inside] = self._interpolated(cell[inside])
+        return undulation
 
     def spacing_m(self, xy: FloatArray, crs: CRS) -> float:
-        """About how far apart, in units of a projected CRS, the posts lie around a point (2,)."""
+        """Approximate spacing of the posts around a point (2,), in the units of a projected CRS."""
         x, y = between(crs.to_2d(), self.crs).transform(xy[0], xy[1])
         a, b, _, d, e = self.transform[:5]
         around = np.array([[x, y], [x + a, y + d], [x + b, y + e]])
@@ -110,28 +110,28 @@ class GeoidRaster:
 
     @property
     def _is_around(self) -> bool:
-        """Whether the last column is followed by the first."""
+        """Whether the raster spans the whole Earth, so that its first column follows its last."""
         return self.period is not None and abs(self.shape[1] - self.period) < 0.5
 
     def _cells(self, xy: FloatArray, crs: CRS) -> FloatArray:
-        """(row, col) of points, whole numbers at the posts; longitudes are turned to where the raster has them."""
+        """(row, col) (n, 2) of points, whole numbers at the posts. Longitudes are shifted into the raster's range."""
         x, y = between(crs.to_2d(), self.crs).transform(xy[:, 0], xy[:, 1])
         a, b, c, d, e, f = (~self.transform)[:6]
         row, col = d * x + e * y + f - 0.5, a * x + b * y + c - 0.5
         if self.period is not None:
-            with np.errstate(invalid="ignore"):  # of points that the CRS cannot express
+            with np.errstate(invalid="ignore"):  # points that the CRS cannot express are infinite
                 col = np.mod(col + ON_POST_TOLERANCE, self.period) - ON_POST_TOLERANCE
         return np.column_stack([row, col])
 
     def _inside(self, cell: FloatArray) -> NDArray[np.bool_]:
-        """Whether (row, col) (n, 2) lie between posts; (n,)."""
+        """Whether (row, col) (n, 2) lie between posts; (n,) bool."""
         last = np.array(self.shape) - 1
-        if self._is_around:  # between the last post and the first
+        if self._is_around:  # any column lies between posts
             return np.asarray((cell[:, 0] >= -ON_POST_TOLERANCE) & (cell[:, 0] <= last[0] + ON_POST_TOLERANCE))
         return np.asarray(((cell >= -ON_POST_TOLERANCE) & (cell <= last + ON_POST_TOLERANCE)).all(axis=1))
 
-    def _between_posts(self, cell: FloatArray) -> FloatArray:
-        """Undulations (n,) m at (row, col) (n, 2) inside, NaN beside posts without a value."""
+    def _interpolated(self, cell: FloatArray) -> FloatArray:
+        """Undulations (n,) m at (row, col) (n, 2) inside the raster; NaN beside posts without a value."""
         if not len(cell):
             return np.empty(0)
         last, cell = np.array(self.shape) - 1, cell.copy()
@@ -146,19 +146,19 @@ class GeoidRaster:
         row, col, beside = row - at_row, col - at_col, beside - at_col
         upper = posts[row, col] * (1.0 - right) + posts[row, beside] * right
         lower = posts[row + 1, col] * (1.0 - right) + posts[row + 1, beside] * right
-        found = np.asarray(upper * (1.0 - down) + lower * down)
-        self._check(found)
-        return found
+        undulation = np.asarray(upper * (1.0 - down) + lower * down)
+        self._check_plausible(undulation)
+        return undulation
 
     def _posts(self, top: int, left: int, bottom: int, right: int) -> FloatArray:
-        """Undulations of posts (r, c) m, NaN where there is none."""
+        """Undulations (r, c) m of the posts of a window; NaN where there is no value."""
         with open_raster(self.path, "geoid") as source:
             window = Window(left, top, right - left, bottom - top)
             posts = source.read(1, window=window, masked=True, out_dtype=np.float64).filled(np.nan)
             return np.asarray(posts * source.scales[0] + source.offsets[0])
 
-    def _check(self, found: FloatArray) -> None:
-        largest = found[np.argmax(np.abs(np.nan_to_num(found)))]
+    def _check_plausible(self, undulation: FloatArray) -> None:
+        largest = undulation[np.argmax(np.abs(np.nan_to_num(undulation)))]
         if abs(largest) > MAX_UNDULATION_M:
             raise InputError(
                 f"{self.path} is no geoid: it holds {largest:.1f} m, and undulations lie between -107 and 86 m "

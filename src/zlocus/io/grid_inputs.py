@@ -1,4 +1,4 @@
-"""What a run is given besides images: the grid of another raster, a DEM, polygons of an area."""
+"""Read the inputs of a run other than images: the grid of another raster, a DEM, polygons of an area."""
 
 from __future__ import annotations
 
@@ -27,18 +27,21 @@ from zlocus.io.vertical import (
     check_heights,
     declared_vertical_datum,
     grid_crs,
-    vertical_datum,
+    named_vertical_datum,
     vertical_part,
 )
 from zlocus.io.virtual_rasters import ARCHIVES
 
-# Polygon edges are straight in the CRS of their file: this many pieces per extent keep them so in another one.
+# Polygon edges are straight in the CRS of their file. Before a conversion each is cut into pieces of at most this
+# fraction of the extent, so that they keep their course.
 MIN_PIECES_PER_EXTENT = 200
-MAX_REASON_CHARACTERS = 300  # of what a library says, characters
-# Formats of vector files that hold their polygons themselves.
-VECTOR_DRIVERS = ("ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
-           "OpenFileGDB", "SQLite", "TopoJSON")  # fmt: skip
-# No extent on the Earth, in any unit, is larger.
+MAX_REASON_CHARACTERS = 300  # of the text of another library in a message
+# Vector formats that hold their polygons in the file itself.
+VECTOR_DRIVERS = (
+    "ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
+    "OpenFileGDB", "SQLite", "TopoJSON",
+)  # fmt: skip
+# Largest extent on the Earth, in any unit of a CRS.
 MAX_EXTENT = 1e9
 
 
@@ -48,9 +51,9 @@ def read_geobox(path: Path) -> GeoBox:
     Raises
     ------
     InputError
-        For a raster without CRS, or one that is not north-up.
+        The raster has no CRS, or is not north-up.
     ConfigError
-        For a CRS that is not projected in metres.
+        Its CRS is not projected in metres.
     """
     with open_raster(path, "raster") as source:
         crs = raster_crs(source, path)
@@ -64,20 +67,20 @@ def read_geobox(path: Path) -> GeoBox:
 
 
 def read_dem(
-    path: Path, geobox: GeoBox, vertical: VerticalDatum | None = None, may_miss: bool = False
+    path: Path, geobox: GeoBox, vertical_datum: VerticalDatum | None = None, may_miss: bool = False
 ) -> NDArray[np.float32]:
     """Ellipsoidal heights of a DEM at the cell centres of a grid, bilinear. (r, c) float32 m, NaN where it has none.
 
-    vertical : what the DEM's heights are above, see `dem_datum`; None is what its CRS says. may_miss : whether it may
-    have no height anywhere on the grid.
+    vertical_datum : datum of the DEM's heights; None: the one that its CRS declares, see `dem_datum`. may_miss : the
+    DEM may have no height anywhere on the grid.
 
     Raises
     ------
     InputError
-        For a file that is no DEM (no CRS, heights not in metres) or covers no cell of the grid, heights above a geoid
-        that is not known, or a geoid that does not cover the DEM's part of the grid.
+        The file is no DEM (no CRS, heights not in metres), it covers no cell of the grid, its vertical datum is not
+        known, or the geoid does not cover the DEM's part of the grid.
     ConfigError
-        For a geoid of PROJ whose grid is not installed.
+        PROJ's grid of the geoid is not installed.
     """
     with open_raster(path, "DEM") as source:
         crs = raster_crs(source, path)
@@ -88,41 +91,40 @@ def read_dem(
         raise InputError(
             f"The DEM {path} has no height anywhere on the grid ({_extent(geobox)}). Give one that covers it."
         )
-    return (vertical or dem_datum(path)).ellipsoidal_from_heights(heights, geobox)
+    return (vertical_datum or dem_datum(path)).ellipsoidal_from_heights(heights, geobox)
 
 
 def dem_datum(path: Path, given: str | None = None) -> VerticalDatum:
-    """What a DEM's heights are above: what is given (see `vertical_datum`), else what its CRS says.
+    """The vertical datum of a DEM: the one that `given` names (see `named_vertical_datum`), else that of its CRS.
 
     Raises
     ------
     InputError, ConfigError
-        See `vertical_datum` and `declared_vertical_datum`.
+        See `named_vertical_datum` and `declared_vertical_datum`.
     """
     if given is not None:
-        return vertical_datum(given, "--dem-vertical")
+        return named_vertical_datum(given, "--dem-vertical")
     with open_raster(path, "DEM") as source:
         return declared_vertical_datum(raster_crs(source, path), path, "--dem-vertical")
 
 
 def lacks_vertical_datum(path: Path) -> bool:
-    """Whether neither the CRS of a DEM nor its band's description, where it was made here, says what its heights are
-    above."""
+    """Whether a DEM declares no vertical datum: neither in its CRS nor, as surfaces of zlocus do, in its band."""
     with open_raster(path, "DEM") as source:
         crs, description = raster_crs(source, path), source.descriptions[0]
     return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != ELLIPSOIDAL_DESCRIPTION
 
 
 def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
-    """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...) in another CRS. (n,) of shapely's.
+    """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...), converted to a CRS. (n,) shapely polygons.
 
     Raises
     ------
     InputError
-        For a file that is no vector file or names other files, an archive, several layers, no CRS, or anything but
-        polygons.
+        The file is no vector file, refers to other files, is an archive, has several layers or no CRS, or holds
+        anything but polygons.
     """
-    # A tenth of a second, with pandas a third, that only runs with polygons need.
+    # Imported here, because it takes 0.1 to 0.3 s and only runs with polygons need it.
     import pyogrio.raw
 
     path = existing_file(path, "vector file")
@@ -138,11 +140,11 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         if (kind := pyogrio.read_info(path)["driver"]) not in VECTOR_DRIVERS:
             raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
         with warnings.catch_warnings():
-            # What they warn of, rings that are not closed or numbers that are not finite, is refused.
+            # The library warns of open rings and numbers that are not finite. Both are refused below.
             warnings.simplefilter("ignore", RuntimeWarning)
             meta, _, wkb, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
             polygons = shapely.from_wkb(wkb)
-    except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # pyogrio's own are of these kinds
+    except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # includes pyogrio's own
         why = (
             "some text in it is not UTF-8"
             if isinstance(error, UnicodeError)
@@ -156,7 +158,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
     if meta["crs"] is None:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
-    with np.errstate(invalid="ignore"):  # of coordinates that are no numbers, which are refused below
+    with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused below
         west, south, east, north = shapely.total_bounds(polygons)
     largest = max(east - west, north - south)
     if not (0 < largest < MAX_EXTENT and np.isfinite(shapely.get_coordinates(polygons)).all()):
@@ -169,22 +171,22 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
 
 
 def cells_inside(polygons: NDArray[Any], geobox: GeoBox) -> NDArray[np.bool_]:
-    """Which cells have their centre inside a polygon. (n,) polygons in the grid's CRS -> (r, c) bool."""
+    """Which cells have their centre inside a polygon, (r, c) bool. polygons : (n,) in the grid's CRS."""
     inside = rasterize(polygons, out_shape=tuple(geobox.shape), transform=geobox.transform, dtype="uint8")
     return np.asarray(inside, bool)
 
 
 def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDArray[np.float32]:
-    """The first band on a grid, reading only the part under it. (r, c) float32, NaN where there is nothing.
+    """The first band, resampled to a grid, (r, c) float32; NaN where there is no value. Reads only the part it needs.
 
-    crs : of the raster, without heights, which GDAL would try to convert.
+    crs : horizontal CRS of the raster, because GDAL would try to convert heights.
     """
     out = np.full(tuple(geobox.shape), np.nan, np.float32)
     bounds = transform_bounds(grid_crs(geobox).to_wkt(), crs.to_wkt(), *geobox.boundingbox.bbox)
     if not np.isfinite(bounds).all():
         return out
     corners = [~source.transform * (x, y) for x in bounds[::2] for y in bounds[1::2]]
-    # Two cells more on each side, for the bilinear neighbours.
+    # Two more cells on each side are read, for bilinear interpolation.
     low = np.clip(np.floor(np.min(corners, axis=0)).astype(int) - 2, 0, (source.width, source.height))
     high = np.clip(np.ceil(np.max(corners, axis=0)).astype(int) + 2, 0, (source.width, source.height))
     if (high <= low).any():

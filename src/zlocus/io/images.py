@@ -1,4 +1,4 @@
-"""Images read by window: one grey channel as float32 and a mask of valid pixels."""
+"""Read images by window: one grey channel as float32, and a mask of valid pixels."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from zlocus.io.usable_pixels import MAX_GREY_VALUE, BorderPlateau, border_platea
 
 # Source: ITU-R BT.601, luma of red, green, blue.
 LUMINANCE = {ColorInterp.red: 0.299, ColorInterp.green: 0.587, ColorInterp.blue: 0.114}
-# What is read in search of something to match: pixels of a window, and of all windows before an image is refused.
+# Pixels of a window that is searched for texture, and of all windows that are searched before an image is refused.
 CHECK_WINDOW_PX, MAX_CHECKED_PX = 1 << 20, 1 << 30
-# Four million a side; to look for tie points in more takes months.
+# Four million pixels a side. Searching a larger image for tie points would take months.
 MAX_IMAGE_PX = 1 << 44
-# Larger images, in pixels, are not read as a whole for what they should not hold: absurd values are left out all the
-# same, but not counted, and borders of one value are matched as they are.
+# Larger images are not read as a whole for their checks: too large values are still invalid, but nobody is warned of
+# them, and plateaus at the border are not searched for.
 MAX_COUNTED_PX = 2_000_000_000
 
 
@@ -42,16 +42,18 @@ class RasterImage:
     """An image file as an `ImageSource`.
 
     The grey channel is the luminance (Rec. 601) where the file declares red, green and blue bands, otherwise the first
-    band. Not valid are: the declared nodata value, pixels off in an internal or side-car mask or fully transparent in
-    an alpha band, NaN, infinities and other numbers that cannot be grey values, a `plateau` at the border, and what a
-    sparse file never held. Beside that, an integer image that declares no nodata value is valid everywhere: 0 is a
-    legal grey value.
+    band. Invalid are: the declared nodata value, pixels that an internal or side-car mask excludes or an alpha band
+    makes fully transparent, NaN, infinities and numbers too large for grey values, a `plateau` at the border, and
+    pixels that a sparse file does not store. All other pixels are valid. In particular 0 is a valid grey value unless
+    it is declared as nodata.
 
-    The object is a plain value that threads and processes can share: open files are kept by thread, see `cached_raster`.
+    The object is a plain value that threads and processes can share: open files are kept by thread, see
+    `cached_raster`.
 
-    bands : 1-based indices of the bands that are read, with `weights`; plateau : pixels of one value at the border,
-    which are not valid; see `with_plateau`. held : see `SparseSource`. state : of the file when it was opened, see
-    `file_state`; sources : other files that its pixels and their mask are read from.
+    bands : 1-based indices of the bands that are read; weights : their weights in the grey value; plateau : pixels of
+    one value at the border, which are invalid, see `with_plateau`; held : the parts that a sparse file stores, see
+    `SparseSource`; state : size and time of the file when it was opened, see `file_state`; sources : other files from
+    which pixels or mask are read.
     """
 
     path: Path
@@ -67,12 +69,12 @@ class RasterImage:
     sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
-        """The window of rows x cols pixels that starts at (row, col); it lies inside the image.
+        """Read the window of rows x cols pixels that starts at (row, col) and lies inside the image.
 
         Raises
         ------
         InputError
-            When the file can no longer be read, or has another size than when it was opened.
+            The file can no longer be read, or its size has changed.
         """
         inside = 0 <= row <= row + rows <= self.shape[0] and 0 <= col <= col + cols <= self.shape[1]
         assert inside, f"window {row, col, rows, cols} leaves {self.path.name} of {self.shape}"
@@ -87,16 +89,16 @@ class RasterImage:
 
     @property
     def has_colours(self) -> bool:
-        """Whether the file declares red, green and blue."""
+        """Whether the file declares red, green and blue bands."""
         return len(self.bands) == len(LUMINANCE)
 
     def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
-        """Red, green and blue (3, r, c) of a window, in the file's own numbers.
+        """Red, green and blue (3, r, c) float32 of a window, in the file's own numbers.
 
         Raises
         ------
         InputError
-            When the file can no longer be read.
+            The file can no longer be read.
         """
         assert self.has_colours, f"{self.path.name} is grey"
         with cached_raster(self.path) as source:
@@ -110,13 +112,13 @@ class RasterImage:
             stored = source.read(band, window=window)
             values = stored.astype(np.float32)
             if may_hold_too_large_values(stored.dtype):
-                is_grey = np.abs(values) <= MAX_GREY_VALUE  # neither are NaN and infinities
+                is_grey = np.abs(values) <= MAX_GREY_VALUE  # False for NaN and infinities too
                 valid &= is_grey
                 values[~is_grey] = 0.0
             pixels += values if weight == 1.0 else np.float32(weight) * values
         plain = len(self.bands) == 1 and stored.dtype.kind in "iu"
         if plain and source.mask_flag_enums[self.bands[0] - 1] == [MaskFlags.nodata]:
-            valid = stored != source.nodata  # as GDAL masks it, without reading the band again
+            valid = stored != source.nodata  # GDAL's mask, without reading the band again
         else:
             valid &= self._mask(source, window)
         if not valid.all():
@@ -124,7 +126,7 @@ class RasterImage:
         return ImageWindow(pixels, valid)
 
     def _mask(self, source: rasterio.DatasetReader, window: Window) -> NDArray[np.bool_]:
-        """(r, c) bool. A colour pixel is nodata when all its bands are."""
+        """The mask of the file, (r, c) bool. A colour pixel is invalid where all its bands are."""
         mask = np.zeros((int(window.height), int(window.width)), bool)
         for band in self.bands:
             if source.mask_flag_enums[band - 1] == [MaskFlags.all_valid]:
@@ -134,12 +136,12 @@ class RasterImage:
 
 
 def open_image(path: Path) -> RasterImage:
-    """The image of a file, found complete: every block lies inside the file and the last one decodes.
+    """Open an image and check that it is complete: every block lies inside the file, and the last one can be decoded.
 
     Raises
     ------
     InputError
-        For no such file, a folder, no image, a truncated file, complex or palette pixels.
+        There is no such file, it is a folder or no image, it is truncated, or its pixels are complex or of a palette.
     """
     path = Path(path)
     state = file_state(path)
@@ -168,8 +170,10 @@ def open_image(path: Path) -> RasterImage:
 
 
 def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:
-    """Files beside an image that its pixels are read from: those that a virtual raster lists, the header of pixels as
-    they are, and a mask. Overviews and statistics are not read, and readers of cameras name their own files."""
+    """The other files from which pixels are read: those of a virtual raster, the header of raw pixels, and a mask.
+
+    Overviews and statistics are not read, and the readers of cameras name their own files.
+    """
     others = [Path(name) for name in source.files if Path(name) != path]
     if source.driver == "VRT" or source.driver in UNCOMPRESSED_DRIVERS:
         return tuple(other for other in others if not other.name.endswith((".ovr", ".aux.xml")))
@@ -177,26 +181,25 @@ def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:
 
 
 def _last_block(source: rasterio.DatasetReader, band: int) -> Window:
-    """The window of the last block of a band, without a list of all."""
+    """The window of the last block of a band, computed without listing all blocks."""
     rows, cols = source.block_shapes[band - 1]
     row, col = (source.height - 1) // rows * rows, (source.width - 1) // cols * cols
     return Window(col, row, source.width - col, source.height - row)
 
 
 def check_content(image: RasterImage) -> None:
-    """Refuse an image with nothing to match: all nodata, or one value everywhere.
+    """Check that an image has something to match: two valid pixels with different values.
 
-    Read by windows until two different valid values are met, so that an ordinary image costs one window. Windows are
-    spread over what the file holds; beyond `MAX_CHECKED_PX` no more are read, so that an image of any size is refused
-    within seconds.
+    Windows are read until such pixels are found, so an ordinary image costs one window. The windows are spread over the
+    stored parts of the image. After `MAX_CHECKED_PX` pixels the image is refused, so that this takes seconds at most.
 
     Raises
     ------
     InputError
-        When no two valid pixels differ.
+        All pixels read are invalid, or have the same value.
     """
     first: float | None = None
-    windows = _Windows.of(image)
+    windows = _CheckWindows.of(image)
     for row, col, rows, cols in windows:
         window = image.read(row, col, rows, cols)
         values = window.pixels[window.valid]
@@ -217,19 +220,19 @@ def check_content(image: RasterImage) -> None:
 
 
 @dataclass(frozen=True)
-class _Windows:
-    """Windows of what the file of an image holds, in an order in which those that follow each other lie far apart.
+class _CheckWindows:
+    """Windows of the stored parts of an image, in an order in which successive windows lie far apart.
 
-    regions : (n, 4) first row, first column, and the first row and column beyond, px; they are cut into windows of
-    `size`, rows and columns.
+    regions : (n, 4) px, first row, first column, and the first row and column beyond each stored part; size : rows and
+    columns of a window.
     """
 
     regions: NDArray[np.int64]
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, image: RasterImage) -> _Windows:
-        """About as wide as the blocks of the file, which are decoded whole."""
+    def of(cls, image: RasterImage) -> _CheckWindows:
+        """Windows about as wide as the blocks of the file, because blocks are decoded as a whole."""
         with cached_raster(image.path) as source:
             block_cols = source.block_shapes[image.bands[0] - 1][1]
         regions = np.array([[0, 0, *image.shape]]) if image.held is None else image.held.regions
@@ -238,8 +241,9 @@ class _Windows:
         return cls(regions, (min(max(CHECK_WINDOW_PX // width, 1), rows), width))
 
     def __iter__(self) -> Iterator[tuple[int, int, int, int]]:
-        """First row, first column, rows and columns."""
-        # Steps of the golden section of their number, which meet each once where they have no divisor in common.
+        """Yield first row, first column, rows and columns of each window."""
+        # The step is the golden section of the number of windows. It visits each window once, because both numbers
+        # have no common divisor.
         n = self._n
         step = max(round(n * (math.sqrt(5.0) - 1.0) / 2.0), 1)
         while math.gcd(step, n) > 1:
@@ -253,12 +257,12 @@ class _Windows:
 
     @property
     def n_read(self) -> int:
-        """How many of them are read."""
+        """Number of windows that are read."""
         return min(self._n, max(MAX_CHECKED_PX // math.prod(self.size), 1))
 
     @property
     def is_whole(self) -> bool:
-        """Whether all of them are."""
+        """Whether all windows are read."""
         return self.n_read == self._n
 
     @property
@@ -272,17 +276,17 @@ class _Windows:
 
 
 def may_hold_too_large_values(dtype: np.dtype[np.generic]) -> bool:
-    """Whether pixels of a type can hold numbers that are larger than any grey value."""
+    """Whether pixels of a type can hold numbers beyond `MAX_GREY_VALUE`."""
     return dtype.kind == "f" or dtype.itemsize > 4
 
 
 def check_grey_values(image: RasterImage) -> None:
-    """Warn of values that are too large for grey values, which are left out; refuse an image that has little else.
+    """Warn of values that are too large for grey values, which are treated as invalid.
 
     Raises
     ------
     InputError
-        Where more than half of the values are too large.
+        More than half of the values are too large.
     """
     if not may_hold_too_large_values(np.dtype(image.dtype)) or is_remote(image.path):
         return
@@ -293,43 +297,43 @@ def check_grey_values(image: RasterImage) -> None:
         def rows_of_first_band(row: int, count: int) -> NDArray[np.floating]:
             return np.asarray(source.read(image.bands[0], window=Window(0, row, image.shape[1], count)), np.float64)
 
-        found = count_too_large_values(image.shape, rows_of_first_band)
-    if not found.n_pixels or (image.nodata is not None and found.largest == abs(image.nodata)):
+        too_large = count_too_large_values(image.shape, rows_of_first_band)
+    if not too_large.n_pixels or (image.nodata is not None and too_large.largest == abs(image.nodata)):
         return
-    if 2 * found.n_pixels > found.n_known:
+    if 2 * too_large.n_pixels > too_large.n_known:
         raise InputError(
-            f"{image.path} holds values up to {found.largest:.3g}, which cannot be grey values. Scale them to numbers "
-            f"below {MAX_GREY_VALUE:.3g}, or declare them as nodata."
+            f"{image.path} holds values up to {too_large.largest:.3g}, which cannot be grey values. Scale them to "
+            f"numbers below {MAX_GREY_VALUE:.3g}, or declare them as nodata."
         )
     warnings.warn(
-        f"{image.path}: {found.n_pixels} of its pixels hold values up to {found.largest:.3g}, which cannot be grey "
-        "values: they are left out.",
+        f"{image.path}: {too_large.n_pixels} of its pixels hold values up to {too_large.largest:.3g}, which cannot be "
+        "grey values: they are left out.",
         ZlocusWarning,
         stacklevel=2,
     )
 
 
 def with_plateau(image: RasterImage) -> RasterImage:
-    """The image without the pixels of one value at its border, if it has such, and a warning that says so.
+    """The image with a plateau at its border made invalid, and a warning; the image itself where it has no plateau.
 
     Raises
     ------
     InputError
-        Where the image cannot be read.
+        The image cannot be read.
     """
     if image.shape[0] * image.shape[1] > MAX_COUNTED_PX:
         return image
-    found = border_plateau(image)
-    if found is None:
+    plateau = border_plateau(image)
+    if plateau is None:
         return image
-    share = 100.0 * found.n_pixels / (image.shape[0] * image.shape[1])
+    share = 100.0 * plateau.n_pixels / (image.shape[0] * image.shape[1])
     warnings.warn(
-        f"{image.path}: {share:.1f} % of its pixels are a border of the constant value {found.value:g} that no tag "
+        f"{image.path}: {share:.1f} % of its pixels are a border of the constant value {plateau.value:g} that no tag "
         "declares: it is taken for nodata. Declare it with gdal_edit.py -a_nodata to be rid of this note.",
         ZlocusWarning,
         stacklevel=2,
     )
-    return replace(image, plateau=found)
+    return replace(image, plateau=plateau)
 
 
 def _grey_bands(source: rasterio.DatasetReader) -> tuple[tuple[int, ...], tuple[float, ...]]:

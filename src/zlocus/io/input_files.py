@@ -1,4 +1,4 @@
-"""The files that a run reads: what they were when it began, whether they still are, and their checksums."""
+"""The input files of a run: whether they have changed since it began, and their checksums."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from zlocus.io.run_record import inputs_record
 
 
 def files_of(scene: Scene) -> list[Path]:
-    """Every file that the views of a scene are read from."""
+    """All files from which the views of a scene are read."""
     return [path for view in scene.views for path in view.files]
 
 
 @dataclass(frozen=True)
 class InputFiles:
-    """Files whose content a result depends on.
+    """The files on whose content a result depends, and their state when the run began.
 
-    states : size (bytes) and time of change (ns) of each file, by its path, when the run began; empty of a file on a
-    server, and of one that is not there.
+    states : size (bytes) and modification time (ns) of each file, by its path; empty for a file that is missing or on a
+    server.
     """
 
     states: Mapping[str, list[int]]
 
     @classmethod
     def of(cls, files: Iterable[Path], scene: Scene | None = None, before: InputFiles | None = None) -> InputFiles:
-        """The files as they are now; of what was read already, as they were then.
+        """Record the state of some files; for those already read, the state at that time.
 
-        scene : whose images know what their files were when they were opened; before : what was looked at earlier.
+        scene : its images carry the state of their files when they were opened; before : an earlier record.
         """
         known: dict[str, list[int]] = {} if before is None else dict(before.states)
         for view in () if scene is None else scene.views:
@@ -41,22 +41,21 @@ class InputFiles:
         return cls({str(path): known.get(str(path)) or file_state(path) for path in dict.fromkeys(files)})
 
     def changed(self) -> list[str]:
-        """Files whose size or time of change is another now, those that are missing last."""
+        """Paths of files whose size or modification time has changed; missing files come last."""
         now = {name: file_state(Path(name)) for name in self.states}
         changed = [name for name, state in self.states.items() if now[name] != state]
         return sorted(changed, key=lambda name: not now[name])
 
-    def check(self, n_kept: int | None = None, may_miss: bool = False) -> None:
-        """End a run whose inputs are no longer what they were when it began: what it made of them, and what it is going
-        to make, would not belong together.
+    def check(self, n_finished_tiles: int | None = None, may_miss: bool = False) -> None:
+        """Stop the run if an input has changed since it began: earlier and later results would not fit together.
 
-        n_kept : finished tiles, made before, which are kept; None where the run keeps none. may_miss : whether files
-        may have disappeared, because something else says what that did.
+        n_finished_tiles : finished tiles whose checkpoints stay; None where the run keeps none. may_miss : missing
+        files are ignored, because another message covers them.
 
         Raises
         ------
         StoppedError
-            Naming a file that changed.
+            A file has changed; the message names it.
         """
         changed = [name for name in self.changed() if not may_miss or Path(name).exists()]
         if not changed:
@@ -64,32 +63,32 @@ class InputFiles:
         first, others = changed[0], len(changed) - 1
         what = "was replaced or written to" if Path(first).exists() else "disappeared"
         more = f", and so did {others} more {'inputs' if others > 1 else 'input'}" if others else ""
-        if n_kept:
+        if n_finished_tiles:
             advice = (
-                f"{n_kept} finished tiles of before are kept: put back what was there and give the same command again "
-                "to go on, or add --overwrite to start anew with what is there now."
+                f"{n_finished_tiles} finished tiles are kept: restore the file and give the same command again to "
+                "resume, or add --overwrite to start again with the changed file."
             )
         else:
             advice = "Give the same command again when the file is complete."
         raise StoppedError(f"The input {first} {what} while the run read it{more}; no result is written. {advice}")
 
-    def record(self, n_kept: int | None = None) -> list[dict[str, Any]]:
-        """Path and SHA-256 of every file, for run.json, of the content that the run has read. n_kept : see `check`.
+    def record(self, n_finished_tiles: int | None = None) -> list[dict[str, Any]]:
+        """Path and SHA-256 of every file, for run.json. n_finished_tiles : see `check`.
 
         Raises
         ------
         StoppedError
-            Where a file is no longer what it was when the run began.
+            A file has changed since the run began, so the checksum would not be that of the content that was read.
         """
-        self.check(n_kept)
+        self.check(n_finished_tiles)
         try:
-            found = inputs_record(Path(name) for name in self.states)
+            records = inputs_record(Path(name) for name in self.states)
         except OSError as error:
-            self.check(n_kept)
+            self.check(n_finished_tiles)
             raise StoppedError(
                 f"The input {error.filename} can no longer be read: {error.strerror or error}. Give the same command "
                 "again when it can."
             ) from error
-        # Once more, for reading takes time.
-        self.check(n_kept)
-        return found
+        # Checked again, because reading takes time.
+        self.check(n_finished_tiles)
+        return records

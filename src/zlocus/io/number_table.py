@@ -1,4 +1,4 @@
-"""Tables of numbers in text: a header of names, then rows; separated by commas, semicolons or blanks."""
+"""Tables of numbers in text files: a header of column names, then rows, separated by commas, semicolons or blanks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SEPARATORS = (",", ";")
 
 @dataclass(frozen=True, eq=False)
 class NumberTable:
-    """A table that has been read.
+    """The content of a table.
 
-    columns : by name, (n,) float64, all finite; labels : the words of each column of words, (n,), by name;
-    lines : (n,) the line of the file, from 1, on which a row stands.
+    what : role of the file, for messages; columns : numbers of each column, (n,) float64, finite, by name; labels :
+    words of each column of words, (n,), by name; lines : (n,) number of the line in the file, from 1, of each row.
     """
 
     path: Path
@@ -35,44 +35,44 @@ class NumberTable:
         return len(self.lines)
 
     def stacked(self, names: Sequence[str]) -> FloatArray:
-        """Some columns side by side: (n, k)."""
+        """The columns of these names side by side, (n, k)."""
         return np.column_stack([self.columns[name] for name in names])
 
     def refuse(self, row: int, fault: str) -> InputError:
-        """The error of a row, by its line in the file."""
+        """The error to raise for a row, with its line in the file. fault : what is wrong, without a full stop."""
         return InputError(f"The {self.what} {self.path}, line {self.lines[row]}: {fault}.")
 
-    def check_steps(self, name: str, either: bool = False) -> None:
-        """Refuse a column whose values do not increase all the way; either : or decrease all the way.
+    def check_monotonic(self, name: str, may_decrease: bool = False) -> None:
+        """Check that a column increases from row to row. may_decrease : or that it decreases from row to row.
 
         Raises
         ------
         InputError
-            Naming the first row that breaks the order.
+            It does not; the message names the first row that breaks the order.
         """
         steps = np.diff(self.columns[name])
-        if either and len(steps) and steps[0] < 0:
+        if may_decrease and len(steps) and steps[0] < 0:
             steps = -steps
         broken = np.flatnonzero(~(steps > 0))
         if len(broken):
             value, before = (float(self.columns[name][broken[0] + i]) for i in (1, 0))
-            rule = "increase, or decrease, from row to row" if either else "increase from row to row"
+            rule = "increase, or decrease, from row to row" if may_decrease else "increase from row to row"
             raise self.refuse(
                 int(broken[0]) + 1, f"{name} is {value!r} after {before!r}, but must {rule}; sort the rows"
             )
 
 
 def read_number_table(path: Path, what: str, allowed: Iterable[str], words: Sequence[str] = ()) -> NumberTable:
-    """The table in a file. Lines that are empty or start with # are skipped; names are read in any case.
+    """Read the table in a file. Lines that are empty or start with # are skipped; column names may be in any case.
 
-    what : the role of the file, for messages; allowed : names a column of numbers may have; words : those of columns of
+    what : role of the file, for messages; allowed : allowed names of columns of numbers; words : names of columns of
     words.
 
     Raises
     ------
     InputError
-        For a file that is missing, no text, without rows, with an unknown or doubled name, a row of another length, or
-        something that is not a finite number: says on which line.
+        The file is missing, no text, or has no rows; a name is unknown or given twice; a row has another length, or
+        holds something that is not a finite number. The message names the line.
     """
     path = existing_file(path, what)
     rows = _rows(path, what)
@@ -91,7 +91,7 @@ def read_number_table(path: Path, what: str, allowed: Iterable[str], words: Sequ
             raise InputError(f"The {what} {path} has the column {name} twice in its header. Remove one.")
     numeric, labels = [name for name in names if name not in words], [name for name in names if name in words]
     number_at, word_at = ([names.index(name) for name in group] for group in (numeric, labels))
-    values, said = [], []
+    values, label_rows = [], []
     for number, line in body:
         cells = line.split(separator)
         if len(cells) != len(names):
@@ -99,24 +99,24 @@ def read_number_table(path: Path, what: str, allowed: Iterable[str], words: Sequ
                 f"The {what} {path}, line {number}: {len(cells)} values, but {len(names)} columns "
                 f"({', '.join(names)}). Mend the line, or copy the file again where it is cut off."
             )
-        said.append([cells[i].strip() for i in word_at])
+        label_rows.append([cells[i].strip() for i in word_at])
         values.append(_numbers([cells[i] for i in number_at], what, path, number))
     columns = dict(zip(numeric, np.array(values, float).reshape(len(values), len(numeric)).T, strict=True))
-    by_name = {name: tuple(row[k] for row in said) for k, name in enumerate(labels)}
+    by_name = {name: tuple(row[k] for row in label_rows) for k, name in enumerate(labels)}
     return NumberTable(path, what, columns, by_name, tuple(number for number, _ in body))
 
 
 def write_number_table(
     path: Path, columns: dict[str, FloatArray], comment: str, labels: dict[str, Sequence[str]] | None = None
 ) -> None:
-    """Write a table with commas that reads back equal.
+    """Write a table, separated by commas, that `read_number_table` reads back with equal values.
 
-    comment : its first line; labels : a column of words by its name, the first of the table.
+    comment : text of the first line; labels : columns of words by name, written before the numbers.
 
     Raises
     ------
     OutputError
-        When the file cannot be written.
+        The file cannot be written.
     """
     numbers = np.column_stack(list(columns.values())).tolist()
     words = zip(*labels.values(), strict=True) if labels else [()] * len(numbers)
@@ -130,7 +130,7 @@ def write_number_table(
 
 
 def _rows(path: Path, what: str) -> list[tuple[int, str]]:
-    """Lines that count, with their numbers from 1."""
+    """The lines that hold a row, each with its number, from 1."""
     rows = []
     for number, line in text_lines(path):
         if len(line) > MAX_LINE_CHARACTERS:
@@ -141,7 +141,7 @@ def _rows(path: Path, what: str) -> list[tuple[int, str]]:
 
 
 def _numbers(cells: list[str], what: str, path: Path, line: int) -> list[float]:
-    """The finite numbers of a row."""
+    """The numbers of a row, checked to be finite."""
     values: list[float] = []
     for cell in cells:
         value = decimal(cell)

@@ -1,4 +1,4 @@
-"""One way to open a raster for reading: small caches, no noise, and errors as sentences."""
+"""Open rasters for reading, the same way everywhere: small caches, no warnings, and errors as sentences."""
 
 from __future__ import annotations
 
@@ -28,46 +28,47 @@ from zlocus.io.virtual_rasters import ARCHIVES, FIRST_BYTES, REMOTE, check_serve
 
 BLOCK_CACHE_BYTES = 128 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# Its place in a TIFF alone.
+# Bytes that each block takes in the list of blocks of a TIFF.
 MIN_BLOCK_ENTRY_BYTES = 4
-# Of a block, that is read whatever stands for it; beyond, as many times what the file holds.
+# Blocks up to this size are always read. Larger ones are refused if they exceed the size of the file by this factor.
 LARGE_BLOCK_BYTES, MAX_COMPRESSION_RATIO = 256 << 20, 10_000
-# Of kinds that only GDAL has.
+# Bytes of pixel types that NumPy does not have.
 PIXEL_BYTES = {"complex_int16": 4}
-MAX_OPEN_RASTERS = 32  # rasters of a thread
+MAX_OPEN_RASTERS = 32  # per thread
 _GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
-# Rasters that are lists of other files or ask services, whatever their file is called. A virtual raster is read where
-# its name says that it is one.
+# Drivers of rasters that refer to other files or to services. They are not used, whatever a file is called; VRT is used
+# for files whose name ends in .vrt.
 INDIRECT_DRIVERS = frozenset((
     "DERIVED", "ECRGTOC", "EEDA", "EEDAI", "ESRIC", "GTI", "HTTP", "KMLSUPEROVERLAY", "MRF", "PLMOSAIC", "RPFTOC",
     "STACIT", "STACTA", "VRT", "WCS", "WMS", "WMTS",
 ))  # fmt: skip
-# Formats whose pixels lie in a file as they are.
+# Formats that store pixels without compression.
 UNCOMPRESSED_DRIVERS = frozenset(
     ("BT", "EHdr", "ENVI", "ERS", "GTX", "ISCE", "KRO", "LAN", "PAux", "PNM", "ROI_PAC", "SAGA")
 )
-# `warnings.catch_warnings` swaps a global list, so two threads must not be inside it at once.
-_quiet = threading.Lock()
+# `warnings.catch_warnings` replaces a global list, so only one thread may be inside it.
+_warnings_lock = threading.Lock()
 
 
 def is_remote(path: Path) -> bool:
-    """Whether a path is one of GDAL's virtual files: `/vsicurl/` and an address, `/vsis3/bucket/key`."""
+    """Whether a path is in one of GDAL's virtual file systems: `/vsicurl/` and an address, `/vsis3/bucket/key`."""
     return str(path).startswith("/vsi")
 
 
 def gdal_name(path: Path) -> str:
-    """A path as GDAL takes it: `Path` makes one of the two slashes of an address within it."""
+    """A path in GDAL's spelling: restores the second slash of an address, which `Path` removes."""
     return re.sub(r"^(/vsi\w+/(?:\w+=[^/]*/)?https?:)/(?!/)", r"\1//", str(path))
 
 
 def existing_file(path: Path, what: str) -> Path:
-    """`path` if it is a file, or one of GDAL's virtual files, of which nothing is known before it is opened. `what`
-    names its role in the message ("image", "DEM").
+    """The path, if it is a file. A path in a virtual file system of GDAL is not looked up.
+
+    what : role of the file in messages ("image", "DEM").
 
     Raises
     ------
     InputError
-        When there is no such file, it is a folder, or lies in an archive.
+        There is no such file, it is a folder, or it lies in an archive.
     """
     path = Path(path)
     if is_remote(path):
@@ -90,22 +91,22 @@ def existing_file(path: Path, what: str) -> Path:
 
 
 def file_state(path: Path) -> list[int]:
-    """Size of a file, bytes, and its time of change, ns; empty where it is not there, or on a server."""
+    """Size (bytes) and modification time (ns) of a file; empty where it is missing or on a server."""
     if is_remote(path):
         return []
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return []
-    return [found.st_size, found.st_mtime_ns]
+    return [status.st_size, status.st_mtime_ns]
 
 
 @contextmanager
 def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetReader]:
-    """An open rasterio dataset; what rasterio or GDAL cannot do inside the block becomes an `InputError`.
+    """Open a raster for the block; errors of rasterio or GDAL inside the block become `InputError`.
 
-    GDAL's block cache is held to `BLOCK_CACHE_BYTES`, siblings of the file are probed by name instead of listing the
-    folder, and the warning that an image lacks a georeference (true of every unrectified one) is not shown.
+    GDAL's block cache is limited to `BLOCK_CACHE_BYTES`. Files beside the raster are looked up by name, without listing
+    the folder. The warning that an image has no georeference, true of every unrectified image, is suppressed.
     """
     path = existing_file(path, what)
     with rasterio.Env(**_GDAL), _opened(path) as dataset, _read_errors(path):
@@ -116,19 +117,19 @@ def open_raster(path: Path, what: str = "image") -> Iterator[rasterio.DatasetRea
 
 @contextmanager
 def cached_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """As `open_raster`, and the image stays open for this thread's next look at it, with the blocks that are in cache.
+    """As `open_raster`, but the image stays open, with its cached blocks, for the next call of the same thread.
 
-    A file that has changed since is opened anew. GDAL's handles must not be shared, neither by threads nor by a process
+    A file that has changed is opened again. Handles of GDAL must not be shared between threads, nor between a process
     and its fork.
     """
     path = existing_file(path, "image")
     with rasterio.Env(**_GDAL):
-        dataset = _kept.dataset(path)
+        dataset = _open_rasters.dataset(path)
         try:
             with _read_errors(path):
                 yield dataset
         except BaseException:
-            _kept.forget(path)
+            _open_rasters.close(path)
             raise
 
 
@@ -137,9 +138,9 @@ def _opened(path: Path) -> rasterio.DatasetReader:
     if is_list and not is_remote(path) and is_virtual(first_bytes(path)):
         check_virtual(path)
     try:
-        with _quiet, warnings.catch_warnings():
+        with _warnings_lock, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            # `rasterio.open` takes one format only.
+            # `rasterio.open` accepts only one driver.
             dataset = rasterio.DatasetReader(gdal_name(path), driver=_drivers(is_list))
     except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
         if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
@@ -160,7 +161,7 @@ def _opened(path: Path) -> rasterio.DatasetReader:
 
 
 def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
-    """A block of pixels is read as one, in memory, however few bytes stand for it."""
+    """Refuse a TIFF whose blocks would need far more memory than the file is large: a block is decoded as a whole."""
     if source.driver not in ("GTiff", "COG") or not source.count:
         return
     bands = source.count if source.interleaving == Interleaving.pixel else 1
@@ -177,13 +178,13 @@ def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
 
 @functools.cache
 def _drivers(virtual: bool) -> list[str]:
-    """GDAL's formats that are read. virtual : lists of other files too."""
+    """The drivers of GDAL that may open a file. virtual : include VRT."""
     with rasterio.Env() as gdal:
         return [name for name in gdal.drivers() if name not in INDIRECT_DRIVERS or (virtual and name == "VRT")]
 
 
 def first_bytes(path: Path) -> bytes:
-    """How a file begins; nothing where it cannot be read."""
+    """The first bytes of a file; empty where it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(FIRST_BYTES)
@@ -204,47 +205,46 @@ def _read_errors(path: Path) -> Iterator[None]:
 
 @dataclass
 class _OpenRasters(threading.local):
-    """Open rasters of one thread, the one used last at the end, with the state of the file when it was opened."""
+    """The open rasters of one thread, the last used at the end, each with the state of its file when it was opened."""
 
     datasets: OrderedDict[Path, tuple[tuple[int, ...], rasterio.DatasetReader]] = field(default_factory=OrderedDict)
 
     def dataset(self, path: Path) -> rasterio.DatasetReader:
-        """The raster, opened where it is not open yet."""
+        """The open raster of a file; it is opened if it is not open, or if the file has changed."""
         state: tuple[int, ...] = (os.getpid(),)
         if not is_remote(path):
             file = os.stat(path)
             state += (file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns)
         known, dataset = self.datasets.get(path, (None, None))
         if known != state or dataset is None:
-            self.forget(path)
+            self.close(path)
             dataset = _opened(path)
             self.datasets[path] = state, dataset
             if len(self.datasets) > MAX_OPEN_RASTERS:
-                self.forget(next(iter(self.datasets)))
+                self.close(next(iter(self.datasets)))
         self.datasets.move_to_end(path)
         return dataset
 
-    def forget(self, path: Path) -> None:
-        """Close a raster, unless the process it was opened by is another."""
+    def close(self, path: Path) -> None:
+        """Close a raster, unless another process opened it."""
         state, dataset = self.datasets.pop(path, (None, None))
         if state and dataset and state[0] == os.getpid():
             dataset.close()
 
 
-_kept = _OpenRasters()
+_open_rasters = _OpenRasters()
 
 
 def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | None:
-    """Compare the offsets and sizes of all TIFF blocks, or of the chunks of a PNG, with the length of the file,
-    decoding nothing.
+    """Check that a TIFF or PNG is not truncated, and return the parts that a sparse TIFF stores (None: everything).
 
-    Other formats pass: GDAL itself finds them truncated, or `open_raster` does. So do files that are elsewhere. Returns
-    the parts whose pixels a sparse TIFF holds; None of all other files.
+    Offsets and sizes of all blocks or chunks are compared with the length of the file; nothing is decoded. Other
+    formats are not checked, because GDAL or `open_raster` detects truncation; neither are files on servers.
 
     Raises
     ------
     InputError
-        When pixels lie behind the end of the file, or there are too many of them.
+        Pixels lie behind the end of the file, or there are too many blocks.
     """
     if is_remote(path):
         return None
@@ -264,7 +264,7 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
 
 
 def _check_plain(source: rasterio.DatasetReader, path: Path) -> None:
-    """Of pixels as they are, GDAL reads those behind the end of the file as 0."""
+    """Refuse a truncated file of pixels without compression: GDAL would read the missing pixels as 0."""
     sizes = {name: os.path.getsize(name) for name in source.files if os.path.isfile(name)}
     largest = max(sizes, key=lambda name: sizes[name], default=None)
     if largest is None or first_bytes(Path(largest)).startswith(tuple(ARCHIVES)):
@@ -279,13 +279,13 @@ def _check_plain(source: rasterio.DatasetReader, path: Path) -> None:
 
 
 def _check_png(path: Path) -> None:
-    """Follow the chunks of a PNG to its last one. Source: PNG specification (ISO/IEC 15948), 5.2 and 5.3."""
+    """Refuse a PNG that ends before its last chunk. Source: PNG specification (ISO/IEC 15948), 5.2 and 5.3."""
     length, at, kind = os.path.getsize(path), len(PNG_SIGNATURE), b""
     with path.open("rb") as file:
         while kind != b"IEND":
             file.seek(at)
             head = file.read(8)
-            # Length and name before, and a checksum behind what the chunk holds.
+            # A chunk has its length and name before its content, and a checksum behind it.
             at += 12 + int.from_bytes(head[:4], "big")
             kind = head[4:]
             if len(head) < 8 or at > length:
@@ -296,7 +296,7 @@ def _check_png(path: Path) -> None:
 
 
 def gdal_message(error: BaseException) -> str:
-    """GDAL's own words: those of the first error of the chain, without a full stop."""
+    """GDAL's own message: that of the first error of the chain, without a full stop."""
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error).strip().rstrip(".") or type(error).__name__

@@ -1,4 +1,4 @@
-"""Finished rasters read again by strips, for what is made of them: never whole in memory."""
+"""Read finished rasters strip by strip, so that products derived from them never hold a whole raster in memory."""
 
 from __future__ import annotations
 
@@ -20,13 +20,17 @@ from zlocus.core.errors import InputError
 from zlocus.io.band_statistics import BandStatistics
 from zlocus.io.open_raster import open_raster
 
-# A quarter of a block of a COG, which stays in GDAL's cache meanwhile; work on a strip takes many times its cells.
+# A quarter of a block of a COG, which stays in GDAL's cache between strips. Working on a strip takes many times its
+# memory.
 STRIP_ROWS = 128
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of a raster. row, rows : its own; above, below : rows beyond them that were asked for and are there."""
+    """Some rows of a raster, and rows beside them that are read along.
+
+    row, rows : first row and number of rows of the strip; above, below : rows read beyond it on both sides.
+    """
 
     row: int
     rows: int
@@ -35,74 +39,76 @@ class Strip:
 
     @property
     def own(self) -> slice:
-        """Its own rows, of those read."""
+        """The rows of the strip itself, counted from the first row that is read."""
         return slice(self.above, self.above + self.rows)
 
 
-def strips_of(n_rows: int, aside: int = 0, strip_rows: int = STRIP_ROWS) -> Iterator[Strip]:
-    """Strips of a raster, from the north, with up to `aside` rows beyond each."""
+def strips_of(n_rows: int, margin_rows: int = 0, strip_rows: int = STRIP_ROWS) -> Iterator[Strip]:
+    """Strips that cover a raster from its first row on, each with up to `margin_rows` rows beyond it on both sides."""
     for row in range(0, n_rows, strip_rows):
         rows = min(strip_rows, n_rows - row)
-        yield Strip(row, rows, min(aside, row), min(aside, n_rows - row - rows))
+        yield Strip(row, rows, min(margin_rows, row), min(margin_rows, n_rows - row - rows))
 
 
 class BandReader(AbstractContextManager["BandReader"]):
-    """The first band of a raster on a grid, open to be read by strips.
+    """An open raster on a grid, read by strips. A context manager.
 
     Raises
     ------
     InputError
-        Where the file is missing or damaged.
+        The file is missing or damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._opening = open_raster(path, "raster")
         self._file: rasterio.DatasetReader = self._opening.__enter__()
-        self._counted: dict[str, str] = {}
+        self._computed: dict[str, str] = {}
 
     @property
     def geobox(self) -> GeoBox:
-        """Its grid; without CRS where it has none."""
+        """The grid of the raster; it has no CRS where the file has none."""
         wkt = None if self._file.crs is None else self._file.crs.to_wkt()
         return GeoBox(self._file.shape, self._file.transform, wkt)
 
     @property
     def crs(self) -> CRS | None:
-        """Its CRS, None where it has none."""
+        """The CRS of the raster; None where the file has none."""
         return None if self._file.crs is None else CRS.from_wkt(self._file.crs.to_wkt())
 
     @property
     def horizontal_geobox(self) -> GeoBox:
-        """Its grid for what holds no heights: the CRS is that of x and y."""
+        """The grid with the horizontal part of its CRS, for products that hold no heights."""
         crs = self.crs
         return self.geobox if crs is None else GeoBox(self._file.shape, self._file.transform, crs.to_2d().to_wkt())
 
     @property
     def description(self) -> str:
-        """Of its band, "" for none."""
+        """Description of the first band, "" for none."""
         return self._file.descriptions[0] or ""
 
     @property
     def cell_m(self) -> float:
-        """Side of a cell, m."""
+        """Side of a cell, in metres of a projected CRS."""
         return float(self._file.transform.a)
 
     @property
     def dtype(self) -> str:
-        """Of its cells, as NumPy names it."""
+        """Type of the cells of the first band, as NumPy names it."""
         return str(self._file.dtypes[0])
 
     def statistic(self, name: str) -> float | None:
-        """MINIMUM, MAXIMUM, MEAN, STDDEV, VALID_PERCENT of the band, None where no cell is valid; read from the cells
-        where the file does not say."""
+        """A statistic of the first band; None where no cell is valid. Computed from the cells if the file lacks it.
+
+        name : MINIMUM, MAXIMUM, MEAN, STDDEV or VALID_PERCENT.
+        """
         tags = self._file.tags(1)
         if "STATISTICS_MEAN" not in tags:
-            tags = self._counted = self._counted or self._count()
+            tags = self._computed = self._computed or self._compute_statistics()
         value = tags.get(f"STATISTICS_{name}")
         return None if value is None else float(value)
 
-    def _count(self) -> dict[str, str]:
+    def _compute_statistics(self) -> dict[str, str]:
         statistics = BandStatistics()
         for strip in strips_of(self._file.height):
             window = self._window(strip)
@@ -110,15 +116,15 @@ class BandReader(AbstractContextManager["BandReader"]):
         return statistics.tags()
 
     def read(self, strip: Strip) -> NDArray[Any]:
-        """Cells of a strip with what is beside it, (r, c)."""
+        """Cells of the first band in a strip and in the rows read along, (r, c)."""
         return np.asarray(self._file.read(1, window=self._window(strip)))
 
     def read_rows(self, row: int, rows: int) -> NDArray[Any]:
-        """Cells of some rows, (r, c)."""
+        """Cells of the first band in some rows, (r, c)."""
         return self.read(Strip(row, rows, 0, 0))
 
     def read_bands(self, strip: Strip) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Cells of all bands, (bands, r, c), and whether they are valid, (r, c)."""
+        """Cells of all bands, (bands, r, c), and whether they are valid, (r, c) bool."""
         window = self._window(strip)
         return np.asarray(self._file.read(window=window)), np.asarray(self._file.dataset_mask(window=window)) > 0
 
@@ -133,12 +139,12 @@ class BandReader(AbstractContextManager["BandReader"]):
 
 
 def check_same_grid(bands: list[BandReader]) -> None:
-    """Make sure that rasters of one result lie on one grid.
+    """Check that rasters of one result lie on one grid.
 
     Raises
     ------
     InputError
-        Where one does not.
+        One of them does not.
     """
     first = bands[0]
     for band in bands[1:]:

@@ -1,4 +1,4 @@
-"""run.json: what was asked, with which inputs and versions, what was done and how long it took."""
+"""The file run.json: the request, inputs and versions of a run, its stages and their times."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from zlocus.io.config import config_as_dict
 from zlocus.io.open_raster import gdal_name, is_remote
 from zlocus.io.safe_documents import read_json
 
-SCHEMA = 1
+# Version of the keys of run.json and of the other JSON files of a result.
+SCHEMA = 2
 CHUNK_BYTES = 1 << 20
 LIBRARIES = (
     "zlocus",
@@ -41,7 +42,7 @@ LIBRARIES = (
 
 @dataclass
 class WorkerUsage:
-    """What a stage took in other processes. cpu_s : all of them together; peak_mb : most that one of them held."""
+    """Resources that a stage used in worker processes. cpu_s : sum of all; peak_mb : largest of one process."""
 
     cpu_s: float = 0.0
     peak_mb: float = 0.0
@@ -55,21 +56,21 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[WorkerUsage]:
-        """Time a block; what is added to what it yields counts too."""
-        wall, cpu, elsewhere = time.perf_counter(), time.process_time(), WorkerUsage()
-        yield elsewhere
+        """Time a block as a stage. The block adds what its workers used to the record that it gets."""
+        wall, cpu, workers = time.perf_counter(), time.process_time(), WorkerUsage()
+        yield workers
         self.stages.append(
             {
                 "name": name,
                 "wall_s": round(time.perf_counter() - wall, 3),
-                "cpu_s": round(time.process_time() - cpu + elsewhere.cpu_s, 3),
-                "peak_mb": round(max(peak_memory_mb(), elsewhere.peak_mb), 1),
+                "cpu_s": round(time.process_time() - cpu + workers.cpu_s, 3),
+                "peak_mb": round(max(peak_memory_mb(), workers.peak_mb), 1),
             }
         )
 
 
 def inputs_record(paths: Iterable[Path]) -> list[dict[str, str | None]]:
-    """Path and SHA-256 of every input file; None of those that are elsewhere, which are never read whole."""
+    """Path and SHA-256 of every input file; None for files on servers, which are never read as a whole."""
     records: list[dict[str, str | None]] = []
     for path in paths:
         if is_remote(path):
@@ -84,7 +85,7 @@ def inputs_record(paths: Iterable[Path]) -> list[dict[str, str | None]]:
 
 
 def request_as_dict(request: Any) -> dict[str, Any]:
-    """A request, one of `zlocus.core.requests`, as JSON can hold it."""
+    """A request, one of `zlocus.core.requests`, as values that JSON can hold."""
     record = {name: str(value) if isinstance(value, Path) else value for name, value in vars(request).items()}
     return record | {"inputs": [str(path) for path in request.inputs]}
 
@@ -92,7 +93,7 @@ def request_as_dict(request: Any) -> dict[str, Any]:
 def result_record(
     request: Any, config: RunConfig, inputs: Sequence[Mapping[str, str | None]], watch: Stopwatch
 ) -> dict[str, Any]:
-    """What was asked, of which versions and inputs, and how long it took, for run.json.
+    """The entries of run.json that all commands share: configuration, versions, inputs and stages.
 
     inputs : see `inputs_record`.
     """
@@ -105,42 +106,53 @@ def result_record(
 
 
 def utc_now() -> str:
-    """The time, as ISO 8601 in UTC."""
+    """The current time in UTC, as ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def versions_record() -> dict[str, str]:
-    """Versions of Python and of the libraries a height may depend on."""
+    """Versions of Python and of the libraries on which heights may depend."""
     return {"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}}
 
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
-    """Write JSON whole or not at all; numbers that are not finite, which it cannot hold, become null."""
+    """Write a JSON file atomically. Numbers that are not finite, which JSON cannot hold, become null.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
     text = json.dumps(finite_only({"schema": SCHEMA, **record}), indent=2, allow_nan=False) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """A JSON object in a file of a result.
+    """The JSON object in a file of a result.
 
     Raises
     ------
     InputError
-        It is damaged.
+        It is damaged, or an earlier version of zlocus wrote it, whose keys had other names.
     """
-    found = read_json(path, again="Make the surface again.")
-    if not isinstance(found, dict):
+    record = read_json(path, advice="Make the surface again.")
+    if not isinstance(record, dict):
         raise InputError(f"{path} holds no JSON object. Make the surface again.")
-    return found
+    if record.get("schema") == 1:
+        raise InputError(
+            f"{path} was written by an earlier version of zlocus (schema 1, and this version reads schema {SCHEMA}). "
+            "Make the surface again, or use that version."
+        )
+    return record
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file to a temporary name beside it, then rename it: whole or not at all.
+    """Write a file under a temporary name, then rename it. write : writes to the path that it is given.
 
     Raises
     ------
     OutputError
-        Where it cannot be written.
+        The file cannot be written.
     """
     try:
         with atomic_file(path) as part:
@@ -151,7 +163,7 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def finite_only(value: Any) -> Any:
-    """The same value with None for every number in it that is not finite."""
+    """The value with every number that is not finite replaced by None, also inside tables and lists."""
     if isinstance(value, dict):
         return {key: finite_only(part) for key, part in value.items()}
     if isinstance(value, list | tuple):

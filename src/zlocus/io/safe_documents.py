@@ -1,4 +1,4 @@
-"""Documents read with suspicion: JSON, XML and YAML without what could flood the memory or mean two things at once."""
+"""Safe reading of JSON, XML and YAML: nothing that could exhaust the memory, and nothing ambiguous."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ MAX_XML_DEPTH = 64
 MAX_YAML_DEPTH = 32
 TOO_DEEP = f"{{path}} is nested more than {MAX_YAML_DEPTH} levels deep. Check its brackets."
 MAX_YAML_BYTES = 64_000_000
-# What ten thousand cameras take. Aliases count as what they stand for.
+# About as many as ten thousand cameras need. An alias counts as often as the values that it repeats.
 MAX_VALUES = 500_000
-# Of YAML 1.1, without whole numbers to other bases than 10, underscores within them, and yes and no for truth.
+# Numbers and truth values of YAML 1.1, but without other bases than 10, underscores, and yes and no as truth values.
 BOOL, INT, FLOAT = (f"tag:yaml.org,2002:{kind}" for kind in ("bool", "int", "float"))
 PLAIN_SCALARS: dict[str, tuple[str, str]] = {
     BOOL: (r"true|True|TRUE|false|False|FALSE", "tTfF"),
@@ -31,14 +31,15 @@ PLAIN_SCALARS: dict[str, tuple[str, str]] = {
 }
 
 
-def read_json(path: Path, start: str | None = None, again: str = EXPORT_AGAIN) -> Any:
-    """A JSON document, with finite numbers and different keys. start : letter before which anything may stand; again :
-    what to do where it is none.
+def read_json(path: Path, start: str | None = None, advice: str = EXPORT_AGAIN) -> Any:
+    """The content of a JSON file whose numbers are finite and whose keys are unique.
+
+    start : first character of the document, before which any other text is ignored. advice : last sentence of messages.
 
     Raises
     ------
     InputError
-        Where it is none.
+        The file is not such a document.
     """
 
     def refuse(constant: str) -> NoReturn:
@@ -61,16 +62,16 @@ def read_json(path: Path, start: str | None = None, again: str = EXPORT_AGAIN) -
         return json.loads(text, parse_constant=refuse, parse_float=number, object_pairs_hook=table)
     except (ValueError, RecursionError) as error:
         what = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise InputError(f"{path} cannot be read as JSON: {what}. {again}") from error
+        raise InputError(f"{path} cannot be read as JSON: {what}. {advice}") from error
 
 
 def read_xml(path: Path) -> Element:
-    """The root of an XML document that declares no document type, and so no entities.
+    """The root element of an XML file without a document type, and so without entities.
 
     Raises
     ------
     InputError
-        Where it does, is nested too deeply, or is not XML.
+        The file declares a document type, is nested too deeply, or is not XML.
     """
     content, depth, n_elements = read_bytes(path), 0, 0
 
@@ -103,7 +104,7 @@ def read_xml(path: Path) -> Element:
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """YAML in which a number is what it looks like."""
+    """YAML in which only plain decimal numbers are numbers (see `PLAIN_SCALARS`)."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own way)
         first: [(tag, pattern) for tag, pattern in known if tag not in PLAIN_SCALARS]
@@ -115,39 +116,39 @@ for _tag, (_pattern, _first) in PLAIN_SCALARS.items():
     _Loader.add_implicit_resolver(_tag, re.compile(rf"(?:{_pattern})\Z"), list(_first))
 
 
-def read_yaml(path: Path, most: int = MAX_YAML_BYTES) -> Any:
-    """A YAML document: YAML 1.1 without its traps (see `PLAIN_SCALARS`), without tags, with different keys. most : bytes.
+def read_yaml(path: Path, max_bytes: int = MAX_YAML_BYTES) -> Any:
+    """The content of a YAML file: YAML 1.1 with plain numbers only (see `PLAIN_SCALARS`), no tags, and unique keys.
 
     Raises
     ------
     InputError
-        Where it is none, stops within a value, holds a key twice, or more than a file of options ever does.
+        The file is not YAML, stops within a value, holds a key twice, or is larger than any file of options.
     """
-    text = read_text(path, most)
+    text = read_text(path, max_bytes)
     try:
-        _Checked(path).look(text)
+        _YamlChecker(path).check(text)
         check_last_line_ended(text.rstrip(" \t"), path)
         return yaml.load(text, _Loader)
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         if "nesting depth" in str(error):
-            # libyaml reads ahead, and has a limit of its own that it may reach first.
+            # libyaml reads ahead and may reach its own limit first.
             raise InputError(TOO_DEEP.format(path=path)) from error
         raise InputError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}. Mend it there.") from error
 
 
-class _Checked:
-    """A look at a YAML document before anything is made of it."""
+class _YamlChecker:
+    """Checks a YAML document before any of its values is built."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # Of each open collection: its anchor, how many values came before it, and of a mapping its keys.
+        # For each open collection: its anchor, the number of values before it, and for a mapping its keys.
         self.open: list[tuple[str | None, int, set[str] | None]] = []
         self.is_key: list[bool] = []
         self.n_values = 0
         self.sizes: dict[str, int] = {}
 
-    def look(self, text: str) -> None:
-        """Refuse what is in the way; see `read_yaml`."""
+    def check(self, text: str) -> None:
+        """Raise `InputError` for anything that `read_yaml` refuses."""
         for event in yaml.parse(text, _Loader):
             if isinstance(event, yaml.CollectionEndEvent):
                 anchor, before, _ = self.open.pop()
@@ -176,7 +177,7 @@ class _Checked:
         self.is_key.append(True)
 
     def _key(self, event: yaml.NodeEvent) -> None:
-        """Of a mapping every second value is a key, and no two are the same."""
+        """Check that keys are unique: in a mapping, every second value is a key."""
         keys = self.open[-1][2] if self.open else None
         if keys is None:
             return

@@ -1,4 +1,4 @@
-"""Text files read with suspicion: whole or line by line, ended, in UTF-8, and numbers that are plainly numbers."""
+"""Safe reading of text files: UTF-8 only, no truncated last line, and only plain decimal numbers."""
 
 from __future__ import annotations
 
@@ -12,53 +12,61 @@ from zlocus.core.errors import InputError
 
 EXPORT_AGAIN = "Export it again, or copy it again from its source."
 MAX_SHOWN_CHARACTERS = 40
-# Of a line that a person or a program writes a table in, with room to spare.
+# Longer than any line of a table that a person or a program writes.
 MAX_LINE_CHARACTERS = 100_000
-# What is measured is smaller; larger numbers are damage, and would overflow.
+# Larger than anything that is measured. A larger number is a sign of damage, and could overflow later.
 MAX_MAGNITUDE = 1e15
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-# What ends a value for certain, where no line end does.
+# A value that ends with one of these is complete, even without a line end.
 CLOSING = ("]", "}", '"', "'")
 WORD = re.compile(r"[^\s,;]+")
 DECIMAL = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 
-def read_bytes(path: Path, most: int | None = None) -> bytes:
-    """The whole file. most : bytes that a file of its kind may have.
+def read_bytes(path: Path, max_bytes: int | None = None) -> bytes:
+    """The content of a file. max_bytes : the most that a file of its kind may have; None: no limit.
 
     Raises
     ------
     InputError
-        Where it cannot be read, or is longer.
+        The file cannot be read, or is longer.
     """
     try:
         length = path.stat().st_size
-        if most is not None and length > most:
+        if max_bytes is not None and length > max_bytes:
             raise InputError(
-                f"{path} has {length} bytes, and no file of its kind has more than {most}. Check that it is the right "
-                "one."
+                f"{path} has {length} bytes, and no file of its kind has more than {max_bytes}. Check that it is the "
+                "right one."
             )
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}. Check the path.") from error
 
 
-def read_text(path: Path, most: int | None = None) -> str:
-    """The whole file, which is UTF-8. most : see `read_bytes`."""
+def read_text(path: Path, max_bytes: int | None = None) -> str:
+    """The content of a text file in UTF-8. max_bytes : see `read_bytes`.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is longer, or is not UTF-8.
+    """
     try:
-        return read_bytes(path, most).decode("utf-8-sig")
+        return read_bytes(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8, from byte {error.start} on. {EXPORT_AGAIN}") from error
 
 
 def text_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, from 1, read one at a time; every line has an end, or the last one's last number is
-    written as those above it are (see `written`).
+    """Yield the lines of a file with their numbers, from 1.
+
+    A last line without a line end is accepted if its last number has as many digits as those above it (see
+    `digits_written`); otherwise the file may have been truncated within that number.
 
     Raises
     ------
     InputError
-        Where the file cannot be read, is not UTF-8, or stops within a line.
+        The file cannot be read, is not UTF-8, or stops within a line.
     """
     above: set[tuple[int, int] | None] = set()
     try:
@@ -78,14 +86,14 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def truncation_error(path: Path, line: int) -> InputError:
-    """The error of a file whose last line has no end, so that its last number may be half of one."""
+    """The error of a file whose last line has no line end, so that its last number may be truncated."""
     return InputError(f"{path} stops within line {line}: it may be truncated. Copy it again, or end that line.")
 
 
 def digits_written(number: str) -> tuple[int, int] | None:
-    """Digits behind the point and of the exponent; None where no digit is behind the point, or for no number.
+    """Number of digits behind the point and in the exponent; None without digits behind the point, or for no number.
 
-    Where all numbers are written alike, one that was cut short is not.
+    Where all numbers of a table have the same digits, a truncated one stands out.
     """
     mantissa, _, exponent = number.lower().partition("e")
     digits = len(mantissa.partition(".")[2])
@@ -93,29 +101,31 @@ def digits_written(number: str) -> tuple[int, int] | None:
 
 
 def check_last_line_ended(text: str, path: Path) -> None:
-    """Refuse options that stop within a value: the last line has an end, unless it closes a bracket or a quotation.
+    """Check that a file of options does not stop within a value.
+
+    Its last line has a line end, unless it closes a bracket or a quotation.
 
     Raises
     ------
     InputError
-        Naming the line.
+        The file may be truncated; the message names the line.
     """
     if text and not text.endswith(("\n", "\r", *CLOSING)):
         raise truncation_error(path, text.count("\n") + 1)
 
 
 def decimal(text: str) -> float:
-    """A number as files write it; NaN for anything else, also what only Python reads as one (1_0, other digits)."""
+    """The value of a decimal number; NaN for any other text, also for what only Python accepts (1_0, other digits)."""
     text = text.strip()
     return float(text) if is_decimal(text) else math.nan
 
 
 def is_decimal(text: str) -> bool:
-    """Whether text is a number as files write it."""
+    """Whether a text is a plain decimal number."""
     return DECIMAL.fullmatch(text) is not None
 
 
 def quoted(value: Any) -> str:
-    """A value for a message, shortened."""
+    """A value in quotation marks for a message, shortened to `MAX_SHOWN_CHARACTERS`."""
     text = value if isinstance(value, str) else repr(value)
     return repr(text if len(text) <= MAX_SHOWN_CHARACTERS else text[:MAX_SHOWN_CHARACTERS] + "...")

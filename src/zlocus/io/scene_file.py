@@ -1,4 +1,4 @@
-"""Scenes from files: a list of images with their own cameras, or one `scene.yaml` (schema 1).
+"""Open scenes: a list of images with their own RPCs, or one `scene.yaml` (schema 1):
 
 schema: 1
 frame: {crs: "EPSG:32631"}             # optional: else the UTM zone; or {local: true, up: [x, y, z], north: [x, y, z]}
@@ -8,7 +8,7 @@ views:
   - name: nadir
     image: img_n1.tif                  # relative to this file
     camera: {kind: rpc, file: other_RPC.TXT, shift: [0.3, -1.2]}   # file and shift are optional
-    date: 2026-05-17                   # optional: near dates are compared first
+    date: 2026-05-17                   # optional: images of near dates are matched first
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ T = TypeVar("T")
 
 
 class Frame(StrictModel):
-    """What all views share: a CRS, or local Cartesian axes in metres with z up.
+    """The frame of all views: a CRS, or local Cartesian axes in metres with z up.
 
-    up : direction, in the axes of the cameras, that becomes z of a local frame; north : another, which becomes y as far
-    as it is at right angles to `up`. Without it the frame is turned as little as it takes.
+    up : direction, in the axes of the cameras, that becomes z of a local frame; north : direction whose part at right
+    angles to `up` becomes y. Without `north` the smallest rotation is used.
     """
 
     crs: str | None = None
@@ -76,7 +76,7 @@ class Frame(StrictModel):
 
 
 class Area(StrictModel):
-    """The part of the ground asked for. bounds : xmin, ymin, xmax, ymax in the frame's CRS."""
+    """The area of interest. bounds : xmin, ymin, xmax, ymax in the frame's CRS."""
 
     bounds: tuple[FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber]
 
@@ -89,7 +89,7 @@ class Area(StrictModel):
 
 
 class ViewEntry(StrictModel):
-    """One image and its camera. name : unique; date : of the exposure."""
+    """An image and its camera. name : unique in the scene; date : of the exposure."""
 
     name: str = Field(min_length=1)
     image: str
@@ -136,31 +136,31 @@ class SceneFile(StrictModel):
 
 
 def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
-    """The scene of some images with RPC, or of one `scene.yaml`.
+    """Open the scene of some images with RPCs, or of one `scene.yaml`.
 
-    crs : a projected CRS in metres, whose horizontal part becomes the frame; it overrides that of the file. By default
-    the WGS84 UTM zone of the scene's centre.
+    crs : a projected CRS in metres, whose horizontal part becomes the frame. It overrides the CRS of the file. The
+    default is the WGS84 UTM zone of the scene's centre.
 
     Raises
     ------
     InputError
-        For a file that is missing, damaged or given twice, an image that is empty, constant or without a camera, fewer
-        than two images.
+        A file is missing, damaged or given twice; an image is empty, constant or without a camera; there are fewer than
+        two images.
     ConfigError
-        For a CRS that is not projected in metres.
+        The CRS is not projected in metres.
     """
-    asked = _asked(inputs, crs)
-    loaded = [_load(entry, asked.folder) for entry in asked.entries]
-    if len(loaded) < 2:
-        given = f"only {loaded[0].entry.path} was given" if loaded else "none was given"
+    scene_input = _inputs_of_scene(inputs, crs)
+    opened = [_open_view(entry, scene_input.folder) for entry in scene_input.entries]
+    if len(opened) < 2:
+        given = f"only {opened[0].entry.path} was given" if opened else "none was given"
         raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
-    frame = _default_crs(loaded) if asked.crs is None else asked.crs
-    return asked.scene([each.view(frame) for each in loaded], frame)
+    frame = _default_crs(opened) if scene_input.crs is None else scene_input.crs
+    return scene_input.scene([each.view(frame) for each in opened], frame)
 
 
 @dataclass(frozen=True)
 class RefusedView:
-    """A view that cannot be used, and why."""
+    """A view that cannot be used. reason : why, as a sentence."""
 
     name: str
     path: Path
@@ -169,50 +169,54 @@ class RefusedView:
 
 @dataclass(frozen=True)
 class UsableViews:
-    """The views that can be used, None where there is no single one, and the others."""
+    """The usable views of a scene. scene : of these, None where there is none; refused : the other views."""
 
     scene: Scene | None
     refused: tuple[RefusedView, ...]
 
 
 def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableViews:
-    """As `open_scene`, but a view that cannot be used, or whose entry is wrong, is named and the others are opened.
+    """As `open_scene`, but views that cannot be used, or whose entry is wrong, are listed instead of raising an error.
 
     Raises
     ------
     InputError, ConfigError
-        Where nothing can be opened at all: a scene file that is wrong elsewhere, an image given twice, a CRS that does
-        not suit.
+        No view can be opened: the scene file has another fault, an image is given twice, or the CRS is not usable.
     """
     wrong: list[RefusedView] = []
-    asked = _asked(inputs, crs, wrong)
+    scene_input = _inputs_of_scene(inputs, crs, wrong)
     refused: dict[str, RefusedView] = {}
 
-    def tried(entry: _ViewInput, step: Callable[[], T]) -> list[T]:
+    def attempt(entry: _ViewInput, step: Callable[[], T]) -> list[T]:
         try:
             return [step()]
         except ZlocusError as error:
             refused[entry.name] = RefusedView(entry.name, entry.path, str(error))
             return []
 
-    loaded = [each for entry in asked.entries for each in tried(entry, partial(_load, entry, asked.folder))]
-    frame = asked.crs
+    opened = [
+        each for entry in scene_input.entries for each in attempt(entry, partial(_open_view, entry, scene_input.folder))
+    ]
+    frame = scene_input.crs
     if frame is None:
-        loaded = [each for each in loaded if tried(each.entry, partial(_default_crs, [each]))]
-        frame = _default_crs(loaded) if loaded else None
-    views = [] if frame is None else [v for each in loaded for v in tried(each.entry, partial(each.view, frame))]
-    scene = asked.scene(views, frame) if views and frame is not None else None
-    return UsableViews(scene, (*wrong, *(refused[entry.name] for entry in asked.entries if entry.name in refused)))
+        opened = [each for each in opened if attempt(each.entry, partial(_default_crs, [each]))]
+        frame = _default_crs(opened) if opened else None
+    views = [] if frame is None else [v for each in opened for v in attempt(each.entry, partial(each.view, frame))]
+    scene = scene_input.scene(views, frame) if views and frame is not None else None
+    return UsableViews(
+        scene, (*wrong, *(refused[entry.name] for entry in scene_input.entries if entry.name in refused))
+    )
 
 
 def read_scene_file(path: Path, wrong: list[RefusedView] | None = None) -> SceneFile:
-    """A `scene.yaml`, checked, its images and cameras unread. wrong : takes the views whose entries are, without which
-    the file is read then.
+    """Read and check a `scene.yaml`, without opening its images and cameras.
+
+    wrong : list to which views with a wrong entry are added, and the file is read without them; None: they are errors.
 
     Raises
     ------
     InputError
-        Naming the file, the key and what is allowed there.
+        The file is wrong; the message names the key and what is allowed.
     """
     path = existing_file(path, "scene file")
     document = read_yaml(path)
@@ -226,7 +230,7 @@ def read_scene_file(path: Path, wrong: list[RefusedView] | None = None) -> Scene
 
 
 def _view_entry(views: list[Any], index: int, path: Path, wrong: list[RefusedView] | None) -> list[ViewEntry]:
-    """One view of a scene file; none where its entry is noted as wrong."""
+    """The entry of a view of a scene file as a list; empty where it was added to `wrong`."""
     view, where = views[index], f"views[{index}]"
     given = view if isinstance(view, dict) else {}
     try:
@@ -237,19 +241,19 @@ def _view_entry(views: list[Any], index: int, path: Path, wrong: list[RefusedVie
         if wrong is None:
             raise
         name, image = given.get("name"), given.get("image")
-        alone = isinstance(name, str) and sum(isinstance(v, dict) and v.get("name") == name for v in views) == 1
+        is_unique = isinstance(name, str) and sum(isinstance(v, dict) and v.get("name") == name for v in views) == 1
         file = path.parent / image if isinstance(image, str) else path
-        wrong.append(RefusedView(name if isinstance(name, str) and alone else where, file, str(error)))
+        wrong.append(RefusedView(name if isinstance(name, str) and is_unique else where, file, str(error)))
         return []
 
 
 def write_scene_file(path: Path, scene_file: SceneFile) -> None:
-    """Write a `scene.yaml`: a temporary name first, then renamed, so that it is whole or not there.
+    """Write a `scene.yaml` atomically.
 
     Raises
     ------
     OutputError
-        When the folder cannot be written.
+        The file cannot be written.
     """
     document = scene_file.model_dump(mode="json", by_alias=True, exclude_none=True)
     try:
@@ -261,6 +265,8 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
 
 @dataclass(frozen=True)
 class _ViewInput:
+    """A view before its image is opened. path : of the image."""
+
     name: str
     path: Path
     camera: CameraEntry
@@ -269,7 +275,7 @@ class _ViewInput:
 
 @dataclass(frozen=True)
 class _SceneInput:
-    """A scene before any image is opened. folder : where relative paths of cameras start; up, north : see `Frame`."""
+    """A scene before any image is opened. folder : base of relative paths of cameras; up, north : see `Frame`."""
 
     entries: tuple[_ViewInput, ...]
     folder: Path
@@ -280,42 +286,42 @@ class _SceneInput:
     north: tuple[float, float, float] | None = None
 
     def scene(self, views: Sequence[View], crs: CRS) -> Scene:
-        """The scene of some views in its frame."""
+        """The scene of opened views, turned into its frame."""
         scene = Scene(tuple(views), crs, self.bounds, self.heights)
-        return scene if self.up is None else _turned(scene, rotation_to_axes(self.up, self.north))
+        return scene if self.up is None else _rotated(scene, rotation_to_axes(self.up, self.north))
 
 
 @dataclass(frozen=True)
 class _OpenedView:
-    """An image and its camera, read, before the scene's CRS is known."""
+    """An opened image and its camera, before the CRS of the scene is known."""
 
     entry: _ViewInput
     image: RasterImage
-    source: OpenedCamera
+    camera: OpenedCamera
 
     def view(self, crs: CRS) -> View:
-        """The view in the scene's frame."""
+        """The view in the frame of the scene."""
         entry = self.entry
-        return View(entry.name, entry.path, self.image, self.source.sensor(crs), self.source.files, entry.date)
+        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, entry.date)
 
 
-def _asked(inputs: Sequence[Path], crs: CRS | None, wrong: list[RefusedView] | None = None) -> _SceneInput:
+def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, wrong: list[RefusedView] | None = None) -> _SceneInput:
     paths = [Path(path) for path in inputs]
     scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
     if scene_files and len(paths) > 1:
         raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
     if scene_files:
-        asked = _from_scene_file(scene_files[0], crs, wrong)
+        scene_input = _from_scene_file(scene_files[0], crs, wrong)
     else:
         entries = [_ViewInput(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
-        asked = _SceneInput(tuple(entries), Path(), crs)
-    if asked.crs is not None and not is_local(asked.crs):
-        asked = replace(asked, crs=checked_crs(asked.crs))
-    _check_distinct([entry.path for entry in asked.entries])
-    return asked
+        scene_input = _SceneInput(tuple(entries), Path(), crs)
+    if scene_input.crs is not None and not is_local(scene_input.crs):
+        scene_input = replace(scene_input, crs=checked_crs(scene_input.crs))
+    _check_distinct([entry.path for entry in scene_input.entries])
+    return scene_input
 
 
-def _load(entry: _ViewInput, folder: Path) -> _OpenedView:
+def _open_view(entry: _ViewInput, folder: Path) -> _OpenedView:
     image = open_image(entry.path)
     check_grey_values(image)
     check_content(image)
@@ -340,8 +346,8 @@ def _from_scene_file(path: Path, crs: CRS | None, wrong: list[RefusedView] | Non
     return _SceneInput(entries, path.parent, crs or frame, bounds, scene_file.heights, *axes)
 
 
-def _turned(scene: Scene, rotation: FloatArray) -> Scene:
-    """The scene in a local frame turned against its own."""
+def _rotated(scene: Scene, rotation: FloatArray) -> Scene:
+    """The scene with its local frame rotated. rotation : (3, 3)."""
     views = []
     for view in scene.views:
         assert isinstance(view.sensor, FrameModel), "other cameras know their place on the Earth"
@@ -350,7 +356,7 @@ def _turned(scene: Scene, rotation: FloatArray) -> Scene:
 
 
 def rotation_to_z(up: tuple[float, float, float]) -> FloatArray:
-    """The smallest rotation, (3, 3), that makes a direction the z axis; half a turn about x for minus z."""
+    """The smallest rotation (3, 3) that turns a direction into the z axis; for -z half a turn about x."""
     x, y, z = np.array(up) / np.max(np.abs(up))
     x, y, z = np.array([x, y, z]) / np.linalg.norm([x, y, z])
     if z < -1.0 + OPPOSITE_TOLERANCE:
@@ -361,8 +367,11 @@ def rotation_to_z(up: tuple[float, float, float]) -> FloatArray:
 
 
 def rotation_to_axes(up: tuple[float, float, float], north: tuple[float, float, float] | None) -> FloatArray:
-    """The rotation, (3, 3), that makes `up` the z axis and what of `north` is at right angles to it the y axis; without
-    `north` the smallest one."""
+    """The rotation (3, 3) that turns `up` into the z axis, and the part of `north` at right angles to it into the y
+    axis.
+
+    Without `north` it is the smallest rotation.
+    """
     rotation = rotation_to_z(up)
     if north is None:
         return rotation
@@ -372,7 +381,7 @@ def rotation_to_axes(up: tuple[float, float, float], north: tuple[float, float, 
 
 
 def _is_along(up: tuple[float, float, float], north: tuple[float, float, float]) -> bool:
-    """Whether two directions are the same or opposite, to rounding, or the second is none."""
+    """Whether two directions are parallel or opposite, to rounding, or the second is zero."""
     if not any(north):
         return True
     one, other = (np.array(v) / np.max(np.abs(v)) for v in (up, north))
@@ -390,13 +399,13 @@ def _frame_crs(frame: Frame, path: Path) -> CRS:
         raise ConfigError(f"{path}: frame.crs: {error}") from error
 
 
-def _default_crs(loaded: Sequence[_OpenedView]) -> CRS:
-    """The UTM zone of the mean of the images' centres (longitudes across the date line are neighbours)."""
+def _default_crs(opened: Sequence[_OpenedView]) -> CRS:
+    """The UTM zone of the mean of the images' centres. Longitudes on both sides of the date line are close together."""
     centres = []
-    for each in loaded:
+    for each in opened:
         top, left, rows, cols = held_window(each.image)
-        # That of an image whose middle is the middle of what the file holds.
-        centre = each.source.centre((2 * top + rows, 2 * left + cols))
+        # The centre of an image whose middle is that of the stored part.
+        centre = each.camera.centre((2 * top + rows, 2 * left + cols))
         if centre is None:
             raise InputError(
                 f"The camera of {each.image.path} does not place its centre on the Earth. Check it, or give --crs."
@@ -408,15 +417,15 @@ def _default_crs(loaded: Sequence[_OpenedView]) -> CRS:
 
 
 def _check_distinct(paths: Sequence[Path]) -> None:
-    seen: set[Path] = set()
+    known_paths: set[Path] = set()
     for path in paths:
-        if path.resolve() in seen:
+        if path.resolve() in known_paths:
             raise InputError(f"{path} is given twice. Each image counts once; remove one.")
-        seen.add(path.resolve())
+        known_paths.add(path.resolve())
 
 
 def _unique_names(paths: Sequence[Path]) -> list[str]:
-    """A name per image: its stem, else parent/stem, else the path without suffix, whichever is unique first."""
+    """A name for each image: the first that is unique of its stem, parent/stem, and path without suffix."""
     names = [path.stem for path in paths]
     for depth in (1, 2):
         doubled = {name for name in names if names.count(name) > 1}
@@ -428,7 +437,7 @@ def _unique_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _camera(value: Any, path: Path, where: str) -> Any:
-    """The camera entry by its kind; anything that is not a mapping is left to the model to refuse."""
+    """The camera entry as the class of its kind. Anything but a mapping is returned, for the model to refuse."""
     if not isinstance(value, dict):
         return value
     kind = value.get("kind")

@@ -1,4 +1,4 @@
-"""Documents checked by pydantic: unknown keys are refused at every level, and what is wrong is said in a sentence."""
+"""Validate documents with pydantic: unknown keys are refused at every level, and errors are one sentence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zlocus.io.safe_text import MAX_MAGNITUDE, is_decimal, quoted
 
 
 def _plain(value: Any) -> Any:
-    """Pydantic takes true for 1, and in text 1_0 for 10."""
+    """Refuse what pydantic would accept as a number: true as 1, and the text 1_0 as 10."""
     if isinstance(value, bool) or (isinstance(value, str) and not is_decimal(value)):
         raise ValueError("is not a number")
     return value
@@ -24,7 +24,7 @@ WholeNumber = Annotated[int, BeforeValidator(_plain), Field(ge=-MAX_MAGNITUDE, l
 
 
 class StrictModel(BaseModel):
-    """A mapping whose keys are all known; frozen."""
+    """Base class of documents: a frozen mapping that refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
@@ -39,7 +39,7 @@ class StrictModel(BaseModel):
         return value
 
 
-# Of a value that is large, or seems so because it holds itself many times over, a message shows the beginning.
+# A message shows only the beginning of a large value.
 SHORT = reprlib.Repr()
 SHORT.maxlevel, SHORT.maxstring, SHORT.maxother = 2, 80, 80
 
@@ -47,12 +47,12 @@ Document = TypeVar("Document", bound=StrictModel)
 
 
 def validate_document(model: type[Document], document: Any, path: Path, where: str = "") -> Document:
-    """The model of a document read from `path`, of which it is the part called `where`.
+    """The document as an instance of `model`. path : its file; where : key of the document within the file.
 
     Raises
     ------
     InputError
-        For the first thing that is wrong: file, key, what stands there and what is allowed.
+        For the first fault: names the file, the key, its value and what is allowed.
     """
     empty = _empty_key(document)
     if empty is not None:
@@ -73,7 +73,7 @@ def validate_document(model: type[Document], document: Any, path: Path, where: s
 
 
 def _empty_key(document: Any) -> str | None:
-    """The first key of a document, as a path, after which nothing stands: whoever wrote it meant something."""
+    """The first key of a document, with the keys that it is in, that has no value; None where there is none."""
     if not isinstance(document, dict):
         return None
     for key, value in document.items():
@@ -86,6 +86,6 @@ def _empty_key(document: Any) -> str | None:
 
 
 def _key(key: Any) -> str:
-    """A key as a message shows it: in one line, and only the beginning of a long one."""
+    """A key for a message: on one line, and only the beginning of a long one."""
     text = str(key)
     return text if text.isprintable() and len(text) <= SHORT.maxstring else quoted(text)

@@ -1,7 +1,7 @@
-"""Which blocks of pixels a TIFF holds: read from the list of blocks in its directory, without decoding any pixel.
+"""Find out which blocks of a TIFF are stored, from the list of blocks in its directory, without decoding pixels.
 
-Source: TIFF revision 6.0 (Adobe, 1992), sections 2 and 15; BigTIFF as libtiff documents it. A sparse file, as GDAL
-writes it, lists the blocks that it leaves out with offset 0 and length 0.
+Source: TIFF revision 6.0 (Adobe, 1992), sections 2 and 15; BigTIFF as libtiff documents it. In a sparse file,
+as GDAL writes it, blocks that are not stored have offset 0 and length 0.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ from zlocus.core.scene import HeldPixels
 OFFSETS, LENGTHS = (273, 324), (279, 325)
 # NumPy's type of the values, by the number of the TIFF type: SHORT, LONG, IFD, LONG8, IFD8.
 VALUE_TYPES = {3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}
-# Values of a list that are in memory at a time.
+# Number of values of a list in memory at a time.
 VALUES_AT_ONCE = 1 << 20
-# A longer list takes more than seconds to read: that of a million pixels a side in blocks of 64 is as long.
+# A longer list takes more than seconds to read. An image of a million pixels a side in blocks of 64 has as many.
 MAX_BLOCKS = 1 << 28
-# Along each axis of the image, cells of whole blocks that are told apart.
+# Blocks are grouped into at most this number of cells along each axis of the image.
 MAX_CELLS_PER_AXIS = 1024
 
 
 @dataclass(frozen=True)
-class _List:
-    """The values of a tag. at : where the first lies in the file; n : how many; dtype : with the file's byte order."""
+class _TagValues:
+    """The values of a TIFF tag in a file. at : offset of the first; n : number; dtype : with the file's byte order."""
 
     at: int
     n: int
     dtype: np.dtype[Any]
 
     def part(self, file: BinaryIO, first: int, end: int) -> NDArray[np.int64]:
-        """Values from `first` to before `end` (n,); 0 for those that the list or the file is too short for."""
+        """Values from `first` to before `end`, (n,); 0 where the list or the file is too short."""
         out = np.zeros(end - first, np.int64)
         file.seek(self.at + first * self.dtype.itemsize)
         wanted = max(min(end, self.n) - first, 0)
         content = file.read(wanted * self.dtype.itemsize)
         values = np.frombuffer(content, self.dtype, len(content) // self.dtype.itemsize)
-        # Beyond what a signed number holds lies no file.
+        # No file is as large as the largest signed integer.
         out[: len(values)] = np.minimum(values.astype(np.uint64), np.iinfo(np.int64).max)
         return out
 
 
 def held_in_blocks(source: rasterio.DatasetReader, path: Path) -> HeldPixels | None:
-    """The parts of a TIFF's first image whose pixels the file holds; None where it holds all, or does not say.
+    """The parts of the first image of a TIFF that are stored; None where all are, or where the file does not say.
 
-    Where bands have blocks of their own, a part counts as held if it is held for one band.
+    Where each band has its own blocks, a part counts as stored if it is stored for one band.
 
     Raises
     ------
     InputError
-        When pixels lie behind the end of the file, or there are too many blocks.
+        Pixels lie behind the end of the file, or there are too many blocks.
     """
     rows, cols = source.block_shapes[0]
     n_down, n_across = -(-source.height // rows), -(-source.width // cols)
@@ -76,7 +76,7 @@ def held_in_blocks(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
     size = os.path.getsize(path)
     for first, offsets, lengths in _blocks(source, path, n_blocks):
         number = np.arange(first, first + len(offsets)) % n_of_band
-        # Not their sum, which a damaged file can make larger than any number.
+        # The sum of both is not used, because it can overflow in a damaged file.
         behind = (offsets > size) | (lengths > size - offsets)
         if behind.any():
             row = int(number[behind.argmax()]) // n_across * rows
@@ -94,8 +94,10 @@ def held_in_blocks(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
 def _blocks(
     source: rasterio.DatasetReader, path: Path, n_blocks: int
 ) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
-    """Number of the first of some blocks, and their offsets and lengths in the file, (n,) bytes; nothing where the
-    directory is not found, for what GDAL opens may be wrapped in other ways."""
+    """Yield the number of a first block, and offsets and lengths (n,) in bytes of the blocks from there on.
+
+    Yields nothing where the directory is not found, because GDAL also opens TIFFs inside other files.
+    """
     with path.open("rb") as file:
         tags = _tags(file, source.get_tag_item("IFD_OFFSET", "TIFF", bidx=1))
         offsets, lengths = (next((tags[name] for name in names if name in tags), None) for names in (OFFSETS, LENGTHS))
@@ -106,26 +108,26 @@ def _blocks(
             yield first, offsets.part(file, first, end), lengths.part(file, first, end)
 
 
-def _tags(file: BinaryIO, directory: str | None) -> dict[int, _List]:
-    """The lists in a directory of a TIFF, by tag. directory : its offset in the file, as GDAL says it."""
+def _tags(file: BinaryIO, directory: str | None) -> dict[int, _TagValues]:
+    """The values of the tags in a directory of a TIFF. directory : its offset in the file, as GDAL gives it."""
     head = file.read(4)
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
     if order is None or directory is None:
         return {}
     is_big = int.from_bytes(head[2:], "little" if order == "<" else "big") == 43
-    # Bytes of a count of entries, of an entry, and of a count or an offset within it.
+    # Bytes of the number of entries, of an entry, and of a number or an offset within an entry.
     n_count, n_entry, n_field = (8, 20, 8) if is_big else (2, 12, 4)
     field = np.dtype(f"{order}u{n_field}")
     file.seek(int(directory))
     n_entries = int(np.frombuffer(file.read(n_count).ljust(n_count, b"\0"), f"{order}u{n_count}")[0])
     start, entries = file.tell(), file.read(min(n_entries, 1 << 16) * n_entry)
-    found = {}
+    tags = {}
     for at in range(0, len(entries) - n_entry + 1, n_entry):
         tag, kind = (int(value) for value in np.frombuffer(entries, f"{order}u2", 2, at))
         n, place = (int(value) for value in np.frombuffer(entries, field, 2, at + 4))
         if kind in VALUE_TYPES:
             dtype = np.dtype(order + VALUE_TYPES[kind])
-            # Few values stand in the entry itself.
+            # A few values are stored in the entry itself.
             is_inside = n * dtype.itemsize <= n_field
-            found[tag] = _List(start + at + 4 + n_field if is_inside else place, n, dtype)
-    return found
+            tags[tag] = _TagValues(start + at + 4 + n_field if is_inside else place, n, dtype)
+    return tags

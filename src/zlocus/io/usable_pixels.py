@@ -1,4 +1,4 @@
-"""Pixels that hold no grey value although no tag of the file says so: borders of one value, and absurd numbers."""
+"""Find pixels without a grey value that no nodata value declares: plateaus at the border, and too large values."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from numpy.typing import NDArray
 
 from zlocus.core.scene import ImageSource, ImageWindow
 
-# No sensor has larger grey values: those of 32-bit integers end here. The square of a larger number, summed over an
-# image, leaves the range of float32.
+# Largest grey value of any sensor, that of 32-bit integers. Larger numbers, squared and summed over an image, would
+# exceed the range of float32.
 MAX_GREY_VALUE = 2.0**32
-# A border of one value is looked for at so many places along every side of an image, and is at least so many pixels
-# wide at one of them.
+# A plateau is searched for at this number of places along each side of an image. It is at least this wide at one of
+# them.
 PLACES_PER_SIDE, MIN_PLATEAU_WIDTH_PX = 24, 8
-# It fills at least this share of the image; less is a dark corner or a bright roof. And it holds at least this share of
-# the pixels of its value; else the value is a grey value that the image has elsewhere too, as a saturated one has.
+# A plateau fills at least this share of the image; a smaller one may be a dark corner or a bright roof. It also holds
+# at least this share of all pixels of its value; otherwise the value is an ordinary one, such as that of saturated
+# pixels.
 MIN_PLATEAU_SHARE, MIN_SHARE_OF_VALUE = 1e-3, 0.5
-BAND_ROWS = 256  # read at a time
+BAND_ROWS = 256  # rows read at a time
 
 
 @dataclass(frozen=True, eq=False)
 class BorderPlateau:
-    """Pixels of one value that are connected to the border of an image.
+    """Pixels of one constant value that are connected to the border of an image.
 
-    value : the grey value that all of them have; left, right : (r,) int64, how many of them each row begins and ends
-    with; top, bottom : (c,) int64, the same for columns.
+    value : their grey value; left, right : (r,) int64, how many pixels of each row belong to it at its begin and its
+    end; top, bottom : (c,) int64, the same for columns.
     """
 
     value: float
@@ -46,20 +47,20 @@ class BorderPlateau:
 
     @property
     def n_pixels(self) -> int:
-        """How many pixels belong to it."""
+        """Number of pixels of the plateau."""
         n_cols = len(self.top)
         return sum(int(self.covers(row, 0, rows, n_cols).sum()) for row, rows in row_bands(len(self.left)))
 
 
 def border_plateau(image: ImageSource) -> BorderPlateau | None:
-    """The pixels of one value at the border of an image; None where there are none worth the name.
+    """The plateau at the border of an image; None where there is none, or too small a one.
 
-    A few windows along the border decide whether the image is read as a whole: an ordinary image costs these alone.
+    The whole image is read only if a few windows along its border suggest a plateau.
 
     Raises
     ------
     InputError
-        Where the image cannot be read.
+        The image cannot be read.
     """
     rows, cols = image.shape
     value = _value_at_border(image)
@@ -84,7 +85,7 @@ def border_plateau(image: ImageSource) -> BorderPlateau | None:
 
 
 def _value_at_border(image: ImageSource) -> float | None:
-    """The value of a plateau at the border, where several neighbours towards the inside have the same; None of none."""
+    """The value of a possible plateau: that of most of the checked places that are constant; None where none is."""
     rows, cols = image.shape
     depth = MIN_PLATEAU_WIDTH_PX
     if min(rows, cols) < 4 * depth:
@@ -104,9 +105,9 @@ def _value_at_border(image: ImageSource) -> float | None:
 
 @dataclass(frozen=True)
 class TooLargeValues:
-    """Pixels whose value is larger than any grey value.
+    """How many pixels have a value that is too large for a grey value.
 
-    n_pixels : how many, of `n_known` that hold a finite number; largest : the largest magnitude of all.
+    n_pixels : their number; n_known : number of pixels with a finite value; largest : the largest magnitude of all.
     """
 
     n_pixels: int
@@ -115,9 +116,9 @@ class TooLargeValues:
 
 
 def count_too_large_values(shape: tuple[int, int], read: Callable[[int, int], NDArray[np.floating]]) -> TooLargeValues:
-    """Count the values beyond `MAX_GREY_VALUE`.
+    """Count the values of an image beyond `MAX_GREY_VALUE`.
 
-    read : gives some rows, from the first of them and their number, (r, c) float.
+    read : returns rows of the image, (r, c) float, for the first row and the number of rows.
     """
     n_pixels, n_known, largest = 0, 0, 0.0
     for row, count in row_bands(shape[0]):
@@ -130,13 +131,13 @@ def count_too_large_values(shape: tuple[int, int], read: Callable[[int, int], ND
 
 
 def row_bands(n_rows: int) -> Iterator[tuple[int, int]]:
-    """First row and number of rows of the parts in which an image is read as a whole."""
+    """First row and number of rows of the bands in which a whole image is read."""
     for row in range(0, n_rows, BAND_ROWS):
         yield row, min(BAND_ROWS, n_rows - row)
 
 
 def drop_pixels(window: ImageWindow, dropped: NDArray[np.bool_]) -> ImageWindow:
-    """A window in which some pixels (r, c) are not valid."""
+    """The window with some more pixels, (r, c) bool, made invalid."""
     if not dropped.any():
         return window
     return ImageWindow(np.where(dropped, np.float32(0.0), window.pixels), window.valid & ~dropped)

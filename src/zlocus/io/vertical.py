@@ -1,8 +1,8 @@
-"""What heights are above: the ellipsoid, as everywhere inside, or a geoid, where files say or want so.
+"""Vertical datums: the ellipsoid, which all of zlocus works with, or a geoid, which files may use.
 
-A height H above a geoid and the ellipsoidal height h of the same point differ by the geoid's undulation N there:
-h = H + N. N is read from a raster and nowhere else: PROJ, asked for a conversion whose grid is missing, may return the
-height as it was.
+A height H above a geoid and the ellipsoidal height h of the same point differ by the undulation N of the geoid there:
+h = H + N. N is always read from a raster. PROJ is not used for this, because it may return a height unchanged when the
+grid of a conversion is missing.
 """
 
 from __future__ import annotations
@@ -27,14 +27,17 @@ from zlocus.io.geoid import GeoidRaster
 
 Float = TypeVar("Float", np.float32, np.float64)
 ELLIPSOID = "ellipsoid"
-# Points a side at which the posts under an area are looked at.
+# Number of points along each side of an area at which the undulation is checked.
 MIN_POINTS_PER_SIDE, MAX_POINTS_PER_SIDE = 9, 513
 
 
 @dataclass(frozen=True)
 class KnownGeoid:
-    """A geoid that PROJ has grids of. title : what heights above it are called; epsg : their vertical CRS; datum :
-    name of its datum; grids : files, those of today first."""
+    """A geoid for which PROJ has grids.
+
+    title : its name in texts; epsg : code of the vertical CRS; datum : name of the vertical datum in a CRS; grids :
+    file names of its grids, the current ones first.
+    """
 
     title: str
     epsg: int
@@ -50,10 +53,10 @@ KNOWN = {
 
 @dataclass(frozen=True)
 class VerticalDatum:
-    """What heights are above.
+    """The surface from which heights are counted.
 
-    name : ellipsoid, egm96, egm2008, or the file of a geoid; geoid : its undulations, None of the ellipsoid; crs :
-    vertical CRS, None of the ellipsoid.
+    name : ellipsoid, egm96, egm2008, or the path of a geoid raster; geoid : undulations, None for the ellipsoid; crs :
+    vertical CRS, None for the ellipsoid.
     """
 
     name: str
@@ -62,22 +65,25 @@ class VerticalDatum:
 
     @property
     def surface(self) -> str:
-        """For descriptions: "the ellipsoid", "the EGM96 geoid"."""
+        """The surface in words, for descriptions: "the ellipsoid", "the EGM96 geoid"."""
         if self.geoid is None:
             return "the ellipsoid"
         return f"the {KNOWN[self.name].title} geoid" if self.name in KNOWN else f"the geoid of {self.geoid.path.name}"
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files that heights above it depend on."""
+        """The files that its heights depend on: the geoid raster, none for the ellipsoid."""
         return () if self.geoid is None else (self.geoid.path,)
 
     def undulation(self, xy: FloatArray, crs: CRS) -> FloatArray:
-        """Its height above the ellipsoid, (n,) m, at points (n, 2) of a CRS; see `GeoidRaster.undulation`."""
+        """Height (n,) m of the datum's surface above the ellipsoid at points (n, 2); see `GeoidRaster.undulation`."""
         return np.zeros(len(xy)) if self.geoid is None else self.geoid.undulation(xy, crs)
 
     def points_from_ellipsoidal(self, xyz: FloatArray, crs: CRS) -> FloatArray:
-        """Points (n, 3) m of a CRS, ellipsoidal heights made heights above it; NaN where its raster has no value."""
+        """Points (n, 3) m with heights in this datum, from points with ellipsoidal heights; NaN where it has no value.
+
+        crs : CRS of x and y.
+        """
         if self.geoid is None:
             return xyz
         return np.column_stack([xyz[:, :2], xyz[:, 2] - self.geoid.known_undulation(xyz[:, :2], crs)])
@@ -85,15 +91,15 @@ class VerticalDatum:
     def heights_from_ellipsoidal(
         self, ellipsoidal: NDArray[np.float32], geobox: GeoBox, row: int = 0, col: int = 0
     ) -> NDArray[np.float32]:
-        """Heights above it of cells' centres, whose ellipsoidal heights are given.
+        """Heights (r, c) float32 m in this datum at cell centres, from their ellipsoidal heights.
 
-        ellipsoidal : (r, c) m, NaN where there is none, the first of them at (row, col) of the grid: a cell gets the
-        same height whatever it is given with. Returns (r, c) float32 m.
+        ellipsoidal : (r, c) m, NaN where there is no height; its first cell is cell (row, col) of the grid. The result
+        of a cell does not depend on the other cells of the call.
         """
         return self._cells(ellipsoidal, geobox, row, col, -1.0)
 
     def ellipsoidal_from_heights(self, heights: NDArray[Float], geobox: GeoBox) -> NDArray[Float]:
-        """Ellipsoidal heights of cells' centres, whose heights above it are given; (r, c) m, see `heights_from_ellipsoidal`."""
+        """Ellipsoidal heights (r, c) m at cell centres, from heights in this datum; the whole grid."""
         return self._cells(heights, geobox, 0, 0, 1.0)
 
     def _cells(self, heights: NDArray[Float], geobox: GeoBox, row: int, col: int, sign: float) -> NDArray[Float]:
@@ -109,8 +115,10 @@ class VerticalDatum:
         return out
 
     def check_covers(self, bounds: tuple[float, float, float, float], crs: CRS) -> None:
-        """Look at undulations all over an area (xmin, ymin, xmax, ymax) m of a projected CRS, and about each post
-        there, as far as there are not too many.
+        """Check that the geoid has a value everywhere in an area.
+
+        bounds : xmin, ymin, xmax, ymax in a projected CRS, m. The points checked are half the posts' spacing apart, but
+        at most `MAX_POINTS_PER_SIDE` along each side.
 
         Raises
         ------
@@ -120,7 +128,7 @@ class VerticalDatum:
         self.undulation_range(bounds, crs)
 
     def undulation_range(self, bounds: tuple[float, float, float, float], crs: CRS) -> tuple[float, float]:
-        """Lowest and highest undulation of an area, m; see `check_covers`."""
+        """Lowest and highest undulation in an area, m; see `check_covers`."""
         if self.geoid is None:
             return 0.0, 0.0
         xmin, ymin, xmax, ymax = bounds
@@ -137,10 +145,10 @@ class VerticalDatum:
         return float(found.min()), float(found.max())
 
     def compound_crs(self, horizontal: CRS) -> CRS:
-        """The CRS of heights on a map: horizontal and vertical.
+        """The compound CRS of a map and this datum; for the ellipsoid the horizontal CRS alone.
 
-        Ellipsoidal heights keep the horizontal one: GeoTIFF has no projected CRS with ellipsoidal heights; GDAL (3.10)
-        puts such a one into a file beside the raster, which then has none of its own.
+        GeoTIFF has no projected CRS with ellipsoidal heights. GDAL (3.10) writes such a CRS into a file beside the
+        raster, and the raster itself then has no CRS.
         """
         if self.crs is None:
             return horizontal
@@ -149,13 +157,13 @@ class VerticalDatum:
         return CRS.from_wkt(parts.to_wkt())
 
     def compound_geobox(self, geobox: GeoBox) -> GeoBox:
-        """The same grid with the CRS of heights on it."""
+        """The same grid with the compound CRS of the map and this datum."""
         if self.crs is None:
             return geobox
         return GeoBox(geobox.shape, geobox.transform, self.compound_crs(grid_crs(geobox)))
 
     def as_dict(self) -> dict[str, Any]:
-        """As run.json has it."""
+        """The entry of run.json."""
         record: dict[str, Any] = {"heights_above": self.surface}
         if self.crs is not None and self.geoid is not None:
             code = self.crs.to_epsg()
@@ -164,20 +172,21 @@ class VerticalDatum:
 
 
 ELLIPSOIDAL = VerticalDatum(ELLIPSOID)
-# What a surface made here says of its heights in its band's description, its CRS having no room for it.
+# Band description of a surface with ellipsoidal heights, which its CRS cannot express.
 ELLIPSOIDAL_DESCRIPTION = f"height above {ELLIPSOIDAL.surface}"
 
 
-def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
-    """What `given` names: ellipsoid, egm96, egm2008, in small letters or capitals, or the file of a geoid. option : for
-    messages.
+def named_vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
+    """The vertical datum that `given` names: ellipsoid, egm96, egm2008 (in any case), or the path of a geoid raster.
+
+    option : the option of the command line that gave it, for messages.
 
     Raises
     ------
     ConfigError
-        For a geoid of PROJ whose grid is not installed.
+        PROJ's grid of the geoid is not installed.
     InputError
-        For a file that is no geoid; see `GeoidRaster.open`.
+        The file is not a geoid; see `GeoidRaster.open`.
     """
     name = given.lower()
     if name == ELLIPSOID:
@@ -189,16 +198,16 @@ def vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:
 
 
 def declared_vertical_datum(crs: CRS, path: Path, option: str) -> VerticalDatum:
-    """What the heights of a file are above by its CRS: the ellipsoid where that has no vertical part.
+    """The vertical datum that the CRS of a file declares; the ellipsoid where the CRS has no vertical part.
 
-    option : that says it instead, for messages.
+    option : the option of the command line that can override it, for messages.
 
     Raises
     ------
     InputError
-        For heights above anything that is not known here.
+        zlocus has no geoid for the declared datum.
     ConfigError
-        For a geoid of PROJ whose grid is not installed.
+        PROJ's grid of the geoid is not installed.
     """
     vertical = vertical_part(crs)
     if vertical is None:
@@ -207,18 +216,18 @@ def declared_vertical_datum(crs: CRS, path: Path, option: str) -> VerticalDatum:
         if vertical.datum is not None and vertical.datum.name == known.datum:
             return _installed(name, f"{path} has {known.title} heights by its CRS, which", f"{option} FILE")
     raise InputError(
-        f"{path} has heights above something that zlocus has no geoid of ({vertical.name}, by its CRS). Give its geoid "
-        f"with {option} FILE, or {option} ellipsoid if they are ellipsoidal."
+        f"{path} has heights in a vertical datum that zlocus has no geoid for ({vertical.name}, by its CRS). Give its "
+        f"geoid with {option} FILE, or {option} ellipsoid if they are ellipsoidal."
     )
 
 
 def check_heights(crs: CRS, path: Path) -> None:
-    """Refuse heights of a file that are not in metres, or go down, by its CRS.
+    """Check that the heights of a file are in metres and upwards, by its CRS.
 
     Raises
     ------
     InputError
-        For such heights.
+        They are not.
     """
     vertical = vertical_part(crs)
     axis = vertical.axis_info[0] if vertical is not None else crs.axis_info[2] if len(crs.axis_info) > 2 else None
@@ -231,18 +240,18 @@ def check_heights(crs: CRS, path: Path) -> None:
 
 
 def vertical_part(crs: CRS) -> CRS | None:
-    """The CRS of the heights of a compound one, None of others."""
+    """The vertical part of a compound CRS; None for other CRSs."""
     return next((part for part in crs.sub_crs_list if part.is_vertical), None)
 
 
 def grid_crs(geobox: GeoBox) -> CRS:
-    """The CRS of a run's grid."""
+    """The CRS of the grid of a run."""
     assert geobox.crs is not None, "the grid of a run has a CRS"
     return CRS.from_user_input(geobox.crs.proj)
 
 
 def proj_folders() -> list[Path]:
-    """Where grids of PROJ may be installed: those of pyproj, of the environment, and of the system's packages."""
+    """Folders in which grids of PROJ may be installed: those of pyproj, the environment and the system's packages."""
     named = [get_data_dir(), os.environ.get("PROJ_DATA", ""), os.environ.get("PROJ_LIB", "")]
     listed = [Path(part) for names in named for part in names.split(os.pathsep) if part]
     shares = [Path(prefix) / "share" / "proj" for prefix in (sys.prefix, "/usr/local", "/usr")]
@@ -250,7 +259,7 @@ def proj_folders() -> list[Path]:
 
 
 def _installed(name: str, who: str, instead: str) -> VerticalDatum:
-    """A geoid of PROJ, from its grid on this machine; never from the network."""
+    """The datum of a geoid whose grid PROJ has on this machine. Nothing is downloaded."""
     known = KNOWN[name]
     folders = proj_folders()
     for grid in known.grids:
@@ -264,7 +273,7 @@ def _installed(name: str, who: str, instead: str) -> VerticalDatum:
 
 
 def _named(path: Path) -> CRS:
-    """The vertical CRS of heights above the geoid of a file, by its name as far as GeoTIFF can hold it."""
+    """A vertical CRS for the geoid of a file, named after the file as far as GeoTIFF can store the name."""
     name = re.sub(r"[^\w .()+-]", "_", path.name, flags=re.ASCII)
     axis = {"name": "Gravity-related height", "abbreviation": "H", "direction": "up", "unit": "metre"}
     return CRS.from_json_dict(

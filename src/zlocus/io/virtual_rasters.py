@@ -1,7 +1,7 @@
-"""What a virtual raster (VRT) may name: files of pixels on this machine, and no server, archive or code.
+"""Check virtual rasters (VRT): they may name files of pixels on this machine, but no server, archive or code.
 
-A VRT is a list of other files, and GDAL opens whatever it names with all that GDAL has. It may come from people who are
-not trusted, so it is looked through before GDAL sees it.
+A VRT is a list of other files, and GDAL opens whatever it names with all of its drivers. A VRT may come from people who
+are not trusted, so its content is checked before GDAL opens it.
 """
 
 from __future__ import annotations
@@ -17,27 +17,29 @@ from zlocus.core.errors import InputError
 from zlocus.io.safe_documents import read_xml
 from zlocus.io.safe_text import quoted
 
-MARK = b"<vrtdataset"  # of a VRT, in small letters, within the bytes that GDAL looks at
+MARK = b"<vrtdataset"  # a VRT holds this, in any case, within the first bytes, at which GDAL looks
 FIRST_BYTES = 1024
-# GDAL's virtual files that are read: those of servers, as they are. None within an archive.
+# GDAL's virtual file systems that may be read: files on servers, but nothing inside an archive.
 REMOTE = ("vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsihdfs", "vsiwebhdfs")
-# How files begin that hold other files.
+# First bytes of archives.
 ARCHIVES = {b"PK\x03\x04": "ZIP", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7-Zip", b"Rar!": "RAR", b"BZh": "bzip2"}
-# Parts of a VRT whose words name no files, whatever they look like, with all that stands in them.
+# Elements of a VRT whose text never names a file, including everything inside them.
 ELEMENTS_WITHOUT_NAMES = frozenset((
     "categorynames", "colortable", "description", "expression", "gcplist", "gdalrasterattributetable", "histograms",
     "lut", "pixelfunctiontype", "srs", "unittype",
 ))  # fmt: skip
 FILE_ELEMENTS = frozenset(("sourcefilename", "sourcedataset", "dempath", "x_dataset", "y_dataset"))
-# Of GDAL: virtual files, and names of anything that is no file, such as an address, WMS:..., or a document.
+# GDAL names that are no plain file: virtual file systems, addresses, drivers such as WMS:..., inline documents.
 NOT_A_FILE = re.compile(r"\s*(?:/vsi|[<{]|[A-Za-z][\w+.-]+:)")
 ADVICE = "Give the images themselves, or a list of plain files that lie on this machine."
 
 
 @dataclass(frozen=True)
 class _VrtText:
-    """A word of a VRT. name : of its element or attribute, in small letters; inside : the element that it belongs to,
-    where GDAL looks for what else is said of it."""
+    """A text in a VRT.
+
+    name : its element or attribute, in lower case; inside : the element in which GDAL looks for its other properties.
+    """
 
     name: str
     text: str
@@ -45,29 +47,29 @@ class _VrtText:
 
 
 def is_virtual(first: bytes) -> bool:
-    """Whether GDAL takes a file for a VRT, by how it begins."""
+    """Whether GDAL takes a file for a VRT, by its first bytes."""
     return MARK in first[:FIRST_BYTES].lower()
 
 
 def check_virtual(path: Path) -> None:
-    """Refuse a VRT that names anything but files of pixels on this machine, or other such lists of them.
+    """Check that a VRT names only files of pixels on this machine, or other VRTs that do.
 
     Raises
     ------
     InputError
-        It names a server, an archive or a service, holds code, takes bytes of any file for pixels, or is no XML.
+        It names a server, an archive or a service, holds code, reads the bytes of any file as pixels, or is no XML.
     """
     state = path.stat()
     _check(path, state.st_size, state.st_mtime_ns, ())
 
 
 def check_served(path: Path, text: str) -> None:
-    """Refuse a VRT on a server that names anything but files on servers. text : of it, as GDAL has read it.
+    """Check that a VRT on a server names only files on servers. text : its content, as GDAL has read it.
 
     Raises
     ------
     InputError
-        It names anything else, holds code, or takes bytes of any file for pixels.
+        It names anything else, holds code, or reads the bytes of any file as pixels.
     """
     servers = tuple(f"/{name}/" for name in REMOTE)
     for entry in _entries(fromstring(text)):
@@ -80,7 +82,8 @@ def check_served(path: Path, text: str) -> None:
 
 @functools.lru_cache(maxsize=1024)
 def _check(path: Path, size: int, time_ns: int, above: tuple[Path, ...]) -> None:
-    """size, time_ns : of the file, so that another content is looked at again; above : lists that name this one."""
+    """See `check_virtual`. size, time_ns : of the file, so that a changed file is checked again; above : VRTs that
+    name this one."""
     root = read_xml(path)
     for entry in _entries(root):
         if NOT_A_FILE.match(entry.text):
@@ -93,12 +96,12 @@ def _check(path: Path, size: int, time_ns: int, above: tuple[Path, ...]) -> None
 
 
 def _entries(element: Element, above: Element | None = None) -> Iterator[_VrtText]:
-    """All that may be said in a VRT. To GDAL an attribute is as good as an element within."""
+    """Yield all texts of a VRT. GDAL treats an attribute like a child element."""
     name = _name(element.tag)
     if name in ELEMENTS_WITHOUT_NAMES or name.endswith("srs"):
         return
     if name == "mdi":
-        # Metadata say what they like, but for the files that places are taken from.
+        # Metadata may hold any text, except the files from which coordinates are read.
         key = element.attrib.get("key", "").lower()
         if key in FILE_ELEMENTS and element.text:
             yield _VrtText(key, element.text.strip(), element)
@@ -112,12 +115,12 @@ def _entries(element: Element, above: Element | None = None) -> Iterator[_VrtTex
 
 
 def _source(path: Path, entry: _VrtText) -> Path:
-    """The file that an entry names. GDAL starts where the list itself lies, not a link to it."""
+    """The file that an entry names. Relative paths start at the VRT itself, not at a link to it, as GDAL has it."""
     return path.resolve().parent / entry.text if _is_relative(path, entry) else Path(entry.text)
 
 
 def _is_relative(path: Path, entry: _VrtText) -> bool:
-    """Whether the file that an entry names is looked for from where the list lies."""
+    """Whether the path of an entry is relative to the VRT."""
     said = next((e.text for e in _entries(entry.inside) if e.name == "relativetovrt"), "0")
     if said not in ("0", "1"):
         raise InputError(f"{path} is a list of files in which relativeToVRT is {quoted(said)}, not 0 or 1. {ADVICE}")
@@ -134,7 +137,7 @@ def _refuse_code(path: Path, entry: _VrtText) -> None:
 
 
 def _check_source(path: Path, source: Path, above: tuple[Path, ...]) -> None:
-    """Refuse a file that GDAL would take for a service, an archive, or a list of yet other files that may not be."""
+    """Refuse a file that GDAL would open as a service, an archive, or a VRT that is refused itself."""
     try:
         with source.open("rb") as file:
             first = file.read(FIRST_BYTES)
@@ -156,17 +159,17 @@ def _check_source(path: Path, source: Path, above: tuple[Path, ...]) -> None:
 
 
 def _check_raw(path: Path, band: Element) -> None:
-    """Refuse a band whose pixels are the bytes of a file that does not lie beside the list or below it."""
+    """Refuse a band whose pixels are the bytes of a file outside the folder of the VRT."""
     for entry in _entries(band):
         if entry.name == "sourcefilename":
             source = _source(path, entry)
             if not source.resolve().is_relative_to(path.resolve().parent):
                 raise InputError(
-                    f"{path} is a list of files and takes the bytes of {quoted(str(source))} for pixels, which does not "
-                    f"lie beside it. {ADVICE}"
+                    f"{path} is a list of files and takes the bytes of {quoted(str(source))} for pixels, which does "
+                    f"not lie beside it. {ADVICE}"
                 )
 
 
 def _name(tag: str) -> str:
-    """Name of an element or attribute as GDAL compares it: in small letters, without XML's name space."""
+    """Name of an element or attribute as GDAL compares it: in lower case, without the XML namespace."""
     return str(tag).rpartition("}")[2].lower()

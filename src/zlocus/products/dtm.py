@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import ProductOptions
-from zlocus.io.rasters import RasterSink
+from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.row_strips import STRIP_ROWS, BandReader, Strip, check_same_grid, strips_of
 from zlocus.matching.quality import Quality
 from zlocus.products.smrf import between_blocks, block_least, block_mean, membrane, outside_of, terrain
@@ -62,7 +62,7 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
         is_filled = _is_near(mean, reach) & ~outside_of(lowest)
         above = heights.description.partition(" above ")[2]
         what = f"height of the ground above {above}" if above else "height of the ground"
-        with RasterSink(path, heights.geobox, "float32", nodata=float("nan"), descriptions=(what,), units="m") as sink:
+        with RasterSink(path, heights.geobox, RasterBands("float32", float("nan"), (what,), "m")) as sink:
             for strip, ground in grounds():
                 rows, cols = np.arange(strip.row, strip.row + strip.rows) // side, np.arange(shape[1]) // side
                 beyond = (flags.read(strip) & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0

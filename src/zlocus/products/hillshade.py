@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import ProductOptions
-from zlocus.io.rasters import RasterSink
+from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.row_strips import STRIP_ROWS, BandReader, strips_of
 from zlocus.products.shade_kernel import shade_cells
 
@@ -31,7 +31,7 @@ def write_hillshade(dsm: Path, path: Path, options: ProductOptions, strip_rows: 
     with (
         BandReader(dsm) as heights,
         RasterSink(
-            path, heights.horizontal_geobox, "uint8", nodata=NO_SHADE, descriptions=("hillshade",), average=True
+            path, heights.horizontal_geobox, RasterBands("uint8", NO_SHADE, ("hillshade",), average_overviews=True)
         ) as sink,
     ):
         for strip in strips_of(heights.geobox.shape[0], 1, strip_rows):

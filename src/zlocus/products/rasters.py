@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from odc.geo.geobox import GeoBox
 
-from zlocus.io.rasters import RasterSink
+from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.surface import Surface
 
@@ -40,13 +40,14 @@ class SurfaceRasters:
 
         def sink(name: str, dtype: DTypeLike, *bands: str, box: GeoBox = geobox, **options: Any) -> RasterSink:
             self._paths.append(folder / name)
-            raster = RasterSink(folder / name, box, dtype, descriptions=bands, **options)
+            raster = RasterSink(folder / name, box, RasterBands(dtype, descriptions=bands, **options))
             return self._stack.enter_context(raster)
 
         with ExitStack() as undo:
             undo.push(self._stack)
             above = f"height above {vertical.surface}"
-            self._dsm = sink("dsm.tif", "float32", above, box=vertical.compound_geobox(geobox), nodata=float("nan"), units="m")
+            box = vertical.compound_geobox(geobox)
+            self._dsm = sink("dsm.tif", "float32", above, box=box, nodata=float("nan"), units="m")
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
             self._quality = sink("quality.tif", "uint16", "quality bit flags")
             self._views = sink("views.tif", "uint8", "images used", nodata=0)

@@ -1,4 +1,4 @@
-"""Whole rendered scenes: what to render (`SceneSpec`), and images with RPC, truth and a description on disk."""
+"""Specifications of rendered scenes (`SceneSpec`), their exact cameras and their ground."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.synthetic.cameras import LineScanner, RectifiedScanner, SatelliteCamera, Shake, axes_of_heading
 from zlocus.synthetic.objects import Objects, add_objects
 from zlocus.synthetic.render import Optics, Sun
-from zlocus.synthetic.terrain import SyntheticGround, natural_ground
+from zlocus.synthetic.terrain import Relief, RoundHill, SyntheticGround, natural_ground
 
 FLIGHT_HEIGHT_M = 2000.0
 ADVANCE_M = 0.208
@@ -22,7 +22,7 @@ WOBBLE_M, WOBBLE_DEG = 0.5, 0.03
 LEVEL_1_M = 0.21
 BORDER_PX = 4
 TALLEST_M = {"city": 66.0, "hills": 15.0}
-LARGE_SIZE = 3000  # beyond, heights and truth are as coarse as the images, for the sake of memory
+LARGE_SIZE = 3000  # cells; in larger scenes heights and truth are as coarse as the images, to save memory
 
 MORNING, AFTERNOON = Sun(152.0, 46.0), Sun(232.0, 33.0)
 CLEAR = Optics()
@@ -35,9 +35,9 @@ HAZY = Optics(gain=900.0, haze=330.0, blur_px=1.3, noise=0.02, noise_floor=22.0,
 class ViewSpec:
     """One image to render.
 
-    along_deg, across_deg : view angles, positive forward and to the right of the nadir, as seen in flight.
-    heading_deg : of the flight, clockwise from north. bias_row_px, bias_col_px : pointing error of the RPC, which
-    projects every point that much too far down and to the right.
+    along_deg, across_deg : view angles from the nadir, positive forward and to the right in flight direction.
+    heading_deg : of the flight, clockwise from north. bias_row_px, bias_col_px : pointing error of the RPC, by which
+    every point is projected too far down and to the right.
     """
 
     name: str
@@ -72,20 +72,24 @@ ADS40_VIEWS = (
 
 @dataclass(frozen=True)
 class SceneSpec(Checked):
-    """A scene to render: the same specification gives the same bytes."""
+    """A scene to render. Equal specifications give equal bytes."""
 
-    kind: str = option("city", "What stands on the ground.", choices=("city", "hills"))
+    kind: str = option("city", "Kind of objects on the ground.", choices=("city", "hills"))
     seed: int = option(1, "Seed of terrain, objects, texture and noise.", low=0)
     size: int = option(520, "Side of the area with truth, in cells of `gsd_m`.", low=32, high=20000)
     gsd_m: float = option(0.5, "Ground pixel.", low=0.05, high=5.0, unit="m")
-    camera: str = option("satellite", "At 600 km, or an airborne three-line scanner.", choices=("satellite", "ads40"))
-    shaken: bool = option(False, "Airborne: an unsteady flight (`Shake`), another one in each strip.")
-    level: int = option(0, "Of airborne images: as they were taken, or resampled to a plane.", choices=(0, 1))
+    camera: str = option(
+        "satellite", "A satellite at 600 km, or an airborne three-line scanner.", choices=("satellite", "ads40")
+    )
+    shaken: bool = option(False, "Airborne: an unsteady flight (`Shake`), different in each strip.")
+    level: int = option(0, "Level of airborne images: raw, or resampled to a plane.", choices=(0, 1))
     truth_step_m: float | None = option(None, "Cell of heights and truth; unset: half of `gsd_m`.", low=0.02, unit="m")
-    whole_truth: bool = option(False, "Truth of all ground that two images see, not of the area alone.")
+    whole_truth: bool = option(False, "Truth covers all ground that two images show, not only the area.")
     samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
-    base_m: float = option(430.0, "Lowest terrain, ellipsoidal.", low=-400.0, high=8000.0, unit="m")
-    relief_m: float = option(38.0, "Terrain from lowest to highest, without its hill.", low=0.1, high=1000.0, unit="m")
+    base_m: float = option(430.0, "Lowest ellipsoidal height of the terrain.", low=-400.0, high=8000.0, unit="m")
+    relief_m: float = option(
+        38.0, "Difference from lowest to highest terrain, without the hill.", low=0.1, high=1000.0, unit="m"
+    )
     hill_m: float = option(0.0, "Height of a round hill in the north-east of the area.", low=0.0, high=100.0, unit="m")
     objects: Objects = field(default=Objects(145.0, 1.15, 0.4, 10.5, rough_m=0.08))
     views: tuple[ViewSpec, ...] = SATELLITE_VIEWS
@@ -112,17 +116,17 @@ class SceneSpec(Checked):
 
     @property
     def crs(self) -> CRS:
-        """Frame of the ground."""
+        """CRS of the ground."""
         return CRS.from_epsg(self.epsg)
 
     @property
     def terrain_range(self) -> tuple[float, float]:
-        """No terrain is lower or higher, m."""
+        """Lower and upper bound of the heights of the terrain, m."""
         return self.base_m, self.base_m + self.relief_m + self.hill_m
 
     @property
     def height_range(self) -> tuple[float, float]:
-        """Nothing is lower or higher, m."""
+        """Lower and upper bound of all heights, with objects, m."""
         low, high = self.terrain_range
         return low - 1.0, high + TALLEST_M[self.kind]
 
@@ -137,16 +141,16 @@ class Exposure:
 
     @property
     def taken(self) -> Exposure:
-        """As it was taken, before it was resampled to a plane."""
+        """The raw exposure, before it was resampled to a plane; the exposure itself if it was not resampled."""
         if isinstance(self.camera, RectifiedScanner):
             return replace(self, camera=self.camera.raw, shape=self.camera.raw_shape)
         return self
 
 
 def city_spec(seed: int, **changes: object) -> SceneSpec:
-    """A town: gentle relief, roads, houses, towers up to 34 m, trees; eight views.
+    """A town with gentle relief, roads, houses, towers up to 34 m and trees; eight views.
 
-    How hard it is was set by methods that are not ours: see `benchmarks/baselines.py`.
+    Its difficulty was tuned with other matching methods, see `benchmarks/baselines.py`.
     """
     return replace(SceneSpec(kind="city", seed=seed), **changes)  # type: ignore[arg-type]
 
@@ -160,7 +164,7 @@ def hills_spec(seed: int, **changes: object) -> SceneSpec:
 
 
 def demo_spec(seed: int = 4) -> SceneSpec:
-    """The demo: a block of six ADS40 images in two unsteady strips over towers, houses, trees and a hill, 120 m square.
+    """The demo: six ADS40 images in two unsteady strips, over 120 m x 120 m of towers, houses, trees and a hill.
 
     Level 1, 62.5 mm, 2000 m above ground, 0.21 m pixels: table 2 of Ji et al. (2014).
     """
@@ -172,17 +176,17 @@ def demo_spec(seed: int = 4) -> SceneSpec:
 
 
 def with_ads40(spec: SceneSpec) -> SceneSpec:
-    """The scene as the demo's six ADS40 images see it, at their ground pixel."""
+    """The scene with the six ADS40 images of the demo, at their ground pixel."""
     return replace(spec, camera="ads40", views=ADS40_VIEWS, gsd_m=0.2)
 
 
 def steady(spec: SceneSpec) -> SceneSpec:
-    """The scene as raw images of a steady flight."""
+    """The scene with raw images of a steady flight."""
     return replace(spec, shaken=False, level=0)
 
 
 def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
-    """The scene with a pointing error drawn for each view, uniform within `max_px` in row and column."""
+    """The scene with a random pointing error for each view, uniform within `max_px` in row and column."""
     rng = np.random.default_rng([spec.seed, 77])
     errors = rng.uniform(-max_px, max_px, (len(spec.views), 2))
     views = (
@@ -193,7 +197,7 @@ def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
 
 
 def exposures(spec: SceneSpec) -> tuple[Exposure, ...]:
-    """Exact cameras whose images hold all terrain of the area."""
+    """The exposures of all views, with exact cameras, whose images show all terrain of the area."""
     corners = area_corners(spec)
     easting, northing, height = map(float, (corners.min(axis=0) + corners.max(axis=0)) / 2)
     middle = easting, northing, height
@@ -209,7 +213,7 @@ def exposures(spec: SceneSpec) -> tuple[Exposure, ...]:
 
 
 def area_corners(spec: SceneSpec) -> FloatArray:
-    """Corners of the area at its lowest and highest terrain, (8, 3) m."""
+    """Corners (8, 3) m of the area at its lowest and highest terrain."""
     side = spec.size * spec.gsd_m
     return np.array([
         (spec.west_m + e * side, spec.north_m - s * side, z) for e in (0, 1) for s in (0, 1) for z in spec.terrain_range
@@ -217,14 +221,15 @@ def area_corners(spec: SceneSpec) -> FloatArray:
 
 
 def placed(xy: FloatArray) -> tuple[tuple[float, float], tuple[int, int]]:
-    """First pixel (column, row) and shape of an image that holds positions (n, 2), and a border."""
+    """First pixel (column, row) and shape (rows, columns) of an image that holds positions (n, 2) px with a border."""
     first = np.floor(xy.min(axis=0)) - BORDER_PX
     cols, rows = np.ceil(xy.max(axis=0)) + BORDER_PX + 1 - first
     return (float(first[0]), float(first[1])), (int(rows), int(cols))
 
 
 def _level_1(view: ViewSpec, camera: LineScanner, middle: tuple[float, float, float], corners: FloatArray) -> Exposure:
-    """The exposure resampled to the plane at the height of `middle`, its rows across the flight, holding `corners`."""
+    """The exposure resampled to the plane at the height of `middle`, with rows across the flight. It shows `corners`.
+    """
     forward, right = LEVEL_1_M * np.array(axes_of_heading(view.heading_deg))
     around_middle = Affine(right[0], -forward[0], middle[0], right[1], -forward[1], middle[1])
     rectified = RectifiedScanner(camera, (0, 0), middle[2], around_middle)
@@ -243,7 +248,7 @@ def _level_1(view: ViewSpec, camera: LineScanner, middle: tuple[float, float, fl
 def _camera(
     spec: SceneSpec, view: ViewSpec, middle: tuple[float, float, float]
 ) -> SatelliteCamera | LineScanner:  # fmt: skip
-    """A camera that sees the middle of the area under the view's angles, with its image's origin yet to be placed."""
+    """A camera that sees the middle of the area at the view's angles. The origin of its image is not set yet."""
     if spec.camera == "satellite":
         return SatelliteCamera(middle, (0.0, 0.0), spec.gsd_m, view.along_deg, view.across_deg, view.heading_deg)
     heading = np.deg2rad(view.heading_deg)
@@ -258,31 +263,31 @@ def _camera(
     )  # fmt: skip
 
 
-def build_ground(spec: SceneSpec, seen_by: tuple[Exposure, ...]) -> SyntheticGround:
-    """The ground of a scene: the area, and as much around it as any of the images can see.
+def build_ground(spec: SceneSpec, images: tuple[Exposure, ...]) -> SyntheticGround:
+    """The ground of a scene: the area, and as much around it as any of the images can show.
 
-    What stands where depends on how far it goes: give the images of a steady flight to all scenes that are to have the
-    same ground (the rim of others may then miss some pixels).
+    The positions of objects depend on the extent of the ground. Scenes that are to have the same ground must therefore
+    be built with the same images, those of a steady flight (`steady`); other images may then miss some pixels at the
+    rim.
     """
-    seen = np.concatenate([_footprint(spec, exposure) for exposure in seen_by])
+    xyz = np.concatenate([_footprint(spec, exposure) for exposure in images])
     step = spec.step_m
-    reach = np.ceil(np.array([
-        spec.west_m - seen[:, 0].min(), seen[:, 1].max() - spec.north_m,
-        seen[:, 0].max() - spec.west_m, spec.north_m - seen[:, 1].min(),
+    # Cells from the area's upper left corner to the west, north, east and south.
+    margin = np.ceil(np.array([
+        spec.west_m - xyz[:, 0].min(), xyz[:, 1].max() - spec.north_m,
+        xyz[:, 0].max() - spec.west_m, spec.north_m - xyz[:, 1].min(),
     ]) / step).astype(int) + 4  # fmt: skip
     side = spec.size * spec.gsd_m
-    origin = (spec.west_m - int(reach[0]) * step, spec.north_m + int(reach[1]) * step)
-    bare = natural_ground(
-        spec.seed, origin, step, (int(reach[1] + reach[3]), int(reach[0] + reach[2])),
-        base_m=spec.base_m, relief_m=spec.relief_m, longest_m=240.0, roughness=3.0,
-        texel_m=spec.gsd_m / 2,
-        hill=(spec.west_m + 0.7 * side, spec.north_m - 0.3 * side, side / 7, spec.hill_m) if spec.hill_m else None,
-    )  # fmt: skip
+    origin = (spec.west_m - int(margin[0]) * step, spec.north_m + int(margin[1]) * step)
+    hill = RoundHill(spec.west_m + 0.7 * side, spec.north_m - 0.3 * side, side / 7, spec.hill_m)
+    relief = Relief(spec.base_m, spec.relief_m, longest_m=240.0, roughness=3.0, hill=hill if spec.hill_m else None)
+    shape = (int(margin[1] + margin[3]), int(margin[0] + margin[2]))
+    bare = natural_ground(spec.seed, origin, step, shape, relief, spec.gsd_m / 2)
     return add_objects(bare, spec.objects, spec.seed)
 
 
 def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:
-    """Ground points (n, 3) around all that an image can see, a few pixels beyond its border."""
+    """Ground points (n, 3) m that enclose all that an image can show, with a few pixels beyond its border."""
     rows, cols = exposure.shape
     along, across = np.linspace(-3.0, rows + 2.0, 9), np.linspace(-3.0, cols + 2.0, 9)
     xy = np.array([(c, r) for r in along for c in across])

@@ -1,8 +1,8 @@
-"""The ground of a rendered scene: a height field of small planes, what each cell is made of, and exact analytic shapes.
+"""The ground of a rendered scene: a height field of small planes, the material of each cell, and analytic shapes.
 
-Each cell is a plane through the height of its centre, and neighbours meet in vertical walls (of millimetres on natural
-ground, of the whole height at the side of a building). So the height at a cell's centre is exact by construction, roofs
-are planes and walls are vertical. Nothing exists outside the field.
+Each cell is a plane through the height of its centre, and neighbouring cells are joined by vertical walls (of
+millimetres on natural ground, of the full height at the side of a building). So the height at the centre of a cell is
+exact by construction, roofs are planes, and walls are vertical. There is nothing outside the field.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ ANALYTIC_KINDS = ("plane", "tilt", "step", "sphere", "sine")
 MATERIAL = np.dtype(
     [
         ("kind", "i4"),  # GROUND, ROAD, BUILDING or TREE
-        ("pattern", "i4"),  # of the top: one of the PATTERN_ constants
+        ("pattern", "i4"),  # pattern of the top: one of the PATTERN_ constants
         ("albedo", "f8"),
-        ("contrast", "f8"),  # of the pattern, relative to the albedo
-        ("period", "f8"),  # m, of stripes and rows
+        ("contrast", "f8"),  # contrast of the pattern, relative to the albedo
+        ("period", "f8"),  # period of stripes and rows, m
         ("x", "f8"),  # m, centre of a building, corner of a crop, in field coordinates (east and south of the field's)
         ("y", "f8"),
         ("cos", "f8"),  # direction of a building's first axis, of rows
@@ -77,7 +77,7 @@ class SyntheticGround:
 
     @cached_property
     def height_range(self) -> tuple[float, float]:
-        """Lowest and highest centre of a cell, m."""
+        """Lowest and highest height of a cell centre, m."""
         return float(self.heights.min()), float(self.heights.max())
 
     @cached_property
@@ -87,7 +87,7 @@ class SyntheticGround:
 
     @cached_property
     def block_tops(self) -> NDArray[np.float32]:
-        """(br, bc) float32: no plane of a block of BLOCK x BLOCK cells is higher than this, m."""
+        """Upper bound (br, bc) float32 m of the planes in each block of BLOCK x BLOCK cells."""
         top = self.heights + 0.5 * (np.abs(self.slopes[..., 0]) + np.abs(self.slopes[..., 1]))
         rows, cols = (-(-n // BLOCK) for n in top.shape)
         padded = np.full((rows * BLOCK, cols * BLOCK), -np.inf, np.float32)
@@ -95,39 +95,61 @@ class SyntheticGround:
         return np.asarray(padded.reshape(rows, BLOCK, cols, BLOCK).max(axis=(1, 3)))
 
     def cells(self, west: float, north: float, shape: tuple[int, int]) -> tuple[slice, slice]:
-        """The rows and columns of a part whose upper left corner is at (west, north) m."""
+        """The rows and columns of a part of `shape` whose upper left corner is at (west, north) m."""
         row, col = round((self.y0 - north) / self.step), round((west - self.x0) / self.step)
         return slice(row, row + shape[0]), slice(col, col + shape[1])
 
 
-def natural_ground(
-    seed: int, origin: tuple[float, float], step: float, shape: tuple[int, int], *, base_m: float, relief_m: float,
-    longest_m: float, roughness: float, texel_m: float, hill: tuple[float, float, float, float] | None = None,
-) -> SyntheticGround:  # fmt: skip
-    """Bare terrain of heights `base_m` to `base_m + relief_m`, with every cell of material 0.
+@dataclass(frozen=True)
+class RoundHill:
+    """A hill with the shape of a Gaussian. x, y : easting and northing of its top, m; radius_m : standard deviation."""
 
-    seed : the same seed, origin, step and shape give the same bytes. longest_m : longest wavelength of the relief;
-    roughness : exponent by which shorter wavelengths fall. hill : easting, northing, radius and height (m) of a round
-    hill added on top.
+    x: float
+    y: float
+    radius_m: float
+    height_m: float
+
+
+@dataclass(frozen=True)
+class Relief:
+    """The shape of bare terrain.
+
+    base_m : lowest height; relief_m : difference from the lowest to the highest, without the hill; longest_m : longest
+    wavelength; roughness : exponent with which the amplitude falls for shorter wavelengths; hill : added on top.
+    """
+
+    base_m: float
+    relief_m: float
+    longest_m: float
+    roughness: float
+    hill: RoundHill | None = None
+
+
+def natural_ground(
+    seed: int, origin: tuple[float, float], step: float, shape: tuple[int, int], relief: Relief, texel_m: float
+) -> SyntheticGround:
+    """Bare terrain in which every cell has material 0. The same arguments give the same bytes.
+
+    origin : easting and northing of the upper left corner, m; step : side of a cell, m; shape : rows and columns;
+    texel_m : side of a texel of the natural textures.
     """
     node = 8 * step
     nodes = (-(-shape[0] // 8) + 4, -(-shape[1] // 8) + 4)
     rng = np.random.default_rng([seed, TERRAIN_STREAM])
-    relief = fractal_surface(rng, nodes, node, longest_m, roughness).astype(np.float64)
-    relief = base_m + relief_m * (relief - relief.min()) / (relief.max() - relief.min())
+    z = fractal_surface(rng, nodes, node, relief.longest_m, relief.roughness).astype(np.float64)
+    z = relief.base_m + relief.relief_m * (z - z.min()) / (z.max() - z.min())
     at_row, at_col = ((np.arange(n) - 2 + 0.5) * 8 - 0.5 for n in nodes)
-    if hill is not None:
-        x, y, radius, height = hill
-        dx = origin[0] + (at_col + 0.5) * step - x
-        dy = origin[1] - (at_row + 0.5) * step - y
-        relief += height * np.exp(-0.5 * (dy[:, None] ** 2 + dx[None, :] ** 2) / radius**2)
-    surface = RectBivariateSpline(at_row, at_col, relief)
+    if (hill := relief.hill) is not None:
+        dx = origin[0] + (at_col + 0.5) * step - hill.x
+        dy = origin[1] - (at_row + 0.5) * step - hill.y
+        z += hill.height_m * np.exp(-0.5 * (dy[:, None] ** 2 + dx[None, :] ** 2) / hill.radius_m**2)
+    spline = RectBivariateSpline(at_row, at_col, z)
     planes = np.empty((*shape, 3), np.float32)
     cols = np.arange(shape[1])
     for first in range(0, shape[0], ROWS_AT_ONCE):
         rows = np.arange(first, min(first + ROWS_AT_ONCE, shape[0]))
         for k, (by_row, by_col) in enumerate(((0, 0), (0, 1), (1, 0))):
-            planes[rows, :, k] = surface(rows, cols, dx=by_row, dy=by_col)
+            planes[rows, :, k] = spline(rows, cols, dx=by_row, dy=by_col)
     textures = natural_textures(np.random.default_rng([seed, TEXTURE_STREAM]))
     return SyntheticGround(
         *origin, step, planes, np.zeros(shape, np.uint16), np.array([bare_material()]), textures, texel_m
@@ -135,12 +157,12 @@ def natural_ground(
 
 
 def bare_material() -> NDArray[np.void]:
-    """Natural ground: () of dtype MATERIAL."""
+    """The material of natural ground, () of dtype MATERIAL."""
     return plain_material(GROUND, PATTERN_NATURAL, albedo=0.44, contrast=0.17)
 
 
 def plain_material(kind: int, pattern: int, albedo: float, contrast: float) -> NDArray[np.void]:
-    """A material without walls of its own: () of dtype MATERIAL."""
+    """A material whose walls look like its top, () of dtype MATERIAL."""
     material = np.zeros((), MATERIAL)
     material["kind"], material["pattern"], material["albedo"], material["contrast"] = kind, pattern, albedo, contrast
     material["cos"], material["wall"] = 1.0, albedo
@@ -148,7 +170,7 @@ def plain_material(kind: int, pattern: int, albedo: float, contrast: float) -> N
 
 
 def analytic_height(kind: str, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height (m) of an analytic shape at offsets x, y (m) east and north of its centre. Arrays of one shape.
+    """Heights (m) of an analytic shape at offsets x, y (m) east and north of its centre. All arrays have one shape.
 
     plane: 50. tilt: 50 + 0.20 x - 0.15 y. step: 65 where x >= 0, else 50. sphere: the cap of a sphere of radius 60
     that rises 20 above 50. sine: 50 + 3 sin(x / 8) cos(y / 11).
@@ -169,10 +191,10 @@ def analytic_height(kind: str, x: FloatArray, y: FloatArray) -> FloatArray:
 def analytic_ground(
     kind: str, centre: tuple[float, float], step: float, shape: tuple[int, int], seed: int = 0
 ) -> SyntheticGround:
-    """The height field of `analytic_height`, with natural texture; `centre` (easting, northing, m) is the middle of it.
+    """The height field of `analytic_height` with natural texture. centre : easting and northing of its middle, m.
 
-    Cells hold the exact height of their centre; their slopes are central differences over one cell (zero on the step,
-    whose wall is on its place where the number of columns is even).
+    Cells hold the exact height of their centre. Slopes are central differences over one cell, and zero on the step,
+    whose wall is in the right place if the number of columns is even.
     """
     x = (np.arange(shape[1]) + 0.5 - shape[1] / 2) * step
     y = (shape[0] / 2 - 0.5 - np.arange(shape[0])) * step

@@ -1,4 +1,4 @@
-"""What every kind of camera in a `scene.yaml` offers: how it is read, and its sensor model once the frame is known."""
+"""The interface of all kinds of camera in a `scene.yaml`: reading one, and building its sensor model."""
 
 from __future__ import annotations
 
@@ -15,29 +15,32 @@ Vector = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
 
 
 class OpenedCamera(Protocol):
-    """A camera that has been read, before the scene's CRS is known."""
+    """A camera that has been read, before the CRS of the scene is known."""
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What it was read from, besides the image."""
+        """The files from which it was read, besides the image."""
         ...
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """Longitude and latitude (degrees) of the image's centre; None for a camera that knows only its own frame."""
+        """Longitude and latitude (degrees) of the image's centre; None for a camera without a place on the Earth.
+
+        shape : rows and columns of the image.
+        """
         ...
 
     def sensor(self, crs: CRS) -> SensorModel:
-        """The sensor model in the scene's frame."""
+        """The sensor model in the frame of the scene, whose CRS is `crs`."""
         ...
 
 
 class CameraEntry(StrictModel, ABC):
-    """The `camera` entry of a view: `kind` and what that kind needs."""
+    """The `camera` entry of a view: its kind, and the keys of that kind."""
 
     @abstractmethod
     def read(self, folder: Path, image: Path) -> OpenedCamera:
-        """The camera of an image; relative paths start at `folder`, that of the scene file."""
+        """Read the camera of an image. folder : of the scene file, where relative paths start."""
 
     def with_default_crs(self, crs: str | None) -> CameraEntry:
-        """The camera whose coordinates, where it names no CRS of its own, are in that of the scene file's frame."""
+        """The entry with `crs`, that of the scene file's frame, filled in where it names no CRS itself."""
         return self

@@ -1,4 +1,4 @@
-"""The kinds of camera a `scene.yaml` can name. A new kind is one class, in a file of its own, and a line in `KINDS`."""
+"""The kinds of camera in a `scene.yaml`. A new kind is one class in its own file, and a line in `KINDS`."""
 
 from __future__ import annotations
 
@@ -21,16 +21,19 @@ from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 
 @dataclass(frozen=True)
 class RpcSource:
-    """An RPC, the shift (column, row) px laid over it, and the files it stands in where that is not the image."""
+    """An RPC that has been read.
+
+    shift : (column, row) px added to its positions; files : files of the RPC, none where it is in the image.
+    """
 
     rpc: RpcCoefficients
     shift: tuple[float, float] | None = None
     files: tuple[Path, ...] = ()
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """See `OpenedCamera`; at the RPC's height offset."""
+        """See `OpenedCamera`; computed at the height offset of the RPC."""
         xy = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-        # The CRS plays no part in the geographic direction.
+        # Any CRS will do, because the result is geographic.
         model = RpcModel(self.rpc, CRS.from_epsg(3857))
         lon, lat = model.geographic_from_image(xy, np.array([self.rpc.height_off]))
         return (float(lon[0]), float(lat[0])) if np.isfinite(lon[0]) else None
@@ -42,7 +45,7 @@ class RpcSource:
 
 
 class RpcCamera(CameraEntry):
-    """An RPC: from `file`, else found beside or in the image. shift: pixels (column, row) added to what it projects."""
+    """An RPC: from `file`, else found beside or in the image. shift : (column, row) px added to its positions."""
 
     kind: Literal["rpc"] = "rpc"
     file: str | None = None

@@ -1,7 +1,7 @@
-"""Line-scanner states of the USGS Community Sensor Model, as usgscsm and Ames Stereo Pipeline write them (JSON).
+"""Read line scanner states of the USGS Community Sensor Model, as usgscsm and Ames Stereo Pipeline write them (JSON).
 
-What is read of `USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL`: positions, quaternions, line times, detector geometry and radial
-distortion. Adjusted parameters that are not zero, other distortions and other bodies than the Earth are refused.
+Of `USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL`, positions, quaternions, line times, detector geometry and radial distortion
+are read. Adjusted parameters other than zero, other distortions and other bodies than the Earth are refused.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ from zlocus.sensors.trajectory import Trajectory
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 RADIAL = 0
 MAX_AXIS_DIFFERENCE_M = 100.0
-# Samples of the converted trajectory: doubled until splines between them are this close to the state's own polynomials.
+# Numbers of samples of the converted trajectory. They are doubled until splines are this close to the polynomials of
+# the state.
 SAMPLE_COUNTS = (256, 512, 1024, 2048, 4096, 8192, 16384)
 TOLERANCE_PX = 1e-3
-# Of the image's time, before its first row and after its last.
+# The trajectory goes beyond the first and the last row by this share of the exposure time of the image.
 TIME_MARGIN = 0.1
 REGULAR_TOLERANCE_ROWS = 1e-6
-# Twice as many would take 500 MB.
+# Twice as many rows would take 500 MB.
 MAX_ROWS = 4_000_000
 
 
 class CsmState(StrictModel):
-    """The fields that are read; see UsgsAstroLsSensorModel in usgscsm for what they mean."""
+    """The fields of a state that are read. For their meaning see UsgsAstroLsSensorModel in usgscsm."""
 
     m_modelName: str
     m_nLines: WholeNumber = Field(gt=1, le=MAX_ROWS)
@@ -102,7 +103,7 @@ class CsmState(StrictModel):
 
 @dataclass(frozen=True, eq=False)
 class CsmLineScanner:
-    """A state that has been read, in geocentric axes. shape : rows and columns of its image."""
+    """The camera of a state, in geocentric axes. shape : rows and columns of its image."""
 
     line: FocalLine
     lines: LineTimes
@@ -111,12 +112,12 @@ class CsmLineScanner:
 
 
 def read_csm(path: Path) -> CsmLineScanner:
-    """The line scanner of a model state.
+    """The line scanner of a state.
 
     Raises
     ------
     InputError
-        For a file that is no such state, or holds what is not supported (see the module).
+        The file is no such state, or holds something that is not supported (see the module).
     """
     state = _state(existing_file(path, "camera file"))
     lines = _line_times(state, path)
@@ -129,14 +130,15 @@ def read_csm(path: Path) -> CsmLineScanner:
 
 
 def convert_csm(path: Path, folder: Path, name: str) -> LineScanCamera:
-    """Write a model state as line scanner files NAME_*.csv into a folder; the `camera` entry of a scene file there.
+    """Write a state as line scanner files NAME_*.csv into a folder, and return the `camera` entry for a scene file
+    there.
 
     Raises
     ------
     InputError
-        As `read_csm`.
+        See `read_csm`.
     OutputError
-        When the folder cannot be written.
+        A file cannot be written.
     """
     scanner = read_csm(path)
     calibration, trajectory, times = (f"{name}_{what}.csv" for what in ("focal_plane", "trajectory", "times"))
@@ -154,7 +156,7 @@ def convert_csm(path: Path, folder: Path, name: str) -> LineScanCamera:
 
 
 def _state(path: Path) -> CsmState:
-    """The state in a file; the name of the model may stand before it."""
+    """The state in a file. The name of the model may stand before the document."""
     document = read_json(path, start="{")
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a CSM model state: it must hold m_modelName: {MODEL}.")
@@ -162,7 +164,7 @@ def _state(path: Path) -> CsmState:
 
 
 def _line_times(state: CsmState, path: Path) -> LineTimes:
-    """When the middle of each row was exposed; CSM has line 0.5 there for row 0."""
+    """Exposure times of the middles of rows, which is line 0.5 of CSM for row 0."""
     rows = np.arange(state.m_nLines, dtype=np.float64)
     line = rows + 0.5
     starts, times, durations = (
@@ -180,9 +182,9 @@ def _line_times(state: CsmState, path: Path) -> LineTimes:
 
 
 def _focal_plane(state: CsmState) -> FloatArray:
-    """Undistorted places of all columns in the focal plane (c, 2), in the units of the focal length.
+    """Undistorted positions of all columns in the focal plane (c, 2), in the units of the focal length.
 
-    CSM counts samples from the outer corner of the first pixel, so that its centre is 0.5.
+    CSM counts samples from the outer corner of the first pixel, so its centre is 0.5.
     """
     sample = np.arange(state.m_nSamples) + 0.5
     across = sample * state.m_detectorSampleSumming + state.m_startingDetectorSample - state.m_detectorSampleOrigin
@@ -198,9 +200,11 @@ def _focal_plane(state: CsmState) -> FloatArray:
 
 
 def _toward_the_ground(state: CsmState, xy: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-    """Signs of x and y, and of the camera's axes (3,), under which columns see along (x, y, -focal) to the ground.
+    """Signs of x and y (2,), and of the camera's axes (3,), with which lines of sight (x, y, -focal) point to the
+    ground.
 
-    The state's lines of sight have no direction: (z x, z y, focal) and its opposite are the same, z the m_zDirection.
+    A line of sight of the state has no direction: (z x, z y, focal), with z the m_zDirection, may also mean its
+    opposite.
     """
     at = np.array([time])
     sight = np.append(state.m_zDirection * xy[len(xy) // 2], state.m_focalLength)
@@ -212,7 +216,7 @@ def _toward_the_ground(state: CsmState, xy: FloatArray, time: float) -> tuple[Fl
 
 
 def _sampled(state: CsmState, lines: LineTimes, toward: FloatArray, line: FocalLine, path: Path) -> Trajectory:
-    """The trajectory around the image, so dense that splines follow the state's own interpolation."""
+    """The trajectory around the image, sampled so densely that splines follow the interpolation of the state."""
     first, last = np.sort(lines.times[[0, -1]])
     known = [
         max(state.m_t0Ephem, state.m_t0Quat),
@@ -250,15 +254,16 @@ def _positions(state: CsmState, times: FloatArray) -> FloatArray:
 
 
 def _quaternions(state: CsmState, times: FloatArray) -> FloatArray:
-    # usgscsm counts the numbers, not the quaternions, so that only one would make it less than 8.
+    # usgscsm compares the count of numbers, not of quaternions, with 8, so the order is lower only for one quaternion.
     order = 8 if state.m_platformFlag else 4
     return lagrange_interpolated(np.reshape(state.m_quaternions, (-1, 4)), state.m_t0Quat, state.m_dtQuat, times, order)
 
 
 def lagrange_interpolated(values: FloatArray, start: float, step: float, times: FloatArray, order: int) -> FloatArray:
-    """Values (k, v) at evenly spaced instants, interpolated at times (n,) by polynomials: (n, v).
+    """Values (n, v) at times (n,), interpolated by polynomials between values (k, v) at evenly spaced times.
 
-    Through the 8 (or `order`) nearest samples, fewer near the ends (6, 4, 2), as usgscsm's lagrangeInterp does it.
+    A polynomial passes through the `order` nearest samples, through fewer near the ends (6, 4, 2), as in lagrangeInterp
+    of usgscsm.
     """
     at = (times - start) / step
     index = np.clip(at.astype(int), 0, len(values) - 2)

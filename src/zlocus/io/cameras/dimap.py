@@ -1,8 +1,8 @@
-"""RPC in DIMAP files of Pleiades, Pleiades Neo and SPOT 6/7 (`RPC_*.XML`, `DIM_*.XML`).
+"""Read RPCs from DIMAP files of Pleiades, Pleiades Neo and SPOT 6/7 (`RPC_*.XML`, `DIM_*.XML`).
 
-DIMAP 2 counts the first pixel as (1, 1), so its offsets are lowered by one; DIMAP 3 says in its validity domain how
-it counts. Of the two models in the file the one from ground to image is used (`Inverse_Model`, in DIMAP 3
-`GroundtoImage_Values`), whose terms stand in the order of RPC00B with longitude first.
+DIMAP 2 counts the first pixel as (1, 1), so its offsets are lowered by one. DIMAP 3 gives the number of the first pixel
+in its validity domain. Of the two models in the file the one from ground to image is used (`Inverse_Model`, in DIMAP 3
+`GroundtoImage_Values`). Its terms are in the order of RPC00B, with longitude first.
 
 Source: Airbus, Pleiades Imagery User Guide (2012), section on the rational function model.
 """
@@ -23,7 +23,7 @@ TILE = re.compile(r"_R(\d+)C(\d+)$", re.IGNORECASE)
 
 
 def find_dimap(image: Path) -> Path | None:
-    """The RPC_*.XML of an image: by name (IMG_id_R1C1.TIF -> RPC_id.XML), else by a DIM_*.XML that lists the image."""
+    """The RPC_*.XML of an image by its name (IMG_id_R1C1.TIF: RPC_id.XML), else a DIM_*.XML that lists it, or None."""
     name = TILE.sub("", re.sub(r"^IMG_", "", image.stem))
     for suffix in (".XML", ".xml"):
         path = image.with_name(f"RPC_{name}{suffix}")
@@ -36,7 +36,10 @@ def find_dimap(image: Path) -> Path | None:
 
 
 def read_dimap_rpc(path: Path, image: Path) -> RpcCoefficients:
-    """The RPC of an `RPC_*.XML`, or of the one a `DIM_*.XML` names, for `image`, which may be a tile of the product."""
+    """The RPC of an image from an `RPC_*.XML`, or from that which a `DIM_*.XML` names.
+
+    image : may be a tile of the product; then the offsets are those of the tile.
+    """
     root = read_xml(path)
     if root.find(".//RFM_Validity") is None:
         path = _named_rpc_file(root, path)
@@ -59,7 +62,7 @@ def read_dimap_rpc(path: Path, image: Path) -> RpcCoefficients:
 
 
 def _tile_origin(path: Path, image: Path) -> tuple[int, int]:
-    """Row and column of the product at which the image, a tile of it, starts. (0, 0) where it is not a tile."""
+    """Row and column of the product at which an image starts; (0, 0) if it is not a tile."""
     tile = TILE.search(image.stem)
     if tile is None or (int(tile[1]), int(tile[2])) == (1, 1):
         return 0, 0
@@ -81,7 +84,7 @@ def _tile_origin(path: Path, image: Path) -> tuple[int, int]:
 
 
 def _whole(element: Element, name: str, path: Path) -> int:
-    """An attribute that counts from 1."""
+    """An attribute that is a whole number from 1 on."""
     text = element.attrib.get(name, "")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", text, re.ASCII):
         raise InputError(f"{path}: {name} is {quoted(text)}, not a whole number above 0. {EXPORT_AGAIN}")
@@ -89,7 +92,7 @@ def _whole(element: Element, name: str, path: Path) -> int:
 
 
 def _first_pixel(domain: Element, name: str, path: Path) -> float:
-    """How the file counts the first pixel: 1 unless it says otherwise."""
+    """Number of the first pixel: 1 unless the file gives another one."""
     text = _child_text(domain, name, path) or "1"
     if not abs(decimal(text)) <= MAX_MAGNITUDE:
         raise InputError(f"{path}: {name} is {quoted(text)}, not a finite number. {EXPORT_AGAIN}")
@@ -97,7 +100,7 @@ def _first_pixel(domain: Element, name: str, path: Path) -> float:
 
 
 def _data_file(root: Element, image: Path) -> Element | None:
-    """The Data_File element of a DIM_*.XML that names the image."""
+    """The Data_File element of a DIM_*.XML that names an image; None where there is none."""
     for entry in root.iterfind(".//Data_File"):
         reference = entry.find("DATA_FILE_PATH")
         if reference is not None and Path(reference.attrib.get("href", "")).name == image.name:
@@ -106,7 +109,7 @@ def _data_file(root: Element, image: Path) -> Element | None:
 
 
 def _named_rpc_file(root: Element, path: Path) -> Path:
-    """The RPC_*.XML a DIM_*.XML refers to, else the one of the same name."""
+    """The RPC_*.XML to which a DIM_*.XML refers, else the one with the same name."""
     for element in root.iter():
         name = Path(element.attrib.get("href", "")).name
         if re.fullmatch(r"RPC_.*\.XML", name, re.IGNORECASE) and path.with_name(name).exists():
@@ -118,8 +121,8 @@ def _named_rpc_file(root: Element, path: Path) -> Path:
 
 
 def _child_text(element: Element, name: str, path: Path) -> str:
-    """What stands in a child, without blanks around it; empty where there is none."""
-    found = {(child.text or "").strip() for child in element.findall(name)}
-    if len(found) > 1:
+    """The text of a child element, without blanks around it; empty where there is none."""
+    texts = {(child.text or "").strip() for child in element.findall(name)}
+    if len(texts) > 1:
         raise InputError(f"{path} holds {name} twice, with different values. {EXPORT_AGAIN}")
-    return found.pop() if found else ""
+    return texts.pop() if texts else ""

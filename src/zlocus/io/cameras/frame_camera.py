@@ -1,4 +1,4 @@
-"""Frame cameras of a `scene.yaml`: interior orientation, distortion, and a pose in a map or in local axes."""
+"""Frame cameras of a `scene.yaml`: interior orientation, distortion, and pose in a map or a local frame."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from zlocus.sensors.earth_frame import between
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 
 ORTHONORMAL_TOLERANCE = 1e-4
-# What no camera on or above the Earth exceeds; larger numbers are damage, and would overflow.
+# Larger than any camera on or above the Earth needs. A larger number is a sign of damage, and could overflow later.
 MAX_COORDINATE_M = 1e9
 MAX_CAMERA_PX = 1e7
-# What is less is taken for 0.
+# A smaller focal length counts as 0.
 MIN_FOCAL_PX = 1e-6
 
 Coordinate = Annotated[FiniteNumber, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
@@ -42,7 +42,7 @@ FocalLength = Annotated[FiniteNumber, Field(gt=MIN_FOCAL_PX, le=MAX_CAMERA_PX)]
 
 
 def _pair(value: Any) -> Any:
-    """One focal length is that of both directions."""
+    """The focal lengths of both directions; a single number holds for both."""
     return (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
@@ -55,8 +55,8 @@ FocalLengths = Annotated[
 ]
 
 
-class Sparse(StrictModel):
-    """A mapping that is written without what it has by default, its kind first."""
+class EntryWithoutDefaults(StrictModel):
+    """Base class of entries that are written without values that equal their defaults; `kind` comes first."""
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -65,8 +65,8 @@ class Sparse(StrictModel):
         return ({"kind": values["kind"]} if "kind" in values else {}) | kept
 
 
-class BrownEntry(Sparse):
-    """See `BrownDistortion`; what is left out is 0."""
+class BrownEntry(EntryWithoutDefaults):
+    """Coefficients of `BrownDistortion`; those that are left out are 0."""
 
     kind: Literal["brown"] = "brown"
     k1: FiniteNumber = 0.0
@@ -79,13 +79,13 @@ class BrownEntry(Sparse):
     k6: FiniteNumber = 0.0
 
     def model(self) -> BrownDistortion | None:
-        """The distortion; None where there is none."""
-        found = BrownDistortion(self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6)
-        return None if found == BrownDistortion() else found
+        """The distortion; None where all coefficients are 0."""
+        distortion = BrownDistortion(self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6)
+        return None if distortion == BrownDistortion() else distortion
 
 
-class FisheyeEntry(Sparse):
-    """See `FisheyeDistortion`; what is left out is 0."""
+class FisheyeEntry(EntryWithoutDefaults):
+    """Coefficients of `FisheyeDistortion`; those that are left out are 0."""
 
     kind: Literal["fisheye"] = "fisheye"
     k1: FiniteNumber = 0.0
@@ -98,9 +98,12 @@ class FisheyeEntry(Sparse):
         return FisheyeDistortion(self.k1, self.k2, self.k3, self.k4)
 
 
-class Interior(Sparse):
-    """Interior orientation. focal : px, one number or (along rows, down columns); principal_point : (column, row) px,
-    (0, 0) the centre of the first pixel; skew : px by which columns grow per unit of y."""
+class Interior(EntryWithoutDefaults):
+    """Interior orientation.
+
+    focal : px, one number, or two (along rows, along columns); principal_point : (column, row) px, with (0, 0) at the
+    centre of the first pixel; skew : px added to the column per unit of y.
+    """
 
     focal: FocalLengths
     principal_point: tuple[Pixels, Pixels]
@@ -111,8 +114,8 @@ class Interior(Sparse):
 class FrameCamera(CameraEntry, Interior):
     """A frame camera; see `FrameModel`, and `rotation_from_angles` for `angles` (omega, phi, kappa).
 
-    crs : of the centre, that of the scene's frame where it is not given. earth : `curved`, the default, has straight
-    rays in space and the pose relative to the map's axes at the centre; `flat` takes the map for Cartesian axes.
+    crs : of the centre; the default is that of the scene's frame. earth : with `curved`, the default, rays are straight
+    in space and the pose is relative to the axes of the map at the centre; with `flat` the map is taken as Cartesian.
     """
 
     kind: Literal["frame"] = "frame"
@@ -152,9 +155,9 @@ def map_crs(text: str, image: Path) -> CRS:
     Raises
     ------
     InputError
-        For text that is no CRS.
+        The text is no CRS.
     ConfigError
-        For one that is not projected in metres.
+        The CRS is not projected in metres.
     """
     try:
         return checked_crs(CRS.from_user_input(text))
@@ -168,7 +171,10 @@ def map_crs(text: str, image: Path) -> CRS:
 
 @dataclass(frozen=True)
 class FrameSource:
-    """A frame camera, given in a map's CRS; `given` None: in the scene's frame. curved : see `FrameCamera.earth`."""
+    """A frame camera that has been read.
+
+    given : CRS of its pose, None for that of the scene's frame; curved : see `FrameCamera`.
+    """
 
     model: FrameModel
     image: Path
@@ -177,7 +183,7 @@ class FrameSource:
     files: tuple[Path, ...] = ()
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """See `OpenedCamera`; below the centre of projection, whichever way it looks."""
+        """See `OpenedCamera`; the place below the projection centre, wherever the camera looks."""
         if self.given is None:
             return None
         lon, lat = between(self.given, CRS.from_epsg(4326)).transform(*self.model.centre[:2])
@@ -189,9 +195,9 @@ class FrameSource:
         Raises
         ------
         ConfigError
-            For a camera that takes another map than the scene's for Cartesian axes.
+            The camera takes another map than the scene's as Cartesian.
         InputError
-            For a centre that lies outside of what its CRS can express.
+            The projection centre is no place in its CRS.
         """
         if is_local(crs):
             return self.model

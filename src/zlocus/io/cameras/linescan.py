@@ -1,4 +1,4 @@
-"""The `linescan` camera of a `scene.yaml`: a line scanner, its focal plane and trajectory (see docs/reference/linescan.md)."""
+"""The `linescan` camera of a `scene.yaml`: focal plane, trajectory and line times (see docs/reference/linescan.md)."""
 
 from __future__ import annotations
 
@@ -35,13 +35,16 @@ def _known(crs: str) -> str:
     return crs
 
 
-# s, mm, or m2 of a pixel: what is less is taken for 0.
+# Smaller times (s), focal lengths (mm) and areas of a pixel (m2) count as 0.
 MIN_POSITIVE = 1e-12
 CrsName = Annotated[str, AfterValidator(_known)]
 
 
 class RegularTimes(StrictModel):
-    """Rows exposed every `interval` s, negative where row 0 is the last one flown; the middle of row 0 at `start` s."""
+    """Equally spaced exposures of rows.
+
+    start : time of the middle of row 0, s; interval : time from row to row, s, negative where row 0 was exposed last.
+    """
 
     start: FiniteNumber
     interval: FiniteNumber
@@ -56,10 +59,10 @@ class RegularTimes(StrictModel):
 class Rectification(StrictModel):
     """The plane to which a level 1 image was resampled.
 
-    height : of the plane, ellipsoidal m; transform : a, b, c, d, e, f of GeoTIFF, x = a column + b row + c and y = d
-    column + e row + f from the outer corner of the first pixel; crs : of x and y, by default the scene's; rows : of the
-    raw image; trajectory : that by which the image was resampled, where the camera's has been corrected since; both
-    have the same crs, lever arm and boresight.
+    height : of the plane, ellipsoidal m; transform : a, b, c, d, e, f as in GeoTIFF, x = a column + b row + c and
+    y = d column + e row + f, counted from the outer corner of the first pixel; crs : of x and y, by default the
+    scene's; rows : number of rows of the raw image; trajectory : the one used for the resampling, if the camera's has
+    been corrected since. Both trajectories have the same crs, lever arm and boresight.
     """
 
     height: FiniteNumber
@@ -76,11 +79,11 @@ class Rectification(StrictModel):
 
 
 class LineScanCamera(CameraEntry):
-    """A line scanner. See `read_calibration`, `read_trajectory` and `read_times` for the files.
+    """A line scanner. For its files see `read_calibration`, `read_trajectory` and `read_times`.
 
-    line : name of the line in the calibration file; first_column : detector of the image's first column; rays : where
-    they are straight, on the Earth or in the scene's frame; lever_arm : m, right, forward, up of the platform;
-    boresight : omega, phi, kappa, degrees.
+    line : name of the line in the calibration file; first_column : detector of the image's first column; rays : whether
+    rays are straight in space ("earth") or in the scene's frame ("frame"); lever_arm : m to the right, forward and up
+    of the platform; boresight : omega, phi, kappa, degrees.
     """
 
     kind: Literal["linescan"] = "linescan"
@@ -119,12 +122,12 @@ class LineScanCamera(CameraEntry):
         return LineScanSource(line, lines, trajectory, of_plane, self.rays, crs, self.rectification, tuple(files))
 
     def with_default_crs(self, crs: str | None) -> LineScanCamera:
-        """See `CameraEntry`; on the Earth a trajectory names its own CRS."""
+        """See `CameraEntry`. Only a trajectory in the scene's frame takes its CRS from it."""
         takes = self.rays == "frame" and self.crs is None and crs is not None
         return self.model_copy(update={"crs": crs}) if takes else self
 
     def _cut(self, line: FocalLine, n_cols: int | None, file: Path, image: Path) -> FocalLine:
-        """The detectors of the image's columns; all from the first one on where their number is not known."""
+        """The detectors of the image's columns; n_cols None: all detectors from the first column on."""
         n = len(line.xy_mm)
         end = n if n_cols is None else self.first_column + n_cols
         if end > n or end - self.first_column < 2:
@@ -147,8 +150,10 @@ def _check_covered(trajectory: Trajectory, lines: LineTimes, n_rows: int, file: 
 
 @dataclass(frozen=True, eq=False)
 class LineScanSource:
-    """A line scanner that has been read; see `LineScanCamera`. of_plane : the trajectory by which a level 1 image was
-    resampled."""
+    """A line scanner that has been read; see `LineScanCamera`.
+
+    of_plane : the trajectory with which a level 1 image was resampled.
+    """
 
     line: FocalLine
     lines: LineTimes
@@ -160,7 +165,7 @@ class LineScanSource:
     files: tuple[Path, ...]
 
     def centre(self, shape: tuple[int, int]) -> tuple[float, float] | None:
-        """See `OpenedCamera`; below the camera at the middle row. None where rays are straight in the frame."""
+        """See `OpenedCamera`; the place below the camera at the middle row. None with rays straight in the frame."""
         if self.rays == "frame":
             return None
         middle = self.trajectory.pose(self.lines.time(self.lines.rows[[0, -1]].mean(keepdims=True)))[9:]
@@ -173,7 +178,7 @@ class LineScanSource:
         Raises
         ------
         InputError
-            Where the scene's frame is not the one in which rays are straight, or has no place on the Earth.
+            Rays are straight in another frame than the scene's, or the scene has no place on the Earth.
         """
         raw = LineScanModel(self.line, self.lines, self.trajectory, self._space(crs))
         if self.rectification is None:

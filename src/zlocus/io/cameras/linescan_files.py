@@ -1,4 +1,4 @@
-"""Files of line scanners: focal planes, trajectories and line times as tables of numbers (see docs/reference/linescan.md)."""
+"""Tables of line scanners: focal planes, trajectories and line times (see docs/reference/linescan.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zlocus.io.number_table import NumberTable, read_number_table, write_number_
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, between, east_north_up
 from zlocus.sensors.linescan import FocalLine, LineTimes
 from zlocus.sensors.rotation import from_navigation, from_photogrammetric, from_quaternions, to_photogrammetric
-from zlocus.sensors.trajectory import LEAST_SAMPLES, Trajectory
+from zlocus.sensors.trajectory import MIN_SAMPLES, Trajectory
 
 CALIBRATION, TRAJECTORY, TIMES = "focal plane calibration", "trajectory", "table of line times"
 POSITION_COLUMNS = {"projected": ("x", "y", "z"), "geographic": ("lon", "lat", "height")}
@@ -23,29 +23,30 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 ROTATION_COLUMNS = (OMEGA_PHI_KAPPA, ROLL_PITCH_HEADING, QUATERNION)
 WGS84_GEOCENTRIC = CRS.from_epsg(4978)
 Rays = Literal["earth", "frame"]
-# Of the norm of a quaternion.
+# Largest difference of the norm of a quaternion from 1.
 UNIT_LENGTH_TOLERANCE = 1e-3
 MAX_DETECTORS = 1_000_000
-# Above the ellipsoid: what lies outside is a mistake in units or CRS.
+# Heights above the ellipsoid outside of this range are a mistake in units or CRS.
 MIN_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_M = -2e4, 2e6
 
 
 def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine:
-    """The line `name` of a focal plane: columns `column`, `x_mm`, `y_mm`, and `line` where the file holds several.
+    """The detectors of a line of the focal plane.
 
-    Columns of detectors that the file leaves out are filled in by a cubic spline.
+    Columns of the table: `column`, `x_mm`, `y_mm`, and `line` where it holds several. name : of the line. Detectors
+    that the table leaves out are interpolated by a cubic spline.
 
     Raises
     ------
     InputError
-        For a malformed table, a line that is not there, or detectors that do not follow one another along a line.
+        The table is malformed, there is no such line, or its detectors do not follow one another along a line.
     """
     table = read_number_table(path, CALIBRATION, ("column", "x_mm", "y_mm"), ("line",))
     _need(table, ("column", "x_mm", "y_mm"))
     table = _of_line(table, name)
     if len(table) < 2:
         raise InputError(f"The {CALIBRATION} {path} holds one column only. At least two are needed.")
-    table.check_steps("column")
+    table.check_monotonic("column")
     column, xy_mm = table.columns["column"], table.stacked(("x_mm", "y_mm"))
     if column[0] != 0.0 or (column != np.rint(column)).any():
         raise table.refuse(0, "columns are whole numbers from 0 on; number them so")
@@ -66,17 +67,17 @@ def read_calibration(path: Path, name: str | None, focal_mm: float) -> FocalLine
 
 
 def read_times(path: Path, n_rows: int) -> LineTimes:
-    """When rows were exposed: columns `row` and `time`, from row 0 (or before) to the last one; straight in between.
+    """The exposure times of rows, from a table with the columns `row` and `time`; linear in between.
 
     Raises
     ------
     InputError
-        For a malformed table, or one that does not reach from the first row to the last.
+        The table is malformed, or does not reach from the first row of the image to the last.
     """
     table = read_number_table(path, TIMES, ("row", "time"))
     _need(table, ("row", "time"))
-    table.check_steps("row")
-    table.check_steps("time", either=True)
+    table.check_monotonic("row")
+    table.check_monotonic("time", may_decrease=True)
     rows = table.columns["row"]
     if len(rows) < 2 or rows[0] > 0 or rows[-1] < n_rows - 1:
         raise InputError(
@@ -91,17 +92,17 @@ def read_times(path: Path, n_rows: int) -> LineTimes:
 def read_trajectory(
     path: Path, crs: CRS | None, rays: Rays, boresight_deg: FloatArray, lever_arm: FloatArray
 ) -> Trajectory:
-    """The projection centres and the camera's rotations: `time`, a place and a turn, by the names of the columns.
+    """The trajectory of a camera, in geocentric axes, or in those of the frame where rays are straight in it.
 
-    crs : of the places; None is WGS84 for `lon`, `lat`, and the scene's frame where rays are straight in that.
+    The table has a column `time`, and columns of a position and a rotation (`POSITION_COLUMNS`, `ROTATION_COLUMNS`).
+    crs : of the positions; None: WGS84 for `lon`, `lat`, or the scene's frame where rays are straight in it.
     boresight_deg : (3,) omega, phi, kappa that turn the platform's axes into the camera's; lever_arm : (3,) m from the
-    point of the table to the projection centre, in the platform's axes. The result is in geocentric axes, or the
-    frame's.
+    point of the table to the projection centre, in the platform's axes.
 
     Raises
     ------
     InputError
-        For a malformed table, times that do not increase, or places that are not in that CRS.
+        The table is malformed, times do not increase, or positions do not fit the CRS.
     """
     names = (
         "time",
@@ -115,9 +116,9 @@ def read_trajectory(
     place = _one_of(table, tuple(POSITION_COLUMNS.values()))
     turn = _one_of(table, ROTATION_COLUMNS)
     _need(table, ("time", *place, *turn))
-    if len(table) < LEAST_SAMPLES:
-        raise InputError(f"The {TRAJECTORY} {path} has {len(table)} rows. At least {LEAST_SAMPLES} are needed.")
-    table.check_steps("time")
+    if len(table) < MIN_SAMPLES:
+        raise InputError(f"The {TRAJECTORY} {path} has {len(table)} rows. At least {MIN_SAMPLES} are needed.")
+    table.check_monotonic("time")
     platform = _platform(table, turn)
     if rays == "frame":
         if place != POSITION_COLUMNS["projected"]:
@@ -133,8 +134,10 @@ def read_trajectory(
 
 
 def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str, every: int = 1) -> None:
-    """Write the lines of a focal plane by name, as `read_calibration` reads them: each `every`-th column and the last,
-    which are enough of straight lines."""
+    """Write the lines of a focal plane as `read_calibration` reads them.
+
+    every : write each such column and the last one, which is enough for straight lines.
+    """
     last = {name: len(line.xy_mm) - 1 for name, line in lines.items()}
     columns = {name: np.unique([*range(0, last[name], every), last[name]]) for name in lines}
     xy_mm = np.concatenate([line.xy_mm[columns[name]] for name, line in lines.items()])
@@ -169,7 +172,7 @@ def _need(table: NumberTable, names: tuple[str, ...]) -> None:
 
 
 def _one_of(table: NumberTable, choices: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
-    """The one group of names, of several, that the table has some of."""
+    """The group of column names of which the table has some; it must be exactly one."""
     given = [names for names in choices if any(name in table.columns for name in names)]
     if len(given) != 1:
         said = " or ".join(", ".join(names) for names in choices)
@@ -178,7 +181,7 @@ def _one_of(table: NumberTable, choices: tuple[tuple[str, ...], ...]) -> tuple[s
 
 
 def _of_line(table: NumberTable, name: str | None) -> NumberTable:
-    """The rows of one line."""
+    """The rows of the table that belong to one line."""
     lines = table.labels.get("line", ())
     held = sorted(set(lines))
     if not held and name is None:
@@ -193,7 +196,7 @@ def _of_line(table: NumberTable, name: str | None) -> NumberTable:
 
 
 def _platform(table: NumberTable, turn: tuple[str, ...]) -> FloatArray:
-    """Local axes from the platform's (n, 3, 3)."""
+    """Rotations from the platform's axes to local ones, (n, 3, 3)."""
     if turn == QUATERNION:
         quaternions = table.stacked(turn)
         wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > UNIT_LENGTH_TOLERANCE)
@@ -207,8 +210,10 @@ def _platform(table: NumberTable, turn: tuple[str, ...]) -> FloatArray:
 def _on_earth(
     table: NumberTable, place: tuple[str, ...], turn: tuple[str, ...], crs: CRS | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Geocentric places (n, 3) m, and geocentric axes from those of the angles (n, 3, 3): east, north and up, the north
-    of the grid where the CRS is projected; quaternions are geocentric themselves."""
+    """Geocentric positions (n, 3) m, and rotations (n, 3, 3) from the axes of the angles to geocentric axes.
+
+    The axes of the angles are east, north and up, with grid north for a projected CRS. Quaternions are geocentric.
+    """
     given, height = table.stacked(place), table.stacked(place)[:, 2]
     crs = _checked(table, place, crs)
     if crs.is_geocentric:
@@ -230,7 +235,7 @@ def _on_earth(
 
 
 def _checked(table: NumberTable, place: tuple[str, ...], crs: CRS | None) -> CRS:
-    """The CRS of places: projected in metres or geocentric for x, y, z; geographic in degrees for lon, lat."""
+    """The CRS of positions, checked: projected in metres or geocentric for x, y, z; geographic for lon, lat."""
     if place == POSITION_COLUMNS["geographic"]:
         crs = WGS84 if crs is None else crs
         fits = crs.is_geographic

@@ -1,7 +1,7 @@
-"""The camera that belongs to an image file: finds and reads its RPC.
+"""Find and read the RPC of an image.
 
-Pixels: all readers give offsets with (0, 0) at the centre of the first pixel. The GeoTIFF tag, `_RPC.TXT` and `.RPB`
-count so already; DIMAP does not (see `rpc_dimap`).
+Pixels: all readers return offsets with (0, 0) at the centre of the first pixel. The GeoTIFF tag, `_RPC.TXT` and `.RPB`
+use this convention; DIMAP does not (see `dimap`).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ TXT_ENDINGS = ("_RPC.TXT", "_rpc.txt", "_RPC.txt")
 def read_rpc(image: Path, file: Path | None = None) -> RpcCoefficients:
     """The RPC of an image.
 
-    Looked for in this order, which is GDAL's (a side-car file was put there on purpose, often to mend the tag):
-    `file` when given; NAME.RPB; NAME_RPC.TXT; DIMAP (RPC_*.XML); the tag in the image.
+    It is searched in GDAL's order, in which a side-car file has precedence because it often corrects the tag: `file` if
+    given; NAME.RPB; NAME_RPC.TXT; DIMAP (RPC_*.XML); the tag in the image.
 
     Raises
     ------
     InputError
-        When there is none, or it is damaged: names the file and the field.
+        There is none, or it is damaged; the message names the file and the field.
     """
     image = Path(image)
     file = find_sidecar(image) if file is None else existing_file(file, "camera file")
@@ -44,7 +44,7 @@ def read_rpc(image: Path, file: Path | None = None) -> RpcCoefficients:
 
 
 def find_sidecar(image: Path) -> Path | None:
-    """The file beside the image that holds its RPC, or None."""
+    """The file beside an image that holds its RPC; None where there is none."""
     names = [image.stem + suffix for suffix in RPB_SUFFIXES] + [image.stem + ending for ending in TXT_ENDINGS]
     for name in names:
         if image.with_name(name).exists():
@@ -53,7 +53,7 @@ def find_sidecar(image: Path) -> Path | None:
 
 
 def _from_tag(image: Path) -> RpcCoefficients:
-    """The RPC stored in an image file (GeoTIFF's RPC tag, NITF's RPC00B), as GDAL hands it out."""
+    """The RPC stored in an image file (RPC tag of GeoTIFF, RPC00B of NITF), read by GDAL."""
     with open_raster(image) as source:
         fields = source.tags(ns="RPC")
     if not fields:

@@ -1,6 +1,6 @@
-"""RPC side-car files in text: `_RPC.TXT` (key: value) and `.RPB` (key = value;).
+"""Read and write RPC side-car files: `_RPC.TXT` (key: value) and `.RPB` (key = value;).
 
-Both count pixels as RPC00B does, (0, 0) at the centre of the first pixel, so that nothing is shifted here.
+Both count pixels as RPC00B does, with (0, 0) at the centre of the first pixel, so offsets are not shifted here.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ SCALARS = (
 POLYNOMIALS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
 TXT_NAMES = {*SCALARS, *(f"{name}_{i}" for name in POLYNOMIALS for i in range(1, 21))}
 ADVICE = "Get the RPC from its source again."
-# Of a file; they have a hundredth of it.
+# A real file has a hundredth of this.
 MAX_RPC_BYTES = 1_000_000
-# What is less is taken for 0 where it divides.
+# A smaller divisor counts as 0.
 MIN_DIVISOR = 1e-12
 RPB_NAMES = {
     "lineOffset": "LINE_OFF", "sampOffset": "SAMP_OFF", "latOffset": "LAT_OFF", "longOffset": "LONG_OFF",
@@ -44,13 +44,13 @@ RPB_NAMES = {
 
 def read_rpc_txt(path: Path) -> RpcCoefficients:
     """The RPC of a `_RPC.TXT` file: `LINE_OFF: +018339.50 pixels`, `LINE_NUM_COEFF_1: ...`."""
-    text, fields = _text(path), Fields(path)
+    text, fields = _text(path), RpcFields(path)
     lines, above = text.splitlines(), set[tuple[int, int] | None]()
     for number, line in enumerate(lines, 1):
         name, _, rest = line.partition(":")
         if name.strip().upper() in TXT_NAMES:
             words = rest.split()
-            # A unit may follow the number, another number may not.
+            # A unit may follow the number, but not another number.
             fields.add(name.strip().upper(), " ".join(words if len(words) > 1 and is_decimal(words[1]) else words[:1]))
             digits = digits_written(words[0]) if words else None
             is_ended = number < len(lines) or len(words) > 1 or text.endswith(("\n", "\r"))
@@ -73,10 +73,10 @@ def read_rpb(path: Path) -> RpcCoefficients:
         raise InputError(
             f"{path} is an {specification[1]} model, of another term order. Only RPC00B is read; convert it."
         )
-    fields = Fields(path)
-    # What follows the last semicolon is not complete.
+    fields = RpcFields(path)
+    # Text behind the last semicolon is no complete statement.
     for statement in text.split(";")[:-1]:
-        # The beginning of a group has no semicolon.
+        # The line that begins a group has no semicolon.
         before, _, value = statement.rpartition("=")
         name = (before.split() or [""])[-1]
         if name in RPB_NAMES:
@@ -84,38 +84,38 @@ def read_rpb(path: Path) -> RpcCoefficients:
     return rpc_from_fields(fields, path)
 
 
-class Fields(dict[str, str]):
-    """Fields of a file by name, of which none says two things."""
+class RpcFields(dict[str, str]):
+    """Fields of an RPC file by name. A field given twice with different values is refused."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def add(self, name: str, value: str) -> None:
-        """Note the value of a field.
+        """Add a field.
 
         Raises
         ------
         InputError
-            Where it has another one already.
+            The field has another value already.
         """
         if self.setdefault(name, value) != value:
             raise InputError(f"{self.path}: {quoted(name)} of the RPC is there twice, with different values. {ADVICE}")
 
 
 def _listed(value: str) -> str:
-    """The numbers of (a, b, ...), or one number, with blanks between them."""
+    """The numbers of "(a, b, ...)", or a single number, separated by blanks."""
     if value.startswith("(") and value.endswith(")"):
         value = value[1:-1].replace(",", " ")
     return value
 
 
 def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
-    """Coefficients from text fields of the names RPC files use; checked.
+    """The coefficients from text fields, whose names are those of `_RPC.TXT`.
 
     Raises
     ------
     InputError
-        Naming the file and the field that is missing, not a finite number, a zero scale, or not 20 numbers long.
+        A field is missing, not a finite number, a scale of 0, or has not 20 numbers. The message names file and field.
     """
     scalar = {name: _numbers(fields, name, 1, path)[0] for name in SCALARS}
     polynomial = {name: _numbers(fields, name, 20, path) for name in POLYNOMIALS}
@@ -136,12 +136,12 @@ def rpc_from_fields(fields: Mapping[str, str], path: Path) -> RpcCoefficients:
 
 
 def write_rpc_txt(path: Path, rpc: RpcCoefficients) -> None:
-    """Write an RPC as `_RPC.TXT`, to be read back equal.
+    """Write an RPC as `_RPC.TXT`; `read_rpc_txt` reads back equal coefficients.
 
     Raises
     ------
     OutputError
-        When the file cannot be written.
+        The file cannot be written.
     """
     units = ("pixels", "pixels", "degrees", "degrees", "meters") * 2
     scalars = (
@@ -159,7 +159,7 @@ def write_rpc_txt(path: Path, rpc: RpcCoefficients) -> None:
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, path: Path) -> tuple[float, ...]:
-    """The `count` finite numbers of a field."""
+    """The numbers of a field, checked: `count` of them, all finite."""
     text = fields.get(name, "").split()
     if not text:
         raise InputError(f"{path}: the RPC has no {name}. {ADVICE}")

@@ -1,1 +1,1 @@
-"""Scenes from the cameras of other programs: one module per format, listed in `registry`."""
+"""Import cameras of other programs: one module per format, listed in `registry`."""

@@ -1,4 +1,4 @@
-"""What every importer hands over, and the reading they share: files found, finite numbers, sizes and rotations."""
+"""The result of every importer, and functions they share: find files, read numbers, sizes and rotations."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class ImportedExposure:
-    """One image and its camera, in zlocus's conventions.
+    """An image and its camera, in zlocus's conventions.
 
-    image : name in the file; interior : entries of a frame camera in `scene.yaml`, of which principal_point may be left
-    out, then it is the centre of the image; centre : (3,) m; rotation : (3, 3), the camera's axes (right, down,
-    forwards); size : columns and rows for which the interior holds, None where the file does not say.
+    image : its name in the imported file; interior : entries of a frame camera in `scene.yaml`, where principal_point
+    defaults to the centre of the image; centre : projection centre (3,) m; rotation : (3, 3), rows are the camera's
+    axes (right, down, forwards); size : columns and rows of the image, None where the file does not give them.
     """
 
     image: str
@@ -36,7 +36,10 @@ class ImportedExposure:
 
 @dataclass(frozen=True)
 class ImportedCameras:
-    """The cameras of a file. path : it; crs : of the centres, None for local axes; flat : they are Cartesian in it."""
+    """The cameras of a file.
+
+    path : of the file; crs : of the projection centres, None for a local frame; flat : the map is taken as Cartesian.
+    """
 
     path: Path
     exposures: tuple[ImportedExposure, ...]
@@ -45,12 +48,14 @@ class ImportedCameras:
 
 
 def find_camera_file(source: Path, names: Sequence[str], what: str) -> Path:
-    """`source` itself if it is a file, else the first of `names` that is one in that folder.
+    """The path `source` if it is a file, else the first of `names` that is a file in that folder.
+
+    what : role of the file, for messages.
 
     Raises
     ------
     InputError
-        Where there is none.
+        There is no such file.
     """
     source = Path(source)
     if not source.is_dir():
@@ -62,25 +67,25 @@ def find_camera_file(source: Path, names: Sequence[str], what: str) -> Path:
 
 
 def read_number(value: Any, path: Path, where: str) -> float:
-    """A finite number, from text or from a number.
+    """A finite number from a text or a number. where : place in the file, for messages.
 
     Raises
     ------
     InputError
-        Naming the place, and what stands there.
+        The value is not a finite number; the message names the place and the value.
     """
     try:
-        # Python takes True for 1 and 1_0 for 10.
-        found = decimal(value) if isinstance(value, str) else math.nan if isinstance(value, bool) else float(value)
+        # Python accepts True as 1 and 1_0 as 10.
+        result = decimal(value) if isinstance(value, str) else math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
-        found = math.nan
-    if not abs(found) <= MAX_MAGNITUDE:
+        result = math.nan
+    if not abs(result) <= MAX_MAGNITUDE:
         raise InputError(f"{path}: {where} is {quoted(value)}, not a finite number. {EXPORT_AGAIN}")
-    return found
+    return result
 
 
 def read_numbers(values: Any, count: int, path: Path, where: str) -> FloatArray:
-    """`count` finite numbers, (count,)."""
+    """Finite numbers (count,) from a list, or from a text that separates them by blanks."""
     values = values.split() if isinstance(values, str) else values
     if not isinstance(values, list | tuple) or len(values) != count:
         n = len(values) if isinstance(values, list | tuple) else 0
@@ -89,15 +94,21 @@ def read_numbers(values: Any, count: int, path: Path, where: str) -> FloatArray:
 
 
 def image_size(width: Any, height: Any, path: Path, where: str) -> tuple[int, int]:
-    """Columns and rows of an image."""
-    found = [read_number(value, path, f"the size of {where}") for value in (width, height)]
-    if not all(v >= 1 and v == int(v) for v in found):
-        raise InputError(f"{path}: {where} has {found[0]:g} x {found[1]:g} pixels. {EXPORT_AGAIN}")
-    return int(found[0]), int(found[1])
+    """Columns and rows of an image, checked to be whole numbers from 1 on."""
+    values = [read_number(value, path, f"the size of {where}") for value in (width, height)]
+    if not all(v >= 1 and v == int(v) for v in values):
+        raise InputError(f"{path}: {where} has {values[0]:g} x {values[1]:g} pixels. {EXPORT_AGAIN}")
+    return int(values[0]), int(values[1])
 
 
 def rotation_matrix(rows: FloatArray, path: Path, where: str) -> FloatArray:
-    """(3, 3), found to be a rotation and freed of rounding."""
+    """The rotation matrix (3, 3) nearest to `rows`, which must be one up to rounding.
+
+    Raises
+    ------
+    InputError
+        The rows are no rotation.
+    """
     rows = np.asarray(rows, float).reshape(3, 3)
     usable = (
         np.abs(rows).max() < 2

@@ -1,7 +1,7 @@
-"""Bundler's `bundle.out` with its list of images.
+"""Import Bundler's `bundle.out` with its list of images.
 
-Axes: the camera's are right, up, backwards, so two of them are turned. Pixels: the origin is the centre of the image,
-and y is up. Distortion: 1 + k1 r2 + k2 r4 on ideal positions, which is Brown's.
+Axes: those of the camera are right, up, backwards, so two of them change their sign. Pixels: the origin is the centre
+of the image, and y is up. Distortion: 1 + k1 r2 + k2 r4 on ideal positions, which is Brown's.
 Source: Bundler v0.4 User's Manual, "Output format and scene representation".
 """
 
@@ -32,12 +32,12 @@ RIGHT_DOWN_FORWARDS = np.diag([1.0, -1.0, -1.0])
 
 
 def read_bundler(request: ImportRequest) -> ImportedCameras:
-    """The registered images. See `ImportedExposure`; coordinates are local, or those of `--crs` taken as Cartesian.
+    """The registered images. Coordinates are local, or those of `--crs`, taken as Cartesian.
 
     Raises
     ------
     InputError
-        For a file that is missing or damaged, or a list of another length.
+        A file is missing or damaged, or the list of images has another length.
     """
     path = find_camera_file(request.source, FILES, "Bundler file")
     list_path = find_camera_file(path.parent, LISTS, "list of images of the Bundler file")
@@ -70,7 +70,7 @@ def _counts(lines: Iterator[tuple[int, str]], path: Path) -> tuple[int, int]:
 
 
 def _exposure(lines: Iterator[tuple[int, str]], name: str, path: Path) -> ImportedExposure | None:
-    """Five lines: focal length, k1, k2; rotation; translation. All 0 is an image that was not registered."""
+    """The camera in the next five lines: focal length, k1, k2; rotation; translation. None for unregistered images."""
     rows = []
     for _ in range(5):
         line_number, line = next(lines, (0, ""))

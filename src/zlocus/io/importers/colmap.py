@@ -1,7 +1,7 @@
-"""COLMAP's sparse models, text (`cameras.txt`, `images.txt`) and binary (`.bin`).
+"""Import COLMAP's sparse models, text (`cameras.txt`, `images.txt`) and binary (`.bin`).
 
-Axes: the camera's are right, down, forwards, as zlocus has them. Pixels: COLMAP's (0.5, 0.5) is the centre of the first
-one, so half a pixel is taken from the principal point.
+Axes: those of the camera are right, down, forwards, as in zlocus. Pixels: COLMAP's (0.5, 0.5) is the centre of the
+first pixel, so half a pixel is subtracted from the principal point.
 Source: COLMAP's documentation, "Output format" and "Camera models".
 """
 
@@ -50,17 +50,19 @@ ORIGIN_PX = 0.5
 
 @dataclass(frozen=True)
 class _ColmapCamera:
+    """A camera of the model. interior : see `ImportedExposure`; size : columns and rows."""
+
     interior: dict[str, Any]
     size: tuple[int, int]
 
 
 def read_colmap(request: ImportRequest) -> ImportedCameras:
-    """The registered images of a model. See `ImportedExposure`; coordinates are local, or those of `--crs` taken as Cartesian.
+    """The registered images of a model. Coordinates are local, or those of `--crs`, taken as Cartesian.
 
     Raises
     ------
     InputError
-        For a file that is missing or damaged, or a camera model that is not supported.
+        A file is missing or damaged, or a camera model is not supported.
     """
     names = [f"{folder}images.{suffix}" for folder in FOLDERS for suffix in ("bin", "txt")]
     images = find_camera_file(request.source, names, "COLMAP model")
@@ -87,7 +89,7 @@ def _camera(name: str, values: FloatArray, pixels: tuple[int, int]) -> _ColmapCa
 def _exposure(
     path: Path, name: str, pose: FloatArray, camera: int, cameras: dict[int, _ColmapCamera]
 ) -> ImportedExposure:
-    """From the quaternion (w, x, y, z) and the translation of camera from world."""
+    """The exposure of an image. pose : (7,) quaternion (w, x, y, z) and translation of camera from world."""
     if camera not in cameras:
         raise InputError(
             f"{path}: {quoted(name)} has camera {camera}, which is not in the file of cameras. {EXPORT_AGAIN}"
@@ -96,8 +98,8 @@ def _exposure(
     if not abs(norm - 1.0) < ROTATION_TOLERANCE:
         raise InputError(f"{path}: {quoted(name)} has a quaternion of length {norm:g}, not 1. {EXPORT_AGAIN}")
     rotation = from_quaternions(np.roll(pose[None, :4], -1, axis=1))[0]
-    found = cameras[camera]
-    return ImportedExposure(name, found.interior, -rotation.T @ pose[4:], rotation, found.size)
+    known = cameras[camera]
+    return ImportedExposure(name, known.interior, -rotation.T @ pose[4:], rotation, known.size)
 
 
 def _checked_model(name: str, path: Path) -> str:
@@ -132,7 +134,7 @@ def _text_cameras(path: Path) -> dict[int, _ColmapCamera]:
 
 
 def _text_images(path: Path, cameras: dict[int, _ColmapCamera]) -> list[ImportedExposure]:
-    """Two lines an image: its pose, then its points, which are skipped."""
+    """The images of a text file: two lines each, its pose, and its points, which are skipped."""
     exposures, announced, is_points = [], None, False
     for line_number, line in text_lines(path):
         if is_points:
@@ -157,7 +159,7 @@ def _text_images(path: Path, cameras: dict[int, _ColmapCamera]) -> list[Imported
 
 
 def _announced(line: str, what: str, before: int | None) -> int | None:
-    """How many the comment that COLMAP writes says there are."""
+    """The number of cameras or images that a comment of COLMAP announces; `before` for other comments."""
     found = re.match(rf"#\s*Number of {what}:\s*(\d{{1,18}})\b", line)
     return int(found[1]) if found else before
 
@@ -179,7 +181,7 @@ def _whole(text: str, path: Path, where: str) -> int:
 
 
 class _BinaryReader:
-    """Numbers of a little-endian binary file, one after the other; nothing is taken on trust."""
+    """Reads values of a little-endian binary file one after the other, and checks the length before each."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._content, self._at = path, read_bytes(path), 0

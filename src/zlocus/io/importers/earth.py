@@ -1,4 +1,4 @@
-"""Poses in geocentric axes, as other programs hold them, as poses in a map."""
+"""Convert poses in geocentric axes, as some programs store them, to poses in a map."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from zlocus.sensors.earth_frame import EarthSpace, between
 
 @dataclass(frozen=True)
 class MapPoses:
-    """From geocentric axes of one datum to a map, exactly.
+    """Exact conversion of poses from geocentric axes of one datum to a map.
 
-    earth : of the geographic CRS that the axes belong to; target : the map, projected in metres.
+    earth : of the geographic CRS to which the axes belong; target : CRS of the map, projected in metres.
     """
 
     earth: EarthSpace
     target: CRS
 
     def pose(self, centre: FloatArray, rotation: FloatArray, path: Path, where: str) -> tuple[FloatArray, FloatArray]:
-        """The centre in the map, (3,), and the camera's axes relative to the map's there, (3, 3).
+        """The projection centre (3,) in the map, and the camera's axes (3, 3) relative to those of the map there.
+
+        centre, rotation : geocentric; path, where : for messages.
 
         Raises
         ------
         InputError
-            For a place that the map does not have.
+            The map has no such place.
         """
         lon, lat, height = self.earth.ground_from_cartesian(centre[None])[0]
         found = np.array([*between(self.earth.crs, self.target).transform(lon, lat), height])
@@ -46,12 +48,14 @@ class MapPoses:
 
 
 def map_poses(geographic: CRS, crs: str | None, centre: FloatArray) -> MapPoses:
-    """The map asked for, else the UTM zone of `centre` (3,), geocentric in the datum of `geographic`.
+    """The conversion to a map. crs : of the map; None: the UTM zone of `centre`.
+
+    centre : (3,), geocentric in the datum of `geographic`.
 
     Raises
     ------
     ConfigError
-        For a CRS that is none, or is not projected in metres.
+        `crs` is no CRS, or is not projected in metres.
     """
     earth = EarthSpace(geographic.to_2d())
     if crs is None:
@@ -61,7 +65,13 @@ def map_poses(geographic: CRS, crs: str | None, centre: FloatArray) -> MapPoses:
 
 
 def parsed_crs(crs: str) -> CRS:
-    """The map that --crs names."""
+    """The CRS that --crs names.
+
+    Raises
+    ------
+    ConfigError
+        It is no CRS, or is not projected in metres.
+    """
     try:
         return checked_crs(CRS.from_user_input(crs))
     except CRSError as error:
@@ -69,6 +79,6 @@ def parsed_crs(crs: str) -> CRS:
 
 
 def scene_file_crs(crs: CRS) -> str:
-    """How a scene file names a CRS: by authority and number, else in full."""
+    """The name of a CRS in a scene file: authority and number, or its WKT."""
     authority = crs.to_authority(min_confidence=100)
     return ":".join(authority) if authority else crs.to_wkt()

@@ -1,8 +1,8 @@
-"""A table of exterior orientations: name, X, Y, Z, omega, phi, kappa (degrees) per line.
+"""Import a table of exterior orientations: name, X, Y, Z, omega, phi, kappa (degrees) per line.
 
-Columns are separated by commas, semicolons, tabs or blanks, in that order or as a heading names them. The interior
-orientation comes with the request. Axes: see `rotation_from_angles`. Pixels: those of the request, counted from the
-centre of the first one.
+Columns are separated by commas, semicolons, tabs or blanks. They are in that order, or in the order of a heading. The
+interior orientation comes from the request, in pixels counted from the centre of the first one. Axes: see
+`rotation_from_angles`.
 """
 
 from __future__ import annotations
@@ -35,19 +35,18 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "kappa": ("kappa", "ka"),
 }
 MAX_ANGLE_DEG = 1e4
-# Bytes.
 MAX_INTERIOR_BYTES = 100_000
 
 
 def read_eo(request: ImportRequest) -> ImportedCameras:
-    """The images of the table. See `ImportedExposure`; coordinates are those of `--crs`, or local.
+    """The images of a table. Coordinates are those of `--crs`, or local.
 
     Raises
     ------
     InputError
-        For a file that is missing or damaged.
+        A file is missing or damaged.
     ConfigError
-        Where the interior orientation is not given.
+        The interior orientation is not given.
     """
     path = find_camera_file(request.source, FILES, "table of exterior orientations")
     interior = _interior(request)
@@ -86,7 +85,7 @@ def _fields(line: str, path: Path, line_number: int) -> list[str]:
 
 
 def _heading(fields: Sequence[str]) -> list[str] | None:
-    """The names of columns, where the line holds no numbers."""
+    """The column names of a heading; None for a line with numbers."""
     for field in fields[1:]:
         if np.isfinite(decimal(field)):
             return None
@@ -120,7 +119,7 @@ def _exposure(
 
 
 def _interior(request: ImportRequest) -> dict[str, Any]:
-    """From --camera, a file of what `scene.yaml` has under `camera`, or from --focal alone."""
+    """The interior orientation: from the file of --camera, with keys as in `scene.yaml`, or from --focal alone."""
     if request.camera is None:
         if request.focal is None:
             raise ConfigError(
@@ -129,7 +128,7 @@ def _interior(request: ImportRequest) -> dict[str, Any]:
         return {"focal": request.focal}
     document = read_yaml(existing_file(request.camera, "interior orientation"), MAX_INTERIOR_BYTES)
     given = document if isinstance(document, dict) else {}
-    # The centre of the image stands in where the principal point is not given.
+    # A principal point that is not given is the centre of the image, which the importer fills in later.
     filled = {"principal_point": [0.0, 0.0]} | given
     entry = validate_document(Interior, filled, Path(request.camera)).model_dump(mode="json", exclude_unset=True)
     return {key: value for key, value in entry.items() if key in given}

@@ -1,8 +1,8 @@
-"""Metashape's `cameras.xml` (File > Export > Export Cameras, Agisoft XML).
+"""Import Metashape's `cameras.xml` (File > Export > Export Cameras, Agisoft XML).
 
-Axes: the camera's are right, down, forwards, as zlocus has them; a chunk with a CRS on the Earth has a transform to
-geocentric axes, others to local ones. Pixels: corners are counted, (0, 0) is that of the first pixel, so half a pixel
-is taken off. Distortion: p1 and p2 are OpenCV's p2 and p1.
+Axes: those of the camera are right, down, forwards, as in zlocus. The transform of a chunk goes to geocentric axes if
+the chunk has a CRS of the Earth, else to local axes. Pixels: (0, 0) is the outer corner of the first pixel, so half a
+pixel is subtracted. Distortion: p1 and p2 are OpenCV's p2 and p1.
 Source: Agisoft Metashape User Manual, appendix "Camera models".
 """
 
@@ -46,7 +46,7 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 @dataclass(frozen=True)
 class _Similarity:
-    """World from chunk: scale * rotation @ point + translation."""
+    """Transform from chunk to world: scale * rotation @ point + translation."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -54,12 +54,12 @@ class _Similarity:
 
 
 def read_metashape(request: ImportRequest) -> ImportedCameras:
-    """The aligned cameras of the first chunk. See `ImportedExposure`; in a map, or in local axes where the chunk has no CRS.
+    """The aligned cameras of the first chunk, in a map, or in local axes where the chunk has no CRS.
 
     Raises
     ------
     InputError
-        For a file that is missing or damaged, an unknown calibration, or a chunk without a place.
+        The file is missing or damaged, a calibration is not supported, or the position of the chunk is not known.
     """
     path = find_camera_file(request.source, FILES, "Metashape export of cameras")
     root = read_xml(path)
@@ -77,7 +77,7 @@ def read_metashape(request: ImportRequest) -> ImportedCameras:
 
 
 def _placed(exposures: list[ImportedExposure], chunk: Element, request: ImportRequest, path: Path) -> ImportedCameras:
-    """In the map, where the chunk knows its place."""
+    """The cameras in the map of the chunk, or in local axes."""
     crs = _chunk_crs(chunk, path)
     if crs is None or not exposures:
         if request.crs is not None:
@@ -95,7 +95,7 @@ def _placed(exposures: list[ImportedExposure], chunk: Element, request: ImportRe
 
 
 def _chunk_crs(chunk: Element, path: Path) -> CRS | None:
-    """None for local coordinates."""
+    """The CRS of the chunk; None for local coordinates."""
     text = (chunk.findtext("reference") or "").strip()
     if not text or text.upper().startswith("LOCAL_CS"):
         return None
@@ -130,7 +130,7 @@ def _exposure(entry: Element, sensors: dict[str | None, Element], chunk: Element
 
 
 def _similarity(entry: Element, chunk: Element, path: Path) -> _Similarity:
-    """That of the camera's component, in older files of the chunk; none is the identity."""
+    """The transform of the camera's component, in older files that of the chunk; the identity where there is none."""
     component = entry.get("component_id")
     found = next(
         (c.find("transform") for c in chunk.iterfind("components/component") if c.get("id") == component), None
@@ -150,7 +150,7 @@ def _similarity(entry: Element, chunk: Element, path: Path) -> _Similarity:
 
 
 def _interior(sensor: Element, path: Path, where: str) -> tuple[dict[str, Any], tuple[int, int]]:
-    """Of the adjusted calibration, else the initial one."""
+    """Interior orientation and size from the adjusted calibration, else from the initial one."""
     calibrations = {entry.get("class", "adjusted"): entry for entry in sensor.iterfind("calibration")}
     entry = calibrations.get("adjusted", calibrations.get("initial"))
     if entry is None or entry.find("f") is None:

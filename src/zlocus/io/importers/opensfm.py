@@ -1,8 +1,8 @@
-"""OpenSfM's and OpenDroneMap's `reconstruction.json`.
+"""Import `reconstruction.json` of OpenSfM and OpenDroneMap.
 
-Axes: the camera's are right, down, forwards, as zlocus has them; the world is a tangent frame (east, north, up) at
-`reference_lla`, so poses go through geocentric axes to the map. Pixels: coordinates are normalised by the larger side
-about the centre of the image.
+Axes: those of the camera are right, down, forwards, as in zlocus. The world is a tangent frame (east, north, up) at
+`reference_lla`, so poses are converted to the map by way of geocentric axes. Pixels: coordinates are counted from the
+centre of the image and divided by its larger side.
 Source: OpenSfM's documentation, "Geometric models" and "Reporting".
 """
 
@@ -45,12 +45,12 @@ MAX_ROTATION_RAD = 1e3  # radians, of an axis of rotation
 
 
 def read_opensfm(request: ImportRequest) -> ImportedCameras:
-    """The shots of the reconstruction. See `ImportedExposure`; in a map, or with `--local` in the tangent frame.
+    """The shots of a reconstruction, in a map, or with `--local` in the tangent frame.
 
     Raises
     ------
     InputError
-        For a file that is missing or damaged, in several parts, of another projection, or without a place on the Earth.
+        The file is missing or damaged, has several parts, another projection, or no place on the Earth.
     """
     path = find_camera_file(request.source, FILES, "OpenSfM reconstruction")
     document = _only_part(read_json(path), path)
@@ -79,7 +79,10 @@ def read_opensfm(request: ImportRequest) -> ImportedCameras:
 
 
 def _tangent(lla: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The tangent frame at longitude, latitude (degrees), height (m): geocentric origin (3,) and axes, rows (3, 3)."""
+    """Geocentric origin (3,) and axes (3, 3), as rows, of a tangent frame.
+
+    lla : (3,) longitude and latitude (degrees) and height (m) of its origin.
+    """
     origin = WGS84_EARTH.cartesian_from_ground(lla[None])[0]
     return origin, east_north_up(*np.deg2rad(lla[:2, None]))[0].T
 

@@ -1,4 +1,4 @@
-"""The formats that can be imported. A new one is a module, and a line in `IMPORTERS`."""
+"""The formats that can be imported. A new format is one module, and a line in `IMPORTERS`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zlocus.io.importers.opensfm import read_opensfm
 
 @dataclass(frozen=True)
 class Importer:
-    """Reads a format; options : those of `ImportRequest` that say something to it."""
+    """An importable format. read : its reader; options : the options of `ImportRequest` that apply to it."""
 
     read: Callable[[ImportRequest], ImportedCameras]
     options: tuple[str, ...]

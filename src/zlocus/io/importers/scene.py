@@ -1,4 +1,4 @@
-"""From cameras of another program to a `scene.yaml`: their images found and measured, their entries checked."""
+"""Write a `scene.yaml` from the cameras of another program, after finding their images and checking their sizes."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ MIN_IMAGES = 2
 
 
 def import_scene(request: ImportRequest) -> SceneFile:
-    """Read the cameras that the request names and write the scene, whole or not at all.
+    """Import the cameras that the request names: write the scene file and return it.
 
     Raises
     ------
     InputError
-        For cameras or images that are missing, damaged or do not fit together.
+        Cameras or images are missing, damaged or do not fit together.
     ConfigError
-        For a format that is not known, or an option that says nothing to it.
+        The format is not known, or an option does not apply to it.
     OutputError
-        Where the scene file exists already, or cannot be written.
+        The scene file exists already, or cannot be written.
     """
     if request.kind not in IMPORTERS:
         raise ConfigError(f"{request.kind} is no format that can be imported. Choose from {', '.join(IMPORTERS)}.")
@@ -51,11 +51,18 @@ def import_scene(request: ImportRequest) -> SceneFile:
 
 
 def scene_of(imported: ImportedCameras, request: ImportRequest) -> SceneFile:
-    """The scene file of cameras, with the paths of their images relative to it."""
+    """The scene file of imported cameras, with paths of images relative to it.
+
+    Raises
+    ------
+    InputError
+        There are fewer than two images, an image is missing or listed twice, or its size is not that of its camera.
+    """
     exposures = imported.exposures
     if len(exposures) < MIN_IMAGES:
         raise InputError(
-            f"{imported.path} holds {len(exposures)} oriented images, and a surface needs {MIN_IMAGES} or more. {EXPORT_AGAIN}"
+            f"{imported.path} holds {len(exposures)} oriented images, and a surface needs {MIN_IMAGES} or more. "
+            f"{EXPORT_AGAIN}"
         )
     image, times = Counter(exposure.image for exposure in exposures).most_common(1)[0]
     if times > 1:
@@ -77,7 +84,7 @@ def scene_of(imported: ImportedCameras, request: ImportRequest) -> SceneFile:
 
 
 def _camera(exposure: ImportedExposure, image: Path, path: Path, earth: dict[str, Any]) -> FrameCamera:
-    """The entry of an exposure, for an image whose size is that of its camera."""
+    """The camera entry of an exposure, after checking that the image has the size of its camera."""
     with open_raster(image) as source:
         size = (source.width, source.height)
     if exposure.size not in (None, size):
@@ -93,12 +100,12 @@ def _camera(exposure: ImportedExposure, image: Path, path: Path, earth: dict[str
 
 
 def _image_paths(exposures: Sequence[ImportedExposure], path: Path, given: Path | None) -> list[Path]:
-    """Where the images lie: in the folder that is given, else in or near that of the cameras."""
+    """The paths of the images: in the given folder, else in or near the folder of the cameras."""
     base = path if path.is_dir() else path.parent
     folders = [given] if given is not None else [base / name for name in FOLDERS]
     for folder in folders:
-        if _found(exposures[0].image, folder) is not None:
-            found = {exposure.image: _found(exposure.image, folder) for exposure in exposures}
+        if _find_image(exposures[0].image, folder) is not None:
+            found = {exposure.image: _find_image(exposure.image, folder) for exposure in exposures}
             missing = [name for name, image in found.items() if image is None]
             if missing:
                 raise InputError(
@@ -112,8 +119,11 @@ def _image_paths(exposures: Sequence[ImportedExposure], path: Path, given: Path 
     )
 
 
-def _found(name: str, folder: Path) -> Path | None:
-    """The image of that name, without its folders if need be, or with a suffix of images that the name lacks."""
+def _find_image(name: str, folder: Path) -> Path | None:
+    """The path of an image in a folder; None where there is none.
+
+    The name is tried with and without its folders, and with the suffixes of images.
+    """
     if not name or "\0" in name or len(os.fsencode(name)) > 1000:
         return None
     plain = name.replace("\\", "/")
@@ -131,12 +141,12 @@ def _found(name: str, folder: Path) -> Path | None:
 
 
 def _names(exposures: Sequence[ImportedExposure]) -> list[str]:
-    """A name per view: that of the image without suffix, in full where two would be equal."""
+    """A name for each view: that of the image without its suffix, or in full where two would be equal."""
     stems = [Path(exposure.image).stem for exposure in exposures]
     times = Counter(stems)
     return [e.image if times[stem] > 1 else stem for e, stem in zip(exposures, stems, strict=True)]
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """As the scene file has it: relative to its folder."""
+    """A path relative to the folder of the scene file, as it is written there."""
     return Path(os.path.relpath(path.resolve(), folder)).as_posix()
