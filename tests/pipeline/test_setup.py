@@ -15,7 +15,7 @@ from zlocus.core.footprints import is_shared
 from zlocus.core.progress import SilentProgress
 from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import capped, lowest_station
-from zlocus.orientation.ties import slabs
+from zlocus.orientation.ties import height_slabs
 from zlocus.pipeline.height_range import LOWEST_LAND_M, heights_below_cameras, possible_heights, range_below_cameras
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
@@ -97,12 +97,12 @@ def test_what_cannot_be_told_is_asked_for():
 
 def test_slabs_of_depth_cover_the_heights_and_overlap():
     views = scene(frame(0.0), frame(600.0)).views
-    found = slabs(views, (-500.0, 1400.0))
+    found = height_slabs(views, (-500.0, 1400.0))
     assert found[0][0] == pytest.approx(-500.0, abs=1e-3)
     assert found[-1][1] == pytest.approx(1400.0, abs=1e-3)
     assert all(a[1] > b[0] for a, b in pairwise(found))
     assert all((1500.0 - low) / (1500.0 - high) < 2.26 for low, high in found)
-    assert slabs(views, (0.0, 300.0)) == [(0.0, 300.0)]
+    assert height_slabs(views, (0.0, 300.0)) == [(0.0, 300.0)]
 
 
 def test_shared_ground_is_area_in_common():

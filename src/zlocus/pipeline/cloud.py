@@ -25,8 +25,8 @@ from zlocus.pipeline.image_tiles import (
     ImageMatching,
     ImageSetup,
     MatchedPixels,
+    build_image_scenes,
     cross_checked_images,
-    image_scenes,
     match_images,
     reference_names,
     set_up_images,
@@ -79,11 +79,11 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         note_orientation(setup.orientation, progress)
         references = supported_references(references, setup)
     with watch.stage("setup"):
-        scenes, config = image_scenes(setup, references, config)
+        image_scenes, config = build_image_scenes(setup, references, config)
         check_geoid(vertical, setup)
     with watch.stage("match"):
         spill_arrays = SpillArrays(request.out, DEFAULT_MEMORY_SHARE * free_bytes())
-        matched = match_images(scenes, ImageMatching(config, True, request.workers, spill_arrays), progress)
+        matched = match_images(image_scenes, ImageMatching(config, True, request.workers, spill_arrays), progress)
     with watch.stage("cross-check"):
         matched = cross_checked_images(matched, progress, spill_arrays)
     checksums = inputs.record()
@@ -160,12 +160,14 @@ def check_geoid(vertical_datum: VerticalDatum, setup: ImageSetup) -> None:
         vertical_datum.check_covers((west, south, east, north), setup.scene.crs)
 
 
-def image_record(one: MatchedPixels) -> dict[str, Any]:
+def image_record(matched_pixels: MatchedPixels) -> dict[str, Any]:
     """What run.json says of a reference image."""
-    match_scene, rays = one.match_scene, one.image.space.rays
+    match_scene, rays = matched_pixels.match_scene, matched_pixels.image.space.rays
     record: dict[str, Any] = {
-        "points": int(np.isfinite(one.image.height).sum()), "levels": match_scene.levels, "steps": match_scene.n_steps,
-    }  # fmt: skip
+        "points": int(np.isfinite(matched_pixels.image.height).sum()),
+        "levels": match_scene.levels,
+        "steps": match_scene.n_steps,
+    }
     if isinstance(rays, DepthRays):
         span = (match_scene.origin_m, match_scene.origin_m + match_scene.n_steps * match_scene.step_m)
         return record | {"disparities_px": [round(v, 3) for v in span], "disparity_times_depth_px_m": rays.scale}

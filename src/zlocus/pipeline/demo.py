@@ -46,6 +46,7 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     OutputError
         Where `out` holds a scene that no demo has rendered.
     """
+    from zlocus.evaluation.comparison import Comparison
     from zlocus.evaluation.evaluate import evaluate
     from zlocus.synthetic.scenes import LEVEL_1_M, demo_spec
 
@@ -55,7 +56,8 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
     result = run_dsm(request, RunConfig(), progress)
     evaluations = (
         evaluate(
-            result.out / "dsm.tif", rendered.truth_dsm, classes=rendered.truth_class, margin_m=0.0, threshold_m=limit
+            result.out / "dsm.tif",
+            Comparison(rendered.truth_dsm, rendered.truth_class, margin_m=0.0, threshold_m=limit),
         )
         for limit in (2 * LEVEL_1_M, 1.0)
     )

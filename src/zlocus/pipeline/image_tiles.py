@@ -1,8 +1,8 @@
 """Matching in image space: every pixel of a reference image gets a height, for clouds and for surfaces.
 
-The steps, in order: `set_up_images` (orientation and height range), `image_scenes` (a match scene for each reference
-image), `match_images` (all tiles of all images), `cross_checked_images` (heights that other images contradict are
-removed), and for a surface `heights_for_grid` and `grid_tile` (the heights on the ground grid).
+The steps, in order: `set_up_images` (orientation and height range), `build_image_scenes` (a match scene for each
+reference image), `match_images` (all tiles of all images), `cross_checked_images` (heights that other images contradict
+are removed), and for a surface `heights_for_grid` and `grid_tile` (the heights on the ground grid).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,12 +71,12 @@ class GroundArea:
     bounds: tuple[float, float, float, float]
     z_range: tuple[float, float]
 
-    def may_show(self, space: ImageSpace, pixels: CellWindow) -> bool:
+    def may_show(self, image_space: ImageSpace, pixel_window: CellWindow) -> bool:
         """Whether a window of pixels of a reference image, with a margin, may show the area between its two heights."""
         col, row = (np.linspace(start - MARGIN_PX, start + n + MARGIN_PX, N_RAYS) for start, n in (
-            (pixels.col, pixels.cols), (pixels.row, pixels.rows)))  # fmt: skip
+            (pixel_window.col, pixel_window.cols), (pixel_window.row, pixel_window.rows)))  # fmt: skip
         x, y, z = (v.ravel() for v in np.meshgrid(col, row, self.z_range))
-        ground = space.reference.sensor.ground_from_image(np.column_stack([x, y]), z)[:, :2]
+        ground = image_space.reference.sensor.ground_from_image(np.column_stack([x, y]), z)[:, :2]
         if not np.isfinite(ground).all():
             return True
         (west, south), (east, north) = ground.min(axis=0), ground.max(axis=0)
@@ -104,7 +105,7 @@ class ImageSetup:
 class ImageScene:
     """A reference image: its image space, and the match scene of its tiles."""
 
-    space: ImageSpace
+    image_space: ImageSpace
     match_scene: MatchScene
 
 
@@ -113,15 +114,16 @@ class ImageMatching:
     """How reference images are matched.
 
     config : options, with the blocks and levels that suit the images; choose_images : see `match_tile`; workers :
-    tiles at a time; spill_arrays : makes the arrays of all pixels; area : tiles that cannot show it are left out, None
-    leaves none out; checkpoint : keeps finished tiles, and holds those of a run that is resumed, None keeps none.
+    tiles at a time; spill_arrays : makes the arrays of all pixels; ground_area : tiles that cannot show it are left
+    out, None leaves none out; checkpoint : keeps finished tiles, and holds those of a run that is resumed, None keeps
+    none.
     """
 
     config: RunConfig
     choose_images: bool
     workers: int
     spill_arrays: SpillArrays
-    area: GroundArea | None = None
+    ground_area: GroundArea | None = None
     checkpoint: TileCheckpoint | None = None
 
 
@@ -216,23 +218,30 @@ def shifted(view: View, shift_px: tuple[float, float]) -> View:
     return replace(view, sensor=view.sensor.moved(*shift_px))
 
 
-def image_scenes(setup: ImageSetup, references: Sequence[str], config: RunConfig) -> tuple[list[ImageScene], RunConfig]:
-    """The match scene of every reference image, and the options with the blocks and levels that suit them.
+class ImageScenes(NamedTuple):
+    """The reference images to be matched, and the configuration with blocks and levels that suit all of them."""
+
+    image_scenes: list[ImageScene]
+    config: RunConfig
+
+
+def build_image_scenes(setup: ImageSetup, references: Sequence[str], config: RunConfig) -> ImageScenes:
+    """The match scene of every reference image, and the configuration that suits them.
 
     Where frame cameras look from very different directions, projections bend too much within the blocks of a coarse
     level for the projection tables: then there are fewer levels, and the coarsest one searches more steps.
     """
     while True:
-        scenes = [image_scene(setup, name, config) for name in references]
-        block = fitting_block([one.match_scene for one in scenes], config.pyramid.block)
-        levels = max(one.match_scene.levels for one in scenes)
+        image_scenes = [build_image_scene(setup, name, config) for name in references]
+        block = fitting_block([each.match_scene for each in image_scenes], config.pyramid.block)
+        levels = max(each.match_scene.levels for each in image_scenes)
         if block is not None or levels <= MIN_LEVELS:
             pyramid = replace(config.pyramid, block=block or config.pyramid.block)
-            return scenes, replace(config, pyramid=pyramid)
+            return ImageScenes(image_scenes, replace(config, pyramid=pyramid))
         config = replace(config, pyramid=replace(config.pyramid, max_levels=levels - 1))
 
 
-def image_scene(setup: ImageSetup, reference: str, config: RunConfig) -> ImageScene:
+def build_image_scene(setup: ImageSetup, reference: str, config: RunConfig) -> ImageScene:
     """A reference image's space, and the match scene of its pixels."""
     space = image_space(setup.scene, reference, setup.z_range or (0.0, 0.0))
     ties = space.frame_from_ground(setup.ties)
@@ -240,50 +249,52 @@ def image_scene(setup: ImageSetup, reference: str, config: RunConfig) -> ImageSc
     span = None if setup.z_range is None else hypotheses_of_heights(space, setup.z_range)
     if span is None:
         span = hypotheses_of_ties(space, ties[is_known & setup.is_supported], config.orientation)
-    measured = ties[: setup.orientation.n_measured]
+    measured = ties[: setup.orientation.n_refined]
     measured = measured[np.isfinite(measured).all(axis=1)]
     return ImageScene(space, build_image_match_scene(space, span, ties[is_known], config.pyramid, measured))
 
 
-def match_images(scenes: Sequence[ImageScene], how: ImageMatching, progress: Progress) -> list[MatchedPixels]:
+def match_images(
+    image_scenes: Sequence[ImageScene], matching: ImageMatching, progress: Progress
+) -> list[MatchedPixels]:
     """Match the tiles of every reference image.
 
     Heights of any precision are kept: in image space they are not in metres, and the ground grid judges them later.
     """
-    checks = replace(how.config.checks, most_sigma_m=None, most_spread_steps=NO_SPREAD_LIMIT_STEPS)
-    config = replace(how.config, checks=checks)
-    images = [CellWindow(0, 0, *one.space.reference.image.shape) for one in scenes]
-    surfaces = [Surface.nothing(window, full=how.spill_arrays.full) for window in images]
+    checks = replace(matching.config.checks, max_sigma_m=None, max_overlap_edge_sigma_steps=NO_SPREAD_LIMIT_STEPS)
+    config = replace(matching.config, checks=checks)
+    images = [CellWindow(0, 0, *one.image_space.reference.image.shape) for one in image_scenes]
+    surfaces = [Surface.nothing(window, full=matching.spill_arrays.full) for window in images]
     tasks = [
         (number, tile)
-        for number, one in enumerate(scenes)
+        for number, one in enumerate(image_scenes)
         for tile in plan_tiles(images[number], one.match_scene.overlap_window, config.pyramid)
-        if how.area is None or how.area.may_show(one.space, tile.kept)
+        if matching.ground_area is None or matching.ground_area.may_show(one.image_space, tile.kept_window)
     ]
-    tallies = np.zeros((len(scenes), 2), np.int64)
+    tallies = np.zeros((len(image_scenes), 2), np.int64)
 
     def work(task: tuple[int, Tile]) -> tuple[TileProduct, bool]:
         """The product of a tile, and whether it was matched now instead of loaded."""
-        arrays = None if how.checkpoint is None else how.checkpoint.load(tile_name(*task))
+        arrays = None if matching.checkpoint is None else matching.checkpoint.load(tile_name(*task))
         if arrays is not None:
             return TileProduct.of(arrays), False
-        return matched_tile(scenes[task[0]], task[1], config, how.choose_images), True
+        return matched_tile(image_scenes[task[0]], task[1], config, matching.choose_images), True
 
-    with progress.stage("Matching", len(tasks)) as stage, _interruption(how.checkpoint, tasks, progress):
-        for (number, tile), (product, is_new) in run_all(work, tasks, how.workers):
-            if how.checkpoint is not None and is_new:
-                how.checkpoint.keep(tile_name(number, tile), product.arrays())
-            kept = tile.kept.slices_in(images[number])
+    with progress.stage("Matching", len(tasks)) as stage, _interruption(matching.checkpoint, tasks, progress):
+        for (number, tile), (product, is_new) in run_all(work, tasks, matching.workers):
+            if matching.checkpoint is not None and is_new:
+                matching.checkpoint.keep(tile_name(number, tile), product.arrays())
+            kept = tile.kept_window.slices_in(images[number])
             for of_image, of_tile in zip(surfaces[number].arrays, product.surface.arrays, strict=True):
                 of_image[kept] = of_tile
-            how.spill_arrays.rest()
+            matching.spill_arrays.rest()
             tallies[number] += product.evaluations, product.all_images
             stage.advance()
-    matched = [matched_pixels(one, surface) for one, surface in zip(scenes, surfaces, strict=True)]
+    matched = [matched_pixels(one, surface) for one, surface in zip(image_scenes, surfaces, strict=True)]
     return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(matched, tallies, strict=True)]
 
 
-def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, choose_images: bool) -> TileProduct:
+def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, choose_images: bool) -> TileProduct:
     """One tile of a reference image.
 
     Raises
@@ -292,14 +303,15 @@ def matched_tile(image: ImageScene, tile: Tile, config: RunConfig, choose_images
         A fault of our own, with the tile in which it happened.
     """
     try:
-        result = match_tile(image.match_scene, tile.core, config, choose_images=choose_images)
+        result = match_tile(image_scene.match_scene, tile.core_window, config, choose_images=choose_images)
     except ZlocusError:
         raise
     except Exception as error:
-        where = f"The pixels from row {tile.core.row}, column {tile.core.col} on of {image.space.reference.name}"
+        window, name = tile.core_window, image_scene.image_space.reference.name
+        where = f"The pixels from row {window.row}, column {window.col} on of {name}"
         what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
         raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
-    return TileProduct(result.surface.part(tile.kept, tile.core), result.evaluations, result.all_images)
+    return TileProduct(result.surface.part(tile.kept_window, tile.core_window), result.evaluations, result.all_images)
 
 
 @contextmanager
@@ -320,14 +332,14 @@ def _interruption(
 
 def tile_name(number: int, tile: Tile) -> str:
     """Name under which the tile of an image is kept."""
-    return f"image{number}_{tile.core.row}_{tile.core.col}"
+    return f"image{number}_{tile.core_window.row}_{tile.core_window.col}"
 
 
-def matched_pixels(image: ImageScene, surface: Surface) -> MatchedPixels:
+def matched_pixels(image_scene: ImageScene, surface: Surface) -> MatchedPixels:
     """The surface of a reference image without the heights that lie beyond the requested range."""
-    match_scene = image.match_scene
+    match_scene = image_scene.match_scene
     middle = match_scene.origin_m + match_scene.n_steps * match_scene.step_m / 2
-    matched = MatchedPixels(MatchedImage(image.space, surface.height, middle), match_scene, surface)
+    matched = MatchedPixels(MatchedImage(image_scene.image_space, surface.height, middle), match_scene, surface)
     for row in range(0, len(surface.height), ROWS_AT_ONCE):
         rows = slice(row, row + ROWS_AT_ONCE)
         matched.remove_heights(rows, beyond_range(match_scene, surface.height[rows]), Quality.RANGE_END)
@@ -358,18 +370,18 @@ def cross_checked_images(
 
 
 def heights_for_grid(
-    setup: ImageSetup, references: Sequence[str], how: ImageMatching, progress: Progress
+    setup: ImageSetup, references: Sequence[str], matching: ImageMatching, progress: Progress
 ) -> GridImages:
     """Match all views in their own spaces and check them against each other, for a surface.
 
     references : names of the images whose heights the surface takes, in the order in which they give grey values.
     """
-    assert how.area is not None, "a surface has an area"
-    config = depth_options(how.config) if is_by_depth(setup.scene) else how.config
-    scenes, config = image_scenes(setup, [view.name for view in setup.scene.views], config)
-    matched = match_images(scenes, replace(how, config=config), progress)
-    checked = cross_checked_images(matched, progress, how.spill_arrays)
-    z = sum(how.area.z_range) / 2
+    assert matching.ground_area is not None, "a surface has an area"
+    config = depth_options(matching.config) if is_by_depth(setup.scene) else matching.config
+    image_scenes, config = build_image_scenes(setup, [view.name for view in setup.scene.views], config)
+    matched = match_images(image_scenes, replace(matching, config=config), progress)
+    checked = cross_checked_images(matched, progress, matching.spill_arrays)
+    z = sum(matching.ground_area.z_range) / 2
     images = {
         kept.image.space.reference.name: pixel_heights(kept, every, z)
         for kept, every in zip(checked, matched, strict=True)
@@ -389,24 +401,24 @@ def pixel_heights(checked: MatchedPixels, unchecked: MatchedPixels, z: float) ->
 
 
 def grid_tile(
-    grid_images: GridImages, match_scene: MatchScene, core: CellWindow, config: RunConfig, fill: str
+    grid_images: GridImages, match_scene: MatchScene, core_window: CellWindow, config: RunConfig, fill: str
 ) -> TileResult:
     """A tile of the ground grid from the heights of the pixels that fall on it."""
-    if not (core.rows and core.cols):
-        return TileResult(Surface.nothing(core))
+    if not (core_window.rows and core_window.cols):
+        return TileResult(Surface.nothing(core_window))
     halo = config.pyramid.halo
-    window = core.at_level(0, halo)
+    window = core_window.at_level(0, halo)
     z_range = (match_scene.origin_m, match_scene.origin_m + match_scene.n_steps * match_scene.step_m)
     cells = Cells((window.rows, window.cols), match_scene.transform(window, 0), z_range)
-    surface = gridded(grid_images.images, cells, grid_images.all_matched).precise(config.checks.most_sigma_m)
+    surface = gridded(grid_images.images, cells, grid_images.all_matched).precise(config.checks.max_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, halo // 2)
-    return TileResult(surface.part(core, window))
+    return TileResult(surface.part(core_window, window))
 
 
 def tile_maker(
     request: DsmRequest,
-    job: TileJob,
+    tile_job: TileJob,
     checkpoint: TileCheckpoint,
     setup: RunSetup,
     plan: Plan,
@@ -415,22 +427,22 @@ def tile_maker(
 ) -> Callable[[Tile], TileProduct]:
     """The function that makes a tile of a surface.
 
-    On the ground grid it is the job itself. In image space all images are matched and checked against each other first;
-    a tile is then made from their heights.
+    On the ground grid it is the tile_job itself. In image space all images are matched and checked against each other
+    first; a tile is then made from their heights.
     """
     if request.method != "gc3-sgm":
-        return job
-    orientation, grid, match_scene = setup.orientation, job.grid, setup.match_scene
+        return tile_job
+    orientation, grid, match_scene = setup.orientation, tile_job.grid, setup.match_scene
     used = supported_views(setup.scene, orientation)
     is_supported = supported(orientation.xyz, orientation.sigma_z_m)
     image_setup = ImageSetup(used, orientation, orientation.xyz, is_supported, setup.z_range)
     references = [view.name for view in match_scene.views if request.reference in (None, view.name)]
-    box, margin = grid.geobox.extent.boundingbox, job.config.pyramid.halo * grid.cell_m
+    box, margin = grid.geobox.extent.boundingbox, tile_job.config.pyramid.halo * grid.cell_m
     bounds = (box.left - margin, box.bottom - margin, box.right + margin, box.top + margin)
     spill_arrays = SpillArrays(request.out, plan.allowed_bytes - plan.n_bytes)
     area = GroundArea(bounds, setup.z_range)
-    how = ImageMatching(job.config, job.choose_images, plan.slots, spill_arrays, area, checkpoint)
-    grid_images = heights_for_grid(image_setup, references, how, progress)
+    matching = ImageMatching(tile_job.config, tile_job.choose_images, plan.slots, spill_arrays, area, checkpoint)
+    grid_images = heights_for_grid(image_setup, references, matching, progress)
     tally.evaluations, tally.all_images = grid_images.evaluations, grid_images.all_images
     if spill_arrays.file_bytes:
         progress.note(
@@ -439,7 +451,9 @@ def tile_maker(
         )
 
     def make(tile: Tile) -> TileProduct:
-        product = job.product(tile, grid_tile(grid_images, match_scene, tile.core, job.config, job.fill))
+        product = tile_job.product(
+            tile, grid_tile(grid_images, match_scene, tile.core_window, tile_job.config, tile_job.fill)
+        )
         spill_arrays.rest()
         return product
 

@@ -69,10 +69,10 @@ def check_doubts(doubts: Sequence[Doubt], product: Path) -> None:
 def what_was_applied(orientation: Orientation) -> str:
     """The corrections of the cameras, in one sentence."""
     moved = [v for v in orientation.views if v.shift_px != (0.0, 0.0)]
-    if orientation.joint is not None and orientation.joint.solution.is_held.all():
+    if orientation.bundle_adjustment is not None and orientation.bundle_adjustment.solution.is_held.all():
         return (
             f"Cameras left as delivered: {len(orientation.measured)} tie points show no errors beyond their noise, "
-            f"{orientation.joint.solution.sigma0_px:.2f} px."
+            f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px."
         )
     if not moved:
         return "Pointing: no correction applied."
@@ -82,9 +82,9 @@ def what_was_applied(orientation: Orientation) -> str:
     else:
         farthest = max(moved, key=lambda v: math.hypot(*v.shift_px))
         by = f"up to {math.hypot(*farthest.shift_px):.2f} px ({farthest.name})."
-    if orientation.joint is not None:
+    if orientation.bundle_adjustment is not None:
         return (
             f"Cameras corrected jointly from {len(orientation.measured)} tie points, to "
-            f"{orientation.joint.solution.sigma0_px:.2f} px; their images moved by, {by}"
+            f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px; their images moved by, {by}"
         )
     return f"Pointing corrected from {len(orientation.xyz)} tie points, {by}"

@@ -15,7 +15,7 @@ from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest
 from zlocus.core.scene import Scene
 from zlocus.io.grid_inputs import cells_inside, read_polygons
 from zlocus.io.input_files import InputFiles
-from zlocus.orientation.orientation import MeasuredTies
+from zlocus.orientation.orientation import RefinedTies
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.fingerprint import key_of
 from zlocus.pipeline.finished_record import Finished
@@ -85,10 +85,10 @@ def _check_room_first(request: DsmRequest, opened: OpenedInputs, checkpoint: Til
         check_room_before_ties(request.out, opened.scene, request.resolution, request.bounds, like)
 
 
-def known_ties(checkpoint: TileCheckpoint, scene: Scene, progress: Progress) -> MeasuredTies | None:
+def known_ties(checkpoint: TileCheckpoint, scene: Scene, progress: Progress) -> RefinedTies | None:
     """Tie points that an interrupted run of the same command kept; None where there is none."""
     arrays = checkpoint.arrays_before_tiles()
-    known = None if arrays is None else MeasuredTies.of(arrays, len(scene.views))
+    known = None if arrays is None else RefinedTies.of(arrays, len(scene.views))
     if known is not None:
         progress.note("The tie points of the interrupted run are used again.")
     return known

@@ -27,29 +27,29 @@ WHITE_ROWS = 16
 
 
 def write_cloud(
-    out: Path, matched: Sequence[MatchedPixels], scene: Scene, vertical: VerticalDatum = ELLIPSOIDAL
+    out: Path, matched: Sequence[MatchedPixels], scene: Scene, vertical_datum: VerticalDatum = ELLIPSOIDAL
 ) -> int:
     """Write all points with their colours, with heights above the vertical datum; returns the number of points."""
     n_points = sum(int(np.isfinite(m.image.height).sum()) for m in matched)
     white = white_level(scene.views)
     number = {view.name: k for k, view in enumerate(scene.views, 1)}
-    with PointCloud(out, n_points, vertical.compound_crs(scene.crs)) as cloud:
-        for one in matched:
-            view, height = one.image.space.reference, one.image.height
+    with PointCloud(out, n_points, vertical_datum.compound_crs(scene.crs)) as cloud:
+        for matched_pixels in matched:
+            view, height = matched_pixels.image.space.reference, matched_pixels.image.height
             for row, rows in strips(len(height)):
                 known = np.isfinite(height[row : row + rows])
                 if known.any():
                     part = slice(row, row + rows)
-                    xyz = one.image.space.ground(row, height[part])[known]
-                    xyz[:, 2] -= vertical.undulation(xyz[:, :2], scene.crs)
+                    xyz = matched_pixels.image.space.ground(row, height[part])[known]
+                    xyz[:, 2] -= vertical_datum.undulation(xyz[:, :2], scene.crs)
                     share = np.clip(read_colours(view.path, row, rows)[known] / white, 0.0, 1.0)
                     rgb = np.rint(share * 65535.0).astype(np.uint16)
-                    sigma_m = precision_m(one, row, known)
-                    cloud.write(number[view.name], xyz, rgb, sigma_m, one.surface.views[part][known])
+                    sigma_m = precision_m(matched_pixels, row, known)
+                    cloud.write(number[view.name], xyz, rgb, sigma_m, matched_pixels.surface.views[part][known])
     return n_points
 
 
-def precision_m(one: MatchedPixels, row: int, known: NDArray[np.bool_]) -> FloatArray:
+def precision_m(matched_pixels: MatchedPixels, row: int, known: NDArray[np.bool_]) -> FloatArray:
     """Standard deviations (n,) in metres of the pixels of some rows that have a height.
 
     They are those of the height, or along the ray for cameras that are matched by depth. row : first of the rows; known
@@ -57,9 +57,9 @@ def precision_m(one: MatchedPixels, row: int, known: NDArray[np.bool_]) -> Float
     """
     rows, cols = np.nonzero(known)
     part = slice(row, row + len(known))
-    z, sigma = one.image.height[part][known], one.surface.sigma[part][known]
+    z, sigma = matched_pixels.image.height[part][known], matched_pixels.surface.sigma[part][known]
     xy = np.column_stack([cols, rows + row]).astype(float)
-    return np.asarray(sigma * one.image.space.rays.metres_per_unit(xy, z.astype(float)))
+    return np.asarray(sigma * matched_pixels.image.space.rays.metres_per_unit(xy, z.astype(float)))
 
 
 def strips(n_rows: int) -> Iterator[tuple[int, int]]:
@@ -83,10 +83,15 @@ def white_level(views: Sequence[View]) -> float:
 
 
 def write_maps(
-    out: Path, name: str, one: MatchedPixels, fill: str, crs: CRS, vertical: VerticalDatum = ELLIPSOIDAL
+    out: Path,
+    name: str,
+    matched_pixels: MatchedPixels,
+    fill: str,
+    crs: CRS,
+    vertical_datum: VerticalDatum = ELLIPSOIDAL,
 ) -> None:
     """NAME_height.tif, NAME_quality.tif and, for frame cameras, NAME_depth.tif."""
-    space, height, quality = one.image.space, one.image.height, one.quality
+    space, height, quality = matched_pixels.image.space, matched_pixels.image.height, matched_pixels.quality
     if fill == "interpolate":
         beyond = (quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
         whole = filled_from_behind(height, beyond)
@@ -96,9 +101,9 @@ def write_maps(
     for row, rows in strips(len(height)):
         xyz = space.ground(row, height[row : row + rows])
         known = np.isfinite(xyz).all(axis=-1)
-        xyz[known, 2] -= vertical.undulation(xyz[known, :2], crs)
+        xyz[known, 2] -= vertical_datum.undulation(xyz[known, :2], crs)
         z[row : row + rows] = xyz[..., 2]
-    above = "" if is_local(crs) else f" above {vertical.surface}"
+    above = "" if is_local(crs) else f" above {vertical_datum.surface}"
     write_map(out / f"{name}_height.tif", z, f"height{above} of what the pixel shows", "m")
     if isinstance(space.rays, DepthRays):
         with np.errstate(divide="ignore", invalid="ignore"):

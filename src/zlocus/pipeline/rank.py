@@ -63,9 +63,9 @@ def rank_tiles(setup: RunSetup, workers: int, config: RunConfig, progress: Progr
     match_scene, ranked = setup.match_scene, []
     tiles = plan_tiles(setup.grid.window, match_scene.overlap_window, config.pyramid)
     with progress.stage("Ranking", len(tiles)) as stage:
-        for tile, tile_labels in run_all(lambda t: rank_tile(match_scene, t.core, config), tiles, workers):
+        for tile, tile_labels in run_all(lambda t: rank_tile(match_scene, t.core_window, config), tiles, workers):
             if tile_labels is not None:
-                ranked.append(LabelledTies.of(tile_labels, match_scene.ties, tile.core))
+                ranked.append(LabelledTies.of(tile_labels, match_scene.ties, tile.core_window))
             stage.advance()
     return ranked
 

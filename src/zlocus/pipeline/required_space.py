@@ -33,7 +33,7 @@ LEAST_REFUSED_BYTES = 1e9
 MARGIN_BEFORE_TIES = 2.0
 
 
-def check_room(out: Path, grid: Grid, matching: MatchScene, has_colours: bool) -> None:
+def check_room(out: Path, grid: Grid, match_scene: MatchScene, has_colours: bool) -> None:
     """Refuse a surface that cannot be kept on the disk of `out` while it is made.
 
     has_colours : of the ortho-image. What an earlier run of the same kept in `out` needs no more room.
@@ -43,9 +43,9 @@ def check_room(out: Path, grid: Grid, matching: MatchScene, has_colours: bool) -
     OutputError
         It takes more than the disk has free.
     """
-    asked, matched = grid.window, grid.window.within(matching.overlap_window)
+    asked, matched = grid.window, grid.window.within(match_scene.overlap_window)
     n_bytes = surface_bytes(
-        asked.rows * asked.cols, matched.rows * matched.cols, matching.views[0].image.dtype, has_colours
+        asked.rows * asked.cols, matched.rows * matched.cols, match_scene.views[0].image.dtype, has_colours
     )
     kept = sum(path.stat().st_size for path in (out / FOLDER).glob("*.npz")) if (out / FOLDER).is_dir() else 0
     _check(out, (asked.rows, asked.cols), grid.cell_m, n_bytes - kept, 1.0)

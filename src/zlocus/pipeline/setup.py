@@ -40,7 +40,7 @@ from zlocus.io.vertical import VerticalDatum, named_vertical_datum
 from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.orientation import RefinedTies, Orientation, orient, supported
+from zlocus.orientation.orientation import Orientation, RefinedTies, orient, supported
 from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.height_range import heights_below_cameras, possible_heights, search_range, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
@@ -304,10 +304,10 @@ def _refuse_maps_in_local_frame(request: SetupRequest) -> None:
             )
 
 
-def _files_read(request: SetupRequest, scene: Scene, datum: VerticalDatum) -> list[Path]:
+def _files_read(request: SetupRequest, scene: Scene, vertical_datum: VerticalDatum) -> list[Path]:
     """Every file whose content the result depends on, each once."""
     extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
-    extra += datum.files
+    extra += vertical_datum.files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
     return list(dict.fromkeys([*request.inputs, *files_of(scene), *extra]))

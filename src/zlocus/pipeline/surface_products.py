@@ -60,15 +60,15 @@ def write_report_inputs(
     setup: RunSetup,
     vertical_datum: VerticalDatum,
     config: RunConfig,
-    watch: Stopwatch,
+    stopwatch: Stopwatch,
     progress: Progress,
 ) -> None:
     """Write what the report shows and no other product holds: footprints, and match curves of a few cells."""
     from zlocus.pipeline.report_inputs import ReportedRun, write_shown
 
     run = ReportedRun.of(setup, vertical_datum)
-    (match_s,) = (stage["wall_s"] for stage in watch.stages if stage["name"] == "match")
-    with watch.stage("curves"), progress.stage("Match curves"):
+    (match_s,) = (stage["wall_s"] for stage in stopwatch.stages if stage["name"] == "match")
+    with stopwatch.stage("curves"), progress.stage("Match curves"):
         write_shown(out, run, config, match_s, progress)
 
 
@@ -83,7 +83,7 @@ def remove_outdated_curves(out: Path, inputs: InputFiles, progress: Progress) ->
 
 
 def write_maps(
-    request: DsmRequest, config: RunConfig, watch: Stopwatch, record: dict[str, Any], progress: Progress
+    request: DsmRequest, config: RunConfig, stopwatch: Stopwatch, record: dict[str, Any], progress: Progress
 ) -> None:
     """Write run.json, the maps, the report and the catalogue item, in this order.
 
@@ -97,7 +97,7 @@ def write_maps(
     """
     write_record(request.out / "run.json", record)
     failed: ZlocusError | None = None
-    with watch.stage("products"):
+    with stopwatch.stage("products"):
         try:
             make_maps(request.out, request.products, config.products, progress)
         except ZlocusError as error:
@@ -182,7 +182,8 @@ def check_coverage(tally: Tally, out: Path, progress: Progress) -> None:
     if tally.n_left_out:
         progress.note(
             f"In {tally.n_left_out} cells an image that may show them took no part, for it sees them too obliquely "
-            "over the heights searched there (IMAGE_EXCLUDED in quality.tif). Give --heights closer to those of the ground."
+            "over the heights searched there (IMAGE_EXCLUDED in quality.tif). Give --heights closer to those of the "
+            "ground."
         )
     if tally.coverage < SUFFICIENT_COVERAGE:
         raise CoverageError(

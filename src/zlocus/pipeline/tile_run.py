@@ -96,7 +96,7 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
             f"--memory {memory_gb:g} GB is too little for one tile, which needs about {here / 1e9:.2g} GB beside the "
             f"{own / 1e9:.2g} GB of the command itself. Allow more, or set a smaller pyramid.tile in --config."
         )
-    n_worked = sum(1 for tile in tiles if tile.core.rows and tile.core.cols)
+    n_worked = sum(1 for tile in tiles if tile.core_window.rows and tile.core_window.cols)
     wanted = request.workers or (cores() if needs.seconds > SHORT_S else 1)
     there = needs.n_bytes + WORKER_BYTES
     slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
@@ -118,18 +118,18 @@ class Tally:
     all_images: int = 0
     ranked: list[LabelledTies] = field(default_factory=list)
 
-    def add(self, product: TileProduct) -> None:
+    def add(self, tile_product: TileProduct) -> None:
         """Add the counts of a tile."""
-        quality = product.surface.quality
+        quality = tile_product.surface.quality
         asked = (quality & np.uint16(Quality.OUTSIDE)) == 0
         self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
-        is_matched = np.isfinite(product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
+        is_matched = np.isfinite(tile_product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
         self.n_matched += int(is_matched.sum())
         self.n_left_out += int((asked & ((quality & np.uint16(Quality.IMAGE_EXCLUDED)) != 0)).sum())
-        self.evaluations += product.evaluations
-        self.all_images += product.all_images
-        if product.ranked is not None:
-            self.ranked.append(product.ranked)
+        self.evaluations += tile_product.evaluations
+        self.all_images += tile_product.all_images
+        if tile_product.ranked is not None:
+            self.ranked.append(tile_product.ranked)
 
     @property
     def coverage(self) -> float:
@@ -149,7 +149,7 @@ class Tally:
 class TileRun:
     """The tiles of a run: what makes them, and where they are kept."""
 
-    job: TileJob
+    tile_job: TileJob
     tiles: Sequence[Tile]
     checkpoint: TileCheckpoint
     log: EventLog
@@ -201,14 +201,14 @@ class TileRun:
 
     def _not_all(self, failed: Sequence[Outcome]) -> str:
         said = [
-            f"{place_of(self.job.match_scene, outcome.task.core)}: {_reason(outcome.failure)}"
+            f"{place_of(self.tile_job.match_scene, outcome.task.core_window)}: {_reason(outcome.failure)}"
             for outcome in failed[:NAMED]
         ]
         more = f"; and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
         return f"{len(failed)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
 
     def run(
-        self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, elsewhere: WorkerUsage
+        self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, worker_usage: WorkerUsage
     ) -> list[Outcome]:
         """Make every tile that is not finished yet, and return the outcomes of those that failed.
 
@@ -219,7 +219,7 @@ class TileRun:
         StoppedError
             Tiles cannot be written.
         """
-        worked = [tile for tile in self.tiles if tile.core.rows and tile.core.cols]
+        worked = [tile for tile in self.tiles if tile.core_window.rows and tile.core_window.cols]
         todo = [tile for tile in worked if not self.checkpoint.holds(name_of(tile))]
         failed: list[Outcome] = []
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
@@ -232,20 +232,20 @@ class TileRun:
                 stage.advance(len(worked) - len(todo))
             if ready is not None:
                 for outcome in run_tasks(ready, todo):
-                    self._took(outcome, stage, elsewhere, is_elsewhere=not isinstance(ready, Here))
+                    self._took(outcome, stage, worker_usage, is_elsewhere=not isinstance(ready, Here))
                     if outcome.failure is not None and outcome.is_final:
                         failed.append(outcome)
         return failed
 
-    def _took(self, outcome: Outcome, stage: Stage, elsewhere: WorkerUsage, is_elsewhere: bool) -> None:
+    def _took(self, outcome: Outcome, stage: Stage, worker_usage: WorkerUsage, is_elsewhere: bool) -> None:
         tile: Tile = outcome.task
         record = {
             "tile": name_of(tile), "worker": outcome.worker, "attempt": outcome.attempt,
             "wall_s": round(outcome.wall_s, 3), "cpu_s": round(outcome.cpu_s, 3), "peak_mb": round(outcome.peak_mb, 1),
         }  # fmt: skip
         if is_elsewhere:
-            elsewhere.cpu_s += outcome.cpu_s
-            elsewhere.peak_mb = max(elsewhere.peak_mb, outcome.peak_mb)
+            worker_usage.cpu_s += outcome.cpu_s
+            worker_usage.peak_mb = max(worker_usage.peak_mb, outcome.peak_mb)
         if outcome.failure is None:
             self.checkpoint.keep(name_of(tile), outcome.result.arrays())
             self.log.add("tile", **record)
@@ -279,13 +279,13 @@ class TileRun:
             for tile in self.tiles:
                 product = self._failed(tile) if tile in lost else self._finished(tile)
                 tally.add(product)
-                window = self.job.grid.window
-                rasters.write(tile.kept.row - window.row, tile.kept.col - window.col, product.surface)
+                window = self.tile_job.grid.window
+                rasters.write(tile.kept_window.row - window.row, tile.kept_window.col - window.col, product.surface)
                 stage.advance()
 
     def _finished(self, tile: Tile) -> TileProduct:
-        if not (tile.core.rows and tile.core.cols):
-            return self.job.product(tile, TileResult(Surface.nothing(tile.core)))
+        if not (tile.core_window.rows and tile.core_window.cols):
+            return self.tile_job.product(tile, TileResult(Surface.nothing(tile.core_window)))
         arrays = self.checkpoint.load(name_of(tile))
         if arrays is None:
             raise StoppedError(
@@ -295,9 +295,9 @@ class TileRun:
         return TileProduct.of(arrays)
 
     def _failed(self, tile: Tile) -> TileProduct:
-        nothing = Surface.nothing(tile.kept)
+        nothing = Surface.nothing(tile.kept_window)
         failed = replace(nothing, quality=np.full_like(nothing.quality, Quality.FAILED))
-        return self.job.product(tile, TileResult(failed.part(tile.core, tile.kept)))
+        return self.tile_job.product(tile, TileResult(failed.part(tile.core_window, tile.kept_window)))
 
 
 def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: Polygons) -> TileJob:
@@ -329,7 +329,7 @@ def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progr
 
 def name_of(tile: Tile) -> str:
     """Name of a tile: row and column of its first kept cell on the lattice of cells."""
-    return f"{tile.kept.row}_{tile.kept.col}"
+    return f"{tile.kept_window.row}_{tile.kept_window.col}"
 
 
 def place_of(match_scene: MatchScene, core: CellWindow) -> str:
@@ -371,10 +371,10 @@ class Polygons:
 
 @dataclass(frozen=True)
 class Terrain:
-    """A terrain model whose heights fill empty cells. datum : its vertical datum."""
+    """A terrain model whose heights fill empty cells. vertical_datum : of its heights."""
 
     path: Path
-    datum: VerticalDatum
+    vertical_datum: VerticalDatum
 
 
 @dataclass(frozen=True)
@@ -428,17 +428,19 @@ class TileJob:
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        result = match_tile(self.match_scene, tile.core, self.config, self.method, self.choose_images, self.fill)
+        result = match_tile(self.match_scene, tile.core_window, self.config, self.method, self.choose_images, self.fill)
         return self.product(tile, result)
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:
         """The product of a matched tile: cut to the requested cells, with gaps filled from the terrain model."""
-        row, col = tile.kept.row - self.grid.window.row, tile.kept.col - self.grid.window.col
-        geobox = self.grid.geobox[row : row + tile.kept.rows, col : col + tile.kept.cols]
-        surface = self.area.cut(result.surface.part(tile.kept, tile.core), geobox)
+        row, col = tile.kept_window.row - self.grid.window.row, tile.kept_window.col - self.grid.window.col
+        geobox = self.grid.geobox[row : row + tile.kept_window.rows, col : col + tile.kept_window.cols]
+        surface = self.area.cut(result.surface.part(tile.kept_window, tile.core_window), geobox)
         if self.terrain is not None:
-            surface = filled_from(surface, read_dem(self.terrain.path, geobox, self.terrain.datum, may_miss=True))
+            surface = filled_from(
+                surface, read_dem(self.terrain.path, geobox, self.terrain.vertical_datum, may_miss=True)
+            )
         ranked = None
         if result.tile_labels is not None:
-            ranked = LabelledTies.of(result.tile_labels, self.match_scene.ties, tile.core)
+            ranked = LabelledTies.of(result.tile_labels, self.match_scene.ties, tile.core_window)
         return TileProduct(surface, result.evaluations, result.all_images, ranked)

@@ -25,7 +25,7 @@ from zlocus.core.options import OrientationOptions
 from zlocus.core.scene import View
 from zlocus.io.scene_file import open_scene, open_usable_views
 from zlocus.orientation.orientation import Orientation, Residuals, ViewOrientation
-from zlocus.orientation.plausibility import Doubt, LeftOut
+from zlocus.orientation.plausibility import Doubt, ExcludedImage
 from zlocus.orientation.triangulate import Observations
 from zlocus.pipeline.doctor.geometry import geometry_findings
 from zlocus.pipeline.doctor.plan import RunPlan, plan_findings
@@ -572,14 +572,14 @@ def test_what_takes_no_part_and_what_is_doubtful_is_told():
     left = Residuals(0.1, 0.1, 0.1)
     views = tuple(ViewOrientation(name, (0.0, 0.0), 500, left, left) for name in "abc")
     doubts = (Doubt("b: its camera is odd."), Doubt("The cameras of b and c are exchanged.", is_grave=True))
-    found = oriented_as(views, (LeftOut("a", "nothing supports it."),), doubts)
+    found = oriented_as(views, (ExcludedImage("a", "nothing supports it."),), doubts)
     told = tie_findings(["a", "b", "c"], found, [], OrientationOptions())
     assert [(f.level, f.sentence) for f in told] == [
         ("poor", "a: it takes no part: nothing supports it."),
         ("poor", doubts[0].sentence),
         ("stops", doubts[1].sentence),
     ]
-    found = oriented_as(views[:2], (LeftOut("a", "nothing supports it."),))
+    found = oriented_as(views[:2], (ExcludedImage("a", "nothing supports it."),))
     told = tie_findings(["a", "b"], found, [], OrientationOptions())
     assert any(f.level == "stops" and "No two images are held together" in f.sentence for f in told)
 

@@ -23,28 +23,28 @@ WINDOWS = st.builds(CellWindow, *[st.integers(-300, 300)] * 2, *[st.integers(1, 
 def test_tiles_hold_each_cell_asked_for_once(asked):
     count = np.zeros((asked.rows, asked.cols), int)
     for tile in plan_tiles(asked, SEEN, OPTIONS):
-        assert tile.kept.within(asked) == tile.kept
-        assert tile.kept.rows * tile.kept.cols > 0
-        count[tile.kept.slices_in(asked)] += 1
+        assert tile.kept_window.within(asked) == tile.kept_window
+        assert tile.kept_window.rows * tile.kept_window.cols > 0
+        count[tile.kept_window.slices_in(asked)] += 1
     assert (count == 1).all()
 
 
 @given(WINDOWS)
 def test_cores_do_not_depend_on_the_area(asked):
     height, width = core_size(SEEN, OPTIONS)
-    everything = {(t.core.row, t.core.col): t.core for t in plan_tiles(SEEN, SEEN, OPTIONS)}
+    everything = {(t.core_window.row, t.core_window.col): t.core_window for t in plan_tiles(SEEN, SEEN, OPTIONS)}
     for tile in plan_tiles(asked, SEEN, OPTIONS):
-        assert tile.kept.rows <= height
-        assert tile.kept.cols <= width
-        if tile.core.rows and tile.core.cols:
-            assert tile.core == everything[tile.core.row, tile.core.col]
+        assert tile.kept_window.rows <= height
+        assert tile.kept_window.cols <= width
+        if tile.core_window.rows and tile.core_window.cols:
+            assert tile.core_window == everything[tile.core_window.row, tile.core_window.col]
 
 
 def test_tiles_are_equal_whole_blocks_row_by_row():
     tiles = plan_tiles(SEEN, SEEN, OPTIONS)
     assert core_size(SEEN, OPTIONS) == (64, 64)
     starts = [(-100 + 64 * i, 30 + 64 * j) for i in range(5) for j in range(4)]
-    assert [(t.core.row, t.core.col) for t in tiles] == starts
+    assert [(t.core_window.row, t.core_window.col) for t in tiles] == starts
 
 
 @given(st.integers(1, 20000), st.integers(1, 20000), st.sampled_from([64, 512, 1024]))
@@ -54,7 +54,7 @@ def test_cores_are_about_as_large_as_asked(rows, cols, tile):
     for side, core in zip((rows, cols), core_size(seen, options), strict=True):
         assert core <= 1.5 * tile + options.block
         assert core >= min(side, tile * 2 / 3)
-    assert sum(t.core.rows * t.core.cols for t in plan_tiles(seen, seen, options)) == rows * cols
+    assert sum(t.core_window.rows * t.core_window.cols for t in plan_tiles(seen, seen, options)) == rows * cols
 
 
 def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):

@@ -116,8 +116,8 @@ class Diagnosis:
             "overlap": _rounded(pair.overlap),
             "base_to_height": _rounded(pair.base_to_height),
             "n_ties": None if self.ties is None else 0 if found is None else found.n_ties,
-            "across_before_px": None if found is None else _rounded(found.across_before_px),
-            "across_after_px": None if found is None else _rounded(found.across_after_px),
+            "epipolar_distance_before_px": None if found is None else _rounded(found.epipolar_distance_before_px),
+            "epipolar_distance_after_px": None if found is None else _rounded(found.epipolar_distance_after_px),
         }
 
     def oriented(self, number: int) -> ViewOrientation | None:
@@ -161,7 +161,11 @@ def _pair_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
         tied = found.tied(pair)
         ties = ("-" if found.ties is None else "0", "-", "-")
         if tied is not None:
-            ties = (str(tied.n_ties), _unit(tied.across_before_px, "px"), _unit(tied.across_after_px, "px"))
+            ties = (
+                str(tied.n_ties),
+                _unit(tied.epipolar_distance_before_px, "px"),
+                _unit(tied.epipolar_distance_after_px, "px"),
+            )
         names = " - ".join(found.names[i] for i in pair.views)
         yield names, percent(pair.overlap), f"{pair.base_to_height:.2f}", *ties
     if len(largest) > MOST_PAIRS:

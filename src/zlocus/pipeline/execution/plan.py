@@ -23,34 +23,40 @@ MAX_SAMPLED_TILES = 64
 
 @dataclass(frozen=True)
 class Tile:
-    """One tile. core : matched as a whole, the same for every grid and area; kept : its requested part."""
+    """One tile.
 
-    core: CellWindow
-    kept: CellWindow
+    core_window : matched as a whole, the same for every grid and area; kept_window : its requested part.
+    """
+
+    core_window: CellWindow
+    kept_window: CellWindow
 
 
-def plan_tiles(asked: CellWindow, seen: CellWindow, options: PyramidOptions) -> list[Tile]:
+def plan_tiles(requested_window: CellWindow, overlap_window: CellWindow, options: PyramidOptions) -> list[Tile]:
     """The tiles that contain the requested cells, row by row.
 
-    asked, seen : finest cells. Cores are equal parts of the ground seen (a property of the scene), whatever the area
-    asked for: so a cell's height does not depend on the area. Cells beyond that ground belong to tiles of the same size
-    without a core.
+    requested_window, overlap_window : finest cells. Cores are equal parts of the overlap of views, which is a property
+    of the scene; so the height of a cell does not depend on the requested area. Cells outside the overlap belong to
+    tiles of the same size without a core.
     """
-    height, width = core_size(seen, options)
-    first_row, first_col = asked.row - (asked.row - seen.row) % height, asked.col - (asked.col - seen.col) % width
+    height, width = core_size(overlap_window, options)
+    first_row, first_col = (
+        requested_window.row - (requested_window.row - overlap_window.row) % height,
+        requested_window.col - (requested_window.col - overlap_window.col) % width,
+    )
     tiles = []
-    for row in range(first_row, asked.row + asked.rows, height):
-        for col in range(first_col, asked.col + asked.cols, width):
+    for row in range(first_row, requested_window.row + requested_window.rows, height):
+        for col in range(first_col, requested_window.col + requested_window.cols, width):
             whole = CellWindow(row, col, height, width)
-            tiles.append(Tile(whole.within(seen), whole.within(asked)))
+            tiles.append(Tile(whole.within(overlap_window), whole.within(requested_window)))
     return tiles
 
 
-def core_size(seen: CellWindow, options: PyramidOptions) -> tuple[int, int]:
+def core_size(overlap_window: CellWindow, options: PyramidOptions) -> tuple[int, int]:
     """Rows and columns of a core: an equal part of the overlap of views, in whole blocks, about `tile` cells a side."""
     height, width = (
         -(-side // (max(round(side / options.tile), 1) * options.block)) * options.block
-        for side in (seen.rows, seen.cols)
+        for side in (overlap_window.rows, overlap_window.cols)
     )
     return height, width
 
@@ -63,16 +69,18 @@ class TileNeeds:
     seconds: float
 
 
-def tile_needs(scene: MatchScene, tiles: Sequence[Tile], config: RunConfig) -> TileNeeds:
+def tile_needs(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig) -> TileNeeds:
     """Estimate what tiles need, from the cells, views and pixels of a sample of them."""
-    worked = [tile for tile in tiles if tile.core.rows and tile.core.cols]
+    worked = [tile for tile in tiles if tile.core_window.rows and tile.core_window.cols]
     most, seconds, looked = 0, 0.0, worked[:: -(-len(worked) // MAX_SAMPLED_TILES) or 1]
     for tile in looked:
-        fine = tile.core.at_level(0, config.pyramid.halo).within(scene.overlap_window)
-        cells, steps = fine.rows * fine.cols, min(STEPS_PER_CELL, scene.n_steps + 16)
-        pixels = sorted(rows * cols for _, _, rows, cols in windows_of(scene, tile.core, config)[1].values())
+        fine = tile.core_window.at_level(0, config.pyramid.halo).within(match_scene.overlap_window)
+        cells, steps = fine.rows * fine.cols, min(STEPS_PER_CELL, match_scene.n_steps + 16)
+        pixels = sorted(
+            rows * cols for _, _, rows, cols in windows_of(match_scene, tile.core_window, config)[1].values()
+        )
         pixels = pixels[-config.selection.max_candidates - 1 :]
         per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * len(pixels)
         most = max(most, cells * per_cell + sum(pixels) * PIXEL_BYTES)
-        seconds += tile.core.rows * tile.core.cols * (CELL_S + VIEW_CELL_S * len(pixels))
+        seconds += tile.core_window.rows * tile.core_window.cols * (CELL_S + VIEW_CELL_S * len(pixels))
     return TileNeeds(most, seconds * len(worked) / max(len(looked), 1))

@@ -96,23 +96,23 @@ def tiny_scene() -> MatchScene:
     )  # fmt: skip
 
 
-def warm_orientation(scene: MatchScene) -> None:
+def warm_orientation(match_scene: MatchScene) -> None:
     """Run the kernels of the orientation once."""
     from zlocus.orientation.epipolar import Sightlines, trace
     from zlocus.orientation.sift import DESCRIPTOR_LENGTH, Features
-    from zlocus.orientation.tie_refinement import sharpened
-    from zlocus.orientation.ties import match_near_loci
+    from zlocus.orientation.tie_refinement import refined_ties
+    from zlocus.orientation.ties import match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
 
-    sensors, options = [view.sensor for view in scene.views], RunConfig().orientation
+    sensors, options = [view.sensor for view in match_scene.views], RunConfig().orientation
     xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
     features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
     loci = trace(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
     for moved in (loci, loci.moved(np.zeros(2))):
-        match_near_loci(moved, features.only(point), features, options.inlier_px, options.match_ratio)
+        match_along_curves(moved, features.only(point), features, options.inlier_px, options.match_ratio)
     seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
     ground = sensors[0].ground_from_image(xy, np.zeros(4))
-    sharpened(scene.views, seen, ground_jacobian(sensors, seen, ground), options)
+    refined_ties(match_scene.views, seen, ground_jacobian(sensors, seen, ground), options)
 
 
 def warm(group: str) -> None:
