@@ -18,8 +18,8 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from places import ROOT
 from docs_commands import INLINE, LAID_OUT, PAGES, PROJ_GRIDS, Step, inline_commands, name_of, steps_of
+from places import ROOT
 from zlocus.cli.app import app
 from zlocus.synthetic.__main__ import _parser
 

@@ -23,7 +23,7 @@ from zlocus.cli.app import app
 from zlocus.core.options import RunConfig
 
 DOCS = ROOT / "docs"
-NOTEBOOKS = sorted(DOCS.glob("notebooks/*.ipynb"))
+NOTEBOOKS = sorted(DOCS.glob("tutorials/notebooks/*.ipynb"))
 # Sphinx, in a process that can reach nothing.
 OFFLINE = """
 import socket, sys
@@ -110,7 +110,7 @@ def letters(text: str) -> str:
 
 
 def test_all_commands_and_options_are_there(site):
-    commands = letters(page(site, "commands.html").text)
+    commands = letters(page(site, "reference/commands.html").text)
     for name, command in vars(typer.main.get_command(app))["commands"].items():
         assert letters(f"zlocus {name}{command.help}") in commands
         for parameter in command.params:
@@ -125,20 +125,20 @@ def test_all_commands_and_options_are_there(site):
             value = getattr(options, f.name)
             yield from sentences(value) if is_dataclass(value) else [f"{f.name} {value or ''}", f.metadata["doc"]]
 
-    options = letters(page(site, "options.html").text)
+    options = letters(page(site, "reference/options.html").text)
     for sentence in sentences(RunConfig()):
         assert letters(sentence) in options, sentence
 
 
 def test_the_interface_is_described(site):
-    anchors = (site / "api.html").read_text(encoding="utf-8")
+    anchors = (site / "reference" / "api.html").read_text(encoding="utf-8")
     for name in set(zlocus.__all__) - {"__version__"}:
         assert f'id="zlocus.api.{name}"' in anchors
 
 
 def test_parameters_stand_in_a_list(site):
     """Those of every function, by name, where its docstring says something of them."""
-    text = (site / "api.html").read_text(encoding="utf-8")
+    text = (site / "reference" / "api.html").read_text(encoding="utf-8")
     listed = set(re.findall(r"<li><p><strong>([\w,]+)</strong>", text.replace("</strong><strong>", "")))
     for names in ("inputs", "bounds", "step_cells", "reference", "window", "area,mask", "dem_vertical", "x,y"):
         assert names in listed, names
@@ -164,18 +164,15 @@ def test_a_docstring_with_parameters_in_its_sentences():
     assert with_listed_parameters(["Only words."], []) == ["Only words."]
 
 
-def test_pages_of_later_have_a_place(tmp_path):
-    """A page that no list names is listed; a mistake in one is a failure."""
-    sys.path.insert(0, str(DOCS))
-    try:
-        from reference_pages import result_pages, unlisted_pages
-    finally:
-        sys.path.remove(str(DOCS))
-    assert unlisted_pages(DOCS) == ""
-    for name, text in (("index", "a\n"), ("a", "#"), ("later", "#"), ("report", "#"), ("products", "#")):
-        (tmp_path / f"{name}.md").write_text(text)
-    assert unlisted_pages(tmp_path) == "later"
-    assert result_pages(tmp_path) == "products\nreport"
+def test_every_page_is_listed_in_the_index():
+    """Readers reach every page from the index, or from an index that it lists."""
+    listed = set()
+    for index in DOCS.glob("**/index.md"):
+        folder = index.parent.relative_to(DOCS).as_posix()
+        for name in re.findall(r"^([a-z_/-]+)$", index.read_text(encoding="utf-8"), re.MULTILINE):
+            listed.add(name if folder == "." else f"{folder}/{name}")
+    pages = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.glob("**/*.md")}
+    assert pages - listed == {"index"}
 
 
 def test_a_mistake_in_a_page_is_a_failure(tmp_path):
@@ -192,7 +189,7 @@ def test_the_figures_are_those_of_the_code(tmp_path):
     subprocess.run([sys.executable, DOCS / "figures.py", tmp_path], check=True, capture_output=True)
     committed = {path.name: path for path in DOCS.glob("figures/*.png")}
     assert {path.name for path in tmp_path.glob("*.png")} == set(committed)
-    shown = re.findall(r"\(figures/([a-z]+\.png)\)", (DOCS / "method.md").read_text(encoding="utf-8"))
+    shown = re.findall(r"figures/([a-z]+\.png)\)", (DOCS / "explanation" / "method.md").read_text(encoding="utf-8"))
     assert sorted(shown) == sorted(committed)
     for name, path in committed.items():
         made, kept = (cv2.imread(str(each), cv2.IMREAD_GRAYSCALE) for each in (tmp_path / name, path))
@@ -220,7 +217,7 @@ def test_notebooks_run(path):
 
 def test_there_are_three_notebooks():
     assert [path.stem for path in NOTEBOOKS] == ["first_surface", "why_this_cell", "your_own_cost"]
-    index = (DOCS / "notebooks" / "index.md").read_text(encoding="utf-8")
+    index = (DOCS / "tutorials" / "notebooks" / "index.md").read_text(encoding="utf-8")
     assert all(f"\n{path.stem}\n" in index for path in NOTEBOOKS)
 
 
@@ -228,7 +225,7 @@ def test_the_citation_is_of_this_version():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert cited["version"] == zlocus.__version__
     assert {"cff-version", "message", "title", "authors"} <= set(cited)
-    page_text = (DOCS / "cite.md").read_text(encoding="utf-8")
+    page_text = (DOCS / "reference" / "cite.md").read_text(encoding="utf-8")
     assert len(cited["references"]) == 3
     for reference in cited["references"]:
         assert reference["title"].split(":")[0] in " ".join(page_text.split())

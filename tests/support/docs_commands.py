@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from dataclasses import dataclass
@@ -10,15 +11,19 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from rasterio.transform import from_origin
+from scipy.spatial.transform import Rotation
 
 import camera_files
 from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
 from places import ROOT
-from rendered_scenes import CENTRE, GSD_M, UTM, rendered
+from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import KNOWN
-from zlocus.synthetic.terrain import analytic_height
+from zlocus.sensors.frame import FrameModel
+from zlocus.synthetic.files import write_image
+from zlocus.synthetic.render import Sun, expose, render
+from zlocus.synthetic.terrain import analytic_ground, analytic_height
 
 # Every page that a reader may be sent to, the notebooks aside.
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks" / "README.md"])
@@ -78,6 +83,44 @@ def lay_out_images(folder: Path) -> None:
         transform=where,
     ) as file:  # fmt: skip
         file.write(heights, 1)
+
+
+# A drone 60 m above its ground: pixels of 0.26 m.
+DRONE_FOCAL_PX, DRONE_SHAPE, DRONE_HEIGHT_M, DRONE_TILT_DEG = 230.0, (180, 240), 110.0, 3.0
+DRONE_STATIONS = ((-10.0, -6.0), (0.0, -6.0), (10.0, -6.0), (-10.0, 6.0), (0.0, 6.0), (10.0, 6.0))
+
+
+def lay_out_drone(folder: Path) -> None:
+    """Images of a drone in a project of OpenSfM."""
+    ground = analytic_ground("sine", (0.0, 0.0), 0.15, (1000, 1000), seed=9)
+    shots = {}
+    for number, station in enumerate(DRONE_STATIONS):
+        tilt = DRONE_TILT_DEG * (-1) ** number
+        camera_from_ground = Rotation.from_euler("xy", [180.0 + tilt, tilt], degrees=True).as_matrix()
+        centre = np.array([*station, DRONE_HEIGHT_M])
+        middle = ((DRONE_SHAPE[1] - 1) / 2, (DRONE_SHAPE[0] - 1) / 2)
+        model = FrameModel(tuple(centre), camera_from_ground, DRONE_FOCAL_PX, middle)
+        grey = expose(render(ground, model, DRONE_SHAPE, Sun(150.0, 50.0)), QUIET, np.random.default_rng(number))
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        write_image(folder / "images" / f"{number}.tif", grey, None)
+        shots[f"{number}.tif"] = {
+            "camera": "drone",
+            "rotation": Rotation.from_matrix(camera_from_ground).as_rotvec().tolist(),
+            "translation": (-camera_from_ground @ centre).tolist(),
+        }
+    camera = {
+        "projection_type": "perspective", "width": DRONE_SHAPE[1], "height": DRONE_SHAPE[0],
+        "focal": DRONE_FOCAL_PX / max(DRONE_SHAPE), "k1": 0.0, "k2": 0.0,
+    }  # fmt: skip
+    place = {"latitude": 47.3, "longitude": 8.6, "altitude": 432.0}
+    project = [{"cameras": {"drone": camera}, "shots": shots, "points": {}, "reference_lla": place}]
+    (folder / "reconstruction.json").write_text(json.dumps(project), encoding="utf-8")
+
+
+def lay_out_readme(folder: Path) -> None:
+    """Three satellite images, a reference, and the project of a drone."""
+    lay_out_images(folder)
+    lay_out_drone(folder / "PROJECT")
 
 
 def lay_out_cameras(folder: Path) -> None:
