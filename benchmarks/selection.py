@@ -1,21 +1,23 @@
-"""Which views to match a cell with: all of them, some by geometry, or those that tie points and match curves ask for.
+"""Choice of the views that match a cell: all, some by geometry, or by labels at tie points and match curves.
 
     python benchmarks/selection.py [SCENE_FOLDER] [-o OUT] [--only NAME ...] [--curves N]
 
-SCENE_FOLDER holds img_*.tif with RPC, truth_dsm.tif and truth_class.tif; the default is the rendered town, two of whose
-eight views are spoiled: d1 (another date) and d2 (haze, blur, clouds). Each choice is one run of `zlocus dsm`:
+SCENE_FOLDER holds img_*.tif with RPC, truth_dsm.tif and truth_class.tif. The default is the rendered town, where two of
+the eight views are bad: d1 (another date) and d2 (haze, blur, clouds). Each choice is one run of `zlocus dsm`:
 
 - all images: `--views all`, which knows nothing of hidden views either;
 - all images, hidden ones masked: what the choices below are to be compared with;
-- six good images: without those that are spoiled (names that begin with d);
+- six good images: without the bad ones (names that begin with d);
 - k best by geometry: the most nadir view and k - 1 others by `candidate_images` (angles and overlap alone);
 - guided: `--views auto`, ranked at tie points, added until match curves are distinct and precise;
-- guided, rule of the paper: the label alone stops, for 95 % of the cells, and no view is left out for its labels.
+- guided, rule of the paper: adding stops when the label of 95 % of the cells is good; no view is excluded for its
+  labels.
 
-Judged against the truth: share of cells within 1 m (empty ones are not), NMAD; NCC evaluations against those of all
-images; CPU of the matching. Then, as the paper does, the final match curves: at about N regularly spaced cells (2000)
-the mean NCC over the views that were used there, along the fixed range around the height found; medians of its largest
-value and of the ratio to the second peak. Writes selection.csv and selection.png, prints a table.
+Compared with the truth: share of the cells within 1 m (empty cells are not within), NMAD. Cost: evaluated correlations
+as a share of those of all images, and CPU of the matching. As in the paper, the final match curves are judged too: at
+about N regularly spaced cells (2000), the mean correlation over the views used there, along a fixed range around the
+resulting height; reported are the medians of its largest value and of its ratio to the second peak. Writes
+selection.csv and selection.png and prints a table.
 """
 
 from __future__ import annotations
@@ -36,30 +38,31 @@ from workplace import CannotRun, ended
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.io.scene_file import open_scene
 from zlocus.matching import tile
+from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import GOOD, ProgressiveMean, curve_peaks, quality_labels
-from zlocus.matching.match_scene import reference_first, parallax_rate
+from zlocus.matching.match_scene import parallax_rate, reference_first
 from zlocus.matching.occlusion import covers
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.view_directions import cells_per_step
-from zlocus.matching.view_ranking import Samples, SearchGeometry, candidate_images
+from zlocus.matching.view_ranking import SearchGeometry, candidate_images
 
 SPOILED = "d"
 CURVES = 2000
-KEEP_ALL = RunConfig(selection=SelectionOptions(least_images=254, most_images=254))
+KEEP_ALL = RunConfig(selection=SelectionOptions(min_images=254, max_images=254))
 OF_THE_PAPER = RunConfig(
     selection=SelectionOptions(
-        sigma_steps=1000.0,
+        max_sigma_steps=1000.0,
         stopped_share=0.95,
-        least_worth=0.0,
+        min_label_share=0.0,
         order="labels",
-        most_images=254,
+        max_images=254,
     )
 )
 
 
 @dataclass(frozen=True)
 class Choice:
-    """images : names of those given; views : --views."""
+    """One run. images : names of its images; views : value of `--views`."""
 
     images: tuple[str, ...]
     views: str
@@ -67,7 +70,7 @@ class Choice:
 
 
 def choices(names: list[str], by_geometry: list[str]) -> dict[str, Choice]:
-    """The runs, by the name they are printed under."""
+    """The runs, by their names in the table."""
     good = tuple(name for name in names if not name.startswith(SPOILED))
     every = tuple(names)
     best = {f"{k} best by geometry": Choice(tuple(by_geometry[:k]), "auto", KEEP_ALL) for k in (3, 4, 5, 6)}
@@ -82,21 +85,21 @@ def choices(names: list[str], by_geometry: list[str]) -> dict[str, Choice]:
 
 
 def ranked_by_geometry(images: dict[str, Path], crs: str, z: float) -> list[str]:
-    """The most nadir view, then the others as `candidate_images` ranks them from angles; all overlap wholly here."""
+    """The view nearest to the nadir, then the others in the order of `candidate_images` for full overlap."""
     views = reference_first(open_scene(tuple(images.values()), CRS.from_user_input(crs)), z, None)
     rays = np.array([(*parallax_rate(view, z), 1.0) for view in views])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     angle_deg = np.degrees(np.arccos(np.clip(rays[1:] @ rays[0], -1.0, 1.0)))
     unknown = np.full(len(angle_deg), np.nan)
     geometry = SearchGeometry(np.ones(len(angle_deg)), angle_deg, unknown)
-    best = candidate_images(geometry, SelectionOptions(candidates=len(views)))
+    best = candidate_images(geometry, SelectionOptions(max_candidates=len(views)))
     by_path = {path: name for name, path in images.items()}
     return [by_path[views[i].path] for i in (0, *(best + 1))]
 
 
 @contextmanager
 def watched(tiles: list[tuple[Any, np.ndarray, RunConfig]]) -> Iterator[None]:
-    """Adds what `final_curves` takes of every tile that is matched: finest level, its views used, options."""
+    """While active, record the finest level of every matched tile, for `final_curves`."""
     used: list[np.ndarray] = []
     costs, finish = tile.cost_volume, tile._finish
 
@@ -116,9 +119,9 @@ def watched(tiles: list[tuple[Any, np.ndarray, RunConfig]]) -> Iterator[None]:
 
 
 def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int) -> np.ndarray:
-    """(n, 4): rho1, ratio, label and number of views of the mean curves over the views used, at a cell in `spacing`.
+    """Largest correlation, ratio of the peaks, label and number of views of mean match curves, (n, 4).
 
-    The reference is the first (most nadir) view used at a cell.
+    They are taken at one cell in `spacing`. The reference is the first (most nadir) view used at a cell.
     """
     half, options = large_window_side(config.cost) // 2, config.selection
     surface = smoothed(result.heights.vertex, config.refine.jump_steps)
@@ -129,7 +132,7 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
     row, col = cells.T
     here = surface[row, col]
     around = [surface[row + i, col + j] - here for i in range(-half, half + 1) for j in range(-half, half + 1)]
-    samples = Samples(cells, here - float(options.reach_steps), 2 * options.reach_steps + 1,
+    samples = CurveSamples(cells, here - float(options.reach_steps), 2 * options.reach_steps + 1,
                       np.ascontiguousarray(np.stack(around, axis=1), np.float32))  # fmt: skip
     index = samples.first[:, None] + np.arange(samples.n_heights)
     windows = []
@@ -146,15 +149,15 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
         mean.add(which, np.einsum("nhk,nhk->nh", first[which], found[which]))
         px = np.hypot(*(per_step[reference[which]] - per_step[view]).T)
         widest_px[which] = np.maximum(widest_px[which], px)
-    peaks = curve_peaks(mean.sncc(everyone), widest_px, options)
+    peaks = curve_peaks(mean.of(everyone), widest_px, options)
     labels = quality_labels(peaks.rho1, peaks.ratio, peaks.is_open, options)
     return np.stack([peaks.rho1, peaks.ratio, labels, takes.sum(axis=1)], axis=1)
 
 
 def run(name: str, choice: Choice, folder: Path, out: Path, curves: int = CURVES) -> dict[str, Any]:
-    """One choice: the run, its judgement and its curves, by the names of `COLUMNS` (evaluations in millions).
+    """Run one choice and return its figures by the names of `COLUMNS` (evaluations in millions).
 
-    curves : about how many cells are asked for their match curves.
+    curves : approximate number of cells whose match curves are judged.
     """
     truth, classes = folder / "truth_dsm.tif", folder / "truth_class.tif"
     with rasterio.open(truth) as file:
@@ -167,7 +170,7 @@ def run(name: str, choice: Choice, folder: Path, out: Path, curves: int = CURVES
         work = matched(
             images, place, choice.config,
             ["--crs", crs, "--resolution", str(cell), "--views", choice.views, "--bounds", *map(str, bounds),
-             # In this process, where `watched` sees the tiles.
+             # The run takes place in this process, so that `watched` can record the tiles.
              "--workers", "1"],
         )  # fmt: skip
     figures = judged(place / "dsm.tif", truth, classes)
@@ -191,7 +194,7 @@ COLUMNS = {
 
 
 def picture(found: list[dict[str, Any]], path: Path) -> None:
-    """Accuracy and the largest correlation against the work."""
+    """Plot accuracy and largest correlation against the cost."""
     import matplotlib
 
     matplotlib.use("Agg")

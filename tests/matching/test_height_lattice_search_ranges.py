@@ -9,15 +9,15 @@ import pytest
 
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions
-from zlocus.matching.height_lattice import ALIKE_PX, LANES, ranges_nearby, shared_heights, without_spikes
-from zlocus.matching.tile import RIVALS_KEPT, _candidates
+from zlocus.matching.height_lattice import MAX_DIFFERENCE_OF_NEIGHBOURS_PX, LANES, search_lattice, shared_heights, without_spikes
+from zlocus.matching.search_range import MAX_COST_MARGIN_OF_SECOND_HEIGHT, range_from_coarser
 
-OPTIONS = PyramidOptions(block=16, margin_steps=6, reach=2)
+OPTIONS = PyramidOptions(block=16, margin_steps=6, neighbour_cells=2)
 
 
 def nearby(low, high=None):
     low = np.asarray(low, np.float32)
-    return ranges_nearby(low, low if high is None else high, 10.0, 0.5, low.shape, OPTIONS)
+    return search_lattice(low, low if high is None else high, 10.0, 0.5, OPTIONS)
 
 
 def holds(lattice, block, low, high):
@@ -74,12 +74,14 @@ def test_a_block_that_nobody_saw_searches_the_least():
     assert (lattice.first[3:, 3:] == 0).all()
 
 
-def coarse_result(best, second, margin, lone, window):
-    heights = SimpleNamespace(best=best, second=second, margin=margin)
-    seen = np.zeros((3, 3, *best.shape), np.int32)
-    seen[1] = 100
-    base = SimpleNamespace(cells=np.zeros(best.shape, np.float32))
-    return SimpleNamespace(window=window, heights=heights, lone=lone, seen=seen, base=base)
+def coarse_result(best, second, margin, winner_takes_all, window):
+    heights = SimpleNamespace(best=best, second=second, uniqueness=margin)
+    visible = np.zeros((3, 3, *best.shape), np.int32)
+    visible[1] = 100
+    return SimpleNamespace(
+        level=SimpleNamespace(window=window), heights=heights, winner_takes_all=winner_takes_all, visible=visible,
+        slope_surface=SimpleNamespace(cells=np.zeros(best.shape, np.float32)),
+    )  # fmt: skip
 
 
 def candidates(second_at, margin_at, ties=(), side=3, lone_at=20):
@@ -92,30 +94,31 @@ def candidates(second_at, margin_at, ties=(), side=3, lone_at=20):
     second, lone, margin = best.copy(), best.copy(), np.full((24, 24), 65535, np.uint16)
     some = np.s_[10 : 10 + side, 12 : 12 + side]
     second[some], margin[some], lone[some] = second_at, margin_at, lone_at
-    scene = SimpleNamespace(
+    match_scene = SimpleNamespace(
         ties=np.array(ties, float).reshape(-1, 3), cell_m=0.5, anchor=(1000.0, 2000.0), origin_m=10.0, step_m=0.25
     )
-    return _candidates(scene, coarse_result(best, second, margin, lone, coarse), CellWindow(0, 0, 40, 40), 1, OPTIONS)
+    level = SimpleNamespace(window=CellWindow(0, 0, 40, 40), number=1, origin_m=10.0, step_m=0.5)
+    return range_from_coarser(match_scene, coarse_result(best, second, margin, lone, coarse), level, OPTIONS)
 
 
 def test_a_near_rival_is_a_candidate():
-    low, high = candidates(55, RIVALS_KEPT - 1)
+    low, high = candidates(55, MAX_COST_MARGIN_OF_SECOND_HEIGHT - 1)
     np.testing.assert_array_equal(high[16:22, 20:26], 110)
     assert (high == 110).sum() == 36
     assert (low == 40).all()
-    low, high = candidates(5, RIVALS_KEPT - 1)
+    low, high = candidates(5, MAX_COST_MARGIN_OF_SECOND_HEIGHT - 1)
     assert (low == 10).sum() == 36
     assert (high == 40).all()
 
 
 def test_what_cells_would_choose_alone_is_a_candidate():
     """However much more their neighbours make it cost; but not where fewer cells agree than make a tower."""
-    low, high = candidates(55, RIVALS_KEPT, lone_at=50)
+    low, high = candidates(55, MAX_COST_MARGIN_OF_SECOND_HEIGHT, lone_at=50)
     assert (high[16:22, 20:26] == 100).all()
     assert (high == 100).sum() == 36
     assert (low == 40).all()
-    assert (candidates(55, RIVALS_KEPT, lone_at=5)[0] == 10).sum() == 36
-    assert (candidates(55, RIVALS_KEPT, lone_at=50, side=2)[1] == 40).all()
+    assert (candidates(55, MAX_COST_MARGIN_OF_SECOND_HEIGHT, lone_at=5)[0] == 10).sum() == 36
+    assert (candidates(55, MAX_COST_MARGIN_OF_SECOND_HEIGHT, lone_at=50, side=2)[1] == 40).all()
 
 
 @pytest.mark.parametrize("second_at", [55, 5])
@@ -144,7 +147,7 @@ def test_spikes_beside_cells_that_nobody_saw():
 def test_heights_that_cells_share():
     """Three by three cells agree; a cell beside them, and cells that each find another height, do not. Whatever slope
     they stand on."""
-    alike = round(ALIKE_PX / OPTIONS.max_shift_px)
+    alike = round(MAX_DIFFERENCE_OF_NEIGHBOURS_PX / OPTIONS.max_shift_px)
     slope = 3 * alike * np.arange(24, dtype=np.float32) * np.ones((20, 1), np.float32)
     best = np.full((20, 24), 40, np.int32)
     lone = best.copy()
@@ -161,7 +164,7 @@ def test_heights_that_cells_share():
 
 
 def test_a_far_rival_is_none():
-    assert (candidates(55, RIVALS_KEPT)[1] == 40).all()
+    assert (candidates(55, MAX_COST_MARGIN_OF_SECOND_HEIGHT)[1] == 40).all()
 
 
 def test_tie_points_are_candidates():

@@ -123,7 +123,7 @@ def test_a_curve_that_is_hardly_seen_is_never_good():
     assert labels_of(hidden) == [GOOD]
     hidden[:42] = np.nan
     assert labels_of(hidden) == [FAIR]
-    assert labels_of(hidden, options=SelectionOptions(least_seen=0.0)) == [GOOD]
+    assert labels_of(hidden, options=SelectionOptions(min_visible_share=0.0)) == [GOOD]
 
 
 def test_a_curve_that_is_not_seen_is_poor():
@@ -137,7 +137,7 @@ def test_a_curve_that_is_not_seen_is_poor():
 def test_rivals_without_positive_correlation():
     negative, none = curve((40, 0.7), (60, -0.6), floor=-0.9), curve((40, 0.7), (60, 0.0))
     assert labels_of(negative, none) == [FAIR, GOOD]
-    assert labels_of(negative, none, options=SelectionOptions(negative_rival="infinite")) == [GOOD, GOOD]
+    assert labels_of(negative, none, options=SelectionOptions(negative_second_peak="infinite")) == [GOOD, GOOD]
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -162,8 +162,8 @@ CURVES = arrays.arrays(
 
 
 @given(CURVES, st.sampled_from([0.25, 0.5, 1.0]), st.sampled_from(["absolute", "infinite"]))
-def test_as_in_plain_loops(curves, step_px, negative_rival):
-    options = SelectionOptions(negative_rival=negative_rival)
+def test_as_in_plain_loops(curves, step_px, negative_second_peak):
+    options = SelectionOptions(negative_second_peak=negative_second_peak)
     peaks = curve_peaks(curves, step_px, options)
     for n, values in enumerate(curves.tolist()):
         rho1, rho2, is_open = plain.peaks(values, step_px, options)

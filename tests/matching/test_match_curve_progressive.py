@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 from reference import selection as plain
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.match_curve import FAIR, GOOD, POOR, ProgressiveMean, SearchPlan, match_progressively
-from zlocus.matching.view_ranking import FeaturePoints, image_order
+from zlocus.matching.view_ranking import FeaturePoints, order_images
 
 OPTIONS = SelectionOptions()
 # No correlation is above 1, so nothing is ever good.
@@ -46,7 +46,7 @@ def plan_of(order, seen, step_px=STEP_PX, block=None, sample=None):
     return SearchPlan(
         order=np.asarray(order),
         block=np.arange(n) if block is None else np.asarray(block),
-        seen=np.asarray(seen),
+        covered=np.asarray(seen),
         step_px=np.broadcast_to(np.asarray(step_px, float), i),
         sample=np.ones(n, bool) if sample is None else np.asarray(sample),
     )
@@ -74,7 +74,7 @@ def test_equation_3_is_equation_2_in_any_order(ncc, random):
         mean.add(np.arange(n), ncc[image])
     count = (~np.isnan(ncc)).sum(axis=0)
     expected = np.where(count > 0, np.nansum(ncc, axis=0) / np.maximum(count, 1), np.nan)
-    np.testing.assert_allclose(mean.sncc(np.arange(n)), expected, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(mean.of(np.arange(n)), expected, rtol=0, atol=ROUNDING)
     np.testing.assert_array_equal(mean.count, count)
 
 
@@ -85,7 +85,7 @@ def test_all_images_are_used_where_nothing_stops(ncc, random):
     found = matched(Volume(ncc), plan_of(order, np.ones((n, n_images), bool)), NEVER)
     count = (~np.isnan(ncc)).sum(axis=0)
     expected = np.where(count > 0, np.nansum(ncc, axis=0) / np.maximum(count, 1), np.nan)
-    np.testing.assert_allclose(found.sncc, expected, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(found.mean_ncc, expected, rtol=0, atol=ROUNDING)
     assert not found.is_stopped.any()
     assert found.evaluations == found.evaluations_all == ncc.size
     assert found.saved == 0.0
@@ -97,7 +97,7 @@ def test_an_image_adds_to_its_cells_only():
     mean.add(np.array([2, 0]), np.array([[0.5, np.nan], [0.25, 0.75]]))
     mean.add(np.array([2]), np.array([[1.0, -1.0]]))
     expected = [[0.25, 0.75], [np.nan, np.nan], [0.75, -1.0]]
-    np.testing.assert_array_equal(mean.sncc(np.arange(3)), expected)
+    np.testing.assert_array_equal(mean.of(np.arange(3)), expected)
 
 
 # --- stop ---
@@ -110,7 +110,7 @@ def test_the_selected_images_of_the_paper_are_enough():
     """
     around = np.array([[-3.0, -2.0], [4.0, -1.0], [0.0, 5.0]])
     labels = np.array([[1, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, -1, -1, -1]], np.int8)
-    order = image_order(FeaturePoints(around, labels), np.zeros((1, 2)), OPTIONS).images
+    order = order_images(FeaturePoints(around, labels), np.zeros((1, 2)), OPTIONS).images
     b1 = curve((40, 0.70), (55, 0.66), floor=-0.4)
     f1 = curve((40, 2 * 0.7322 - 0.70), (55, 2 * 0.1618 - 0.66), (20, 0.5), floor=-0.4)
     poor = curve((10, 0.4), (70, 0.39))
@@ -120,7 +120,7 @@ def test_the_selected_images_of_the_paper_are_enough():
     assert (found.n_images.tolist(), found.n_added.tolist()) == ([2], [2])
     assert found.label.tolist() == [GOOD]
     assert found.is_stopped.all()
-    assert found.sncc[0, [40, 55]] == pytest.approx([0.7322, 0.1618], abs=1e-12)
+    assert found.mean_ncc[0, [40, 55]] == pytest.approx([0.7322, 0.1618], abs=1e-12)
     assert (found.evaluations, found.evaluations_all) == (2 * N_HEIGHTS, 5 * N_HEIGHTS)
     assert found.saved == pytest.approx(0.6)
 
@@ -137,7 +137,7 @@ def test_each_cell_stops_by_itself():
     assert found.n_images.tolist() == [1, 2, 2]
     assert found.is_stopped.tolist() == [True, True, False]
     assert found.label.tolist() == [GOOD, GOOD, POOR]
-    np.testing.assert_array_equal(found.sncc[0], GOOD_ALONE)
+    np.testing.assert_array_equal(found.mean_ncc[0], GOOD_ALONE)
 
 
 def test_images_that_do_not_enter_are_not_evaluated():
@@ -148,7 +148,7 @@ def test_images_that_do_not_enter_are_not_evaluated():
     assert volume.asked == [(0, 1)]
     assert found.n_images.tolist() == [1, 0]
     assert found.evaluations_all == 2 * N_HEIGHTS
-    assert np.isnan(found.sncc[1]).all()
+    assert np.isnan(found.mean_ncc[1]).all()
     assert found.label.tolist() == [GOOD, POOR]
 
 
@@ -156,7 +156,7 @@ def test_a_view_that_is_hidden_at_some_heights_does_not_drag_the_mean():
     hidden = curve((40, 0.1))
     hidden[:50] = np.nan
     found = matched(Volume(np.array([[hidden], [curve((40, 0.95))]])), plan_of([[0, 1]], np.ones((1, 2), bool)))
-    assert found.sncc[0, 40] == 0.95
+    assert found.mean_ncc[0, 40] == 0.95
     assert found.n_images.tolist() == [2]
     nowhere = np.full(N_HEIGHTS, np.nan)
     found = matched(Volume(np.array([[nowhere], [GOOD_ALONE]])), plan_of([[0, 1]], np.ones((1, 2), bool)))
@@ -194,7 +194,7 @@ def test_as_in_plain_loops(ncc, random):
         values, used, is_stopped = plain.matched(
             ncc[:, cell].tolist(), order[cell], seen[cell].tolist(), step_px.tolist(), OPTIONS
         )
-        np.testing.assert_allclose(found.sncc[cell], values, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(found.mean_ncc[cell], values, rtol=0, atol=ROUNDING)
         assert [image for at, image in volume.asked if at == cell] == used
         assert found.is_stopped[cell] == is_stopped == (found.label[cell] == GOOD)
     assert found.evaluations == len(volume.asked) * n_heights

@@ -15,7 +15,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions
 from zlocus.core.scene import Scene, View
 from zlocus.matching.ground_pixels import check_resolution, median_ground_pixel
-from zlocus.matching.match_scene import height_step, reference_first, levels_for, parallax_rate, seen_window, build_match_scene
+from zlocus.matching.match_scene import height_step, reference_first, levels_for, parallax_rate, cells_of_bounds, build_match_scene
 from zlocus.core.footprints import shared_ground
 from zlocus.matching.radiometry import grey_scales
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -71,7 +71,7 @@ def test_views_along_one_line_show_no_height():
 
 @pytest.mark.parametrize(("n_steps", "levels"), [(4, 3), (256, 3), (257, 4), (1024, 5), (10**6, 6)])
 def test_levels(n_steps, levels):
-    assert levels_for(n_steps, PyramidOptions(coarsest_steps=64)) == levels
+    assert levels_for(n_steps, PyramidOptions(max_coarsest_steps=64)) == levels
     assert levels_for(n_steps, PyramidOptions(max_levels=1)) == 1
 
 
@@ -94,7 +94,7 @@ def test_shared_ground_is_what_two_views_see():
 
 
 def test_the_seen_window_is_whole_coarsest_cells():
-    window = seen_window((100.3, -7.0, 140.2, 21.0), (0.5, 0.5), 0.5, 4)
+    window = cells_of_bounds((100.3, -7.0, 140.2, 21.0), (0.5, 0.5), 0.5, 4)
     assert (window.row % 8, window.col % 8, window.rows % 8, window.cols % 8) == (0, 0, 0, 0)
     west, north = 0.5 + window.col * 0.5, 0.5 - window.row * 0.5
     assert west <= 100.3 < west + 4
@@ -143,7 +143,7 @@ def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
     )
     views = []
     for each in exposures(spec):
-        camera = replace(each.camera, centre=(3000.0, each.camera.centre[1]))
+        camera = replace(each.sensor, centre=(3000.0, each.sensor.centre[1]))
         wide = replace(each, camera=camera, shape=(each.shape[0], 6001))
         image = image_of(np.zeros(wide.shape))
         views.append(View(each.view.name, Path(each.view.name), image, line_scanner(wide)))

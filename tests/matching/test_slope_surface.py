@@ -7,7 +7,7 @@ import pytest
 
 from kernel_scene import at_all_heights, kernel_scene
 from zlocus.matching.kernels.cost_volume import plane_grid
-from zlocus.matching.slope_surface import DAMPING, PATCH, ROUNDS, BaseSurface, CoarserBase, patch_medians, relaxed
+from zlocus.matching.slope_surface import DAMPING, PATCH, ROUNDS, SlopeSurface, CoarserSlope, patch_medians, relaxed
 from zlocus.matching.tile_views import TileViews
 
 BLOCK = 16
@@ -39,8 +39,8 @@ def test_sheared_views_project_where_the_base_lies():
     """Index k of the base, at a node that lies `up` steps above the lattice's origin, is k + up of the lattice."""
     scene = kernel_scene()
     up = np.random.default_rng(4).uniform(-30, 30, scene.nodes.shape[1:3])
-    base = BaseSurface(up, scene.block, scene.shape, scene.block)
-    sheared = base.shear(views_of(scene))
+    base = SlopeSurface(up, scene.block, scene.shape, scene.block)
+    sheared = base.along(views_of(scene))
     assert sheared.nodes.shape == scene.nodes.shape
     start, step = scene.heights
     grid, plain = np.empty(8), np.empty(8)
@@ -62,16 +62,16 @@ def test_sheared_views_project_where_the_base_lies():
 def test_small_blocks_have_the_base_of_whole_patches(shape):
     """Medians over a few cells would follow noise."""
     surface = plane(0.7, -0.4, shape) + np.random.default_rng(2).normal(size=shape).astype(np.float32)
-    small, whole = BaseSurface.along(surface, PATCH // 2), BaseSurface.along(surface, PATCH)
+    small, whole = SlopeSurface.from_surface(surface, PATCH // 2), SlopeSurface.from_surface(surface, PATCH)
     assert small.nodes.shape == tuple(-(-n // (PATCH // 2)) + 1 for n in shape)
     np.testing.assert_allclose(small.cells, whole.cells, rtol=0, atol=FLOAT32_STEPS)
 
 
 def test_a_level_base_changes_nothing():
     scene = kernel_scene()
-    views, base = views_of(scene), BaseSurface.level(scene.shape, scene.block)
+    views, base = views_of(scene), SlopeSurface.flat(scene.shape, scene.block)
     assert base.nodes.shape == scene.nodes.shape[1:3]
-    np.testing.assert_array_equal(base.shear(views).nodes, views.nodes)
+    np.testing.assert_array_equal(base.along(views).nodes, views.nodes)
     assert base.cells.shape == base.relief.shape == scene.shape
     assert base.padded(5).shape == (scene.shape[0] + 10, scene.shape[1] + 10)
     assert (base.padded(5) == 0).all()
@@ -136,18 +136,18 @@ def test_a_corner_hears_of_patches_nearby_alone():
 @pytest.mark.parametrize(("row", "col"), [(0.0, 0.0), (-16.0, -4.5)])
 def test_the_coarser_base_on_finer_cells(row, col):
     """A plane of the coarser level, continued: in cells half as large, and steps half as high."""
-    coarse = BaseSurface(corners_of(0.6, -0.2, (6, 7)), PATCH, (48, 56), PATCH)
-    found = CoarserBase(coarse, row, col).corners((9, 11), PATCH)
+    coarse = SlopeSurface(corners_of(0.6, -0.2, (6, 7)), PATCH, (48, 56), PATCH)
+    found = CoarserSlope(coarse, row, col).corners((9, 11), PATCH)
     down, across = ((np.arange(n + 1) * PATCH + 0.5) / 2 - 0.5 - first for n, first in ((9, row), (11, col)))
     np.testing.assert_allclose(found, 2 * (0.6 * down[:, None] - 0.2 * across + 5.0), rtol=0, atol=STEPS)
 
 
 def test_long_slopes_are_those_of_the_coarser_base():
     """Where the surface is level, as far as its patches tell, the slope that the coarser level found stays."""
-    coarse = BaseSurface(corners_of(0.0, 0.5, (10, 10)), PATCH, (80, 80), PATCH)
-    base = BaseSurface.along(np.full((64, 96), 40.0, np.float32), BLOCK, CoarserBase(coarse, 0.0, 0.0))
-    middle = np.diff(base.patches, axis=1)[2:-2, 5:-5]
-    assert (base.patches == np.rint(base.patches)).all()
+    coarse = SlopeSurface(corners_of(0.0, 0.5, (10, 10)), PATCH, (80, 80), PATCH)
+    base = SlopeSurface.from_surface(np.full((64, 96), 40.0, np.float32), BLOCK, CoarserSlope(coarse, 0.0, 0.0))
+    middle = np.diff(base.patch_corners, axis=1)[2:-2, 5:-5]
+    assert (base.patch_corners == np.rint(base.patch_corners)).all()
     np.testing.assert_allclose(middle, PATCH * 0.5, rtol=0, atol=WHOLE_STEPS)
 
 
@@ -156,14 +156,14 @@ def test_long_slopes_are_those_of_the_coarser_base():
 def test_along_a_slope(by_row, by_col, block):
     """Everywhere, also where the last blocks are cut off by the tile's border and where no slope is known."""
     surface = plane(by_row, by_col)
-    base = BaseSurface.along(surface, block)
+    base = SlopeSurface.from_surface(surface, block)
     rise = block * max(abs(by_row), abs(by_col))
     assert base.is_steep(ALL) == (rise > 8)
     for axis, slope in enumerate((by_row, by_col)):
         np.testing.assert_allclose(np.diff(base.cells, axis=axis), slope, rtol=0, atol=WHOLE_STEPS / base.patch)
     # Whole steps are all that it misses the plane by, from one end to the other.
-    n_patches = np.subtract(base.patches.shape, 1)
-    away = base.patches - corners_of(by_row, by_col, n_patches, base.patch)
+    n_patches = np.subtract(base.patch_corners.shape, 1)
+    away = base.patch_corners - corners_of(by_row, by_col, n_patches, base.patch)
     assert np.ptp(away) <= WHOLE_STEPS + LOST * rise
     assert base.cells.shape == SHAPE
     assert base.cells.dtype == np.float32
@@ -179,7 +179,7 @@ def hillside(wavelength=64.0, height=8.0):
 def test_patches_follow_a_rough_hillside():
     """Windows see what slope the base leaves: along the patches it is two fifths of that along whole blocks at most."""
     surface = hillside()
-    base = BaseSurface.along(surface, 32)
+    base = SlopeSurface.from_surface(surface, 32)
 
     def left_over(cells):
         by_row, by_col = np.gradient((cells - surface)[16:-16, 16:-16])
@@ -191,10 +191,10 @@ def test_patches_follow_a_rough_hillside():
 
 
 def test_relief_is_what_lies_above_the_corners_of_blocks():
-    base = BaseSurface.along(hillside()[:150, :187], 32)
+    base = SlopeSurface.from_surface(hillside()[:150, :187], 32)
     relief = base.relief
     assert base.nodes.shape == (6, 7)
-    assert base.patches.shape == (21, 25)
+    assert base.patch_corners.shape == (21, 25)
     assert (relief[::32, ::32] == 0).all()
     assert np.abs(relief).max() > 3
     for r, c in ((5, 9), (33, 64), (31, 100), (149, 186)):
@@ -206,16 +206,16 @@ def test_relief_is_what_lies_above_the_corners_of_blocks():
 
 
 def test_a_block_that_patches_do_not_divide_is_one_patch():
-    base = BaseSurface.along(hillside(), 12)
+    base = SlopeSurface.from_surface(hillside(), 12)
     assert base.patch == base.block == 12
-    np.testing.assert_array_equal(base.nodes, base.patches)
+    np.testing.assert_array_equal(base.nodes, base.patch_corners)
     assert (base.relief == 0).all()
     assert np.ptp(base.cells) > 50
 
 
 def test_a_tile_too_small_to_know_slopes_is_level():
     surface = np.random.default_rng(1).normal(0, 30, (8, 5)).astype(np.float32)
-    base = BaseSurface.along(surface, BLOCK)
+    base = SlopeSurface.from_surface(surface, BLOCK)
     assert base.cells.shape == (8, 5)
     assert np.ptp(base.cells) < FLOAT32_STEPS
 
@@ -224,7 +224,7 @@ def level_above(by_col=0.0):
     """The base of the coarser level on half as many cells as `SHAPE`."""
     shape = (SHAPE[0] // 2 + 1, SHAPE[1] // 2)
     n_patches = [-(-n // PATCH) for n in shape]
-    return CoarserBase(BaseSurface(corners_of(0.0, by_col, n_patches), PATCH, shape, PATCH), 0.0, 0.0)
+    return CoarserSlope(SlopeSurface(corners_of(0.0, by_col, n_patches), PATCH, shape, PATCH), 0.0, 0.0)
 
 
 @pytest.mark.parametrize("above", ["level", None])
@@ -232,7 +232,7 @@ def test_a_building_on_level_ground_leaves_the_base_nearly_level(above):
     surface = np.full(SHAPE, 40.0, np.float32)
     surface[20:43, 30:61] = 130.0
     surface[50:53, 5:100] = 70.0
-    base = BaseSurface.along(surface, BLOCK, level_above() if above else None)
+    base = SlopeSurface.from_surface(surface, BLOCK, level_above() if above else None)
     assert max(np.abs(np.diff(base.nodes, axis=axis)).max() for axis in (0, 1)) < 0.5
     assert np.abs(base.relief).max() < 0.5
     assert not base.is_steep(ALL)
@@ -242,7 +242,7 @@ def test_a_jump_in_a_slope_adds_nothing_to_it():
     """A terrace wall across a hill: the base rises by the slope, not by the wall."""
     surface = plane(0.0, 1.0)
     surface[:, 52:] += 60.0
-    nodes = BaseSurface.along(surface, BLOCK, level_above(by_col=1.0)).nodes
+    nodes = SlopeSurface.from_surface(surface, BLOCK, level_above(by_col=1.0)).nodes
     np.testing.assert_allclose(np.diff(nodes[1:4], axis=1)[:, 1:5], BLOCK, rtol=0, atol=0.1 * BLOCK)
 
 
@@ -252,7 +252,7 @@ def test_values_of_cells_and_of_their_border(shape, patch, half):
     """Bilinear between the corners of patches, and on from the outermost ones."""
     n_b, n_d = (-(-n // patch) for n in shape)
     corners = np.random.default_rng(2).normal(0, 50, (n_b + 1, n_d + 1))
-    base = BaseSurface(corners, patch, shape, patch)
+    base = SlopeSurface(corners, patch, shape, patch)
     found = base.padded(half)
     assert found.dtype == np.float32
     assert found.shape == (shape[0] + 2 * half, shape[1] + 2 * half)

@@ -12,20 +12,20 @@ from reference import selection as plain
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.view_ranking import (
-    Evidence,
+    OrderSource,
     FeaturePoints,
     NeighbourSearch,
     SearchGeometry,
     candidate_images,
-    image_order,
+    order_images,
     scene_labels,
     triangulated,
 )
 
 RADIUS_PX = 10.0
-OPTIONS = SelectionOptions(radius_px=RADIUS_PX, nearest=3, widest=4.0)
-COUNT = SelectionOptions(radius_px=RADIUS_PX, nearest=3, widest=4.0, accumulate="count")
-TIN = SelectionOptions(radius_px=RADIUS_PX, nearest=3, widest=4.0, neighbours="tin")
+OPTIONS = SelectionOptions(radius_px=RADIUS_PX, nearest=3, max_radii=4.0)
+COUNT = SelectionOptions(radius_px=RADIUS_PX, nearest=3, max_radii=4.0, accumulate="count")
+TIN = SelectionOptions(radius_px=RADIUS_PX, nearest=3, max_radii=4.0, neighbours="tin")
 B1, F1, B2, N2, F2 = range(5)
 # Ji et al. 2014, table 3, labels of B1, F1, B2, N2, F2 at P1, P2, P3; table 4, their sums.
 TABLE_3 = np.array([[1, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, -1, -1, -1]], np.int8)
@@ -39,7 +39,7 @@ def features(xy, labels):
 
 
 def order_of(points, *at, options=OPTIONS):
-    return image_order(points, np.array(at, float).reshape(-1, 2), options)
+    return order_images(points, np.array(at, float).reshape(-1, 2), options)
 
 
 @pytest.mark.parametrize("options", [OPTIONS, TIN], ids=["radius", "tin"])
@@ -47,7 +47,7 @@ def order_of(points, *at, options=OPTIONS):
 def test_the_printed_ranking(options, shift):
     found = order_of(features(AROUND + shift, TABLE_3), shift, options=options)
     assert found.accumulated.tolist() == [TABLE_4]
-    assert found.evidence == Evidence.NEIGHBOURS
+    assert found.order_source == OrderSource.NEIGHBOURS
     order = found.images[0].tolist()
     assert [set(order[:2]), set(order[2:3]), set(order[3:])] == [{B1, F1}, {B2}, {N2, F2}]
 
@@ -113,7 +113,7 @@ def test_plain_ground_takes_the_nearest_features():
     """No feature within the radius: the three nearest, as far as four radii."""
     points = features([[15, 0], [0, 20], [-25, 0], [0, -28]], [[0, 1], [0, 1], [1, 0], [1, -1]])
     found = order_of(points, (0, 0))
-    assert found.evidence == Evidence.NEAREST
+    assert found.order_source == OrderSource.NEAREST
     assert found.accumulated.tolist() == [[1, 2]]
     assert found.images.tolist() == [[1, 0]]
     further = features([[15, 0], [0, 41], [-25, 0]], [[0, 1], [0, 1], [1, 0]])
@@ -123,7 +123,7 @@ def test_plain_ground_takes_the_nearest_features():
 def test_far_from_all_features_the_order_of_the_scene_holds():
     points = features([[0, 0], [5, 0], [10, 0]], [[1, 1, 0], [-1, 1, 1], [0, 1, -1]])
     found = order_of(points, (10, 40.1), (10, 39.9))
-    assert found.evidence.tolist() == [Evidence.SCENE, Evidence.NEAREST]
+    assert found.order_source.tolist() == [OrderSource.SCENE, OrderSource.NEAREST]
     assert found.images[0].tolist() == [1, 0, 2]
     assert found.accumulated[0].tolist() == scene_labels(points.labels, OPTIONS).tolist() == [0, 3, 0]
 
@@ -132,7 +132,7 @@ def test_far_from_all_features_the_order_of_the_scene_holds():
 def test_a_scene_without_features_keeps_the_given_order(options):
     found = order_of(features([], np.zeros((0, 4))), (0, 0), (3, 4), options=options)
     assert found.images.tolist() == [[0, 1, 2, 3]] * 2
-    assert (found.evidence == Evidence.SCENE).all()
+    assert (found.order_source == OrderSource.SCENE).all()
 
 
 @pytest.mark.parametrize("accumulate", ["sum", "count"])
@@ -164,14 +164,14 @@ def test_no_triangle_can_be_made(xy):
     xy = np.array(xy)
     assert triangulated(xy) is None
     found = order_of(features(xy, np.ones((len(xy), 2))), (1, 1), options=TIN)
-    assert found.evidence == (Evidence.NEAREST if len(xy) else Evidence.SCENE)
+    assert found.order_source == (OrderSource.NEAREST if len(xy) else OrderSource.SCENE)
     assert sorted(found.images[0]) == [0, 1]
 
 
 def test_outside_all_triangles_the_nearest_features_count():
     points = features([[0, 0], [10, 0], [0, 10], [10, 10]], [[0, 1], [0, 1], [1, 0], [1, 0]])
     found = order_of(points, (5, -30), (5, -50), (5, 5.5), options=TIN)
-    assert found.evidence.tolist() == [Evidence.NEAREST, Evidence.SCENE, Evidence.NEIGHBOURS]
+    assert found.order_source.tolist() == [OrderSource.NEAREST, OrderSource.SCENE, OrderSource.NEIGHBOURS]
     assert found.accumulated[0, 1] == 2
 
 
@@ -179,8 +179,8 @@ def test_outside_all_triangles_the_nearest_features_count():
        arrays.arrays(np.float64, (4, 2), elements=st.integers(-5, 65).map(float)))  # fmt: skip
 def test_the_triangle_holds_the_cell_and_is_delaunay(xy, at):
     near = NeighbourSearch(xy, TIN).of(at)
-    assume((near.evidence == Evidence.NEIGHBOURS).any())
-    for cell in np.flatnonzero(near.evidence == Evidence.NEIGHBOURS):
+    assume((near.order_source == OrderSource.NEIGHBOURS).any())
+    for cell in np.flatnonzero(near.order_source == OrderSource.NEIGHBOURS):
         corners = xy[near.index[near.start[cell] : near.start[cell + 1]]]
         assert len(corners) == 3
         assert (np.diff(np.hypot(*(corners - at[cell]).T)) >= -1e-9).all()
@@ -205,15 +205,15 @@ SCENES = st.tuples(st.integers(1, 30), st.integers(1, 5)).flatmap(
 @given(SCENES, arrays.arrays(np.float64, (6, 2), elements=WHOLE), st.sampled_from([OPTIONS, COUNT]),
        st.sampled_from([2.0, 5.0, 20.0]))  # fmt: skip
 def test_as_in_plain_loops(scene, at, base, radius_px):
-    options = SelectionOptions(radius_px=radius_px, nearest=3, widest=2.0, accumulate=base.accumulate)
+    options = SelectionOptions(radius_px=radius_px, nearest=3, max_radii=2.0, accumulate=base.accumulate)
     xy, labels = scene
     # Whole positions are kept whole, so that equal distances are equal.
     xy = np.vstack([xy, -xy])
     labels = np.vstack([labels, labels[::-1]])
     found = order_of(features(xy, labels), *at, options=options)
     for cell, place in enumerate(at.tolist()):
-        evidence, neighbours = plain.radius_neighbours(xy.tolist(), place, options)
-        assert found.evidence[cell] == evidence
+        order_source, neighbours = plain.radius_neighbours(xy.tolist(), place, options)
+        assert found.order_source[cell] == order_source
         assert found.images[cell].tolist() == plain.order(labels.tolist(), neighbours, options)
 
 
@@ -222,18 +222,18 @@ def test_cells_do_not_depend_on_each_other():
     rng = np.random.default_rng(4)
     points = features(rng.uniform(0, 300, (400, 2)), rng.integers(-1, 2, (400, 6)))
     at = rng.uniform(-50, 350, (20500, 2))
-    found = image_order(points, at, OPTIONS)
+    found = order_images(points, at, OPTIONS)
     assert found.images.shape == found.accumulated.shape == (20500, 6)
     some = [0, 19999, 20000, 20499]
-    alone = image_order(points, at[some], OPTIONS)
-    for name in ("images", "accumulated", "evidence"):
+    alone = order_images(points, at[some], OPTIONS)
+    for name in ("images", "accumulated", "order_source"):
         np.testing.assert_array_equal(getattr(found, name)[some], getattr(alone, name))
     np.testing.assert_array_equal(np.sort(found.images, axis=1), np.broadcast_to(np.arange(6), (20500, 6)))
-    assert set(found.evidence.tolist()) == set(Evidence)
+    assert set(found.order_source.tolist()) == set(OrderSource)
 
 
 def test_no_cells_at_all():
-    assert image_order(features(AROUND, TABLE_3), np.zeros((0, 2)), OPTIONS).images.shape == (0, 5)
+    assert order_images(features(AROUND, TABLE_3), np.zeros((0, 2)), OPTIONS).images.shape == (0, 5)
 
 
 # --- candidates ---
@@ -274,9 +274,9 @@ def test_a_hundred_images():
     assert len(set(chosen.tolist())) == 12
     assert (given_numbers.overlap[chosen] >= 0.2).all()
     assert ((given_numbers.angle_deg[chosen] >= 5) & (given_numbers.angle_deg[chosen] <= 45)).all()
-    assert chosen.tolist() == candidate_images(given_numbers, SelectionOptions(candidates=50)).tolist()[:12]
+    assert chosen.tolist() == candidate_images(given_numbers, SelectionOptions(max_candidates=50)).tolist()[:12]
 
 
 def test_angles_that_contradict_each_other_are_refused():
-    with pytest.raises(ConfigError, match=r"best_angle_deg = 4\.0 is outside least_angle_deg to most_angle_deg"):
+    with pytest.raises(ConfigError, match=r"best_angle_deg = 4\.0 is outside min_angle_deg to max_angle_deg"):
         SelectionOptions(best_angle_deg=4.0)

@@ -16,10 +16,10 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.match_curve import FAIR, GOOD, POOR, predicted_sigma
+from zlocus.matching.pair_labels import PairLabels, TiesOnGrid, label_pairs
 from zlocus.matching.tile_views import TileViews
-from zlocus.matching.view_ranking import Ranking, rank_views
 from zlocus.matching.view_selection import (
-    Coarser,
+    CoarserCurves,
     ViewOrder,
     block_middles,
     block_of_cells,
@@ -89,10 +89,10 @@ WINDOW = CellWindow(0, 0, *SHAPE)
 
 
 def ranked(views, xy, index, slope=(0.0, 0.0), window=WINDOW, options=SHORT):
-    return rank_views(views, window, xy, index, np.tile(slope, (len(xy), 1)), SIDE, STEPS_PER_CELL, options)
+    return label_pairs(views, window, TiesOnGrid(xy, index, np.tile(slope, (len(xy), 1))), SIDE, STEPS_PER_CELL, options)
 
 
-# --- rank_views ---
+# --- label_pairs ---
 
 
 def test_labels_of_views_that_show_the_same_and_of_one_that_does_not():
@@ -119,7 +119,7 @@ def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)
     index, flat = rng.uniform(5, 15, 50), np.zeros((50, 2))
-    found = rank_views(views, window, xy, index, flat, SIDE, STEPS_PER_CELL, SHORT)
+    found = label_pairs(views, window, TiesOnGrid(xy, index, flat), SIDE, STEPS_PER_CELL, SHORT)
     np.testing.assert_array_equal(found.labels, found.labels.swapaxes(1, 2))
     assert (np.diagonal(found.labels, axis1=1, axis2=2) == POOR).all()
     assert (found.labels == GOOD).mean() < 0.1
@@ -176,7 +176,7 @@ def ranking_of(xy, labels, angle_deg=None):
     labels = np.asarray(labels, np.int8)
     n_views = labels.shape[-1]
     angle_deg = 10.0 * (1 - np.eye(n_views)) if angle_deg is None else np.asarray(angle_deg, float)
-    return Ranking(np.arange(len(xy)), xy, np.broadcast_to(labels, (len(xy), n_views, n_views)).copy(), angle_deg)
+    return PairLabels(np.arange(len(xy)), xy, np.broadcast_to(labels, (len(xy), n_views, n_views)).copy(), angle_deg)
 
 
 def agreeing(n_views, *stranger):
@@ -195,24 +195,24 @@ def test_the_reference_is_the_first_view_that_shows_the_whole_block():
     found = order_views(ranking_of(NEAR, agreeing(3)), share, AT.repeat(3, axis=0), OPTIONS)
     assert found.reference.tolist() == [1, 0, 0]
     assert [sorted(row) for row in found.search.tolist()] == [[0, 2], [1, 2], [1, 2]]
-    assert found.is_worth.all()
+    assert found.is_helpful.all()
 
 
 def test_a_view_that_agrees_with_none_is_not_the_reference_and_stands_last():
     found = order_views(ranking_of(NEAR, agreeing(4, 0)), np.ones((4, 1)), AT, OPTIONS)
     assert found.reference.tolist() == [1]
     assert found.search.tolist() == [[2, 3, 0]]
-    assert found.is_worth.tolist() == [[True, True, False]]
+    assert found.is_helpful.tolist() == [[True, True, False]]
 
 
 def test_without_any_agreement_the_view_that_shows_most_leads():
     share = np.array([[0.5], [0.8], [0.8]])
     found = order_views(ranking_of(NEAR, agreeing(3, 0, 1, 2)), share, AT, OPTIONS)
     assert found.reference.tolist() == [1]
-    assert not found.is_worth.any()
+    assert not found.is_helpful.any()
     found = order_views(ranking_of(NEAR, agreeing(3)), share, AT, OPTIONS)
     assert found.reference.tolist() == [1], "no view shows all of the block"
-    assert found.is_worth.all()
+    assert found.is_helpful.all()
 
 
 def test_views_below_a_share_of_the_best_mislead():
@@ -222,10 +222,10 @@ def test_views_below_a_share_of_the_best_mislead():
     labels[:3, 0, 3] = labels[:3, 3, 0] = FAIR
     xy = 50.0 + np.arange(10.0).reshape(5, 2)
     for least, expected in ((0.6, [True, True, False]), (0.61, [True, False, False]), (0.4, [True, True, True])):
-        options = SelectionOptions(least_worth=least)
+        options = SelectionOptions(min_label_share=least)
         found = order_views(ranking_of(xy, labels), np.ones((4, 1)), AT, options)
         assert found.search.tolist() == [[1, 2, 3]]
-        assert found.is_worth.tolist() == [expected], least
+        assert found.is_helpful.tolist() == [expected], least
 
 
 def test_of_views_that_help_the_one_at_the_best_angle_comes_first():
@@ -241,7 +241,7 @@ def test_of_views_that_help_the_one_at_the_best_angle_comes_first():
         found = order_views(ranking_of(NEAR, labels, angle), np.ones((5, 1)), AT, options)
         assert found.reference.tolist() == [0]
         assert found.search.tolist() == [expected], order
-        assert found.is_worth.tolist() == [[True, True, True, False]]
+        assert found.is_helpful.tolist() == [[True, True, True, False]]
 
 
 def test_blocks_have_the_order_of_the_points_around_them():
@@ -250,7 +250,7 @@ def test_blocks_have_the_order_of_the_points_around_them():
     found = order_views(ranking_of(xy, labels), np.ones((3, 2)), xy + 5.0, OPTIONS)
     assert found.reference.tolist() == [1, 0]
     assert found.search.tolist() == [[2, 0], [1, 2]]
-    assert found.is_worth.tolist() == [[True, False], [True, False]]
+    assert found.is_helpful.tolist() == [[True, False], [True, False]]
 
 
 def test_far_from_all_points_the_whole_scene_says_which_view_misleads():
@@ -261,7 +261,7 @@ def test_far_from_all_points_the_whole_scene_says_which_view_misleads():
     found = order_views(ranking_of(xy, labels), np.ones((4, 2)), at, OPTIONS)
     assert found.reference.tolist() == [2, 0]
     assert found.search[0].tolist() == [3, 0, 1]
-    assert found.is_worth.tolist() == [[True, False, False], [True, True, True]]
+    assert found.is_helpful.tolist() == [[True, False, False], [True, True, True]]
 
 
 @pytest.mark.parametrize("xy", [np.zeros((0, 2)), np.full((3, 2), 1e5)], ids=["no point at all", "far points"])
@@ -275,9 +275,9 @@ def test_cells_of_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a
         assert sorted([int(found.reference[b]), *found.search[b].tolist()]) == [0, 1, 2]
     if len(xy):
         assert found.search[0].tolist() == [2, 1], "by the whole scene"
-        assert found.is_worth[0].tolist() == [True, False]
+        assert found.is_helpful[0].tolist() == [True, False]
     else:
-        assert found.is_worth.all(), "nothing is known against any"
+        assert found.is_helpful.all(), "nothing is known against any"
 
 
 # --- chosen_views ---
@@ -289,8 +289,8 @@ def plainly_chosen(order, n_search, covered, of_cell, options):
     for b, reference in enumerate(order.reference.tolist()):
         chosen[b].add(reference)
         mine = np.flatnonzero(of_cell == b)
-        for view, is_worth in zip(order.search[b].tolist(), order.is_worth[b].tolist(), strict=True):
-            most = n_search[b] if is_worth else min(n_search[b], options.least_images)
+        for view, is_helpful in zip(order.search[b].tolist(), order.is_helpful[b].tolist(), strict=True):
+            most = n_search[b] if is_helpful else min(n_search[b], options.min_images)
             if any(covered[view, c] and covered[list(chosen[b]), c].sum() < 1 + most for c in mine):
                 chosen[b].add(view)
     return chosen
@@ -309,20 +309,20 @@ def choices(draw):
     n_search = draw(arrays.arrays(np.int64, n_blocks, elements=st.integers(0, n_views)))
     covered = draw(arrays.arrays(np.bool_, (n_views, n_cells)))
     of_cell = draw(arrays.arrays(np.int64, n_cells, elements=st.integers(0, n_blocks - 1)))
-    return order, n_search, covered, of_cell, SelectionOptions(least_images=draw(st.integers(1, 4)))
+    return order, n_search, covered, of_cell, SelectionOptions(min_images=draw(st.integers(1, 4)))
 
 
 @given(choices())
 def test_every_cell_is_covered_by_as_many_views_as_asked_for_or_as_there_are(choice):
-    """Those that mislead fill up to `least_images` beside the first, never beyond."""
+    """Those that mislead fill up to `min_images` beside the first, never beyond."""
     order, n_search, covered, of_cell, options = choice
     chosen = chosen_views(*choice)
     assert chosen.shape == (len(covered), len(order.reference))
     for c, b in enumerate(of_cell.tolist()):
-        helpful = [int(order.reference[b]), *order.search[b][order.is_worth[b]].tolist()]
+        helpful = [int(order.reference[b]), *order.search[b][order.is_helpful[b]].tolist()]
         covering = covered[chosen[:, b], c].sum()
         assert covering >= min(1 + n_search[b], covered[helpful, c].sum())
-        assert covering >= min(1 + n_search[b], 1 + options.least_images, covered[:, c].sum())
+        assert covering >= min(1 + n_search[b], 1 + options.min_images, covered[:, c].sum())
 
 
 @given(choices())
@@ -333,7 +333,7 @@ def test_views_are_chosen_as_in_plain_loops(choice):
 
 def test_no_view_is_taken_that_no_cell_asks_for():
     order = ViewOrder(np.array([0]), np.array([[1, 2, 3]]), np.array([[True, True, False]]))
-    of_cell, options = np.zeros(2, np.int64), SelectionOptions(least_images=2)
+    of_cell, options = np.zeros(2, np.int64), SelectionOptions(min_images=2)
 
     def taken(covered, n_search, options=options):
         chosen = chosen_views(order, np.array([n_search]), np.array(covered, bool), of_cell, options)
@@ -341,7 +341,7 @@ def test_no_view_is_taken_that_no_cell_asks_for():
 
     everywhere = [[1, 1]] * 4
     assert [taken(everywhere, n) for n in (0, 1, 2, 3)] == [[0], [0, 1], [0, 1, 2], [0, 1, 2]]
-    assert taken(everywhere, 3, SelectionOptions(least_images=3)) == [0, 1, 2, 3]
+    assert taken(everywhere, 3, SelectionOptions(min_images=3)) == [0, 1, 2, 3]
     beside = [[1, 1], [1, 0], [0, 1], [1, 1]]
     assert taken(beside, 1) == [0, 1, 2], "each cell with one"
     assert taken([[1, 1], [1, 1], [0, 0], [1, 1]], 2) == [0, 1, 3], "not the one that shows nothing"
@@ -413,7 +413,7 @@ def test_shares_of_blocks(shape, block):
 
 # --- images_needed ---
 
-BY_LABEL = replace(SHORT, sigma_steps=1000.0)
+BY_LABEL = replace(SHORT, max_sigma_steps=1000.0)
 REACH = 16
 
 
@@ -429,8 +429,8 @@ def needed(views, options, *, worth=(True, True, True), covering=None, hidden=No
     order = ViewOrder(np.zeros(2, np.int64), np.tile(search, (2, 1)), np.tile(worth, (2, 1)))
     covering = np.ones((len(cells), n_views), bool) if covering is None else covering(cells)
     surface = np.full(SHAPE, LEVEL_STEPS, np.float32)
-    coarser = Coarser(views, seen, surface, SIDE, REACH)
-    return images_needed(coarser, cells, of_block, covering, order, options)
+    curves = CoarserCurves(views, seen, surface, SIDE, REACH)
+    return images_needed(curves, cells, of_block, covering, order, options)
 
 
 def test_one_perfect_view_is_enough_by_its_label_and_not_where_precision_is_asked_for():
@@ -438,14 +438,14 @@ def test_one_perfect_view_is_enough_by_its_label_and_not_where_precision_is_aske
     by_label = needed(views, BY_LABEL)
     assert by_label.n_added.tolist() == [1, 1]
     assert by_label.evaluations == 12 * (2 * REACH + 1)
-    count = np.ones(by_label.sncc.shape, int)
-    alone = predicted_sigma(by_label.sncc, count, SIDE**2)
+    count = np.ones(by_label.mean_ncc.shape, int)
+    alone = predicted_sigma(by_label.mean_ncc, count, SIDE**2)
     assert 0 < alone.min() <= alone.max() < 1.0
-    precise = needed(views, replace(SHORT, sigma_steps=float(alone.min()) * 0.8))
+    precise = needed(views, replace(SHORT, max_sigma_steps=float(alone.min()) * 0.8))
     assert (precise.n_added > 1).all()
-    assert needed(views, replace(SHORT, sigma_steps=float(alone.max()) * 1.01)).n_added.tolist() == [1, 1]
-    assert needed(views, replace(SHORT, sigma_steps=1e-3)).n_added.tolist() == [3, 3]
-    np.testing.assert_array_equal(by_label.sncc.argmax(axis=1), REACH)
+    assert needed(views, replace(SHORT, max_sigma_steps=float(alone.max()) * 1.01)).n_added.tolist() == [1, 1]
+    assert needed(views, replace(SHORT, max_sigma_steps=1e-3)).n_added.tolist() == [3, 3]
+    np.testing.assert_array_equal(by_label.mean_ncc.argmax(axis=1), REACH)
 
 
 def test_a_spoiled_view_before_the_good_ones_is_not_enough():
@@ -455,7 +455,7 @@ def test_a_spoiled_view_before_the_good_ones_is_not_enough():
 
 
 def test_views_that_mislead_are_not_asked():
-    found = needed(textured(), replace(SHORT, sigma_steps=1e-3), worth=(True, False, False))
+    found = needed(textured(), replace(SHORT, max_sigma_steps=1e-3), worth=(True, False, False))
     assert found.n_added.tolist() == [1, 1]
     assert found.evaluations == found.evaluations_all == 12 * (2 * REACH + 1)
 
@@ -465,19 +465,19 @@ def test_heights_at_which_a_view_is_hidden_are_left_out():
     hidden_above = int(LEVEL_STEPS) - 3
     views, one = textured(), (True, False, False)
     index = LEVEL_STEPS - REACH + np.arange(2 * REACH + 1)
-    open_ = needed(views, BY_LABEL, worth=one).sncc
+    open_ = needed(views, BY_LABEL, worth=one).mean_ncc
     assert not np.isnan(open_).any()
     for which in (0, 1):
         hidden = [-1000] * 4
         hidden[which] = hidden_above
-        found = needed(views, BY_LABEL, worth=one, hidden=hidden).sncc
+        found = needed(views, BY_LABEL, worth=one, hidden=hidden).mean_ncc
         np.testing.assert_array_equal(np.isnan(found), np.broadcast_to(index < hidden_above, found.shape))
         np.testing.assert_array_equal(found[:, index >= hidden_above], open_[:, index >= hidden_above])
     # Hidden at the peak: the next view is needed, and it alone makes the curve there.
     found = needed(views, BY_LABEL, hidden=[-1000, int(LEVEL_STEPS) + 5, -1000, -1000])
     assert found.n_added.tolist() == [2, 2]
-    alone = needed(views, BY_LABEL, search=(2, 1, 3), worth=one).sncc
-    np.testing.assert_array_equal(found.sncc[:, REACH], alone[:, REACH])
+    alone = needed(views, BY_LABEL, search=(2, 1, 3), worth=one).mean_ncc
+    np.testing.assert_array_equal(found.mean_ncc[:, REACH], alone[:, REACH])
 
 
 def test_a_block_none_of_whose_samples_is_seen_adds_nothing():
@@ -492,7 +492,7 @@ def test_a_block_none_of_whose_samples_is_seen_adds_nothing():
     for covering in (right_only, reference_on_the_right_only):
         found = needed(textured(), BY_LABEL, covering=covering)
         assert found.n_added.tolist() == [0, 1]
-        assert np.isnan(found.sncc[:6]).all()
+        assert np.isnan(found.mean_ncc[:6]).all()
 
 
 # --- predicted_sigma ---

@@ -36,7 +36,7 @@ def corners():
 
 
 def chosen(views, n):
-    return [views[i].name for i in preselected(views, corners(), Z, SelectionOptions(candidates=n))]
+    return [views[i].name for i in preselected(views, corners(), Z, SelectionOptions(max_candidates=n))]
 
 
 def test_a_hundred_images_leave_a_reference_and_its_candidates():

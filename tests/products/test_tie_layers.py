@@ -16,7 +16,7 @@ from zlocus.core.errors import OutputError
 from zlocus.core.grid import CellWindow
 from zlocus.core.scene import Scene, View
 from zlocus.io.crs import local_frame
-from zlocus.matching.view_ranking import NOT_RANKED, LabelledTies, PairLabels
+from zlocus.matching.pair_labels import NOT_RANKED, LabelledTies, PairLabels, TileLabels
 from zlocus.orientation.orientation import Orientation, Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.products import tie_layers as points
@@ -115,9 +115,9 @@ def test_labels_of_very_many_images_are_one_text(tmp_path, monkeypatch):
 def test_a_tile_keeps_the_points_of_its_own_cells():
     xy = np.array([[9.9, 20.0], [10.0, 20.0], [13.9, 22.9], [12.0, 23.0]])
     labels = np.arange(4, dtype=np.int8)[:, None, None] * np.ones((2, 2), np.int8)
-    ranking = PairLabels(np.array([4, 0, 2, 1]), xy, labels, np.ones((2, 2)))
+    pair_labels = PairLabels(np.array([4, 0, 2, 1]), xy, labels, np.ones((2, 2)))
     ties = np.arange(15.0).reshape(5, 3)
-    found = LabelledTies.of(ranking, [3, 5], ties, CellWindow(20, 10, 3, 4))
+    found = LabelledTies.of(TileLabels(pair_labels, [3, 5]), ties, CellWindow(20, 10, 3, 4))
     np.testing.assert_array_equal(found.xyz, ties[[0, 2]])
     assert found.labels[:, 0, 1].tolist() == [1, 2]
     assert found.views.tolist() == [3, 5]

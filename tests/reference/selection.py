@@ -14,10 +14,10 @@ def peaks(curve, step_px, options):
     rho2 = None
     for k in seen:
         if k - 1 in seen and k + 1 in seen and curve[k] > curve[k - 1] and curve[k] > curve[k + 1]:
-            is_rival = round(abs(k - peak) * step_px, 6) >= options.rival_px
+            is_rival = round(abs(k - peak) * step_px, 6) >= options.second_peak_distance_px
             if is_rival and (rho2 is None or curve[k] > rho2):
                 rho2 = curve[k]
-    is_open = peak - 1 not in seen or peak + 1 not in seen or len(seen) / len(curve) < options.least_seen
+    is_open = peak - 1 not in seen or peak + 1 not in seen or len(seen) / len(curve) < options.min_visible_share
     return curve[peak], rho2, is_open
 
 
@@ -26,7 +26,7 @@ def label(curve, step_px, options):
     rho1, rho2, is_open = peaks(curve, step_px, options)
     if rho1 is None:
         return -1
-    if rho2 is None or rho2 == 0 or (rho2 < 0 and options.negative_rival == "infinite"):
+    if rho2 is None or rho2 == 0 or (rho2 < 0 and options.negative_second_peak == "infinite"):
         ratio = math.inf
     else:
         ratio = abs(rho1 / rho2)
@@ -40,12 +40,12 @@ def label(curve, step_px, options):
 
 
 def radius_neighbours(features, at, options):
-    """(evidence, feature points by distance) of one cell."""
+    """(order_source, feature points by distance) of one cell."""
     by_distance = sorted((math.hypot(at[0] - x, at[1] - y), n) for n, (x, y) in enumerate(features))
     close = [n for distance, n in by_distance if distance <= options.radius_px]
     if close:
         return 0, close
-    widest = options.widest * options.radius_px
+    widest = options.max_radii * options.radius_px
     if not by_distance or by_distance[0][0] > widest:
         return 2, []
     farthest = by_distance[min(options.nearest, len(by_distance)) - 1][0]

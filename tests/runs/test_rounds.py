@@ -12,20 +12,20 @@ from zlocus.core.options import RunConfig
 from zlocus.matching import tile
 
 TWO_ROUNDS, SMALL_TWICE = (
-    replace(config, pyramid=replace(config.pyramid, finest_rounds=2)) for config in (RunConfig(), SMALL_TILES)
+    replace(config, pyramid=replace(config.pyramid, finest_level_rounds=2)) for config in (RunConfig(), SMALL_TILES)
 )
 
 
 @pytest.fixture
 def levels_matched(monkeypatch):
-    """(level, whether views may be hidden, cells by which obstacles are narrowed) of every level that is matched."""
-    calls, one = [], tile._match_level
+    """(level, whether occlusions are found, cells by which the occluding surface is eroded) of every matched level."""
+    calls, one = [], tile.match_level
 
-    def counted(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking):
-        calls.append((level, use_visibility, len(guide.obstacle) // 2))
-        return one(scene, pixels, core, window, level, guide, config, method, use_visibility, ranking)
+    def counted(inputs, level, prior, pair_labels):
+        calls.append((level.number, inputs.handles_occlusion, len(prior.erosion) // 2))
+        return one(inputs, level, prior, pair_labels)
 
-    monkeypatch.setattr(tile, "_match_level", counted)
+    monkeypatch.setattr(tile, "match_level", counted)
     return calls
 
 
@@ -39,10 +39,14 @@ def test_two_views_have_one_and_none_is_hidden(images, tmp_path, levels_matched)
     assert [call for call in levels_matched if call[0] == 0] == [(0, False, 2)]
 
 
-def test_one_round_by_default_and_without_visibility(images, tmp_path, levels_matched):
-    run(images("step"), tmp_path / "a")
-    run(images("step"), tmp_path / "b", TWO_ROUNDS, views="all")
-    assert [call[2] for call in levels_matched if call[0] == 0] == [2, 2]
+def test_one_round_by_default(images, tmp_path, levels_matched):
+    run(images("step"), tmp_path / "out")
+    assert [call for call in levels_matched if call[0] == 0] == [(0, True, 2)]
+
+
+def test_occlusions_are_found_without_a_choice_of_images_too(images, tmp_path, levels_matched):
+    run(images("step"), tmp_path / "out", TWO_ROUNDS, views="all")
+    assert [call for call in levels_matched if call[0] == 0] == [(0, True, 2), (0, True, 1)]
 
 
 def test_workers_change_nothing(images, tmp_path):

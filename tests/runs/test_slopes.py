@@ -66,6 +66,6 @@ def test_heights_of_a_hillside(hillside, tmp_path):
 
 def test_a_level_base_makes_stairs(hillside, tmp_path, monkeypatch):
     """What the base surface is for: without it the same bar is missed, by heights a step of the stairs away."""
-    monkeypatch.setattr(SlopeSurface, "along", lambda surface, block, _=None: SlopeSurface.flat(surface.shape, block))
+    monkeypatch.setattr(SlopeSurface, "from_surface", lambda surface, block, _=None: SlopeSurface.flat(surface.shape, block))
     error = errors_on(hillside, tmp_path / "out")
     assert (np.abs(error) < WITHIN_M).mean() < WITHIN

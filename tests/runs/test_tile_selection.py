@@ -37,10 +37,10 @@ SPEC = SceneSpec(
     objects=Objects(35.0, 22.0, 0.0, 10.0, plain_roofs=1.0),
 )  # fmt: skip
 # Small blocks, so that there are some.
-SMALL_BLOCKS = RunConfig(pyramid=PyramidOptions(block=16), selection=SelectionOptions(fewest_views=3))
-USE_ALL = replace(SMALL_BLOCKS, selection=SelectionOptions(least_images=254, most_images=254))
+SMALL_BLOCKS = RunConfig(pyramid=PyramidOptions(block=16), selection=SelectionOptions(min_images_for_choice=3))
+USE_ALL = replace(SMALL_BLOCKS, selection=SelectionOptions(min_images=254, max_images=254))
 # Hardly any block has a tie point as near as this.
-LONELY = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, widest=1.0, fewest_views=3))
+LONELY = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, max_radii=1.0, min_images_for_choice=3))
 WITHIN_M, ROAD, BUILDING = 1.0, 1, 2
 # Cells that may be lost, of a few tens of thousands.
 COVERAGE = 0.005
@@ -80,17 +80,17 @@ def surface(town, out, config=SMALL_BLOCKS, names=(*GOOD_VIEWS, SPOILED), **requ
 @pytest.fixture
 def blocks_used(monkeypatch):
     """By name of the view, the share of the finest level's blocks that are matched with it."""
-    found, choose = {}, zlocus.matching.tile._choose
+    found, choose = {}, zlocus.matching.tile.choose_views
     names, match = [], zlocus.matching.tile.match_tile
 
-    def matched(scene, *rest):
-        names[:] = [view.name.removeprefix("img_") for view in scene.views]
-        return match(scene, *rest)
+    def matched(match_scene, *rest):
+        names[:] = [view.name.removeprefix("img_") for view in match_scene.views]
+        return match(match_scene, *rest)
 
-    def chosen(seen, ranking, lattice, window, level, *rest):
-        used, *others = choose(seen, ranking, lattice, window, level, *rest)
-        if level == 0:
-            for name, takes, might in zip(names, covers(used), covers(seen), strict=True):
+    def choose_and_count(level, lattice, visible, *rest):
+        chosen = choose(level, lattice, visible, *rest)
+        if level.number == 0:
+            for name, takes, might in zip(names, covers(chosen.matched), covers(visible), strict=True):
                 by_block = [
                     (takes[r : r + lattice.block, c : c + lattice.block].any())
                     for r in range(0, lattice.shape[0], lattice.block)
@@ -98,10 +98,10 @@ def blocks_used(monkeypatch):
                     if might[r : r + lattice.block, c : c + lattice.block].any()
                 ]
                 found[name] = float(np.mean(by_block))
-        return used, *others
+        return chosen
 
     monkeypatch.setattr(zlocus.pipeline.tile_run, "match_tile", matched)
-    monkeypatch.setattr(zlocus.matching.tile, "_choose", chosen)
+    monkeypatch.setattr(zlocus.matching.tile, "choose_views", choose_and_count)
     return found
 
 
@@ -151,7 +151,7 @@ def test_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a_height(t
 
     def watched(ranking, share, at, options):
         apart = np.hypot(*(at[:, None] - ranking.xy[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-        rows.append((apart > options.widest * options.radius_px).mean())
+        rows.append((apart > options.max_radii * options.radius_px).mean())
         found = order(ranking, share, at, options)
         assert (np.sort(np.column_stack([found.reference, found.search])) == np.arange(len(share))).all()
         return found

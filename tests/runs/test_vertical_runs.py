@@ -25,6 +25,7 @@ from zlocus.core.footprints import shared_ground
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress, progress_for
 from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.control_points import read_control
 from zlocus.io.grid_inputs import dem_datum
@@ -140,7 +141,7 @@ def points_in(path):
 
 
 def test_a_surface_above_a_geoid_is_judged_and_gives_its_grid(both, images, tmp_path):
-    found = evaluate(both[1] / "dsm.tif", both[1] / "dsm.tif", margin_m=0.0).all
+    found = evaluate(both[1] / "dsm.tif", Comparison(both[1] / "dsm.tif", margin_m=0.0)).statistics
     assert found.median == 0.0
     assert found.completeness > 0.95
     again = run(images("sine"), tmp_path / "again", SMALL_TILES, like=both[1] / "dsm.tif", heights=HEIGHTS).out

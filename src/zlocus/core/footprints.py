@@ -35,11 +35,12 @@ AREA_PERCENT, AREA_MARGIN, MIN_TIES_FOR_AREA = (0.5, 99.5), 0.05, 20
 
 
 def footprint(view: View, z: float, per_side: int = 8, margin_px: float = 0.0) -> FloatArray:
-    """Outline of an image on the ground at height z (m), (4 * per_side, 2) m, clockwise or counter-clockwise, not closed.
+    """Outline of an image on the ground at height z (m), (4 * per_side, 2) m, clockwise or counter-clockwise, not
+    closed.
 
     Of an image in a sparse file: the outline of the part that the file holds. The outline runs along the outer edges of
-    the border pixels, or `margin_px` outside of them. It has `per_side` points on each side, because the sides of a line
-    scanner's image are curves. Points that the sensor cannot map are left out.
+    the border pixels, or `margin_px` outside of them. It has `per_side` points on each side, because the sides of a
+    line scanner's image are curves. Points that the sensor cannot map are left out.
     """
     top, left, rows, cols = held_window(view.image)
     t = np.arange(per_side) / per_side
@@ -162,8 +163,8 @@ def area_to_match(scene: Scene, z_range: tuple[float, float], ties: FloatArray) 
     """Bounds (xmin, ymin, xmax, ymax), m, of the area to match.
 
     The area that the scene file gives, or else the ground that two views see between two heights (m). In a local frame
-    that ground is cut to the surroundings of the tie points, because cameras there may look at a wall from the side: what
-    two footprints share far behind the wall is many times the area of the wall.
+    that ground is cut to the surroundings of the tie points, because cameras there may look at a wall from the side:
+    what two footprints share far behind the wall is many times the area of the wall.
 
     ties : (n, 3) m, tie points that their neighbours support.
     """
@@ -205,8 +206,8 @@ class ViewGeometry:
     """How one image lies on the ground.
 
     outline : polygon of the footprint in the scene's frame, empty where the rays meet no ground; ground_px_m : ground
-    pixel at its middle, m; closing_px : largest distance by which a pixel that is projected to the ground and back misses
-    itself, NaN where the camera maps none; lost : share of pixels that the camera cannot map.
+    pixel at its middle, m; closing_px : largest distance by which a pixel that is projected to the ground and back
+    misses itself, NaN where the camera maps none; lost : share of pixels that the camera cannot map.
     """
 
     outline: Any
@@ -219,8 +220,9 @@ class ViewGeometry:
 class PairGeometry:
     """How two images overlap.
 
-    views : their numbers; overlap : area of the shared ground over that of the smaller footprint; base_to_height : by how
-    much their rays diverge for each metre of height, at the middle of the shared ground; shared : polygon of that ground.
+    views : their numbers; overlap : area of the shared ground over that of the smaller footprint; base_to_height : by
+    how much their rays diverge for each metre of height, at the middle of the shared ground; shared : polygon of that
+    ground.
     """
 
     views: tuple[int, int]

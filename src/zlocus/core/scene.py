@@ -175,15 +175,3 @@ class Scene:
 def is_local(crs: CRS) -> bool:
     """Whether a frame is local Cartesian axes at no known place of the Earth."""
     return bool(crs.is_engineering)
-
-
-
-
-
-
-
-
-
-
-
-

@@ -20,7 +20,7 @@ from zlocus.inspector.profile import reference_at
 from zlocus.inspector.reference import Reference
 from zlocus.inspector.restored_run import Restored
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.point_match import LookedAt, curves_at
+from zlocus.matching.point_match import PlaceCurves, curves_at
 from zlocus.pipeline.report_inputs import NOT_SHOWN, SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.match_curve_figures import (
     STRETCH_PERCENT,
@@ -40,7 +40,7 @@ BLACK, BRIGHT = 1, 255  # 0: not shown by the image
 
 @dataclass(frozen=True)
 class WhatIf:
-    """What is looked at otherwise than in the run. left_out : names of images; reference : name of the image to be it;
+    """What is place_curves at otherwise than in the run. left_out : names of images; reference : name of the image to be it;
     window : side of the window, cells; selection : options of `SelectionOptions` by name."""
 
     left_out: frozenset[str] = frozenset()
@@ -112,11 +112,11 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     if len(match_scene.views) < 2:
         raise GeometryError("Two images are needed at least. Switch another one on.")
     try:
-        looked = curves_at("The cell", what_if.reference, match_scene, place, config, SHOWN_WITHIN_CELLS)
+        place_curves = curves_at("The cell", what_if.reference, match_scene, place, config, SHOWN_WITHIN_CELLS)
     except GeometryError as error:
         raise GeometryError(why_not_shown(what_if)) from error
-    report = PointReport.of("the cell", looked, match_scene, matched.scene.crs)
-    images = image_records(looked, loci(looked.views, report))
+    report = PointReport.of("the cell", place_curves, match_scene, matched.scene.crs)
+    images = image_records(place_curves, loci(place_curves.views, report))
     below = float(matched.undulation(xy[None])[0])
     report = replace(
         report, heights_m=report.heights_m - below, peak_m=report.peak_m - below, xyz=report.xyz - (0.0, 0.0, below)
@@ -131,7 +131,7 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
         "says": {"order": what_order_rests_on(report, options), "stop": where_it_stops(report, options)},
         "images": images,
         "window": large_window_side(config.cost),
-        "neighbours": neighbour_records(looked, match_scene, config),
+        "neighbours": neighbour_records(place_curves, match_scene, config),
     }
 
 
@@ -142,16 +142,16 @@ def why_not_shown(what_if: WhatIf) -> str:
     return NOT_SHOWN + (" Some are switched off." if what_if.left_out else "")
 
 
-def image_records(looked: LookedAt, found: list[Locus]) -> list[dict[str, Any]]:
+def image_records(place_curves: PlaceCurves, found: list[Locus]) -> list[dict[str, Any]]:
     """What each image shows of a place, the reference first: a crop with the locus, and windows at every height."""
-    names = [view.name for view in looked.views]
-    middle, large, less = len(looked.heights_m) // 2, looked.patches(SHOWN_SIDES[0]), None
+    names = [view.name for view in place_curves.views]
+    middle, large, less = len(place_curves.heights_m) // 2, place_curves.patches(SHOWN_SIDES[0]), None
     records = []
     for locus in found:
         i = names.index(locus.name)
         side, patches = SHOWN_SIDES[0], large[i]
         if not np.isfinite(patches[middle]).all():
-            less = looked.patches(SHOWN_SIDES[1]) if less is None else less
+            less = place_curves.patches(SHOWN_SIDES[1]) if less is None else less
             side, patches = SHOWN_SIDES[1], less[i]
         records.append(
             {
@@ -164,9 +164,9 @@ def image_records(looked: LookedAt, found: list[Locus]) -> list[dict[str, Any]]:
     return records
 
 
-def neighbour_records(looked: LookedAt, match_scene: MatchScene, config: RunConfig) -> dict[str, Any]:
+def neighbour_records(place_curves: PlaceCurves, match_scene: MatchScene, config: RunConfig) -> dict[str, Any]:
     """The tie points that order the images, on the ground, with their labels."""
-    order, options = looked.curves.order, config.selection
+    order, options = place_curves.curves.order, config.selection
     xy = match_scene.anchor + order.xy * match_scene.cell_m * (1.0, -1.0)
     return {
         "by": options.neighbours, "radius_m": options.radius_px * match_scene.cell_m,

@@ -24,7 +24,7 @@ from zlocus.inspector.reference import Reference, check_comparison, reference_fo
 from zlocus.inspector.restored_run import Restored, config_of, restored
 from zlocus.io.run_record import read_record
 from zlocus.pipeline.report_inputs import said
-from zlocus.products.report.comparison import Comparison
+from zlocus.evaluation.comparison import Comparison
 from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.report.page import KIND_WORDS
 
@@ -39,7 +39,7 @@ NOT_THE_SAME = (
 NOT_KNOWN = "The run did not keep what tells whether cameras come out again as they were."
 MADE_AGAIN = "The surface was made again, or removed, since this page was opened. Start `zlocus inspect` anew."
 # Options that nothing of a single cell depends on.
-OF_RUNS = ("stopped_share", "fewest_views")
+OF_RUNS = ("stopped_share", "min_images_for_choice")
 
 
 @dataclass
@@ -220,7 +220,7 @@ class Inspection:
             "made": run.get("created", ""),
             "images": list(run["orientation"]["views"]), "method": run["config"]["request"]["method"],
             "small_window": config.cost.small_window, "max_images_for_large_window": config.cost.max_images_for_large_window,
-            "fewest_views": config.selection.fewest_views, "views": run["config"]["request"]["views"],
+            "min_images_for_choice": config.selection.min_images_for_choice, "views": run["config"]["request"]["views"],
             "options": options_record(config.selection),
             "window": {"value": large_window_side(config.cost), "choices": list(WINDOWS)},
             "cells": self._cells(),

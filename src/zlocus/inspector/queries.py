@@ -17,7 +17,7 @@ Pairs = Iterable[tuple[str, str]]
 # Pixels of a picture, and along one side of it; layers over each other; levels of a map.
 MOST_PX, MOST_SIDE_PX, MOST_LAYERS, MOST_LEVELS = 10_000_000, 4096, 8, 24
 # Options that make an answer large are held below what a run may take.
-MOST = {"reach_steps": 200, "candidates": 48, "nearest": 500, "most_images": 48, "least_images": 48}
+MOST = {"reach_steps": 200, "max_candidates": 48, "nearest": 500, "max_images": 48, "min_images": 48}
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 # Cells from the grid at which something may still be asked for.
 FARTHEST_CELLS = 1e7

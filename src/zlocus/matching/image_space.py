@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError, GeometryError
+from zlocus.core.footprints import ground_sample_distance
+from zlocus.core.grid import cells_of_bounds
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
 from zlocus.core.scene import ImageSource, ImageWindow, Scene, View
-from zlocus.core.footprints import ground_sample_distance
 from zlocus.core.sensor_model import FloatArray
-from zlocus.matching.match_scene import MatchScene, levels_for, seen_window
+from zlocus.matching.match_scene import MatchScene, levels_for
 from zlocus.matching.radiometry import grey_scales
 from zlocus.matching.tile_views import COARSER_TABLE_PX, FINEST_TABLE_PX
 from zlocus.sensors.correction import ShiftedModel
@@ -40,11 +41,11 @@ BY_DEPTH: dict[str, dict[str, Any]] = {
     "semiglobal": {
         "predecessors": 1,
         "p1": 20,
-        "p1_two": 20,
+        "p1_two_images": 20,
         "p2": 240,
         "p2_edge": 100,
         "edge_contrast": 2.0,
-        "edge_contrast_two": 2.0,
+        "edge_contrast_two_images": 2.0,
     },
 }
 SMALLEST_BLOCK = 8
@@ -180,7 +181,7 @@ def build_image_match_scene(
         step_m=step,
         n_steps=n_steps,
         levels=levels,
-        seen=seen_window((-0.5, 0.5 - rows, cols - 0.5, 0.5), ANCHOR, 1.0, levels),
+        overlap_window=cells_of_bounds((-0.5, 0.5 - rows, cols - 0.5, 0.5), ANCHOR, 1.0, levels),
         grey=grey_scales(views, ties if ground is None else ground),
         ties=ties,
     )
@@ -280,7 +281,7 @@ def _fits(scene: MatchScene, block: int) -> bool:
     z_range = (scene.origin_m - 2 * step, scene.origin_m + scene.n_steps * scene.step_m + 18 * step)
     try:
         for level in range(scene.levels):
-            window = scene.seen.at_level(level, 0)
+            window = scene.overlap_window.at_level(level, 0)
             tolerance_px = 2**level * (COARSER_TABLE_PX if level else FINEST_TABLE_PX)
             for view in scene.views:
                 shape = (window.rows, window.cols)

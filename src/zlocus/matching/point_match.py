@@ -1,6 +1,7 @@
-"""One cell under the glass: match curve of every search view, their order, and where the mean of the first is enough.
+"""Match curves, order of images and stopping point of one cell, for `zlocus curves` and the inspector.
 
-What `zlocus.matching.view_selection` does for blocks, with all that it passes through kept.
+The same steps as `zlocus.matching.view_selection` takes for blocks, with every intermediate result kept. Heights are
+lattice indices (`zlocus.matching.height_lattice`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
+from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import (
     CurvePeaks,
     ProgressiveMean,
@@ -27,36 +29,37 @@ from zlocus.matching.match_curve import (
     quality_labels,
 )
 from zlocus.matching.match_scene import MatchScene
+from zlocus.matching.pair_labels import PairLabels, TiesOnGrid, label_pairs
 from zlocus.matching.tile_views import TileViews, pixel_window, read_pixels, tile_views
 from zlocus.matching.view_directions import cells_per_step
-from zlocus.matching.view_ranking import (
-    OrderSource,
-    FeaturePoints,
-    NeighbourSearch,
-    PairLabels,
-    Samples,
-    order_images,
-    label_pairs,
-)
+from zlocus.matching.view_ranking import FeaturePoints, NeighbourSearch, OrderSource, order_images
 from zlocus.matching.view_selection import order_views, preselected
 
 IntArray = NDArray[np.int64]
 
+# The height of a place where none is given is the median height of this many nearest tie points.
+NEAREST_TIES = 5
+# Tie points within this distance order the images of a cell where none is nearer.
+RANKED_WITHIN_CELLS = 2048
+# Points along each side of a window whose projections say which pixels it needs.
+GROUND_POINTS_PER_SIDE = 5
+
 
 @dataclass(frozen=True)
 class PointOrder:
-    """The reference of a cell and the other views that show it, best first.
+    """The reference image of a cell and the other views that show it, best first.
 
-    reference : view; search : (j,) int64 views; accumulated : (j,) int64, their labels summed over the feature points
-    around; is_worth : (j,) bool, whether they help; order_source : what the order rests on; features : (f,) int64 feature
-    points, the nearest first; xy : (f, 2) float64, where they are, as `PairLabels.xy`; distance : (f,) float64 cells;
-    labels : (f, j) int8, of the search views there.
+    reference : number of the view; search : (j,) int64 views; accumulated : (j,) int64, their labels accumulated over
+    the feature points around; is_helpful : (j,) bool, whether they improve the match; order_source : which feature
+    points the order rests on; features : (f,) int64, numbers of these feature points, the nearest first; xy : (f, 2)
+    float64, where they are, as `PairLabels.xy`; distance : (f,) float64 cells; labels : (f, j) int8, of the search
+    views there.
     """
 
     reference: int
     search: IntArray
     accumulated: IntArray
-    is_worth: NDArray[np.bool_]
+    is_helpful: NDArray[np.bool_]
     order_source: OrderSource
     features: IntArray
     xy: FloatArray
@@ -66,7 +69,10 @@ class PointOrder:
 
 @dataclass(frozen=True)
 class JudgedCurves:
-    """Match curves and what Table 1 says of them. values : (j, h) float64, NaN where not seen; labels : (j,) int8."""
+    """Match curves with their peaks and labels.
+
+    values : (j, h) float64, NaN where not visible; labels : (j,) int8, by table 1 of Ji et al. 2014.
+    """
 
     values: FloatArray
     peaks: CurvePeaks
@@ -74,23 +80,25 @@ class JudgedCurves:
 
     @classmethod
     def of(cls, values: FloatArray, step_px: FloatArray, options: SelectionOptions) -> JudgedCurves:
-        """Judge curves. step_px : (j,), see `curve_peaks`."""
+        """Peaks and labels of curves. step_px : (j,), see `curve_peaks`."""
         peaks = curve_peaks(values, step_px, options)
         return cls(values, peaks, quality_labels(peaks.rho1, peaks.ratio, peaks.is_open, options))
 
 
 @dataclass(frozen=True)
 class PointCurves:
-    """All that one cell's match passes through.
+    """The match of one cell.
 
-    order; index : (h,) float64, height indices; step_px : (j,) float64, equivalent disparity of a step; single : NCC
-    with each search view, in their order; mean : SNCC of the first 1, 2, ... of them; sigma_steps : (j,) float64,
-    predicted for its peak, infinite where it has no two sides; n_used : views after which the match ends; is_stopped :
-    whether the mean was enough by then, else no view that helps was left (of such, `least_images` are used at least).
+    order : reference and search views; lattice_index : (h,) float64, heights of the curves; step_px : (j,) float64,
+    equivalent disparity of a height step; single : correlation of the reference with each search view, in their order;
+    mean : mean correlation of the first 1, 2, ... of them; sigma_steps : (j,) float64, predicted standard deviation of
+    the peak of each mean, infinite where the peak lies at an end; n_used : number of search views with which the match
+    ends; is_stopped : whether the mean was good enough by then; if not, no helpful view was left (at least `min_images`
+    are used all the same).
     """
 
     order: PointOrder
-    index: FloatArray
+    lattice_index: FloatArray
     step_px: FloatArray
     single: JudgedCurves
     mean: JudgedCurves
@@ -100,118 +108,141 @@ class PointCurves:
 
     @property
     def peak_index(self) -> float:
-        """Height index of the peak of the mean where the match ends, between samples by a parabola; NaN without one."""
-        return peak_of(self.index, self.mean.values[self.n_used - 1])
+        """Lattice index of the peak of the mean with which the match ends, refined by a parabola; NaN without a
+        peak."""
+        return peak_of(self.lattice_index, self.mean.values[self.n_used - 1])
 
 
-def peak_of(index: FloatArray, curve: FloatArray) -> float:
-    """Height index of the largest value of a curve, (h,) both; the vertex of a parabola where both sides are seen."""
+def peak_of(lattice_index: FloatArray, curve: FloatArray) -> float:
+    """Lattice index of the largest value of a curve, (h,) both: the vertex of a parabola where both sides are visible.
+
+    NaN where no value is.
+    """
     if np.isnan(curve).all():
         return np.nan
     peak = int(np.nanargmax(curve))
     if not 0 < peak < len(curve) - 1:
-        return float(index[peak])
+        return float(lattice_index[peak])
     left, top, right = curve[peak - 1 : peak + 2]
     bend = left - 2 * top + right
-    return float(index[peak] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
+    return float(lattice_index[peak] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
 
 
-def point_order(ranking: PairLabels, share: FloatArray, at: FloatArray, options: SelectionOptions) -> PointOrder:
-    """Reference and order of the views at one place.
+def point_order(pair_labels: PairLabels, share: FloatArray, xy: FloatArray, options: SelectionOptions) -> PointOrder:
+    """Reference image and order of the views at one place.
 
-    share : (i,) float64, 1 for views that show it and may be the reference; at : (2,) float64, as `PairLabels.xy`.
+    share : (i,) float64, 1 for views that show the place and may be the reference; xy : (2,) float64, as
+    `PairLabels.xy`.
     """
-    found = order_views(ranking, share[:, None], at[None], options)
-    reference, search = int(found.reference[0]), found.search[0]
+    view_order = order_views(pair_labels, share[:, None], xy[None], options)
+    reference, search = int(view_order.reference[0]), view_order.search[0]
     others = np.delete(np.arange(len(share)), reference)
-    labels = ranking.labels[:, reference]
-    order = order_images(FeaturePoints(ranking.xy, labels[:, others]), at[None], options)
-    accumulated = dict(zip(others.tolist(), order.accumulated[0].tolist(), strict=True))
-    features = NeighbourSearch(ranking.xy, options).of(at[None]).index
+    labels = pair_labels.labels[:, reference]
+    image_order = order_images(FeaturePoints(pair_labels.xy, labels[:, others]), xy[None], options)
+    accumulated = dict(zip(others.tolist(), image_order.accumulated[0].tolist(), strict=True))
+    features = NeighbourSearch(pair_labels.xy, options).of(xy[None]).index
     return PointOrder(
         reference=reference,
         search=search,
         accumulated=np.array([accumulated[i] for i in search.tolist()], np.int64),
-        is_worth=found.is_worth[0],
-        order_source=OrderSource(int(order.order_source[0])),
+        is_helpful=view_order.is_helpful[0],
+        order_source=OrderSource(int(image_order.order_source[0])),
         features=features,
-        xy=ranking.xy[features],
-        distance=np.hypot(*(ranking.xy[features] - at).T),
+        xy=pair_labels.xy[features],
+        distance=np.hypot(*(pair_labels.xy[features] - xy).T),
         labels=labels[features][:, search],
     )
 
 
 def cell_windows(
-    views: TileViews, window: CellWindow, cell: tuple[int, int], index: float, side: int, reach: int
+    tile_views: TileViews, window: CellWindow, cell: tuple[int, int], lattice_index: float, side: int, reach: int
 ) -> NDArray[np.float32]:
-    """Level windows of every view around a cell, (i, h, k) float32, NaN where a view does not show them.
+    """Level correlation windows of every view around a cell, (i, h, k) float32, NaN where a view does not show them.
 
-    views : of the cells `window`; cell : row and column of the lattice; index : height index in the middle; reach :
-    indices to both sides; side : cells of the window.
+    tile_views : of the cells `window`; cell : row and column of the lattice; lattice_index : the middle of the heights;
+    side : cells along the side of a correlation window; reach : height steps to both sides.
     """
-    at = np.array([[cell[0] - window.row, cell[1] - window.col]], np.int64)
-    flat = np.zeros((1, side * side), np.float32)
-    samples = Samples(at, np.array([index - reach]), 2 * reach + 1, flat)
-    return np.concatenate([samples.windows(views, i, slice(None)) for i in range(len(views.layout))])
+    cells = np.array([[cell[0] - window.row, cell[1] - window.col]], np.int64)
+    level = np.zeros((1, side * side), np.float32)
+    samples = CurveSamples(cells, np.array([lattice_index - reach]), 2 * reach + 1, level)
+    return np.concatenate([samples.windows(tile_views, i, slice(None)) for i in range(len(tile_views.layout))])
 
 
-def steps_px(views: TileViews, reference: int, search: IntArray) -> FloatArray:
+def steps_px(tile_views: TileViews, reference: int, search: IntArray) -> FloatArray:
     """Equivalent disparity of a height step of search views against the reference, (j,) float64 px."""
-    at_reference = np.array(cells_per_step(views, reference))
-    return np.array([np.hypot(*(np.array(cells_per_step(views, int(i))) - at_reference)) for i in search])
+    of_reference = np.array(cells_per_step(tile_views, reference))
+    return np.array([np.hypot(*(np.array(cells_per_step(tile_views, int(i))) - of_reference)) for i in search])
 
 
 def point_curves(
-    windows: NDArray[np.float32], order: PointOrder, step_px: FloatArray, index: FloatArray, options: SelectionOptions
+    windows: NDArray[np.float32],
+    order: PointOrder,
+    step_px: FloatArray,
+    lattice_index: FloatArray,
+    options: SelectionOptions,
 ) -> PointCurves:
-    """Match curves of one cell, one view after the other, and after how many the match ends.
+    """Match curves of one cell, one search view after the other, and after how many of them the match ends.
 
-    windows : (i, h, k) float32, normalised, NaN where not seen; step_px : (j,) px; index : (h,) height indices.
+    windows : (i, h, k) float32, of mean 0 and length 1, NaN where not visible; step_px : (j,); lattice_index : (h,).
     Source: Ji et al. 2014, section 3.3, step 3, and figures 3 to 7.
     """
     n_search, n_heights, window_cells = len(order.search), windows.shape[1], windows.shape[2]
     ncc = np.einsum("hk,jhk->jh", windows[order.reference], windows[order.search], dtype=np.float64)
-    mean, zero = ProgressiveMean.empty(1, n_heights), np.zeros(1, np.int64)
-    sncc, sigma = np.empty_like(ncc), np.empty(n_search)
+    mean, cell = ProgressiveMean.empty(1, n_heights), np.zeros(1, np.int64)
+    mean_ncc, sigma_steps = np.empty_like(ncc), np.empty(n_search)
     for m in range(n_search):
-        mean.add(zero, ncc[m : m + 1])
-        sncc[m] = mean.sncc(zero)[0]
-        sigma[m] = predicted_sigma(sncc[m : m + 1], mean.count, window_cells)[0]
-
-    def measure(_: IntArray, images: IntArray) -> NDArray[np.floating]:
-        return np.asarray(ncc[images])
-
-    plan = SearchPlan(
-        order=np.where(order.is_worth, np.arange(n_search), n_search)[None], block=zero,
-        seen=np.array([[True] * n_search + [False]]), step_px=np.append(step_px, 0.0), sample=np.ones(1, bool),
-        window_cells=window_cells,
-    )  # fmt: skip
-    match = match_progressively(measure, n_heights, plan, options)
-    is_stopped = bool(match.is_stopped[0])
-    # Views that mislead are better than none.
-    at_last = max(int(order.is_worth.sum()), min(options.least_images, n_search))
-    added = int(match.n_added[0]) if is_stopped else at_last
+        mean.add(cell, ncc[m : m + 1])
+        mean_ncc[m] = mean.of(cell)[0]
+        sigma_steps[m] = predicted_sigma(mean_ncc[m : m + 1], mean.count, window_cells)[0]
+    n_used, is_stopped = _stopping_point(ncc, order, step_px, window_cells, options)
     return PointCurves(
         order=order,
-        index=index,
+        lattice_index=lattice_index,
         step_px=step_px,
         single=JudgedCurves.of(ncc, step_px, options),
-        mean=JudgedCurves.of(sncc, np.maximum.accumulate(step_px), options),
-        sigma_steps=sigma,
-        n_used=min(added, options.most_images),
-        is_stopped=is_stopped and added <= options.most_images,
+        mean=JudgedCurves.of(mean_ncc, np.maximum.accumulate(step_px), options),
+        sigma_steps=sigma_steps,
+        n_used=n_used,
+        is_stopped=is_stopped,
     )
 
 
-NEAREST_TIES = 5
-# Cells around a point in which tie points order its images where none is nearer.
-RANKED_WITHIN_CELLS = 2048
+def _stopping_point(
+    ncc: FloatArray, order: PointOrder, step_px: FloatArray, window_cells: int, options: SelectionOptions
+) -> tuple[int, bool]:
+    """After how many search views the match of a cell ends, and whether its mean curve is good enough then.
+
+    ncc : (j, h), correlation of the reference with each search view.
+    """
+
+    def correlate(_: IntArray, images: IntArray) -> NDArray[np.floating]:
+        return np.asarray(ncc[images])
+
+    n_search, n_heights = ncc.shape
+    # View number n_search stands for "no view": a view that does not help is never added.
+    search_plan = SearchPlan(
+        order=np.where(order.is_helpful, np.arange(n_search), n_search)[None],
+        block=np.zeros(1, np.int64),
+        covered=np.array([[True] * n_search + [False]]),
+        step_px=np.append(step_px, 0.0),
+        sample=np.ones(1, bool),
+        window_cells=window_cells,
+    )
+    match = match_progressively(correlate, n_heights, search_plan, options)
+    is_stopped = bool(match.is_stopped[0])
+    # Views that do not help are better than none.
+    n_at_end = max(int(order.is_helpful.sum()), min(options.min_images, n_search))
+    n_added = int(match.n_added[0]) if is_stopped else n_at_end
+    return min(n_added, options.max_images), is_stopped and n_added <= options.max_images
 
 
 @dataclass(frozen=True)
 class Place:
-    """xyz : (3,) m, the point asked for, at the height about which it is matched; height_from : what tells it; cell :
-    row and column of the finest lattice; middle : (2,) m, of the cell."""
+    """A place whose cell is matched.
+
+    xyz : (3,) m, the point asked for, at the height around which it is matched; height_from : where that height comes
+    from, in words; cell : row and column of the finest lattice; middle : (2,) m, of the cell.
+    """
 
     xyz: FloatArray
     height_from: str
@@ -220,60 +251,67 @@ class Place:
 
 
 @dataclass(frozen=True)
-class LookedAt:
+class PlaceCurves:
     """A place and its match curves.
 
-    views : that show it and were compared; curves : numbers of views in it are of these; index : height index of the
-    place, in the middle of those sampled; heights_m : (h,) m; sampled : what all views show around it, of the cells
-    `window`; kept : (i,) int64, which of them `views` are.
+    views : those that show the place and were compared, to which the numbers in `curves` refer; lattice_index : of the
+    place, in the middle of the sampled heights; heights_m : (h,) m; tile_views : all views near the place, over the
+    cells `window`; view_rows : (i,) int64, which of them `views` are.
     """
 
     place: Place
     views: tuple[View, ...]
     curves: PointCurves
-    index: float
+    lattice_index: float
     heights_m: FloatArray
-    sampled: TileViews
+    tile_views: TileViews
     window: CellWindow
-    kept: IntArray
+    view_rows: IntArray
 
     def patches(self, side: int) -> NDArray[np.float32]:
         """Windows of `side` cells around the place, (i, h, k) float32, of every view at every height.
 
-        Normalised as those that are compared; NaN where a view does not show one whole.
+        Normalised like those that are compared; NaN where a view does not show the whole window.
         """
         reach = len(self.heights_m) // 2
-        return cell_windows(self.sampled, self.window, self.place.cell, self.index, side, reach)[self.kept]
+        windows = cell_windows(self.tile_views, self.window, self.place.cell, self.lattice_index, side, reach)
+        return windows[self.view_rows]
 
 
 def cell_of(xy: FloatArray, match_scene: MatchScene) -> tuple[int, int]:
-    """Row and column of the finest lattice's cell that holds a ground point."""
+    """Row and column of the cell of the finest lattice that contains a ground point (2,) m."""
     col, row = (xy - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
     return math.floor(row), math.floor(col)
 
 
 def height_nearby(xy: FloatArray, ties: FloatArray) -> float:
-    """Median height of the ties (n, 3) nearest to a place (2,), m."""
-    away = np.hypot(*(ties[:, :2] - xy).T)
-    return float(np.median(ties[np.argsort(away, kind="stable")[:NEAREST_TIES], 2]))
+    """Median height (m) of the tie points (n, 3) m that are nearest to a place (2,) m."""
+    distance = np.hypot(*(ties[:, :2] - xy).T)
+    return float(np.median(ties[np.argsort(distance, kind="stable")[:NEAREST_TIES], 2]))
 
 
 def shows(view: View, xyz: FloatArray) -> bool:
-    """Whether a ground point (3,) lies inside an image."""
+    """Whether a ground point (3,) m lies inside an image."""
     col, row = view.sensor.image_from_ground(xyz[None])[0]
     rows, cols = view.image.shape
     return bool(0 <= row <= rows - 1 and 0 <= col <= cols - 1)
 
 
-def check_shown(asked: str, reference: str | None, xyz: FloatArray, names: Sequence[str], match_scene: MatchScene) -> None:
-    """Refuse a point that fewer than two views show, or a reference that is not among them.
+def check_shown(
+    point_name: str, reference: str | None, xyz: FloatArray, names: Sequence[str], match_scene: MatchScene
+) -> None:
+    """Refuse a point that fewer than two views show, or that the requested reference image does not show.
 
-    asked : the point as it was asked for, for messages.
+    point_name : the point as it was requested, for the message; names : of the views that show it.
+
+    Raises
+    ------
+    GeometryError
+        In both cases.
     """
-    what = f"{asked} (E {xyz[0]:.1f}, N {xyz[1]:.1f}, height {xyz[2]:.1f} m)"
+    what = f"{point_name} (E {xyz[0]:.1f}, N {xyz[1]:.1f}, height {xyz[2]:.1f} m)"
     if len(names) < 2:
-        west, north = match_scene.transform(match_scene.seen, 0) * (0, 0)
-        east, south = match_scene.transform(match_scene.seen, 0) * (match_scene.seen.cols, match_scene.seen.rows)
+        west, south, east, north = match_scene.overlap_bounds
         fault = (
             f"is shown, with the window around it, by {names[0]} only, and two images are needed"
             if names
@@ -288,99 +326,107 @@ def check_shown(asked: str, reference: str | None, xyz: FloatArray, names: Seque
 
 
 def curves_at(
-    asked: str,
+    point_name: str,
     reference: str | None,
     match_scene: MatchScene,
     place: Place,
     config: RunConfig,
-    farthest: int = RANKED_WITHIN_CELLS,
-) -> LookedAt:
+    max_distance_cells: int = RANKED_WITHIN_CELLS,
+) -> PlaceCurves:
     """Match curves of a place with the views that show it.
 
-    Tie points are looked for farther and farther away, as far as the rules of the order reach, and `farthest` cells at
-    most. asked : the point as it was asked for, for messages; reference : name of the view to be it, None for the best.
+    The tie points that order the views are looked for in growing windows around the place: within the radius, within
+    `max_radii` radii, and within `max_distance_cells` at most. point_name : the point as it was requested, for
+    messages; reference : name of the reference image, None for the best one.
 
     Raises
     ------
     GeometryError
-        Fewer than two views show the place, or not the reference.
+        Fewer than two views show the place, or the reference image does not.
     """
     names = [view.name for view in match_scene.views if shows(view, place.xyz)]
-    check_shown(asked, reference, place.xyz, names, match_scene)
-    options, side = config.selection, large_window_side(config.cost)
-    index = (place.xyz[2] - match_scene.origin_m) / match_scene.step_m
-    radius, at = options.radius_px, np.array(place.cell[::-1]) + 0.5
-    near = () if options.neighbours == "tin" else ((radius, OrderSource.NEIGHBOURS),)
-    for around, enough in (*near, (options.widest * radius, OrderSource.NEAREST), (farthest, OrderSource.SCENE)):
-        halo = min(math.ceil(around), farthest)
-        window = CellWindow(*place.cell, 1, 1).at_level(0, halo).within(match_scene.seen)
+    check_shown(point_name, reference, place.xyz, names, match_scene)
+    options = config.selection
+    lattice_index = (place.xyz[2] - match_scene.origin_m) / match_scene.step_m
+    for distance_cells, sufficient_source in _tie_windows(options, max_distance_cells):
+        halo = min(math.ceil(distance_cells), max_distance_cells)
+        window = CellWindow(*place.cell, 1, 1).at_level(0, halo).within(match_scene.overlap_window)
         if not (window.rows and window.cols):
-            check_shown(asked, reference, place.xyz, [], match_scene)
-        numbers, views = views_of(match_scene, window, place, config)
-        windows = cell_windows(views, window, place.cell, index, side, options.reach_steps)
-        kept = np.flatnonzero(~np.isnan(windows[:, options.reach_steps, 0]))
-        compared = tuple(match_scene.views[numbers[i]] for i in kept)
-        check_shown(asked, reference, place.xyz, [view.name for view in compared], match_scene)
-        ranking = ranked(match_scene, views, window, config)
-        ranking = replace(ranking, labels=ranking.labels[:, kept][:, :, kept])
-        order = point_order(ranking, references(reference, compared), at, options)
-        if order.order_source <= enough:
+            check_shown(point_name, reference, place.xyz, [], match_scene)
+        numbers, views = views_around(match_scene, window, place, config)
+        side = large_window_side(config.cost)
+        windows = cell_windows(views, window, place.cell, lattice_index, side, options.reach_steps)
+        view_rows = np.flatnonzero(~np.isnan(windows[:, options.reach_steps, 0]))
+        compared = tuple(match_scene.views[numbers[i]] for i in view_rows)
+        check_shown(point_name, reference, place.xyz, [view.name for view in compared], match_scene)
+        pair_labels = labels_around(match_scene, views, window, config)
+        pair_labels = replace(pair_labels, labels=pair_labels.labels[:, view_rows][:, :, view_rows])
+        middle = np.array(place.cell[::-1]) + 0.5
+        order = point_order(pair_labels, may_be_reference(reference, compared), middle, options)
+        if order.order_source <= sufficient_source:
             break
-    step_px = steps_px(views, int(kept[order.reference]), kept[order.search])
-    along = index + np.arange(-options.reach_steps, options.reach_steps + 1)
-    curves = point_curves(windows[kept], order, step_px, along, options)
+    step_px = steps_px(views, int(view_rows[order.reference]), view_rows[order.search])
+    along = lattice_index + np.arange(-options.reach_steps, options.reach_steps + 1)
+    curves = point_curves(windows[view_rows], order, step_px, along, options)
     heights_m = match_scene.origin_m + along * match_scene.step_m
-    return LookedAt(place, compared, curves, index, heights_m, views, window, kept)
+    return PlaceCurves(place, compared, curves, lattice_index, heights_m, views, window, view_rows)
 
 
-def references(reference: str | None, views: Sequence[View]) -> FloatArray:
-    """1 for every view that may be the reference, (i,) float64."""
+def _tie_windows(options: SelectionOptions, max_distance_cells: int) -> list[tuple[float, OrderSource]]:
+    """Distances, cells, within which tie points are looked for one after the other, each with the source that is found
+    in no smaller window."""
+    distances: list[tuple[float, OrderSource]] = []
+    if options.neighbours != "tin":
+        distances.append((options.radius_px, OrderSource.NEIGHBOURS))
+    distances.append((options.max_radii * options.radius_px, OrderSource.NEAREST))
+    distances.append((max_distance_cells, OrderSource.SCENE))
+    return distances
+
+
+def may_be_reference(reference: str | None, views: Sequence[View]) -> FloatArray:
+    """1 for every view that may be the reference image, else 0, (i,) float64."""
     return np.array([float(reference in (None, view.name)) for view in views])
 
 
-def views_of(match_scene: MatchScene, window: CellWindow, place: Place, config: RunConfig) -> tuple[list[int], TileViews]:
-    """The views worth comparing at the place, by number, and what they show of a window of cells around it."""
-    z = heights_around(match_scene, window, place, config.selection)
+def views_around(
+    match_scene: MatchScene, window: CellWindow, place: Place, config: RunConfig
+) -> tuple[list[int], TileViews]:
+    """Numbers of the views to compare at a place, and their pixels and projections over a window of cells around it."""
+    z_range = heights_around(match_scene, window, place, config.selection)
     transform = match_scene.transform(window, 0)
-    across, down = np.linspace(0, window.cols, 5), np.linspace(0, window.rows, 5)
-    corners = np.array([transform * (c, r) for c in across for r in down])
-    numbers, found = [], []
-    which = [number for number, view in enumerate(match_scene.views) if shows(view, place.xyz)]
-    if len(which) > config.selection.candidates + 1:
-        shown = [match_scene.views[number] for number in which]
-        rows = preselected(shown, place.middle[None], float(place.xyz[2]), config.selection)
-        which = [which[row] for row in rows]
-    for number in which:
-        part = pixel_window(match_scene.views[number], corners, z, 1)
-        if part is not None:
+    across, down = (np.linspace(0, n, GROUND_POINTS_PER_SIDE) for n in (window.cols, window.rows))
+    ground_xy = np.array([transform * (c, r) for c in across for r in down])
+    candidates = [number for number, view in enumerate(match_scene.views) if shows(view, place.xyz)]
+    if len(candidates) > config.selection.max_candidates + 1:
+        showing = [match_scene.views[number] for number in candidates]
+        rows = preselected(showing, place.middle[None], float(place.xyz[2]), config.selection)
+        candidates = [candidates[row] for row in rows]
+    numbers, view_pixels = [], []
+    for number in candidates:
+        view_window = pixel_window(match_scene.views[number], ground_xy, z_range, 1)
+        if view_window is not None:
             numbers.append(number)
-            found.append(read_pixels(match_scene.views[number], part, 1, match_scene.grey[number]))
+            view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey[number]))
     shape, lattice = (window.rows, window.cols), (match_scene.origin_m, match_scene.step_m)
     half = large_window_side(config.cost) // 2
-    return numbers, tile_views(found, 0, transform, shape, config.pyramid.block, lattice, z, half)
+    return numbers, tile_views(view_pixels, 0, transform, shape, config.pyramid.block, lattice, z_range, half)
 
 
 def heights_around(
     match_scene: MatchScene, window: CellWindow, place: Place, options: SelectionOptions
 ) -> tuple[float, float]:
-    """Between which heights, m, curves of the place and of the tie points in a window are looked at: of a scene's whole
-    range projections would be tabulated several times as long."""
-    xy = ties_on_cells(match_scene)
-    first, size = np.array([window.col, window.row]), np.array([window.cols, window.rows])
-    inside = ((xy >= first) & (xy < first + size)).all(axis=1) & np.isfinite(match_scene.ties[:, 2])
+    """Lowest and highest height (m) of the match curves of a place and of the tie points in a window.
+
+    Projections are tabulated over these heights only: over the height range of the scene that would take several times
+    as long.
+    """
+    inside = TiesOnGrid.of(match_scene).inside(window) & np.isfinite(match_scene.ties[:, 2])
     heights = np.append(match_scene.ties[inside, 2], place.xyz[2])
     reach = (options.reach_steps + 1) * match_scene.step_m
     return float(heights.min()) - reach, float(heights.max()) + reach
 
 
-def ties_on_cells(match_scene: MatchScene) -> FloatArray:
-    """Columns and rows of the finest lattice where the tie points lie, (n, 2)."""
-    return np.asarray((match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m)
-
-
-def ranked(match_scene: MatchScene, views: TileViews, window: CellWindow, config: RunConfig) -> PairLabels:
-    """Labels of all pairs of views at the tie points of a window, on level ground."""
-    xy = ties_on_cells(match_scene)
-    index = (match_scene.ties[:, 2] - match_scene.origin_m) / match_scene.step_m
-    side, steps_per_cell, flat = large_window_side(config.cost), match_scene.cell_m / match_scene.step_m, np.zeros((len(xy), 2))
-    return label_pairs(views, window, xy, index, flat, side, steps_per_cell, config.selection)
+def labels_around(match_scene: MatchScene, tile_views: TileViews, window: CellWindow, config: RunConfig) -> PairLabels:
+    """Labels of all pairs of views at the tie points of a window, as on level ground."""
+    ties, steps_per_cell = TiesOnGrid.of(match_scene), match_scene.cell_m / match_scene.step_m
+    return label_pairs(tile_views, window, ties, large_window_side(config.cost), steps_per_cell, config.selection)

@@ -1,9 +1,12 @@
-"""Which views each block of cells is matched with: ranked at tie points, added until their match curve is distinct.
+"""Choice of images: which views each block of cells is matched with.
 
-At the tie points in and around a tile, every pair of views gets a label (`match_curve`). A block takes as its reference
-the most nadir view that shows it and agrees with others. The other views follow in the order of the labels around the
-block (`view_ranking`). How many of them the block takes is decided one level up, on a few sampled cells, where the
-range of heights that labels need is cheap to search. Views beyond that number are not evaluated.
+At the tie points in and around a tile every pair of views has a label (`zlocus.matching.pair_labels`). The reference of
+a block is the most nadir view that shows it and agrees with others. The other views follow in the order of their labels
+around the block (`zlocus.matching.view_ranking`). How many of them a block needs is decided on the coarser level, from
+match curves of a few sampled cells (`zlocus.matching.match_curve`); there few heights have to be compared. Views beyond
+that number are not evaluated.
+
+Heights are slope indices, except in the match curves of the coarser level (see `zlocus.matching.height_lattice`).
 """
 
 from __future__ import annotations
@@ -15,239 +18,346 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
-from zlocus.core.options import SelectionOptions
+from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.scene import View
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import HIDDEN
+from zlocus.matching.level_records import LevelResult, PyramidLevel
+from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.match_scene import parallax_rate
-from zlocus.matching.occlusion import NOTHING_HIDDEN, covers
+from zlocus.matching.occlusion import NOTHING_HIDDEN, covers, sees
+from zlocus.matching.pair_labels import PairLabels
+from zlocus.matching.subpixel import smoothed
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.view_directions import cells_per_step
-from zlocus.matching.view_ranking import (
-    FeaturePoints,
-    PairLabels,
-    Samples,
-    SearchGeometry,
-    candidate_images,
-    closeness,
-    order_images,
-)
+from zlocus.matching.view_ranking import FeaturePoints, SearchGeometry, candidate_images, closeness, order_images
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-# A reference shows this share of a block.
-WHOLE = 0.95
+# A reference image shows at least this share of a block.
+MIN_SHARE_OF_REFERENCE = 0.95
 # Sampled cells along the side of a block.
-SAMPLES = 3
+SAMPLES_PER_SIDE = 3
+# Every so many cells, along rows and columns, it is checked that enough of the chosen views cover a cell.
+COVERAGE_STRIDE_CELLS = 2
+# Height steps on each side of a surface over which a match curve is judged, at least.
+MIN_CURVE_REACH_STEPS = 4
 
 
 @dataclass(frozen=True)
 class ViewOrder:
-    """The views of every block.
+    """Order of the views of every block.
 
-    reference : (b,) int64; search : (b, i - 1) int64, the others, best first; is_worth : (b, i - 1) bool, whether they
-    help: those that do stand before those that mislead.
+    reference : (b,) int64, the reference image; search : (b, i - 1) int64, the other views, best first; is_helpful :
+    (b, i - 1) bool, whether each of them improves the match; those that do stand before the others.
     """
 
     reference: IntArray
     search: IntArray
-    is_worth: NDArray[np.bool_]
+    is_helpful: NDArray[np.bool_]
 
 
-def preselected(views: Sequence[View], corners: FloatArray, z: float, options: SelectionOptions) -> list[int]:
-    """Numbers of the views worth reading for a patch of ground, ascending: a reference and its `candidates`.
+@dataclass(frozen=True)
+class ChosenViews:
+    """Visible height ranges of the views that the blocks of a level use.
 
-    views : in the order in which they may be the reference; corners : (n, 2) m, a grid of points over the patch; z : m.
-    Of a scene of hundreds of images few see the patch, and fewer are worth comparing; see `candidate_images`.
+    matched : (3, i, r, c) int32, of the views that a block is matched with; helpful : the same of all views that
+    improve its match, for what follows; evaluations : cells x heights x images that the choice compared.
     """
-    xyz = np.column_stack([corners, np.full(len(corners), z)])
+
+    matched: NDArray[np.int32]
+    helpful: NDArray[np.int32]
+    evaluations: int = 0
+
+
+def choose_views(
+    level: PyramidLevel,
+    lattice: HeightLattice,
+    visible: NDArray[np.int32],
+    surface: NDArray[np.float32] | None,
+    coarser_result: LevelResult | None,
+    pair_labels: PairLabels,
+    config: RunConfig,
+) -> ChosenViews:
+    """Choose the views of every block.
+
+    visible : (3, i, r, c) int32 slope indices, see `coverage`; surface : (r, c) slope indices known before, None where
+    nothing is known; coarser_result : the level on which match curves decide how many views a block needs, None at the
+    coarsest level, which takes `max_images` everywhere.
+    """
+    options = config.selection
+    middles = block_middles(level.window, level.number, lattice)
+    view_order = order_views(pair_labels, block_shares(visible, lattice), middles, options)
+    n_all = np.full(len(view_order.reference), view_order.search.shape[1])
+    n_needed, evaluations = np.minimum(n_all, options.max_images), 0
+    if coarser_result is not None:
+        cells, block_of_cell = sampled_cells(lattice)
+        covering = covers(visible[:, :, cells[:, 0], cells[:, 1]]).T
+        curves = CoarserCurves.of(coarser_result, config)
+        coarser_cells = cells_one_level_up(cells, level.window, coarser_result.level.window)
+        match = images_needed(curves, coarser_cells, block_of_cell, covering, view_order, options)
+        n_needed = np.where(match.n_added > 0, np.minimum(match.n_added, options.max_images), n_all)
+        evaluations = match.evaluations + len(cells) * curves.n_heights
+    every = slice(None, None, COVERAGE_STRIDE_CELLS)
+    some = visible[:, :, every, every]
+    covered = (covers(some) if surface is None else sees(some, surface[every, every])).reshape(visible.shape[1], -1)
+    block_of_cell = block_of_cells(lattice, COVERAGE_STRIDE_CELLS).ravel()
+    matched, helpful = (
+        only_chosen(visible, chosen_views(view_order, n_search, covered, block_of_cell, options), lattice)
+        for n_search in (n_needed, n_all)
+    )
+    return ChosenViews(matched, helpful, evaluations)
+
+
+def curve_reach_steps(level: int, options: SelectionOptions) -> int:
+    """Height steps of a level on each side of a surface over which its match curves are judged."""
+    return max(options.reach_steps >> level, MIN_CURVE_REACH_STEPS)
+
+
+def cells_one_level_up(cells: IntArray, window: CellWindow, coarser_window: CellWindow) -> IntArray:
+    """Cells of the coarser level, (n, 2) rows and columns in its window, that hold cells of a level, moved inside
+    it."""
+    last = np.array([coarser_window.rows - 1, coarser_window.cols - 1])
+    coarser_cells = (cells + np.array([window.row, window.col])) // 2
+    return np.asarray(np.clip(coarser_cells - np.array([coarser_window.row, coarser_window.col]), 0, last), np.int64)
+
+
+def preselected(views: Sequence[View], ground_xy: FloatArray, z: float, options: SelectionOptions) -> list[int]:
+    """Numbers of the views to read for a patch of ground, ascending: a reference image and its best candidates.
+
+    views : in the order in which they may be the reference; ground_xy : (n, 2) m, a grid of points over the patch; z :
+    m. Of a scene of hundreds of images few see the patch, and fewer are worth a comparison; see `candidate_images`.
+    """
+    xyz = np.column_stack([ground_xy, np.full(len(ground_xy), z)])
     inside = [_inside(view, xyz) for view in views]
-    overlap = np.array([seen.mean() for seen in inside])
-    reference = int(np.argmax(overlap >= WHOLE)) if (overlap >= WHOLE).any() else int(overlap.argmax())
-    slant = np.array([_slant_at(view, xyz[seen], z) for view, seen in zip(views, inside, strict=True)])
-    angle = np.degrees(np.arctan(np.hypot(*(slant - slant[reference]).T)))
+    overlap = np.array([is_inside.mean() for is_inside in inside])
+    shows_all = overlap >= MIN_SHARE_OF_REFERENCE
+    reference = int(np.argmax(shows_all)) if shows_all.any() else int(overlap.argmax())
+    rates = np.array([_parallax_rate_at(view, xyz[is_in], z) for view, is_in in zip(views, inside, strict=True)])
+    angle = np.degrees(np.arctan(np.hypot(*(rates - rates[reference]).T)))
     days = np.array([_days_between(view, views[reference]) for view in views])
     overlap[reference] = 0.0
     return sorted([reference, *candidate_images(SearchGeometry(overlap, angle, days), options).tolist()])
 
 
-def _slant_at(view: View, xyz: FloatArray, z: float) -> FloatArray:
-    """`parallax_rate` amid the points (n, 3) that a view sees: a wide lens looks another way at every place."""
+def _parallax_rate_at(view: View, xyz: FloatArray, z: float) -> FloatArray:
+    """`parallax_rate` at the middle of ground points (n, 3): a wide-angle camera looks another way at every place."""
     return parallax_rate(
         view, z, view.sensor.image_from_ground(xyz.mean(axis=0, keepdims=True))[0] if len(xyz) else None
     )
 
 
 def _inside(view: View, xyz: FloatArray) -> NDArray[np.bool_]:
-    """Which ground points (n, 3) fall into a view, (n,) bool."""
+    """Which ground points (n, 3) fall inside an image, (n,) bool."""
     xy = view.sensor.image_from_ground(xyz)
     with np.errstate(invalid="ignore"):
         return np.asarray(((xy >= -0.5) & (xy < np.array(view.image.shape[::-1]) - 0.5)).all(axis=1))
 
 
-def _days_between(one: View, other: View) -> float:
+def _days_between(view_a: View, view_b: View) -> float:
     """Days between the dates of two views, NaN where either is unknown."""
-    if one.date is None or other.date is None:
+    if view_a.date is None or view_b.date is None:
         return np.nan
-    return float(abs((one.date - other.date).days))
+    return float(abs((view_a.date - view_b.date).days))
 
 
-def order_views(ranking: PairLabels, share: FloatArray, at: FloatArray, options: SelectionOptions) -> ViewOrder:
-    """Reference and order of the other views of blocks.
+def order_views(
+    pair_labels: PairLabels, share: FloatArray, block_xy: FloatArray, options: SelectionOptions
+) -> ViewOrder:
+    """Reference image and order of the other views of blocks.
 
-    share : (i, b) float64, of each block that each view covers, the views in the order in which they may be the
-    reference; at : (b, 2) float64, the blocks' middles, as `PairLabels.xy`. The reference is the first view that shows the
-    whole block and has a label above zero with another view around it; far from all tie points, at those of the whole
-    tile. A view whose accumulated label is below `least_worth` of the best one's misleads more than it helps. Those
-    that help come in the order of their angles, see `closeness`: labels are a matter of tens of points, and
-    neighbouring blocks should not differ by the luck of one.
+    share : (i, b) float64, share of each block that each view covers, the views in the order in which they may be the
+    reference; block_xy : (b, 2) float64, middles of the blocks, as `PairLabels.xy`.
+
+    The reference is the first view that shows the whole block and whose label with some other view is above zero around
+    it; far from all tie points, the labels of the whole tile count. A view whose accumulated label is below
+    `min_label_share` of the best one's misleads more than it helps. The views that help come in the order of their
+    angles, see `closeness`: labels rest on tens of points, and neighbouring blocks should not differ by chance.
     """
     n_views, n_blocks = share.shape
     reference = share.argmax(axis=0)
-    search, is_worth = np.zeros((n_blocks, n_views - 1), np.int64), np.zeros((n_blocks, n_views - 1), bool)
+    search, is_helpful = np.zeros((n_blocks, n_views - 1), np.int64), np.zeros((n_blocks, n_views - 1), bool)
     is_open = np.ones(n_blocks, bool)
     for last_resort in (False, True):
         for view in range(n_views):
-            rows = np.flatnonzero(is_open & ((reference == view) if last_resort else (share[view] >= WHOLE)))
+            may_lead = (reference == view) if last_resort else (share[view] >= MIN_SHARE_OF_REFERENCE)
+            rows = np.flatnonzero(is_open & may_lead)
             if not len(rows):
                 continue
-            others = np.delete(np.arange(n_views), view)
-            order = order_images(FeaturePoints(ranking.xy, ranking.labels[:, view][:, others]), at[rows], options)
-            value = np.take_along_axis(order.accumulated, order.images, axis=1)
-            fits = last_resort | (value[:, 0] > 0) | (len(ranking.xy) == 0)
-            rows, images, value = rows[fits], others[order.images[fits]], value[fits]
-            helps = value >= options.least_worth * np.maximum(value[:, :1], 0)
-            if options.order == "angle":
-                first = np.where(helps, closeness(ranking.angle_deg[view, images], options), -1.0)
-                by_angle = np.argsort(-first, axis=1, kind="stable")
-                images, helps = np.take_along_axis(images, by_angle, 1), np.take_along_axis(helps, by_angle, 1)
-            search[rows], is_worth[rows], reference[rows], is_open[rows] = images, helps, view, False
-    return ViewOrder(reference, search, is_worth)
+            images, value, helps = _ordered_search_views(pair_labels, view, block_xy[rows], options)
+            fits = last_resort | (value > 0) | (len(pair_labels.xy) == 0)
+            rows = rows[fits]
+            search[rows], is_helpful[rows] = images[fits], helps[fits]
+            reference[rows], is_open[rows] = view, False
+    return ViewOrder(reference, search, is_helpful)
+
+
+def _ordered_search_views(
+    pair_labels: PairLabels, reference: int, block_xy: FloatArray, options: SelectionOptions
+) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
+    """Of blocks with a reference image: the other views, best first (b, i - 1), the highest accumulated label of a
+    block (b,), and which views help (b, i - 1)."""
+    others = np.delete(np.arange(pair_labels.labels.shape[1]), reference)
+    feature_points = FeaturePoints(pair_labels.xy, pair_labels.labels[:, reference][:, others])
+    order = order_images(feature_points, block_xy, options)
+    value = np.take_along_axis(order.accumulated, order.images, axis=1)
+    images = others[order.images]
+    helps = value >= options.min_label_share * np.maximum(value[:, :1], 0)
+    if options.order == "angle":
+        first = np.where(helps, closeness(pair_labels.angle_deg[reference, images], options), -1.0)
+        by_angle = np.argsort(-first, axis=1, kind="stable")
+        images, helps = np.take_along_axis(images, by_angle, 1), np.take_along_axis(helps, by_angle, 1)
+    return images, value[:, 0], helps
 
 
 def chosen_views(
-    order: ViewOrder, n_search: IntArray, covered: NDArray[np.bool_], of_cell: IntArray, options: SelectionOptions
+    view_order: ViewOrder,
+    n_search: IntArray,
+    covered: NDArray[np.bool_],
+    block_of_cell: IntArray,
+    options: SelectionOptions,
 ) -> NDArray[np.bool_]:
-    """The views that each block takes, (i, b) bool.
+    """The views that each block uses, (i, b) bool.
 
-    Views are taken in their order until every cell is covered by the reference and `n_search` (b,) others, those that
-    mislead until it is by `least_images`. covered : (i, n) bool, cells that each view covers; of_cell : (n,) int64, the
-    block of each cell.
+    Views are added in their order until every cell is covered by the reference and `n_search` (b,) others; views that
+    do not help are added only until it is covered by `min_images`. covered : (i, n) bool, cells that each view covers;
+    block_of_cell : (n,) int64.
     """
-    n_blocks, cells = len(order.reference), np.arange(len(of_cell))
+    n_blocks, cells = len(view_order.reference), np.arange(len(block_of_cell))
     chosen = np.zeros((len(covered), n_blocks), bool)
-    chosen[order.reference, np.arange(n_blocks)] = True
-    count = covered[order.reference[of_cell], cells].astype(np.int64)
-    for rank in range(order.search.shape[1]):
-        view = order.search[:, rank]
-        wanted = 1 + np.where(order.is_worth[:, rank], n_search, np.minimum(n_search, options.least_images))
-        gains = covered[view[of_cell], cells]
-        is_taken = np.bincount(of_cell[gains & (count < wanted[of_cell])], minlength=n_blocks) > 0
+    chosen[view_order.reference, np.arange(n_blocks)] = True
+    count = covered[view_order.reference[block_of_cell], cells].astype(np.int64)
+    for rank in range(view_order.search.shape[1]):
+        view = view_order.search[:, rank]
+        n_of_unhelpful = np.minimum(n_search, options.min_images)
+        wanted = 1 + np.where(view_order.is_helpful[:, rank], n_search, n_of_unhelpful)
+        gains = covered[view[block_of_cell], cells]
+        is_taken = np.bincount(block_of_cell[gains & (count < wanted[block_of_cell])], minlength=n_blocks) > 0
         chosen[view[is_taken], np.flatnonzero(is_taken)] = True
-        count += gains & is_taken[of_cell]
+        count += gains & is_taken[block_of_cell]
     return chosen
 
 
-def only_chosen(seen: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLattice) -> NDArray[np.int32]:
-    """`seen` without the views that a block does not take. chosen : (i, b) bool."""
+def only_chosen(visible: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLattice) -> NDArray[np.int32]:
+    """Visible height ranges without those of the views that a block does not use. chosen : (i, b) bool."""
     by_block = chosen.reshape(len(chosen), *lattice.count.shape)
     rows, cols = lattice.shape
-    left_out = ~by_block.repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
-    kept = seen.copy()
-    kept[0][left_out], kept[1][left_out] = HIDDEN, NOTHING_HIDDEN
-    return kept
+    excluded = ~by_block.repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
+    of_chosen = visible.copy()
+    of_chosen[0][excluded], of_chosen[1][excluded] = HIDDEN, NOTHING_HIDDEN
+    return of_chosen
 
 
 def sampled_cells(lattice: HeightLattice) -> tuple[IntArray, IntArray]:
-    """Cells of every block whose match curves decide, (n, 2) int64 row and column, and the block of each (n,)."""
+    """Cells whose match curves decide how many views a block needs, (n, 2) int64 row and column, and the block of each
+    of them, (n,)."""
     along = []
     for n in lattice.shape:
         first = np.arange(-(-n // lattice.block))[:, None] * lattice.block
-        inner = ((np.arange(SAMPLES) + 0.5) * lattice.block / SAMPLES).astype(np.int64)
+        inner = ((np.arange(SAMPLES_PER_SIDE) + 0.5) * lattice.block / SAMPLES_PER_SIDE).astype(np.int64)
         along.append(np.minimum(first + inner, n - 1).ravel())
     row, col = (v.ravel() for v in np.meshgrid(*along, indexing="ij"))
     return np.stack([row, col], axis=1), row // lattice.block * lattice.count.shape[1] + col // lattice.block
 
 
 @dataclass(frozen=True)
-class Coarser:
-    """A coarser level, on which match curves are looked at.
+class CoarserCurves:
+    """A coarser level, from which match curves are sampled along its surface.
 
-    views, seen : see `TileViews`, `coverage`; surface : (r, c) float32, smooth height indices that windows follow; side
-    : cells of a window; reach : height indices to both sides of the surface.
+    tile_views : of that level; visible : (3, i, r, c) level indices, see `LevelResult`; surface : (r, c) float32,
+    smooth level indices, which the windows follow; side : cells along the side of a window; reach : steps to both sides
+    of the surface.
     """
 
-    views: TileViews
-    seen: NDArray[np.int32]
+    tile_views: TileViews
+    visible: NDArray[np.int32]
     surface: NDArray[np.float32]
     side: int
     reach: int
 
-    def samples(self, cells: IntArray) -> Samples:
-        """The match curves' windows of cells (n, 2), moved off the border."""
+    @classmethod
+    def of(cls, coarser_result: LevelResult, config: RunConfig) -> CoarserCurves:
+        """Match curves along the heights of a level."""
+        return cls(
+            coarser_result.tile_views,
+            coarser_result.visible,
+            smoothed(coarser_result.heights.vertex, config.refine.jump_steps),
+            large_window_side(config.cost),
+            curve_reach_steps(coarser_result.level.number, config.selection),
+        )
+
+    @property
+    def n_heights(self) -> int:
+        """Heights of a match curve."""
+        return 2 * self.reach + 1
+
+    def samples(self, cells: IntArray) -> CurveSamples:
+        """The match curves of cells (n, 2); cells whose windows would cross the border are moved inside."""
         half, surface = self.side // 2, self.surface
         row, col = np.clip(cells, half, np.subtract(surface.shape, half + 1)).T
         offsets = [(i, j) for i in range(-half, half + 1) for j in range(-half, half + 1)]
         around = np.stack([surface[row + i, col + j] for i, j in offsets], axis=1)
         here = surface[row, col]
         relief = np.ascontiguousarray(around - here[:, None])
-        return Samples(np.stack([row, col], axis=1), here.astype(np.float64) - self.reach, 2 * self.reach + 1, relief)
+        first = here.astype(np.float64) - self.reach
+        return CurveSamples(np.stack([row, col], axis=1), first, self.n_heights, relief)
 
-    def windows(self, samples: Samples, view: int, rows: IntArray) -> NDArray[np.float32]:
-        """Windows of one view, NaN where it does not show them and at heights where something hides them."""
-        found = samples.windows(self.views, view, rows)
+    def windows(self, samples: CurveSamples, view: int, rows: IntArray) -> NDArray[np.float32]:
+        """Windows of one view, (m, h, k) float32, NaN where it does not show them and at heights that are occluded."""
+        windows = samples.windows(self.tile_views, view, rows)
         row, col = samples.cells[rows].T
-        index = samples.first[rows, None] + np.arange(samples.n_heights)
-        found[index < self.seen[2, view, row, col][:, None]] = np.nan
-        return found
+        level_index = samples.first[rows, None] + np.arange(samples.n_heights)
+        windows[level_index < self.visible[2, view, row, col][:, None]] = np.nan
+        return windows
 
 
 def images_needed(
-    coarser: Coarser,
+    curves: CoarserCurves,
     cells: IntArray,
-    of_block: IntArray,
+    block_of_cell: IntArray,
     covering: NDArray[np.bool_],
-    order: ViewOrder,
+    view_order: ViewOrder,
     options: SelectionOptions,
 ) -> ProgressiveMatch:
-    """How many search views each block needs, from match curves of sampled cells of the coarser level.
+    """How many search views each block needs, from the match curves of sampled cells of the coarser level.
 
-    cells : (n, 2) int64, of the coarser level; of_block : (n,) the finer block of each; covering : (n, i) bool, views
-    that cover it. See `match_progressively`.
+    cells : (n, 2) int64, of the coarser level; block_of_cell : (n,) the block of the finer level that each belongs to;
+    covering : (n, i) bool, views that cover each cell. See `match_progressively`.
     """
-    samples, n_views = coarser.samples(cells), len(coarser.views.layout)
-    reference = order.reference[of_block]
+    samples, n_views = curves.samples(cells), len(curves.tile_views.layout)
+    reference = view_order.reference[block_of_cell]
     of_reference = np.empty((len(cells), *samples.shape), np.float32)
     for view in np.unique(reference):
         rows = np.flatnonzero(reference == view)
-        of_reference[rows] = coarser.windows(samples, int(view), rows)
+        of_reference[rows] = curves.windows(samples, int(view), rows)
 
-    def measure(which: IntArray, images: IntArray) -> NDArray[np.floating]:
+    def correlate(which: IntArray, images: IntArray) -> NDArray[np.floating]:
         ncc = np.empty((len(which), samples.n_heights))
         for view in np.unique(images):
             rows = np.flatnonzero(images == view)
-            shown = coarser.windows(samples, int(view), which[rows])
-            ncc[rows] = np.einsum("nhk,nhk->nh", of_reference[which[rows]], shown)
+            of_view = curves.windows(samples, int(view), which[rows])
+            ncc[rows] = np.einsum("nhk,nhk->nh", of_reference[which[rows]], of_view)
         return ncc
 
-    per_step = np.array([cells_per_step(coarser.views, i) for i in range(n_views)] + [(0.0, 0.0)])
-    base = np.hypot(*np.moveaxis(per_step[order.reference][:, None] - per_step[None], -1, 0))
+    # One column more than views stands for "no view": a view that does not help is never added.
+    per_step = np.array([cells_per_step(curves.tile_views, i) for i in range(n_views)] + [(0.0, 0.0)])
+    step_px = np.hypot(*np.moveaxis(per_step[view_order.reference][:, None] - per_step[None], -1, 0))
     covering = covering & np.take_along_axis(covering, reference[:, None], axis=1)
-    plan = SearchPlan(
-        order=np.where(order.is_worth, order.search, n_views),
-        block=of_block,
-        seen=np.concatenate([covering, np.zeros((len(cells), 1), bool)], axis=1),
-        step_px=base,
+    search_plan = SearchPlan(
+        order=np.where(view_order.is_helpful, view_order.search, n_views),
+        block=block_of_cell,
+        covered=np.concatenate([covering, np.zeros((len(cells), 1), bool)], axis=1),
+        step_px=step_px,
         sample=np.ones(len(cells), bool),
-        window_cells=coarser.side**2,
+        window_cells=curves.side**2,
     )
-    return match_progressively(measure, samples.n_heights, plan, options)
+    return match_progressively(correlate, samples.n_heights, search_plan, options)
 
 
-def block_shares(seen: NDArray[np.int32], lattice: HeightLattice) -> FloatArray:
-    """Share of each block that each view covers, (i, b) float64. seen : (3, i, r, c), see `coverage`."""
-    block, covered = lattice.block, covers(seen)
+def block_shares(visible: NDArray[np.int32], lattice: HeightLattice) -> FloatArray:
+    """Share of each block that each view covers, (i, b) float64. visible : (3, i, r, c), see `coverage`."""
+    block, covered = lattice.block, covers(visible)
     rows, cols = np.arange(0, lattice.shape[0], block), np.arange(0, lattice.shape[1], block)
     count = np.add.reduceat(np.add.reduceat(covered, rows, axis=1, dtype=np.int32), cols, axis=2)
     size = np.outer(np.minimum(block, lattice.shape[0] - rows), np.minimum(block, lattice.shape[1] - cols))

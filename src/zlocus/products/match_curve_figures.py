@@ -22,9 +22,9 @@ from pyproj import CRS
 from zlocus.core.options import SelectionOptions
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.run_record import write_record, write_atomically
+from zlocus.io.run_record import write_atomically, write_record
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.point_match import JudgedCurves, LookedAt, PointCurves
+from zlocus.matching.point_match import JudgedCurves, PlaceCurves, PointCurves
 from zlocus.matching.view_ranking import OrderSource
 
 if TYPE_CHECKING:
@@ -86,14 +86,14 @@ class PointReport:
     peak_m: float
 
     @classmethod
-    def of(cls, asked: str, looked: LookedAt, match_scene: MatchScene, crs: CRS) -> PointReport:
+    def of(cls, asked: str, place_curves: PlaceCurves, match_scene: MatchScene, crs: CRS) -> PointReport:
         """Of a place whose curves are known. match_scene, crs : of the scene."""
-        place, curves = looked.place, looked.curves
+        place, curves = place_curves.place, place_curves.curves
         return cls(
             asked=asked, crs=crs.to_string().splitlines()[0], xyz=place.xyz, height_from=place.height_from,
-            middle=place.middle, cell_m=match_scene.cell_m, names=tuple(view.name for view in looked.views),
-            left_out=tuple(view.name for view in match_scene.views if view not in looked.views),
-            heights_m=looked.heights_m, curves=curves, peak_m=match_scene.origin_m + curves.peak_index * match_scene.step_m,
+            middle=place.middle, cell_m=match_scene.cell_m, names=tuple(view.name for view in place_curves.views),
+            left_out=tuple(view.name for view in match_scene.views if view not in place_curves.views),
+            heights_m=place_curves.heights_m, curves=curves, peak_m=match_scene.origin_m + curves.peak_index * match_scene.step_m,
             step_m=match_scene.step_m,
         )  # fmt: skip
 
@@ -189,11 +189,11 @@ def where_it_stops(report: PointReport, options: SelectionOptions) -> str:
     """After how many images the match ends, and why, in a sentence."""
     curves = report.curves
     n, total = curves.n_used, len(report.search)
-    is_precise = options.sigma_steps < LABEL_ALONE_STEPS
+    is_precise = options.max_sigma_steps < LABEL_ALONE_STEPS
     if curves.is_stopped:
-        rule = f" and its sigma is at most {options.sigma_steps:g} steps" if is_precise else ""
+        rule = f" and its sigma is at most {options.max_sigma_steps:g} steps" if is_precise else ""
         return f"Stops after {n} of {total} search images: the mean is good{rule}."
-    rule = f" and precise to {options.sigma_steps:g} steps at once" if is_precise else ""
+    rule = f" and precise to {options.max_sigma_steps:g} steps at once" if is_precise else ""
     why = f"the mean is never good{rule}"
     rest = "no image is left" if n == total else "the images left do not help"
     return f"Does not stop before {n} of {total} search images: {why}, and {rest}."
@@ -211,7 +211,7 @@ def _order_rows(report: PointReport) -> list[tuple[str, ...]]:
     curves, order = report.curves, report.curves.order
     rows: list[tuple[str, ...]] = []
     for j, name in enumerate(report.search):
-        unused = "not needed" if order.is_worth[j] else "does not help"
+        unused = "not needed" if order.is_helpful[j] else "does not help"
         rows.append((name, _signed(order.accumulated[j]), "yes" if j < curves.n_used else unused))
     return rows
 
@@ -311,7 +311,7 @@ def point_record(report: PointReport, options: SelectionOptions) -> dict[str, An
             "rests_on": order.order_source.name.lower(),
             "tie_points": len(order.features),
             "images": [
-                {"image": name, "accumulated": int(order.accumulated[j]), "helps": bool(order.is_worth[j])}
+                {"image": name, "accumulated": int(order.accumulated[j]), "helps": bool(order.is_helpful[j])}
                 for j, name in enumerate(report.search)
             ],
         },
@@ -321,7 +321,7 @@ def point_record(report: PointReport, options: SelectionOptions) -> dict[str, An
             for j, name in enumerate(report.search)
         ],
         "stop": {
-            "images": curves.n_used, "is_stopped": curves.is_stopped, "sigma_steps_asked": options.sigma_steps,
+            "images": curves.n_used, "is_stopped": curves.is_stopped, "sigma_steps_asked": options.max_sigma_steps,
         },
         "peak_m": report.peak_m,
     }  # fmt: skip

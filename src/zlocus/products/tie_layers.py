@@ -18,7 +18,7 @@ from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.match_curve import FAIR, GOOD
-from zlocus.matching.view_ranking import NOT_RANKED, LabelledTies
+from zlocus.matching.pair_labels import NOT_RANKED, LabelledTies
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.triangulate import project_points
 
@@ -44,7 +44,7 @@ def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: 
     OutputError
         Where the file cannot be written.
     """
-    seen, xyz = orientation.seen, orientation.xyz
+    seen, xyz = orientation.observations, orientation.xyz
     away = np.hypot(*(seen.xy - project_points([view.sensor for view in oriented.views], seen, xyz)).T)
     residual = np.zeros(len(xyz))
     np.maximum.at(residual, seen.point, np.nan_to_num(away))

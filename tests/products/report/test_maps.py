@@ -174,7 +174,7 @@ def scene_with(xy: np.ndarray):
     from types import SimpleNamespace
 
     ties = np.column_stack([xy[:, 0], -xy[:, 1], np.full(len(xy), 10.0)])
-    return SimpleNamespace(ties=ties, anchor=(0.0, 0.0), cell_m=1.0, seen=CellWindow(0, 0, 800, 1000))
+    return SimpleNamespace(ties=ties, anchor=(0.0, 0.0), cell_m=1.0, overlap_window=CellWindow(0, 0, 800, 1000))
 
 
 def test_places_of_a_sample_are_spread_and_inside():
@@ -203,13 +203,13 @@ def card(kind: str, why: str, rho1: float) -> list[str]:
         "kind": kind, "why": why, "row": 1, "col": 2, "x": 3.0, "y": 4.0, "height_m": None, "sigma_m": None,
         "quality": int(Quality.NO_MATCH), "n_shown": 1, "svg": "<svg/>", "point": {"reference": "a", "means": [mean]},
     }  # fmt: skip
-    run = {"heights": {"range_m": [1.25, 99.0]}, "config": {"options": {"checks": {"least_ncc": -0.2}}}}
+    run = {"heights": {"range_m": [1.25, 99.0]}, "config": {"options": {"checks": {"min_ncc": -0.2}}}}
     return curve_card(cell, run)["lines"]
 
 
 def test_a_failed_cell_with_a_high_peak_says_why_it_has_no_height():
     (said,) = (line for line in card("failed", "NO_MATCH", 0.97) if line.startswith("No height in spite of the peak"))
-    assert "below -0.2 (checks.least_ncc)" in said
+    assert "below -0.2 (checks.min_ncc)" in said
     assert "1.2 to 99.0 m" in card("failed", "RANGE_END", 0.97)[-1]
     assert not any("in spite" in line for line in card("failed", "NO_MATCH", 0.3))
     assert not any("in spite" in line for line in card("doubtful", "WEAK", 0.97))

@@ -15,8 +15,8 @@ const WAIT_MS = 700;
 const REST_MS = 60;
 // Options that a cell's curves depend on most; the others are behind them.
 const FIRST = [
-  "rho1_high", "ratio_high", "rho1_middle", "ratio_middle", "rho1_low", "ratio_low", "rho1_fair", "ratio_fair", "sigma_steps",
-  "neighbours", "radius_px", "order", "least_worth", "most_images",
+  "rho1_high", "ratio_high", "rho1_middle", "ratio_middle", "rho1_low", "ratio_low", "rho1_fair", "ratio_fair", "max_sigma_steps",
+  "neighbours", "radius_px", "order", "min_label_share", "max_images",
 ];
 let surface, leaflet, drawn, shown = null, asRun = null, busy = null, resting = null, framed = null, unpacked = [];
 let charts = {};
@@ -262,8 +262,8 @@ function ofRun(found) {
   const settles = ` Curves compare windows of ${window} cells; the run also compares smaller ones and grey values` +
     (surface.method === "mvll" ? "." : ", and settles the height together with those of the neighbours: it need not lie at this peak.");
   if (surface.views === "all") return `${used}The run was told to use every image in every cell (--views all).${settles}`;
-  if (surface.images.length < surface.fewest_views) {
-    return `${used}With fewer than ${surface.fewest_views} images it leaves out no other: order and stop ` +
+  if (surface.images.length < surface.min_images_for_choice) {
+    return `${used}With fewer than ${surface.min_images_for_choice} images it leaves out no other: order and stop ` +
       `are what the rule says of this cell alone.${settles}`;
   }
   return `${used}It decides by the same rule, for blocks of cells and one level up.${settles}`;

@@ -1,0 +1,117 @@
+"""What follows the matching of the finest level: planes, refinement, checks, precision and ortho-image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.core.options import RunConfig
+from zlocus.matching.height_checks import judge
+from zlocus.matching.kernels.spline import spline_coefficients
+from zlocus.matching.level_records import LevelResult, TileInputs
+from zlocus.matching.local_contrast import texture_unit
+from zlocus.matching.occlusion import covers, left_out, n_seeing
+from zlocus.matching.overlap import BorderGround, unsupported
+from zlocus.matching.plane_fitting import PlanarHeights, with_planes
+from zlocus.matching.precision import sigma_steps, signs_of_precision, spread_around
+from zlocus.matching.quality import Quality, is_empty
+from zlocus.matching.subpixel import refine
+from zlocus.matching.surface import Surface
+from zlocus.matching.true_ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
+
+# Number of views in which segments without texture are looked for, one after the other.
+MAX_VIEWS_FOR_PLANES = 2
+# A view is sharp enough to tell a plain roof from a blurred one where the texture of the second sharpest view (the
+# sharpest may be noise) is at most this many times its own.
+MAX_TEXTURE_RATIO_OF_SHARP_VIEW = 1.5
+
+
+@dataclass(frozen=True)
+class RefinedSurface:
+    """surface : of the finest level's window, without ortho-image; lattice_index : (r, c) float32, heights of all
+    cells, of those too that the surface leaves empty."""
+
+    surface: Surface
+    lattice_index: NDArray[np.float32]
+
+
+def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResult:
+    """The finest level with planes in place of the heights of segments without texture, such as roofs.
+
+    The segments are found in the first `MAX_VIEWS_FOR_PLANES` views that are sharp.
+    """
+    heights, core = result.heights, result.level.core
+    planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
+    n_views = len(result.tile_views.layout)
+    orthos = [ortho_image(result.tile_views, planar.height, view) for view in range(n_views)]
+    texture = [texture_unit(ortho, core) for ortho in orthos]
+    second_sharpest = sorted(texture)[-2]
+    sharp_views = [view for view, t in enumerate(texture) if t * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest]
+    for number, view in enumerate(sharp_views[:MAX_VIEWS_FOR_PLANES]):
+        ortho = orthos[view] if number == 0 else ortho_image(result.tile_views, planar.height, view)
+        planar = with_planes(result.tile_views, ortho, planar, result.visible, config.planes, core)
+    return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
+
+
+def refined_surface(tile: TileInputs, result: LevelResult, border: BorderGround) -> RefinedSurface:
+    """Refine the heights of the finest level, halo included, check them, and estimate their precision."""
+    match_scene, config = tile.match_scene, tile.config
+    splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in tile.view_pixels])
+    refined = refine(
+        result.tile_views, splines, result.heights.vertex, result.visible, match_scene.step_cells, config.refine,
+        result.is_planar,
+    )  # fmt: skip
+    n_covering = covers(result.visible).sum(axis=0)
+    n_views = n_seeing(result.visible, refined.height)
+    signs = signs_of_precision(result.heights, refined, n_views)
+    last_index = match_scene.n_steps - 1
+    quality = judge(result.heights, refined, n_covering, n_views, np.exp(signs["apart"]), last_index, config.checks)
+    _mark_overlap(quality, result, border, refined.height)
+    height = result.lattice.metres(refined.height)
+    sigma = sigma_steps(signs, refined)
+    is_noise = border.is_near(result.level.window) & (spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps)
+    quality[is_noise] |= np.uint16(Quality.NO_MATCH)
+    sigma *= np.float32(match_scene.step_m)
+    height[is_empty(quality)] = np.nan
+    sigma[is_empty(quality)] = np.nan
+    n_images = np.where(np.isnan(height), 0, n_views).astype(np.uint8)
+    surface = Surface(height, sigma, quality, n_images, np.full_like(height, np.nan))
+    return RefinedSurface(surface, refined.height)
+
+
+def _mark_overlap(
+    quality: NDArray[np.uint16], result: LevelResult, border: BorderGround, lattice_index: NDArray[np.float32]
+) -> None:
+    """Mark excluded views, cells outside the overlap of the images, and planes; changes `quality` (r, c)."""
+    window = result.level.window
+    quality[left_out(result.tile_views, quality.shape)] |= np.uint16(Quality.IMAGE_EXCLUDED)
+    quality[border.is_beyond(window)] |= np.uint16(Quality.UNSEEN)
+    is_unsupported = unsupported(border, window, result.tile_views, result.visible, lattice_index)
+    quality[is_unsupported] |= np.uint16(Quality.UNSEEN)
+    if result.is_planar is not None:
+        quality[result.is_planar] |= np.uint16(Quality.PLANE)
+
+
+def ortho_of_surface(
+    tile: TileInputs, results: Sequence[LevelResult], surface: Surface, lattice_index: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """True ortho-image of a surface with its filled cells, (r, c) or (r, c, 3) float32; NaN where there is no height.
+
+    results : of all levels, the coarsest first; surface : of the finest level's window; lattice_index : (r, c) heights
+    of all cells as they were matched, which occlude others whether they were kept or not.
+    """
+    *coarser_results, finest = results
+    lattice, config = finest.lattice, tile.config
+    is_filled = (surface.quality & np.uint16(Quality.FILLED)) != 0
+    of_filled = (surface.height - np.float32(lattice.origin_m)) / np.float32(lattice.step_m)
+    lattice_index = np.where(is_filled, of_filled, lattice_index)
+    coarser = [CoarserHeights(r.level.number, r.level.window, r.heights.vertex) for r in reversed(coarser_results)]
+    around = what_stands_around(coarser, finest.tile_views, finest.level.window, lattice_index, config.pyramid.halo)
+    scale = tile.match_scene.grey[0] if config.products.ortho_levels == "common" else None
+    coloured = tile.match_scene.coloured(tile.view_numbers)
+    ortho = true_ortho(tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, around, scale)
+    ortho[np.isnan(surface.height)] = np.nan
+    return ortho
