@@ -2,9 +2,8 @@
 
     python benchmarks/audit.py [--registry URL]
 
-The registry answers for a version; where it does not, for the latest one, which tells nothing of an older one that is
-installed. Such versions are listed too: whoever needs to know asks for them elsewhere. Status 1 where something is
-known.
+If the registry does not know a version, its answer for the latest version says nothing about the installed one. Such
+packages are listed as unknown. The exit status is 1 if a vulnerability is known.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ AT_ONCE, TIMEOUT_S = 8, 60.0
 
 @dataclass(frozen=True)
 class Answer:
-    """What the registry says of an installed version. known : vulnerabilities; None where it says nothing of it."""
+    """Answer of the registry about an installed version. known : vulnerabilities, None for an unknown version."""
 
     name: str
     version: str
@@ -34,7 +33,7 @@ class Answer:
 
 
 def asked(name: str, version: str, registry: str = REGISTRY) -> Answer:
-    """The registry's answer for a version, or for the latest one if that is it."""
+    """Ask the registry about a version, and about the latest version if it does not know the first."""
     for page in (f"{name}/{version}", name):
         try:
             with urlopen(Request(f"{registry}/{page}/json"), timeout=TIMEOUT_S) as reply:
@@ -49,13 +48,13 @@ def asked(name: str, version: str, registry: str = REGISTRY) -> Answer:
 
 
 def sentence(vulnerability: dict[str, Any]) -> str:
-    """What is known, and where it is mended."""
+    """A vulnerability and the versions without it, in one line."""
     mended = ", ".join(vulnerability.get("fixed_in") or ()) or "no version"
     return f"{vulnerability['id']}: {vulnerability.get('summary') or 'no summary'} (mended in {mended})"
 
 
 def main() -> int:
-    """Ask for all, and say what is known."""
+    """Ask about all installed packages and print the known vulnerabilities; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--registry", default=REGISTRY, metavar="URL", help="where NAME/VERSION/json is answered")
     registry = parser.parse_args().registry.rstrip("/")

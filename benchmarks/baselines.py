@@ -1,4 +1,4 @@
-"""What methods without zlocus' own steps reach on a rendered scene: how hard the scene is, whatever zlocus makes of it.
+"""Accuracy of two simple methods on a rendered scene, which tells how hard the scene is, independently of zlocus.
 
     python benchmarks/baselines.py FOLDER ... [--keep OUT] [--only mvll|opencv]
 
@@ -50,7 +50,7 @@ METHODS = ("mvll", "opencv")
 
 @dataclass(frozen=True)
 class RenderedFolder:
-    """A rendered scene on disk. low, high : heights of the truth, m; bounds : west, south, east, north."""
+    """A rendered scene on disk. low, high : lowest and highest true height, m; bounds : west, south, east, north, m."""
 
     folder: Path
     kind: str
@@ -66,7 +66,7 @@ class RenderedFolder:
 
 
 def open_rendered(folder: Path) -> RenderedFolder:
-    """What is in a folder of a rendered scene."""
+    """Read the description of a rendered scene from its folder."""
     folder = rendered_scene(folder)
     text = json.loads((folder / "scene.json").read_text())
     with rasterio.open(folder / "truth_dsm.tif") as truth:
@@ -77,7 +77,7 @@ def open_rendered(folder: Path) -> RenderedFolder:
 
 
 def mvll(scene: RenderedFolder, out: Path) -> Path:
-    """`zlocus dsm --method mvll` on the six views. Returns the surface."""
+    """Run `zlocus dsm --method mvll` on the six views and return the path of the surface."""
     command = [
         sys.executable, "-c", "from zlocus.cli.app import app; app()", "dsm", *scene.images, "-o", out,
         "--method", "mvll", "--resolution", STEP_M, "--crs", scene.crs, "--bounds", *scene.bounds, "--overwrite",
@@ -88,7 +88,10 @@ def mvll(scene: RenderedFolder, out: Path) -> Path:
 
 
 def pointing(scene: RenderedFolder, record: Path | None) -> dict[str, np.ndarray]:
-    """(column, row) px by view, to be added to what the RPC projects: a run's, or those that undo what was put in."""
+    """Pointing corrections (column, row) px by view, to be added to projected positions.
+
+    record : `run.json` with corrections; without it, the negative of the planted pointing errors.
+    """
     if record is not None:
         views = json.loads(record.read_text())["orientation"]["views"]
         return {name: np.array(views[f"img_{name}"]["shift_px"]) for name in PAIR}
@@ -97,9 +100,9 @@ def pointing(scene: RenderedFolder, record: Path | None) -> dict[str, np.ndarray
 
 
 def opencv(scene: RenderedFolder, out: Path, record: Path | None = None) -> Path:
-    """StereoSGBM on the pair; heights from disparities; the highest in each cell, gaps from the nearest cell.
+    """Match the pair by StereoSGBM and return the path of the surface: the highest point of each cell, gaps filled.
 
-    record : `run.json` that holds the pointing corrections. Returns the surface.
+    record : `run.json` that holds the pointing corrections. A gap takes the height of the nearest cell.
     """
     opened = open_scene([scene.folder / f"img_{name}.tif" for name in PAIR])
     shifts = [pointing(scene, record)[name] for name in PAIR]
@@ -121,7 +124,7 @@ def opencv(scene: RenderedFolder, out: Path, record: Path | None = None) -> Path
 
 
 def grey_on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> np.ndarray:
-    """(r, c) uint8 of a view on the plane."""
+    """A view resampled onto the plane and stretched to 8 bits, (r, c) uint8."""
     rows, cols = view.image.shape
     dark, bright = np.percentile(view.image.read(0, 0, rows, cols).pixels, GREY_PERCENT)
     stretched = 255.0 * (on_plane(view, shift, plane, z) - dark) / (bright - dark)
@@ -129,13 +132,13 @@ def grey_on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> 
 
 
 def judged(scene: RenderedFolder, dsm: Path) -> dict[str, dict[str, float]]:
-    """The judge's figures; hills are aligned first, for their pointing errors."""
+    """Accuracy by class; hills, whose RPC have pointing errors, are aligned first."""
     truth, classes = scene.folder / "truth_dsm.tif", scene.folder / "truth_class.tif"
     return judging.judged(dsm, truth, classes, align=scene.kind == "hills")
 
 
 def baselines(folder: Path, out: Path, methods: tuple[str, ...] = METHODS) -> dict[str, dict[str, dict[str, float]]]:
-    """The judge's figures by method. out : folder for the runs."""
+    """Accuracy by method and class. out : folder for the runs."""
     scene = open_rendered(folder)
     found = {}
     if "mvll" in methods:

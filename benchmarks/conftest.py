@@ -24,5 +24,5 @@ def pytest_configure(config):
 
 @pytest.fixture
 def side(request):
-    """Cells along a side as the command line asks for them; None where each scene has its own."""
+    """Cells along a side from the command line; None for the usual size of each scene."""
     return request.config.getoption("--side")

@@ -1,11 +1,11 @@
-"""Co-registration of `zlocus evaluate` beside that of xdem, an independent program, on planted shifts.
+"""Co-registration of `zlocus evaluate` and of xdem, an independent program, on planted shifts.
 
     python benchmarks/coregistration.py [--steps N]
 
-Both use the method of Nuth and Kääb (2011), each its own form of it. xdem (`pip install xdem`) is no dependency of
-zlocus: its own pins would hold others back. Without it nothing is compared, and the command says so. Surfaces lie on
-the grid of their reference, as xdem asks for. The rendered hills and the mountain are those of `ZLOCUS_TEST_DATA`, left
-out without it.
+Both implement the method of Nuth and Kääb (2011). xdem (`pip install xdem`) is not a dependency of zlocus, because its
+pinned requirements would hold other packages back; without it the command ends with a sentence. Surfaces lie on the
+grid of their reference, as xdem requires. The rendered hills and the mountain come from `ZLOCUS_TEST_DATA`; without it
+they are left out.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from rasterio.transform import from_origin
 from rasterio.warp import Resampling, reproject, transform_bounds
 from scipy.ndimage import map_coordinates
 
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 
 Heights = NDArray[np.float64]
@@ -38,7 +39,7 @@ HEAD = "| ground | planted | zlocus | xdem |\n|---|---|---|---|"
 
 @dataclass(frozen=True)
 class Case:
-    """A reference and what was done to it. planted : (east, north, up) m."""
+    """A reference and the surface made from it by a planted shift (east, north, up) m."""
 
     name: str
     reference: Heights
@@ -64,7 +65,7 @@ def main() -> None:
 
 
 def cases() -> Iterator[Case]:
-    """Analytic ground, as it is and spoilt, then the shared grounds where they are."""
+    """Analytic ground without and with errors, then the shared grounds if they are there."""
     x, y = np.meshgrid((np.arange(400) + 0.5) * 0.5, (np.arange(400) + 0.5) * 0.5)
     planted = (2.1, -1.7, 5.0)
     shifted = rolling(x - planted[0], y + planted[1]) + planted[2]
@@ -86,19 +87,19 @@ def cases() -> Iterator[Case]:
 
 
 def rolling(x: Heights, y: Heights) -> Heights:
-    """Slopes of up to some 40 degrees; x east, y south, m."""
+    """Heights of analytic ground with slopes of up to about 40 degrees; x east, y south, m."""
     return np.asarray(100 + 6 * np.sin(x / 17) + 5 * np.cos(y / 15) + 3 * np.sin((x + 2 * y) / 40))
 
 
 def moved(z: Heights, cell_m: float, shift: tuple[float, float, float]) -> Heights:
-    """Heights laid beside themselves, by cubic splines."""
+    """Heights moved by a shift, interpolated by cubic splines."""
     row, col = np.indices(z.shape, float)
     at = row + shift[1] / cell_m, col - shift[0] / cell_m
     return np.asarray(map_coordinates(z, at, order=3, mode="nearest")) + shift[2]
 
 
 def spoilt(z: Heights) -> Heights:
-    """With noise, cells that are too high by far, and holes."""
+    """Heights with noise, gross errors and holes."""
     rng = np.random.default_rng(8)
     z = z + rng.normal(0, NOISE_M, z.shape)
     z[rng.random(z.shape) < GROSS_SHARE] += GROSS_M
@@ -110,7 +111,7 @@ def srtm(path: Path) -> Heights:
     """A real mountain, on a grid in metres that lies within it."""
     with rasterio.open(path) as source:
         west, south, east, north = transform_bounds(source.crs, "EPSG:32631", *source.bounds)
-        inset = 400.0  # by which the corners of the map lie outside of those in degrees
+        inset = 400.0  # Corners of the map lie this far outside the raster in degrees.
         shape = int((north - south - 2 * inset) / 90), int((east - west - 2 * inset) / 90)
         z = np.full(shape, np.nan)
         at = from_origin(west + inset, north - inset, 90, 90)
@@ -120,7 +121,7 @@ def srtm(path: Path) -> Heights:
 
 
 def write(path: Path, z: Heights, cell_m: float) -> None:
-    """A raster of float64: xdem would keep float32 to itself."""
+    """Write a raster of float64, because xdem computes in the dtype of its input."""
     at = Affine(cell_m, 0, 500_000, 0, -cell_m, 5_200_000)
     profile = {"driver": "GTiff", "height": z.shape[0], "width": z.shape[1], "count": 1, "dtype": "float64"}
     with rasterio.open(path, "w", crs=CRS, transform=at, nodata=-9999.0, **profile) as sink:
@@ -128,14 +129,14 @@ def write(path: Path, z: Heights, cell_m: float) -> None:
 
 
 def evaluated(surface: Path, reference: Path, cell_m: float) -> tuple[float, float, float]:
-    """Where the surface lies by zlocus, (east, north, up) m."""
-    shift = evaluate(surface, reference, coregister="nuth-kaab", margin_m=4 * cell_m).shift
+    """Shift of the surface by zlocus, (east, north, up) m."""
+    shift = evaluate(surface, Comparison(reference, coregister="nuth-kaab", margin_m=4 * cell_m)).shift
     assert shift is not None
     return shift.east_m, shift.north_m, shift.up_m
 
 
 def by_xdem(surface: Path, reference: Path, steps: int) -> tuple[float, float, float]:
-    """Where the surface lies by xdem, which says by how much it is to be moved."""
+    """Shift of the surface by xdem, (east, north, up) m: the negative of the correction that xdem returns."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import xdem

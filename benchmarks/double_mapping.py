@@ -1,6 +1,4 @@
-"""Whether an ortho-image shows a place twice: cells of a rendered scene that show a pixel of an image that is, by the
-exact truth, hidden from them.
-"""
+"""Double mapping of an ortho-image: cells that show an object which occludes them in the source image."""
 
 from __future__ import annotations
 
@@ -12,19 +10,22 @@ from scipy.ndimage import map_coordinates
 
 from zlocus.core.scene import Scene
 
-# Grey values: a sample equals its source to rounding; others as near as that leave the source unknown.
-SAME_GREY, RIVAL_GREY = 1.5, 2.0
-# Metres: steps along a ray, how high something may stand above it, the highest building, the rim of the truth left out.
+# Grey values: a cell of the ortho-image differs from its source image by rounding only. If a second image is as
+# similar, the source is unknown.
+SAME_GREY, SIMILAR_GREY = 1.5, 2.0
+# Metres: step along a ray, tolerance of the truth above the ray, highest building, rim of the truth that is left out.
 STEP_M, ABOVE_M, HIGHEST_M, RIM_M = 0.25, 0.3, 60.0, 10.0
 RIGHT_M = 1.0
 KINDS = {"ground": (0, 1), "building": (2,), "tree": (3,)}
 
 
 def double_mapped(folder: Path, truth: Path, classes: Path, scene: Scene) -> dict[str, tuple[float, float]]:
-    """Share of the cells of a class whose source is hidden from them: of all, and of those with a right height.
+    """Share of the cells of each class that are occluded in the image they were taken from.
 
-    folder : a result of `zlocus dsm` with `products.ortho_levels = "own"`, for grey values tell the source; truth,
-    classes : the rendered scene's; scene : its images.
+    The first number counts all cells, the second those with a right height.
+
+    folder : result of `zlocus dsm` with `products.ortho_levels = "own"`, because the source of a cell is recognised by
+    its grey value; truth, classes : rasters of the rendered scene; scene : its images.
     """
     with rasterio.open(truth) as file:
         z_true, to_truth = file.read(1).astype(float), ~file.transform
@@ -45,7 +46,7 @@ def double_mapped(folder: Path, truth: Path, classes: Path, scene: Scene) -> dic
     free = np.array([_sees(view.sensor, np.column_stack([x, y, z]), z_true, to_truth) for view in scene.views])
     away = np.array([np.abs(_grey(view, np.column_stack([x, y, z_found])) - grey) for view in scene.views])
     source, nearest = away.argmin(axis=0), away.min(axis=0)
-    known = (nearest <= SAME_GREY) & ((away <= nearest + RIVAL_GREY).sum(axis=0) == 1) & free.any(axis=0)
+    known = (nearest <= SAME_GREY) & ((away <= nearest + SIMILAR_GREY).sum(axis=0) == 1) & free.any(axis=0)
     hidden = ~free[source, np.arange(len(x))]
     return {
         name: (float(hidden[of].mean()), float(hidden[of & right].mean()))
@@ -55,7 +56,7 @@ def double_mapped(folder: Path, truth: Path, classes: Path, scene: Scene) -> dic
 
 
 def _sees(sensor, xyz: np.ndarray, z_true: np.ndarray, to_truth) -> np.ndarray:
-    """Whether nothing of the truth stands in the way of a sensor to points (n, 3), (n,) bool."""
+    """Whether a sensor sees the points (n, 3) without occlusion by the true surface, (n,) bool."""
     up = sensor.ground_from_image(sensor.image_from_ground(xyz), xyz[:, 2] + 10.0)
     by_metre, free = (up[:, :2] - xyz[:, :2]) / 10.0, np.ones(len(xyz), bool)
     rows, cols = z_true.shape

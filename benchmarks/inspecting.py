@@ -1,9 +1,9 @@
-"""Rows of the acceptance table on the inspector: how long a click takes, and a tile of the map.
+"""Rows of the acceptance table on the inspector: response times of clicks and of tiles of the map.
 
     python benchmarks/inspecting.py OUT [--bar-ms N] [--clicks N] [--tiles N]
 
-OUT holds a surface of `zlocus dsm`. Clicks are answered by the server, and half of them are drawn by the page in a
-browser (from CHROMIUM or the PATH) where there is one.
+OUT holds a surface of `zlocus dsm`. All clicks are answered by the server. Half of them are also drawn by the page, if
+there is a browser (named by CHROMIUM, or on the PATH).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DEMO_MS, LARGE_MS, LARGE_M = 300.0, 1000.0, 100.0
 OPENED_S = 300.0
 SIZE = {"width": 1280, "height": 860}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-# The time from a click to the frame in which all of the cell is drawn.
+# Measures the time from a click to the frame in which the whole cell is drawn.
 CLOCK = """() => {
   window.drawnAfter = null;
   document.getElementById("map").addEventListener("pointerup", () => (window.clickedAt = performance.now()),
@@ -42,24 +42,24 @@ CLOCK = """() => {
 }"""
 
 
-def inspect(at: Workplace) -> list[Figure]:
-    """Clicks on the demo."""
-    run([ZLOCUS, "demo", "-o", at.out])
-    return measured(at.out, DEMO_MS)
+def inspect(workplace: Workplace) -> list[Figure]:
+    """Response times on the demo."""
+    run([ZLOCUS, "demo", "-o", workplace.out])
+    return measured(workplace.out, DEMO_MS)
 
 
-def inspect_large(at: Workplace) -> list[Figure]:
-    """Clicks on a run of 100 M cells."""
-    with tempfile.TemporaryDirectory(dir=at.out.parent) as scratch:
+def inspect_large(workplace: Workplace) -> list[Figure]:
+    """Response times on a surface of 100 million cells."""
+    with tempfile.TemporaryDirectory(dir=workplace.out.parent) as scratch:
         images = scaling.write_views(Path(scratch), scaling.town(), 6, round((LARGE_M * 1e6) ** 0.5))
-        run([ZLOCUS, "dsm", *images, "-o", at.out, "--crs", "EPSG:32632", "--resolution", 0.5, "--overwrite"])
-        return measured(at.out, LARGE_MS)
+        run([ZLOCUS, "dsm", *images, "-o", workplace.out, "--crs", "EPSG:32632", "--resolution", 0.5, "--overwrite"])
+        return measured(workplace.out, LARGE_MS)
 
 
 def measured(out: Path, bar_ms: float, n_clicks: int = N_CLICKS, n_tiles: int = N_TILES) -> list[Figure]:
-    """Clicks at random cells with a height, and tiles of all levels, one after the other.
+    """Response times of clicks at random cells with a height, and of map tiles of all levels, one after the other.
 
-    n_clicks : answered by the server; half of them are drawn by the browser too.
+    n_clicks : answered by the server; the browser draws half of them.
     """
     with served(out) as address, httpx.Client(base_url=address, timeout=60) as client:
         about = client.get("api/surface").json()
@@ -85,7 +85,7 @@ def measured(out: Path, bar_ms: float, n_clicks: int = N_CLICKS, n_tiles: int = 
 
 @contextmanager
 def served(out: Path) -> Iterator[str]:
-    """The address of the page, once the scene is open."""
+    """Serve a surface, and give the address of the page once the scene is open."""
     with subprocess.Popen([str(ZLOCUS), "inspect", str(out)], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -103,7 +103,7 @@ def served(out: Path) -> Iterator[str]:
 
 
 def places(out: Path, n: int) -> Iterator[tuple[float, float]]:
-    """Middles of random cells that have a height, m."""
+    """Centres (x, y) m of random cells that have a height."""
     rng, found = np.random.default_rng(11), 0
     with rasterio.open(out / "dsm.tif") as file:
         while found < n:
@@ -114,7 +114,7 @@ def places(out: Path, n: int) -> Iterator[tuple[float, float]]:
 
 
 def tile_paths(about: dict, n: int) -> Iterator[str]:
-    """Random tiles of random layers at random levels."""
+    """Addresses of random map tiles of random layers and levels."""
     rng, names = np.random.default_rng(12), [layer["name"] for layer in about["layers"]]
     for _ in range(n):
         level = int(rng.integers(about["levels"] + 1))
@@ -123,15 +123,17 @@ def tile_paths(about: dict, n: int) -> Iterator[str]:
 
 
 def timed(client: httpx.Client, path: str, query: dict[str, float] | None = None) -> float:
-    """How long an answer takes, ms."""
+    """Time of an answer, ms."""
     start = time.perf_counter()
     client.get(path, params=query).raise_for_status()
     return 1e3 * (time.perf_counter() - start)
 
 
 def drawn_ms(address: str, cells: list[tuple[float, float]]) -> list[float]:
-    """How long it takes from clicks to all that the page draws of the cells, ms; none without a browser. The first
-    click, for which the browser compiles the page's scripts, does not count."""
+    """Times from clicks to complete drawings of the cells, ms; empty without a browser.
+
+    The first click does not count, because the browser compiles the scripts of the page for it.
+    """
     browser = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         return []

@@ -1,7 +1,7 @@
-"""What benchmarks of `zlocus dsm` share: a run with its work, judging its surface, and tables.
+"""Runs of `zlocus dsm`, accuracy of their surfaces, and tables, for the benchmarks that need all three.
 
-Shared scenes, and the judge that shares no code with zlocus, are those of `ZLOCUS_TEST_DATA`; where that is not set,
-those of the folder `shared` beside this checkout.
+The shared scenes and the judge, a script that shares no code with zlocus, lie in `ZLOCUS_TEST_DATA`; where that is not
+set, in the folder `shared` beside this checkout.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RENDERED_TOWN = DATA / "rendered-city"
 
 @dataclass(frozen=True)
 class Work:
-    """What matching took: NCC evaluated, in millions, and as a share of those of all images; CPU, s."""
+    """Cost of matching: evaluated correlations in millions and as a share of those of all images; CPU in seconds."""
 
     evaluations: float
     share: float
@@ -38,12 +38,12 @@ class Work:
 
 
 def rendered_scene(folder: Path) -> Path:
-    """The folder of a rendered scene, once it is known to be one.
+    """The given folder, after a check that it holds a rendered scene.
 
     Raises
     ------
     CannotRun
-        Where the folder has no truth.
+        The folder has no truth.
     """
     if not (folder / "truth_dsm.tif").exists():
         raise CannotRun(
@@ -54,14 +54,14 @@ def rendered_scene(folder: Path) -> Path:
 
 
 def run_here(command: Sequence[str]) -> None:
-    """Run a command of zlocus in this process, where a benchmark can watch it. What it prints goes to standard error.
+    """Run a command of zlocus in this process, where a benchmark can observe it; its output goes to standard error.
 
-    command : what follows `zlocus` on the command line.
+    command : the words after `zlocus` on the command line.
 
     Raises
     ------
     CannotRun
-        Where the command ends with another status than 0.
+        The exit status of the command is not 0.
     """
     with redirect_stdout(sys.stderr):
         # In this mode the command line returns the status of a failure instead of ending the process.
@@ -71,9 +71,9 @@ def run_here(command: Sequence[str]) -> None:
 
 
 def matched(images: Iterable[Path], out: Path, config: RunConfig, options: Iterable[str]) -> Work:
-    """One run of `zlocus dsm` in this process, into an empty folder; its configuration lies beside it.
+    """Run `zlocus dsm` in this process, into an empty folder, with the configuration written beside it.
 
-    Its page about the run is not asked for: nobody reads it, and it takes longer than matching a small scene.
+    No report is written: it would take longer than matching a small scene.
     """
     shutil.rmtree(out, ignore_errors=True)
     file = out.with_name(f"{out.name}.toml")
@@ -87,7 +87,7 @@ def matched(images: Iterable[Path], out: Path, config: RunConfig, options: Itera
 
 
 def judged(dsm: Path, truth: Path, classes: Path, threshold_m: float = 1.0, align: bool = False) -> dict[str, Any]:
-    """Figures of each class: of the independent script where it is at hand, else of our own evaluation.
+    """Accuracy of each class of cells: by the independent judge if there is one, else by `zlocus evaluate`.
 
     align : remove a common shift of the surface first, for images with pointing errors.
     """
@@ -95,26 +95,27 @@ def judged(dsm: Path, truth: Path, classes: Path, threshold_m: float = 1.0, alig
         command = [sys.executable, str(JUDGE), str(dsm), str(truth), "--class", str(classes), "--json"]
         command += ["--thr", str(threshold_m), *(["--align"] if align else [])]
         found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        # The shift that was removed stands beside the classes.
+        # The judge reports the removed shift beside the classes.
         classes_of = {kind: figures for kind, figures in found.items() if isinstance(figures, dict)}
         return {kind: {**figures, "completeness": figures["complete"]} for kind, figures in classes_of.items()}
+    from zlocus.evaluation.comparison import Comparison
     from zlocus.evaluation.evaluate import evaluate
 
-    return evaluate(dsm, truth, classes=classes, threshold_m=threshold_m, align=align).as_dict()
+    return evaluate(dsm, Comparison(truth, classes=classes, threshold_m=threshold_m, align=align)).as_dict()
 
 
 def table_head(columns: dict[str, str]) -> str:
-    """The head of a table. columns : how a value is written, by heading."""
+    """The first two lines of a Markdown table. columns : format of a value, by heading."""
     return "| " + " | ".join(columns) + " |\n|" + "---|" * len(columns)
 
 
 def table_row(columns: dict[str, str], found: dict[str, Any]) -> str:
-    """A row of figures, by the names that `columns` knows."""
+    """A line of a Markdown table with the figures that `columns` names."""
     return "| " + " | ".join(form.format(**found) for form in columns.values()) + " |"
 
 
 def write_table(found: list[dict[str, Any]], path: Path) -> None:
-    """All figures as CSV."""
+    """Write all figures as CSV."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, found[0])
         writer.writeheader()

@@ -1,6 +1,6 @@
-"""What one core can do, as plain loops compiled as the kernels are (IEEE arithmetic, whole vectors) reach it.
+"""Rates of one core, reached by plain loops that are compiled like the kernels (IEEE arithmetic, whole vectors).
 
-Every rate is the best of several short runs in CPU time of the thread, for the machine may be shared.
+Every rate is the best of several short runs in CPU time of the thread, because the machine may be shared.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def gathers(a, index, rounds, out):
 # (n,) u2, (n,) u2, (n,) u2, (n,) u2, i8 -> u2
 @kernel
 def greatest(a, b, c, d, rounds):
-    """Loads alone: four arrays, one value kept."""
+    """Loads only: four arrays, one value kept."""
     most = np.uint16(0)
     for _ in range(rounds):
         for j in range(a.shape[0]):
@@ -77,7 +77,7 @@ def greatest(a, b, c, d, rounds):
 # (n,) u2, u2, i8 -> None
 @kernel
 def written(a, value, rounds):
-    """Stores alone."""
+    """Stores only."""
     for _ in range(rounds):
         for j in range(a.shape[0]):
             a[j] = value
@@ -86,7 +86,7 @@ def written(a, value, rounds):
 # (n,) u2, (n,) u2, i8 -> None
 @kernel
 def added(a, b, rounds):
-    """b += a: two loads and a store a value."""
+    """b += a: two loads and one store per value."""
     for _ in range(rounds):
         for j in range(a.shape[0]):
             b[j] = np.uint16(b[j] + a[j])
@@ -110,20 +110,20 @@ class Machine:
     reads: dict[int, float]
 
     def or_better(self, other: Machine) -> Machine:
-        """The higher of both of every rate: what else runs on the machine only lowers them."""
+        """The higher of two measurements of every rate, because other load on the machine only lowers them."""
         mine, theirs = asdict(self), asdict(other)
         reads = {size: max(found, theirs["reads"][size]) for size, found in mine.pop("reads").items()}
         return Machine(**{name: max(found, theirs[name]) for name, found in mine.items()}, reads=reads)
 
     def bandwidth(self, size: int) -> float:
-        """GB/s on arrays of `size` bytes: that of the largest size measured that is no larger, so never too low."""
+        """GB/s on arrays of `size` bytes: the rate of the next smaller measured size, so that it is never too low."""
         return self.reads[max((known for known in self.reads if known <= size), default=min(self.reads))]
 
 
 def rate(call: Callable[[int], object], n: float, runs: int = RUNS, seconds: float = 0.02) -> float:
-    """1e9 units a second of the best of some runs, each of about so many seconds of CPU.
+    """Rate of the best run, in 1e9 units per second; each run takes about `seconds` of CPU.
 
-    call : with the number of rounds; n : units of a round.
+    call : takes the number of rounds; n : units per round.
     """
     call(1)
     start, rounds = time.thread_time(), 1
@@ -140,7 +140,7 @@ def rate(call: Callable[[int], object], n: float, runs: int = RUNS, seconds: flo
 
 
 def measured(runs: int = RUNS) -> Machine:
-    """The rates of the core that this runs on, each the best of so many runs."""
+    """Measure the rates of this core, each as the best of `runs` runs."""
     rng = np.random.default_rng(1)
     n = IN_L1 // 4
     grey, out = rng.random(n // 2).astype(np.float32) + np.float32(0.5), np.empty(n // 2, np.float32)

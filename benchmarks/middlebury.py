@@ -1,10 +1,10 @@
-"""Rectified photographs with ground truth (Scharstein & Szeliski 2002, 2003), beside OpenCV's semi-global matcher.
+"""Rectified photographs with ground truth (Scharstein and Szeliski 2002, 2003): `zlocus cloud` and OpenCV's matcher.
 
     python benchmarks/middlebury.py FOLDER [--only CASE ...] [--keep OUT]
 
 FOLDER holds cones, teddy and tsukuba, or those of them that the CASEs need (a CASE is "teddy, 2 views"). A pixel is bad
-when its disparity is wrong by more than 1 px, or missing. Counted are all pixels whose truth is known and, where both
-images have a truth, confirmed by the other's (not occluded).
+if its disparity is wrong by more than 1 px, or missing. All pixels with a known truth count. Where both images have a
+truth, pixels whose two truths disagree are occluded and do not count.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from zlocus.io.scene_file import Frame, SceneFile, ViewEntry, write_scene_file
 from zlocus.matching.quality import Quality
 
 ZLOCUS = Path(sys.executable).with_name("zlocus")
-# Any focal length and step will do; reports are in pixels of disparity.
+# The focal length and the step are arbitrary; results are in pixels of disparity.
 FOCAL_PX, STEP_M = 500.0, 1.0
 LEAST_PX, BAD_PX = 1.0, 1.0
 LEVEL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -37,9 +37,12 @@ BLOCK, UNIQUENESS = 3, 0
 
 @dataclass(frozen=True)
 class Case:
-    """views : image files and steps to the right of the first, which is the reference; most_px : largest disparity
-    per step that is searched, by both programs; truth : (file, value of a pixel of disparity) of the reference, and of
-    the view a step to the right where it has one."""
+    """Photographs of one scene.
+
+    views : image files and their steps to the right of the first, which is the reference; most_px : largest disparity
+    per step that both programs search; truth : (file, value of one pixel of disparity) of the reference and, if there
+    is one, of the view one step to the right.
+    """
 
     folder: str
     views: tuple[tuple[str, float], ...]
@@ -61,7 +64,7 @@ CASES = {
 
 @dataclass(frozen=True)
 class BadPixels:
-    """Percent of the judged pixels: with zlocus, with OpenCV (of the first two views), and what zlocus leaves empty
+    """Percent of the counted pixels that are bad with zlocus, bad with OpenCV (first two views), and empty with zlocus
     before gaps are filled."""
 
     zlocus: float
@@ -70,7 +73,7 @@ class BadPixels:
 
 
 def judge(data: Path, name: str, out: Path) -> BadPixels:
-    """One case. data : folder of the scenes; out : folder for the run."""
+    """Match one case by both programs. data : folder of the scenes; out : folder for the run."""
     case = CASES[name]
     truth = true_disparity(data / case.folder, case)
     found, unfilled = zlocus_disparity(data / case.folder, case, out)
@@ -81,7 +84,7 @@ def judge(data: Path, name: str, out: Path) -> BadPixels:
 
 
 def true_disparity(folder: Path, case: Case) -> np.ndarray:
-    """(r, c) px per step, NaN where it is not known or the other image's truth does not confirm it."""
+    """True disparity (r, c) px per step, NaN where it is unknown or the truth of the other image disagrees."""
     first, *others = (cv2.imread(str(folder / file), cv2.IMREAD_UNCHANGED) / unit for file, unit in case.truth)
     known = first > 0
     for other in others:
@@ -98,7 +101,7 @@ def bad(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def zlocus_disparity(folder: Path, case: Case, out: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(r, c) px per step, gaps filled, and where there was a gap."""
+    """Disparity (r, c) px per step with gaps filled, and the mask of the gaps."""
     out.mkdir(parents=True, exist_ok=True)
     scene = out / "scene.yaml"
     write_scene_file(scene, scene_file(folder, case))
@@ -115,7 +118,7 @@ def zlocus_disparity(folder: Path, case: Case, out: Path) -> tuple[np.ndarray, n
 
 
 def scene_file(folder: Path, case: Case) -> SceneFile:
-    """The same ideal camera for all views, moved along x; it looks along z."""
+    """Write the scene file: one ideal camera, moved along x, that looks along z."""
     entries = []
     for file, steps in case.views:
         path = (folder / file).resolve()
@@ -128,10 +131,10 @@ def scene_file(folder: Path, case: Case) -> SceneFile:
 
 
 def opencv_disparity(folder: Path, case: Case) -> np.ndarray:
-    """(r, c) px of StereoSGBM with eight paths, from the luminance of the first two views."""
+    """Disparity (r, c) px of StereoSGBM with eight paths, from the luminance of the first two views."""
     first, second = (cv2.imread(str(folder / file), cv2.IMREAD_GRAYSCALE) for file, _ in case.views[:2])
     n = -(-(case.most_px + 1) // 16) * 16
-    # Without a border on the left it would leave out the first n columns.
+    # A border on the left keeps the first n columns, which StereoSGBM would leave empty.
     first, second = (cv2.copyMakeBorder(image, 0, 0, n, 0, cv2.BORDER_REPLICATE) for image in (first, second))
     matcher = cv2.StereoSGBM_create(
         minDisparity=0, numDisparities=n, blockSize=BLOCK, P1=8 * BLOCK**2, P2=32 * BLOCK**2, disp12MaxDiff=1,

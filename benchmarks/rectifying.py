@@ -1,7 +1,7 @@
-"""Pairs of images for matchers that know rows of images only: both resampled onto a plane at a constant height.
+"""Rectified pairs for matchers that search along rows: both images resampled onto a plane at a constant height.
 
-On the plane the parallax of a pair lies along rows, so a disparity is a height; points go back through the camera
-of the first view.
+On the plane the parallax of a pair lies along rows, so a disparity is a height. Matched points are projected back
+through the camera of the first view.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MARGIN_M = 25.0
 
 
 class Area(Protocol):
-    """What is asked for. bounds : west, south, east, north, m."""
+    """Area of the surface. bounds : west, south, east, north, m."""
 
     @property
     def crs(self) -> str: ...
@@ -35,7 +35,7 @@ class Area(Protocol):
 
 @dataclass(frozen=True)
 class Rectified:
-    """A view on the plane: positions on it are metres along and across the parallax, `shape` cells of STEP_M.
+    """Grid on the plane: `shape` cells of STEP_M, with rows along the parallax.
 
     origin : (x, y) m of the first cell's centre; along, across : unit vectors in (x, y).
     """
@@ -46,7 +46,7 @@ class Rectified:
     shape: tuple[int, int]
 
     def ground(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """(n, 2) m of cells."""
+        """Positions (n, 2) m of cells."""
         at = STEP_M * np.stack([cols, rows], axis=-1).reshape(-1, 2)
         return self.origin + at @ np.stack([self.along, self.across])
 
@@ -57,8 +57,7 @@ def to_image(view: View, shift: np.ndarray, xy: np.ndarray, z: float) -> np.ndar
 
 
 def parallax(area: Area, views: Sequence[View], shifts: Sequence[np.ndarray], z: float) -> np.ndarray:
-    """How far (x, y) m on the plane the second view moves against the first for each metre of height; the direction is
-    that in which a higher point of the second view lies before that of the first."""
+    """Parallax (x, y) on the plane, metres per metre of height: position by the first view less that by the second."""
     west, south, east, north = area.bounds
     point = np.array([[(west + east) / 2, (south + north) / 2]])
     on_plane = []
@@ -69,7 +68,7 @@ def parallax(area: Area, views: Sequence[View], shifts: Sequence[np.ndarray], z:
 
 
 def rectified(area: Area, moved: np.ndarray) -> Rectified:
-    """A plane's frame around the area, whose rows run along the parallax."""
+    """Grid around the area, with rows along the parallax. moved : parallax per metre, see `parallax`."""
     west, south, east, north = area.bounds
     along = moved / np.hypot(*moved)
     across = np.array([along[1], -along[0]])
@@ -81,7 +80,7 @@ def rectified(area: Area, moved: np.ndarray) -> Rectified:
 
 
 def on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> np.ndarray:
-    """(r, c) pixels of a view on the plane, of its own type; beyond the image its border is carried on."""
+    """A view resampled onto the plane, (r, c), in its own dtype; beyond the image its border is repeated."""
     rows, cols = view.image.shape
     grey = view.image.read(0, 0, rows, cols).pixels
     row, col = np.mgrid[: plane.shape[0], : plane.shape[1]]
@@ -95,7 +94,7 @@ def on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> np.nd
 
 
 def disparity_range(area_heights: tuple[float, float], moved: np.ndarray, margin_m: float) -> tuple[int, int]:
-    """First disparity and their number, a multiple of 16, for heights around the middle of a range."""
+    """First disparity and number of disparities (a multiple of 16) that cover a range of heights with a margin."""
     low, high = area_heights
     reach = float(np.hypot(*moved)) / STEP_M * ((high - low) / 2 + margin_m)
     return -int(np.ceil(reach)), 16 * int(np.ceil(2 * reach / 16) + 1)
@@ -104,8 +103,9 @@ def disparity_range(area_heights: tuple[float, float], moved: np.ndarray, margin
 def ground_points(
     disparity: np.ndarray, view: View, shift: np.ndarray, plane: Rectified, moved: np.ndarray, middle: float
 ) -> np.ndarray:
-    """(n, 3) m where a disparity was found. disparity : (r, c) px, NaN where there is none; middle : the plane's
-    height.
+    """Ground points (n, 3) m of all pixels with a disparity.
+
+    disparity : (r, c) px, NaN where there is none; middle : height of the plane, m.
     """
     rows, cols = np.nonzero(np.isfinite(disparity))
     z = middle + disparity[rows, cols] * STEP_M / float(np.hypot(*moved))
@@ -114,7 +114,7 @@ def ground_points(
 
 
 def gridded(area: Area, xyz: np.ndarray) -> np.ndarray:
-    """(r, c) m: the highest point (n, 3) m in each cell of STEP_M, NaN where there is none."""
+    """Surface (r, c) m with the highest of the points (n, 3) m in each cell of STEP_M, NaN in empty cells."""
     west, south, east, north = area.bounds
     rows, cols = round((north - south) / STEP_M), round((east - west) / STEP_M)
     row = np.floor((north - xyz[:, 1]) / STEP_M).astype(int)
@@ -126,7 +126,7 @@ def gridded(area: Area, xyz: np.ndarray) -> np.ndarray:
 
 
 def write_surface(area: Area, surface: np.ndarray, path: Path) -> Path:
-    """Heights (r, c) m as a raster, gaps from the nearest cell that has one."""
+    """Write heights (r, c) m as a raster; empty cells take the height of the nearest cell."""
     nearest = distance_transform_edt(np.isnan(surface), return_distances=False, return_indices=True)
     west, _, _, north = area.bounds
     path.parent.mkdir(parents=True, exist_ok=True)

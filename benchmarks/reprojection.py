@@ -1,10 +1,10 @@
-"""How well heights from some images of a local frame fit others, which had no say in them.
+"""Check of a surface by images that were left out of the matching, in a local frame.
 
-Every left-out image is compared with the surface textured by the images that were matched: both are resampled at the
-cells of the surface, and correlated over windows of `WINDOW` x `WINDOW` cells (a cell is about a pixel), as far as both
-show them. A window takes its texture from the matched image that shows it from the direction nearest to that of the
-left-out one. What an image shows is told by the surface alone: the ray from a cell to the camera must not meet it.
-Correlations never decide what counts, and even windows count as 0.
+The surface is textured with the matched images and compared with every left-out image: both are resampled at the cells
+of the surface and correlated over windows of `WINDOW` x `WINDOW` cells (a cell is about a pixel), where both show the
+surface. A window takes its texture from the matched image with the viewing direction nearest to that of the left-out
+image. Occlusions follow from the surface alone: the ray from a cell to the camera must not meet the surface. No window
+is dropped because of its correlation; windows without texture count as 0.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from zlocus.core.scene import View
 from zlocus.evaluation.heights import read_heights
 
 WINDOW = 11
-# A cell is hidden where the surface stands so many cells above its ray.
+# A cell is occluded where the surface rises more than this many cells above its ray.
 CLEAR_CELLS = 3.0
-# Side of the squares of cells that a ray may pass over at once, and of those that are hidden, or not, together.
+# Side, in cells, of the squares that a ray may skip at once, and of the squares whose occlusion is decided together.
 SQUARE, ALIKE = 16, 2
 # Share of a window that both images must see.
 LEAST_SEEN = 0.5
-# Product of the variances of two windows, grey values squared, of which one is even.
+# Below this product of the variances of two windows (grey values squared) one of them has no texture.
 EVEN = 1e-6
 
 
 @dataclass(frozen=True)
 class Reprojection:
-    """What a surface's cells are worth in an image that was left out, counts of cells.
+    """Comparison of a surface with an image that was left out; all but `ncc` are numbers of cells.
 
-    ncc : (n,) correlations of the windows compared; empty : without a height; outside : beyond the image; hidden : by
-    the surface; untextured : seen by no matched image; at_rim : most of whose window is one of these.
+    ncc : (n,) correlations of the compared windows; empty : without a height; outside : of the image; hidden : occluded
+    by the surface; untextured : not seen by a matched image; at_rim : most of the window is one of these.
     """
 
     ncc: np.ndarray
@@ -75,14 +75,17 @@ class Surface:
         return cls(np.dstack([x, y, raster.z]), float(raster.transform.a))
 
     def moved(self, by_m: float) -> Surface:
-        """The surface with other heights."""
+        """The surface with all heights raised by `by_m`."""
         return Surface(self.xyz + np.array([0.0, 0.0, by_m]), self.cell_m)
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a view shows of a surface. grey : (r, c), where `inside`; inside, clear : (r, c), in the image, not hidden;
-    towards : (r, c, 3), unit vectors to the camera."""
+    """A view resampled at the cells of a surface.
+
+    grey : (r, c), defined where `inside`; inside : (r, c), inside the image; clear : (r, c), inside and not occluded;
+    towards : (r, c, 3), unit vectors to the camera.
+    """
 
     grey: np.ndarray
     inside: np.ndarray
@@ -93,7 +96,7 @@ class Shown:
 # (r,c) f4, (b,d) f4, f8, f8, f8, f8, (r,c) b1 -> None
 @kernel
 def clear_cells(height, highest, cam_col, cam_row, cam_height, margin, out):
-    """Whether the ray from each cell to a camera stays above the surface: followed cell by cell along its longer side.
+    """Whether the ray from each cell to a camera stays above the surface; it is followed cell by cell.
 
     height : (r, c) float32 in cells, NaN where there is none; highest : (b, d) float32, see `highest_of`; cam_col,
     cam_row, cam_height : of the camera, in cells; margin : cells by which the surface must stand above the ray to hide.
@@ -139,7 +142,7 @@ def is_clear(height, highest, r, c, camera, margin):
 # f8, f8 -> f8
 @kernel
 def way_out(at, by):
-    """Steps until a place on an axis leaves its square, less than half a cell short of the next."""
+    """Steps until a position on an axis leaves its square of cells."""
     first = np.rint(at) // SQUARE * SQUARE - 0.5
     if by > 0.0:
         return (first + SQUARE - at) / by
@@ -157,7 +160,7 @@ def highest_of(height: np.ndarray) -> np.ndarray:
 
 
 def shown(view: View, surface: Surface) -> Shown:
-    """A view at the cells of a surface, which hides some of them."""
+    """A view resampled at the cells of a surface, with the occlusions that the surface causes."""
     points = surface.xyz.reshape(-1, 3)
     shape = surface.xyz.shape[:2]
     xy = view.sensor.image_from_ground(points)
@@ -176,7 +179,7 @@ def shown(view: View, surface: Surface) -> Shown:
 
 
 def compared(target: Shown, matched: Sequence[Shown], has_height: np.ndarray) -> Reprojection:
-    """Correlations of an image with the surface's texture, around every cell that both show."""
+    """Correlations of an image with the texture of the surface, at every cell that both show."""
     seen = has_height & target.inside & target.clear
     is_textured, is_compared = np.zeros(seen.shape, bool), np.zeros(seen.shape, bool)
     nearest, ncc = np.full(seen.shape, -2.0, np.float32), np.zeros(seen.shape, np.float32)
@@ -200,15 +203,15 @@ def compared(target: Shown, matched: Sequence[Shown], has_height: np.ndarray) ->
 
 
 def windows(values: np.ndarray) -> np.ndarray:
-    """Mean of the window around each cell, 0 beyond the border. (r, c) -> (r, c)"""
+    """Mean of the window around each cell, (r, c); values beyond the border are 0."""
     return cv2.blur(values, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT)
 
 
 def window_ncc(a: np.ndarray, b: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Correlation over the usable cells of the window around each cell, 0 where one of the two is even. (r, c) each."""
+    """Correlation over the usable cells of the window around each cell, (r, c); 0 where one window has no texture."""
     if not usable.any():
         return np.zeros(usable.shape)
-    # Squares of differences from a constant lose fewer digits.
+    # The mean is subtracted first, because squares of large values lose digits.
     a, b = (np.where(usable, v - v[usable].mean(dtype=float), 0.0) for v in (a, b))
     share = np.maximum(windows(usable.astype(float)), 1e-9)
     mean_a, mean_b = windows(a) / share, windows(b) / share
@@ -220,7 +223,10 @@ def window_ncc(a: np.ndarray, b: np.ndarray, usable: np.ndarray) -> np.ndarray:
 def reprojected(
     surface: Surface, matched: Sequence[View], left_out: Sequence[View], by_m: float = 0.0
 ) -> dict[str, Reprojection]:
-    """Each left-out image by its name. by_m : the heights are moved by so much, to see what the figure is worth."""
+    """Comparison with each left-out image, by name.
+
+    by_m : all heights are raised by this much first, to see how far the correlations fall for a wrong surface.
+    """
     moved = surface.moved(by_m)
     has_height = np.isfinite(surface.xyz[..., 2])
     textures = [shown(view, moved) for view in matched]

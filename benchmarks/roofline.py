@@ -1,13 +1,13 @@
-"""What bounds each kernel on this machine, and what it reaches; then what a second thread gains.
+"""Bound of each kernel on this machine, the speed that it reaches, and the gain of a second thread.
 
     python benchmarks/roofline.py [--no-threads] [--program FOLDER [--rounds N]] [--kernels NAME ...] [--seconds S]
                                   [--rates N]
 
-Counts are in `roofline_counts.py`, rates of the machine are measured (`machine.py`), kernels run on the scenes of
-`bench_kernels.py`. Times are CPU times of the thread, the best of short runs: each kernel runs for S seconds, each rate
-N times. A kernel faster than its bound would be a wrong count: exit status 1. NAME : kernels whose names begin with it,
-the others being left out. FOLDER : a rendered scene; the whole program runs there with one worker and two, so many
-rounds, of which the best counts.
+Operations are counted in `roofline_counts.py`, the rates of the machine are measured (`machine.py`), and kernels run on
+the scenes of `bench_kernels.py`. Times are CPU times of the thread, the best of several short runs: each kernel runs
+for S seconds, each rate N times. A kernel that is faster than its bound shows a wrong count: exit status 1. NAME
+selects the kernels whose names begin with it. FOLDER is a rendered scene, on which the whole program runs with one and
+with two workers, N rounds each; the best round counts.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from threads import RUN_SECONDS, kernels_on_two, program_on_two
 SECONDS, FEWEST_RUNS = 1.5, 5
 ROUNDS = 2
 STEPS = 32
-# Noise of the best of short runs: a kernel this much below its bound is one whose count is wrong.
+# Tolerance for noise: a kernel that needs less than this share of its bound has a wrong count.
 TOLERANCE = 1.05
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A line of the table. size : bytes of the arrays of the scene; lost : why it does not reach its bound."""
+    """A line of the table. size : bytes of the arrays; lost : reason why the kernel does not reach its bound."""
 
     name: str
     case: Callable[[], Case]
@@ -44,7 +44,7 @@ class Kernel:
 
 
 CELLS, SUM_CELLS = SIDE * SIDE, SGM_SIDE * SGM_SIDE
-# Figures were taken apart once, on the machine that README.md names; instructions were looked up in the compiled code.
+# The reasons were found once, on the machine that README.md names, by measurements and in the compiled code.
 COSTS = (
     "resampling (2.6 ns with its border; 2.9 with that of 5 x 5) loads from one index after the other; then planes of "
     "all images (32 KB an image with two windows) are read and written from the second cache, and 1 / sqrt takes 0.4 "
@@ -117,7 +117,7 @@ KERNELS = (
 
 
 def best_ns(case: Case, seconds: float = SECONDS) -> float:
-    """CPU time of a unit of work in the best of the runs of some seconds, after one that compiles."""
+    """CPU time of one unit of work, ns: the best of the runs in some seconds, after a run that compiles."""
     case.call()
     best, runs, end = float("inf"), 0, time.perf_counter() + seconds
     while runs < FEWEST_RUNS or time.perf_counter() < end:
@@ -128,7 +128,7 @@ def best_ns(case: Case, seconds: float = SECONDS) -> float:
 
 
 def show_machine(machine: Machine) -> None:
-    """The rates of a core."""
+    """Print the rates of a core."""
     print(f"One core of {bench.processor()}, as Numba's loops reach it:\n")
     print("| what | rate |\n|---|---|")
     print(f"| float32 multiplications and additions | {machine.arithmetic:.0f} G/s |")
@@ -142,7 +142,7 @@ def show_machine(machine: Machine) -> None:
 
 
 def show_kernels(machine: Machine, cases: dict[str, Case], reached_ns: dict[str, float]) -> bool:
-    """The table; whether every kernel is within its bound."""
+    """Print the table; return whether every kernel is within its bound."""
     print("| kernel | unit | operations | bytes in cache, from beyond | bound, ns | reached, ns | share | lost |")
     print("|---|---|---|---|---|---|---|---|")
     sound = True
@@ -162,7 +162,7 @@ def show_kernels(machine: Machine, cases: dict[str, Case], reached_ns: dict[str,
 
 
 def operations(count: Count) -> str:
-    """Operations as text, those of their own kind beside the others."""
+    """Operations as text, by kind."""
     parts = [f"{count.ops + count.narrow:.3g}"]
     parts += [f"{count.roots:.2g} roots"] if count.roots else []
     parts += [f"{count.gathers:.3g} gathers"] if count.gathers else []

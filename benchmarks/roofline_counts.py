@@ -1,9 +1,9 @@
-"""What each kernel does per unit of work, counted from its source, and what the machine needs at least for that.
+"""Operations of each kernel per unit of work, counted from its source, and the least time that the machine needs.
 
-Counted are the loops over cells, heights and pixels, as they are written: an operation is an addition, multiplication,
-minimum, maximum, comparison, selection, shift, rounding or conversion of one value; float64 counts as two. Not
-counted: what is done once a block or line, the ends of loops, addresses. Where borders are worked on too, counts are
-times the cells worked on over those asked for.
+The loops over cells, heights and pixels are counted as they are written. An operation is an addition, multiplication,
+minimum, maximum, comparison, selection, shift, rounding or conversion of one value; float64 counts twice. Work done
+once per block or line, loop overhead and addresses are not counted. Where a kernel computes a margin too, the counts
+are multiplied by all cells over the cells of the result.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ BLOCK, SLACK = 32, 32
 
 @dataclass(frozen=True)
 class Count:
-    """Work of one unit.
+    """Operations and bytes of one unit of work.
 
-    ops : of 32 bits; narrow : of uint16; roots : 1 / sqrt (a division: half of one); gathers : values read at an index
-    from a table; loads, stores : bytes of the other reads and writes, a narrower value that is widened counting as what
-    it becomes, for it takes the same slot; memory : bytes of what does not stay in a core's own caches.
+    ops : operations of 32 bits; narrow : of uint16; roots : 1 / sqrt (a division counts as half of one); gathers :
+    values read through an index; loads, stores : bytes of the other reads and writes, where a value that is widened
+    counts in its wide form; memory : bytes that do not stay in the caches of a core.
     """
 
     ops: float = 0.0
@@ -39,7 +39,7 @@ class Count:
         return Count(*(a * times for a in astuple(self)))
 
     def bounds_ns(self, machine: Machine, size: int) -> dict[str, float]:
-        """Least time of a unit by what may limit it, ns. size : bytes of the arrays that `memory` is read from."""
+        """Least time of a unit by each possible limit, ns. size : bytes of the arrays that `memory` is read from."""
         return {
             "operations": self.ops / machine.arithmetic + self.narrow / machine.narrow,
             "roots": self.roots / machine.roots,
@@ -60,13 +60,13 @@ RESAMPLE = BILINEAR_POSITION + BILINEAR_GATHER
 
 
 def bordered(half: int) -> tuple[float, float, float]:
-    """Of a block, over its cells: the plane with its border, whole rows of it, and these with the slack."""
+    """Cells over those of the block: of the plane with its margin, of its whole rows, and of these with padding."""
     width = BLOCK + 2 * half
     return width**2 / BLOCK**2, width / BLOCK, (BLOCK * width + SLACK) / BLOCK**2
 
 
 def moments(windows: list[int]) -> Count:
-    """`window_moments` per cell and image."""
+    """Count of `window_moments` per cell and image."""
     _, rows, slack = bordered(windows[-1])
     found, done = Count(), 0
     for window in windows:
@@ -86,7 +86,7 @@ def moments(windows: list[int]) -> Count:
 
 
 def correlation(windows: list[int], n_views: int) -> Count:
-    """`add_pairs` per cell and pair of images."""
+    """Count of `add_pairs` per cell and pair of images."""
     coupled = n_views // 2 * 2 if windows == [1] else 0
     by_couples = coupled * (coupled - 2) // 2
     share = by_couples / (n_views * (n_views - 1) // 2)
@@ -94,7 +94,7 @@ def correlation(windows: list[int], n_views: int) -> Count:
 
 
 def couples() -> Count:
-    """`couple_products` and `add_couples` per cell and pair, of which each does four."""
+    """Count of `couple_products` and `add_couples` per cell and pair; each call handles four pairs."""
     _, rows, slack = bordered(1)
     # Three products and 2 sums a pair; twelve values read, four written.
     found = Count(ops=4 * 5, loads=48, stores=16) * slack
@@ -105,7 +105,7 @@ def couples() -> Count:
 
 
 def single_pairs(windows: list[int]) -> Count:
-    """`column_products` and `add_correlation` per cell and pair."""
+    """Count of `column_products` and `add_correlation` per cell and pair."""
     _, rows, slack = bordered(windows[-1])
     found, done = Count(), 0
     for window in windows:
@@ -123,7 +123,7 @@ def single_pairs(windows: list[int]) -> Count:
 
 
 def costs(n_views: int, windows: list[int], n_heights: int, with_greys: bool = True) -> Count:
-    """`tile_costs` per cell, step and image, every view covering every cell."""
+    """Count of `tile_costs` per cell, step and image, where every view covers every cell."""
     plane, rows, _ = bordered(windows[-1])
     pairs, share = (n_views - 1) / 2, 1 / n_views
     # centred: one subtraction a value; the grey times its weight.
@@ -157,7 +157,7 @@ WINNERS = Count(ops=5 + 14, narrow=2, loads=8, memory=2)
 
 
 def profile(windows: list[int], n_views: int, n_offsets: int) -> Count:
-    """`tile_profile` per cell, offset and image."""
+    """Count of `tile_profile` per cell, offset and image."""
     plane, rows, _ = bordered(windows[-1])
     # level: sum, difference, division; once for all images.
     level = Count(ops=2, roots=0.5, loads=4, stores=4) * (plane / n_views)

@@ -44,7 +44,7 @@ from zlocus.sensors.rpc import RpcCoefficients
 from zlocus.sensors.rpc_fit import fit_rpc
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.render import Optics, expose, render
-from zlocus.synthetic.scenes import build_ground, city_spec, exposures, steady
+from zlocus.synthetic.scenes import build_ground, city_spec, exposures_of, steady
 from zlocus.synthetic.terrain import SyntheticGround
 
 ROOT = Path(__file__).parents[1]
@@ -76,7 +76,7 @@ class Town:
 def town(period_px: int = PERIOD_PX) -> Town:
     """Render one period of a town, surrounded by copies of itself."""
     spec = replace(steady(city_spec(7)), size=period_px, gsd_m=GSD_M)
-    ground = build_ground(spec, exposures(spec))
+    ground = build_ground(spec, exposures_of(spec))
     n = round(period_px * GSD_M / ground.step)
     row, col = round((ground.y0 - spec.north_m) / ground.step), round((spec.west_m - ground.x0) / ground.step)
     one = (slice(row, row + n), slice(col, col + n))
@@ -127,7 +127,7 @@ def camera(at: Town, look: tuple[float, float], first: tuple[int, int]) -> Satel
 def pixels(at: Town, look: tuple[float, float], number: int) -> NDArray[np.integer]:
     """One period of the image of the repeated town, (period_px, period_px)."""
     shape = (at.period_px, at.period_px)
-    seen = render(at.ground, camera(at, look, (0, 0)), shape, exposures(steady(city_spec(7)))[0].view.sun)
+    seen = render(at.ground, camera(at, look, (0, 0)), shape, exposures_of(steady(city_spec(7)))[0].view.sun)
     return expose(seen, Optics(), np.random.default_rng([5, number]))
 
 

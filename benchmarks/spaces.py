@@ -1,4 +1,4 @@
-"""Object space against image space: the same measure and semi-global constraint on a ground grid, and in the images.
+"""Object space and image space: the same matching cost and semi-global constraint on a ground grid and in the images.
 
     python benchmarks/spaces.py [SCENE_FOLDER ...] [-o OUT] [--views N ...]
 
@@ -6,13 +6,13 @@ SCENE_FOLDER holds img_*.tif with RPC, truth_dsm.tif and truth_class.tif; the de
 f1), three (b1 too) and six views (n2 f2 b2 too) at 0.5 m it runs
 
 - object space: `zlocus dsm --method mvll-sgm`;
-- image space: `--method gc3-sgm`, every image matched in its own space and all put on the grid;
-- nadir only: the same with `--reference`, so that only the pixels of n1 give heights (the others confirm them).
+- image space: `--method gc3-sgm`, every image matched in its own space, and the heights of all put on the grid;
+- nadir only: the same with `--reference`, so that only the pixels of n1 give heights (the others check them).
 
-Each is judged against the truth per class and per place, as shares of all blocks of half a metre, so that a block
-without a height is not within 1 m: edges (at most two blocks from a jump of 2 m), hidden (away from edges, hidden from
-a view: a visibility sweep over the truth), dark (away from both, less than half the median grey in n1: shadows), open
-(the rest). Writes spaces.csv and, of the first folder, spaces.png; prints tables.
+Surfaces are compared with the truth by class and by place, as shares of all blocks of half a metre; a block without a
+height is not within 1 m. Places: edges (at most two blocks from a height jump of 2 m), hidden (away from edges,
+occluded in at least one view), dark (away from both, less than half the median grey value in n1: shadows), open (the
+rest). Writes spaces.csv and, for the first folder, spaces.png; prints tables.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import TruthBlocks, read_classes, truth_blocks
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.kernels.occlusion import lowest_visible
-from zlocus.matching.match_scene import nadir_offset
+from zlocus.matching.match_scene import parallax_rate
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -61,8 +61,11 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Truth:
-    """blocks : of the truth; shape : rows and columns that they lie in; places : (n,) bool each, by `PLACES`, and
-    `roofs`, buildings that are none of the first three."""
+    """Blocks of the truth and the places they belong to.
+
+    shape : rows and columns of the blocks; places : (n,) bool each, by `PLACES`, and `roofs` (buildings in none of the
+    first three).
+    """
 
     blocks: TruthBlocks
     shape: tuple[int, int]
@@ -70,7 +73,7 @@ class Truth:
 
 
 def truth_of(folder: Path, views: tuple[str, ...]) -> Truth:
-    """The truth with the places that these views make hard."""
+    """Read the truth and find the places that are hard for these views."""
     reference = read_heights(folder / "truth_dsm.tif")
     blocks = truth_blocks(reference, MARGIN_M, read_classes(folder / "truth_class.tif", reference))
     shape = (len(np.unique(blocks.xy[:, 1])), len(np.unique(blocks.xy[:, 0])))
@@ -82,7 +85,7 @@ def truth_of(folder: Path, views: tuple[str, ...]) -> Truth:
     scene = open_scene([folder / f"img_{name}.tif" for name in views])
     middle, hidden = float(np.median(z)), np.zeros(shape, bool)
     for view in scene.views:
-        east, north = nadir_offset(view, middle) / CELL_M
+        east, north = parallax_rate(view, middle) / CELL_M
         lowest = np.empty_like(z)
         lowest_visible(z, east, -north, lowest)
         hidden |= lowest > z + HIDDEN_M
@@ -99,7 +102,7 @@ def truth_of(folder: Path, views: tuple[str, ...]) -> Truth:
 
 
 def looked_up(path: Path, xy: np.ndarray) -> np.ndarray:
-    """Values of a raster at points (n, 2), NaN outside. (n,)"""
+    """Values (n,) of a raster at points (n, 2), NaN outside."""
     with rasterio.open(path) as file:
         values, (col, row) = file.read(1), ~file.transform * tuple(xy.T)
     row, col = np.floor(row).astype(int), np.floor(col).astype(int)
@@ -110,7 +113,7 @@ def looked_up(path: Path, xy: np.ndarray) -> np.ndarray:
 def run(
     folder: Path, views: tuple[str, ...], method: str, truth: Truth, out: Path
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """One run: its figures by the names of `COLUMNS`, and its errors (r, c)."""
+    """One run: figures by the names of `COLUMNS`, and errors (r, c) m."""
     place = out / f"{folder.name}-{len(views)}-{method.replace(' ', '-')}"
     with rasterio.open(folder / "truth_dsm.tif") as file:
         box, crs = file.bounds, file.crs
@@ -131,7 +134,7 @@ def run(
 
 
 def picture(truth: Truth, errors: dict[tuple[int, str], np.ndarray], path: Path) -> None:
-    """Places, and the errors of object and image space, a row for each number of views."""
+    """Draw the places and the errors in object and image space, one row for each number of views."""
     numbers = sorted({n for n, _ in errors})
     shown = ["object space", "image space"]
     figure, axes = plt.subplots(len(numbers), 2, figsize=(7.4, 3.7 * len(numbers) + 0.6), squeeze=False)

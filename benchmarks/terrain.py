@@ -1,8 +1,8 @@
-"""How well dtm.tif tells the ground of a rendered scene: `python benchmarks/terrain.py SCENE [SURFACE]`.
+"""Accuracy of dtm.tif on a rendered scene: `python benchmarks/terrain.py SCENE [SURFACE]`.
 
-SCENE : folder that `python -m zlocus.synthetic` made; SURFACE : folder that `zlocus dsm` made of its images. Without
-SURFACE the terrain is that of the true surface, so that all errors are the filter's. The true ground below roofs and
-trees is interpolated linearly (Delaunay) between the cells of ground around them, which the filter knows nothing of.
+SCENE : folder written by `python -m zlocus.synthetic`; SURFACE : folder written by `zlocus dsm` from its images.
+Without SURFACE the true surface is filtered, so that all errors are errors of the filter. The true ground below roofs
+and trees is interpolated linearly (Delaunay) between the cells of ground around them.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from zlocus.io.rasters import write_cog
 from zlocus.products.dtm import write_dtm
 
 NEAR_M = 1.0
-# Cells of ground around an object that tell what is below it.
+# Cells of ground around an object, from which the ground below it is interpolated.
 RIM_CELLS = 3
 
 
 def true_ground(z, is_ground):
-    """Heights (r, c) with those of what stands on the ground replaced."""
+    """True heights (r, c) with the ground below objects interpolated."""
     rim = is_ground & binary_dilation(~is_ground, iterations=RIM_CELLS)
     known, unknown = np.argwhere(rim), np.argwhere(~is_ground)
     below = LinearNDInterpolator(known, z[rim])(unknown)

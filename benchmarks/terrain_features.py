@@ -1,4 +1,4 @@
-"""What the semi-global constraint and the levels gain on three terrain features: the paper's test, on rendered crops.
+"""Gain of the semi-global constraint and of the resolution levels on three terrain features, on rendered crops.
 
     python benchmarks/terrain_features.py [-o OUT] [--only FEATURE ...] [--views N] [--size CELLS]
 
@@ -8,9 +8,9 @@ The crops are 200 m square (400 cells, unless CELLS says otherwise), rendered at
 - similar: crops in straight rows that repeat every 1.6 to 4 m, roads, houses;
 - occlusion: towers of 25 to 60 m and houses that hide the ground behind them.
 
-Each is matched by MVLL alone and by MVLL under the semi-global constraint (`--method mvll`, `mvll-sgm`), with one
-resolution (`pyramid.max_levels = 1`: the whole range of heights on the finest cells) and with many; all else is the
-same. Judged against the truth: all cells, and those that show the feature (`feature_cells`). Writes features.csv,
+Each crop is matched by MVLL without and with the semi-global constraint (`--method mvll`, `mvll-sgm`), with one
+resolution level (`pyramid.max_levels = 1`: the whole height range on the finest cells) and with several; all else is
+equal. All cells and those that show the feature (`feature_cells`) are compared with the truth. Writes features.csv,
 FEATURE.png and features.png, prints a table.
 """
 
@@ -38,7 +38,15 @@ from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.synthetic.files import render_scene
 from zlocus.synthetic.objects import Objects
 from zlocus.synthetic.render import seen_from
-from zlocus.synthetic.scenes import SATELLITE_VIEWS, Exposure, SceneSpec, build_ground, city_spec, exposures, hills_spec
+from zlocus.synthetic.scenes import (
+    SATELLITE_VIEWS,
+    Exposure,
+    SceneSpec,
+    build_ground,
+    city_spec,
+    exposures_of,
+    hills_spec,
+)
 from zlocus.synthetic.terrain import PATTERN_ROWS, ROAD, TREE, SyntheticGround
 
 mpl.use("Agg")
@@ -74,8 +82,11 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Crop:
-    """A rendered crop. views : names of those to match; mask : raster of `FEATURE` and `REST`; share : of its cells
-    that show the feature."""
+    """A rendered crop.
+
+    views : names of the views that are matched; mask : raster of `FEATURE` and `REST`; share : of the cells that show
+    the feature.
+    """
 
     name: str
     spec: SceneSpec
@@ -97,7 +108,7 @@ class Crop:
 
 
 def rendered(name: str, n_views: int, out: Path, size: int = CELLS) -> Crop:
-    """The crop, rendered anew only where it is not there yet: with all views, on which the ground depends.
+    """The crop, rendered if it does not exist yet, always with all views, because the ground depends on them.
 
     size : cells along a side.
     """
@@ -105,7 +116,7 @@ def rendered(name: str, n_views: int, out: Path, size: int = CELLS) -> Crop:
     folder = out / (f"{name}-scene" if size == CELLS else f"{name}-{size}-scene")
     if not folder.exists():
         render_scene(spec, folder)
-    seen_by = exposures(spec)
+    seen_by = exposures_of(spec)
     ground, used = build_ground(spec, seen_by), seen_by[:n_views]
     with rasterio.open(folder / "truth_class.tif") as file:
         profile = file.profile
@@ -116,10 +127,10 @@ def rendered(name: str, n_views: int, out: Path, size: int = CELLS) -> Crop:
 
 
 def feature_cells(name: str, ground: SyntheticGround, spec: SceneSpec, seen_by: tuple[Exposure, ...]) -> np.ndarray:
-    """Which cells of the truth (r, c) show the feature of a crop.
+    """Cells (r, c) of the truth that show the feature of a crop.
 
-    uneven: ground that rises by more than `STEEP`; similar: crops `APART_M` and more away from what stands on the
-    ground, whose shadow and hidden side are another matter; occlusion: tops that a view does not see.
+    uneven: ground steeper than `STEEP`; similar: crops at least `APART_M` away from objects, which cast shadows and
+    occlude; occlusion: cells that at least one view does not see.
     """
     n = round(spec.size * spec.gsd_m / spec.step_m)
     cells = ground.cells(spec.west_m, spec.north_m, (n, n))
@@ -136,13 +147,13 @@ def feature_cells(name: str, ground: SyntheticGround, spec: SceneSpec, seen_by: 
     xyz = np.column_stack([east, north, ground.heights[cells].ravel()])
     hidden = np.zeros(len(xyz), bool)
     for exposure in seen_by:
-        seen = seen_from(ground, exposure.camera, exposure.camera.image_from_ground(xyz))
+        seen = seen_from(ground, exposure.sensor, exposure.sensor.image_from_ground(xyz))
         hidden |= seen[:, 2] > xyz[:, 2] + HIDDEN_M
     return hidden.reshape(n, n)
 
 
 def run(crop: Crop, method: str, levels: str, out: Path) -> tuple[dict[str, Any], Path]:
-    """One of the four runs: its figures by the names of `COLUMNS`, and its surface."""
+    """One of the four runs: figures by the names of `COLUMNS`, and the surface."""
     place = out / f"{crop.name}-{METHODS[method]}-{levels.split()[0]}"
     images = [crop.folder / f"img_{view}.tif" for view in crop.views]
     grid = ["--crs", f"EPSG:{crop.spec.epsg}", "--resolution", str(crop.spec.gsd_m), "--bounds", *map(str, crop.bounds)]
@@ -158,7 +169,7 @@ def run(crop: Crop, method: str, levels: str, out: Path) -> tuple[dict[str, Any]
 
 
 def heights(path: Path, cells: int) -> np.ndarray:
-    """A surface on `cells` x `cells` cells of the crop, (r, c) m; averaged where it is finer."""
+    """A surface on `cells` x `cells` cells of the crop, (r, c) m; finer surfaces are averaged."""
     with rasterio.open(path) as file:
         z = file.read(1, masked=True).astype(float).filled(np.nan)
     size = z.shape[0] // cells
@@ -166,7 +177,7 @@ def heights(path: Path, cells: int) -> np.ndarray:
 
 
 def picture(crops: list[tuple[Crop, dict[str, Path]]], path: Path, panel_px: int) -> None:
-    """Two rows a crop: hillshades of the truth and of the surfaces; the image, and the errors. A PNG of few colours."""
+    """Draw two rows for each crop: hillshades of the truth and the surfaces; the image and the errors."""
     n_columns = 1 + len(crops[0][1])
     panel = panel_px / DPI
     width, height = n_columns * panel, 2.1 * len(crops) * panel + 0.9
@@ -181,7 +192,7 @@ def picture(crops: list[tuple[Crop, dict[str, Path]]], path: Path, panel_px: int
         shades[0].imshow(hillshade(true, crop.spec.gsd_m), **GREY)
         shades[0].set_title("truth, and an image", **font)
         shades[0].set_ylabel(f"{crop.name}: relief", **font)
-        errors[0].imshow(leading_image(crop), **GREY)
+        errors[0].imshow(nadir_image(crop), **GREY)
         errors[0].set_ylabel(f"{crop.name}: errors", **font)
         for (name, dsm), shade, error in zip(surfaces.items(), shades[1:], errors[1:], strict=True):
             found = heights(dsm, crop.spec.size)
@@ -208,12 +219,12 @@ def picture(crops: list[tuple[Crop, dict[str, Path]]], path: Path, panel_px: int
 
 
 def hillshade(z: np.ndarray, cell_m: float) -> np.ndarray:
-    """Light from the north-west on a surface (r, c), in [0, 1]; NaN where there is no height."""
+    """Hillshade of a surface (r, c) lit from the north-west, in [0, 1]; NaN where there is no height."""
     return np.where(np.isfinite(z), LightSource(315, 45).hillshade(np.nan_to_num(z), dx=cell_m, dy=cell_m), np.nan)
 
 
-def leading_image(crop: Crop) -> np.ndarray:
-    """The most nadir image as it was taken, cut to the size of the crop and stretched."""
+def nadir_image(crop: Crop) -> np.ndarray:
+    """The image nearest to the nadir, cut to the size of the crop and stretched."""
     with rasterio.open(crop.folder / f"img_{crop.views[0]}.tif") as file:
         grey = file.read(1).astype(float)
     size = crop.spec.size

@@ -1,8 +1,8 @@
-"""What a second thread gains: of each kernel, and of the whole program.
+"""Gain of a second thread: for each kernel, and for the whole program.
 
-The machine may be shared. A wall time says little then; beside it stands how much CPU the two threads got for each
-second of wall (2 on a quiet machine with two cores), and by how much the work of each took more CPU than alone, which
-other load touches less: 2 over that is what two threads gain where both cores are free.
+On a shared machine a wall time says little. Therefore the tables also show the CPU seconds that the two threads got per
+second of wall time (2 on a quiet machine with two cores), and the ratio of the CPU of a thread beside another one to
+its CPU alone. Two divided by this ratio is the gain of two threads when both cores are free.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ STRIPS = ("n1", "f1", "b1", "n2", "f2", "b2")
 
 @dataclass(frozen=True)
 class Run:
-    """Of threads that each do the same work: wall time until the last one ends, and CPU time of the slowest, s."""
+    """Threads that do the same work: wall time until the last one ends, and CPU time of the slowest, s."""
 
     wall_s: float
     cpu_s: float
 
 
 def run_together(cases: list[Case], calls: int) -> Run:
-    """Some calls of each case, each case in a thread of its own."""
+    """Time some calls of each case, each case in a thread of its own."""
     cpu = [0.0] * len(cases)
     ready = threading.Barrier(len(cases) + 1)
 
@@ -56,7 +56,7 @@ def run_together(cases: list[Case], calls: int) -> Run:
 
 
 def kernels_on_two(cases: dict[str, Callable[[], Case]], seconds: float = RUN_SECONDS) -> None:
-    """Each kernel on one thread and on two, in turn; the best of each. seconds : about how long a run takes."""
+    """Print the best times of each kernel with one and with two threads. seconds : approximate time of a run."""
     print("\n| kernel | two threads over one, wall | CPU per wall | the same from CPU: 2 x alone / beside the other |")
     print("|---|---|---|---|")
     for name, make in cases.items():
@@ -74,9 +74,9 @@ def kernels_on_two(cases: dict[str, Callable[[], Case]], seconds: float = RUN_SE
 
 
 def program_on_two(scene: Path, rounds: int = 2) -> None:
-    """`zlocus dsm` with one worker and two, in turn; wall and CPU of each stage in the best run of each.
+    """Print wall time and CPU of each stage of `zlocus dsm` with one and with two workers, of the best run of each.
 
-    rounds : runs with each number of workers, after one that compiles.
+    rounds : runs with each number of workers, after a run that compiles.
     """
     images = [image for name in STRIPS if (image := scene / f"img_{name}.tif").exists()]
     best: dict[int, tuple[float, float, list[dict]]] = {}

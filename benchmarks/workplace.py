@@ -1,4 +1,4 @@
-"""Where rows of the acceptance table work: scenes, results, commands that are measured, figures with their bars."""
+"""Shared parts of the acceptance rows: folders of scenes and results, measured commands, figures with their bars."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 ZLOCUS = Path(sys.executable).with_name("zlocus")
 RENDERED_VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
-# In a small process of its own: a child's peak memory counts from what its parent held when it was started.
+# Exit status of a run of which too little was matched; its products are kept.
+COVERAGE_SHORT = 3
+# Runs a command from a small process, because the peak memory of a child begins with the memory of its parent.
 MEASURE = """
 import resource, subprocess, sys
 status = subprocess.call(sys.argv[2:])
@@ -26,11 +28,11 @@ sys.exit(status)
 
 
 class CannotRun(Exception):
-    """Why a row, or a benchmark, has no figures."""
+    """Reason why a row or a benchmark has no figures."""
 
 
 def ended(main: Callable[[], object]) -> None:
-    """Run a script to its end. What keeps it from running is said in one sentence, with status 1."""
+    """Run the main function of a script. If it cannot run, end with status 1 and one sentence that says why."""
     try:
         main()
     except CannotRun as reason:
@@ -39,7 +41,7 @@ def ended(main: Callable[[], object]) -> None:
 
 @dataclass(frozen=True)
 class Figure:
-    """One line of the table. bar : lowest or highest value that passes, None where the figure is only reported."""
+    """One line of the table. at_least, at_most : values that pass; a figure with neither is only reported."""
 
     what: str
     value: float
@@ -48,7 +50,7 @@ class Figure:
     at_most: float | None = None
 
     def cells(self) -> tuple[str, str, str, str]:
-        """What, figure, bar and verdict as text."""
+        """Label, figure, bar and verdict as text."""
         unit = f" {self.unit}" if self.unit else ""
         bar = "" if self.at_least is None else f">= {self.at_least:g}{unit}"
         bar = bar if self.at_most is None else f"<= {self.at_most:g}{unit}"
@@ -62,7 +64,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a command took: CPU with that of its children, memory of its largest process (GB of 1024^3 bytes)."""
+    """CPU of a command with its children, and memory of its largest process (GB of 1024^3 bytes)."""
 
     cpu_s: float
     peak_gb: float
@@ -70,7 +72,7 @@ class Usage:
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where the scenes are and where results go."""
+    """Folder of the shared scenes (None if there is none), and folder for the results of a row."""
 
     data: Path | None
     out: Path
@@ -85,7 +87,7 @@ class Workplace:
         return folder
 
     def judge(self, dsm: Path, scene: Path, *options: str) -> dict[str, dict[str, float]]:
-        """The shared judge's figures, which share no code with ours."""
+        """Accuracy of a surface by class, from the shared judge, which shares no code with zlocus."""
         if self.data is None:
             raise CannotRun("ZLOCUS_TEST_DATA is not set")
         script = self.data.parent / "tools" / "evaluate_dsm.py"
@@ -96,7 +98,7 @@ class Workplace:
 
 
 def run(command: list[Any], accept: tuple[int, ...] = (0,), cwd: Path | None = None) -> Usage:
-    """Run a command to its end and measure it."""
+    """Run a command and measure it. accept : exit statuses that are no failure."""
     with tempfile.TemporaryDirectory() as scratch:
         usage = Path(scratch) / "usage"
         measured = [sys.executable, "-c", MEASURE, str(usage), *map(str, command)]

@@ -1,13 +1,14 @@
-"""zlocus beside other programs, on the same images, area, grid and cores: `make peers`, or
+"""Comparison of zlocus with other programs on the same images, area, grid and cores: `make peers`, or
 
     python benchmarks/peers [--scenes NAME ...] [--programs NAME ...] [--views N ...] [--side CELLS] [--runs N]
                             [--out FOLDER] [--cores 0,1] [--s2p PATH] [--micmac PATH] [--setsm PATH]
 
-Installs CARS, Pandora with libSGM, and OpenCV from the package registry into environments of their own below FOLDER;
-s2p, MicMac and SETSM are run when a path to their command is given. Renders its scenes; the Pleiades sets and
-Middlebury's photographs are used where `ZLOCUS_TEST_DATA` has them. Hours; a run that was cut off goes on. Writes
-results.json, and from it peers.md with its pictures; `--page FOLDER` writes the page alone, from `--results FILE`.
-`--side` makes the rendered scenes smaller or larger, and `--runs` says how often zlocus is run, for a first look.
+Installs CARS, Pandora with libSGM, and OpenCV from the package registry into environments of their own below FOLDER.
+s2p, MicMac and SETSM run if a path to their command is options. Rendered scenes are made on demand; the Pleiades sets
+and the Middlebury photographs are used if `ZLOCUS_TEST_DATA` has them. The whole comparison takes hours; an
+interrupted one is resumed. Writes results.json, and from it peers.md with its pictures; `--page FOLDER` only writes
+the page, from `--results FILE`. For a first look, `--side` sets the size of the rendered scenes and `--runs` the
+number of runs of zlocus.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-# Python puts the folder of this script first, where `middlebury` would be another module than beside it.
+# Python puts the folder of this script first; there `middlebury` would be the module of this package.
 sys.path[:] = [str(HERE.parent), *(path for path in sys.path if Path(path or ".").resolve() != HERE)]
 
 from peers import builds, matchers  # noqa: E402
@@ -26,7 +27,7 @@ from peers.cars import Cars  # noqa: E402
 from peers.environments import Environment, Missing, installed, this_checkout  # noqa: E402
 from peers.own import Own  # noqa: E402
 from peers.page import write_page  # noqa: E402
-from peers.running import OWN_RUNS, Asked, Program, run_all  # noqa: E402
+from peers.running import OWN_RUNS, PeerComparison, Program, run_all  # noqa: E402
 from peers.scenes import RENDERED  # noqa: E402
 
 NAMES = (*RENDERED, "pleiades", "middlebury", "kernels")
@@ -42,36 +43,44 @@ def parsed() -> argparse.Namespace:
     parser.add_argument(
         "--programs", nargs="+", choices=PROGRAMS, default=PROGRAMS, metavar="NAME", help=", ".join(PROGRAMS)
     )
-    parser.add_argument("--views", nargs="+", type=int, metavar="N", help="of rendered scenes, these numbers alone")
-    parser.add_argument("--side", type=int, metavar="CELLS", help="of 0.5 m, of rendered scenes; else each has its own")
-    parser.add_argument("--runs", type=int, default=OWN_RUNS, metavar="N", help="of zlocus, whose median counts")
+    parser.add_argument(
+        "--views", nargs="+", type=int, metavar="N", help="numbers of views of rendered scenes; default: all"
+    )
+    parser.add_argument(
+        "--side", type=int, metavar="CELLS", help="side of rendered scenes in cells of 0.5 m; default: their own"
+    )
+    parser.add_argument(
+        "--runs", type=int, default=OWN_RUNS, metavar="N", help="runs of zlocus, of which the median counts"
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("build/peers"), help="folder for environments, scenes and results"
     )
-    parser.add_argument("--cores", help="numbers of the cores that everything is pinned to; by default the first two")
-    parser.add_argument("--page", type=Path, metavar="FOLDER", help="write the page and its pictures there and end")
-    parser.add_argument("--results", type=Path, default=HERE / "results.json", help="of an earlier run, for --page")
+    parser.add_argument("--cores", help="numbers of the cores that all programs run on; default: the first two")
+    parser.add_argument("--page", type=Path, metavar="FOLDER", help="only write the page and its pictures there")
+    parser.add_argument(
+        "--results", type=Path, default=HERE / "results.json", help="results of an earlier run, for --page"
+    )
     for name in BUILDS:
-        parser.add_argument(f"--{name.lower()}", type=Path, metavar="PATH", help=f"the command of a build of {name}")
+        parser.add_argument(f"--{name.lower()}", type=Path, metavar="PATH", help=f"command of a build of {name}")
     return parser.parse_args()
 
 
-def programs(given: argparse.Namespace, environments: dict[str, Environment]) -> list[Program]:
-    """Those asked for that can be had, zlocus first; says what cannot."""
+def programs(options: argparse.Namespace, environments: dict[str, Environment]) -> list[Program]:
+    """The requested programs that are available, zlocus first; a message names those that are not."""
     found: list[Program] = []
-    for name in (name for name in PROGRAMS if name in given.programs):
+    for name in (name for name in PROGRAMS if name in options.programs):
         try:
             if name in BUILDS:
-                if (path := getattr(given, name.lower())) is not None:
+                if (path := getattr(options, name.lower())) is not None:
                     found.append(BUILDS[name](builds.working(path)))
                 continue
             if name == "zlocus":
-                environments["zlocus"] = this_checkout(given.out / "environments")
+                environments["zlocus"] = this_checkout(options.out / "environments")
                 found.append(Own(environments["zlocus"]))
                 continue
             kind = "cars" if name == "CARS" else "matchers"
             if kind not in environments:
-                environments[kind] = installed(kind, given.out / "environments")
+                environments[kind] = installed(kind, options.out / "environments")
             make = {"CARS": Cars, "OpenCV": matchers.opencv, "Pandora": matchers.pandora}[name]
             found.append(make(environments[kind]))
         except Missing as missing:
@@ -80,17 +89,17 @@ def programs(given: argparse.Namespace, environments: dict[str, Environment]) ->
 
 
 def main() -> None:
-    given = parsed()
-    if given.page is not None:
-        print(write_page(given.results, given.page))
+    options = parsed()
+    if options.page is not None:
+        print(write_page(options.results, options.page))
         return
-    given.out = given.out.resolve()
+    options.out = options.out.resolve()
     usable = sorted(os.sched_getaffinity(0))
-    cores = tuple(map(int, given.cores.split(","))) if given.cores else tuple(usable[:2])
+    cores = tuple(map(int, options.cores.split(","))) if options.cores else tuple(usable[:2])
     environments: dict[str, Environment] = {}
-    asked = Asked(given.scenes, given.views, given.side, given.runs)
-    results = run_all(programs(given, environments), asked, given.out, cores, environments)
-    print(write_page(results, given.out))
+    comparison = PeerComparison(options.scenes, options.views, options.side, options.runs)
+    results = run_all(programs(options, environments), comparison, options.out, cores, environments)
+    print(write_page(results, options.out))
 
 
 if __name__ == "__main__":

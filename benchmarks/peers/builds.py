@@ -1,6 +1,6 @@
-"""Programs that no registry has: s2p, MicMac and SETSM, when a path to a build is given.
+"""Programs that no package registry has: s2p, MicMac and SETSM, used if a path to a build is given.
 
-Written from their documents; on the machine of the published results there was no build of them. See `configurations/`.
+Written from their documentation; the machine of the published results had no builds of them. See `configurations/`.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ ANSWER_S = 60.0
 
 
 def recommended(name: str) -> dict:
-    """Of `configurations/NAME.yaml`."""
+    """The recommended options in `configurations/NAME.yaml`."""
     return dict(yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")))
 
 
 def digest(name: str) -> dict[str, str]:
-    """Tells states of a configuration apart."""
+    """Fingerprint of a configuration."""
     return {"configuration": digest_of([CONFIGURATIONS / f"{name}.yaml"])}
 
 
 def working(program: Path) -> Path:
-    """The program, found. Raises `Missing` otherwise."""
+    """Path of the program; raises `Missing` if there is none."""
     found = shutil.which(program)
     if found is None:
         raise Missing(f"{program} is no program that can be run: give the path to the command of a build")
@@ -53,7 +53,7 @@ def working(program: Path) -> Path:
 
 
 def said_version(program: Path, *asks: str) -> str:
-    """What looks like a version in what a program says of itself, or nothing."""
+    """The version in the output of a program, or an empty text."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         said = subprocess.run([program, *asks], capture_output=True, text=True, errors="replace", timeout=ANSWER_S)
         found = re.search(r"\d+\.\d+[\w.+-]*|\b[0-9a-f]{7,40}\b", said.stdout + said.stderr)
@@ -94,7 +94,7 @@ class MicMac:
         return {"mm3d": said_version(self.program, "CheckDependencies")} | digest("micmac")
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
-        # Its patterns take every TIFF of a folder.
+        # The patterns of MicMac match every TIFF of a folder.
         work = out / "work"
         work.mkdir(parents=True, exist_ok=True)
         for path in scene.images.values():
@@ -109,7 +109,7 @@ class MicMac:
         return georeferenced(work / "MEC-Malt", scene, out / "dsm.tif"), used
 
 
-# Of MicMac: a projection by a definition of PROJ.
+# Format of MicMac: a projection by a definition of PROJ.
 SYSTEM_OF_COORDINATES = """<SystemeCoord>
   <BSC>
     <TypeCoord> eTC_Proj4 </TypeCoord>
@@ -121,7 +121,7 @@ SYSTEM_OF_COORDINATES = """<SystemeCoord>
 
 
 def proj_string(crs: str) -> str:
-    """A UTM zone as MicMac takes it. Raises `Failed` for other systems."""
+    """A UTM zone in the form of MicMac; raises `Failed` for other systems."""
     zone = CRS(crs).utm_zone
     if zone is None:
         raise Failed(f"MicMac is given UTM zones only, and {crs} is none")
@@ -130,7 +130,7 @@ def proj_string(crs: str) -> str:
 
 
 def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
-    """Malt's last surface as a raster with its place, heights in m, nothing where Malt masks."""
+    """Write the last surface of Malt as a georeferenced raster in metres, without the cells that Malt masks."""
     steps = sorted(folder.glob("Z_Num*_DeZoom1_STD-MALT.tif"), key=lambda each: int(re.findall(r"\d+", each.name)[0]))
     if not steps or not steps[-1].with_suffix(".xml").exists():
         raise Failed(f"MicMac left no surface in {folder}")
@@ -144,7 +144,7 @@ def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
     if masks:
         z = np.where(pixels(masks[-1]) > 0, z, np.nan)
     (x, y), (right, down) = numbers("OriginePlani"), numbers("ResolutionPlani")
-    # The middle of the first cell, as in the world files that MicMac writes of it.
+    # The centre of the first cell, as in the world files of MicMac.
     transform = rasterio.Affine(right, 0.0, x - right / 2, 0.0, down, y - down / 2)
     with rasterio.open(
         path, "w", driver="GTiff", height=z.shape[0], width=z.shape[1], count=1, dtype="float32", crs=scene.crs,
@@ -155,7 +155,7 @@ def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
 
 
 def pixels(path: Path) -> np.ndarray:
-    """(r, c) of a raster that has no place of its own."""
+    """Values (r, c) of a raster without georeference."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(path) as file:
@@ -164,7 +164,7 @@ def pixels(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Setsm:
-    """Pairs of images on a TIN that is refined (Noh and Howat 2015); pairs are merged by the median of cells."""
+    """Pairs of images on a refined TIN (Noh and Howat 2015); pairs are merged by the median of each cell."""
 
     program: Path
     name: str = "SETSM"
@@ -190,7 +190,7 @@ class Setsm:
 
 
 def write_isd(path: Path, rpc: RpcCoefficients) -> None:
-    """The RPC as DigitalGlobe's XML, which SETSM reads beside an image of the same name."""
+    """Write the RPC as XML of DigitalGlobe, which SETSM reads beside an image of the same name."""
     root = ElementTree.Element("isd")
     block = ElementTree.SubElement(root, "RPB")
     ElementTree.SubElement(block, "SATID").text = "WV01"
@@ -215,7 +215,7 @@ def write_isd(path: Path, rpc: RpcCoefficients) -> None:
 
 
 def only(folder: Path, pattern: str) -> Path:
-    """Raises `Failed` where there is no such file."""
+    """The file that matches a pattern; raises `Failed` if there is none."""
     found = sorted(folder.glob(pattern))
     if not found:
         raise Failed(f"no {pattern} was left in {folder}")
@@ -223,7 +223,7 @@ def only(folder: Path, pattern: str) -> Path:
 
 
 def on_grid(path: Path, scene: Scene) -> np.ndarray:
-    """(r, c) m of a surface on the scene's grid, NaN where it has none."""
+    """Heights (r, c) m of a surface on the grid of the scene, NaN without a height."""
     with rasterio.open(path) as file:
         if file.crs is None or file.crs.to_epsg() != CRS(scene.crs).to_epsg():
             raise Failed(f"{path} is in {file.crs}, not in {scene.crs}")
@@ -234,7 +234,7 @@ def on_grid(path: Path, scene: Scene) -> np.ndarray:
 
 
 def write_median(surfaces: list[np.ndarray], scene: Scene, path: Path) -> Path:
-    """The median of surfaces (r, c) m on the scene's grid, NaN where none has a height."""
+    """Write the median of surfaces (r, c) m on the grid of the scene, NaN where none has a height."""
     stacked = np.ma.masked_invalid(np.stack(surfaces))
     merged = np.ma.median(stacked, axis=0).filled(np.nan).astype(np.float32)
     west, _, _, north = scene.bounds

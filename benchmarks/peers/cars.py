@@ -31,12 +31,12 @@ class Cars:
     name: str = "CARS"
 
     def versions(self) -> dict[str, str]:
-        """Of what computes."""
+        """Versions of the packages that compute, and of the configuration."""
         configuration = digest_of([CONFIGURATIONS / "cars.yaml"])
         return self.environment.versions(*PACKAGES) | {"configuration": configuration}
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
-        """A surface of the scene, and what it took."""
+        """Make the surface of a scene; return its path and the cost."""
         out.mkdir(parents=True, exist_ok=True)
         config = out / "cars.yaml"
         config.write_text(yaml.safe_dump(configuration(scene, out), sort_keys=False), encoding="utf-8")
@@ -45,7 +45,7 @@ class Cars:
 
 
 def configuration(scene: Scene, out: Path) -> dict[str, Any]:
-    """What `configurations/cars.yaml` says, for a scene. All pairs whose rays meet at a usable angle are given."""
+    """Configuration of CARS for a scene, from `configurations/cars.yaml`, with all usable pairs of the scene."""
     recommended = yaml.safe_load((CONFIGURATIONS / "cars.yaml").read_text(encoding="utf-8"))
     pairs = scene.pairs
     views = [view for view in scene.images if view in set(itertools.chain(*pairs))]
@@ -67,7 +67,7 @@ def configuration(scene: Scene, out: Path) -> dict[str, Any]:
 
 
 def size_class(scene: Scene) -> str:
-    """By the shortest side of any image."""
+    """`small` or `large`, by the shortest side of all images."""
     sides = []
     for path in scene.images.values():
         with rasterio.open(path) as file:
@@ -76,7 +76,7 @@ def size_class(scene: Scene) -> str:
 
 
 def write_no_geoid(path: Path) -> Path:
-    """Undulations of zero: the terrain model's heights are above the ellipsoid, and CARS would add its own geoid."""
+    """Write a geoid of zero undulation: the terrain model is above the ellipsoid, and CARS would add its own geoid."""
     with rasterio.open(
         path, "w", driver="GTiff", height=181, width=361, count=1, dtype="float32", crs="EPSG:4326",
         transform=from_origin(-180.5, 90.5, 1.0, 1.0),

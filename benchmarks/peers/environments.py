@@ -1,4 +1,4 @@
-"""Environments of other programs, each with a Python that they support, installed from the registry."""
+"""Environments of the other programs, each with a supported Python, installed from the package registry."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGURATIONS = Path(__file__).parent / "configurations"
-# Of CPython, in the order in which they are looked for: all that CARS 1.3.0 needs is there for them.
+# Versions of CPython for which CARS 1.3.0 and all that it needs have wheels, in the order of preference.
 SUPPORTED = ((3, 12), (3, 13), (3, 11))
 STAMP = ".installed"
 
 
 class Missing(Exception):
-    """What another program lacks here, in a sentence."""
+    """A program cannot run here; the message says what is missing."""
 
 
 @dataclass(frozen=True)
 class Environment:
-    """A folder with an interpreter and what a file of requirements names."""
+    """A folder with an interpreter and installed packages."""
 
     folder: Path
 
@@ -34,7 +34,7 @@ class Environment:
         return self.folder / "bin" / "python"
 
     def program(self, name: str) -> Path:
-        """A command that a package brings."""
+        """Path of a command that a package installs."""
         return self.folder / "bin" / name
 
     def versions(self, *packages: str) -> dict[str, str]:
@@ -55,7 +55,7 @@ def installed(name: str, folder: Path) -> Environment:
 
 
 def this_checkout(folder: Path) -> Environment:
-    """zlocus as a user has it: this checkout with what it needs and no more, installed again where its code differs."""
+    """Install this checkout with its required packages only, as a user does; again if its code has changed."""
     files = sorted([ROOT / "pyproject.toml", ROOT / "README.md", ROOT / "LICENSE", *(ROOT / "src").rglob("*")])
     files = [
         path
@@ -64,7 +64,7 @@ def this_checkout(folder: Path) -> Environment:
     ]
     digest = digest_of(files)
     with tempfile.TemporaryDirectory() as scratch:
-        # From a copy: a build leaves its own folders beside what it builds.
+        # The build leaves folders beside the source, so a copy is built.
         for path in files:
             copy = Path(scratch) / path.relative_to(ROOT)
             copy.parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ def this_checkout(folder: Path) -> Environment:
 
 
 def digest_of(files: Iterable[Path]) -> str:
-    """Of names and contents."""
+    """Fingerprint of the names and contents of files."""
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.name.encode() + path.read_bytes())
@@ -81,7 +81,7 @@ def digest_of(files: Iterable[Path]) -> str:
 
 
 def made(environment: Environment, wanted: str, python: Callable[[], Path], what: list[str]) -> Environment:
-    """An environment whose stamp says what is wanted, made anew otherwise."""
+    """The environment if its stamp equals `wanted`; otherwise it is made again."""
     stamp = environment.folder / STAMP
     if stamp.exists() and stamp.read_text(encoding="utf-8") == wanted:
         return environment
@@ -94,7 +94,13 @@ def made(environment: Environment, wanted: str, python: Callable[[], Path], what
 
 
 def run(command: list[Any]) -> None:
-    """Raises `Missing` where it fails, with what it said last."""
+    """Run a command.
+
+    Raises
+    ------
+    Missing
+        The command failed; the message holds its last line of output.
+    """
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         said = (done.stderr.strip() or done.stdout.strip() or "nothing said").splitlines()[-1]
@@ -102,7 +108,7 @@ def run(command: list[Any]) -> None:
 
 
 def supported_python() -> Path:
-    """An interpreter that runs and whose version is supported: this one, or one by its name on the path or of pyenv."""
+    """A Python interpreter of a supported version: this one, one on the PATH, or one of pyenv."""
     named = [shutil.which(f"python{major}.{minor}") for major, minor in SUPPORTED]
     pyenv = sorted(Path.home().glob(".pyenv/versions/*/bin/python"))
     for candidate in [*filter(None, named), *map(str, pyenv), sys.executable]:

@@ -1,8 +1,8 @@
-"""Runs a command on given cores and says what it took: `python launch.py USAGE CORES SECONDS COMMAND ...`.
+"""Run a command on given cores and measure its cost: `python launch.py USAGE CORES SECONDS COMMAND ...`.
 
-In a process of its own, which adopts what the command leaves behind (a server of workers outlives it by a moment), so
-that CPU counts whatever it started. `beside` is the share of the cores that other work had meanwhile. Memory is that
-of all its processes together, shared pages once (proportional set size).
+This is a process of its own that adopts the processes which the command leaves behind (such as a server of workers that
+ends a moment later), so that their CPU counts. `beside` is the share of the cores that other processes used meanwhile.
+Memory is that of all processes of the command together; shared pages count once (proportional set size).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 import psutil
 
 ADOPT = 36  # PR_SET_CHILD_SUBREAPER
-# Memory is asked for rarely: where there are many processes that takes a tenth of a second.
+# Memory is sampled rarely, because that takes a tenth of a second if there are many processes.
 POLL_S, SAMPLE_S, LINGER_S = 0.02, 0.5, 5.0
 TOO_LONG = 124
 
@@ -39,7 +39,7 @@ def busy(cores: set[int]) -> float:
 
 
 def watch(process: subprocess.Popen[bytes], limit_s: float) -> tuple[int, int]:
-    """Exit status and the most bytes that all processes held at once; stops them when time is up."""
+    """Exit status, and the largest number of bytes of all processes together; they are stopped at the time limit."""
     itself, peak, start, sampled = psutil.Process(), 0, time.monotonic(), 0.0
     while process.poll() is None:
         now = time.monotonic()
@@ -54,14 +54,14 @@ def watch(process: subprocess.Popen[bytes], limit_s: float) -> tuple[int, int]:
 
 
 def stop(itself: psutil.Process) -> None:
-    """Ends all that was started."""
+    """End all processes of the command."""
     for each in itself.children(recursive=True):
         with contextlib.suppress(psutil.Error):
             each.kill()
 
 
 def reap(itself: psutil.Process) -> None:
-    """Waits for what was left behind, and ends what does not end by itself."""
+    """Wait for the remaining processes, and end those that do not end by themselves."""
     until = time.monotonic() + LINGER_S
     while True:
         try:

@@ -1,4 +1,4 @@
-"""StereoSGBM on rectified pairs, in an environment that has OpenCV and NumPy alone: `python match_opencv.py JOB`."""
+"""StereoSGBM on rectified pairs, in an environment with OpenCV and NumPy only: `python match_opencv.py JOB`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def stretched(grey: np.ndarray, percent: list[float]) -> np.ndarray:
-    """8 bits between two percentiles; pixels of 8 bits as they are."""
+    """Grey values stretched to 8 bits between two percentiles; images of 8 bits are not changed."""
     if grey.dtype == np.uint8:
         return grey
     dark, bright = np.percentile(grey, percent)
@@ -19,10 +19,10 @@ def stretched(grey: np.ndarray, percent: list[float]) -> np.ndarray:
 
 
 def match(pair: dict, options: dict) -> None:
-    """Writes (r, c) px of disparity: how far left a point of the first image lies in the second, NaN for nowhere."""
+    """Write the disparity (r, c) px: column in the first image less column in the second, NaN without a match."""
     images = (cv2.imread(pair[side], cv2.IMREAD_UNCHANGED) for side in ("left", "right"))
     first, count = pair["first"], pair["count"]
-    # Without borders it would leave out the columns that the largest disparities cannot reach.
+    # Without margins it would leave out the columns that the largest disparities cannot reach.
     left, right = (
         cv2.copyMakeBorder(stretched(image, options["grey_percent"]), 0, 0, count, count, cv2.BORDER_REPLICATE)
         for image in images

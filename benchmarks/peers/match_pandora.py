@@ -1,4 +1,4 @@
-"""Pandora with libSGM on rectified pairs, by its command, in its environment: `python match_pandora.py JOB`."""
+"""Pandora with libSGM on rectified pairs, through its command, in its environment: `python match_pandora.py JOB`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pandora.constants import Criteria
 
 
 def match(pair: dict, options: dict) -> None:
-    """Writes (r, c) px of disparity: how far left a point of the first image lies in the second, NaN for nowhere."""
+    """Write the disparity (r, c) px: column in the first image less column in the second, NaN without a match."""
     out = Path(pair["disparity"]).with_suffix("")
     out.mkdir(parents=True, exist_ok=True)
-    # Pandora counts to the right.
+    # Pandora counts disparities with the opposite sign.
     reach = [-(pair["first"] + pair["count"] - 1), -pair["first"]]
     images = {
         "left": {"img": pair["left"], "disp": reach, "nodata": -9999},

@@ -20,7 +20,7 @@ PAIRS = HERE / "pairs.py"
 class Matcher:
     """A script that matches pairs in an environment of its own.
 
-    script : names its `match_NAME.py` and its configuration; packages : of what computes.
+    script : NAME of its `match_NAME.py` and its configuration; packages : those that compute.
     """
 
     environment: Environment
@@ -29,17 +29,17 @@ class Matcher:
     packages: tuple[str, ...]
 
     def versions(self) -> dict[str, str]:
-        """Of what computes."""
+        """Versions of the packages that compute, and of the configuration."""
         configuration = digest_of([CONFIGURATIONS / f"{self.script}.json"])
         return self.environment.versions(*self.packages) | {"configuration": configuration}
 
     def options(self) -> dict[str, object]:
-        """What its documentation recommends."""
+        """The options that its documentation recommends."""
         found: dict[str, object] = json.loads((CONFIGURATIONS / f"{self.script}.json").read_text(encoding="utf-8"))
         return found
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
-        """A surface of the scene, and what rectifying, matching and merging took."""
+        """Make the surface of a scene; return its path and the cost of rectifying, matching and merging."""
         out.mkdir(parents=True, exist_ok=True)
         pairs = [
             {

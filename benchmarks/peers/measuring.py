@@ -1,4 +1,4 @@
-"""What a command takes, on given cores: CPU of all that it starts, wall time, memory of all its processes together."""
+"""Cost of a command on given cores: CPU and memory of all its processes, and wall time."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from typing import Any
 
 LAUNCH = Path(__file__).with_name("launch.py")
 LIMIT_S = 3 * 3600.0
-# As many threads as there are cores, whatever a library would take.
+# Libraries get as many threads as there are cores.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 class Failed(Exception):
-    """A program did not end well: which, how, and where it says more."""
+    """A program failed; the message names it, its exit status and its log."""
 
 
 @dataclass(frozen=True)
 class Usage:
-    """cpu_s, wall_s : s; peak_gb : GB of 1024^3 bytes; beside : share of the cores that other work had meanwhile."""
+    """Cost of a command. peak_gb : GB of 1024^3 bytes; beside : share of the cores used by other processes."""
 
     cpu_s: float = 0.0
     wall_s: float = 0.0
@@ -45,7 +45,13 @@ def measured(
     limit_s: float = LIMIT_S,
     accept: Sequence[int] = (0,),
 ) -> Usage:
-    """Runs a command to its end; what it says goes to a file. Raises `Failed` where it ends with another status."""
+    """Run a command with its output in a log file, and measure it.
+
+    Raises
+    ------
+    Failed
+        The exit status is not one of `accept`.
+    """
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | dict.fromkeys(THREADS, str(len(cores)))
     with tempfile.TemporaryDirectory() as scratch, log.open("wb") as said:

@@ -1,4 +1,4 @@
-"""Rectified photographs with truth (Scharstein & Szeliski 2002, 2003): matchers of pairs beside `zlocus cloud`."""
+"""Rectified photographs with truth (Scharstein and Szeliski 2002, 2003): matchers of pairs and `zlocus cloud`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,18 +15,16 @@ import numpy as np
 import middlebury as cases
 from peers.environments import CONFIGURATIONS, Environment
 from peers.measuring import Failed, measured
-
-if TYPE_CHECKING:
-    from peers.running import Results
+from peers.results import Results
 
 MATCHERS = {"OpenCV SGBM": "opencv", "Pandora": "pandora"}
 HERE = Path(__file__).parent
 
 
 def middlebury(results: Results, out: Path, environments: dict[str, Environment], cores: Sequence[int]) -> None:
-    """Bad pixels of every case that has two views; zlocus' also with more.
+    """Measure the share of bad pixels: of all programs with two views, and of zlocus also with more.
 
-    Cases whose photographs are not there are left out.
+    Cases whose photographs are missing are left out.
     """
     data = Path(os.environ.get("ZLOCUS_TEST_DATA", "")) / "middlebury_multiview"
     for name, case in cases.CASES.items():
@@ -55,8 +53,10 @@ def middlebury(results: Results, out: Path, environments: dict[str, Environment]
 def matched(
     folder: Path, case: cases.Case, script: str, out: Path, environment: Environment, cores: Sequence[int]
 ) -> np.ndarray:
-    """(r, c) px of disparity of the first two views, NaN where there is none; every pixel counts, so gaps are filled as
-    the matcher can (`dense` of its configuration)."""
+    """Disparity (r, c) px of the first two views, NaN where there is none.
+
+    Every pixel counts, so gaps are filled by the means of the matcher (`dense` of its configuration).
+    """
     out.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = json.loads((CONFIGURATIONS / f"{script}.json").read_text(encoding="utf-8"))
     changed = options.get("pipeline", options)

@@ -1,4 +1,4 @@
-"""zlocus itself, with the options that it has by default: images, grid and area are all it is given."""
+"""zlocus itself, with default options; it gets the images, the grid and the area."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from pathlib import Path
 from peers.environments import STAMP, Environment
 from peers.measuring import Usage, measured
 from peers.scenes import RESOLUTION_M, Scene
+from workplace import COVERAGE_SHORT
 
-# Exit status where much of the area has no height: a surface all the same.
-COVERAGE_SHORT = 3
 PACKAGES = ("zlocus", "numba", "numpy", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
 class Own:
-    """This checkout of zlocus, as a user has it. Its page about the run is not asked for: the others make none."""
+    """This checkout of zlocus, installed as by a user. It writes no report, because the other programs write none."""
 
     environment: Environment
     name: str = "zlocus"
 
     def versions(self) -> dict[str, str]:
-        """Of what computes; `code` tells states of the checkout apart."""
+        """Versions of the packages that compute; `code` identifies the state of the checkout."""
         code = (self.environment.folder / STAMP).read_text(encoding="utf-8")
         return self.environment.versions(*PACKAGES) | {"code": code}
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
-        """A surface of the scene, and what it took."""
+        """Make the surface of a scene; return its path and the cost."""
         command = [
             self.environment.program("zlocus"),
             "dsm",
@@ -45,7 +44,7 @@ class Own:
 
 
 def shifts(out: Path, scene: Scene) -> dict[str, tuple[float, float]]:
-    """Pointing corrections (column, row) px by view that a run in this folder found; none where there is no run."""
+    """Pointing corrections (column, row) px by view from the run in this folder; empty if there is no run."""
     record = out / "zlocus" / "run.json"
     if not record.exists():
         return {}

@@ -1,4 +1,4 @@
-"""The page of results and its pictures, from the file that a run leaves: nothing on it is written by hand."""
+"""The page of results and its pictures, made from results.json; nothing on it is written by hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 OWN, CARS, MICMAC = "zlocus", "CARS", "MicMac"
-# Of the acceptance: so many times less CPU per million cells than these programs.
+# Acceptance bars: these programs need at least this many times the CPU of zlocus per million cells.
 LESS_CPU = {CARS: 50.0, MICMAC: 10.0}
 COLOURS = {
     OWN: "#b3261e",
@@ -28,37 +28,41 @@ NAMES = {"opencv": "OpenCV", "libsgm": "libSGM", "pandora": "Pandora"}
 MARKS = "osD^v<>ph*XP"
 PLAIN = "{x:g}"
 PICTURES = ("peers_accuracy.png", "peers_cost.png")
-HEAD = """# Beside other programs
+HEAD = """# Comparison with other programs
 
-<!-- Made by `python benchmarks/peers --page docs/reference` from benchmarks/peers/results.json: change those, not this page. -->
+<!-- Written by `python benchmarks/peers --page docs/reference` from benchmarks/peers/results.json: do not edit. -->
 
     make peers                                                     # all of it, some hours: build/peers/peers.md
     python benchmarks/peers --scenes town --programs zlocus CARS   # one scene, two programs
     python benchmarks/peers --micmac /opt/micmac/bin/mm3d          # a program that no registry has
     python benchmarks/peers --page docs/reference                  # this page, from benchmarks/peers/results.json
 
-The same images, area, grid and cores for all. Programs are installed from the package registry into environments
-of their own; their configurations stand in `benchmarks/peers/configurations`, as their documents recommend them,
-each with its reason. Programs for pairs get every pair whose rays meet at no more than 30 degrees, and merge them
-by their own means. CARS gets a terrain model with cells of 30 m besides (made of the truth, low in each cell; of the
-Pleiades triplet made of s2p's surface, of the pair SRTM). Around its tie points it searches as far as the heights
-reach apart. OpenCV and Pandora are matchers of rectified rows without cameras: for them images are resampled onto a
-plane, the range of heights is that of the truth, a cell gets the median of all pairs and gaps the nearest height;
-of Pleiades they get the pointing corrections that zlocus found. That is done by code of this comparison, and counts
-in their CPU and memory. zlocus gets images, area and grid; its page about a run is not asked for. Options of zlocus
-were chosen on other scenes of the same renderer.
+All programs get the same images, area, grid and cores.
 
-CPU and wall times are those of all processes a program starts, memory that of all of them together (shared pages
-once), after a run on another scene that fills caches; zlocus is run three times and the median counts. Shares are
-of the cells with a truth less a rim of 10 m, and an empty one is not within 1 m; where the truth has an edge, either
-side is right. NMAD, RMSE and LE90 are of the cells with a height. The best figure of a column is bold.
+- Programs are installed from the package registry into environments of their own. Their configurations follow their
+  documentation; they are in `benchmarks/peers/configurations`, with the reasons.
+- Programs that match pairs get every pair whose rays meet at no more than 30 degrees, and merge the pairs themselves.
+- CARS also gets a terrain model with cells of 30 m. It is made from the truth (a low height of each cell); for the
+  Pleiades triplet it is made from the surface of s2p, for the Pleiades pair it is SRTM. Around its tie points CARS
+  searches the whole height range.
+- OpenCV and Pandora match rectified rows and have no cameras. For them the images are resampled onto a plane, the
+  height range is that of the truth, a cell takes the median of all pairs, and a gap takes the nearest height. For
+  Pleiades they get the pointing corrections of zlocus. Code of this comparison does that; its CPU and memory count as
+  theirs.
+- zlocus gets the images, the area and the grid, and writes no report. Its options were chosen on other scenes of the
+  same renderer.
+
+CPU, wall time and memory are those of all processes of a program (shared pages count once), after a run on another
+scene that fills caches. zlocus runs three times, and the median counts. Shares are shares of the cells with a truth,
+without a rim of 10 m; an empty cell is not within 1 m, and at an edge of the truth both sides are right. NMAD, RMSE
+and LE90 count cells with a height. The best figure of a column is bold.
 """
-# Other work on the cores from which on it is told, as a share of them.
+# Share of the cores used by other processes from which on the page mentions it.
 BESIDE = 0.05
 
 
 def write_page(results: Path, folder: Path) -> Path:
-    """Writes peers.md and its pictures. results : what a run left."""
+    """Write peers.md and its pictures; return the path of the page. results : results.json of a comparison."""
     found = json.loads(results.read_text())
     folder.mkdir(parents=True, exist_ok=True)
     draw_accuracy(found, folder / PICTURES[0])
@@ -69,14 +73,14 @@ def write_page(results: Path, folder: Path) -> Path:
 
 
 def page_of(found: dict[str, Any]) -> str:
-    """The text."""
+    """Text of the page."""
     parts = [HEAD, "\n".join(where(found)), *verdicts(found), "\n".join(pictures()), *scene_tables(found)]
     parts += [*difference_tables(found), *kernel_table(found), *middlebury_table(found), "\n".join(versions(found))]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
 
 def where(found: dict[str, Any]) -> Iterator[str]:
-    """Machine, dates, states of the code, judges, and what else the machine did."""
+    """Lines on the machine, the dates, the commits, the judges and the load of the machine."""
     it, rows = found["machine"], [row for part in PARTS for row in found[part]]
     cores = f"{len(it['cores'])} of {it['of_cores']} cores"
     computer = f"{cores} of {it['processor']}, {it['memory_gb']} GB, {it['system']}"
@@ -87,21 +91,21 @@ def where(found: dict[str, Any]) -> Iterator[str]:
     busy = [row for row in rows if row.get("beside", 0.0) > BESIDE]
     if busy:
         listed = ", ".join(f"{row['program']} on {row['scene']} ({row['beside']:.0%} of the cores)" for row in busy)
-        yield f"The machine did other work beside {listed}: wall times there are too long, CPU a little."
+        yield f"Other processes used the cores during {listed}: these wall times are too long, and CPU slightly."
 
 
 PARTS = ("surfaces", "differences", "kernels", "middlebury")
 
 
 def of_scene(found: dict[str, Any], scene: str) -> dict[str, dict[str, Any]]:
-    """What was measured on a scene, by program; programs in the order in which they first came."""
+    """Measurements on a scene by program, in the order in which the programs were first run."""
     order = list(found["programs"])
     rows = [row for row in found["surfaces"] if row["scene"] == scene]
     return {row["program"]: row for row in sorted(rows, key=lambda row: order.index(row["program"]))}
 
 
 def judged(found: dict[str, Any]) -> list[str]:
-    """Scenes with a truth that were measured."""
+    """Names of the measured scenes that have a truth."""
     return [name for name, scene in found["scenes"].items() if scene["truth"] and of_scene(found, name)]
 
 
@@ -114,17 +118,17 @@ def succeeded(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def figure(row: dict[str, Any], kind: str, what: str) -> float | None:
-    """Of a class of cells; nothing where the scene has none of it, of which judges give no count, or zero."""
+    """A figure of a class of cells; None if the scene has none of them."""
     figures = row["classes"].get(kind, {})
     return figures.get(what) if figures.get("n") else None
 
 
 def verdicts(found: dict[str, Any]) -> Iterator[str]:
-    """Who is first on each scene, and how much less CPU zlocus takes."""
+    """Table of the best programs on each scene, and of the CPU of the others over that of zlocus."""
     names = judged(found)
     if not names:
         return
-    yield "## Who is first"
+    yield "## Best programs"
     lines = ["| scene | lowest NMAD, m | next | largest share within 1 m | next | CPU over zlocus' |", "|" + 6 * "---|"]
     for name in names:
         rows = succeeded(of_scene(found, name))
@@ -133,13 +137,13 @@ def verdicts(found: dict[str, Any]) -> Iterator[str]:
     yield "\n".join(lines)
     bars = ", ".join(f"{bar:g} for {program}" for program, bar in LESS_CPU.items())
     yield (
-        f"Bold: zlocus is not alone in the first place. Bars of CPU over zlocus': {bars}, 1 for others; what falls "
-        "short of them is bold."
+        f"A first place is bold if zlocus does not hold it alone. Bars for the CPU over that of zlocus: {bars}, 1 for "
+        "the others; a ratio below its bar is bold."
     )
 
 
 def ranked(rows: dict[str, dict[str, Any]], what: str, sign: float) -> list[str]:
-    """The first and the next as cells of a table, of all cells; sign : 1 where little is good, -1 where much is."""
+    """The best two programs as cells of a table. sign : 1 where a low figure is good, -1 where a high one is."""
     pairs = [(figure(row, "all", what), program) for program, row in rows.items()]
     pairs = sorted((pair for pair in pairs if pair[0] is not None), key=lambda pair: sign * pair[0])
     cells = [f"{program} {value:.3f}" for value, program in pairs[:2]]
@@ -149,7 +153,7 @@ def ranked(rows: dict[str, dict[str, Any]], what: str, sign: float) -> list[str]
 
 
 def ratios(rows: dict[str, dict[str, Any]]) -> str:
-    """CPU of each other program over that of zlocus."""
+    """CPU of each other program over that of zlocus, as text."""
     if OWN not in rows:
         return ""
     found = []
@@ -167,8 +171,8 @@ def pictures() -> Iterator[str]:
     yield f"![CPU for a million cells, and shares of all cells more than 1 m off, by program and scene]({PICTURES[1]})"
 
 
-# Columns of a scene's table: what is written, of which class and figure (none: of the row, for a million cells where it
-# is a time), and whether little (1) or much (-1) is good.
+# Columns of the table of a scene: format, class (None: a figure of the row itself; times are per million cells),
+# figure, and whether a low (1) or a high (-1) value is good.
 COLUMNS = {
     "CPU, s / M cells": ("{:.1f}", None, "cpu_s", 1), "wall, s / M cells": ("{:.1f}", None, "wall_s", 1),
     "peak, GB": ("{:.2f}", None, "peak_gb", 1), "complete": ("{:.3f}", "all", "completeness", -1),
@@ -180,7 +184,7 @@ COLUMNS = {
 
 
 def scene_tables(found: dict[str, Any]) -> Iterator[str]:
-    """A table for each scene with truth."""
+    """A heading and a table for each scene with a truth."""
     for name in judged(found):
         about = found["scenes"][name]
         pairs = f"{about['pairs']} pair" + ("s" if about["pairs"] > 1 else "")
@@ -198,14 +202,14 @@ def scene_tables(found: dict[str, Any]) -> Iterator[str]:
 
 
 def failure(row: dict[str, Any]) -> str:
-    """Why there are no figures, for a cell of a table."""
+    """Reason why there are no figures, for a cell of a table."""
     return f"failed: {row['failed']}".replace("|", "/").replace("\n", " ")
 
 
 def column_of(
     found: dict[str, Any], rows: dict[str, dict[str, Any]], form: str, kind: str | None, what: str, sign: int
 ) -> dict[str, str]:
-    """A column's texts by program, the best one bold."""
+    """Texts of a column by program; the best one is bold."""
     if kind is not None:
         values = {program: figure(row, kind, what) for program, row in rows.items()}
     elif what == "peak_gb":
@@ -221,14 +225,14 @@ def column_of(
 
 
 def difference_tables(found: dict[str, Any]) -> Iterator[str]:
-    """Scenes without truth: what their surfaces differ by."""
+    """Differences between the surfaces of each scene without a truth."""
     for name in (name for name, scene in found["scenes"].items() if not scene["truth"]):
         rows = [row for row in found["differences"] if row["scene"] == name]
         if not rows:
             continue
         about = found["scenes"][name]
         yield f"## {name}: {about['million_cells']:.2f} M cells, no truth"
-        yield "Differences of each two surfaces (second less first); none of them is the truth, so nobody wins."
+        yield "Differences of each two surfaces (second less first); none of them is the truth."
         lines = [
             "| first | second | median, m | NMAD, m | within 1 m | second's cells where the first has heights |",
             "|---|---|---|---|---|---|",
@@ -244,7 +248,7 @@ def difference_tables(found: dict[str, Any]) -> Iterator[str]:
 
 
 def work_lines(found: dict[str, Any], rows: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """What the programs took, where nothing is judged."""
+    """Cost of the programs on a scene without a truth."""
     yield "| program | CPU, s / M cells | wall, s / M cells | peak, GB |"
     yield "|---|---|---|---|"
     for row in rows:
@@ -256,14 +260,14 @@ def work_lines(found: dict[str, Any], rows: Iterable[dict[str, Any]]) -> Iterato
 
 
 def kernel_table(found: dict[str, Any]) -> Iterator[str]:
-    """Semi-global aggregation."""
+    """Table of the semi-global aggregation."""
     if not found["kernels"]:
         return
     heights = sorted({row["heights"] for row in found["kernels"]})
-    yield "## Semi-global aggregation alone"
+    yield "## Semi-global aggregation only"
     yield (
-        "Million cell-steps (cells x heights, all eight paths) a second on one core, the best of all turns; OpenCV's "
-        "time holds its costs and minima too, which it does not separate."
+        "Million cell-steps (cells x heights, all eight paths) per second on one core, best of all turns. The time "
+        "of OpenCV includes its costs and minima, which cannot be timed separately."
     )
     lines = [f"| program | form | {' | '.join(f'{n} heights' for n in heights)} |", "|---|---|" + "---|" * len(heights)]
     speeds: dict[tuple[str, str], dict[int, float]] = {}
@@ -276,7 +280,7 @@ def kernel_table(found: dict[str, Any]) -> Iterator[str]:
 
 
 def middlebury_table(found: dict[str, Any]) -> Iterator[str]:
-    """Rectified photographs."""
+    """Table of the rectified photographs."""
     if not found["middlebury"]:
         return
     programs = list(dict.fromkeys(row["program"] for row in found["middlebury"]))
@@ -284,7 +288,7 @@ def middlebury_table(found: dict[str, Any]) -> Iterator[str]:
     for row in found["middlebury"]:
         bad.setdefault(row["case"], {})[row["program"]] = row["bad_percent"]
     yield "## Rectified photographs (Middlebury)"
-    yield "Pixels off by more than 1 px of disparity or without one, of those that both images see."
+    yield "Share of the pixels seen by both images whose disparity is wrong by more than 1 px, or missing."
     lines = [f"| photographs | {' | '.join(programs)} |", "|---|" + "---|" * len(programs)]
     lines += [
         f"| {case} | {' | '.join(f'{of[program]:.2f} %' if program in of else '' for program in programs)} |"
@@ -294,17 +298,17 @@ def middlebury_table(found: dict[str, Any]) -> Iterator[str]:
 
 
 def versions(found: dict[str, Any]) -> Iterator[str]:
-    """What computed."""
+    """List of the versions."""
     yield "## Versions"
     yield ""
     for program, parts in found["programs"].items():
         named = (f"{name} {version}" for name, version in parts.items() if name != "configuration")
         yield f"- {program}: {', '.join(named)}"
-    yield f"- kernels and photographs of zlocus, and what compares: Python {found['machine']['python']}"
+    yield f"- kernels and photographs of zlocus, and the comparison: Python {found['machine']['python']}"
 
 
 def draw_accuracy(found: dict[str, Any], path: Path) -> None:
-    """Share within 1 m and NMAD, a column of points for each scene."""
+    """Plot the share within 1 m and the NMAD, one column of points for each scene."""
     names = judged(found)
     picture, axes = plt.subplots(2, 1, figsize=(10, 7), sharex=True, layout="constrained")
     for axis, (what, label) in zip(axes, (("within", "share within 1 m"), ("nmad", "NMAD, m")), strict=True):
@@ -324,7 +328,7 @@ def draw_accuracy(found: dict[str, Any], path: Path) -> None:
 
 
 def draw_cost(found: dict[str, Any], path: Path) -> None:
-    """CPU against what is missed; left and low is good."""
+    """Plot CPU against the share of wrong or empty cells; low values of both are good."""
     picture, axis = plt.subplots(figsize=(10, 5.5), layout="constrained")
     marks = dict(zip(judged(found), MARKS, strict=False))
     for program in found["programs"]:

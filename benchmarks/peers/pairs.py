@@ -1,8 +1,8 @@
 """Rectified pairs for matchers, and surfaces from their disparities: `python pairs.py prepare|merge JOB`.
 
-A matcher knows rows of two images: it has no cameras, and no means to merge pairs. So both are done for it: pairs are
-resampled onto a plane (see `rectifying.py`), each pair's points are put on the grid (the highest in a cell), and a
-cell gets the median of all pairs, gaps the nearest height. What it takes counts as the matcher's.
+A matcher searches along the rows of two images; it has no cameras and cannot merge pairs. Both are done for it: pairs
+are resampled onto a plane (see `rectifying.py`), the points of each pair are put on the grid (the highest in a cell),
+a cell takes the median of all pairs, and a gap the nearest height. The cost counts as that of the matcher.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from zlocus.io.scene_file import open_scene
 
 @dataclass(frozen=True)
 class Plane:
-    """A pair on its plane. moved : m on it per m of height; middle : its height, m."""
+    """A pair on its plane. moved : parallax in metres per metre of height; middle : height of the plane, m."""
 
     views: tuple[View, View]
     shifts: tuple[np.ndarray, np.ndarray]
@@ -46,14 +46,14 @@ class Plane:
 
 @dataclass(frozen=True)
 class Area:
-    """What is asked for."""
+    """Area of the surface. bounds : west, south, east, north, m."""
 
     crs: str
     bounds: tuple[float, float, float, float]
 
 
 def planes(job: dict[str, Any]) -> list[Plane]:
-    """One for each pair of a job."""
+    """The plane of each pair of a job."""
     area, middle = area_of(job), sum(job["heights"]) / 2
     names = list(job["images"])
     views = dict(zip(names, open_scene([Path(path) for path in job["images"].values()]).views, strict=True))
@@ -71,7 +71,7 @@ def area_of(job: dict[str, Any]) -> Area:
 
 
 def prepare(path: Path) -> None:
-    """Writes both images of each pair and its range of disparities."""
+    """Write both rectified images of each pair and its range of disparities."""
     job = json.loads(path.read_text())
     for pair, plane in zip(job["pairs"], planes(job), strict=True):
         for side, view, shift in zip(("left", "right"), plane.views, plane.shifts, strict=True):
@@ -81,7 +81,7 @@ def prepare(path: Path) -> None:
 
 
 def merge(path: Path) -> None:
-    """Writes the surface of all pairs."""
+    """Write the surface: the median over all pairs."""
     job = json.loads(path.read_text())
     surfaces = []
     for pair, plane in zip(job["pairs"], planes(job), strict=True):

@@ -1,4 +1,4 @@
-"""Scenes that all programs get: rendered ones with exact truth, and satellite images where they are at hand."""
+"""Scenes of the comparison: rendered ones with exact truth, and satellite images if there are any."""
 
 from __future__ import annotations
 
@@ -24,24 +24,23 @@ from zlocus.io.scene_file import open_scene
 
 VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
 RESOLUTION_M = STEP_M
-# What a user of a satellite program has before matching: a terrain model with cells of 30 m, which reaches beyond
-# the area.
+# A coarse terrain model, as users of satellite programs have one before matching; it extends beyond the area.
 TERRAIN_M, TERRAIN_PERCENTILE, TERRAIN_BORDER = 30.0, 20.0, 30
-# Pairs that programs for pairs are given: rays that meet at no more than this. The fore and aft views of the
-# shared town (40 degrees), beside the nadir's two pairs (20), cost CARS a tenth of its roofs and gained .01 m of NMAD.
-STEEPEST_PAIR_DEG = 30.0
-# Heights beyond the lowest and highest of the area, that programs with a range of heights search.
+# Largest angle between the rays of a pair. With the pair of 40 degrees (fore and aft view of the shared town) beside
+# the two pairs of 20 degrees, CARS loses a tenth of its roofs and gains 0.01 m of NMAD.
+MAX_PAIR_ANGLE_DEG = 30.0
+# The height range that programs search exceeds the true heights by this much on both sides.
 RANGE_MARGIN_M = 3.0
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Images with RPC of an area, and what is known of it.
+    """Images with RPC, the area of the surface, and truth or reference data.
 
-    images : paths by view, the first one nearest to the nadir; kind : what stands there; bounds : west, south, east,
-    north m of the area asked for; heights : lowest and highest m that are searched, above the ellipsoid; terrain : a
-    coarse terrain model (EPSG:4326, above the ellipsoid); truth, classes : exact, None where there is none; reference :
-    another program's surface; shifts : pointing corrections (column, row) px by view, for matchers, which find none.
+    images : paths by view, the first one nearest to the nadir; kind : city or hills; bounds : west, south, east, north
+    of the area, m; heights : lowest and highest height of the search, m above the ellipsoid; terrain : a coarse terrain
+    model (EPSG:4326, above the ellipsoid); truth, classes : exact rasters, None if there are none; reference : surface
+    of another program; shifts : pointing corrections (column, row) px by view, for matchers that cannot find them.
     """
 
     name: str
@@ -62,25 +61,25 @@ class Scene:
 
     @property
     def slug(self) -> str:
-        """The name for a folder."""
+        """Name of the scene's folder."""
         return "-".join(self.name.replace(",", "").lower().split())
 
     @property
     def million_cells(self) -> float:
-        """Cells of the area asked for, in millions."""
+        """Cells of the area, in millions."""
         west, south, east, north = self.bounds
         return (east - west) * (north - south) / RESOLUTION_M**2 / 1e6
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Views whose rays meet at no more than STEEPEST_PAIR_DEG; the first of each is the one nearer to the nadir."""
+        """Pairs of views whose rays meet at no more than MAX_PAIR_ANGLE_DEG; the first view is nearer to the nadir."""
         views = list(self.images)
         rays = dict(zip(views, self.rays(), strict=True))
         steepness = {view: float(rays[view] @ (0.0, 0.0, 1.0)) for view in views}
         found = []
         for pair in itertools.combinations(views, 2):
             angle = np.degrees(np.arccos(np.clip(rays[pair[0]] @ rays[pair[1]], -1.0, 1.0)))
-            if angle <= STEEPEST_PAIR_DEG or len(views) == 2:
+            if angle <= MAX_PAIR_ANGLE_DEG or len(views) == 2:
                 steeper, other = sorted(pair, key=steepness.__getitem__, reverse=True)
                 found.append((steeper, other))
         return found
@@ -101,7 +100,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A scene to be rendered by `zlocus.synthetic`. side : cells of RESOLUTION_M; views : numbers of views matched."""
+    """A scene that `zlocus.synthetic` renders. side : in cells of RESOLUTION_M; views : numbers of views to match."""
 
     kind: str
     seed: int
@@ -110,7 +109,7 @@ class Rendered:
     options: tuple[str, ...] = field(default=())
 
     def scenes(self, name: str, folder: Path) -> list[Scene]:
-        """Renders into a folder, where that is not done yet; one scene per number of views."""
+        """Render into a folder, if that is not done yet; one scene for each number of views."""
         where = folder / f"{self.kind}-{self.seed}-{self.side}"
         if not (where / "scene.json").exists():
             command = [sys.executable, "-m", "zlocus.synthetic", "-o", where, "--kind", self.kind, *self.options]
@@ -131,7 +130,7 @@ class Rendered:
         ]  # fmt: skip
 
 
-# Seeds that zlocus had not seen when its options were chosen. The large one has more than 4 M cells.
+# The options of zlocus were chosen without these seeds. The large town has more than 4 million cells.
 RENDERED = {
     "town": Rendered("city", 211, 1024),
     "hills": Rendered("hills", 211, 1024),
@@ -141,13 +140,13 @@ WARM_UP = Rendered("city", 100, 640, views=(2,))
 
 
 def write_terrain(heights: np.ndarray, transform: rasterio.Affine, crs: str, path: Path) -> Path:
-    """A coarse terrain model as a user has it: a low percentile of each cell, borders carried outwards, in degrees."""
+    """Write a coarse terrain model: a low percentile of each cell, extended beyond the area, in degrees."""
     k = round(TERRAIN_M / transform.a)
     rows, cols = (-(-n // k) for n in heights.shape)
     padded = np.pad(heights, [(0, rows * k - heights.shape[0]), (0, cols * k - heights.shape[1])], mode="edge")
     blocks = padded.reshape(rows, k, cols, k).swapaxes(1, 2).reshape(rows, cols, -1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # cells of which nothing is known
+        warnings.simplefilter("ignore", RuntimeWarning)  # cells without any height
         coarse = np.nanpercentile(blocks, TERRAIN_PERCENTILE, axis=-1)
     coarse = coarse[tuple(distance_transform_edt(np.isnan(coarse), return_distances=False, return_indices=True))]
     coarse = np.pad(coarse, TERRAIN_BORDER, mode="edge").astype(np.float32)
@@ -172,7 +171,7 @@ def write_terrain(heights: np.ndarray, transform: rasterio.Affine, crs: str, pat
 
 
 def shared(folder: Path) -> list[Scene]:
-    """The Pleiades sets of `ZLOCUS_TEST_DATA`; none where it is not set. folder : for their coarse terrain models."""
+    """The Pleiades sets of `ZLOCUS_TEST_DATA`; empty if it is not set. folder : for their coarse terrain models."""
     data = os.environ.get("ZLOCUS_TEST_DATA")
     if not data:
         return []
@@ -182,7 +181,7 @@ def shared(folder: Path) -> list[Scene]:
 
 
 def calanques(data: Path, folder: Path) -> Scene | None:
-    """Pleiades triplet; s2p's surface of it gives the range of heights and, in coarse form, the terrain model."""
+    """The Pleiades triplet; the surface of s2p gives the height range and the coarse terrain model."""
     where = data / "pleiades_triplet_calanques"
     reference = where / "reference" / "s2p_dsm_0.5m_utm31n.tif"
     if not reference.exists():
@@ -197,7 +196,7 @@ def calanques(data: Path, folder: Path) -> Scene | None:
 
 
 def ventoux(data: Path, folder: Path) -> Scene | None:
-    """Pleiades pair that shares a strip; the terrain model is SRTM, brought above the ellipsoid."""
+    """The Pleiades pair, which overlaps in a strip; the terrain model is SRTM, converted to ellipsoidal heights."""
     where = data / "pleiades_pair_ventoux"
     srtm, geoid = (where / "reference" / name for name in ("srtm3_v2_egm96_heights.tif", "geoid_egm96_15min.tif"))
     if not srtm.exists():
@@ -220,12 +219,12 @@ def ventoux(data: Path, folder: Path) -> Scene | None:
     return Scene("Pleiades pair", "hills", images, crs, bounds, VENTOUX_M[1:], terrain)
 
 
-# Ground in the middle of the pair, and what lies around it: SRTM, some metres more to both sides.
+# Height of the ground in the middle of the pair, and height range around it: that of SRTM and some metres more.
 VENTOUX_M = (500.0, 440.0, 600.0)
 
 
 def grid_of(file: rasterio.DatasetReader) -> dict[str, object]:
-    """What a raster of heights in place of another one needs."""
+    """Profile of a raster of heights on the grid of another one."""
     return {
         "height": file.height, "width": file.width, "count": 1, "dtype": "float32", "crs": file.crs,
         "transform": file.transform,
@@ -233,7 +232,7 @@ def grid_of(file: rasterio.DatasetReader) -> dict[str, object]:
 
 
 def overlap(images: dict[str, Path], crs: str, z: float) -> tuple[float, float, float, float]:
-    """West, south, east, north m of what at least two images see at a height, in whole cells."""
+    """West, south, east, north, m, of the ground inside at least two images at a height, in whole cells."""
     footprints = []
     opened = open_scene(list(images.values()))
     for view in opened.views:

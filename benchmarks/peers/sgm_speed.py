@@ -1,9 +1,8 @@
-"""Semi-global aggregation on one core: `python sgm_speed.py PROGRAM SIDE HEIGHTS ROUNDS` prints what each form
-takes, s of CPU.
+"""Semi-global aggregation on one core: `python sgm_speed.py PROGRAM SIDE HEIGHTS ROUNDS` prints CPU seconds.
 
-Run in the environment of the program. All get SIDE x SIDE cells with HEIGHTS heights (disparities), eight paths
-and constant penalties; the best of some rounds counts. OpenCV has no aggregation by itself: its time holds costs
-and minima too.
+Runs in the environment of the program. All programs get SIDE x SIDE cells with HEIGHTS heights (disparities), eight
+paths and constant penalties; the best of ROUNDS rounds counts. OpenCV has no separate aggregation, so its time includes
+costs and minima.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, -1), (-1, 0), (-1, -1), (-1, 
 
 
 def best(call: Callable[[], object], rounds: int) -> float:
-    """CPU seconds of the fastest of some calls, after one that warms up. All threads count."""
+    """CPU seconds of all threads in the fastest of some calls, after one call that warms up."""
     call()
     seconds = []
     for _ in range(rounds):
@@ -32,12 +31,12 @@ def best(call: Callable[[], object], rounds: int) -> float:
 
 
 def costs(side: int, heights: int) -> np.ndarray:
-    """(r, c, k) uint8."""
+    """A cost volume (r, c, k) uint8."""
     return np.random.default_rng(5).integers(0, 25, (side, side, heights)).astype(np.uint8)
 
 
 def pair(side: int, heights: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two images of texture with `side` columns that both see at all disparities."""
+    """Two textured images with `side` columns that both images see at all disparities."""
     import cv2
 
     right = np.random.default_rng(2).integers(0, 256, (side, side + heights)).astype(np.uint8)
@@ -56,7 +55,7 @@ def zlocus(side: int, heights: int) -> Iterator[tuple[str, Callable[[], object]]
     lattice = HeightLattice(
         0.0, 1.0, (side, side), block, np.zeros(blocks, np.int64), np.full(blocks, heights, np.int64)
     )
-    # Of equal counts in all cells: the order of blocks does not matter for the time.
+    # All cells have the same number of heights, so the order of the blocks does not matter for the time.
     cost = costs(side, heights).reshape(-1)
     p2 = np.full((4, side, side), P2, np.uint16)
     total = np.zeros(lattice.size, np.uint16)
@@ -129,7 +128,7 @@ def pandora(side: int, heights: int) -> Iterator[tuple[str, Callable[[], object]
 
 
 def written(side: int, heights: int) -> list[str]:
-    """Both images, SIDE columns of them, as TIFF in a folder that goes with the process."""
+    """Write both images as TIFF into a folder that is removed with the process."""
     import atexit
     import shutil
     import tempfile

@@ -20,13 +20,13 @@ import pytest
 
 import acceptance
 import audit
-import compared
 import coregistration
 import judging
 import middlebury
 import reprojection
 import workplace
 from benchmark_scripts import DISPARITY_PX, printed_table, run_script, write_photographs
+from rows import other_programs
 from workplace import CannotRun, Figure, Workplace
 from zlocus.sensors.frame import FrameModel
 
@@ -97,7 +97,7 @@ def test_the_rows_of_other_programs_are_those_of_their_last_run(monkeypatch, cap
     """Ratios of the figures that results.json holds, here for the first judged scene and by hand."""
     assert run_script(monkeypatch, acceptance, "peers") == 0
     figures = table_of(capsys.readouterr().out)
-    found = json.loads(compared.KEPT.read_text(encoding="utf-8"))
+    found = json.loads(other_programs.RESULTS.read_text(encoding="utf-8"))
     scene = next(name for name, about in found["scenes"].items() if about["truth"])
     rows = {row["program"]: row for row in found["surfaces"] if row["scene"] == scene and "failed" not in row}
     own = rows["zlocus"]
@@ -106,9 +106,9 @@ def test_the_rows_of_other_programs_are_those_of_their_last_run(monkeypatch, cap
     assert float(figures[f"{scene}, within 1 m over the next"][0]) == pytest.approx(within, rel=1e-3)
     cpu = rows["CARS"]["cpu_s"] / own["cpu_s"]
     assert float(figures[f"{scene}, CPU of CARS over ours"][0]) == pytest.approx(cpu, rel=1e-3)
-    monkeypatch.setattr(compared, "KEPT", tmp_path / "results.json")
+    monkeypatch.setattr(other_programs, "RESULTS", tmp_path / "results.json")
     with pytest.raises(CannotRun, match="is not there: run `make peers`"):
-        compared.peers(Workplace(None, tmp_path))
+        other_programs.peers(Workplace(None, tmp_path))
 
 
 def test_figures_are_held_against_their_bars():

@@ -5,7 +5,6 @@ The programs themselves are not installed here: what stands for them writes what
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import re
@@ -21,19 +20,12 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
+from peers import builds, cars, environments, matchers, measuring, page, running, scenes
+from peers.results import Results
 from places import ROOT
 from rendered_scenes import CENTRE, HEIGHTS, rendered
 from zlocus.io.cameras.rpc_text import read_rpc_txt
 from zlocus.synthetic.terrain import analytic_height
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-# A runner of programs that finds its parts by their names, like a script: they are no part of the package.
-builds, cars, environments, matchers, measuring, page, running, scenes = (
-    importlib.import_module(f"peers.{name}")
-    for name in ("builds", "cars", "environments", "matchers", "measuring", "page", "running", "scenes")
-)
-judging = importlib.import_module("judging")
 
 CORE = min(os.sched_getaffinity(0))
 # Seconds of CPU that a process burns, and what else a Python takes to start and end.
@@ -289,8 +281,8 @@ class Copy:
 
 
 def run_copy(copy: Copy, scene: Any, out: Path) -> dict[str, Any]:
-    results = running.Results(out / "results.json", (CORE,))
-    results.say_of("programs", copy.name, copy.versions())
+    results = Results(out / "results.json", (CORE,))
+    results.describe("programs", copy.name, copy.versions())
     running.surfaces_of(scene, [copy], results, out, (CORE,))
     return json.loads((out / "results.json").read_text())
 
@@ -351,7 +343,7 @@ def test_the_page_says_who_wins():
 def test_other_work_on_the_machine_is_told():
     found = results_of(zlocus=10.0, CARS=600.0)
     found["surfaces"][1]["beside"] = 0.2
-    assert "other work beside CARS on town, 2 views (20% of the cores)" in page.page_of(found)
+    assert "Other processes used the cores during CARS on town, 2 views (20% of the cores)" in page.page_of(found)
 
 
 def test_a_class_without_cells_has_no_figures(tmp_path):

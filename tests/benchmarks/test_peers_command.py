@@ -20,6 +20,7 @@ import peers.__main__ as command
 from benchmark_scripts import BENCHMARKS, run_script, write_photographs
 from peers import cars, environments, own, running, scenes
 from peers import middlebury as photographs
+from peers.results import Results
 
 CORE = min(os.sched_getaffinity(0))
 SIDE = 96
@@ -79,7 +80,7 @@ def test_zlocus_alone_is_compared_with_the_truth(here, tmp_path, monkeypatch, ca
     # What was measured is not measured again, and corrections that zlocus found are handed to others.
     run_script(monkeypatch, command, *asked)
     assert json.loads((out / "results.json").read_text())["surfaces"] == found["surfaces"]
-    (measured,) = running.scenes(running.Asked(["town"], side=SIDE), out)
+    (measured,) = running.scenes(running.Comparison(["town"], side=SIDE), out)
     shifts = own.shifts(out / "surfaces" / measured.slug / "zlocus", measured)
     assert shifts.keys() == {"n1", "f1"}
     assert np.abs(list(shifts.values())).max() < 0.5
@@ -100,15 +101,15 @@ def test_scenes_asked_for_are_rendered(tmp_path, monkeypatch):
     monkeypatch.setattr(
         scenes.Rendered, "scenes", lambda self, name, folder: [(name, self.side, n) for n in self.views]
     )
-    sides = running.scenes(running.Asked(["town"], side=64), tmp_path)
+    sides = running.scenes(running.Comparison(["town"], side=64), tmp_path)
     assert list(sides) == [("town of 64 cells", 64, 2), ("town of 64 cells", 64, 3)]
-    assert list(running.scenes(running.Asked(["town"]), tmp_path)) == [("town", 1024, 2), ("town", 1024, 3)]
-    assert list(running.scenes(running.Asked(["hills"]), tmp_path)) == []
+    assert list(running.scenes(running.Comparison(["town"]), tmp_path)) == [("town", 1024, 2), ("town", 1024, 3)]
+    assert list(running.scenes(running.Comparison(["hills"]), tmp_path)) == []
 
 
 def test_aggregation_is_timed_beside_other_programs(here, tmp_path, monkeypatch, capsys):
     """OpenCV is here too; programs that are not installed are told, and the others' figures stay."""
-    results = running.Results(tmp_path / "results.json", (CORE,))
+    results = Results(tmp_path / "results.json", (CORE,))
     running.speeds(results, {"matchers": here}, CORE, side=64, all_heights=(16,), turns=1)
     rows = {(row["program"], row["form"]): row for row in results.found["kernels"]}
     forms = {"zlocus": ["one predecessor (sgm)", "two predecessors (mgm, the default)"],
@@ -132,7 +133,7 @@ def test_photographs_are_matched_by_all(here, tmp_path, monkeypatch, capsys):
     """Of the cases that are at hand, here one: zlocus and OpenCV, and what became of Pandora."""
     monkeypatch.setenv("ZLOCUS_TEST_DATA", str(tmp_path))
     write_photographs(tmp_path / "middlebury_multiview" / "teddy")
-    results = running.Results(tmp_path / "results.json", (CORE,))
+    results = Results(tmp_path / "results.json", (CORE,))
     photographs.middlebury(results, tmp_path / "out", {"matchers": here}, (CORE,))
     rows = {row["program"]: row for row in results.found["middlebury"]}
     assert {row["case"] for row in rows.values()} == {"teddy, 2 views"}

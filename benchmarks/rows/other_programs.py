@@ -1,4 +1,4 @@
-"""The acceptance lines of the comparison with other programs, from its last whole run (`make peers`, hours)."""
+"""Row of the acceptance table on other programs, from the results of the last full comparison (`make peers`, hours)."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from peers.page import figure, judged, of_scene, per_million, succeeded
 from workplace import ROOT, CannotRun, Figure, Workplace
 
 OWN, CARS = "zlocus", "CARS"
-KEPT = ROOT / "benchmarks" / "peers" / "results.json"
+RESULTS = ROOT / "benchmarks" / "peers" / "results.json"
 
 
-def peers(_at: Workplace) -> list[Figure]:
-    """What docs/peers.md is made of."""
-    if not KEPT.exists():
-        raise CannotRun(f"{KEPT} is not there: run `make peers`")
-    found, figures = json.loads(KEPT.read_text(encoding="utf-8")), []
+def peers(_workplace: Workplace) -> list[Figure]:
+    """Accuracy, CPU and speed of zlocus over those of the best other program (docs/reference/peers.md)."""
+    if not RESULTS.exists():
+        raise CannotRun(f"{RESULTS} is not there: run `make peers`")
+    found, figures = json.loads(RESULTS.read_text(encoding="utf-8")), []
     for scene in judged(found):
         rows = succeeded(of_scene(found, scene))
         if not {OWN, CARS} <= rows.keys():
-            raise CannotRun(f"{KEPT} has no surface of {scene} by {OWN} and {CARS}")
+            raise CannotRun(f"{RESULTS} has no surface of {scene} by {OWN} and {CARS}")
         own, others = rows.pop(OWN), rows.values()
         within, nmad = (figure(own, "all", what) for what in ("within", "nmad"))
         most = max(figure(row, "all", "within") for row in others)

@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 import rasterio
 
-import acceptance
 import bench_kernels
 import inspecting
-import large
 import machine
 import roofline
 import roofline_counts
 import scaling
 import threads
 from benchmark_scripts import printed_table, run_script, share_of
+from rows import large_areas, resources
 from workplace import CannotRun, Workplace, rendered_images
 from zlocus.io.scene_file import open_scene
 
@@ -123,7 +122,7 @@ def test_growth_of_the_acceptance_table(tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "write_views", lambda folder, town, n_views, side: n_views * [side])
     monkeypatch.setattr(scaling, "measured", measured)
     at = Workplace(None, tmp_path / "growth")
-    figures = {figure.what: figure for figure in large.growth(at, 0.01, 0.04, PERIOD_PX)}
+    figures = {figure.what: figure for figure in large_areas.growth(at, 0.01, 0.04, PERIOD_PX)}
     assert sides == [(6, 100, 1), (6, 100, 2), (6, 200, 1), (6, 200, 2)]
     assert figures["million cells"].value == figures["million cells"].at_least == 0.04
     assert figures["CPU per cell over that of 0.01 M"].value == pytest.approx(1)
@@ -135,16 +134,16 @@ def test_growth_of_the_acceptance_table(tmp_path, monkeypatch):
 def test_what_a_wider_halo_changes(small_town, tmp_path):
     """Few cells of a town in four tiles; and a cell counts where it differs by more than half a step or is empty."""
     at = Workplace(None, tmp_path / "halo")
-    (figure,) = large.changes(at, rendered_images(small_town, ("n1", "f1")), 64, {"twice": 64})
+    (figure,) = large_areas.changes(at, rendered_images(small_town, ("n1", "f1")), 64, {"twice": 64})
     assert figure.what == "tiles of 64, changed by a halo twice as wide"
-    assert figure.at_most == large.CHANGED
+    assert figure.at_most == large_areas.MAX_CHANGED
     assert 0 <= figure.value < 0.03
     n_tiles = [event for event in (tmp_path / "halo" / "halo32" / "events.jsonl").read_text().splitlines()
                if json.loads(event)["event"] == "tile"]  # fmt: skip
     assert len(n_tiles) >= 4
     one = np.array([1.0, 2.0, np.nan, np.nan, 5.0])
-    assert large.changed(one, one + np.array([0.0, 0.2, 0.0, 0.0, 0.3]), step_m=0.5) == 0.2
-    assert large.changed(one, np.array([1.0, 2.0, np.nan, 4.0, np.nan]), step_m=0.5) == 0.4
+    assert large_areas.changed(one, one + np.array([0.0, 0.2, 0.0, 0.0, 0.3]), step_m=0.5) == 0.2
+    assert large_areas.changed(one, np.array([1.0, 2.0, np.nan, 4.0, np.nan]), step_m=0.5) == 0.4
 
 
 def test_rates_of_a_core_are_measured():
@@ -222,7 +221,7 @@ def test_the_roofline_of_a_kernel_and_of_the_program(a_pair, monkeypatch, capsys
     # Of a machine that does other work little can be said, but never more than two threads can do.
     assert 0 < float(threaded["CPU per wall"]) < 2.2
     names = [row["stage"] for row in stages]
-    assert {"open", "orient", "settle", "match"} < set(names)
+    assert {"open", "orient", "setup", "match"} < set(names)
     assert names[-1] == "all, with start and imports"
     for column in ("CPU", "wall, 1 worker"):
         *parts, whole = (float(row[column]) for row in stages)
@@ -259,7 +258,7 @@ def test_the_benchmarks_of_the_kernels(tmp_path, monkeypatch):
     """All of them on scenes of 64 cells, by the row of the acceptance table; speeds mean nothing there."""
     # Where these tests run in several processes, pytest-benchmark would believe that the benchmarks do so too.
     monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
-    figures = {figure.what: figure for figure in acceptance.kernels(Workplace(None, tmp_path), side=64)}
+    figures = {figure.what: figure for figure in resources.kernels(Workplace(None, tmp_path), side=64)}
     report = json.loads((tmp_path / "benchmarks.json").read_text())
     names = {benchmark["name"].split("[")[0] for benchmark in report["benchmarks"]}
     assert names == {

@@ -1,0 +1,133 @@
+"""Rows of the acceptance table on aerial images, drone images and photographs of a facade."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+from reprojection import Surface, reprojected
+from rows.resources import of_all_processes
+from strecha import write_strecha_scene
+from workplace import COVERAGE_SHORT, ZLOCUS, Figure, Workplace, run
+from zlocus.evaluation.heights import read_heights
+from zlocus.io.scene_file import open_scene, write_scene_file
+
+# Standard deviation of heights that a user of oblique drone images may ask for (option checks.max_sigma_m).
+PRECISE_M = 1.0
+# Directions in the axes of the cameras of the facade: out of the wall, and up along it.
+FACADE_UP, FACADE_NORTH = (-0.733, 0.68, 0.0), (0.0, 0.0, -1.0)
+# All heights of the facade are moved by this much, to see how far the correlations fall.
+MOVED_M = 0.05
+
+
+def dmc(workplace: Workplace) -> list[Figure]:
+    """Four images of a mapping camera in two strips, with their exterior orientation and without a height range."""
+    scene = workplace.scene("aerial_ngi_dmc")
+    workplace.out.mkdir(parents=True, exist_ok=True)
+    (camera := workplace.out / "camera.yaml").write_text(f"focal: {120 / 0.144}\n")
+    crs = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", workplace.out / "scene.yaml"])
+    run([ZLOCUS, "dsm", workplace.out / "scene.yaml", "-o", workplace.out / "dsm"], accept=(0, COVERAGE_SHORT))
+    # The reference is a terrain model of 24 m cells; a difference of more than 50 m is a false height, not its error.
+    error, _ = errors_where_two_see(workplace.out, scene / "reference" / "dem_24m_egm2008.tif")
+    return [
+        *two_view_figures(error, min_filled=0.7, max_nmad_m=8.0, max_median_m=6.0),
+        Figure("heights > 50 m off", float((np.abs(error[np.isfinite(error)]) > 50.0).mean())),
+    ]
+
+
+def tuniu(workplace: Workplace) -> list[Figure]:
+    """Four oblique images of a drone, in four directions, without a height range."""
+    scene = workplace.scene("drone_tuniu_oblique")
+    workplace.out.mkdir(parents=True, exist_ok=True)
+    (bundle,) = json.loads((scene / "opensfm_reconstruction.json").read_text())[0]["cameras"].values()
+    side, lens = bundle["width"], {name: bundle[name] for name in ("k1", "k2", "k3", "p1", "p2")}
+    point = [(bundle[f"c_{axis}"] * side + (bundle[size] - 1) / 2) for axis, size in (("x", "width"), ("y", "height"))]
+    (camera := workplace.out / "camera.yaml").write_text(
+        json.dumps(
+            {"focal": bundle["focal_x"] * side, "principal_point": point, "distortion": {"kind": "brown", **lens}}
+        )
+    )
+    table = ["--crs", "EPSG:32651", "--earth", "flat", "--camera", camera]
+    run([ZLOCUS, "import", "eo", scene, *table, "-o", workplace.out / "scene.yaml"])
+    run([ZLOCUS, "dsm", workplace.out / "scene.yaml", "-o", workplace.out / "dsm"], accept=(0, COVERAGE_SHORT))
+    error, sigma = errors_where_two_see(workplace.out, scene / "reference" / "odm_dsm_0.8m.tif")
+    precise = np.where(sigma <= PRECISE_M, error, np.nan)
+    left_out = json.loads((workplace.out / "dsm" / "run.json").read_text())["left_out_cells"]
+    return [
+        *two_view_figures(error, min_filled=0.6, max_nmad_m=0.5),
+        *two_view_figures(precise, min_filled=0.6, max_nmad_m=0.5, which=f", sigma <= {PRECISE_M:g} m"),
+        Figure("cells an image was left out of", float(left_out)),
+    ]
+
+
+def errors_where_two_see(folder: Path, reference: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Height differences to a reference and the standard deviations of `sigma.tif`, (n,) m each, NaN without a height.
+
+    They are taken at the centres of those cells of the reference that lie inside at least two images.
+    """
+    opened = open_scene([folder / "scene.yaml"])
+    dsm, sigma = (read_heights(folder / "dsm" / f"{name}.tif") for name in ("dsm", "sigma"))
+    with rasterio.open(reference) as source:
+        z, transform = source.read(1, masked=True).astype(float).filled(np.nan), source.transform
+    col, row = np.meshgrid(np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5)
+    x, y = transform * (col, row)
+    xyz = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    n_seeing = np.zeros(len(xyz), int)
+    for view in opened.views:
+        xy = view.sensor.image_from_ground(xyz)
+        n_seeing += ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
+    xyz = xyz[n_seeing >= 2]
+    return np.asarray(dsm.nearest(xyz[:, :2]) - xyz[:, 2]), np.asarray(sigma.nearest(xyz[:, :2]))
+
+
+def two_view_figures(
+    error: np.ndarray, min_filled: float, max_nmad_m: float, max_median_m: float | None = None, which: str = ""
+) -> list[Figure]:
+    """Completeness, median and NMAD of height differences.
+
+    error : (n,) m, of ground that two images see, NaN without a height; which : end of the labels.
+    """
+    finite = error[np.isfinite(error)]
+    median = float(np.median(finite))
+    return [
+        Figure(f"ground seen by two, filled{which}", float(np.isfinite(error).mean()), at_least=min_filled),
+        Figure(f"|median difference|{which}", abs(median), "m", at_most=max_median_m),
+        Figure(f"NMAD{which}", float(1.4826 * np.median(np.abs(finite - median))), "m", at_most=max_nmad_m),
+    ]
+
+
+def herzjesu(workplace: Workplace) -> list[Figure]:
+    """Eight photographs of a facade: heights from every second one, checked by correlation in the others."""
+    scene = workplace.scene("herzjesu_p8")
+    workplace.out.mkdir(parents=True, exist_ok=True)
+    written = write_strecha_scene(scene, workplace.out / "scene.yaml", FACADE_UP, FACADE_NORTH)
+    write_scene_file(workplace.out / "half.yaml", written.model_copy(update={"views": written.views[::2]}))
+    run(
+        [ZLOCUS, "dsm", workplace.out / "half.yaml", "-o", workplace.out / "dsm", "--overwrite"],
+        accept=(0, COVERAGE_SHORT),
+    )
+    record = json.loads((workplace.out / "dsm" / "run.json").read_text())
+    views, surface = open_scene([workplace.out / "scene.yaml"]).views, Surface.read(workplace.out / "dsm" / "dsm.tif")
+    found = reprojected(surface, views[::2], views[1::2])
+    together = np.concatenate([one.ncc for one in found.values()])
+    figures = [Figure("left-out images, median NCC", float(np.median(together)), at_least=0.7)]
+    for name, one in found.items():
+        figures.append(Figure(f"image {name}, median NCC", one.median))
+        for what in ("hidden", "outside", "untextured", "at_rim"):
+            figures.append(Figure(f"image {name}, {what.replace('_', ' ')}", getattr(one, what) / one.with_height))
+        figures.append(Figure(f"image {name}, compared", len(one.ncc) / one.with_height))
+    worse = reprojected(surface, views[::2], views[1::2], MOVED_M)
+    ncc = float(np.median(np.concatenate([one.ncc for one in worse.values()])))
+    figures.append(Figure(f"heights moved by {MOVED_M:g} m, median NCC", ncc))
+    return [
+        *figures,
+        Figure("cell", surface.cell_m, "m"),
+        Figure("million cells", surface.xyz[..., 2].size / 1e6),
+        Figure("seen by two, filled", record["coverage"]),
+        *of_all_processes(record),
+    ]

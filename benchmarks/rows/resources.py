@@ -1,0 +1,103 @@
+"""Rows of the acceptance table on speed, memory and interruption, and on a fresh clone."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import rasterio
+
+from rows.rendered import VIEWS, town_figures
+from workplace import ROOT, ZLOCUS, CannotRun, Figure, Workplace, render, rendered_images, run
+
+LARGE_SIDE_CELLS = 4000
+# A town of more than 4 million cells of 0.5 m, and the CPU seconds per million cells that it may take.
+SPEED_SIDE_CELLS, SPEED_SEED = 2048, 12
+SPEED_BARS_S = {"six": 8.0, "three": 4.0}
+# Signals in the row `signals`; the tests send fewer.
+N_SIGNALS = 30
+
+
+def kernels(workplace: Workplace, side: int | None = None) -> list[Figure]:
+    """Speed of the kernels, from the `extra_info` of their benchmarks.
+
+    side : cells along a side of the benchmarks' scenes, None for the usual number.
+    """
+    report = workplace.out / "benchmarks.json"
+    workplace.out.mkdir(parents=True, exist_ok=True)
+    options = ["--benchmark-enable", "--benchmark-only", f"--benchmark-json={report}"]
+    options += [] if side is None else ["--side", str(side)]
+    run([sys.executable, "-m", "pytest", ROOT / "benchmarks", *options], cwd=ROOT)
+    found: dict[str, float] = {}
+    for benchmark in json.loads(report.read_text())["benchmarks"]:
+        found |= benchmark["extra_info"]
+    try:
+        sgm, opencv = found["sgm_cell_steps_per_s"], found["opencv_hh_cell_steps_per_s"]
+        ncc = found["resample_ncc_ns"]
+    except KeyError as missing:
+        raise CannotRun(f"no benchmark gives {missing} in its extra_info") from missing
+    return [
+        Figure("SGM, 8 paths", sgm / 1e6, "M cell-steps/s", at_least=200),
+        Figure("over OpenCV StereoSGBM HH", sgm / opencv, at_least=1.3),
+        Figure("resample + NCC 7 x 7", ncc, "ns", at_most=6),
+    ]
+
+
+def memory(workplace: Workplace) -> list[Figure]:
+    """CPU and memory of a run on six rendered views of a large area."""
+    scene = workplace.out / "scene"
+    render(scene, "city", LARGE_SIDE_CELLS)
+    with rasterio.open(scene / "truth_dsm.tif") as truth:
+        crs, bounds = truth.crs.to_string(), tuple(truth.bounds)
+    images, out = rendered_images(scene), workplace.out / "dsm"
+    run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--crs", crs, "--bounds", *bounds])
+    return of_all_processes(json.loads((out / "run.json").read_text()), at_most_gb=3)
+
+
+def of_all_processes(record: dict[str, Any], at_most_gb: float | None = None) -> list[Figure]:
+    """CPU of a run with its workers, and the largest memory of one process, from run.json.
+
+    Workers are not children of the command, so the usage that the system reports for the command leaves them out.
+    """
+    stages = record["stages"]
+    return [
+        Figure("CPU", sum(stage["cpu_s"] for stage in stages), "s"),
+        Figure("peak memory of a process", max(stage["peak_mb"] for stage in stages) / 1e3, "GB", at_most=at_most_gb),
+    ]
+
+
+def speed(workplace: Workplace) -> list[Figure]:
+    """CPU of the whole program on a large town with one worker and cached kernels, and the accuracy of the surface."""
+    scene, small, figures = workplace.out / "scene", workplace.scene("rendered-city"), []
+    render(scene, "city", SPEED_SIDE_CELLS, "--seed", SPEED_SEED)
+    with rasterio.open(scene / "truth_dsm.tif") as truth:
+        crs, bounds = truth.crs.to_string(), tuple(truth.bounds)
+    area = ["--resolution", 0.5, "--crs", crs, "--bounds", *bounds, "--workers", 1]
+    million_cells = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / 0.5**2 / 1e6
+    run([ZLOCUS, "dsm", *rendered_images(small), "-o", workplace.out / "compiled", "--resolution", 0.5, "--overwrite"])
+    for name, bar in SPEED_BARS_S.items():
+        out, images = workplace.out / name, rendered_images(scene, VIEWS[name])
+        used = run([ZLOCUS, "dsm", *images, "-o", out, *area, "--overwrite"])
+        per_million = used.cpu_s / million_cells
+        figures.append(Figure(f"{name}, CPU per million cells", per_million, "s", at_most=bar))
+        figures += town_figures(name, workplace.judge(out / "dsm.tif", scene), {})
+    return [Figure("million cells", million_cells, at_least=4), *figures]
+
+
+def signals(workplace: Workplace) -> list[Figure]:
+    """The test that interrupts a run by signals at random moments and resumes it, with more signals than usual."""
+    test = "tests/runs/test_resume.py::test_signals_at_random_moments"
+    used = run(["env", f"ZLOCUS_SIGNALS={N_SIGNALS}", sys.executable, "-m", "pytest", "-q", test], cwd=ROOT)
+    return [Figure("signals, and the same bytes afterwards", N_SIGNALS), Figure("CPU", used.cpu_s, "s")]
+
+
+def clone(workplace: Workplace) -> list[Figure]:
+    """A fresh clone, with nothing but Python and make: `make demo` and `make test`."""
+    folder = workplace.out / "zlocus"
+    run(["git", "clone", "--quiet", ROOT, folder])
+    figures = []
+    for target in ("demo", "test"):
+        used = run(["make", target, f"PYTHON={sys.base_prefix}/bin/python3"], cwd=folder)
+        figures.append(Figure(f"make {target} passes, CPU", used.cpu_s, "s"))
+    return figures

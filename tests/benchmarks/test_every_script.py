@@ -1,0 +1,103 @@
+"""Every script of benchmarks/ is run by a test, on an input as small as it takes; its page says how it is called."""
+
+from __future__ import annotations
+
+import importlib
+import re
+
+import pytest
+
+from benchmark_scripts import BENCHMARKS, run_script
+from places import TESTS
+
+# Script: the test that runs it, of several the one that runs most of it.
+RUN_BY = {
+    "acceptance.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "audit.py": "test_acceptance.py::test_known_vulnerabilities_are_found",
+    "baselines.py": "test_surfaces.py::test_the_benchmark_of_other_methods",
+    "bench_kernels.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "bench_linescan.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "rows/other_programs.py": "test_acceptance.py::test_the_rows_of_other_programs_are_those_of_their_last_run",
+    "conftest.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "coregistration.py": "test_acceptance.py::test_planted_shifts_are_found",
+    "double_mapping.py": "test_surfaces.py::test_cells_that_show_what_hides_them",
+    "inspecting.py": "test_speed.py::test_clicks_on_a_surface_are_timed",
+    "judging.py": "test_surfaces.py::test_the_benchmark_of_the_choice_of_views",
+    "rows/large_areas.py": "test_speed.py::test_what_a_wider_halo_changes",
+    "machine.py": "test_speed.py::test_rates_of_a_core_are_measured",
+    "middlebury.py": "test_acceptance.py::test_the_benchmark_of_rectified_photographs",
+    "peers/__main__.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
+    "peers/builds.py": "test_peers.py::test_micmac_as_its_documents_say",
+    "peers/cars.py": "test_peers_command.py::test_cars_is_run_with_its_configuration",
+    "peers/environments.py": "test_peers_command.py::test_an_environment_is_made_once_for_what_is_wanted",
+    "peers/launch.py": "test_peers.py::test_all_that_is_started_counts",
+    "peers/match_opencv.py": "test_peers.py::test_a_matcher_of_rows_finds_a_surface",
+    "peers/match_pandora.py": "test_peers_command.py::test_disparities_of_pandora_point_to_the_left",
+    "peers/matchers.py": "test_peers.py::test_a_matcher_of_rows_finds_a_surface",
+    "peers/measuring.py": "test_peers.py::test_all_that_is_started_counts",
+    "peers/middlebury.py": "test_peers_command.py::test_photographs_are_matched_by_all",
+    "peers/own.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
+    "peers/page.py": "test_peers_command.py::test_the_command_writes_the_page_of_results",
+    "peers/pairs.py": "test_peers.py::test_a_matcher_of_rows_finds_a_surface",
+    "peers/results.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
+    "peers/running.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
+    "peers/scenes.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
+    "peers/sgm_speed.py": "test_peers_command.py::test_aggregation_is_timed_beside_other_programs",
+    "precision.py": "test_surfaces.py::test_standard_deviations_are_calibrated",
+    "rectifying.py": "test_surfaces.py::test_the_benchmark_of_other_methods",
+    "reprojection.py": "test_acceptance.py::test_images_left_out_confirm_a_surface",
+    "roofline.py": "test_speed.py::test_the_roofline_of_a_kernel_and_of_the_program",
+    "roofline_counts.py": "test_speed.py::test_bounds_follow_from_counts",
+    "rows/__init__.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/demo.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/methods.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/photographs.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/rendered.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/resources.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "rows/satellite.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "same_pixels.py": "test_same_pixels.py::test_each_planted_difference_is_one_sentence",
+    "scaling.py": "test_speed.py::test_growth_is_measured_and_kept",
+    "selection.py": "test_surfaces.py::test_the_benchmark_of_the_choice_of_views",
+    "spaces.py": "test_surfaces.py::test_the_benchmark_of_object_and_image_space",
+    "strecha.py": "test_strecha.py::test_the_script_writes_the_scene_turned_to_its_up",
+    "terrain.py": "test_surfaces.py::test_the_benchmark_of_the_terrain",
+    "terrain_features.py": "test_surfaces.py::test_the_benchmark_of_terrain_features",
+    "threads.py": "test_speed.py::test_the_roofline_of_a_kernel_and_of_the_program",
+    "workplace.py": "test_acceptance.py::test_a_command_is_measured_and_its_failure_told",
+}
+# What has a command line of its own, by how it is called; the other files are parts of these, or are run by pytest.
+COMMANDS = {
+    path.name: path.stem for path in sorted(BENCHMARKS.glob("*.py")) if "ArgumentParser(" in path.read_text("utf-8")
+} | {"peers": "peers.__main__"}
+
+
+def test_every_script_is_run_by_a_test():
+    """A new one needs a row above, and the test that the row names."""
+    scripts = {path.relative_to(BENCHMARKS).as_posix() for path in BENCHMARKS.rglob("*.py")}
+    assert scripts == RUN_BY.keys()
+    for test in RUN_BY.values():
+        module, name = test.split("::")
+        assert f"\ndef {name}(" in (TESTS / "benchmarks" / module).read_text(encoding="utf-8"), test
+
+
+def options_of(text: str) -> set[str]:
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*|(?<![\w-])-o\b", text))
+
+
+@pytest.mark.parametrize("script", COMMANDS)
+def test_the_page_says_how_a_script_is_called(script, monkeypatch, capsys):
+    """With all the options that it has, and no other."""
+    page = (BENCHMARKS / "README.md").read_text(encoding="utf-8").split("\n| script |")[0]
+    lines = re.findall(rf"^    python benchmarks/{re.escape(script)}(?: .*)?$", page, re.MULTILINE)
+    assert lines, f"benchmarks/README.md does not say how {script} is called"
+    with pytest.raises(SystemExit):
+        run_script(monkeypatch, importlib.import_module(COMMANDS[script]), "--help")
+    usage = capsys.readouterr().out.split("\n\n")[0]
+    assert options_of("\n".join(lines)) == options_of(usage.replace("[-o OUT]", "-o"))
+
+
+def test_every_command_has_a_row_in_the_table_of_the_page():
+    page = (BENCHMARKS / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`[^|]+`) \|", page.partition("\n| script |")[2].partition("\n\n")[0], re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    assert named == COMMANDS.keys() | {path.name for path in BENCHMARKS.glob("bench_*.py")}
