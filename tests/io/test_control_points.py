@@ -40,9 +40,9 @@ def test_control_and_check_points_are_read(tmp_path, views):
     assert found.is_check.tolist() == [True, False]
     assert found.xyz.tolist() == [[500100, 5200100, 440], [500000.25, 5200000.5, 431.125]]
     assert found.sigma_m.tolist() == [[0.02, 0.02, 0.04]] * 2
-    assert found.seen.view.tolist() == [0, 1, 0, 1]
-    assert found.seen.point.tolist() == [1, 1, 0, 0]
-    assert found.seen.xy.tolist() == [[10.5, 20.25], [11.5, 21.25], [50, 60], [51, 61]]
+    assert found.observations.view.tolist() == [0, 1, 0, 1]
+    assert found.observations.point.tolist() == [1, 1, 0, 0]
+    assert found.observations.xy.tolist() == [[10.5, 20.25], [11.5, 21.25], [50, 60], [51, 61]]
     plain = read_control(written(tmp_path, PLAIN), views)
     assert np.isnan(plain.sigma_m).all()
     assert not plain.is_check.any()
@@ -52,8 +52,8 @@ def test_some_points_keep_their_image_points(tmp_path, views):
     found = read_control(written(tmp_path, GOOD), views)
     control = found.only(~found.is_check)
     assert control.names == ("gcp1",)
-    assert control.seen.point.tolist() == [0, 0]
-    assert control.seen.xy.tolist() == [[10.5, 20.25], [11.5, 21.25]]
+    assert control.observations.point.tolist() == [0, 0]
+    assert control.observations.xy.tolist() == [[10.5, 20.25], [11.5, 21.25]]
     assert len(GroundControl.none().only(np.empty(0, bool))) == 0
 
 

@@ -24,10 +24,18 @@ from joint_scenes import (
     views_of,
 )
 from orientation_scenes import random_ground, without_translation
-from zlocus.core.options import JointOptions, OrientationOptions
-from zlocus.orientation.bundle_adjustment import adjust_jointly
+from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
+from zlocus.orientation.bundle_adjustment import adjust_bundle
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.parameter_groups import DRIFT, FOCAL, POSE, SHIFT, blocks_of, kind_of, needs_joint
+from zlocus.orientation.parameter_groups import (
+    DRIFT,
+    FOCAL,
+    POSE,
+    SHIFT,
+    parameter_groups_of,
+    kind_of,
+    needs_bundle_adjustment,
+)
 from zlocus.orientation.shift_adjustment import adjust
 from zlocus.orientation.triangulate import project_points
 from zlocus.sensors.correction import AffineModel, ShiftedModel
@@ -35,7 +43,7 @@ from zlocus.sensors.trajectory import Drift
 
 OPTIONS = OrientationOptions()
 # Control points measured as exactly as the ties, and priors that the planted errors fit.
-EXACT = JointOptions(sigma_control_px=0.01, sigma_position_m=1.0, sigma_attitude_deg=0.05)
+EXACT = BundleAdjustmentOptions(sigma_control_px=0.01, sigma_position_m=1.0, sigma_attitude_deg=0.05)
 SCAN_SIZE = (SCAN_COLUMNS, SCAN_ROWS)
 # Exact ties: what is left is the pull of the priors, which hold cameras against errors that all ties share.
 RECOVERED_PX = 0.05
@@ -44,9 +52,9 @@ DATUM_M = 1e-3
 
 def oriented(exact, flawed, xyz, size, options=None, noise_px=0.0, **more):
     """What the flawed cameras become, from what the exact ones see."""
-    options = options or OrientationOptions(joint=EXACT)
+    options = options or OrientationOptions(bundle_adjustment=EXACT)
     seen, xyz = seen_by(exact, xyz, size, noise_px)
-    return adjust_jointly(views_of(flawed, size), seen, first_points(flawed, seen, xyz), options, **more), xyz
+    return adjust_bundle(views_of(flawed, size), seen, first_points(flawed, seen, xyz), options, **more), xyz
 
 
 def image_errors(found, exact, xyz):
@@ -60,7 +68,7 @@ def image_errors(found, exact, xyz):
 
 def frames(options=None, noise_px=0.0, n=600, **more):
     exact = flight_of_frames()
-    options = options or OrientationOptions(joint=EXACT)
+    options = options or OrientationOptions(bundle_adjustment=EXACT)
     return *oriented(exact, flawed_frames(exact), frame_ground(n), FRAME_SIZE, options, noise_px, **more), exact
 
 
@@ -70,9 +78,9 @@ def frame_control(**more):
 
 def test_poses_of_frame_cameras_are_recovered_with_control():
     found, xyz, exact = frames(control=frame_control())
-    assert np.median(np.hypot(*found.adjusted.before_px.T)) > 1.0
+    assert np.median(np.hypot(*found.adjustment.before_px.T)) > 1.0
     assert np.nanmax(image_errors(found, exact, xyz)) < RECOVERED_PX
-    assert found.solution.n_seen == 48 - 7
+    assert found.solution.n_determined == 48 - 7
 
 
 def test_the_datum_stays_where_positions_put_it():
@@ -81,7 +89,7 @@ def test_the_datum_stays_where_positions_put_it():
     moved = np.array([s.centre for s in found.sensors]) - [s.centre for s in flawed_frames(flight_of_frames())]
     assert np.abs(moved).max() > 0.1
     assert np.abs(moved.mean(axis=0)).max() < DATUM_M
-    assert np.hypot(*found.adjusted.after_px.T).max() < RECOVERED_PX
+    assert np.hypot(*found.adjustment.after_px.T).max() < RECOVERED_PX
 
 
 def test_sigma0_is_the_noise_of_an_image_coordinate():
@@ -104,7 +112,7 @@ def test_a_kind_of_correction_that_no_tie_asks_for_is_not_made():
     exact = flight_of_frames()
     rng = np.random.default_rng(3)
     wrong = [camera.corrected(rng.normal(0.0, 0.5, 3), np.zeros(3)) for camera in exact]
-    options = OrientationOptions(joint=replace(EXACT, sigma_attitude_deg=1e-3))
+    options = OrientationOptions(bundle_adjustment=replace(EXACT, sigma_attitude_deg=1e-3))
     found, _ = oriented(exact, wrong, frame_ground(600), FRAME_SIZE, options, 0.1)
     assert found.solution.is_held.reshape(8, 6).tolist() == [[False] * 3 + [True] * 3] * 8
 
@@ -115,12 +123,12 @@ def test_the_focal_length_is_found_on_request():
     ground = frame_ground(600, relief_m=400.0)
     fixed, xyz = oriented(exact, wrong, ground, FRAME_SIZE, control=frame_control())
     assert np.nanmax(image_errors(fixed, exact, xyz)) > 0.5
-    options = OrientationOptions(joint=replace(EXACT, sigma_focal_px=20.0))
+    options = OrientationOptions(bundle_adjustment=replace(EXACT, sigma_focal_px=20.0))
     found, xyz = oriented(exact, wrong, ground, FRAME_SIZE, options, control=frame_control())
     assert [sensor.focal for sensor in found.sensors] == pytest.approx([6000.0] * 8, abs=0.1)
     assert np.nanmax(image_errors(found, exact, xyz)) < RECOVERED_PX
-    (block,) = [block for block in found.blocks if block.kind == FOCAL]
-    assert block.views == tuple(range(8))
+    (focal,) = [group for group in found.groups if group.kind == FOCAL]
+    assert focal.views == tuple(range(8))
 
 
 def test_a_drift_of_line_scanners_is_recovered():
@@ -133,12 +141,12 @@ def test_a_drift_of_line_scanners_is_recovered():
         values = rng.standard_normal((3, 6)) * ([0.5] * 3 + [np.deg2rad(0.02)] * 3)
         drift = Drift(np.linspace(start, end, 3), values)
         flawed += [sensor.corrected(drift) for sensor in exact[3 * strip : 3 * strip + 3]]
-    options = OrientationOptions(joint=replace(EXACT, drift_s=20.0))
+    options = OrientationOptions(bundle_adjustment=replace(EXACT, drift_knot_interval_s=20.0))
     control = control_of(exact, scan_ground(10, 3), SCAN_SIZE)
     found, xyz = oriented(exact, flawed, scan_ground(200), SCAN_SIZE, options, control=control)
-    assert [block.kind for block in found.blocks] == [DRIFT] * 2
-    assert [block.views for block in found.blocks] == [(0, 1, 2), (3, 4, 5)]
-    assert [len(block) for block in found.blocks] == [18, 18]
+    assert [group.kind for group in found.groups] == [DRIFT] * 2
+    assert [group.views for group in found.groups] == [(0, 1, 2), (3, 4, 5)]
+    assert [len(group) for group in found.groups] == [18, 18]
     before = [a.image_from_ground(xyz) - b.image_from_ground(xyz) for a, b in zip(flawed, exact, strict=True)]
     assert np.nanmedian(np.abs(before)) > 1.0
     assert np.nanmax(image_errors(found, exact, xyz)) < RECOVERED_PX
@@ -150,7 +158,7 @@ def test_affine_errors_of_rpcs_are_recovered_with_control():
     flawed = [
         AffineModel(s, *map(tuple, np.column_stack([rng.normal(0, 3, 2), rng.normal(0, 2e-3, (2, 2))]))) for s in exact
     ]
-    options = OrientationOptions(joint=replace(EXACT, rpc="affine"))
+    options = OrientationOptions(bundle_adjustment=replace(EXACT, rpc_correction="affine"))
     control = control_of(exact, random_ground(8, seed=4), AFFINE_SIZE)
     found, xyz = oriented(exact, flawed, random_ground(300), AFFINE_SIZE, options, control=control)
     assert np.nanmax(image_errors(found, exact, xyz)) < RECOVERED_PX
@@ -173,10 +181,12 @@ def test_shifts_are_those_of_the_adjustment_of_shifts(n_views):
     """Two solvers that share no algebra; with two images nothing moves along the loci in either."""
     flawed, seen, xyz = shifted_block(n_views)
     alone = adjust(flawed, seen, xyz, OPTIONS)
-    found = adjust_jointly(views_of(flawed, AFFINE_SIZE), seen, xyz, OPTIONS)
-    assert {block.kind for block in found.blocks} == {SHIFT}
-    assert found.solution.n_seen == alone.n_seen
-    np.testing.assert_allclose(found.solution.parameters.reshape(-1, 2) * OPTIONS.prior_px, alone.shift_px, atol=2e-3)
+    found = adjust_bundle(views_of(flawed, AFFINE_SIZE), seen, xyz, OPTIONS)
+    assert {group.kind for group in found.groups} == {SHIFT}
+    assert found.solution.n_determined == alone.n_determined
+    np.testing.assert_allclose(
+        found.solution.parameters.reshape(-1, 2) * OPTIONS.sigma_shift_px, alone.shift_px, atol=2e-3
+    )
 
 
 def test_wrong_ties_are_dropped():
@@ -184,11 +194,11 @@ def test_wrong_ties_are_dropped():
     rng = np.random.default_rng(4)
     wrong = rng.choice(len(seen), len(seen) // 20, replace=False)
     seen.xy[wrong] += rng.uniform(-60.0, 60.0, (len(wrong), 2))
-    found = adjust_jointly(views_of(flawed, AFFINE_SIZE), seen, xyz, OPTIONS)
-    left = found.solution.parameters.reshape(-1, 2) * OPTIONS.prior_px - SHIFTS
+    found = adjust_bundle(views_of(flawed, AFFINE_SIZE), seen, xyz, OPTIONS)
+    left = found.solution.parameters.reshape(-1, 2) * OPTIONS.sigma_shift_px - SHIFTS
     assert np.abs(without_translation(left, flawed)).max() < 0.05
-    assert len(found.adjusted.seen) < len(seen) - 0.8 * len(wrong)
-    assert np.hypot(*found.adjusted.after_px.T).max() < 2.0
+    assert len(found.adjustment.observations) < len(seen) - 0.8 * len(wrong)
+    assert np.hypot(*found.adjustment.after_px.T).max() < 2.0
 
 
 def test_control_fixes_the_datum():
@@ -198,7 +208,7 @@ def test_control_fixes_the_datum():
     flawed = [replace(camera, centre=tuple(np.array(camera.centre) + common)) for camera in exact]
     for control, expected in ((None, common), (frame_control(), np.zeros(3))):
         found, xyz = oriented(exact, flawed, frame_ground(400), FRAME_SIZE, control=control)
-        error = found.adjusted.points.xyz - xyz[found.adjusted.numbers]
+        error = found.adjustment.ground_points.xyz - xyz[found.adjustment.numbers]
         np.testing.assert_allclose(error.mean(axis=0), expected, rtol=0, atol=0.02)
 
 
@@ -226,10 +236,10 @@ def test_terrain_heights_hold_the_ground_up():
     terrain = TerrainHeights(60.0 + col - 0.5 * row, -2000.0, 2000.0, 80.0)
     xyz = frame_ground(800)
     xyz[:, 2] = terrain.at(xyz[:, :2])[0] + 12.0 * (np.arange(800) % 4 == 0)
-    options = OrientationOptions(joint=JointOptions(sigma_dem_m=0.5))
+    options = OrientationOptions(bundle_adjustment=BundleAdjustmentOptions(sigma_dem_m=0.5))
     for given, expected in ((None, 1.0), (terrain, 0.0)):
         found, seen_xyz = oriented(exact, flawed, xyz, FRAME_SIZE, options, terrain=given)
-        error = (found.adjusted.points.xyz - seen_xyz[found.adjusted.numbers])[:, 2]
+        error = (found.adjustment.ground_points.xyz - seen_xyz[found.adjustment.numbers])[:, 2]
         assert error.mean() == pytest.approx(expected, abs=0.15)
     assert np.median(found.terrain_m) == pytest.approx(0.0, abs=0.15)
 
@@ -240,9 +250,9 @@ def test_many_ties_do_not_move_cameras_that_they_hardly_hold():
     exact = [replace(c, centre=(*c.centre[:2], 15_000.0), focal=60_000.0) for c in flight_of_frames(1, 3)]
     seen, xyz = seen_by(exact, frame_ground(3000), FRAME_SIZE, noise_px=0.1)
     seen.xy[:, 1] += 0.1 * ((seen.xy[:, 0] - 3000.0) / 3000.0) ** 2 * (seen.view - 1)
-    found = adjust_jointly(views_of(exact, FRAME_SIZE), seen, xyz, OPTIONS)
+    found = adjust_bundle(views_of(exact, FRAME_SIZE), seen, xyz, OPTIONS)
     assert np.abs(found.solution.parameters).max() < 0.1
-    assert abs(np.median(found.adjusted.points.xyz[:, 2] - xyz[found.adjusted.numbers, 2])) < 6.0
+    assert abs(np.median(found.adjustment.ground_points.xyz[:, 2] - xyz[found.adjustment.numbers, 2])) < 6.0
 
 
 def test_an_affine_correction_there_and_back():
@@ -258,11 +268,11 @@ def test_every_kind_of_sensor_at_once():
     frames_, scanners, satellites = flight_of_frames(1, 2), strips_of_lines((0.0,)), affine_sensors()[:1]
     views = views_of([*frames_, *scanners, *satellites], AFFINE_SIZE)
     assert [kind_of(view.sensor) for view in views] == ["frame"] * 2 + ["linescan"] * 3 + ["rpc"]
-    blocks = blocks_of(views, OPTIONS)
-    assert [(block.kind, block.views) for block in blocks] == [
+    groups = parameter_groups_of(views, OPTIONS)
+    assert [(group.kind, group.views) for group in groups] == [
         (SHIFT, (5,)), (POSE, (0,)), (POSE, (1,)), (DRIFT, (2, 3, 4)),
     ]  # fmt: skip
-    assert [needs_joint(views), needs_joint(views[5:])] == [True, False]
+    assert [needs_bundle_adjustment(views), needs_bundle_adjustment(views[5:])] == [True, False]
 
 
 def test_frames_and_a_satellite_are_adjusted_together():
@@ -277,7 +287,7 @@ def test_frames_and_a_satellite_are_adjusted_together():
 def test_no_ties_leave_the_cameras_as_they_are():
     flawed, seen, _ = shifted_block(3)
     nothing = seen.kept(np.zeros(len(seen), bool))
-    found = adjust_jointly(views_of(flawed, AFFINE_SIZE), nothing, np.empty((0, 3)), OPTIONS, GroundControl.none())
+    found = adjust_bundle(views_of(flawed, AFFINE_SIZE), nothing, np.empty((0, 3)), OPTIONS, GroundControl.none())
     assert all(a is b for a, b in zip(found.sensors, flawed, strict=True))
     assert np.isnan(found.solution.sigma0_px)
 
@@ -286,7 +296,7 @@ def test_control_alone_orients_an_image():
     exact = affine_sensors()
     flawed = [ShiftedModel(sensor, 2.0, -1.0) for sensor in exact]
     control = control_of(exact, random_ground(6), AFFINE_SIZE)
-    nothing = control.seen.kept(np.zeros(len(control.seen), bool))
-    found = adjust_jointly(views_of(flawed, AFFINE_SIZE), nothing, np.empty((0, 3)), OPTIONS, control)
-    xy = project_points(found.sensors, control.seen, control.xyz)
-    assert np.abs(xy - control.seen.xy).max() < 0.02
+    nothing = control.observations.kept(np.zeros(len(control.observations), bool))
+    found = adjust_bundle(views_of(flawed, AFFINE_SIZE), nothing, np.empty((0, 3)), OPTIONS, control)
+    xy = project_points(found.sensors, control.observations, control.xyz)
+    assert np.abs(xy - control.observations.xy).max() < 0.02

@@ -24,14 +24,16 @@ from joint_scenes import (
 )
 from orientation_scenes import random_ground
 from reference.joint import dense_jacobians, dense_reduced
-from zlocus.core.options import JointOptions, OrientationOptions
+from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.orientation.bundle_adjustment import problem_of
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.normal_equations import known_ground, linearise, reduced, weights
-from zlocus.orientation.parameter_groups import blocks_of
+from zlocus.orientation.normal_equations import ground_information, linearise, reduced, weights
+from zlocus.orientation.parameter_groups import parameter_groups_of
 from zlocus.orientation.triangulate import project_points
 
-OPTIONS = OrientationOptions(joint=JointOptions(sigma_focal_px=10.0, rpc="affine", drift_s=20.0))
+OPTIONS = OrientationOptions(
+    bundle_adjustment=BundleAdjustmentOptions(sigma_focal_px=10.0, rpc_correction="affine", drift_knot_interval_s=20.0)
+)
 # Of the largest derivative: one-sided differences over a twentieth of a sigma.
 DERIVATIVES = 2e-3
 
@@ -45,8 +47,8 @@ def problems(kind, n=40, control=None, terrain=None):
     else:
         sensors, xyz, size = affine_sensors(), random_ground(n), AFFINE_SIZE
     seen, xyz = seen_by(sensors, xyz, size, noise_px=0.3)
-    blocks = blocks_of(views_of(sensors, size), OPTIONS)
-    problem = problem_of(tuple(sensors), blocks, seen, xyz, OPTIONS, control or GroundControl.none(), terrain)
+    groups = parameter_groups_of(views_of(sensors, size), OPTIONS)
+    problem = problem_of(tuple(sensors), groups, seen, xyz, OPTIONS, control or GroundControl.none(), terrain)
     parameters = np.random.default_rng(2).normal(0.0, 0.5, problem.n_parameters)
     return problem, parameters, np.concatenate([xyz, problem.control_xyz])
 
@@ -60,8 +62,8 @@ def test_derivatives_are_those_of_central_differences(kind):
     largest = np.abs(by_parameters).max(axis=0)
     assert (largest > 0).all()
     assert (np.abs(linear.by_parameters.toarray() - by_parameters) / largest).max() < DERIVATIVES
-    rows = np.arange(len(problem.seen))
-    own = by_ground.reshape(len(rows), 2, -1, 3)[rows, :, problem.seen.point]
+    rows = np.arange(len(problem.observations))
+    own = by_ground.reshape(len(rows), 2, -1, 3)[rows, :, problem.observations.point]
     assert np.abs(linear.by_ground - own).max() / np.abs(own).max() < DERIVATIVES
 
 
@@ -71,14 +73,14 @@ def test_reduced_normal_equations_are_the_dense_ones(known):
     control = control_of(flight_of_frames(1, 3), frame_ground(4, seed=8), FRAME_SIZE) if known else None
     problem, parameters, xyz = problems("frame", control=control, terrain=heights if known else None)
     linear = linearise(problem, parameters, xyz)
-    residual = problem.seen.xy - project_points(problem.sensors, problem.seen, xyz)
+    residual = problem.observations.xy - project_points(problem.sensors, problem.observations, xyz)
     sigma, weight = weights(problem, residual, linear)
-    ground = known_ground(problem, xyz, sigma)
+    ground = ground_information(problem, xyz, sigma)
     found = reduced(problem, linear, residual, weight, ground)
     by_parameters = linear.by_parameters.toarray()
-    by_ground = np.zeros((len(problem.seen), 2, len(xyz), 3))
-    by_ground[np.arange(len(problem.seen)), :, problem.seen.point] = linear.by_ground
-    by_ground = by_ground.reshape(2 * len(problem.seen), -1)
+    by_ground = np.zeros((len(problem.observations), 2, len(xyz), 3))
+    by_ground[np.arange(len(problem.observations)), :, problem.observations.point] = linear.by_ground
+    by_ground = by_ground.reshape(2 * len(problem.observations), -1)
     normal, pull = dense_reduced(by_parameters, by_ground, weight, residual, ground.precision, ground.pull)
     np.testing.assert_allclose(found.normal, normal, rtol=0, atol=1e-9 * np.abs(normal).max())
     np.testing.assert_allclose(found.pull, pull, rtol=0, atol=1e-8 * np.abs(by_parameters.T @ residual.ravel()).max())
@@ -90,7 +92,7 @@ def test_what_is_known_of_the_ground_is_the_gradient_of_its_misfit():
     heights = TerrainHeights(np.add.outer(np.linspace(0, 9, 40), np.linspace(0, 30, 40)), -1950.0, 1950.0, 100.0)
     problem, _, xyz = problems("frame", n=10, terrain=heights)
     xyz[:, 2] = heights.at(xyz[:, :2])[0] + np.linspace(-5.0, 5.0, len(xyz))
-    ground = known_ground(problem, xyz, sigma=1.0)
+    ground = ground_information(problem, xyz, sigma=1.0)
 
     def squares(at):
         off = at[:, 2] - heights.at(at[:, :2])[0]
@@ -108,12 +110,13 @@ def test_heights_far_from_the_terrain_pull_no_harder():
     flat = TerrainHeights(np.zeros((40, 40)), -1950.0, 1950.0, 100.0)
     problem, _, xyz = problems("frame", n=10, terrain=flat)
     near, far = (
-        known_ground(problem, np.where([False, False, True], height, xyz), 1.0).pull[:, 2] for height in (6.0, 500.0)
+        ground_information(problem, np.where([False, False, True], height, xyz), 1.0).pull[:, 2]
+        for height in (6.0, 500.0)
     )
     assert np.abs(far).max() <= 1.01 * 1.5 / problem.terrain_m
     assert np.abs(near).max() < np.abs(far).max()
     beyond = replace(problem, terrain=TerrainHeights(np.zeros((2, 2)), 1e6, 1e6, 1.0))
-    assert not known_ground(beyond, xyz, 1.0).precision.any()
+    assert not ground_information(beyond, xyz, 1.0).precision.any()
 
 
 def test_points_without_distinct_rays_say_nothing():
@@ -123,8 +126,8 @@ def test_points_without_distinct_rays_say_nothing():
     first = np.flatnonzero(seen.point == 0)[0]
     lonely = seen.kept((seen.point != 0) | (np.arange(len(seen)) == first))
     flawed = tuple(flawed_frames(exact))
-    blocks = blocks_of(views_of(flawed, FRAME_SIZE), OPTIONS)
-    problem = problem_of(flawed, blocks, lonely, xyz, OPTIONS, GroundControl.none(), None)
+    groups = parameter_groups_of(views_of(flawed, FRAME_SIZE), OPTIONS)
+    problem = problem_of(flawed, groups, lonely, xyz, OPTIONS, GroundControl.none(), None)
     linear = linearise(problem, np.zeros(problem.n_parameters), xyz)
     residual = lonely.xy - project_points(flawed, lonely, xyz)
     weight = np.ones(len(lonely)), (lonely.point > 0).astype(float)

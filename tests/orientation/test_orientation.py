@@ -13,9 +13,9 @@ from pyproj import CRS
 
 from orientation_scenes import hill, hill_scene, image_of, observe, rendered, texture, without_translation
 from zlocus.core.errors import GeometryError
-from zlocus.core.options import JointOptions, OrientationOptions
+from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.scene import Scene, View
-from zlocus.orientation.orientation import MeasuredTies, Orientation, height_range, orient
+from zlocus.orientation.orientation import RefinedTies, Orientation, height_range, orient
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel
@@ -45,21 +45,21 @@ def test_planted_pointing_errors_are_taken_back(scene, oriented):
         assert view.after.median <= view.after.rms < 0.3
         assert view.after.median < view.before.median
     for pair in oriented.pairs:
-        assert pair.across_after_px < 0.3 < pair.across_before_px
+        assert pair.epipolar_distance_after_px < 0.3 < pair.epipolar_distance_before_px
 
 
 def test_ties_that_are_known_make_the_same_orientation(scene, oriented, monkeypatch):
     def looked_for(*_):
         raise AssertionError("ties are looked for again")
 
-    for name in ("find_ties", "sharpened"):
+    for name in ("find_ties", "refined_ties"):
         monkeypatch.setattr(f"zlocus.orientation.orientation.{name}", looked_for)
-    known = MeasuredTies.of(oriented.ties.arrays(), len(scene.views))
+    known = RefinedTies.of(oriented.ties.arrays(), len(scene.views))
     again = orient(scene, OPTIONS, known=known)
     assert again.as_dict() == oriented.as_dict()
     assert again.z_bounds == oriented.z_bounds
     np.testing.assert_array_equal(again.xyz, oriented.xyz)
-    np.testing.assert_array_equal(again.seen.xy, oriented.seen.xy)
+    np.testing.assert_array_equal(again.observations.xy, oriented.observations.xy)
 
 
 @pytest.mark.parametrize(
@@ -77,9 +77,9 @@ def test_ties_that_are_known_make_the_same_orientation(scene, oriented, monkeypa
 )
 def test_arrays_that_are_no_ties_of_the_scene_are_none(scene, oriented, change):
     kept = oriented.ties.arrays()
-    assert MeasuredTies.of(kept, len(scene.views)) is not None
+    assert RefinedTies.of(kept, len(scene.views)) is not None
     change(kept)
-    assert MeasuredTies.of(kept, len(scene.views)) is None
+    assert RefinedTies.of(kept, len(scene.views)) is None
 
 
 def test_applied_shifts_are_the_reported_ones(scene, oriented):
@@ -129,7 +129,7 @@ def test_frame_cameras_are_corrected_jointly():
     for i, (exact, flawed) in enumerate(zip(*turned_frames(), strict=True)):
         views.append(View(f"view{i}", Path(f"view{i}.tif"), image_of(rendered(exact, 280, coefficients)), flawed))
     scene = Scene(tuple(views), CRS.from_epsg(32631), heights=(60.0, 180.0))
-    found = orient(scene, replace(OPTIONS, joint=JointOptions(sigma_attitude_deg=0.1)))
+    found = orient(scene, replace(OPTIONS, bundle_adjustment=BundleAdjustmentOptions(sigma_attitude_deg=0.1)))
     assert found.model == "joint"
     assert {view.sensor for view in found.views} == {"frame"}
     corrected = found.apply(scene)
@@ -139,13 +139,13 @@ def test_frame_cameras_are_corrected_jointly():
         assert view.before.rms > 0.5
         assert view.after.rms < 0.3
     for pair in found.pairs:
-        assert pair.across_after_px < 0.3 < pair.across_before_px
-    xyz, sensors = found.measured, [view.sensor for view in corrected.views]
+        assert pair.epipolar_distance_after_px < 0.3 < pair.epipolar_distance_before_px
+    xyz, sensors = found.refined_xyz, [view.sensor for view in corrected.views]
     assert np.median(np.abs(xyz[:, 2] - hill(*xyz[:, :2].T) - np.median(xyz[:, 2] - hill(*xyz[:, :2].T)))) < 0.5
-    seen = found.seen.kept(found.seen.point < found.n_measured)
+    seen = found.observations.kept(found.observations.point < found.n_refined)
     assert np.median(np.hypot(*(project_points(sensors, seen, found.xyz) - seen.xy).T)) < 0.3
     shift = orient(scene, replace(OPTIONS, model="shift"))
-    assert (shift.model, shift.joint) == ("shift", None)
+    assert (shift.model, shift.bundle_adjustment) == ("shift", None)
     assert "directions" in found.as_dict()["unobservable"]
 
 

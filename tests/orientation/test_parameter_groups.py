@@ -92,7 +92,7 @@ def ties(scene):
 
 def assert_same(found, expected):
     for name in ("view", "point", "xy"):
-        np.testing.assert_array_equal(getattr(found.seen, name), getattr(expected.seen, name))
+        np.testing.assert_array_equal(getattr(found.observations, name), getattr(expected.observations, name))
     np.testing.assert_array_equal(found.z, expected.z)
     assert [pair.views for pair in found.pairs] == [pair.views for pair in expected.pairs]
 

@@ -17,15 +17,15 @@ from zlocus.core.requests import DsmRequest
 from zlocus.io.scene_file import open_scene
 from zlocus.orientation.orientation import first_ground, orient
 from zlocus.orientation.plausibility import (
-    FARTHEST_SHIFT_PX,
-    POOR_RESIDUAL_PX,
+    MAX_USUAL_SHIFT_PX,
+    MAX_USUAL_RESIDUAL_PX,
     agreeing_shares,
     contradicting_views,
     doubts_about,
     exchanged_views,
-    untied_views,
+    untied_images,
 )
-from zlocus.orientation.shift_adjustment import moved_least
+from zlocus.orientation.shift_adjustment import shifts_with_most_images_in_place
 from zlocus.orientation.triangulate import Observations
 from zlocus.pipeline.dsm import run_dsm
 
@@ -93,7 +93,7 @@ def test_noise_beside_two_images_takes_no_part(images, tmp_path):
     assert wrong < FEW
     assert filled > 0.95
     record = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert list(record["orientation"]["left_out"]) == ["noise"]
+    assert list(record["orientation"]["excluded_images"]) == ["noise"]
     with rasterio.open(tmp_path / "out" / "views.tif") as file:
         assert file.read(1).max() == 2
 
@@ -147,7 +147,7 @@ def observations(counts):
 
 
 def test_views_with_few_ties_are_untied():
-    np.testing.assert_array_equal(untied_views(observations([5, 3, 0, 4]), 4), [False, True, True, False])
+    np.testing.assert_array_equal(untied_images(observations([5, 3, 0, 4]), 4), [False, True, True, False])
 
 
 def test_views_that_keep_few_of_their_ties_contradict():
@@ -172,9 +172,9 @@ class View:
 @pytest.mark.parametrize(
     ("residual", "shift", "outside", "said"),
     [
-        (POOR_RESIDUAL_PX / 2, 3.0, 0, []),
-        (2 * POOR_RESIDUAL_PX, 3.0, 0, ["still lie 0.60 px off"]),
-        (0.1, 2 * FARTHEST_SHIFT_PX, 0, ["pointed 120 px off"]),
+        (MAX_USUAL_RESIDUAL_PX / 2, 3.0, 0, []),
+        (2 * MAX_USUAL_RESIDUAL_PX, 3.0, 0, ["still lie 0.60 px off"]),
+        (0.1, 2 * MAX_USUAL_SHIFT_PX, 0, ["pointed 120 px off"]),
         (0.1, 3.0, 5, ["5 of 205 tie points lie at heights of 50 to 130 m, outside the 0 to 100 m"]),
         (0.1, 3.0, 1, []),
     ],
@@ -197,7 +197,7 @@ def test_one_image_far_off_does_not_move_the_others():
     drawn = (true.ravel() - basis @ (basis.T @ true.ravel())).reshape(4, 2)
     assert np.hypot(*drawn.T)[[0, 1, 3]].max() > 10.0
     tied = np.ones(4, bool)
-    np.testing.assert_allclose(moved_least(drawn, basis, tied, 2), true, atol=0.1)
+    np.testing.assert_allclose(shifts_with_most_images_in_place(drawn, basis, tied, 2), true, atol=0.1)
 
 
 def test_cameras_of_their_own_are_not_called_exchanged(images):
@@ -214,5 +214,5 @@ def test_good_images_raise_no_doubt(images, tmp_path):
     scene: RenderedImages = images("sine")
     out = run(scene, tmp_path / "out", report=False, products=()).out
     orientation = json.loads((out / "run.json").read_text())["orientation"]
-    assert orientation["left_out"] == {}
+    assert orientation["excluded_images"] == {}
     assert orientation["doubts"] == []

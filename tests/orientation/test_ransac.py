@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orientation_scenes import AffineSensor, observe, random_ground
-from zlocus.orientation.epipolar import OnLocus, Sightlines, locate
+from zlocus.orientation.epipolar import EpipolarOffsets, Sightlines, epipolar_offsets
 from zlocus.orientation.ransac import find_shift
 
 N = 400
@@ -20,7 +20,7 @@ def matches(shift, wrong_share, normal, noise_px=0.0, seed=3):
     across = normal @ np.asarray(shift) + rng.normal(0.0, 1.0, len(normal)) * noise_px
     wrong = rng.permutation(len(normal)) < wrong_share * len(normal)
     across[wrong] = rng.uniform(-30.0, 30.0, wrong.sum())
-    return OnLocus(np.zeros(len(normal)), across, normal), wrong
+    return EpipolarOffsets(np.zeros(len(normal)), across, normal), wrong
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.5, 0.8])
@@ -68,10 +68,10 @@ def test_the_same_matches_give_the_same_answer():
 
 def test_matches_without_a_locus_or_beyond_the_pointing_limit_are_never_right():
     found, _ = matches((0.0, 2.0), 0.0, np.tile([0.0, 1.0], (20, 1)))
-    found.across_px[:5] = np.nan
-    found.across_px[5:10] = 31.0
+    found.distance_px[:5] = np.nan
+    found.distance_px[5:10] = 31.0
     assert find_shift(found, 30.0, 1.0).inliers.tolist() == [False] * 10 + [True] * 10
-    assert not find_shift(OnLocus(np.zeros(1), np.zeros(1), np.ones((1, 2))), 30.0, 1.0).inliers.any()
+    assert not find_shift(EpipolarOffsets(np.zeros(1), np.zeros(1), np.ones((1, 2))), 30.0, 1.0).inliers.any()
 
 
 def test_distance_and_height_are_those_of_the_planted_point():
@@ -80,11 +80,11 @@ def test_distance_and_height_are_those_of_the_planted_point():
     seen = observe(sensors, xyz)
     in_a, in_b = seen.xy[:60], seen.xy[60:]
     lines = Sightlines.of(sensors[0], in_a, (0.0, 300.0))
-    exact = locate(lines, sensors[1], in_b, (0.0, 300.0))
+    exact = epipolar_offsets(lines, sensors[1], in_b, (0.0, 300.0))
     assert np.abs(exact.z - xyz[:, 2]).max() < 1e-6
-    assert np.abs(exact.across_px).max() < 1e-6
-    moved = locate(lines, sensors[1], in_b + 2.5 * exact.normal, (0.0, 300.0))
-    assert np.abs(moved.across_px - 2.5).max() < 1e-6
+    assert np.abs(exact.distance_px).max() < 1e-6
+    moved = epipolar_offsets(lines, sensors[1], in_b + 2.5 * exact.normal, (0.0, 300.0))
+    assert np.abs(moved.distance_px - 2.5).max() < 1e-6
     assert np.abs(moved.z - xyz[:, 2]).max() < 1e-6
 
 
@@ -92,4 +92,4 @@ def test_parallel_rays_have_no_locus():
     sensors = [AffineSensor(0.1, 0.0), AffineSensor(0.1, 0.0, (5.0, 5.0))]
     xy = np.zeros((3, 2))
     lines = Sightlines.of(sensors[0], xy, (0.0, 300.0))
-    assert np.isnan(locate(lines, sensors[1], xy, (0.0, 300.0)).across_px).all()
+    assert np.isnan(epipolar_offsets(lines, sensors[1], xy, (0.0, 300.0)).distance_px).all()

@@ -32,7 +32,7 @@ def test_shifts_of_a_block_are_recovered_up_to_a_translation(numbers):
     planted = np.reshape(numbers, (4, 2))
     sensors, seen, xyz = block(planted, n=60)
     found = adjust(sensors, seen, xyz, OPTIONS)
-    assert found.n_seen == 5
+    assert found.n_determined == 5
     assert np.abs(without_translation(found.shift_px - planted, sensors)).max() < PRIOR_PULL_PX * 10
     assert np.hypot(*found.after_px.T).max() < 0.05
 
@@ -45,7 +45,7 @@ def test_one_tie_in_five_may_be_wrong():
     seen.xy[wrong] += rng.uniform(-60.0, 60.0, (len(wrong), 2))
     found = adjust(sensors, seen, xyz, OPTIONS)
     assert np.abs(without_translation(found.shift_px - planted, sensors)).max() < 0.05
-    assert len(found.seen) < len(seen) - 0.8 * len(wrong)
+    assert len(found.observations) < len(seen) - 0.8 * len(wrong)
     assert np.median(np.hypot(*found.before_px.T)) > 1.0
     assert np.median(np.hypot(*found.after_px.T)) < 0.3
 
@@ -56,14 +56,14 @@ def test_small_errors_on_one_side_hardly_pull():
     sensors, seen, xyz = block(planted, n=700, noise_px=0.1)
     seen.xy[(seen.view == 1) & (seen.point % 7 == 0)] += np.array([0.0, 0.9])
     found = adjust(sensors, seen, xyz, OPTIONS)
-    assert len(found.seen) > 0.99 * len(seen)
+    assert len(found.observations) > 0.99 * len(seen)
     assert np.abs(without_translation(found.shift_px - planted, sensors)).max() < 0.03
 
 
 def test_a_tight_prior_holds_shifts_back():
     sensors, seen, xyz = block(np.array([[0.0, 2.0], [0.0, -2.0]]), n=12, noise_px=0.5, looks=((-0.2, 0.0), (0.2, 0.0)))
     free = adjust(sensors, seen, xyz, OPTIONS)
-    held = adjust(sensors, seen, xyz, OrientationOptions(prior_px=0.1))
+    held = adjust(sensors, seen, xyz, OrientationOptions(sigma_shift_px=0.1))
     assert free.shift_px[:, 1] == pytest.approx([2.0, -2.0], abs=0.3)
     assert 0.05 < held.shift_px[0, 1] < 1.8
 
@@ -74,11 +74,11 @@ def test_two_images_get_no_shift_along_the_locus_and_heights_stay():
         np.array([[0.0, 0.0], 4.0 * along + np.array([0.0, 3.0])]), looks=((0.0, 0.0), (0.3, 0.0))
     )
     found = adjust(sensors, seen, xyz, OPTIONS)
-    assert found.n_seen == 1
+    assert found.n_determined == 1
     assert np.abs(found.shift_px[:, 0]).max() < 1e-9
     assert found.shift_px[:, 1] == pytest.approx([-1.5, 1.5], abs=PRIOR_PULL_PX)
     uncorrected = triangulate(sensors, seen, xyz)
-    assert np.abs(found.points.xyz[:, 2] - uncorrected.xyz[:, 2]).max() < 1e-6
+    assert np.abs(found.ground_points.xyz[:, 2] - uncorrected.xyz[:, 2]).max() < 1e-6
 
 
 def test_the_datum_is_the_smallest_shifts():
@@ -102,7 +102,7 @@ def test_nearly_parallel_loci_do_not_amplify_noise(bend):
     second = seen.view == 1
     seen.xy[second, 1] += 0.2 * np.sin(seen.xy[second, 0] / 60.0) * np.sign(xyz[:, 2] - 130.0)
     found = adjust(sensors, seen, xyz, OPTIONS)
-    assert found.n_seen == 1
+    assert found.n_determined == 1
     assert np.abs(found.shift_px).max() < 0.1
 
 
@@ -111,7 +111,7 @@ def test_a_triplet_on_one_line_shows_three_components():
     looks = ((-0.06, 0.0), (0.0, 0.0005), (0.055, 0.0))
     sensors, seen, xyz = block(planted, n=800, noise_px=0.3, looks=looks)
     found = adjust(sensors, seen, xyz, OPTIONS)
-    assert found.n_seen == 3
+    assert found.n_determined == 3
     assert np.abs(without_translation(found.shift_px - planted, sensors)).max() < 0.05
 
 
@@ -161,8 +161,8 @@ def test_sensors_of_several_kinds_do_not_move_the_ground():
     sensors = [ShiftedModel(s, *(-shift)) for s, shift in zip(exact, planted, strict=True)]
     seen = observe(exact, xyz, noise_px=0.1)
     found = adjust(sensors, seen, xyz, OPTIONS)
-    assert found.n_seen == 2 * len(exact) - 3
+    assert found.n_determined == 2 * len(exact) - 3
     true = adjust(exact, seen, xyz, OPTIONS)
     assert np.abs(true.shift_px).max() < 0.02
-    assert abs(np.median(true.points.xyz[:, 2] - xyz[true.numbers, 2])) < 0.02
+    assert abs(np.median(true.ground_points.xyz[:, 2] - xyz[true.numbers, 2])) < 0.02
     assert np.abs(without_translation(found.shift_px - planted, exact)).max() < 0.02

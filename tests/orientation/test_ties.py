@@ -15,9 +15,9 @@ from rpc_fixtures import satellite_rpc
 from zlocus.core.errors import GeometryError
 from zlocus.core.options import OrientationOptions
 from zlocus.orientation import sift as features_module
-from zlocus.orientation.epipolar import Loci, Sightlines
+from zlocus.orientation.epipolar import EpipolarCurves, Sightlines
 from zlocus.orientation.sift import Features, detect, part_grid, reduction
-from zlocus.orientation.ties import PairMatches, find_ties, join_tracks, match_near_loci, widest_range
+from zlocus.orientation.ties import PairMatches, find_ties, join_tracks, match_along_curves, widest_range
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.rpc import RpcModel
 
@@ -137,14 +137,14 @@ def test_ties_lie_on_the_ground_despite_wrong_pointing():
     assert [p.views for p in ties.pairs] == [(0, 1), (0, 2), (1, 2)]
     assert all(len(p) > 100 for p in ties.pairs)
     exact = [view.sensor.base for view in scene.views]
-    error = np.full(len(ties.seen), np.nan)
+    error = np.full(len(ties.observations), np.nan)
     for i, sensor in enumerate(exact):
-        rows = np.flatnonzero(ties.seen.view == i)
-        xyz = sensor.ground_from_image(ties.seen.xy[rows], np.full(len(rows), 110.0))
+        rows = np.flatnonzero(ties.observations.view == i)
+        xyz = sensor.ground_from_image(ties.observations.xy[rows], np.full(len(rows), 110.0))
         for _ in range(20):
-            xyz = sensor.ground_from_image(ties.seen.xy[rows], hill(xyz[:, 0], xyz[:, 1]))
+            xyz = sensor.ground_from_image(ties.observations.xy[rows], hill(xyz[:, 0], xyz[:, 1]))
         error[rows] = xyz[:, 0]
-    spread = [np.ptp(error[ties.seen.point == p]) for p in range(0, len(ties.z), 5)]
+    spread = [np.ptp(error[ties.observations.point == p]) for p in range(0, len(ties.z), 5)]
     assert np.median(spread) < 0.25
     assert np.mean(np.array(spread) < 1.5) > 0.95
 
@@ -168,7 +168,7 @@ def test_images_of_different_ground_are_not_compared():
     far = replace(scene.views[1], sensor=ShiftedModel(scene.views[1].sensor, 9000.0, 0.0))
     stages = []
     ties = find_ties(replace(scene, views=(scene.views[0], far)), OPTIONS, progress=lambda *done: stages.append(done))
-    assert len(ties.seen) == 0
+    assert len(ties.observations) == 0
     assert len(ties.z) == 0
     assert stages[-1] == ("matches", 1.0)
 
@@ -193,20 +193,20 @@ def unit(*numbers):
 def test_matches_are_mutual_unambiguous_and_near_their_locus():
     """Four points on parallel loci; each rival breaks one rule."""
     low = np.array([[0.0, 0.0], [0.0, 50.0], [0.0, 100.0], [0.0, 150.0]])
-    loci = Loci(low, low + np.array([80.0, 0.0]), 0.0, 100.0)
+    loci = EpipolarCurves(low, low + np.array([80.0, 0.0]), 0.0, 100.0)
     in_a = Features(low, unit(0, 1, 2, 3))
     xy_b = np.array([[40.0, 1.0], [40.0, 60.0], [30.0, 100.0], [60.0, 100.0], [40.0, 150.0], [40.8, 150.0]])
     in_b = Features(xy_b, unit(0, 1, 2, 2, 3, 3))
-    first, second = match_near_loci(loci, in_a, in_b, 5.0, 0.8)
+    first, second = match_along_curves(loci, in_a, in_b, 5.0, 0.8)
     # 1 lies 10 px off its locus; 2 has an equal rival elsewhere; 3's rival is at the same place, so no rival
     assert first.tolist() == [0, 3]
     assert second.tolist() == [0, 4]
-    wider, _ = match_near_loci(loci, in_a, in_b, 12.0, 0.8)
+    wider, _ = match_along_curves(loci, in_a, in_b, 12.0, 0.8)
     assert wider.tolist() == [0, 1, 3]
     twins = Features(low[[0, 0]] + np.array([[0.0, 0.0], [0.0, 4.0]]), unit(0, 0) + np.float32(0.1) * unit(9, 0))
     lengths = np.linalg.norm(twins.descriptors, axis=1, keepdims=True)
-    pair = Loci(twins.xy, twins.xy + np.array([80.0, 0.0]), 0.0, 100.0)
-    first, _ = match_near_loci(
+    pair = EpipolarCurves(twins.xy, twins.xy + np.array([80.0, 0.0]), 0.0, 100.0)
+    first, _ = match_along_curves(
         pair, Features(twins.xy, twins.descriptors / lengths), in_b.only(np.array([0])), 5.0, 0.8
     )
     assert first.tolist() == [1]  # the one whose descriptor is nearer takes the point
@@ -223,11 +223,11 @@ def test_matches_of_all_pairs_join_into_points():
         pair_of((1, 2), [3, 2], [4, 2], [14.0, 30.0]),
     )
     ties = join_tracks(views, pairs, (0.0, 100.0))
-    assert sorted(zip(ties.seen.view.tolist(), ties.seen.point.tolist(), strict=True)) == [
+    assert sorted(zip(ties.observations.view.tolist(), ties.observations.point.tolist(), strict=True)) == [
         (0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (2, 0), (2, 2),
     ]  # fmt: skip
     assert ties.z.tolist() == [12.0, 20.0, 30.0]
-    assert ties.seen.xy[ties.seen.point == 0].tolist() == [[0.0, 10.0], [60.0, 70.0], [80.0, 90.0]]
+    assert ties.observations.xy[ties.observations.point == 0].tolist() == [[0.0, 10.0], [60.0, 70.0], [80.0, 90.0]]
 
 
 def test_a_point_seen_twice_by_one_image_is_dropped():
@@ -239,7 +239,7 @@ def test_a_point_seen_twice_by_one_image_is_dropped():
     )
     ties = join_tracks(views, pairs, (0.0, 100.0))
     assert ties.z.tolist() == [20.0]
-    assert ties.seen.view.tolist() == [0, 1]
+    assert ties.observations.view.tolist() == [0, 1]
 
 
 def test_orientations_of_one_place_are_one_feature():
@@ -247,7 +247,7 @@ def test_orientations_of_one_place_are_one_feature():
     views = [Features(xy, np.zeros((3, 128), np.float32)) for _ in range(2)]
     ties = join_tracks(views, (pair_of((0, 1), [0, 1], [0, 1], [10.0, 10.0]),), (0.0, 100.0))
     assert len(ties.z) == 1
-    assert len(ties.seen) == 2
+    assert len(ties.observations) == 2
 
 
 def test_sightlines_are_the_rays_of_the_sensor():

@@ -69,7 +69,7 @@ def test_the_report(oriented):
     assert after < 0.5 * before
     assert 0.01 < report["sigma0_px"] < 0.5
     assert report["n_parameters"] == 6
-    assert report["n_parameters_seen"] == 3
+    assert report["n_parameters_determined"] == 3
     assert [block["views"] for block in report["corrections"]] == [["aft"], ["fore"], ["nadir"]]
     for block in report["corrections"]:
         name = block["views"][0]
@@ -137,7 +137,7 @@ def test_a_terrain_model_holds_the_heights(flawed, tmp_path):
         transform=rasterio.Affine(10, 0, CENTRE[0] - 300, 0, -10, CENTRE[1] + 300),
     ) as raster:  # fmt: skip
         raster.write(np.full((1, 60, 60), 60.0, np.float32))
-    (tmp_path / "mine.toml").write_text("[orientation.joint]\nsigma_dem_m = 0.1\n")
+    (tmp_path / "mine.toml").write_text("[orientation.bundle_adjustment]\nsigma_dem_m = 0.1\n")
     out = tmp_path / "out"
     options = ["--dem", tmp_path / "dem.tif", "--config", tmp_path / "mine.toml", "--crs", "EPSG:32632"]
     result = invoke("orient", *flawed.inputs, "-o", out, *HEIGHTS, *options)

@@ -10,8 +10,8 @@ from zlocus.orientation.triangulate import project_points
 
 def all_projections(problem, parameters, xyz):
     """(2 m,) px of every image point."""
-    sensors = corrected_sensors(problem.blocks, problem.sensors, parameters)
-    return project_points(sensors, problem.seen, xyz).ravel()
+    sensors = corrected_sensors(problem.groups, problem.sensors, parameters)
+    return project_points(sensors, problem.observations, xyz).ravel()
 
 
 def central(function, at, step):

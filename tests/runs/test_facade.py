@@ -110,7 +110,7 @@ def test_a_local_frame_has_no_place_on_the_earth(facade, surface, tmp_path):
 def test_joint_corrections_are_made_where_they_are_asked_for(facade, tmp_path):
     scene = open_scene([imported(facade, tmp_path / "scene.yaml")])
     assert orient(scene, OrientationOptions(), (40.0, 60.0)).model == "none"
-    asked = OrientationOptions(model="joint", joint=BundleAdjustmentOptions(sigma_position_m=0.01))
+    asked = OrientationOptions(model="joint", bundle_adjustment=BundleAdjustmentOptions(sigma_position_m=0.01))
     assert orient(scene, asked, (40.0, 60.0)).model == "joint"
 
 

@@ -59,11 +59,11 @@ def bases_of_classes(folder: Path) -> dict[str, set[str]]:
 
 
 def annotated_names(folder: Path) -> list[AnnotatedName]:
-    """Every parameter, and every annotated field or variable, whose annotation names a class of the package.
+    """Every parameter, and every annotated field or variable, whose annotation names a public class of the package.
 
     A method's `other` of its own class is left out: Python's usual name of a second operand.
     """
-    classes = class_definitions(folder)
+    classes = {name for name in class_definitions(folder) if not name.startswith("_")}
     return [
         AnnotatedName(f"{path}:{line}", name, class_name, is_collection)
         for path, tree in modules(folder)

@@ -235,7 +235,7 @@ def _read_control(path: Path) -> Leaves:
     }
     seen = {
         (found.names[point], int(view)): xy
-        for view, point, xy in zip(found.seen.view, found.seen.point, found.seen.xy, strict=True)
+        for view, point, xy in zip(found.observations.view, found.observations.point, found.observations.xy, strict=True)
     }
     return leaves({"points": points, "seen": seen})
 

@@ -16,7 +16,7 @@ from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.server import application
 from zlocus.inspector.serving import checked_address, listening
-from zlocus.products.report.comparison import Comparison
+from zlocus.evaluation.comparison import Comparison
 
 # The scene of a small run is open by then, kernels and all.
 OPENED_S = 120.0

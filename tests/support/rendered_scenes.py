@@ -54,11 +54,11 @@ class RenderedImages:
 
 def line_scanner(exposure: Exposure) -> LineScanModel:
     """The sensor model of a rendered line scanner's raw image, straight from its exact camera."""
-    raw, first = exposure.taken, int(NADIR_COLUMN - exposure.taken.camera.centre[0])
-    line = focal_line(raw.camera)
+    raw, first = exposure.taken, int(NADIR_COLUMN - exposure.taken.sensor.centre[0])
+    line = focal_line(raw.sensor)
     line = FocalLine(line.xy_mm[first : first + raw.shape[1]], line.focal_mm)
-    times = LineTimes.regular(0.0, -raw.camera.advance_m / SPEED_M_S, raw.shape[0])
-    return LineScanModel(line, times, sampled(raw.camera, raw.shape[0]), FRAME_SPACE)
+    times = LineTimes.regular(0.0, -raw.sensor.advance_m / SPEED_M_S, raw.shape[0])
+    return LineScanModel(line, times, sampled(raw.sensor, raw.shape[0]), FRAME_SPACE)
 
 
 def camera(name: str, size: int = SIZE_PX) -> SatelliteCamera:

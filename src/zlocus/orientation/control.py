@@ -16,14 +16,14 @@ class GroundControl:
     """Points known on the ground and seen in images.
 
     names : (n,); xyz : (n, 3) m in the scene's frame; sigma_m : (n, 3), standard deviations, NaN where they are not
-    given; is_check : (n,) bool, points that only judge the result; seen : their image points, by the scene's views.
+    given; is_check : (n,) bool, points that only judge the result; observations : their image points, by the scene's views.
     """
 
     names: tuple[str, ...]
     xyz: FloatArray
     sigma_m: FloatArray
     is_check: NDArray[np.bool_]
-    seen: Observations
+    observations: Observations
 
     @classmethod
     def none(cls) -> GroundControl:
@@ -37,9 +37,9 @@ class GroundControl:
     def only(self, wanted: NDArray[np.bool_]) -> GroundControl:
         """Some of the points, wanted : (n,) bool, with numbers of their own."""
         number = np.cumsum(wanted) - 1
-        seen = self.seen.kept(wanted[self.seen.point])
+        observations = self.observations.kept(wanted[self.observations.point])
         names = tuple(name for name, is_wanted in zip(self.names, wanted, strict=True) if is_wanted)
-        renumbered = Observations(seen.view, number[seen.point], seen.xy)
+        renumbered = Observations(observations.view, number[observations.point], observations.xy)
         return GroundControl(names, self.xyz[wanted], self.sigma_m[wanted], self.is_check[wanted], renumbered)
 
 

@@ -13,76 +13,78 @@ from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.plausibility import (
-    FEWEST_THAT_AGREE,
+    MIN_AGREEING_IMAGES,
     Doubt,
-    LeftOut,
+    ExcludedImage,
     agreeing_shares,
     contradicting_views,
     exchanged_views,
-    untied_views,
+    untied_images,
 )
-from zlocus.orientation.shift_adjustment import Adjustment, adjust, with_datum_of_most
+from zlocus.orientation.shift_adjustment import Adjustment, adjust, with_most_images_in_place
 from zlocus.orientation.triangulate import Observations
 
 if TYPE_CHECKING:
-    from zlocus.orientation.bundle_adjustment import JointAdjustment
+    from zlocus.orientation.bundle_adjustment import BundleAdjustment
 
 
 @dataclass(frozen=True)
-class Solved:
-    """adjusted : the ties; sensors : corrected, but for the shifts of `adjusted`; joint : where all were jointly."""
+class CorrectedCameras:
+    """adjustment : the ties; sensors : corrected, but for the shifts of `adjustment`; joint : where all were jointly."""
 
-    adjusted: Adjustment
+    adjustment: Adjustment
     sensors: list[SensorModel]
-    joint: JointAdjustment | None = None
+    bundle_adjustment: BundleAdjustment | None = None
 
 
 @dataclass(frozen=True)
-class Solver:
-    """Corrects the cameras of a scene by ties. is_joint : all jointly, else one shift each; control, terrain : see
+class CameraSolver:
+    """Corrects the cameras of a scene by ties. uses_bundle_adjustment : all jointly, else one shift each; control, terrain : see
     `orient`."""
 
     scene: Scene
     options: OrientationOptions
-    is_joint: bool
+    uses_bundle_adjustment: bool
     control: GroundControl | None
     terrain: TerrainHeights | None
 
-    def __call__(self, seen: Observations, xyz: FloatArray) -> Solved:
-        """seen, xyz : observations and first ground points (n, 3) m of the ties."""
+    def __call__(self, observations: Observations, xyz: FloatArray) -> CorrectedCameras:
+        """observations, xyz : observations and first ground points (n, 3) m of the ties."""
         views, options = self.scene.views, self.options
         sensors = [view.sensor for view in views]
-        if self.is_joint:
+        if self.uses_bundle_adjustment:
             # SciPy's sparse matrices and linear algebra cost 0.2 s to import.
-            from zlocus.orientation.bundle_adjustment import adjust_jointly
+            from zlocus.orientation.bundle_adjustment import adjust_bundle
 
-            joint = adjust_jointly(views, seen, xyz, options, self.control, self.terrain)
-            return Solved(joint.adjusted, list(joint.sensors), joint)
-        adjusted = adjust(sensors, seen, xyz, options)
-        if np.hypot(*adjusted.shift_px.T).max(initial=0.0) > options.max_pointing_px:
-            adjusted = with_datum_of_most(sensors, adjusted, options)
-        return Solved(adjusted, sensors)
+            bundle_adjustment = adjust_bundle(views, observations, xyz, options, self.control, self.terrain)
+            return CorrectedCameras(bundle_adjustment.adjustment, list(bundle_adjustment.sensors), bundle_adjustment)
+        adjustment = adjust(sensors, observations, xyz, options)
+        if np.hypot(*adjustment.shift_px.T).max(initial=0.0) > options.max_pointing_px:
+            adjustment = with_most_images_in_place(sensors, adjustment, options)
+        return CorrectedCameras(adjustment, sensors)
 
 
-def without_contradictions(
-    solve: Solver, seen: Observations, xyz: FloatArray
-) -> tuple[Solved, NDArray[np.int64], list[Doubt]]:
+def without_contradicting_images(
+    solve: CameraSolver, observations: Observations, xyz: FloatArray
+) -> tuple[CorrectedCameras, NDArray[np.int64], list[Doubt]]:
     """The cameras corrected without images that contradict the others, the numbers of these, and what is to be doubted.
 
-    Where too few images agree with each other all are kept, and doubted. seen, xyz : see `Solver`.
+    Where too few images agree with each other all are kept, and doubted. observations, xyz : see `CameraSolver`.
     """
-    solved, nobody = solve(seen, xyz), np.empty(0, np.int64)
+    solved, nobody = solve(observations, xyz), np.empty(0, np.int64)
     names = [view.name for view in solve.scene.views]
-    shares = agreeing_shares(seen, solved.adjusted, len(names))
+    shares = agreeing_shares(observations, solved.adjustment, len(names))
     wrong = contradicting_views(shares)
-    n_tied = len(np.unique(seen.view))
+    n_tied = len(np.unique(observations.view))
     if solve.options.model == "none" or not n_tied:
         return solved, nobody, []
     doubts = []
     sensors = [view.sensor for view in solve.scene.views]
     # Of more images those that are exchanged contradict the others.
-    candidates = np.unique(seen.view) if n_tied <= FEWEST_THAT_AGREE else wrong
-    pair = exchanged_views(sensors, seen, xyz, candidates.tolist(), solve.options) if len(candidates) > 1 else None
+    candidates = np.unique(observations.view) if n_tied <= MIN_AGREEING_IMAGES else wrong
+    pair = (
+        exchanged_views(sensors, observations, xyz, candidates.tolist(), solve.options) if len(candidates) > 1 else None
+    )
     if pair is not None:
         one, other = (names[number] for number in pair)
         doubts.append(
@@ -94,12 +96,12 @@ def without_contradictions(
         )
     if not len(wrong):
         return solved, nobody, doubts
-    rest = ~np.isin(seen.view, wrong)
-    rest &= np.bincount(seen.point[rest], minlength=len(xyz))[seen.point] >= 2
-    if len(np.unique(seen.view[rest])) >= FEWEST_THAT_AGREE:
-        others = seen.kept(rest)
+    rest = ~np.isin(observations.view, wrong)
+    rest &= np.bincount(observations.point[rest], minlength=len(xyz))[observations.point] >= 2
+    if len(np.unique(observations.view[rest])) >= MIN_AGREEING_IMAGES:
+        others = observations.kept(rest)
         again = solve(others, xyz)
-        if not len(contradicting_views(agreeing_shares(others, again.adjusted, len(names)))):
+        if not len(contradicting_views(agreeing_shares(others, again.adjustment, len(names)))):
             return again, wrong, [replace(doubt, is_grave=False) for doubt in doubts]
     told = ", ".join(f"{names[number]} ({100 * shares[number]:.0f} %)" for number in wrong)
     doubts.append(
@@ -112,12 +114,12 @@ def without_contradictions(
     return solved, nobody, doubts
 
 
-def views_left_out(
+def excluded_images_of(
     scene: Scene, found: Observations, wrong: NDArray[np.int64], options: OrientationOptions
-) -> tuple[LeftOut, ...]:
+) -> tuple[ExcludedImage, ...]:
     """Images that take no part. found : observations of all ties; wrong : numbers of those that contradict others."""
-    untied = untied_views(found, len(scene.views))
-    left_out = []
+    untied = untied_images(found, len(scene.views))
+    excluded = []
     for number, view in enumerate(scene.views):
         if number in wrong:
             reason = (
@@ -131,5 +133,5 @@ def views_left_out(
             )
         else:
             continue
-        left_out.append(LeftOut(view.name, reason))
-    return tuple(left_out)
+        excluded.append(ExcludedImage(view.name, reason))
+    return tuple(excluded)

@@ -1,4 +1,4 @@
-"""Loci between two images: where the ray of one image's pixel runs in another."""
+"""EpipolarCurves between two images: where the ray of one image's pixel runs in another."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from zlocus.core.sensor_model import FloatArray, SensorModel
 
-SHORTEST_LOCUS_PX = 1.0
+MIN_CURVE_LENGTH_PX = 1.0
 # Heights of a range at which rays are looked up, from its middle in half ranges, and how far from it the cubic through
 # these is taken.
-NODES, FARTHEST = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0]), 1.25
+NODES, MAX_CUBIC_T = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0]), 1.25
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class Sightlines:
             others = np.delete(NODES, k)
             xyz += np.prod((t[:, None] - others) / (NODES[k] - others), axis=1)[:, None] * ground
         xyz[:, 2] = z
-        beyond = np.flatnonzero((np.abs(t) > FARTHEST) | np.isnan(xyz).any(axis=1))
+        beyond = np.flatnonzero((np.abs(t) > MAX_CUBIC_T) | np.isnan(xyz).any(axis=1))
         xyz[beyond] = self.sensor.ground_from_image(self.xy[beyond], z[beyond])
         return xyz
 
 
 @dataclass(frozen=True)
-class Loci:
+class EpipolarCurves:
     """Straight chords of loci: the second image's points that see the same ray at two heights.
 
     low, high : (n, 2) px at z_low and z_high (m); NaN where a sensor cannot map the point.
@@ -68,48 +68,50 @@ class Loci:
         """(n,) px between the two heights."""
         return np.asarray(np.hypot(*(self.high - self.low).T))
 
-    def part(self, rows: slice) -> Loci:
+    def part(self, rows: slice) -> EpipolarCurves:
         """Some of them."""
-        return Loci(self.low[rows], self.high[rows], self.z_low, self.z_high)
+        return EpipolarCurves(self.low[rows], self.high[rows], self.z_low, self.z_high)
 
-    def moved(self, shift_px: FloatArray) -> Loci:
+    def moved(self, shift_px: FloatArray) -> EpipolarCurves:
         """The loci of a second image whose points are moved by (2,) px."""
-        return Loci(self.low + shift_px, self.high + shift_px, self.z_low, self.z_high)
+        return EpipolarCurves(self.low + shift_px, self.high + shift_px, self.z_low, self.z_high)
 
 
 @dataclass(frozen=True)
-class OnLocus:
+class EpipolarOffsets:
     """Where matched points lie with respect to their loci.
 
-    z : (n,) m, height of the nearest point of the locus; across_px : (n,) signed distance from it;
+    z : (n,) m, height of the nearest point of the locus; distance_px : (n,) signed distance from it;
     normal : (n, 2) unit vectors across the locus. NaN where there is no locus.
     """
 
     z: FloatArray
-    across_px: FloatArray
+    distance_px: FloatArray
     normal: FloatArray
 
 
-def trace(lines: Sightlines, sensor: SensorModel, z_range: tuple[float, float]) -> Loci:
+def trace(lines: Sightlines, sensor: SensorModel, z_range: tuple[float, float]) -> EpipolarCurves:
     """The loci of an image's points (n,) in another one, over a range of heights in m."""
     low, high = (sensor.image_from_ground(lines.at(np.full(len(lines.xy), z))) for z in z_range)
-    return Loci(low, high, *z_range)
+    return EpipolarCurves(low, high, *z_range)
 
 
-def locate(lines: Sightlines, sensor: SensorModel, xy: FloatArray, z_range: tuple[float, float]) -> OnLocus:
+def epipolar_offsets(
+    lines: Sightlines, sensor: SensorModel, xy: FloatArray, z_range: tuple[float, float]
+) -> EpipolarOffsets:
     """Height and distance from the locus of points (n, 2) px of another image, matched with those of `lines`.
 
     One Newton step from the chord: loci of every sensor are straight to well below a pixel over such a step.
     """
     chord = trace(lines, sensor, z_range)
     by_z = (chord.high - chord.low) / (chord.z_high - chord.z_low)
-    by_z[~(chord.length_px > SHORTEST_LOCUS_PX)] = np.nan
+    by_z[~(chord.length_px > MIN_CURVE_LENGTH_PX)] = np.nan
     z = chord.z_low + along(xy - chord.low, by_z)
     here = sensor.image_from_ground(lines.at(z))
     there = sensor.image_from_ground(lines.at(z + 0.01 * (chord.z_high - chord.z_low)))
     tangent = (there - here) / (0.01 * (chord.z_high - chord.z_low))
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
-    return OnLocus(z + along(xy - here, tangent), np.einsum("nj,nj->n", xy - here, normal), normal)
+    return EpipolarOffsets(z + along(xy - here, tangent), np.einsum("nj,nj->n", xy - here, normal), normal)
 
 
 def along(offset: FloatArray, by_z: FloatArray) -> FloatArray:

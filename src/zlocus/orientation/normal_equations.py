@@ -17,7 +17,7 @@ from scipy import linalg, sparse
 
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import TerrainHeights
-from zlocus.orientation.parameter_groups import Block, corrected_sensors
+from zlocus.orientation.parameter_groups import ParameterGroup, corrected_sensors
 from zlocus.orientation.shift_adjustment import HUBER_SIGMAS, huber_weight, robust_sigma
 from zlocus.orientation.triangulate import Observations, ground_jacobian, project_points, summed
 
@@ -27,8 +27,8 @@ TOLERANCE_PX = 1e-3
 VARIANCE_TOLERANCE = 0.1
 VARIANCE_ROUNDS = 12
 # Corrections of one kind say how large they are where ties show at least so many of them.
-LEAST_SHOWN = 0.5
-LEAST_VARIANCE = 1e-12
+MIN_DETERMINED_PARAMETERS = 0.5
+MIN_VARIANCE = 1e-12
 # Derivatives are taken again after a step that moves image points by more.
 RELINEARISE_PX = 5.0
 # Of a parameter's sigma, for its derivative.
@@ -43,14 +43,14 @@ COMMON_PX = 0.03
 class Problem:
     """What is adjusted.
 
-    sensors : as delivered; blocks : of their parameters; seen : image points of ties, then of control points; n_ties :
+    sensors : as delivered; blocks : of their parameters; observations : image points of ties, then of control points; n_ties :
     the first so many ground points are ties; control_xyz, control_precision : (k, 3) m and 1/m2 of the others;
     control_px : sigma of their image points; terrain : heights that ties should have, with their sigma in m.
     """
 
     sensors: tuple[SensorModel, ...]
-    blocks: tuple[Block, ...]
-    seen: Observations
+    groups: tuple[ParameterGroup, ...]
+    observations: Observations
     n_ties: int
     control_xyz: FloatArray
     control_precision: FloatArray
@@ -61,7 +61,7 @@ class Problem:
     @property
     def is_tie(self) -> NDArray[np.bool_]:
         """(m,) which image points are those of ties."""
-        return np.asarray(self.seen.point < self.n_ties)
+        return np.asarray(self.observations.point < self.n_ties)
 
     @property
     def n_points(self) -> int:
@@ -70,8 +70,8 @@ class Problem:
 
     @property
     def n_parameters(self) -> int:
-        """Of all blocks."""
-        return sum(map(len, self.blocks))
+        """Of all groups."""
+        return sum(map(len, self.groups))
 
     @property
     def is_controlled(self) -> bool:
@@ -81,7 +81,7 @@ class Problem:
     @property
     def kinds(self) -> NDArray[np.int64]:
         """(p,) numbers of the kinds of parameters: those of one kind of block that have one standard deviation."""
-        kinds = [(block.kind, sigma) for block in self.blocks for sigma in block.sigma]
+        kinds = [(group.kind, sigma) for group in self.groups for sigma in group.sigma]
         return np.array([kinds.index(kind) for kind in kinds], np.int64)
 
 
@@ -99,7 +99,7 @@ class Linearised:
 
 
 @dataclass(frozen=True, eq=False)
-class KnownGround:
+class GroundInformation:
     """Information of ground points beforehand: precision (n, 3, 3) px2 per m2 and pull (n, 3) px2 per m towards it."""
 
     precision: FloatArray
@@ -132,12 +132,12 @@ class WeakDirections:
     def without(self, full: Reduced, ties: Reduced) -> tuple[FloatArray, FloatArray]:
         """Normal matrix (p, p) and pull (p,) of everything, without what ties say of the weak directions."""
         left = ties.normal - self.ahead @ (self.back.T @ ties.normal)
-        seen = left - (left @ self.back) @ self.ahead.T
-        return full.normal - ties.normal + seen, full.pull - self.ahead @ (self.back.T @ ties.pull)
+        observations = left - (left @ self.back) @ self.ahead.T
+        return full.normal - ties.normal + observations, full.pull - self.ahead @ (self.back.T @ ties.pull)
 
 
 @dataclass(frozen=True, eq=False)
-class Beforehand:
+class PriorVariance:
     """How large parameters are thought to be.
 
     variance : (p,) in units of their sigma squared; n_rounds : of estimation so far; is_settled : whether it ended;
@@ -157,7 +157,7 @@ class Solution:
     parameters : (p,) in units of their sigma; parameter_sigma : (p,), of those found, in the same units; is_held : (p,)
     which are zero because ties and control ask for none of their kind; xyz : (n, 3) m, ties, then control points;
     residual : (m, 2) px; sigma0_px : noise of one image coordinate of a tie, from the residuals of all ties kept and
-    their redundancy; n_seen : how many directions of the parameters the ties show; n_steps : taken.
+    their redundancy; n_determined : how many directions of the parameters the ties show; n_steps : taken.
     """
 
     parameters: FloatArray
@@ -167,7 +167,7 @@ class Solution:
     residual: FloatArray
     sigma0_px: float
     redundancy: int
-    n_seen: int
+    n_determined: int
     n_steps: int
 
 
@@ -175,15 +175,15 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
     """Gauss-Newton from parameters (p,) and ground points of the ties xyz (n, 3) m, NaN where they are not known."""
     xyz = np.concatenate([xyz, problem.control_xyz])
     linear, weak, moved_px, n_steps = None, None, np.inf, 0
-    ahead = Beforehand(np.ones(len(parameters)), 0, False, np.zeros(len(parameters), bool))
+    ahead = PriorVariance(np.ones(len(parameters)), 0, False, np.zeros(len(parameters), bool))
     while True:
-        sensors = corrected_sensors(problem.blocks, problem.sensors, parameters)
+        sensors = corrected_sensors(problem.groups, problem.sensors, parameters)
         if linear is None or moved_px > RELINEARISE_PX:
             linear, weak = linearise(problem, parameters, xyz), None
-        residual = problem.seen.xy - project_points(sensors, problem.seen, xyz)
+        residual = problem.observations.xy - project_points(sensors, problem.observations, xyz)
         sigma, weight = weights(problem, residual, linear)
         of_ties = np.where(problem.is_tie, weight, 0.0)
-        full = reduced(problem, linear, residual, weight, known_ground(problem, xyz, sigma))
+        full = reduced(problem, linear, residual, weight, ground_information(problem, xyz, sigma))
         ties = reduced(problem, linear, residual, of_ties, None) if problem.is_controlled else full
         weak = weak_directions(problem, linear, of_ties, ties.normal) if weak is None else weak
         normal, pull = weak.without(full, ties)
@@ -199,13 +199,13 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
         moved_px = float(np.abs(linear.by_parameters @ step).max(initial=0.0))
         xyz = xyz + np.einsum("nij,nj->ni", full.covariance, rest)
         n_steps += 1
-    n_seen = len(parameters) - weak.ahead.shape[1]
+    n_determined = len(parameters) - weak.ahead.shape[1]
     used = of_ties > 0.0
-    redundancy = 2 * int(used.sum()) - 3 * len(np.unique(problem.seen.point[used])) - n_seen
+    redundancy = 2 * int(used.sum()) - 3 * len(np.unique(problem.observations.point[used])) - n_determined
     sigma0 = np.sqrt((residual[used] ** 2).sum() / redundancy) if redundancy > 0 else np.nan
     parameters = np.where(ahead.is_held, 0.0, parameters)
     found = parameters, np.sqrt(np.diag(covariance)), ahead.is_held
-    return Solution(*found, xyz, residual, float(sigma0), redundancy, n_seen, n_steps)
+    return Solution(*found, xyz, residual, float(sigma0), redundancy, n_determined, n_steps)
 
 
 def covariance_of(normal: FloatArray, sigma: float, variance: FloatArray) -> FloatArray:
@@ -214,7 +214,7 @@ def covariance_of(normal: FloatArray, sigma: float, variance: FloatArray) -> Flo
     return np.asarray(linalg.inv(normal / sigma**2 + np.diag(1.0 / variance)))
 
 
-def estimated(problem: Problem, ahead: Beforehand, parameters: FloatArray, after: FloatArray) -> Beforehand:
+def estimated(problem: Problem, ahead: PriorVariance, parameters: FloatArray, after: FloatArray) -> PriorVariance:
     """How large parameters (p,) are thought to be, from how large they came out. after : (p,) their variances now.
 
     The variance of a kind is the sum of its squares over how many of its parameters are shown, at most 1. Parameters no
@@ -224,15 +224,15 @@ def estimated(problem: Problem, ahead: Beforehand, parameters: FloatArray, after
     """
     kinds, variance = problem.kinds, ahead.variance
     n_shown = np.bincount(kinds, 1.0 - after / variance, len(kinds))[kinds]
-    is_shown = n_shown > LEAST_SHOWN
+    is_shown = n_shown > MIN_DETERMINED_PARAMETERS
     squares = np.bincount(kinds, parameters**2, len(kinds))[kinds]
-    new = np.where(is_shown, np.clip(squares / np.where(is_shown, n_shown, 1.0), LEAST_VARIANCE, 1.0), variance)
+    new = np.where(is_shown, np.clip(squares / np.where(is_shown, n_shown, 1.0), MIN_VARIANCE, 1.0), variance)
     n_rounds = ahead.n_rounds + 1
     changed = np.abs(np.log(new / variance)).max(initial=0.0)
     if changed > VARIANCE_TOLERANCE and n_rounds < VARIANCE_ROUNDS:
-        return Beforehand(new, n_rounds, False, ahead.is_held)
+        return PriorVariance(new, n_rounds, False, ahead.is_held)
     is_held = ~is_shown & (variance < 1.0)
-    return Beforehand(np.where(is_held, new, 1.0), n_rounds, True, is_held)
+    return PriorVariance(np.where(is_held, new, 1.0), n_rounds, True, is_held)
 
 
 def weights(problem: Problem, residual: FloatArray, linear: Linearised) -> tuple[float, FloatArray]:
@@ -241,7 +241,7 @@ def weights(problem: Problem, residual: FloatArray, linear: Linearised) -> tuple
     ties = problem.is_tie
     usable = linear.usable & np.isfinite(residual).all(axis=1)
     sigma = robust_sigma(residual[ties & usable])
-    n_per_view = (ties & usable).sum() / max(len(np.unique(problem.seen.view[ties & usable])), 1)
+    n_per_view = (ties & usable).sum() / max(len(np.unique(problem.observations.view[ties & usable])), 1)
     scale = np.where(ties, 1.0, sigma / problem.control_px)
     base = np.where(ties, 1.0 / (1.0 + n_per_view * (COMMON_PX / sigma) ** 2), scale**2)
     weight = base * huber_weight(residual * scale[:, None], sigma)
@@ -250,27 +250,27 @@ def weights(problem: Problem, residual: FloatArray, linear: Linearised) -> tuple
 
 def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Linearised:
     """Derivatives of all image points, by differences; xyz : (n, 3) m."""
-    sensors = corrected_sensors(problem.blocks, problem.sensors, parameters)
-    by_ground = ground_jacobian(sensors, problem.seen, xyz)
-    here = project_points(sensors, problem.seen, xyz)
-    rows_of = [np.flatnonzero(problem.seen.view == i) for i in range(len(sensors))]
+    sensors = corrected_sensors(problem.groups, problem.sensors, parameters)
+    by_ground = ground_jacobian(sensors, problem.observations, xyz)
+    here = project_points(sensors, problem.observations, xyz)
+    rows_of = [np.flatnonzero(problem.observations.view == i) for i in range(len(sensors))]
     values, rows, columns = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     first = 0
-    for block in problem.blocks:
-        for k in range(first, first + len(block)):
+    for group in problem.groups:
+        for k in range(first, first + len(group)):
             changed = parameters.copy()
             changed[k] += DIFFERENCE
-            for i in block.views:
-                at = xyz[problem.seen.point[rows_of[i]]]
+            for i in group.views:
+                at = xyz[problem.observations.point[rows_of[i]]]
                 moved = corrected_sensor(problem, changed, i).image_from_ground(at) - here[rows_of[i]]
                 values.append(moved.ravel() / DIFFERENCE)
                 rows.append((2 * rows_of[i][:, None] + np.arange(2)).ravel())
                 columns.append(np.full(2 * len(at), k))
-        first += len(block)
+        first += len(group)
     value, row = np.concatenate(values), np.concatenate(rows)
     usable = np.asarray(np.isfinite(by_ground).all(axis=(1, 2)))
     usable[row[~np.isfinite(value)] // 2] = False
-    shape = (2 * len(problem.seen), len(parameters))
+    shape = (2 * len(problem.observations), len(parameters))
     matrix = sparse.csr_array((np.nan_to_num(value), (row, np.concatenate(columns))), shape=shape)
     return Linearised(matrix, np.where(usable[:, None, None], by_ground, 0.0), usable)
 
@@ -278,14 +278,14 @@ def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Line
 def corrected_sensor(problem: Problem, parameters: FloatArray, view: int) -> SensorModel:
     """The sensor of one view with all blocks that it belongs to."""
     sensor, first = problem.sensors[view], 0
-    for block in problem.blocks:
-        if view in block.views:
-            sensor = block.correct(sensor, parameters[first : first + len(block)] * block.sigma)
-        first += len(block)
+    for group in problem.groups:
+        if view in group.views:
+            sensor = group.correct(sensor, parameters[first : first + len(group)] * group.sigma)
+        first += len(group)
     return sensor
 
 
-def known_ground(problem: Problem, xyz: FloatArray, sigma: float) -> KnownGround:
+def ground_information(problem: Problem, xyz: FloatArray, sigma: float) -> GroundInformation:
     """What control points and the terrain say at ground points xyz (n, 3) m. sigma : px, as of now.
 
     Heights of the terrain get Huber's weight: trees, houses and mistakes of the terrain stand out of it.
@@ -304,18 +304,18 @@ def known_ground(problem: Problem, xyz: FloatArray, sigma: float) -> KnownGround
         normal = np.where(known[:, None], np.column_stack([-slope, np.ones(len(ties))]), 0.0)
         precision[: problem.n_ties] += weight[:, None, None] * normal[:, :, None] * normal[:, None, :]
         pull[: problem.n_ties] -= (weight * np.where(known, off, 0.0))[:, None] * normal
-    return KnownGround(sigma**2 * precision, sigma**2 * pull)
+    return GroundInformation(sigma**2 * precision, sigma**2 * pull)
 
 
 def reduced(
-    problem: Problem, linear: Linearised, residual: FloatArray, weight: FloatArray, ground: KnownGround | None
+    problem: Problem, linear: Linearised, residual: FloatArray, weight: FloatArray, ground: GroundInformation | None
 ) -> Reduced:
     """Normal equations without the ground points: A - E C^-1 E^T, with A the parameters' block, E that of parameters by
     points and C that of the points. ground : None leaves out what is known of them, times px2.
 
     Points that their rays (and the ground) do not fix are left out, with their image points.
     """
-    point, n = problem.seen.point, problem.n_points
+    point, n = problem.observations.point, problem.n_points
     scaled = weight[:, None, None] * linear.by_ground
     own = summed(np.einsum("mji,mjk->mik", scaled, linear.by_ground).reshape(-1, 9), point, n).reshape(-1, 3, 3)
     covariance = inverses(own if ground is None else own + ground.precision)
@@ -344,16 +344,16 @@ def spread(by_ground: FloatArray, point: NDArray[np.int64], n_points: int) -> An
 
 
 def weak_directions(problem: Problem, linear: Linearised, weight: FloatArray, normal: FloatArray) -> WeakDirections:
-    """Directions whose information from ties, per image point, is next to nothing (see `blocks.SEEN_IN_IMAGE`).
+    """Directions whose information from ties, per image point, is next to nothing (see `groups.MIN_INFORMATION_IN_IMAGE`).
 
     normal : (p, p) of the ties alone.
     """
     squared = linear.by_parameters.multiply(linear.by_parameters).T @ np.repeat(weight, 2)
-    seen = np.concatenate([np.full(len(block), block.seen) for block in problem.blocks])
-    scale = np.sqrt(squared * seen)
+    observations = np.concatenate([np.full(len(group), group.observations) for group in problem.groups])
+    scale = np.sqrt(squared * observations)
     linked = scale > 0.0
     inverse = np.where(linked, 1.0 / np.where(linked, scale, 1.0), 0.0)
-    n_views = max(len(np.unique(problem.seen.view[weight > 0.0])), 1)
+    n_views = max(len(np.unique(problem.observations.view[weight > 0.0])), 1)
     scaled = normal * inverse[:, None] * inverse
     _, vectors = linalg.eigh(scaled, subset_by_value=(-np.inf, 1.0 / n_views**2))
     return WeakDirections(scale[:, None] * vectors, inverse[:, None] * vectors)

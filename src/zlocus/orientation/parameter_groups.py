@@ -19,10 +19,10 @@ Correct = Callable[[SensorModel, FloatArray], SensorModel]
 Scanner = LineScanModel | RectifiedModel
 
 # A direction of the parameters counts as seen when its information, per observation and in px2, exceeds this over the
-# number of images squared. Shifts: see `adjust.SEEN_INFORMATION`. Physical cameras have honest priors, which need no
+# number of images squared. Shifts: see `adjust.MIN_SHIFT_INFORMATION`. Physical cameras have honest priors, which need no
 # help but where there is no information at all.
-SEEN_IN_IMAGE = 0.01
-SEEN_IN_SPACE = 1e-6
+MIN_INFORMATION_IN_IMAGE = 0.01
+MIN_INFORMATION_IN_SPACE = 1e-6
 SHIFT, AFFINE, POSE, FOCAL, DRIFT = "shift", "affine", "pose", "focal length", "drift"
 SHIFT_NAMES = ("column_px", "row_px")
 AFFINE_NAMES = ("column_by_column_px", "column_by_row_px", "row_by_column_px", "row_by_row_px")
@@ -32,11 +32,11 @@ UNITS = {"deg": 180.0 / np.pi}
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ParameterGroup:
     """Parameters that correct some images together.
 
     kind : see above; views : numbers of the images; names : (k,) of the parameters, which end in their unit; sigma :
-    (k,) standard deviations beforehand, about zero, in m, rad and px; seen : see `SEEN_IN_IMAGE`; correct : a sensor
+    (k,) standard deviations beforehand, about zero, in m, rad and px; observations : see `MIN_INFORMATION_IN_IMAGE`; correct : a sensor
     model of one of the images and values (k,) in the units of `sigma`, to the corrected model.
     """
 
@@ -44,7 +44,7 @@ class Block:
     views: tuple[int, ...]
     names: tuple[str, ...]
     sigma: FloatArray
-    seen: float
+    observations: float
     correct: Correct
 
     def __len__(self) -> int:
@@ -72,36 +72,41 @@ def uncorrected(sensor: SensorModel) -> SensorModel:
     return sensor
 
 
-def needs_joint(views: Sequence[View]) -> bool:
+def needs_bundle_adjustment(views: Sequence[View]) -> bool:
     """Whether a shift of each image is too little: some sensor knows its pose."""
     return any(isinstance(view.sensor, FrameModel | Scanner) for view in views)
 
 
-def blocks_of(views: Sequence[View], options: OrientationOptions) -> tuple[Block, ...]:
+def parameter_groups_of(views: Sequence[View], options: OrientationOptions) -> tuple[ParameterGroup, ...]:
     """The blocks of a scene: for each image a shift (or affine map), or a pose; one drift for all images of a
     trajectory; on request one focal length for all images of a camera."""
     frames = [i for i, view in enumerate(views) if isinstance(view.sensor, FrameModel)]
     scanners = [i for i, view in enumerate(views) if isinstance(view.sensor, Scanner)]
     in_image = sorted(set(range(len(views))) - set(frames) - set(scanners))
-    image_block = affine_block if options.joint.rpc == "affine" else shift_block
-    blocks = [image_block(i, views[i], options) for i in in_image]
-    blocks += [pose_block(i, options) for i in frames]
-    blocks += [drift_block(group, views, options) for group in same(scanners, views, same_trajectory)]
-    if options.joint.sigma_focal_px is not None:
-        blocks += [focal_block(group, views, options.joint.sigma_focal_px) for group in same(frames, views, same_lens)]
-    return tuple(blocks)
+    image_group = affine_group if options.bundle_adjustment.rpc_correction == "affine" else shift_group
+    groups = [image_group(i, views[i], options) for i in in_image]
+    groups += [pose_group(i, options) for i in frames]
+    groups += [drift_group(group, views, options) for group in same(scanners, views, same_trajectory)]
+    if options.bundle_adjustment.sigma_focal_px is not None:
+        groups += [
+            focal_group(group, views, options.bundle_adjustment.sigma_focal_px)
+            for group in same(frames, views, same_lens)
+        ]
+    return tuple(groups)
 
 
-def shift_block(number: int, view: View, options: OrientationOptions) -> Block:
+def shift_group(number: int, view: View, options: OrientationOptions) -> ParameterGroup:
     """A shift of the image."""
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
         return ShiftedModel(sensor, float(values[0]), float(values[1]))
 
-    return Block(SHIFT, (number,), SHIFT_NAMES, np.full(2, options.prior_px), SEEN_IN_IMAGE, correct)
+    return ParameterGroup(
+        SHIFT, (number,), SHIFT_NAMES, np.full(2, options.sigma_shift_px), MIN_INFORMATION_IN_IMAGE, correct
+    )
 
 
-def affine_block(number: int, view: View, options: OrientationOptions) -> Block:
+def affine_group(number: int, view: View, options: OrientationOptions) -> ParameterGroup:
     """A shift of the image's centre, and what it grows by towards the borders."""
     rows, cols = view.image.shape
     middle, half = np.array([(cols - 1) / 2, (rows - 1) / 2]), np.array([cols / 2, rows / 2])
@@ -112,35 +117,35 @@ def affine_block(number: int, view: View, options: OrientationOptions) -> Block:
         column, row = ((float(c), float(g[0]), float(g[1])) for c, g in zip(constant, growth, strict=True))
         return AffineModel(sensor, column, row)
 
-    sigma = np.append(np.full(2, options.prior_px), np.full(4, options.joint.sigma_affine_px))
-    return Block(AFFINE, (number,), SHIFT_NAMES + AFFINE_NAMES, sigma, SEEN_IN_IMAGE, correct)
+    sigma = np.append(np.full(2, options.sigma_shift_px), np.full(4, options.bundle_adjustment.sigma_affine_px))
+    return ParameterGroup(AFFINE, (number,), SHIFT_NAMES + AFFINE_NAMES, sigma, MIN_INFORMATION_IN_IMAGE, correct)
 
 
-def pose_block(number: int, options: OrientationOptions) -> Block:
+def pose_group(number: int, options: OrientationOptions) -> ParameterGroup:
     """Position and attitude of a frame camera, along and about its axes."""
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
         assert isinstance(sensor, FrameModel), "blocks fit their sensors"
         return sensor.corrected(values[:3], values[3:])
 
-    return Block(POSE, (number,), POSE_NAMES, pose_sigma(options), SEEN_IN_SPACE, correct)
+    return ParameterGroup(POSE, (number,), POSE_NAMES, pose_sigma(options), MIN_INFORMATION_IN_SPACE, correct)
 
 
-def focal_block(numbers: Sequence[int], views: Sequence[View], sigma_px: float) -> Block:
+def focal_group(numbers: Sequence[int], views: Sequence[View], sigma_px: float) -> ParameterGroup:
     """The focal length of some frame cameras."""
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
         assert isinstance(sensor, FrameModel), "blocks fit their sensors"
         return replace(sensor, focal=sensor.focal + float(values[0]))
 
-    return Block(FOCAL, tuple(numbers), ("focal_px",), np.array([sigma_px]), SEEN_IN_SPACE, correct)
+    return ParameterGroup(FOCAL, tuple(numbers), ("focal_px",), np.array([sigma_px]), MIN_INFORMATION_IN_SPACE, correct)
 
 
-def drift_block(numbers: Sequence[int], views: Sequence[View], options: OrientationOptions) -> Block:
+def drift_group(numbers: Sequence[int], views: Sequence[View], options: OrientationOptions) -> ParameterGroup:
     """A slow error of a trajectory while its images were exposed: even for short ones, a spline for long ones."""
     ends = [raw(views[i].sensor).lines.times[[0, -1]] for i in numbers]
     start, end = float(np.min(ends)), float(np.max(ends))
-    n_knots = 1 + int(np.ceil((end - start) / options.joint.drift_s))
+    n_knots = 1 + int(np.ceil((end - start) / options.bundle_adjustment.drift_knot_interval_s))
     drift = Drift.zero(start, end, n_knots)
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
@@ -148,13 +153,15 @@ def drift_block(numbers: Sequence[int], views: Sequence[View], options: Orientat
         return sensor.corrected(drift.with_parameters(values))
 
     names = tuple(f"knot{k}_{name}" for k in range(n_knots) for name in POSE_NAMES)
-    return Block(DRIFT, tuple(numbers), names, np.tile(pose_sigma(options), n_knots), SEEN_IN_SPACE, correct)
+    return ParameterGroup(
+        DRIFT, tuple(numbers), names, np.tile(pose_sigma(options), n_knots), MIN_INFORMATION_IN_SPACE, correct
+    )
 
 
 def pose_sigma(options: OrientationOptions) -> FloatArray:
     """(6,) m and rad."""
-    joint = options.joint
-    return np.array([joint.sigma_position_m] * 3 + [np.deg2rad(joint.sigma_attitude_deg)] * 3)
+    bundle_options = options.bundle_adjustment
+    return np.array([bundle_options.sigma_position_m] * 3 + [np.deg2rad(bundle_options.sigma_attitude_deg)] * 3)
 
 
 def same(
@@ -197,15 +204,15 @@ def raw(sensor: SensorModel) -> LineScanModel:
 
 
 def corrected_sensors(
-    blocks: Sequence[Block], sensors: Sequence[SensorModel], parameters: FloatArray
+    groups: Sequence[ParameterGroup], sensors: Sequence[SensorModel], parameters: FloatArray
 ) -> tuple[SensorModel, ...]:
-    """The sensors with parameters (p,) of all blocks, one after the other, in units of their sigma; where they are
+    """The sensors with parameters (p,) of all groups, one after the other, in units of their sigma; where they are
     all zero, the sensor itself."""
     corrected, first = list(sensors), 0
-    for block in blocks:
-        values = parameters[first : first + len(block)] * block.sigma
-        first += len(block)
+    for group in groups:
+        values = parameters[first : first + len(group)] * group.sigma
+        first += len(group)
         if values.any():
-            for i in block.views:
-                corrected[i] = block.correct(corrected[i], values)
+            for i in group.views:
+                corrected[i] = group.correct(corrected[i], values)
     return tuple(corrected)

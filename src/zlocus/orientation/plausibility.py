@@ -17,27 +17,27 @@ from zlocus.orientation.shift_adjustment import Adjustment, adjust, renumbered, 
 from zlocus.orientation.triangulate import Observations
 
 # An image takes part in the matching where so many tie points were found in it.
-FEWEST_SUPPORTING_TIES = 4
+MIN_TIES_OF_IMAGE = 4
 # An image contradicts the others where they leave less than this share of its tie points. Of images whose cameras are
 # their own at least 0.74 were left (nineteen satellite images of ten months); of exchanged ones at most 0.35.
-LEAST_AGREEING = 0.5
+MIN_AGREEING_SHARE = 0.5
 # So many others must remain that agree with each other, or nobody can tell which images are wrong.
-FEWEST_THAT_AGREE = 3
+MIN_AGREEING_IMAGES = 3
 # Cameras are doubted where the median residual of their ties is larger, or where their images had to be moved farther,
 # than those of any satellite, aircraft or drone that are in order.
-POOR_RESIDUAL_PX = 0.3
-FARTHEST_SHIFT_PX = 60.0
+MAX_USUAL_RESIDUAL_PX = 0.3
+MAX_USUAL_SHIFT_PX = 60.0
 # Share of the trusted tie points that may lie outside the heights for which the sensor models were made.
-MOST_OUTSIDE_RANGE = 0.01
+MAX_SHARE_OUTSIDE_RANGE = 0.01
 # Two sensor models are said to be exchanged where the ties fit this much better with them exchanged: by their noise, or
 # by the share that agrees. Looked for among so many images, with so many tie points.
-NOISE_RATIO, MORE_AGREE = 0.5, 0.1
-MOST_EXCHANGED, TIES_TO_COMPARE = 6, 400
+MAX_NOISE_RATIO, MIN_GAIN_OF_SHARE = 0.5, 0.1
+MAX_IMAGES_TO_EXCHANGE, TIES_TO_COMPARE = 6, 400
 MEANINGFUL_NOISE_PX = 0.1
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class ExcludedImage:
     """An image that takes no part in the matching. reason : a sentence without its name."""
 
     name: str
@@ -59,25 +59,25 @@ class Doubt:
         return {"sentence": self.sentence, "is_grave": self.is_grave}
 
 
-def untied_views(found: Observations, n_views: int) -> NDArray[np.bool_]:
+def untied_images(found: Observations, n_views: int) -> NDArray[np.bool_]:
     """(i,) images in which too few tie points were found for them to take part. found : observations of all ties."""
-    return np.asarray(np.bincount(found.view, minlength=n_views) < FEWEST_SUPPORTING_TIES)
+    return np.asarray(np.bincount(found.view, minlength=n_views) < MIN_TIES_OF_IMAGE)
 
 
-def agreeing_shares(found: Observations, adjusted: Adjustment, n_views: int) -> FloatArray:
+def agreeing_shares(found: Observations, adjustment: Adjustment, n_views: int) -> FloatArray:
     """(i,) share of the observations of each image that agree with those of the other images; 1 for those without any.
 
     found : all observations that were adjusted.
     """
     of_view = np.bincount(found.view, minlength=n_views)
-    kept = np.bincount(adjusted.seen.view, minlength=n_views)
+    kept = np.bincount(adjustment.observations.view, minlength=n_views)
     return np.where(of_view > 0, kept / np.maximum(of_view, 1), 1.0)
 
 
 def contradicting_views(shares: FloatArray) -> NDArray[np.int64]:
     """Numbers of the images that contradict the others, the worst first."""
     worst = np.argsort(shares, kind="stable")
-    return np.asarray(worst[shares[worst] < LEAST_AGREEING], np.int64)
+    return np.asarray(worst[shares[worst] < MIN_AGREEING_SHARE], np.int64)
 
 
 def doubts_about(
@@ -94,14 +94,14 @@ def doubts_about(
     doubts = []
     for view, residual, shift in zip(views, residual_px, shift_px, strict=True):
         far = float(np.hypot(*shift))
-        if residual > POOR_RESIDUAL_PX:
+        if residual > MAX_USUAL_RESIDUAL_PX:
             doubts.append(
                 Doubt(
                     f"{view.name}: its tie points still lie {residual:.2f} px off after the correction (median), more "
                     "than cameras that are in order show. Try `zlocus orient`, or ask for better cameras."
                 )
             )
-        if far > FARTHEST_SHIFT_PX:
+        if far > MAX_USUAL_SHIFT_PX:
             doubts.append(
                 Doubt(
                     f"{view.name}: its camera pointed {far:.0f} px off and was corrected, farther than such sensors "
@@ -118,7 +118,7 @@ def _outside_range(views: Sequence[View], heights: FloatArray) -> list[Doubt]:
         return []
     low, high = max(low for low, _ in bounds), min(high for _, high in bounds)
     outside = (heights < low) | (heights > high)
-    if outside.mean() <= MOST_OUTSIDE_RANGE:
+    if outside.mean() <= MAX_SHARE_OUTSIDE_RANGE:
         return []
     return [
         Doubt(
@@ -145,15 +145,15 @@ def exchanged_views(
     points = np.unique(found.point)
     few = found.kept(np.isin(found.point, points[:: max(len(points) // TIES_TO_COMPARE, 1)]))
     noise, share = _fit(sensors, few, xyz, options)
-    if noise <= MEANINGFUL_NOISE_PX and share >= 1.0 - MORE_AGREE:
+    if noise <= MEANINGFUL_NOISE_PX and share >= 1.0 - MIN_GAIN_OF_SHARE:
         return None
     best: tuple[int, int] | None = None
-    for a, b in combinations(sorted(candidates)[:MOST_EXCHANGED], 2):
+    for a, b in combinations(sorted(candidates)[:MAX_IMAGES_TO_EXCHANGE], 2):
         exchanged = list(sensors)
         exchanged[a], exchanged[b] = exchanged[b], exchanged[a]
         its_noise, its_share = _fit(exchanged, few, xyz, options)
-        is_quieter = noise > MEANINGFUL_NOISE_PX and its_noise < NOISE_RATIO * noise and its_share >= share
-        if is_quieter or its_share > share + MORE_AGREE:
+        is_quieter = noise > MEANINGFUL_NOISE_PX and its_noise < MAX_NOISE_RATIO * noise and its_share >= share
+        if is_quieter or its_share > share + MIN_GAIN_OF_SHARE:
             best, noise, share = (a, b), its_noise, its_share
     return best
 
@@ -162,6 +162,6 @@ def _fit(
     sensors: Sequence[SensorModel], found: Observations, xyz: FloatArray, options: OrientationOptions
 ) -> tuple[float, float]:
     """Noise of the ties (px) after shifts of all images, and the share of the observations that agree with them."""
-    seen, start = renumbered(found, xyz)
-    shifted = adjust(sensors, seen, start, replace(options, model="shift"))
-    return robust_sigma(shifted.points.residual), len(shifted.seen) / max(len(seen), 1)
+    observations, start = renumbered(found, xyz)
+    shifted = adjust(sensors, observations, start, replace(options, model="shift"))
+    return robust_sigma(shifted.ground_points.residual), len(shifted.observations) / max(len(observations), 1)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.orientation.epipolar import OnLocus
+from zlocus.orientation.epipolar import EpipolarOffsets
 
 N_HYPOTHESES = 400
-MOST_JUDGES = 500  # matches that choose between the hypotheses, about: up to twice as many
+MATCHES_TO_SCORE = 500  # matches that choose between the hypotheses, about: up to twice as many
 REFINEMENTS = 10
 SEED = 20240229
 # Singular values of a shift's design below this share of the largest carry no information about the pointing.
@@ -36,19 +36,19 @@ class PairShift:
         return bool(self.inliers.sum() >= min_ties + 2.0 * self.by_chance)
 
 
-def find_shift(found: OnLocus, max_px: float, inlier_px: float) -> PairShift:
+def find_shift(found: EpipolarOffsets, max_px: float, inlier_px: float) -> PairShift:
     """The shift that puts most matches on their loci, by RANSAC (MSAC score), and the matches it puts there.
 
     Matches were looked for within `max_px` of where the loci were expected. Half of the hypotheses come from one match
     (right where all loci are parallel), half from two (where they are not). Deterministic: fixed seed. Survives 80 % of
     wrong matches: a hypothesis from one match is right one time in five.
     """
-    usable = np.flatnonzero(np.isfinite(found.across_px) & (np.abs(found.across_px) <= max_px))
-    few = usable[:: max(len(usable) // MOST_JUDGES, 1)]
-    inliers = np.zeros(len(found.across_px), bool)
+    usable = np.flatnonzero(np.isfinite(found.distance_px) & (np.abs(found.distance_px) <= max_px))
+    few = usable[:: max(len(usable) // MATCHES_TO_SCORE, 1)]
+    inliers = np.zeros(len(found.distance_px), bool)
     if len(usable) < 2:
         return PairShift(np.zeros(2), inliers, 0.0)
-    normal, across = found.normal[usable], found.across_px[usable]
+    normal, across = found.normal[usable], found.distance_px[usable]
     rng = np.random.default_rng(SEED)
     one = rng.integers(0, len(usable), N_HYPOTHESES // 2)
     two = rng.integers(0, len(usable), (N_HYPOTHESES // 2, 2))
@@ -56,7 +56,7 @@ def find_shift(found: OnLocus, max_px: float, inlier_px: float) -> PairShift:
     hypotheses = hypotheses[np.hypot(*hypotheses.T) <= max_px * (1.0 + 1e-9)]
     # plain sums, not a matrix product: for inner dimension 2 the linear algebra library only wakes its threads
     expected = found.normal[few, :1] * hypotheses[:, 0] + found.normal[few, 1:] * hypotheses[:, 1]
-    squares = (found.across_px[few, None] - expected) ** 2
+    squares = (found.distance_px[few, None] - expected) ** 2
     best = hypotheses[np.argmin(np.minimum(squares, inlier_px**2).sum(axis=0))]
     for _ in range(REFINEMENTS):
         near = np.abs(across - normal @ best) <= inlier_px

@@ -16,42 +16,42 @@ MAX_ITERATIONS = 15
 TOLERANCE_PX = 1e-3
 HUBER_SIGMAS = 1.5
 OUTLIER_SIGMAS = 4.0
-SMALLEST_SIGMA_PX = 0.02
+MIN_SIGMA_PX = 0.02
 # A direction of the shifts counts as seen when its normalised information exceeds this / n_views**2: two images whose
 # loci differ by less than 3 degrees do not fix the shift along them, while the slow bends of a long chain of n images,
 # whose information falls as 5 / n**2, are kept.
-SEEN_INFORMATION = 0.01
+MIN_SHIFT_INFORMATION = 0.01
 # Shifts like a translation of the ground that are not unseen, by more than this sine, need the information that counts
 # for two images, however many there are: no chain of images adds any to them.
 APART_SINE = 0.5
 # Below this size, px, a shift is as good as none where it is decided which images keep their place.
-NO_SHIFT_PX, MAJORITY_ROUNDS, MOST_SUSPECTS = 1.0, 30, 12
+NO_SHIFT_PX, MAJORITY_ROUNDS, MAX_SUSPECTS = 1.0, 30, 12
 
 
 @dataclass(frozen=True)
 class Adjustment:
     """Shifts and the ties they were found from.
 
-    shift_px : (i, 2) column and row to add to what each model projects; n_seen: how many of the 2 i components the ties
-    show, the rest stay at zero; seen, points: the ties kept and their ground points with the shifts; before_px : (m, 2)
+    shift_px : (i, 2) column and row to add to what each model projects; n_determined: how many of the 2 i components the ties
+    show, the rest stay at zero; observations, ground_points: the ties kept and their ground points with the shifts; before_px : (m, 2)
     residuals of those ties with the models as delivered; numbers : (n,) which of the ties given are kept.
     """
 
     shift_px: FloatArray
-    n_seen: int
-    seen: Observations
-    points: GroundPoints
+    n_determined: int
+    observations: Observations
+    ground_points: GroundPoints
     before_px: FloatArray
     numbers: NDArray[np.int64]
 
     @property
     def after_px(self) -> FloatArray:
         """Residuals (m, 2) px with the shifts."""
-        return self.points.residual
+        return self.ground_points.residual
 
 
 def adjust(
-    sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray, options: OrientationOptions
+    sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray, options: OrientationOptions
 ) -> Adjustment:
     """Shifts that make the rays of all ties meet, with Huber's loss, and the ties that remain.
 
@@ -59,20 +59,22 @@ def adjust(
     rest of their tie puts them are dropped, then everything is solved again. With `model` "none" shifts stay
     zero.
     """
-    shift, n_seen = np.zeros((len(sensors), 2)), 0
+    shift, n_determined = np.zeros((len(sensors), 2)), 0
     for _ in range(2):
         if options.model != "none":
-            shift, n_seen = solve_shifts(sensors, seen, xyz, options.prior_px, shift)
-        points = triangulate(sensors, moved(seen, shift), xyz)
-        seen, xyz = consistent(seen, points, options.inlier_px), points.xyz
-    numbers = np.unique(seen.point)
-    seen, xyz = renumbered(seen, xyz)
-    points = triangulate(sensors, moved(seen, shift), xyz)
-    before = triangulate(sensors, seen, points.xyz, by_ground=points.by_ground)
-    return Adjustment(shift, n_seen, seen, points, before.residual, numbers)
+            shift, n_determined = solve_shifts(sensors, observations, xyz, options.sigma_shift_px, shift)
+        ground_points = triangulate(sensors, moved(observations, shift), xyz)
+        observations, xyz = without_outliers(observations, ground_points, options.inlier_px), ground_points.xyz
+    numbers = np.unique(observations.point)
+    observations, xyz = renumbered(observations, xyz)
+    ground_points = triangulate(sensors, moved(observations, shift), xyz)
+    before = triangulate(sensors, observations, ground_points.xyz, by_ground=ground_points.by_ground)
+    return Adjustment(shift, n_determined, observations, ground_points, before.residual, numbers)
 
 
-def with_datum_of_most(sensors: Sequence[SensorModel], found: Adjustment, options: OrientationOptions) -> Adjustment:
+def with_most_images_in_place(
+    sensors: Sequence[SensorModel], found: Adjustment, options: OrientationOptions
+) -> Adjustment:
     """The same adjustment with the common translation of ground and images that leaves most images where they were.
 
     Ties do not see that translation. Among errors of a few pixels the least squares of all shifts are a good choice.
@@ -81,19 +83,24 @@ def with_datum_of_most(sensors: Sequence[SensorModel], found: Adjustment, option
     ones (iteratively reweighted least squares, begun without each of the images that moved most in turn).
     """
     n_views = len(found.shift_px)
-    tied = np.bincount(found.seen.view, minlength=n_views) > 0
-    basis = translations(found.seen, found.points, np.ones(len(found.seen)), n_views)
-    begun = [moved_least(found.shift_px, basis, tied, suspect) for suspect in _farthest(found.shift_px, tied)]
+    tied = np.bincount(found.observations.view, minlength=n_views) > 0
+    basis = translations(found.observations, found.ground_points, np.ones(len(found.observations)), n_views)
+    begun = [
+        shifts_with_most_images_in_place(found.shift_px, basis, tied, suspect)
+        for suspect in _farthest(found.shift_px, tied)
+    ]
     shift_px = min(begun, key=lambda shift: _sum_of_logarithms(shift[tied]))
-    points = triangulate(sensors, moved(found.seen, shift_px), found.points.xyz)
+    ground_points = triangulate(sensors, moved(found.observations, shift_px), found.ground_points.xyz)
     # A translation is not quite a shift of every image: the rest is solved for.
-    shift_px, _ = solve_shifts(sensors, found.seen, points.xyz, options.prior_px, shift_px)
-    points = triangulate(sensors, moved(found.seen, shift_px), points.xyz)
-    before = triangulate(sensors, found.seen, points.xyz, by_ground=points.by_ground)
-    return Adjustment(shift_px, found.n_seen, found.seen, points, before.residual, found.numbers)
+    shift_px, _ = solve_shifts(sensors, found.observations, ground_points.xyz, options.sigma_shift_px, shift_px)
+    ground_points = triangulate(sensors, moved(found.observations, shift_px), ground_points.xyz)
+    before = triangulate(sensors, found.observations, ground_points.xyz, by_ground=ground_points.by_ground)
+    return Adjustment(shift_px, found.n_determined, found.observations, ground_points, before.residual, found.numbers)
 
 
-def moved_least(shift_px: FloatArray, basis: FloatArray, tied: NDArray[np.bool_], suspect: int) -> FloatArray:
+def shifts_with_most_images_in_place(
+    shift_px: FloatArray, basis: FloatArray, tied: NDArray[np.bool_], suspect: int
+) -> FloatArray:
     """Shifts (i, 2) px plus the translation that leaves most images where they were, looked for from a first guess in
     which one image, `suspect`, has no say.
 
@@ -110,9 +117,9 @@ def moved_least(shift_px: FloatArray, basis: FloatArray, tied: NDArray[np.bool_]
 
 
 def _farthest(shift_px: FloatArray, tied: NDArray[np.bool_]) -> list[int]:
-    """Numbers of the tied images that were moved farthest, at most `MOST_SUSPECTS`."""
+    """Numbers of the tied images that were moved farthest, at most `MAX_SUSPECTS`."""
     order = np.argsort(-np.hypot(*shift_px.T), kind="stable")
-    return [int(number) for number in order if tied[number]][:MOST_SUSPECTS]
+    return [int(number) for number in order if tied[number]][:MAX_SUSPECTS]
 
 
 def _sum_of_logarithms(shift_px: FloatArray) -> float:
@@ -120,61 +127,65 @@ def _sum_of_logarithms(shift_px: FloatArray) -> float:
 
 
 def solve_shifts(
-    sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray, prior_px: float, shift: FloatArray
+    sensors: Sequence[SensorModel],
+    observations: Observations,
+    xyz: FloatArray,
+    sigma_shift_px: float,
+    shift: FloatArray,
 ) -> tuple[FloatArray, int]:
     """Robust shifts (i, 2) px, from those to start with, and the number of their directions that the ties show.
 
     Iteratively reweighted least squares: every round triangulates with the present shifts and weights, then eliminates
     the ground points from the normal equations (Schur complement) and solves for the shifts alone.
     """
-    weight, by_ground, n_seen = np.ones(len(seen)), None, 0
+    weight, by_ground, n_determined = np.ones(len(observations)), None, 0
     for _ in range(MAX_ITERATIONS):
-        points = triangulate(sensors, moved(seen, shift), xyz, weight, by_ground)
-        sigma = robust_sigma(points.residual)
-        weight = huber_weight(points.residual, sigma)
-        normal, pull = reduced_normal_equations(seen, points, weight, len(sensors))
-        information = normal / sigma**2 + np.eye(len(normal)) / prior_px**2
-        of_views = np.bincount(seen.view, weight, len(sensors)).astype(float)
-        basis = seen_directions(normal, of_views, translations(seen, points, weight, len(sensors)))
-        right = basis.T @ (pull / sigma**2 - shift.ravel() / prior_px**2)
+        ground_points = triangulate(sensors, moved(observations, shift), xyz, weight, by_ground)
+        sigma = robust_sigma(ground_points.residual)
+        weight = huber_weight(ground_points.residual, sigma)
+        normal, pull = reduced_normal_equations(observations, ground_points, weight, len(sensors))
+        information = normal / sigma**2 + np.eye(len(normal)) / sigma_shift_px**2
+        of_views = np.bincount(observations.view, weight, len(sensors)).astype(float)
+        basis = determined_directions(normal, of_views, translations(observations, ground_points, weight, len(sensors)))
+        right = basis.T @ (pull / sigma**2 - shift.ravel() / sigma_shift_px**2)
         step = basis @ np.linalg.solve(basis.T @ information @ basis, right)
-        shift, n_seen, xyz = shift + step.reshape(-1, 2), basis.shape[1], points.xyz
-        by_ground = points.by_ground
+        shift, n_determined, xyz = shift + step.reshape(-1, 2), basis.shape[1], ground_points.xyz
+        by_ground = ground_points.by_ground
         if np.abs(step).max(initial=0.0) < TOLERANCE_PX:
             break
-    return shift, n_seen
+    return shift, n_determined
 
 
 def reduced_normal_equations(
-    seen: Observations, points: GroundPoints, weight: FloatArray, n_views: int
+    observations: Observations, ground_points: GroundPoints, weight: FloatArray, n_views: int
 ) -> tuple[FloatArray, FloatArray]:
     """Normal matrix (2 i, 2 i) and right side (2 i,) of the shifts once the ground points are eliminated.
 
     With A the shifts' block, E the shifts-by-points block and C the points' block: A - E C^-1 E^T.
     """
-    usable = np.isfinite(points.residual).all(axis=1) & np.isfinite(points.xyz[seen.point, 0])
+    usable = np.isfinite(ground_points.residual).all(axis=1) & np.isfinite(ground_points.xyz[observations.point, 0])
     weight = np.where(usable, weight, 0.0)
-    by_ground = np.where(usable[:, None, None], points.by_ground, 0.0)
-    residual = np.where(usable[:, None], points.residual, 0.0)
-    n_points = len(points.xyz)
-    covariance = np.nan_to_num(point_covariance(by_ground, weight, seen.point, n_points))
+    by_ground = np.where(usable[:, None, None], ground_points.by_ground, 0.0)
+    residual = np.where(usable[:, None], ground_points.residual, 0.0)
+    n_points = len(ground_points.xyz)
+    covariance = np.nan_to_num(point_covariance(by_ground, weight, observations.point, n_points))
     mixed = by_ground * weight[:, None, None]
-    own = np.repeat(np.bincount(seen.view, weight, n_views), 2)
-    pull = summed(residual * weight[:, None], seen.view, n_views)
-    pull_of_points = summed(np.einsum("mji,mj->mi", mixed, residual), seen.point, n_points)
+    own = np.repeat(np.bincount(observations.view, weight, n_views), 2)
+    pull = summed(residual * weight[:, None], observations.view, n_views)
+    pull_of_points = summed(np.einsum("mji,mj->mi", mixed, residual), observations.point, n_points)
     solved = np.einsum("nij,nj->ni", covariance, pull_of_points)
-    explained = summed(np.einsum("mji,mi->mj", mixed, solved[seen.point]), seen.view, n_views)
-    return np.diag(own) - between_views(seen, mixed, covariance, n_views), (pull - explained).ravel()
+    explained = summed(np.einsum("mji,mi->mj", mixed, solved[observations.point]), observations.view, n_views)
+    return np.diag(own) - between_views(observations, mixed, covariance, n_views), (pull - explained).ravel()
 
 
-def between_views(seen: Observations, mixed: FloatArray, covariance: FloatArray, n_views: int) -> FloatArray:
+def between_views(observations: Observations, mixed: FloatArray, covariance: FloatArray, n_views: int) -> FloatArray:
     """E C^-1 E^T (2 i, 2 i): what views have to do with each other through the points that they share.
 
     mixed : (m, 2, 3), the blocks of E; covariance : (n, 3, 3), the blocks of C^-1. Every observation of a point meets
     every other, so the work grows with the number of points.
     """
-    order = np.argsort(seen.point, kind="stable")
-    point, view, mixed = seen.point[order], seen.view[order], mixed[order]
+    order = np.argsort(observations.point, kind="stable")
+    point, view, mixed = observations.point[order], observations.view[order], mixed[order]
     most = int(np.bincount(point, minlength=1).max())
     total = np.zeros((2, 2, n_views * n_views))
     for lag in range(most):
@@ -190,21 +201,23 @@ def between_views(seen: Observations, mixed: FloatArray, covariance: FloatArray,
     return total.reshape(2, 2, n_views, n_views).transpose(2, 0, 3, 1).reshape(2 * n_views, 2 * n_views)
 
 
-def translations(seen: Observations, points: GroundPoints, weight: FloatArray, n_views: int) -> FloatArray:
+def translations(
+    observations: Observations, ground_points: GroundPoints, weight: FloatArray, n_views: int
+) -> FloatArray:
     """The shifts (2 i, k) that a common translation of the ground looks like, k at most 3, orthonormal."""
-    usable = np.asarray(np.isfinite(points.by_ground).all(axis=(1, 2)))
-    by_ground = np.where(usable[:, None, None], points.by_ground * weight[:, None, None], 0.0)
-    total = summed(by_ground.reshape(-1, 6), seen.view, n_views)
-    mean = total / np.maximum(np.bincount(seen.view, weight * usable, n_views), 1e-12)[:, None]
+    usable = np.asarray(np.isfinite(ground_points.by_ground).all(axis=(1, 2)))
+    by_ground = np.where(usable[:, None, None], ground_points.by_ground * weight[:, None, None], 0.0)
+    total = summed(by_ground.reshape(-1, 6), observations.view, n_views)
+    mean = total / np.maximum(np.bincount(observations.view, weight * usable, n_views), 1e-12)[:, None]
     left, size, _ = np.linalg.svd(mean.reshape(2 * n_views, 3), full_matrices=False)
-    n_seen = int((size > 1e-6 * max(float(size[0]), 1e-12)).sum())
-    return np.asarray(left)[:, :n_seen]
+    n_determined = int((size > 1e-6 * max(float(size[0]), 1e-12)).sum())
+    return np.asarray(left)[:, :n_determined]
 
 
-def seen_directions(normal: FloatArray, weight_of_view: FloatArray, translated: FloatArray) -> FloatArray:
+def determined_directions(normal: FloatArray, weight_of_view: FloatArray, translated: FloatArray) -> FloatArray:
     """Orthonormal basis (2 i, k) of the shifts that ties can tell from a change of the ground.
 
-    Information is judged per observation, so that an image with few ties counts like one with many; what is not seen
+    Information is judged per observation, so that an image with few ties counts like one with many; what is not observations
     (a translation of the ground; for two images the shift along their loci; images without ties) stays exactly zero.
     translated : see `translations`. Where sensors of several kinds are mixed, a translation changes the scales of their
     images by different amounts, from which a height can be had to a decimetre or so; the cameras say it better, so it
@@ -215,30 +228,30 @@ def seen_directions(normal: FloatArray, weight_of_view: FloatArray, translated: 
     inverse = np.where(linked, 1.0 / np.where(linked, scale, 1.0), 0.0)
     values, vectors = np.linalg.eigh(normal * inverse[:, None] * inverse)
     n_views = max(int((weight_of_view > 0.0).sum()), 1)
-    unseen = vectors[:, values < SEEN_INFORMATION / n_views**2]
+    unseen = vectors[:, values < MIN_SHIFT_INFORMATION / n_views**2]
     hidden = np.where(linked[:, None], unseen * inverse[:, None], unseen)
     left, _, _ = np.linalg.svd(hidden, full_matrices=True)
     known = left[:, : hidden.shape[1]]
     apart, sine, _ = np.linalg.svd(translated - known @ (known.T @ translated), full_matrices=False)
     scaled = apart * scale[:, None]
     information = np.einsum("ik,ij,jk->k", apart, normal, apart) / np.maximum((scaled**2).sum(axis=0), 1e-12)
-    is_doubtful = (np.asarray(sine) > APART_SINE) & (information < SEEN_INFORMATION / 2**2)
+    is_doubtful = (np.asarray(sine) > APART_SINE) & (information < MIN_SHIFT_INFORMATION / 2**2)
     if is_doubtful.any():
         hidden = np.column_stack([known, apart[:, is_doubtful]])
         left, _, _ = np.linalg.svd(hidden, full_matrices=True)
     return np.where(linked[:, None], left[:, hidden.shape[1] :], 0.0)
 
 
-def moved(seen: Observations, shift: FloatArray) -> Observations:
+def moved(observations: Observations, shift: FloatArray) -> Observations:
     """The observations as the uncorrected models would have projected them."""
-    return Observations(seen.view, seen.point, seen.xy - shift[seen.view])
+    return Observations(observations.view, observations.point, observations.xy - shift[observations.view])
 
 
 def robust_sigma(residual: FloatArray) -> float:
     """Noise of one coordinate (px) from residuals (m, 2): the median length of Gaussian residuals is 1.18 sigma."""
     length = np.hypot(*residual.T)
     length = length[np.isfinite(length)]
-    return max(float(np.median(length)) / 1.1774 if len(length) else 0.0, SMALLEST_SIGMA_PX)
+    return max(float(np.median(length)) / 1.1774 if len(length) else 0.0, MIN_SIGMA_PX)
 
 
 def huber_weight(residual: FloatArray, sigma: float) -> FloatArray:
@@ -248,16 +261,16 @@ def huber_weight(residual: FloatArray, sigma: float) -> FloatArray:
     return np.where(np.isfinite(length), weight, 0.0)
 
 
-def consistent(seen: Observations, points: GroundPoints, inlier_px: float) -> Observations:
+def without_outliers(observations: Observations, ground_points: GroundPoints, inlier_px: float) -> Observations:
     """Observations near where their tie puts them, of ties that keep two images or more."""
-    length = np.hypot(*points.residual.T)
-    limit = max(OUTLIER_SIGMAS * robust_sigma(points.residual), inlier_px)
+    length = np.hypot(*ground_points.residual.T)
+    limit = max(OUTLIER_SIGMAS * robust_sigma(ground_points.residual), inlier_px)
     keep = length <= limit
-    keep &= np.bincount(seen.point[keep], minlength=len(points.xyz))[seen.point] >= 2
-    return seen.kept(keep)
+    keep &= np.bincount(observations.point[keep], minlength=len(ground_points.xyz))[observations.point] >= 2
+    return observations.kept(keep)
 
 
-def renumbered(seen: Observations, xyz: FloatArray) -> tuple[Observations, FloatArray]:
+def renumbered(observations: Observations, xyz: FloatArray) -> tuple[Observations, FloatArray]:
     """The same with points numbered without gaps."""
-    used, point = np.unique(seen.point, return_inverse=True)
-    return Observations(seen.view, point, seen.xy), xyz[used]
+    used, point = np.unique(observations.point, return_inverse=True)
+    return Observations(observations.view, point, observations.xy), xyz[used]

@@ -23,7 +23,7 @@ CONTRAST_THRESHOLD = 0.02
 DESCRIPTOR_LENGTH = 128
 # Descriptors held in memory, all images together.
 HELD_BYTES = 500e6
-WHOLLY = 0.999  # valid share of what a reduced pixel covers
+MIN_VALID_SHARE = 0.999  # valid share of what a reduced pixel covers
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def reduced(window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
     if window.valid.all():
         return ImageWindow(pixels, np.ones(pixels.shape, bool))
     valid = cv2.resize(window.valid.astype(np.float32), size.tolist(), interpolation=cv2.INTER_AREA)
-    return ImageWindow(pixels, valid > WHOLLY)
+    return ImageWindow(pixels, valid > MIN_VALID_SHARE)
 
 
 def stretched(window: ImageWindow) -> NDArray[np.uint8]:

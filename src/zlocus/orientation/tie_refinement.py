@@ -19,12 +19,12 @@ from zlocus.orientation.sift import parts, reduction
 from zlocus.orientation.triangulate import Observations
 
 # A view with fewer observations that could be measured keeps them all as SIFT found them: another season, haze.
-ENOUGH = 50
+MIN_REFINED_OF_VIEW = 50
 BORDER_PX = 4  # that cubic interpolation and the last steps need around what is searched
 
 
 @dataclass(frozen=True)
-class Squares:
+class PixelSquares:
     """Pixels around whole pixels of one part of an image.
 
     rows : (k,) which points; pixels : (k, s, s) float32; valid : (k,) bool, whether all of them are valid.
@@ -35,32 +35,36 @@ class Squares:
     valid: NDArray[np.bool_]
 
 
-def sharpened(
-    views: Sequence[View], seen: Observations, by_ground: FloatArray, options: OrientationOptions, threads: int = 1
+def refined_ties(
+    views: Sequence[View],
+    observations: Observations,
+    by_ground: FloatArray,
+    options: OrientationOptions,
+    threads: int = 1,
 ) -> Observations:
     """The observations, each put where its image correlates best with that of the tie's reference.
 
     by_ground : (m, 2, 3) px per m of each observation, from which follows how level ground looks in one image against
     another. The reference of a tie is the image that sees it the least slanted; what SIFT found there stays. What
-    correlates less than `least_ncc` is dropped, and ties that keep no two images with it.
+    correlates less than `min_ncc` is dropped, and ties that keep no two images with it.
     """
-    if not len(seen):
-        return seen
-    reference = reference_rows(seen, by_ground, len(views))
-    other = np.flatnonzero(reference != np.arange(len(seen)))
-    whole = np.rint(seen.xy).astype(np.int64)
-    patches, usable = reference_patches(views, seen.view, whole, np.unique(reference), options, threads)
-    warp = np.zeros((len(seen), 2, 2))
+    if not len(observations):
+        return observations
+    reference = reference_rows(observations, by_ground, len(views))
+    other = np.flatnonzero(reference != np.arange(len(observations)))
+    whole = np.rint(observations.xy).astype(np.int64)
+    patches, usable = reference_patches(views, observations.view, whole, np.unique(reference), options, threads)
+    warp = np.zeros((len(observations), 2, 2))
     warp[other] = warps(by_ground[reference[other]], by_ground[other])
     # Where the whole pixel of the reference is expected.
-    expected = seen.xy + np.einsum("mij,mj->mi", warp, (whole - seen.xy)[reference])
-    found = np.zeros((len(seen), 3))
+    expected = observations.xy + np.einsum("mij,mj->mi", warp, (whole - observations.xy)[reference])
+    found = np.zeros((len(observations), 3))
     reach = math.ceil(max(reduction(held_window(view.image)[2:], options) for view in views) / 2.0)
     half = 2 * (options.patch_px // 2) + reach + BORDER_PX
 
     def measure(i: int) -> None:
         """Observations of one view."""
-        for squares in squares_around(views[i], whole, other[seen.view[other] == i], half):
+        for squares in squares_around(views[i], whole, other[observations.view[other] == i], half):
             rows, of = squares.rows, reference[squares.rows]
             out = np.empty((len(rows), 3))
             centres = expected[rows] - whole[rows] + half
@@ -69,26 +73,28 @@ def sharpened(
             found[rows] = out
 
     deque(run_all(measure, range(len(views)), threads), maxlen=0)
-    is_good = found[:, 2] >= options.least_ncc
-    n_good = np.bincount(seen.view[is_good], minlength=len(views))
-    as_found = (n_good < ENOUGH)[seen.view]
+    is_good = found[:, 2] >= options.min_ncc
+    n_good = np.bincount(observations.view[is_good], minlength=len(views))
+    as_found = (n_good < MIN_REFINED_OF_VIEW)[observations.view]
     moved = is_good & ~as_found
-    xy = seen.xy + np.where(moved[:, None], found[:, :2], 0.0)
-    keep = moved | as_found | (reference == np.arange(len(seen)))
-    keep &= np.bincount(seen.point[keep], minlength=int(seen.point.max()) + 1)[seen.point] >= 2
-    return Observations(seen.view[keep], seen.point[keep], xy[keep])
+    xy = observations.xy + np.where(moved[:, None], found[:, :2], 0.0)
+    keep = moved | as_found | (reference == np.arange(len(observations)))
+    keep &= np.bincount(observations.point[keep], minlength=int(observations.point.max()) + 1)[observations.point] >= 2
+    return Observations(observations.view[keep], observations.point[keep], xy[keep])
 
 
-def reference_rows(seen: Observations, by_ground: FloatArray, n_views: int) -> NDArray[np.int64]:
+def reference_rows(observations: Observations, by_ground: FloatArray, n_views: int) -> NDArray[np.int64]:
     """For each observation (m,) that of the same tie in the view that looks the least slanted at the ground."""
     along = np.einsum("mij,mj->mi", inverses(by_ground[:, :, :2]), by_ground[:, :, 2])
     slant = np.nan_to_num(np.hypot(*along.T), nan=np.inf)
-    of_view = np.array([np.median(slant[seen.view == i]) if (seen.view == i).any() else np.inf for i in range(n_views)])
-    order = np.lexsort((seen.view, of_view[seen.view], seen.point))
-    _, first = np.unique(seen.point[order], return_index=True)
-    row_of = np.zeros(int(seen.point.max()) + 1, np.int64)
-    row_of[seen.point[order[first]]] = order[first]
-    return np.asarray(row_of[seen.point])
+    of_view = np.array(
+        [np.median(slant[observations.view == i]) if (observations.view == i).any() else np.inf for i in range(n_views)]
+    )
+    order = np.lexsort((observations.view, of_view[observations.view], observations.point))
+    _, first = np.unique(observations.point[order], return_index=True)
+    row_of = np.zeros(int(observations.point.max()) + 1, np.int64)
+    row_of[observations.point[order[first]]] = order[first]
+    return np.asarray(row_of[observations.point])
 
 
 def inverses(matrix: FloatArray) -> FloatArray:
@@ -128,8 +134,8 @@ def reference_patches(
     return patches, usable
 
 
-def squares_around(view: View, whole: NDArray[np.int64], rows: NDArray[np.int64], half: int) -> Iterator[Squares]:
-    """Squares of 2 half + 1 px around whole pixels, read part by part; those that leave the image are left out.
+def squares_around(view: View, whole: NDArray[np.int64], rows: NDArray[np.int64], half: int) -> Iterator[PixelSquares]:
+    """PixelSquares of 2 half + 1 px around whole pixels, read part by part; those that leave the image are left out.
 
     whole : (m, 2) column and row of all points; rows : (k,) which of them.
     """
@@ -146,4 +152,4 @@ def squares_around(view: View, whole: NDArray[np.int64], rows: NDArray[np.int64]
         window = view.image.read(row0, col0, *size)
         at = (row[here] - row0)[:, None, None] + offset[:, None], (col[here] - col0)[:, None, None] + offset
         valid = np.ones(len(here), bool) if window.valid.all() else window.valid[at].all(axis=(1, 2))
-        yield Squares(rows[here], window.pixels[at], valid)
+        yield PixelSquares(rows[here], window.pixels[at], valid)

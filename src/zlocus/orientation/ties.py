@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from zlocus.core.errors import GeometryError
 from zlocus.core.options import OrientationOptions
 from zlocus.core.parallel import run_all
-from zlocus.core.scene import Scene, View, ground_box, held_window
+from zlocus.core.scene import Scene, View, held_window
+from zlocus.core.footprints import ground_box
 from zlocus.core.sensor_model import FloatArray, lowest_station
-from zlocus.orientation.epipolar import Loci, Sightlines, locate, trace
+from zlocus.orientation.epipolar import EpipolarCurves, Sightlines, epipolar_offsets, trace
 from zlocus.orientation.kernels.descriptors import nearest_descriptors
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.sift import Features, detect_all, part_grid, parts, reduction
@@ -24,12 +25,12 @@ Progress = Callable[[str, float], None]
 
 PART_POINTS = 5  # along each side of a part, whose loci are looked at
 PARTS_AT_ONCE = 4096  # whose loci are in memory: those of an image of 64 000 px a side
-SAMPLE = 1000  # features of a pair's first search
-# Loci of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
+FIRST_SEARCH_FEATURES = 1000  # features of a pair's first search
+# EpipolarCurves of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
 DEPTH_RATIO = 1.5
 # Images that tie to none are looked for this many times farther away from where their cameras point, beside so many of
 # the others; and are believed where they tie to so many that tie to each other.
-WIDER, MOST_PARTNERS, FEWEST_PARTNERS = 10.0, 6, 2
+WIDER_POINTING_FACTOR, MAX_PARTNERS, MIN_PARTNERS = 10.0, 6, 2
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,11 @@ class PairMatches:
 class Ties:
     """Tie points of a scene.
 
-    seen: their observations; z : (n,) m, first height of each point; pairs: the matches they were built from;
+    observations: their observations; z : (n,) m, first height of each point; pairs: the matches they were built from;
     z_range: the heights that were looked at, m.
     """
 
-    seen: Observations
+    observations: Observations
     z: FloatArray
     pairs: tuple[PairMatches, ...]
     z_range: tuple[float, float]
@@ -79,7 +80,7 @@ def find_ties(
     """
     z_range = z_range_hint or scene.heights or widest_range(scene.views)
     report = progress or (lambda _stage, _share: None)
-    z_ranges = slabs(scene.views, z_range)
+    z_ranges = height_slabs(scene.views, z_range)
     near = neighbours(scene.views, z_range, options.max_pointing_px)
     wanted = shared_parts(scene.views, z_ranges, options.max_pointing_px, near)
     images = [view.image for view in scene.views]
@@ -101,13 +102,13 @@ def find_ties(
         done += int(near[a, a + 1 :].sum())
         report("matches", done / n_pairs if n_pairs else 1.0)
     every = tuple(pair for a in sorted(pairs) for pair in pairs[a])
-    every += lost_images(scene.views, features, every, z_ranges, options)
+    every += match_untied_images(scene.views, features, every, z_ranges, options)
     if len(z_ranges) > 1 and every:
         z_range = likely_range(np.concatenate([pair.z for pair in every]))
     return join_tracks(features, every, z_range)
 
 
-def lost_images(
+def match_untied_images(
     views: Sequence[View],
     features: Sequence[Features],
     pairs: Sequence[PairMatches],
@@ -123,18 +124,18 @@ def lost_images(
     for pair in pairs:
         n_ties[list(pair.views)] += len(pair)
     tied = np.argsort(-n_ties, kind="stable")[: int((n_ties > 0).sum())]
-    wide, found = replace(options, max_pointing_px=WIDER * options.max_pointing_px), []
+    wide, found = replace(options, max_pointing_px=WIDER_POINTING_FACTOR * options.max_pointing_px), []
     for lost in np.flatnonzero(n_ties == 0).tolist():
         lines = [Sightlines.of(views[lost].sensor, features[lost].xy, z_range) for z_range in z_ranges]
-        matches = [match_pair(views, features, (lost, int(b)), lines, wide) for b in tied[:MOST_PARTNERS]]
+        matches = [match_pair(views, features, (lost, int(b)), lines, wide) for b in tied[:MAX_PARTNERS]]
         matches = [pair for pair in matches if len(pair)]
         partners = {pair.views[1] for pair in matches}
-        if len(partners) >= FEWEST_PARTNERS and any(partners >= set(pair.views) for pair in pairs):
+        if len(partners) >= MIN_PARTNERS and any(partners >= set(pair.views) for pair in pairs):
             found += matches
     return tuple(found)
 
 
-def slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tuple[float, float]]:
+def height_slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tuple[float, float]]:
     """Ranges (m) that cover the heights, overlapping, in each of which loci run on evenly: all of it but for cameras
     that stood close by."""
     station = lowest_station(view.sensor for view in views)
@@ -210,7 +211,7 @@ def _seen_by(
     return seen
 
 
-def may_fall_inside(loci: Loci, shape: tuple[int, int], margin_px: float) -> bool:
+def may_fall_inside(loci: EpipolarCurves, shape: tuple[int, int], margin_px: float) -> bool:
     """Whether the box around some loci, widened by a margin, touches an image of that shape."""
     ends = np.concatenate([loci.low, loci.high])
     ends = ends[np.isfinite(ends).all(axis=1)]
@@ -234,12 +235,12 @@ def match_pair(
 
     Twice: first a sample of the features within `max_pointing_px` of the loci; then, with the shift and the heights
     found, all features within twice `inlier_px`, where fewer rivals let more matches through. In reduced images the
-    distance counts by `looseness`.
+    distance counts by `sift_tolerance_factor`.
     """
     a, b = pair
-    inlier_px = options.inlier_px * looseness([views[a], views[b]], options)
+    inlier_px = options.inlier_px * sift_tolerance_factor([views[a], views[b]], options)
     sensor, xy_b, n_a = views[b].sensor, features[b].xy, len(features[a])
-    sample = np.arange(0, n_a, max(n_a // SAMPLE, 1))
+    sample = np.arange(0, n_a, max(n_a // FIRST_SEARCH_FEATURES, 1))
     nothing = np.empty(0, np.int64)
     empty = PairMatches(pair, nothing, nothing, np.empty(0), 0, np.zeros(2))
     max_px, pointing, found, likely_lines = options.max_pointing_px, None, None, lines[0]
@@ -247,8 +248,8 @@ def match_pair(
         loci = trace(line.only(sample), sensor, line.z_range)
         if not len(xy_b) or not may_fall_inside(loci, views[b].image.shape, max_px):
             continue
-        first, second = match_near_loci(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
-        here = locate(line.only(sample[first]), sensor, xy_b[second], line.z_range)
+        first, second = match_along_curves(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
+        here = epipolar_offsets(line.only(sample[first]), sensor, xy_b[second], line.z_range)
         shift = find_shift(here, max_px, inlier_px)
         if pointing is None or shift.inliers.sum() > pointing.inliers.sum():
             pointing, found, likely_lines = shift, here, line
@@ -256,17 +257,17 @@ def match_pair(
         return empty
     likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * inlier_px
     loci = trace(likely_lines, sensor, likely).moved(pointing.shift_px)
-    first, second = match_near_loci(loci, features[a], features[b], near_px, options.match_ratio)
+    first, second = match_along_curves(loci, features[a], features[b], near_px, options.match_ratio)
     moved_b = xy_b[second] - pointing.shift_px
-    rest = find_shift(locate(likely_lines.only(first), sensor, moved_b, likely), near_px, inlier_px)
+    rest = find_shift(epipolar_offsets(likely_lines.only(first), sensor, moved_b, likely), near_px, inlier_px)
     if not rest.is_certain(options.min_ties):
         return empty
     keep = rest.inliers
-    found = locate(likely_lines.only(first[keep]), sensor, xy_b[second[keep]], likely)
+    found = epipolar_offsets(likely_lines.only(first[keep]), sensor, xy_b[second[keep]], likely)
     return PairMatches(pair, first[keep], second[keep], found.z, len(first), pointing.shift_px + rest.shift_px)
 
 
-def looseness(views: Sequence[View], options: OrientationOptions) -> float:
+def sift_tolerance_factor(views: Sequence[View], options: OrientationOptions) -> float:
     """How much farther than in halved images features may lie from their loci: with the reduction they blur."""
     return max(1.0, *(reduction(held_window(view.image)[2:], options) / 2.0 for view in views))
 
@@ -280,8 +281,8 @@ def likely_range(z: FloatArray) -> tuple[float, float]:
     return low - (high - low) - 1.0, high + (high - low) + 1.0
 
 
-def match_near_loci(
-    loci: Loci, in_a: Features, in_b: Features, max_px: float, ratio: float
+def match_along_curves(
+    loci: EpipolarCurves, in_a: Features, in_b: Features, max_px: float, ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Feature numbers (k,), (k,) of mutual best matches at most `max_px` from their locus.
 

@@ -51,7 +51,7 @@ class GroundPoints:
 
 def triangulate(
     sensors: Sequence[SensorModel],
-    seen: Observations,
+    observations: Observations,
     xyz: FloatArray,
     weight: FloatArray | None = None,
     by_ground: FloatArray | None = None,
@@ -62,44 +62,46 @@ def triangulate(
     derivatives from an earlier round near these points. Every point needs two observations with distinct rays; others
     come out NaN.
     """
-    weight = np.ones(len(seen)) if weight is None else weight
-    by_ground = ground_jacobian(sensors, seen, xyz) if by_ground is None else by_ground
-    inverse = point_covariance(by_ground, weight, seen.point, len(xyz))
+    weight = np.ones(len(observations)) if weight is None else weight
+    by_ground = ground_jacobian(sensors, observations, xyz) if by_ground is None else by_ground
+    inverse = point_covariance(by_ground, weight, observations.point, len(xyz))
     step_px = 0.0
     for _ in range(MAX_ITERATIONS):
         if step_px > RELINEARISE_PX:
-            by_ground = ground_jacobian(sensors, seen, xyz)
-            inverse = point_covariance(by_ground, weight, seen.point, len(xyz))
-        residual = seen.xy - project_points(sensors, seen, xyz)
-        pull = summed(np.einsum("mji,mj,m->mi", by_ground, residual, weight), seen.point, len(xyz))
+            by_ground = ground_jacobian(sensors, observations, xyz)
+            inverse = point_covariance(by_ground, weight, observations.point, len(xyz))
+        residual = observations.xy - project_points(sensors, observations, xyz)
+        pull = summed(np.einsum("mji,mj,m->mi", by_ground, residual, weight), observations.point, len(xyz))
         step = np.einsum("nij,nj->ni", inverse, pull)
         xyz = xyz + step
-        moved_px = np.einsum("mji,mi->mj", by_ground, step[seen.point])
+        moved_px = np.einsum("mji,mi->mj", by_ground, step[observations.point])
         step_px = np.nanmax(np.abs(moved_px), initial=0.0)
         if step_px <= TOLERANCE_PX:
             break
     return GroundPoints(xyz, np.sqrt(inverse[:, 2, 2]), residual - moved_px, by_ground)
 
 
-def project_points(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:
+def project_points(sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray) -> FloatArray:
     """Image positions (m, 2) px at which each observation's ground point is expected."""
-    xy = np.full((len(seen), 2), np.nan)
-    for i, rows in enumerate(rows_of_views(seen, len(sensors))):
+    xy = np.full((len(observations), 2), np.nan)
+    for i, rows in enumerate(rows_of_views(observations, len(sensors))):
         if len(rows):
-            xy[rows] = sensors[i].image_from_ground(xyz[seen.point[rows]])
+            xy[rows] = sensors[i].image_from_ground(xyz[observations.point[rows]])
     return xy
 
 
-def rows_of_views(seen: Observations, n_views: int) -> list[NDArray[np.intp]]:
+def rows_of_views(observations: Observations, n_views: int) -> list[NDArray[np.intp]]:
     """The observations of each view, in their order."""
-    order = np.argsort(seen.view, kind="stable")
-    return np.split(order, np.searchsorted(seen.view, np.arange(1, n_views), sorter=order))
+    order = np.argsort(observations.view, kind="stable")
+    return np.split(order, np.searchsorted(observations.view, np.arange(1, n_views), sorter=order))
 
 
-def ground_jacobian(sensors: Sequence[SensorModel], seen: Observations, xyz: FloatArray) -> FloatArray:
+def ground_jacobian(sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray) -> FloatArray:
     """Derivatives (m, 2, 3) of image position by ground position, px per m, as differences over a metre."""
-    here = project_points(sensors, seen, xyz)
-    columns = [(project_points(sensors, seen, xyz + step) - here) / DIFFERENCE_M for step in np.eye(3) * DIFFERENCE_M]
+    here = project_points(sensors, observations, xyz)
+    columns = [
+        (project_points(sensors, observations, xyz + step) - here) / DIFFERENCE_M for step in np.eye(3) * DIFFERENCE_M
+    ]
     return np.stack(columns, axis=2)
 
 

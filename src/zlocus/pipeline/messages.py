@@ -34,10 +34,10 @@ def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress) -> 
 def note_orientation(orientation: Orientation, progress: Progress) -> None:
     """Say which corrections were applied, which images take no part, and which cameras are doubtful."""
     progress.note(what_was_applied(orientation))
-    for left_out in orientation.left_out[:MAX_NAMED]:
-        progress.note(str(left_out))
-    if len(orientation.left_out) > MAX_NAMED:
-        progress.note(f"{len(orientation.left_out) - MAX_NAMED} more images take no part: see run.json.")
+    for excluded in orientation.excluded_images[:MAX_NAMED]:
+        progress.note(str(excluded))
+    if len(orientation.excluded_images) > MAX_NAMED:
+        progress.note(f"{len(orientation.excluded_images) - MAX_NAMED} more images take no part: see run.json.")
     note_doubts(orientation.doubts, progress)
 
 
@@ -71,7 +71,7 @@ def what_was_applied(orientation: Orientation) -> str:
     moved = [v for v in orientation.views if v.shift_px != (0.0, 0.0)]
     if orientation.bundle_adjustment is not None and orientation.bundle_adjustment.solution.is_held.all():
         return (
-            f"Cameras left as delivered: {len(orientation.measured)} tie points show no errors beyond their noise, "
+            f"Cameras left as delivered: {len(orientation.refined_xyz)} tie points show no errors beyond their noise, "
             f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px."
         )
     if not moved:
@@ -84,7 +84,7 @@ def what_was_applied(orientation: Orientation) -> str:
         by = f"up to {math.hypot(*farthest.shift_px):.2f} px ({farthest.name})."
     if orientation.bundle_adjustment is not None:
         return (
-            f"Cameras corrected jointly from {len(orientation.measured)} tie points, to "
+            f"Cameras corrected jointly from {len(orientation.refined_xyz)} tie points, to "
             f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px; their images moved by, {by}"
         )
     return f"Pointing corrected from {len(orientation.xyz)} tie points, {by}"

@@ -71,7 +71,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     if not request.cameras:
         return f"{request.out / 'ties.gpkg'}: {len(orientation.xyz)} tie points."
-    return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(orientation.measured)} tie points."
+    return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(orientation.refined_xyz)} tie points."
 
 
 def options_of_command(options: OrientationOptions, cameras: bool) -> OrientationOptions:
@@ -90,10 +90,10 @@ def check_ties(orientation: Orientation, scene: Scene) -> None:
     GeometryError
         There are fewer than `MIN_TIES`.
     """
-    if len(orientation.measured) < MIN_TIES:
+    if len(orientation.refined_xyz) < MIN_TIES:
         names = some_names([view.name for view in scene.views])
         raise GeometryError(
-            f"Only {len(orientation.measured)} tie points were found between {names}, too few to orient the cameras "
+            f"Only {len(orientation.refined_xyz)} tie points were found between {names}, too few to orient the cameras "
             f"({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check that the images overlap."
         )
 

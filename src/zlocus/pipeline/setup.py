@@ -191,7 +191,7 @@ def set_up_run(
     grid = _grid(request, opened.like, scene, orientation, z_range)
     match_scene = build_match_scene(
         scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
-        orientation.measured,
+        orientation.refined_xyz,
     )  # fmt: skip
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)
@@ -209,7 +209,7 @@ def supported_views(scene: Scene, orientation: Orientation) -> Scene:
     GeometryError
         They do so because all images look along the same line.
     """
-    excluded = {each.name for each in orientation.left_out}
+    excluded = {each.name for each in orientation.excluded_images}
     views = tuple(view for view in scene.views if view.name not in excluded)
     if len(views) >= MIN_VIEWS:
         return replace(scene, views=views)

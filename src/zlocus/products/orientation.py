@@ -8,68 +8,68 @@ import numpy as np
 
 from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray
-from zlocus.orientation.bundle_adjustment import JointAdjustment
+from zlocus.orientation.bundle_adjustment import BundleAdjustment
 from zlocus.orientation.orientation import Orientation, Residuals
-from zlocus.orientation.parameter_groups import Block
+from zlocus.orientation.parameter_groups import ParameterGroup
 
 DIGITS = 6
 
 
-def orientation_record(found: Orientation, scene: Scene) -> dict[str, Any]:
+def orientation_record(orientation: Orientation, scene: Scene) -> dict[str, Any]:
     """The report as JSON can hold it."""
-    record = {"crs": scene.crs.to_string(), **found.as_dict()}
-    if found.joint is None:
+    record = {"crs": scene.crs.to_string(), **orientation.as_dict()}
+    if orientation.bundle_adjustment is None:
         return record
-    joint, names = found.joint, [view.name for view in scene.views]
-    solution = joint.solution
+    bundle_adjustment, names = orientation.bundle_adjustment, [view.name for view in scene.views]
+    solution = bundle_adjustment.solution
     record |= {
         "sigma0_px": rounded(solution.sigma0_px),
         "redundancy": solution.redundancy,
         "n_parameters": len(solution.parameters),
-        "n_parameters_seen": solution.n_seen,
+        "n_parameters_determined": solution.n_determined,
         "n_steps": solution.n_steps,
-        "sensors": sensors_record(found, joint),
-        "corrections": corrections_record(joint, names),
+        "sensors": sensors_record(orientation, bundle_adjustment),
+        "corrections": corrections_record(bundle_adjustment, names),
     }
-    if len(joint.control):
-        record["control"] = control_record(joint)
-    if len(joint.terrain_m):
-        record["terrain"] = terrain_record(joint.terrain_m)
+    if len(bundle_adjustment.control):
+        record["control"] = control_record(bundle_adjustment)
+    if len(bundle_adjustment.terrain_m):
+        record["terrain"] = terrain_record(bundle_adjustment.terrain_m)
     return record
 
 
-def sensors_record(found: Orientation, joint: JointAdjustment) -> dict[str, Any]:
+def sensors_record(orientation: Orientation, bundle_adjustment: BundleAdjustment) -> dict[str, Any]:
     """Residuals of all images of a kind of sensor."""
-    adjusted, record = joint.adjusted, {}
-    kinds = np.array([view.sensor for view in found.views])
+    adjustment, record = bundle_adjustment.adjustment, {}
+    kinds = np.array([view.sensor for view in orientation.views])
     for kind in np.unique(kinds):
-        mine = kinds[adjusted.seen.view] == kind
+        mine = kinds[adjustment.observations.view] == kind
         record[str(kind)] = {
             "n_views": int((kinds == kind).sum()),
             "n_ties": int(mine.sum()),
-            "residual_before_px": Residuals.of(adjusted.before_px[mine]).as_dict(),
-            "residual_after_px": Residuals.of(adjusted.after_px[mine]).as_dict(),
+            "residual_before_px": Residuals.of(adjustment.before_px[mine]).as_dict(),
+            "residual_after_px": Residuals.of(adjustment.after_px[mine]).as_dict(),
         }
     return record
 
 
-def corrections_record(joint: JointAdjustment, names: list[str]) -> list[dict[str, Any]]:
+def corrections_record(bundle_adjustment: BundleAdjustment, names: list[str]) -> list[dict[str, Any]]:
     """What was added to the parameters of each block, with standard deviations after and before."""
     record, first = [], 0
-    for block in joint.blocks:
-        part = slice(first, first + len(block))
-        first += len(block)
-        held = joint.solution.is_held[part]
+    for group in bundle_adjustment.groups:
+        part = slice(first, first + len(group))
+        first += len(group)
+        held = bundle_adjustment.solution.is_held[part]
         values = (
-            joint.solution.parameters[part] * block.sigma,
-            np.where(held, np.nan, joint.solution.parameter_sigma[part]) * block.sigma,
-            block.sigma,
+            bundle_adjustment.solution.parameters[part] * group.sigma,
+            np.where(held, np.nan, bundle_adjustment.solution.parameter_sigma[part]) * group.sigma,
+            group.sigma,
         )
-        added, after, before = (described(block, value) for value in values)
+        added, after, before = (described(group, value) for value in values)
         record.append(
             {
-                "kind": block.kind,
-                "views": [names[i] for i in block.views],
+                "kind": group.kind,
+                "views": [names[i] for i in group.views],
                 "added": added,
                 "sigma_after": after,
                 "sigma_before": before,
@@ -78,22 +78,22 @@ def corrections_record(joint: JointAdjustment, names: list[str]) -> list[dict[st
     return record
 
 
-def described(block: Block, values: FloatArray) -> dict[str, float | None]:
+def described(group: ParameterGroup, values: FloatArray) -> dict[str, float | None]:
     """Values (k,) of a block by name, rounded."""
-    return {name: rounded(value) for name, value in block.described(values).items()}
+    return {name: rounded(value) for name, value in group.described(values).items()}
 
 
-def control_record(joint: JointAdjustment) -> dict[str, Any]:
+def control_record(bundle_adjustment: BundleAdjustment) -> dict[str, Any]:
     """Errors of control and check points: where the adjustment put them less where they are known to be."""
-    control, error = joint.control, joint.control_points - joint.control.xyz
+    control, error = bundle_adjustment.control, bundle_adjustment.control_points - bundle_adjustment.control.xyz
     points = {}
     for i, name in enumerate(control.names):
-        mine = control.seen.point == i
+        mine = control.observations.point == i
         points[name] = {
             "role": "check" if control.is_check[i] else "control",
             "n_images": int(mine.sum()),
             "error_m": [rounded(v) for v in error[i]],
-            "residual_px": Residuals.of(joint.control_residual[mine]).as_dict()["rms"],
+            "residual_px": Residuals.of(bundle_adjustment.control_residual[mine]).as_dict()["rms"],
         }
     summary = {}
     for role, wanted in (("control", ~control.is_check), ("check", control.is_check)):

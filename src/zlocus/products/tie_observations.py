@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.io.run_record import write_atomically
-from zlocus.orientation.orientation import MeasuredTies
+from zlocus.orientation.orientation import RefinedTies
 
 OBSERVATIONS = "observations.npz"
 
 
-def write_observations(folder: Path, ties: MeasuredTies) -> None:
+def write_observations(folder: Path, ties: RefinedTies) -> None:
     """Write the observations of a run into its folder.
 
     Raises
@@ -28,10 +28,10 @@ def write_observations(folder: Path, ties: MeasuredTies) -> None:
     write_atomically(folder / OBSERVATIONS, lambda part: part.write_bytes(content.getbuffer()))
 
 
-def read_observations(folder: Path, n_views: int) -> MeasuredTies | None:
+def read_observations(folder: Path, n_views: int) -> RefinedTies | None:
     """What `write_observations` wrote of a scene with so many views; None where it is missing or damaged."""
     try:
         with np.load(folder / OBSERVATIONS, allow_pickle=False) as file:
-            return MeasuredTies.of(dict(file), n_views)
+            return RefinedTies.of(dict(file), n_views)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
         return None

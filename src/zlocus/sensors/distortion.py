@@ -15,7 +15,7 @@ import numpy as np
 from zlocus.core.sensor_model import FloatArray
 
 WIDEST_DEG = 89.5
-LEAST_SLOPE = 0.01
+MIN_SLOPE = 0.01
 N_NODES = 4096
 MAX_ITERATIONS = 50
 CONVERGED = 1e-14
@@ -51,8 +51,8 @@ class _Disc:
 
 
 def _disc(inside: FloatArray, outside: FloatArray, least_slope: FloatArray) -> _Disc:
-    """The part from the axis on in which the least slope in any direction stays above `LEAST_SLOPE`."""
-    usable = (least_slope > LEAST_SLOPE) & (np.diff(outside, prepend=-1.0) > 0)
+    """The part from the axis on in which the least slope in any direction stays above `MIN_SLOPE`."""
+    usable = (least_slope > MIN_SLOPE) & (np.diff(outside, prepend=-1.0) > 0)
     n = len(usable) if usable.all() else int(np.argmin(usable))
     return _Disc(inside[: max(n, 1)], outside[: max(n, 1)])
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.rotation import from_vectors
 
-LEAST_SAMPLES = 4
+MIN_SAMPLES = 4
 # Beyond an end, the mean motion of its last `MEAN_SECONDS` goes on; the turning eases off within `EASE_SECONDS`.
 MEAN_SECONDS = 0.25
 EASE_SECONDS = 6.0
@@ -38,7 +38,7 @@ class Trajectory:
         # SciPy's interpolation costs 0.2 s to import, and only line scanners need it.
         from scipy.interpolate import CubicSpline
 
-        assert len(self.times) >= LEAST_SAMPLES, "a cubic spline needs four samples"
+        assert len(self.times) >= MIN_SAMPLES, "a cubic spline needs four samples"
         before, first_velocity = self._run_on(0, -1)
         after, last_velocity = self._run_on(-1, 1)
         own = np.column_stack([self.times, self.rotations.reshape(-1, 9), self.centres])

@@ -543,12 +543,12 @@ def test_a_camera_that_does_not_agree_with_itself(first_column, share):
     assert any("cannot map 40 %" in sentence for sentence in told) == (share > 0)
 
 
-def oriented_as(views, left_out=(), doubts=()):
+def oriented_as(views, excluded=(), doubts=()):
     """An orientation without tie points that says this of its views."""
     nothing = np.empty(0)
     seen = Observations(nothing.astype(int), nothing.astype(int), np.empty((0, 2)))
     return Orientation(
-        views, (), np.empty((0, 3)), nothing, seen, "shift", 0, (0.0, 1.0), 0, left_out=left_out, doubts=doubts
+        views, (), np.empty((0, 3)), nothing, seen, "shift", 0, (0.0, 1.0), 0, excluded_images=excluded, doubts=doubts
     )
 
 

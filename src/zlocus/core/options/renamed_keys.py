@@ -47,4 +47,9 @@ RENAMED_KEYS: dict[str, str] = {
     "semiglobal.p1_two": "semiglobal.p1_two_images",
     "semiglobal.level_easing": "semiglobal.penalty_factor_per_level",
     "semiglobal.edge_contrast_two": "semiglobal.edge_contrast_two_images",
+    "orientation.joint": "orientation.bundle_adjustment",
+    "orientation.joint.rpc": "orientation.bundle_adjustment.rpc_correction",
+    "orientation.joint.drift_s": "orientation.bundle_adjustment.drift_knot_interval_s",
+    "orientation.least_ncc": "orientation.min_ncc",
+    "orientation.prior_px": "orientation.sigma_shift_px",
 }

@@ -67,7 +67,7 @@ def run_plan(
     found = ties.orientation
     bounds = area_to_match(scene, z_range, found.xyz[supported(found.xyz, found.sigma_z_m)])
     grid = grid_from_bounds(bounds, cell, scene.crs)
-    settled = build_match_scene(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.measured)
+    settled = build_match_scene(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.refined_xyz)
     matched = grid.window.within(settled.overlap_window)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")

@@ -88,11 +88,11 @@ def tie_findings(
 ) -> list[Finding]:
     """What the ties let expect, in sentences."""
     findings = []
-    left_out = {each.name: each.reason for each in found.left_out}
+    excluded = {each.name: each.reason for each in found.excluded_images}
     for view in found.views:
         moved = max(map(abs, view.shift_px))
-        if view.name in left_out:
-            sentence = f"it takes no part: {left_out[view.name]}"
+        if view.name in excluded:
+            sentence = f"it takes no part: {excluded[view.name]}"
         elif view.n_ties < FEW_TIES:
             sentence = f"only {view.n_ties} tie points hold its camera. Its correction may be off."
         elif NEAR_LIMIT * options.max_pointing_px < moved <= options.max_pointing_px:
@@ -103,13 +103,13 @@ def tie_findings(
         else:
             continue
         findings.append(poor(view.name, sentence))
-    if len(found.views) - len(left_out) < MIN_VIEWS:
+    if len(found.views) - len(excluded) < MIN_VIEWS:
         findings.append(Finding(STOPS, "No two images are held together by tie points: a run will match nothing."))
     findings += [Finding(STOPS if doubt.is_grave else POOR, doubt.sentence) for doubt in found.doubts]
     tied = {frozenset(pair.views) for pair in found.pairs}
     for pair in pairs:
         a, b = (names[i] for i in pair.views)
-        if pair.overlap > EXPECTED_OVERLAP and frozenset((a, b)) not in tied and not {a, b} & left_out.keys():
+        if pair.overlap > EXPECTED_OVERLAP and frozenset((a, b)) not in tied and not {a, b} & excluded.keys():
             findings.append(
                 Finding(
                     POOR,

@@ -92,7 +92,7 @@ def tiny_scene() -> MatchScene:
     views = tuple(View(f"v{i}", Path(f"v{i}"), Noise(i), SlantedCamera(0.5 * i)) for i in range(2))
     return MatchScene(
         views=views, anchor=(0.0, 0.0), cell_m=1.0, origin_m=0.0, step_m=1.0, n_steps=16, levels=2,
-        overlap_window=CellWindow(0, 0, SIDE, SIDE), grey=(GreyScale(0.0, 1.0),) * 2, ties=np.zeros((0, 3)),
+        overlap_window=CellWindow(0, 0, SIDE, SIDE), grey_scales=(GreyScale(0.0, 1.0),) * 2, ties=np.zeros((0, 3)),
     )  # fmt: skip
 
 
@@ -132,7 +132,7 @@ def warm(group: str) -> None:
         without = replace(config, refine=replace(config.refine, rounds=0))
         tile.match_tile(scene, scene.overlap_window, without)
         return
-    pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey[0]) for view in scene.views]
+    pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey_scales[0]) for view in scene.views]
     shape, block = (SIDE, SIDE), config.pyramid.block
     views = tile_views(pixels, 0, scene.transform(scene.overlap_window, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
     for view in pixels:

@@ -129,9 +129,9 @@ def pair_matrix(
         cells[i][j] = Cell(number(overlap["base_to_height"]), title=says)
     for pair in pairs:
         i, j = sorted(place[name] for name in pair["views"])
-        before, after = (number(pair[f"across_{when}_px"], "px", 3) for when in ("before", "after"))
+        before, after = (number(pair[f"epipolar_distance_{when}_px"], "px", 3) for when in ("before", "after"))
         says = f"{names[i]} and {names[j]}: {pair['n_ties']} ties, off by {before} before and {after} after"
-        cells[j][i] = Cell(number(pair["across_after_px"], "", 3), title=says)
+        cells[j][i] = Cell(number(pair["epipolar_distance_after_px"], "", 3), title=says)
     return Matrix(tuple(names), tuple(tuple(row) for row in cells))
 
 
