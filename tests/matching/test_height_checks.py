@@ -11,7 +11,7 @@ from zlocus.matching.quality import Quality
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.subpixel import RefinedHeights
 
-OPTIONS = CheckOptions(least_ncc=0.2, doubtful_ncc=0.5, rival_cost=64)
+OPTIONS = CheckOptions(min_ncc=0.2, weak_ncc=0.5, min_uniqueness=64)
 AT = (3, 4)
 
 
@@ -55,7 +55,7 @@ def test_good_cells_have_no_reason():
     ("changed", "reason"),
     [
         ({"covering": 1, "seeing": 1}, Quality.UNSEEN),
-        ({"seeing": 1}, Quality.HIDDEN),
+        ({"seeing": 1}, Quality.OCCLUDED),
         ({"best": 0}, Quality.RANGE_END),
         ({"best": 99}, Quality.RANGE_END),
         ({"best": 110}, Quality.RANGE_END),

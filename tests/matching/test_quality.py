@@ -13,7 +13,7 @@ def test_bits_are_distinct_and_fit_the_raster():
 
 def test_which_reasons_empty_a_cell():
     empties = {reason for reason in Quality if is_empty(np.array([reason], np.uint16))[0]}
-    assert empties == {Quality.OUTSIDE, Quality.UNSEEN, Quality.HIDDEN, Quality.RANGE_END, Quality.NO_MATCH,
-                       Quality.FAILED, Quality.UNCONFIRMED, Quality.IMPRECISE}  # fmt: skip
+    assert empties == {Quality.OUTSIDE, Quality.UNSEEN, Quality.OCCLUDED, Quality.RANGE_END, Quality.NO_MATCH,
+                       Quality.FAILED, Quality.INCONSISTENT, Quality.IMPRECISE}  # fmt: skip
     filled = np.array([EMPTY | Quality.FILLED, Quality.WEAK, 0, EMPTY | Quality.WEAK], np.uint16)
     np.testing.assert_array_equal(is_empty(filled), [False, False, False, True])

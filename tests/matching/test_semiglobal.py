@@ -12,13 +12,13 @@ from kernel_scene import even_lattice
 from reference.semiglobal import BEHIND
 from zlocus.core.options import SemiGlobalOptions
 from zlocus.matching.local_contrast import edge_unit
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, alone, penalties
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties, winner_takes_all_heights
 
-OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, level_easing=0.5)
+OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, penalty_factor_per_level=0.5)
 
 
 def test_without_an_ortho_image_penalties_are_even():
-    p2 = penalties(None, (5, 7), 0, OPTIONS)
+    p2 = jump_penalties(None, (5, 7), 0, OPTIONS)
     assert p2.dtype == np.uint16
     assert p2.shape == (4, 5, 7)
     assert (p2 == 240).all()
@@ -26,7 +26,7 @@ def test_without_an_ortho_image_penalties_are_even():
 
 def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
     ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
-    p2 = penalties(ortho, (12, 15), 0, OPTIONS)
+    p2 = jump_penalties(ortho, (12, 15), 0, OPTIONS)
     unit = 2.0 * edge_unit(ortho)
     for path, (dr, dc) in enumerate(BEHIND):
         for r in range(1, 11):
@@ -40,14 +40,14 @@ def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
 @pytest.mark.parametrize("shape", [(9, 14), (1, 6), (5, 1), (1, 1)])
 def test_penalties_of_all_cells(shape):
     """At the border too, where the image goes on as it ends; to a rounding of P2."""
-    rng, options = np.random.default_rng(3), replace(OPTIONS, edge_contrast_two=6.0)
-    ortho, by_two = rng.normal(size=shape).astype(np.float32), rng.random(shape) < 0.5
+    rng, options = np.random.default_rng(3), replace(OPTIONS, edge_contrast_two_images=6.0)
+    ortho, has_two_views = rng.normal(size=shape).astype(np.float32), rng.random(shape) < 0.5
     ortho[rng.random(shape) < 0.1] = np.nan
-    found, unit = penalties(ortho, shape, 0, options, by_two), max(edge_unit(ortho), 1e-6)
+    found, unit = jump_penalties(ortho, shape, 0, options, has_two_views), max(edge_unit(ortho), 1e-6)
     for path, (dr, dc) in enumerate(BEHIND):
         for r, c in np.ndindex(shape):
             away = abs(ortho[r, c] - ortho[max(r + dr, 0), min(max(c + dc, 0), shape[1] - 1)])
-            contrast = options.edge_contrast_two if by_two[r, c] else options.edge_contrast
+            contrast = options.edge_contrast_two_images if has_two_views[r, c] else options.edge_contrast
             plain = 240 / (1 + (0 if np.isnan(away) else away) / (contrast * unit))
             assert abs(found[path, r, c] - max(plain, 60)) <= 1, (path, r, c)
 
@@ -55,30 +55,30 @@ def test_penalties_of_all_cells(shape):
 def test_a_strong_edge_is_cheap_to_cross_only_where_it_is():
     ortho = np.zeros((8, 12), np.float32) + np.random.default_rng(1).normal(0, 0.01, (8, 12)).astype(np.float32)
     ortho[:, 6:] += 5
-    p2 = penalties(ortho, (8, 12), 0, OPTIONS)
+    p2 = jump_penalties(ortho, (8, 12), 0, OPTIONS)
     assert (p2[0, :, 6] == 60).all()
     assert (p2[2, 1:, 6] > 60).all()
 
 
 def test_a_penalty_of_edges_above_p2_does_not_raise_it():
     ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
-    assert penalties(ortho, (6, 6), 0, SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
+    assert jump_penalties(ortho, (6, 6), 0, SemiGlobalOptions(p2=50, p2_edge=400)).max() <= 50
 
 
 def test_edges_count_less_where_two_views_see_a_cell():
     ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
-    options, by_two = replace(OPTIONS, edge_contrast_two=6.0), np.zeros((9, 10), bool)
-    by_two[:, 5:] = True
-    p2 = penalties(ortho, (9, 10), 0, options, by_two)
-    few, many = (penalties(ortho, (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (6.0, 2.0))
-    np.testing.assert_array_equal(p2, np.where(by_two, few, many))
+    options, has_two_views = replace(OPTIONS, edge_contrast_two_images=6.0), np.zeros((9, 10), bool)
+    has_two_views[:, 5:] = True
+    p2 = jump_penalties(ortho, (9, 10), 0, options, has_two_views)
+    few, many = (jump_penalties(ortho, (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (6.0, 2.0))
+    np.testing.assert_array_equal(p2, np.where(has_two_views, few, many))
     assert (few[few > 60] > many[few > 60]).mean() > 0.9
 
 
 def test_no_edge_counts_where_nothing_is_shown():
     ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
     ortho[:, 6:] = np.nan
-    p2 = penalties(ortho, (9, 10), 0, OPTIONS)
+    p2 = jump_penalties(ortho, (9, 10), 0, OPTIONS)
     assert (p2[:, :, 6:] == 240).all()
     assert (p2[:, 1:-1, 1:5] < 240).all()
 
@@ -88,9 +88,9 @@ def test_penalties_ease_from_level_to_level(level):
     """Those of even ground and those of edges alike."""
     ortho = gaussian_filter(np.random.default_rng(0).normal(size=(12, 15)), 1).astype(np.float32)
     ortho[:, 6:] += 5
-    even, finest = penalties(None, (12, 15), level, OPTIONS), penalties(ortho, (12, 15), 0, OPTIONS)
+    even, finest = jump_penalties(None, (12, 15), level, OPTIONS), jump_penalties(ortho, (12, 15), 0, OPTIONS)
     assert (even == 240 // 2**level).all()
-    eased = penalties(ortho, (12, 15), level, OPTIONS)
+    eased = jump_penalties(ortho, (12, 15), level, OPTIONS)
     assert (finest == 60).any()
     assert (eased[finest == 60] == 60 // 2**level).all()
     assert np.abs(eased - finest / 2**level).max() <= 1
@@ -98,8 +98,8 @@ def test_penalties_ease_from_level_to_level(level):
 
 def test_penalties_without_easing_are_the_same_at_every_level():
     ortho = np.random.default_rng(0).normal(size=(6, 6)).astype(np.float32)
-    kept = replace(OPTIONS, level_easing=1.0)
-    np.testing.assert_array_equal(penalties(ortho, (6, 6), 3, kept), penalties(ortho, (6, 6), 0, kept))
+    kept = replace(OPTIONS, penalty_factor_per_level=1.0)
+    np.testing.assert_array_equal(jump_penalties(ortho, (6, 6), 3, kept), jump_penalties(ortho, (6, 6), 0, kept))
 
 
 @pytest.mark.parametrize("predecessors", [1, 2])
@@ -108,9 +108,9 @@ def test_aggregation_joins_what_picking_alone_does_not(predecessors):
     rng = np.random.default_rng(3)
     cost = rng.integers(30, 90, (20, 24, 16)).astype(np.uint8)
     cost[..., 7] -= 25
-    p2 = penalties(None, lattice.shape, 0, OPTIONS)
+    p2 = jump_penalties(None, lattice.shape, 0, OPTIONS)
     joined = aggregate(cost.ravel(), lattice, p2, 1.0, replace(OPTIONS, predecessors=predecessors))
-    single = alone(cost.ravel(), lattice)
+    single = winner_takes_all_heights(cost.ravel(), lattice)
     assert (np.abs(joined.best - 7) <= 1).mean() > 0.97
     assert (np.abs(single.best - 7) <= 1).mean() < 0.9
     assert joined.vertex.dtype == np.float32
@@ -122,22 +122,22 @@ def test_cells_by_themselves_are_aggregation_without_penalties():
     lattice = even_lattice(16, (20, 24), 16)
     cost = np.random.default_rng(4).integers(0, 256, lattice.size).astype(np.uint8)
     free = aggregate(cost, lattice, np.zeros((4, *lattice.shape), np.uint16), 1.0, replace(OPTIONS, p1=0))
-    single = alone(cost, lattice)
-    for name in ("best", "second", "margin", "vertex"):
+    single = winner_takes_all_heights(cost, lattice)
+    for name in ("best", "second", "uniqueness", "vertex"):
         np.testing.assert_array_equal(getattr(single, name), getattr(free, name))
-    assert 0 < np.median(single.margin) < 65535
+    assert 0 < np.median(single.uniqueness) < 65535
 
 
 def test_one_and_two_predecessors_give_margins_of_the_same_size():
     """The chosen kernel is the one that the option names: the sums differ, their size does not."""
     lattice = even_lattice(16, (20, 24), 16)
     cost = np.random.default_rng(3).integers(30, 90, lattice.size).astype(np.uint8)
-    p2 = penalties(None, lattice.shape, 0, OPTIONS)
-    one, two = (aggregate(cost, lattice, p2, 1.0, replace(OPTIONS, predecessors=n)).margin for n in (1, 2))
+    p2 = jump_penalties(None, lattice.shape, 0, OPTIONS)
+    one, two = (aggregate(cost, lattice, p2, 1.0, replace(OPTIONS, predecessors=n)).uniqueness for n in (1, 2))
     assert (one != two).any()
     assert np.median(two) == pytest.approx(np.median(one), rel=0.5)
     for step_cells, expected in ((2.0, two), (2.1, one)):
-        unset = aggregate(cost, lattice, p2, step_cells, OPTIONS).margin
+        unset = aggregate(cost, lattice, p2, step_cells, OPTIONS).uniqueness
         np.testing.assert_array_equal(unset, expected, err_msg=f"steps of {step_cells} cells")
 
 
@@ -145,9 +145,9 @@ def test_heights_above_a_base_surface():
     """Indices along the base become indices of the lattice: whole ones to half a step, the vertex exactly."""
     base = np.linspace(-7.3, 12.9, 12, dtype=np.float32).reshape(3, 4)
     best, second = np.arange(12, dtype=np.int32).reshape(3, 4), np.full((3, 4), -3, np.int32)
-    margin, vertex = np.arange(12, dtype=np.uint16).reshape(3, 4), (best + 0.25).astype(np.float32)
-    moved = SemiGlobalHeights(best, second, margin, vertex).above(base)
-    np.testing.assert_array_equal(moved.margin, margin)
+    uniqueness, vertex = np.arange(12, dtype=np.uint16).reshape(3, 4), (best + 0.25).astype(np.float32)
+    moved = SemiGlobalHeights(best, second, uniqueness, vertex).on_lattice(base)
+    np.testing.assert_array_equal(moved.uniqueness, uniqueness)
     np.testing.assert_allclose(moved.vertex, vertex + base, rtol=0, atol=1e-6)
     assert moved.vertex.dtype == np.float32
     for found, plain in ((moved.best, best), (moved.second, second)):
@@ -157,13 +157,13 @@ def test_heights_above_a_base_surface():
 
 @pytest.mark.parametrize("predecessors", [1, 2])
 def test_a_pair_has_a_penalty_of_its_own(predecessors):
-    """Of two images, `p1_two` takes the place of `p1`."""
+    """Of two images, `p1_two_images` takes the place of `p1`."""
     lattice, rng = even_lattice(6, (9, 11), 8), np.random.default_rng(4)
     cost = rng.integers(0, 129, lattice.size).astype(np.uint8)
-    p2 = penalties(None, (9, 11), 0, OPTIONS)
-    options = replace(OPTIONS, predecessors=predecessors, p1_two=90)
-    of_two, of_three = (aggregate(cost, lattice, p2, 1.0, options, by_two).margin for by_two in (True, False))
+    p2 = jump_penalties(None, (9, 11), 0, OPTIONS)
+    options = replace(OPTIONS, predecessors=predecessors, p1_two_images=90)
+    of_two, of_three = (aggregate(cost, lattice, p2, 1.0, options, is_pair).uniqueness for is_pair in (True, False))
     for found, p1 in ((of_two, 90), (of_three, 20)):
-        expected = aggregate(cost, lattice, p2, 1.0, replace(options, p1=p1)).margin
+        expected = aggregate(cost, lattice, p2, 1.0, replace(options, p1=p1)).uniqueness
         np.testing.assert_array_equal(found, expected)
     assert (of_two != of_three).any()

@@ -22,7 +22,7 @@ from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.match_scene import height_step, reference_first
 from zlocus.matching.occlusion import coverage
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, penalties
+from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import pixel_window, read_pixels, tile_views
 
@@ -237,5 +237,5 @@ def semiglobal(
     lattice = HeightLattice(
         0.0, 1.0, shape, max(shape), np.zeros((1, 1), np.int64), np.full((1, 1), cost.shape[2], np.int64)
     )
-    p2 = penalties(ortho, shape, 0, options)
+    p2 = jump_penalties(ortho, shape, 0, options)
     return aggregate(np.ascontiguousarray(counted).ravel(), lattice, p2, step_cells, options)

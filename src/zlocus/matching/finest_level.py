@@ -110,7 +110,7 @@ def ortho_of_surface(
     lattice_index = np.where(is_filled, of_filled, lattice_index)
     coarser = [CoarserHeights(r.level.number, r.level.window, r.heights.vertex) for r in reversed(coarser_results)]
     around = what_stands_around(coarser, finest.tile_views, finest.level.window, lattice_index, config.pyramid.halo)
-    scale = tile.match_scene.grey[0] if config.products.ortho_levels == "common" else None
+    scale = tile.match_scene.grey_scales[0] if config.products.ortho_levels == "common" else None
     coloured = tile.match_scene.coloured(tile.view_numbers)
     ortho = true_ortho(tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, around, scale)
     ortho[np.isnan(surface.height)] = np.nan

@@ -36,12 +36,12 @@ def judge(
         quality[where] |= np.uint16(reason)
 
     mark(n_covering < 2, Quality.UNSEEN)
-    mark((n_covering >= 2) & (n_seeing < 2), Quality.HIDDEN)
+    mark((n_covering >= 2) & (n_seeing < 2), Quality.OCCLUDED)
     seen = n_seeing >= 2
     mark(seen & ((heights.best <= 0) | (heights.best >= last_index)), Quality.RANGE_END)
-    mark(seen & (refined.ncc < options.least_ncc), Quality.NO_MATCH)
-    mark(seen & (refined.ncc < options.doubtful_ncc), Quality.WEAK)
-    mark(heights.margin < options.rival_cost, Quality.AMBIGUOUS)
+    mark(seen & (refined.ncc < options.min_ncc), Quality.NO_MATCH)
+    mark(seen & (refined.ncc < options.weak_ncc), Quality.WEAK)
+    mark(heights.uniqueness < options.min_uniqueness, Quality.AMBIGUOUS)
     mark(cv2.dilate(refined.height, AROUND) - cv2.erode(refined.height, AROUND) > JUMP_STEPS, Quality.JUMP)
     mark(~refined.is_refined, Quality.UNREFINED)
     mark(seen & (apart > options.disputed_steps), Quality.DISPUTED)

@@ -1,4 +1,4 @@
-"""Why a cell has, lacks or deserves less trust in its height."""
+"""Quality flags: the reasons why a cell has no height, or a doubtful one."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from numpy.typing import NDArray
 
 
 class Quality(IntFlag):
-    """Bits of `quality.tif`. The first eight empty a cell, the others only warn."""
+    """Bits of `quality.tif`. A cell with one of the first eight has no height; the others are warnings."""
 
-    OUTSIDE = 1  # not asked for: outside the area, or inside a mask
-    UNSEEN = 2  # fewer than two images cover the cell at the ground's height, or support a height above it
-    HIDDEN = 4  # fewer than two images see the surface there, the others are behind it
-    RANGE_END = 8  # best match at an end of the height range: the true height may lie beyond it
-    NO_MATCH = 16  # images do not agree at any height, or heights at the border are noise
-    FAILED = 32  # its tile could not be processed
-    UNCONFIRMED = 64  # no other image finds the same height when matched back (image space only)
-    IMPRECISE = 128  # its standard deviation is larger than asked for (checks.most_sigma_m)
-    WEAK = 256  # images agree poorly
+    OUTSIDE = 1  # outside the area that was asked for, or inside a mask
+    UNSEEN = 2  # fewer than two images cover the cell at the ground's height, or agree on a height above it
+    OCCLUDED = 4  # fewer than two images see the surface here; in the others it is occluded
+    RANGE_END = 8  # the best match is at an end of the height range; the true height may lie beyond it
+    NO_MATCH = 16  # the images do not agree at any height, or the heights at the edge of the overlap are noise
+    FAILED = 32  # the tile could not be processed
+    INCONSISTENT = 64  # the height failed the cross-consistency check with the other images (image space only)
+    IMPRECISE = 128  # the standard deviation of the height is larger than checks.max_sigma_m
+    WEAK = 256  # the images agree poorly
     AMBIGUOUS = 512  # another height fits nearly as well
     JUMP = 1024  # next to a jump in height
-    UNREFINED = 2048  # height to a fraction of a step only: sub-step refinement did not converge
-    FILLED = 4096  # no match: interpolated from its neighbours
-    DISPUTED = 8192  # two halves of the pairs of images find different heights around
-    LEFT_OUT = 16384  # an image that may show the cell took no part: it sees it too obliquely for the tables
-    PLANE = 32768  # too plain to be matched alone: height of a plane fitted to all of a plain segment
+    UNREFINED = 2048  # the sub-step refinement did not converge; the height is that of the semi-global constraint
+    FILLED = 4096  # no match; the height is interpolated from the neighbours
+    DISPUTED = 8192  # two groups of image pairs find different heights around the cell
+    IMAGE_EXCLUDED = 16384  # an image that may show the cell was not used: it sees the cell too obliquely
+    PLANE = 32768  # without texture of its own; the height is that of a plane fitted to the whole segment
 
 
 EMPTY = (
-    Quality.OUTSIDE | Quality.UNSEEN | Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
-    | Quality.UNCONFIRMED | Quality.IMPRECISE
+    Quality.OUTSIDE | Quality.UNSEEN | Quality.OCCLUDED | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
+    | Quality.INCONSISTENT | Quality.IMPRECISE
 )  # fmt: skip
 
 
 def is_empty(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Whether a cell has no height, from its reasons. quality : (r, c) uint16."""
+    """(r, c) bool: cells without a height, by their flags. A filled cell has one. quality : (r, c) uint16."""
     return np.asarray(((quality & EMPTY) != 0) & ((quality & Quality.FILLED) == 0))

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kernel_scene import even_lattice, ragged_lattice
-from reference.semiglobal import dense, more_global_sums
+from reference.semiglobal import dense, more_global_path_sums
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.mgm import sweep_quarter
-from zlocus.matching.semiglobal import more_global_sums as aggregated
-from zlocus.matching.semiglobal import pick
+from zlocus.matching.semiglobal import more_global_path_sums as aggregated
+from zlocus.matching.semiglobal import heights_of_sums
 
 
 def random_cost(lattice, seed=0, high=129):
@@ -26,7 +26,7 @@ def random_p2(shape, seed=0):
 
 
 def twin(cost, lattice, p1, p2):
-    return more_global_sums(dense(cost, lattice, np.inf), p1, p2)
+    return more_global_path_sums(dense(cost, lattice, np.inf), p1, p2)
 
 
 @pytest.mark.parametrize(
@@ -136,4 +136,4 @@ def test_false_minima_side_by_side_give_in():
     cost[..., 5] = 20
     cost[7, 5:10, 5], cost[7, 5:10, 11] = 30, 20
     p2 = np.full((4, 15, 15), 240, np.uint16)
-    assert (pick(aggregated(blocks(cost), lattice, p2, 20), lattice).best == 5).all()
+    assert (heights_of_sums(aggregated(blocks(cost), lattice, p2, 20), lattice).best == 5).all()

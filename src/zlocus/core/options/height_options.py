@@ -9,82 +9,89 @@ from zlocus.core.options.option_fields import Checked, option
 
 @dataclass(frozen=True)
 class RefineOptions(Checked):
-    """The last pass: sub-step heights from windows that follow the surface (method section 6)."""
+    """The last stage: sub-step heights from windows that follow the surface (method section 6)."""
 
     window: int | None = option(
         None,
-        "Side of the correlation window; unset: 9 where a height step is higher than two cells (narrow bases, noise "
-        "rules), else 7 (relief within the window rules).",
+        "Side of the correlation window. Unset: 9 where a height step is higher than two cells (narrow bases, where "
+        "noise prevails), else 7 (wide bases, where the relief within the window prevails).",
         choices=(3, 5, 7, 9, 11, 13),
         unit="cells",
     )
-    rounds: int = option(2, "Times the surface is smoothed and measured again.", low=0, high=10)
+    rounds: int = option(2, "Number of times that the surface is smoothed and refined again.", low=0, high=10)
     jump_steps: float = option(
-        2.0, "Height difference that smoothing does not bridge.", low=0.5, high=100.0, unit="steps"
+        2.0, "Height difference from which on the surface is not smoothed across.", low=0.5, high=100.0, unit="steps"
     )
-    reach_steps: float = option(
-        1.5, "A refined height stays this close to the semi-global one, else that is kept.", low=0.1, high=10.0,
-        unit="steps",
+    max_correction_steps: float = option(
+        1.5, "Largest difference between a refined height and the semi-global height. Beyond it the semi-global height "
+        "is kept.", low=0.1, high=10.0, unit="steps",
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class PlaneOptions(Checked):
-    """Planes in place of the heights of plain segments, such as roofs without texture (method section 6)."""
+    """Planes that replace the heights of plain segments, such as roofs without texture (method section 6)."""
 
     texture: float = option(
-        0.4, "Grey deviation below which a cell is plain, as a share of the tile's median; 0: no planes.",
+        0.4, "Grey deviation below which a cell is plain, as a share of the tile's median deviation. 0: no planes.",
         low=0.0, high=1.0,
     )  # fmt: skip
-    least_cells: int = option(60, "Cells of a plain segment, at least.", low=10, high=100000)
-    most_cells: int = option(20000, "Cells of a plain segment, at most.", low=10, high=1000000)
-    longest_cells: float = option(
-        160.0, "Longer side of a plain segment, at most: a street follows the ground.", low=4.0, high=1e4, unit="cells"
-    )
-    least_filled: float = option(
-        0.6, "Share of a rectangle of its extent that a plain segment fills, at least.", low=0.0, high=1.0
+    min_cells: int = option(60, "Smallest number of cells of a plain segment.", low=10, high=100000)
+    max_cells: int = option(20000, "Largest number of cells of a plain segment.", low=10, high=1000000)
+    max_length_cells: float = option(
+        160.0, "Longest side of a plain segment. Longer ones are streets, which follow the ground.",
+        low=4.0, high=1e4, unit="cells",
+    )  # fmt: skip
+    min_filled_share: float = option(
+        0.6, "Smallest share of its enclosing rectangle that a plain segment fills.", low=0.0, high=1.0
     )
     noise: float = option(
-        0.3, "Grey difference between views that says little, as a share of the tile's median deviation.",
+        0.3, "Grey difference between images that is noise, as a share of the tile's median deviation.",
         low=0.01, high=10.0,
     )  # fmt: skip
-    most_cost: float = option(
-        0.2, "A segment is plain, and a plane right, where views differ by less than this within, in noise squared.",
+    max_cost: float = option(
+        0.2, "A segment is plain, and a plane fits it, where the images differ by less than this within the segment. "
+        "In units of the noise squared.",
         low=0.0, high=10.0,
     )  # fmt: skip
     near_steps: float = option(
-        3.0, "A height confirms a plane that is nearer than this.", low=0.1, high=100.0, unit="steps"
+        3.0, "A matched height supports a plane that is closer than this.", low=0.1, high=100.0, unit="steps"
     )
-    least_near: float = option(
-        0.8, "Share of the cells that confirm a plane, at least; half of them where the views agree better on it.",
+    min_near_share: float = option(
+        0.8, "Smallest share of the cells that have to support a plane. Half of the cells are enough where the images "
+        "agree better on the plane than on the matched heights.",
         low=0.5, high=1.0,
     )  # fmt: skip
-    most_slope_steps: float = option(0.8, "Slope of a plane, at most, in steps per cell.", low=0.0, high=100.0)
+    max_slope_steps: float = option(
+        0.8, "Largest slope of a plane, in height steps per cell.", low=0.0, high=100.0, unit="steps per cell"
+    )
 
 
 @dataclass(frozen=True)
 class CheckOptions(Checked):
-    """When a cell stays empty, or is marked as doubtful."""
+    """Limits beyond which a cell has no height, or is marked as doubtful."""
 
-    least_ncc: float = option(
-        -0.2, "A cell is left empty below this mean NCC: less than plain roofs give, where noise decides.",
+    min_ncc: float = option(
+        -0.2, "A cell has no height below this mean NCC. Roofs without texture have a higher one; below it noise "
+        "decides.",
         low=-1.0, high=1.0,
     )  # fmt: skip
-    doubtful_ncc: float = option(0.3, "A cell is marked as weak below this mean NCC.", low=-1.0, high=1.0)
+    weak_ncc: float = option(0.3, "A cell is marked as WEAK below this mean NCC.", low=-1.0, high=1.0)
     disputed_steps: float = option(
-        1.0, "A cell is marked as disputed where the heights of two groups of pairs of images are farther apart around "
-        "it.", low=0.0, high=100.0, unit="steps",
+        1.0, "A cell is marked as DISPUTED where the heights of two groups of image pairs differ by more than this "
+        "around it.", low=0.0, high=100.0, unit="steps",
     )  # fmt: skip
-    rival_cost: int = option(
-        64, "A cell is marked as ambiguous when another height costs less than this more over the eight paths.",
+    min_uniqueness: int = option(
+        64, "A cell is marked as AMBIGUOUS when the path costs of another height, summed over the eight paths, are "
+        "larger by less than this.",
         low=0, high=10000,
     )  # fmt: skip
-    most_spread_steps: float = option(
-        8.0, "At the border of the ground that images share, a cell is left empty where the standard deviations of the "
-        "heights around it (geometric mean over 5 x 5 cells) are larger than this: such heights are noise.",
+    max_overlap_edge_sigma_steps: float = option(
+        8.0, "At the edge of the overlap of the images, a cell has no height where the standard deviations around it "
+        "(geometric mean over 5 x 5 cells) are larger than this: such heights are noise.",
         low=0.1, high=1e4, unit="steps",
     )  # fmt: skip
-    most_sigma_m: float | None = option(
-        None, "A cell of a surface is left empty where the standard deviation of its height is larger; unset: none is.",
+    max_sigma_m: float | None = option(
+        None, "A cell of the surface has no height where its standard deviation is larger. Unset: no limit.",
         low=1e-6, high=1e5, unit="m",
     )  # fmt: skip

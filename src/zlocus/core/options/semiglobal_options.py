@@ -9,30 +9,30 @@ from zlocus.core.options.option_fields import Checked, option
 
 @dataclass(frozen=True)
 class SemiGlobalOptions(Checked):
-    """Penalties of the semi-global constraint, in cost units: 64 is the cost of NCC 0 (method section 5)."""
+    """Penalties of the semi-global constraint, in units in which NCC 0 costs 64 (method section 5)."""
 
     predecessors: int | None = option(
-        None, "Neighbours that each of the eight paths draws on: 1 (semi-global) or 2 (more global, slower); unset: 1 "
-        "where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
+        None, "Neighbours on which each of the eight path costs depends: 1 (semi-global) or 2 (more global, slower). "
+        "Unset: 1 where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
-    p1: int = option(45, "Penalty of a neighbour one step away.", low=0, high=1000)
-    p1_two: int = option(
-        110, "The same in scenes of two images: one pair's curves are noisy.",
-        low=0, high=1000,
-    )  # fmt: skip
-    p2: int = option(400, "Penalty of a jump where the ortho-image is even.", low=1, high=4000)
-    p2_edge: int = option(45, "Penalty of a jump across a strong edge of the ortho-image.", low=1, high=4000)
-    level_easing: float = option(
-        0.85, "Penalties of jumps are eased by this at every coarser level, where a roof has fewer cells.",
+    p1: int = option(45, "Penalty P1 of a height difference of one step between neighbours.", low=0, high=1000)
+    p1_two_images: int = option(
+        110, "Penalty P1 in scenes of two images: the match curves of a single pair are noisy.", low=0, high=1000
+    )
+    p2: int = option(
+        400, "Penalty P2 of a larger height difference where the ortho-image has no edge.", low=1, high=4000
+    )
+    p2_edge: int = option(45, "Penalty P2 across a strong edge of the ortho-image.", low=1, high=4000)
+    penalty_factor_per_level: float = option(
+        0.85, "Factor by which P2 decreases from each pyramid level to the next coarser one, where a roof has fewer "
+        "cells.",
         low=0.1, high=1.0,
     )  # fmt: skip
     edge_contrast: float = option(
-        1.0, "Grey difference that halves the penalty of a jump, in median differences of the tile.",
+        1.0, "Grey difference in the ortho-image that halves P2. In units of the tile's median grey difference.",
         low=0.01, high=1e3,
     )  # fmt: skip
-    edge_contrast_two: float = option(
-        4.0,
-        "The same where only two views see a cell: one pair is alike by chance at many heights.",
-        low=0.01,
-        high=1e3,
-    )
+    edge_contrast_two_images: float = option(
+        4.0, "The same in cells that only two images cover: a single pair agrees by chance at many heights.",
+        low=0.01, high=1e3,
+    )  # fmt: skip

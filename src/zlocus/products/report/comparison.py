@@ -63,7 +63,7 @@ def _sentence(note: str) -> str:
 
 def _histogram(evaluation: Evaluation) -> maps.Picture:
     figure = histogram_figure(evaluation, HISTOGRAM_INCHES)
-    figures = evaluation.all
+    figures = evaluation.statistics
     alt = (
         f"Histogram of the errors about their median {words.number(figures.median, 'm', 3)}, "
         f"NMAD {words.number(figures.nmad, 'm', 3)}."
@@ -79,7 +79,7 @@ def _error_map(evaluation: Evaluation) -> tuple[maps.Picture, maps.Scale]:
 
 def full_colour_m(evaluation: Evaluation) -> float:
     """Size of an error from which a map's colours are full, m."""
-    nmad = np.nan_to_num(evaluation.all.nmad)
+    nmad = np.nan_to_num(evaluation.statistics.nmad)
     return float(f"{max(evaluation.threshold_m, FULL_AT_NMAD * nmad):.1g}")
 
 

@@ -15,7 +15,7 @@ TYPICAL, DOUBTFUL, FAILED = "typical", "doubtful", "failed"
 QUARTILES = {25: "the lower quartile", 50: "the median", 75: "the upper quartile"}
 # Warnings that say something of the match itself, and reasons for no height that have curves.
 WARNINGS = (Quality.WEAK, Quality.AMBIGUOUS, Quality.DISPUTED)
-FAILURES = (Quality.NO_MATCH, Quality.RANGE_END, Quality.HIDDEN, Quality.UNCONFIRMED, Quality.IMPRECISE)
+FAILURES = (Quality.NO_MATCH, Quality.RANGE_END, Quality.OCCLUDED, Quality.INCONSISTENT, Quality.IMPRECISE)
 MOST_WARNINGS, MOST_FAILURES = 2, 3
 MOST_PATCHES = 4
 RULE = (

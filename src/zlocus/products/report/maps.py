@@ -37,13 +37,13 @@ GROUPS: tuple[tuple[str, Quality, tuple[int, int, int]], ...] = (
     ("filled from its neighbours (FILLED)", Quality.FILLED, (86, 180, 233)),
     ("no height: tile failed (FAILED)", Quality.FAILED, (90, 60, 20)),
     ("no height: end of the height range (RANGE_END)", Quality.RANGE_END, (213, 94, 0)),
-    ("no height: no agreement (NO_MATCH, UNCONFIRMED)", Quality.NO_MATCH | Quality.UNCONFIRMED, (0, 0, 0)),
-    ("no height: hidden (HIDDEN)", Quality.HIDDEN, (0, 114, 178)),
+    ("no height: no agreement (NO_MATCH, INCONSISTENT)", Quality.NO_MATCH | Quality.INCONSISTENT, (0, 0, 0)),
+    ("no height: occluded (OCCLUDED)", Quality.OCCLUDED, (0, 114, 178)),
     ("no height: not precise enough (IMPRECISE)", Quality.IMPRECISE, (120, 120, 120)),
     ("height to be checked: halves disagree (DISPUTED)", Quality.DISPUTED, (204, 121, 167)),
     ("height to be checked (WEAK, AMBIGUOUS)", Quality.WEAK | Quality.AMBIGUOUS, (230, 159, 0)),
     ("height of a fitted plane (PLANE)", Quality.PLANE, (0, 158, 115)),
-    ("height with another note (JUMP, UNREFINED, LEFT_OUT)", Quality(0xFFFF), (240, 228, 66)),
+    ("height with another note (JUMP, UNREFINED, IMAGE_EXCLUDED)", Quality(0xFFFF), (240, 228, 66)),
 )
 PLAIN = ("height without a warning", (225, 225, 225))
 

@@ -15,11 +15,12 @@ from pyproj import CRS, Transformer
 from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
+from zlocus.evaluation.comparison import Comparison
 from zlocus.io.run_record import read_record, write_atomically
 from zlocus.matching.quality import Quality
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
-from zlocus.products.report.comparison import Comparison, comparison_part
+from zlocus.products.report.comparison import comparison_part
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.report.sampling import Survey, survey
 

@@ -17,33 +17,33 @@ from zlocus.products.report.sampling import Survey
 
 # As docs/reference/quality.md has them; a test keeps them the same.
 MEANINGS = {
-    Quality.OUTSIDE: "not asked for: outside the area, or inside a mask",
-    Quality.UNSEEN: "fewer than two images cover the cell at the ground's height, or support a height above it",
-    Quality.HIDDEN: "fewer than two images see the surface there, the others are behind it",
-    Quality.RANGE_END: "best match at an end of the height range: the true height may lie beyond it",
-    Quality.NO_MATCH: "images do not agree at any height, or heights at the border are noise",
-    Quality.FAILED: "its tile could not be processed",
-    Quality.UNCONFIRMED: "no other image finds the same height when matched back (image space only)",
-    Quality.IMPRECISE: "its standard deviation is larger than asked for (checks.most_sigma_m)",
-    Quality.WEAK: "images agree poorly",
+    Quality.OUTSIDE: "outside the area that was asked for, or inside a mask",
+    Quality.UNSEEN: "fewer than two images cover the cell at the ground's height, or agree on a height above it",
+    Quality.OCCLUDED: "fewer than two images see the surface here; in the others it is occluded",
+    Quality.RANGE_END: "the best match is at an end of the height range; the true height may lie beyond it",
+    Quality.NO_MATCH: "the images do not agree at any height, or the heights at the edge of the overlap are noise",
+    Quality.FAILED: "the tile could not be processed",
+    Quality.INCONSISTENT: "the height failed the cross-consistency check with the other images (image space only)",
+    Quality.IMPRECISE: "the standard deviation of the height is larger than checks.max_sigma_m",
+    Quality.WEAK: "the images agree poorly",
     Quality.AMBIGUOUS: "another height fits nearly as well",
     Quality.JUMP: "next to a jump in height",
-    Quality.UNREFINED: "height to a fraction of a step only: sub-step refinement did not converge",
-    Quality.FILLED: "no match: interpolated from its neighbours",
-    Quality.DISPUTED: "two halves of the pairs of images find different heights around",
-    Quality.LEFT_OUT: "an image that may show the cell took no part: it sees it too obliquely for the tables",
-    Quality.PLANE: "too plain to be matched alone: height of a plane fitted to all of a plain segment",
+    Quality.UNREFINED: "the sub-step refinement did not converge; the height is that of the semi-global constraint",
+    Quality.FILLED: "no match; the height is interpolated from the neighbours",
+    Quality.DISPUTED: "two groups of image pairs find different heights around the cell",
+    Quality.IMAGE_EXCLUDED: "an image that may show the cell was not used: it sees the cell too obliquely",
+    Quality.PLANE: "without texture of its own; the height is that of a plane fitted to the whole segment",
 }
 # Why a cell has no height although its own match curve may have a high peak: see `zlocus.matching.height_checks`.
 DESPITE_PEAK = {
     Quality.NO_MATCH: "the surface lies where the heights around it allow, which need not be at this peak; there, in "
-    "windows that follow its slope, the mean correlation of all pairs of images that see it is below {least_ncc:g} "
-    "(checks.least_ncc)",
+    "windows that follow its slope, the mean correlation of all pairs of images that see it is below {min_ncc:g} "
+    "(checks.min_ncc)",
     Quality.RANGE_END: "with the heights around it taken into account the best height is the lowest or the highest of "
     "those searched ({low:.1f} to {high:.1f} m)",
-    Quality.HIDDEN: "the curve does not know what stands in the way: at the height that the surface has here fewer "
+    Quality.OCCLUDED: "the curve does not know what stands in the way: at the height that the surface has here fewer "
     "than two images see past what is around it",
-    Quality.UNCONFIRMED: "the curve is of one reference: the height found from an image was not found again from any "
+    Quality.INCONSISTENT: "the curve is of one reference: the height found from an image was not found again from any "
     "other",
     Quality.IMPRECISE: "a peak may be high and yet wide or in doubt: its standard deviation is larger than asked for",
 }
@@ -51,19 +51,20 @@ HIGH_PEAK = 0.5
 # What helps, where something does.
 ADVICE = {
     Quality.UNSEEN: "add images, or ask for a smaller area",
-    Quality.HIDDEN: "add images from other directions",
+    Quality.OCCLUDED: "add images from other directions",
     Quality.RANGE_END: "give a wider --heights",
     Quality.NO_MATCH: "usual on water, snow and other plain ground; --fill interpolate closes small gaps",
-    Quality.IMPRECISE: "add images at wider angles, or allow more in checks.most_sigma_m",
+    Quality.IMPRECISE: "add images at wider angles, or allow more in checks.max_sigma_m",
     Quality.WEAK: "usual on vegetation, water and snow; check before use",
     Quality.AMBIGUOUS: "usual on repeating patterns and plain ground; check before use",
     Quality.DISPUTED: "holds most of the gross errors in towns; check before use",
-    Quality.LEFT_OUT: "give --heights closer to those of the ground",
+    Quality.IMAGE_EXCLUDED: "give --heights closer to those of the ground",
 }
 STAGES = {
     "open": "opening images and cameras",
     "orient": "finding tie points and correcting the cameras",
-    "settle": "settling heights, grid and tiles",
+    "setup": "height range, grid and plan of tiles",
+    "cross-check": "heights compared between images",
     "match": "matching and writing the rasters",
     "points": "writing tie points and ranking",
     "curves": "footprints and match curves for this page",
@@ -173,7 +174,7 @@ def despite_peak(why: Quality, rho1: float | None, run: Mapping[str, Any]) -> st
     if rho1 is None or rho1 < HIGH_PEAK or why not in DESPITE_PEAK:
         return ""
     low, high = run["heights"]["range_m"]
-    text = DESPITE_PEAK[why].format(least_ncc=run["config"]["options"]["checks"]["least_ncc"], low=low, high=high)
+    text = DESPITE_PEAK[why].format(min_ncc=run["config"]["options"]["checks"]["min_ncc"], low=low, high=high)
     return f"No height in spite of the peak: {text}."
 
 
@@ -235,7 +236,7 @@ def what_is_doubtful(found: Survey) -> str:
 
 def against_reference(evaluation: Evaluation, reference: str) -> str:
     """How the surface compares with a reference, in a sentence."""
-    figures = evaluation.all
+    figures = evaluation.statistics
     moved = "" if evaluation.shift is None else ", once the shift between the two is removed"
     return (
         f"Against the reference {reference}{moved}: {percent(figures.completeness, 1)} of its cells have a height, "
