@@ -41,7 +41,7 @@ from zlocus.inspector.serving import checked_address, fragment_of, listening
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.match_curve_figures import PointReport, point_record
-from zlocus.products.report.comparison import Comparison
+from zlocus.evaluation.comparison import Comparison
 from zlocus.products.report.maps import GROUPS, groups_of
 from zlocus.products.tie_observations import OBSERVATIONS
 
@@ -99,7 +99,7 @@ def report_of(scene, folder, row, col, config: RunConfig, reference=None, views=
     if views is not None:
         kept = [i for i, view in enumerate(settled.views) if view.name in views]
         settled = replace(
-            settled, views=tuple(settled.views[i] for i in kept), grey=tuple(settled.grey[i] for i in kept)
+            settled, views=tuple(settled.views[i] for i in kept), grey_scales=tuple(settled.grey_scales[i] for i in kept)
         )
     looked = curves_at("the cell", reference, settled, place, config, SHOWN_WITHIN_CELLS)
     return PointReport.of("the cell", looked, settled, scene.matched.scene.crs)
@@ -304,7 +304,7 @@ def test_the_reference_is_moved_as_the_surface_is(out, tmp_path):
         moved = file.transform.translation(-SHIFT_M[0], -SHIFT_M[1]) * file.transform
     reference = written(out, tmp_path / "moved.tif", lambda z: z - SHIFT_M[2], transform=moved)
     comparison = Comparison(reference, coregister="nuth-kaab", margin_m=0.0)
-    shift = evaluate(out / "dsm.tif", **vars(comparison)).shift
+    shift = evaluate(out / "dsm.tif", comparison).shift
     np.testing.assert_allclose(shift.enu_m, SHIFT_M, atol=0.1)
     with Inspection(out, comparison) as inspection:
         opened(inspection)

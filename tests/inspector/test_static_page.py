@@ -19,7 +19,7 @@ from zlocus.inspector.restored_run import restored
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.match_curve_figures import PointReport
-from zlocus.products.report.comparison import Comparison
+from zlocus.evaluation.comparison import Comparison
 
 LAYERS = ["hillshade", "ortho", "height", "sigma", "views", "quality", "difference"]
 DESK, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
@@ -151,7 +151,7 @@ def shown_table(page) -> dict[str, dict[str, str]]:
 
 def agrees(table, report: PointReport) -> None:
     """The numbers shown are the library's, rounded."""
-    single, mean = report.curves.single, report.curves.mean
+    single, mean = report.curves.single_curves, report.curves.mean_curves
     for j, name in enumerate(report.search):
         row = table[name]
         assert number(row["label"]) == single.labels[j]
@@ -220,7 +220,7 @@ def test_the_slider_moves_all_that_shows_a_height(page, inspected, out):
     assert float(page.locator(line).get_attribute("x1")) > at
     assert page.eval_on_selector_all("#loci-figure circle.looked-at", circles) != places
     said = page.locator("#windows-figure text.moving-value").nth(1).text_content()
-    assert said == f"{height:.2f} m: ρ {report.curves.single.values[0, middle + 9]:.2f}"
+    assert said == f"{height:.2f} m: ρ {report.curves.single_curves.values[0, middle + 9]:.2f}"
 
 
 def test_an_image_can_be_switched_off_and_on(page, inspected, out):

@@ -19,7 +19,7 @@ from zlocus.matching.match_scene import height_step, reference_first, levels_for
 from zlocus.core.footprints import shared_ground
 from zlocus.matching.radiometry import grey_scales
 from zlocus.synthetic.cameras import SatelliteCamera
-from zlocus.synthetic.scenes import ViewSpec, demo_spec, exposures, steady
+from zlocus.synthetic.scenes import ViewSpec, demo_spec, exposures_of, steady
 
 GREY = np.random.default_rng(0).normal(500, 40, (120, 160))
 
@@ -110,8 +110,8 @@ def test_a_settled_scene():
     assert match_scene.views[0].name == "n"
     assert match_scene.n_steps == np.ceil(60 / match_scene.step_m)
     assert match_scene.origin_m == 30.0
-    assert match_scene.grey == grey_scales(match_scene.views, ties)
-    assert match_scene.grey != grey_scales(match_scene.views, ties[:0])
+    assert match_scene.grey_scales == grey_scales(match_scene.views, ties)
+    assert match_scene.grey_scales != grey_scales(match_scene.views, ties[:0])
     transform = match_scene.transform(CellWindow(-4, 6, 3, 3), 2)
     assert transform * (0, 0) == (12.0, 8.0)
     assert transform.a == 2.0
@@ -122,7 +122,7 @@ def scanners(*looks):
     """Line scanners of steady flights, by their angles ahead and aside, degrees, over one place."""
     views = tuple(ViewSpec(str(number), *look) for number, look in enumerate(looks))
     spec = replace(steady(demo_spec()), views=views)
-    seen_by = exposures(spec)
+    seen_by = exposures_of(spec)
     return tuple(
         View(each.view.name, Path(each.view.name), image_of(np.zeros(each.shape)), line_scanner(each))
         for each in seen_by
@@ -142,9 +142,9 @@ def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
         steady(demo_spec()), views=tuple(ViewSpec(name, 2.0, side) for name, side in (("a", -15), ("b", 15)))
     )
     views = []
-    for each in exposures(spec):
+    for each in exposures_of(spec):
         camera = replace(each.sensor, centre=(3000.0, each.sensor.centre[1]))
-        wide = replace(each, camera=camera, shape=(each.shape[0], 6001))
+        wide = replace(each, sensor=camera, shape=(each.shape[0], 6001))
         image = image_of(np.zeros(wide.shape))
         views.append(View(each.view.name, Path(each.view.name), image, line_scanner(wide)))
     assert np.hypot(*(parallax_rate(views[0], 438.0) - parallax_rate(views[1], 438.0))) < 0.02

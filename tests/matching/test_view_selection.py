@@ -16,7 +16,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.match_curve import FAIR, GOOD, POOR, predicted_sigma
-from zlocus.matching.pair_labels import PairLabels, TiesOnGrid, label_pairs
+from zlocus.matching.pair_labels import PairLabels, GridTies, label_pairs
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.view_selection import (
     CoarserCurves,
@@ -89,7 +89,7 @@ WINDOW = CellWindow(0, 0, *SHAPE)
 
 
 def ranked(views, xy, index, slope=(0.0, 0.0), window=WINDOW, options=SHORT):
-    return label_pairs(views, window, TiesOnGrid(xy, index, np.tile(slope, (len(xy), 1))), SIDE, STEPS_PER_CELL, options)
+    return label_pairs(views, window, GridTies(xy, index, np.tile(slope, (len(xy), 1))), SIDE, STEPS_PER_CELL, options)
 
 
 # --- label_pairs ---
@@ -119,7 +119,7 @@ def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)
     index, flat = rng.uniform(5, 15, 50), np.zeros((50, 2))
-    found = label_pairs(views, window, TiesOnGrid(xy, index, flat), SIDE, STEPS_PER_CELL, SHORT)
+    found = label_pairs(views, window, GridTies(xy, index, flat), SIDE, STEPS_PER_CELL, SHORT)
     np.testing.assert_array_equal(found.labels, found.labels.swapaxes(1, 2))
     assert (np.diagonal(found.labels, axis1=1, axis2=2) == POOR).all()
     assert (found.labels == GOOD).mean() < 0.1

@@ -204,8 +204,8 @@ def test_the_match_ends_where_the_mean_is_good(worth, least, n_used, is_stopped)
     ncc = np.stack([np.maximum(bump(30, 0.85), bump(60, 0.8)), bump(30, 0.9), bump(50, 0.4)])
     options = replace(OPTIONS, max_sigma_steps=1000.0, min_images=least)
     found = point_curves(windows_of(ncc), order_of(3, worth), np.full(3, 0.5), np.arange(81.0), options)
-    assert found.single.labels.tolist() == [0, 1, -1]
-    assert found.mean.labels[:2].tolist() == [0, 1]
+    assert found.single_curves.labels.tolist() == [0, 1, -1]
+    assert found.mean_curves.labels[:2].tolist() == [0, 1]
     np.testing.assert_allclose(found.mean.values[2], ncc.mean(axis=0), atol=1e-6)
     assert (found.n_used, found.is_stopped) == (n_used, is_stopped)
     assert abs(found.peak_index - 30) < 0.2
@@ -215,7 +215,7 @@ def test_an_imprecise_peak_does_not_stop():
     ncc = np.stack([bump(30, 0.9), bump(30, 0.9)])
     options = replace(OPTIONS, max_sigma_steps=1e-3)
     found = point_curves(windows_of(ncc), order_of(2, [True] * 2), np.full(2, 0.5), np.arange(81.0), options)
-    assert (found.mean.labels == 1).all()
+    assert (found.mean_curves.labels == 1).all()
     assert not found.is_stopped
 
 

@@ -76,7 +76,7 @@ class WhatIf:
         if self.reference in self.left_out:
             raise ConfigError(f"{self.reference} is the reference, and switched off. Choose another reference.")
         kept = [i for i, name in enumerate(names) if name not in self.left_out]
-        return replace(match_scene, views=tuple(match_scene.views[i] for i in kept), grey=tuple(match_scene.grey[i] for i in kept))
+        return replace(match_scene, views=tuple(match_scene.views[i] for i in kept), grey_scales=tuple(match_scene.grey_scales[i] for i in kept))
 
 
 def cell_record(folder: SurfaceFolder, reference: Reference | None, row: int, col: int) -> dict[str, Any]:
@@ -125,8 +125,8 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     return {
         **point_record(report, options),
         "heights_m": report.heights_m.round(4).tolist(),
-        "ncc": curves.single.values.round(5).tolist(),
-        "sncc": curves.mean.values.round(5).tolist(),
+        "ncc": curves.single_curves.values.round(5).tolist(),
+        "sncc": curves.mean_curves.values.round(5).tolist(),
         "sigma_m": (curves.sigma_steps * report.step_m).tolist(),
         "says": {"order": what_order_rests_on(report, options), "stop": where_it_stops(report, options)},
         "images": images,

@@ -182,7 +182,7 @@ def build_image_match_scene(
         n_steps=n_steps,
         levels=levels,
         overlap_window=cells_of_bounds((-0.5, 0.5 - rows, cols - 0.5, 0.5), ANCHOR, 1.0, levels),
-        grey=grey_scales(views, ties if ground is None else ground),
+        grey_scales=grey_scales(views, ties if ground is None else ground),
         ties=ties,
     )
 

@@ -44,9 +44,9 @@ class MatchScene:
     views : oriented, the reference image (the most nadir one, or the one asked for) first; anchor : easting and
     northing of the north-west corner of cell (0, 0); cell_m : side of a finest cell; origin_m, step_m, n_steps :
     lattice of heights at the finest level; levels : of the pyramid; overlap_window : finest cells that two views may
-    cover; grey : grey scale of each image; ties : (n, 3) ground points, to which the search ranges of their cells
-    extend; dem_limits : (2, r, c) float32 m, lowest and highest height to search on the cells of `overlap_window` at
-    the coarsest level, NaN where the terrain model has no height; None without one.
+    cover; grey_scales : grey scale of each image; ties : (n, 3) ground points, to which the search ranges of their
+    cells extend; dem_limits : (2, r, c) float32 m, lowest and highest height to search on the cells of `overlap_window`
+    at the coarsest level, NaN where the terrain model has no height; None without one.
 
     Metres become pixels and disparities where the ground is a reference image (`zlocus.matching.image_space`).
     """
@@ -59,7 +59,7 @@ class MatchScene:
     n_steps: int
     levels: int
     overlap_window: CellWindow
-    grey: tuple[GreyScale, ...]
+    grey_scales: tuple[GreyScale, ...]
     ties: NDArray[np.float64] = field(repr=False)
     dem_limits: NDArray[np.float32] | None = field(default=None, repr=False)
 
@@ -279,6 +279,6 @@ def build_match_scene(
         n_steps=n_steps,
         levels=levels,
         overlap_window=cells_of_bounds(shared_ground(scene, z_range), anchor, cell_m, levels),
-        grey=grey_scales(views, ties if ground is None else ground),
+        grey_scales=grey_scales(views, ties if ground is None else ground),
         ties=ties,
     )

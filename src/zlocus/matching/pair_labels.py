@@ -55,7 +55,7 @@ class TileLabels:
     view_numbers: Sequence[int]
 
 
-class TiesOnGrid(NamedTuple):
+class GridTies(NamedTuple):
     """Tie points on the finest level's cells.
 
     xy : (n, 2) float64, column and row; lattice_index : (n,) float64, height; slope : (n, 2) float64, of the ground
@@ -67,7 +67,7 @@ class TiesOnGrid(NamedTuple):
     slope: FloatArray
 
     @classmethod
-    def of(cls, match_scene: MatchScene, slope: FloatArray | None = None) -> TiesOnGrid:
+    def of(cls, match_scene: MatchScene, slope: FloatArray | None = None) -> GridTies:
         """All tie points of a scene, by default on level ground."""
         ties = match_scene.ties
         xy = (ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
@@ -88,7 +88,7 @@ def label_pairs_at_ties(tile: TileInputs, coarsest_result: LevelResult | None) -
     """
     match_scene, config = tile.match_scene, tile.config
     window = tile.core_window.at_level(0, math.ceil(config.selection.radius_px)).within(match_scene.overlap_window)
-    ties = TiesOnGrid.of(match_scene)
+    ties = GridTies.of(match_scene)
     if coarsest_result is not None:
         ties = ties._replace(slope=slope_at(coarsest_result, ties.xy, config))
     views = _views_around_ties(tile, window, ties)
@@ -108,7 +108,7 @@ def slope_at(result: LevelResult, xy: FloatArray, config: RunConfig) -> FloatArr
     return np.stack(by_axis, axis=1)
 
 
-def _views_around_ties(tile: TileInputs, window: CellWindow, ties: TiesOnGrid) -> TileViews:
+def _views_around_ties(tile: TileInputs, window: CellWindow, ties: GridTies) -> TileViews:
     """A tile's views over a window of finest cells, at all heights of match curves at the tie points in it."""
     match_scene, config = tile.match_scene, tile.config
     reach = config.selection.reach_steps * match_scene.step_m
@@ -125,7 +125,7 @@ def _views_around_ties(tile: TileInputs, window: CellWindow, ties: TiesOnGrid) -
 def label_pairs(
     tile_views: TileViews,
     window: CellWindow,
-    ties: TiesOnGrid,
+    ties: GridTies,
     side: int,
     steps_per_cell: float,
     options: SelectionOptions,
@@ -156,7 +156,7 @@ def label_pairs(
     return PairLabels(rows, ties.xy[rows], labels, angle_deg, len(rows) * n_views * samples.n_heights)
 
 
-def _one_tie_per_square(window: CellWindow, ties: TiesOnGrid, options: SelectionOptions) -> IntArray:
+def _one_tie_per_square(window: CellWindow, ties: GridTies, options: SelectionOptions) -> IntArray:
     """Numbers of the northernmost tie points of all squares of `feature_cells` cells in a window, ascending."""
     square = np.floor(ties.xy / options.feature_cells).astype(np.int64)
     candidates = np.flatnonzero(ties.inside(window) & np.isfinite(ties.lattice_index))

@@ -29,7 +29,7 @@ from zlocus.matching.match_curve import (
     quality_labels,
 )
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.pair_labels import PairLabels, TiesOnGrid, label_pairs
+from zlocus.matching.pair_labels import GridTies, PairLabels, label_pairs
 from zlocus.matching.tile_views import TileViews, pixel_window, read_pixels, tile_views
 from zlocus.matching.view_directions import cells_per_step
 from zlocus.matching.view_ranking import FeaturePoints, NeighbourSearch, OrderSource, order_images
@@ -90,18 +90,18 @@ class PointCurves:
     """The match of one cell.
 
     order : reference and search views; lattice_index : (h,) float64, heights of the curves; step_px : (j,) float64,
-    equivalent disparity of a height step; single : correlation of the reference with each search view, in their order;
-    mean : mean correlation of the first 1, 2, ... of them; sigma_steps : (j,) float64, predicted standard deviation of
-    the peak of each mean, infinite where the peak lies at an end; n_used : number of search views with which the match
-    ends; is_stopped : whether the mean was good enough by then; if not, no helpful view was left (at least `min_images`
-    are used all the same).
+    equivalent disparity of a height step; single_curves : correlation of the reference with each search view, in their
+    order; mean_curves : mean correlation of the first 1, 2, ... of them; sigma_steps : (j,) float64, predicted standard
+    deviation of the peak of each mean, infinite where the peak lies at an end; n_used : number of search views with
+    which the match ends; is_stopped : whether the mean was good enough by then; if not, no helpful view was left (at
+    least `min_images` are used all the same).
     """
 
     order: PointOrder
     lattice_index: FloatArray
     step_px: FloatArray
-    single: JudgedCurves
-    mean: JudgedCurves
+    single_curves: JudgedCurves
+    mean_curves: JudgedCurves
     sigma_steps: FloatArray
     n_used: int
     is_stopped: bool
@@ -110,7 +110,7 @@ class PointCurves:
     def peak_index(self) -> float:
         """Lattice index of the peak of the mean with which the match ends, refined by a parabola; NaN without a
         peak."""
-        return peak_of(self.lattice_index, self.mean.values[self.n_used - 1])
+        return peak_of(self.lattice_index, self.mean_curves.values[self.n_used - 1])
 
 
 def peak_of(lattice_index: FloatArray, curve: FloatArray) -> float:
@@ -199,8 +199,8 @@ def point_curves(
         order=order,
         lattice_index=lattice_index,
         step_px=step_px,
-        single=JudgedCurves.of(ncc, step_px, options),
-        mean=JudgedCurves.of(mean_ncc, np.maximum.accumulate(step_px), options),
+        single_curves=JudgedCurves.of(ncc, step_px, options),
+        mean_curves=JudgedCurves.of(mean_ncc, np.maximum.accumulate(step_px), options),
         sigma_steps=sigma_steps,
         n_used=n_used,
         is_stopped=is_stopped,
@@ -375,12 +375,9 @@ def curves_at(
 def _tie_windows(options: SelectionOptions, max_distance_cells: int) -> list[tuple[float, OrderSource]]:
     """Distances, cells, within which tie points are looked for one after the other, each with the source that is found
     in no smaller window."""
-    distances: list[tuple[float, OrderSource]] = []
-    if options.neighbours != "tin":
-        distances.append((options.radius_px, OrderSource.NEIGHBOURS))
-    distances.append((options.max_radii * options.radius_px, OrderSource.NEAREST))
-    distances.append((max_distance_cells, OrderSource.SCENE))
-    return distances
+    within_radius = [] if options.neighbours == "tin" else [(options.radius_px, OrderSource.NEIGHBOURS)]
+    nearest = (options.max_radii * options.radius_px, OrderSource.NEAREST)
+    return [*within_radius, nearest, (max_distance_cells, OrderSource.SCENE)]
 
 
 def may_be_reference(reference: str | None, views: Sequence[View]) -> FloatArray:
@@ -406,7 +403,7 @@ def views_around(
         view_window = pixel_window(match_scene.views[number], ground_xy, z_range, 1)
         if view_window is not None:
             numbers.append(number)
-            view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey[number]))
+            view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey_scales[number]))
     shape, lattice = (window.rows, window.cols), (match_scene.origin_m, match_scene.step_m)
     half = large_window_side(config.cost) // 2
     return numbers, tile_views(view_pixels, 0, transform, shape, config.pyramid.block, lattice, z_range, half)
@@ -420,7 +417,7 @@ def heights_around(
     Projections are tabulated over these heights only: over the height range of the scene that would take several times
     as long.
     """
-    inside = TiesOnGrid.of(match_scene).inside(window) & np.isfinite(match_scene.ties[:, 2])
+    inside = GridTies.of(match_scene).inside(window) & np.isfinite(match_scene.ties[:, 2])
     heights = np.append(match_scene.ties[inside, 2], place.xyz[2])
     reach = (options.reach_steps + 1) * match_scene.step_m
     return float(heights.min()) - reach, float(heights.max()) + reach
@@ -428,5 +425,5 @@ def heights_around(
 
 def labels_around(match_scene: MatchScene, tile_views: TileViews, window: CellWindow, config: RunConfig) -> PairLabels:
     """Labels of all pairs of views at the tie points of a window, as on level ground."""
-    ties, steps_per_cell = TiesOnGrid.of(match_scene), match_scene.cell_m / match_scene.step_m
+    ties, steps_per_cell = GridTies.of(match_scene), match_scene.cell_m / match_scene.step_m
     return label_pairs(tile_views, window, ties, large_window_side(config.cost), steps_per_cell, config.selection)

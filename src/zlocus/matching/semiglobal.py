@@ -36,12 +36,12 @@ class SemiGlobalHeights:
 
         slope_cells : (r, c), lattice index of that surface at each cell.
         """
-        best, second = (lattice_indices(index, slope_cells) for index in (self.best, self.second))
+        best, second = (level_indices(index, slope_cells) for index in (self.best, self.second))
         return SemiGlobalHeights(best, second, self.uniqueness, self.vertex + slope_cells)
 
 
-def lattice_indices(index: NDArray[np.int32], slope_cells: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Indices of the lattice, from indices counted from a slanted support surface, all (r, c)."""
+def level_indices(index: NDArray[np.int32], slope_cells: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Level indices of slope indices, both (r, c)."""
     return np.asarray(np.rint(index + slope_cells), np.int32)
 
 

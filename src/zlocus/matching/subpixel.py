@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import RefineOptions
-from zlocus.matching.height_lattice import NARROW_BASE
+from zlocus.matching.height_lattice import NARROW_BASE_STEP_CELLS
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.subpixel import CUBIC, LINEAR, profile_peaks, tile_profile, vertices_apart
 from zlocus.matching.occlusion import n_seeing
@@ -77,8 +77,8 @@ def refine(
     coefficients : of cubic B-splines, as `views` has pixels. Each round smooths the surface, measures the mean NCC at a
     few fractions of a step around it and puts a parabola through the best three: linear values of the images will do
     for all rounds but the last. Windows that follow a noisy surface would see a different place in each image, hence
-    the smoothing; a refined height further than `reach_steps` from the semi-global one is not believed. What the last
-    round finds counts by how much of it is noise: what narrow windows find beside wide ones (see `sharpened`), then
+    the smoothing; a refined height further than `max_correction_steps` from the semi-global one is not believed. What the last
+    round finds counts by how much of it is noise: what narrow windows find beside wide ones (see `refined_ties`), then
     what either finds beside the smooth surface (see `weighed`). step_cells : height of a step over the side of a
     cell; fixed : (r, c), cells that are measured like the others and keep their heights.
     """
@@ -99,7 +99,7 @@ def refine(
         )  # fmt: skip
         profile, spacing = profiles[-1].sum(axis=0), offsets[1] - offsets[0]
         found, best, inside = parabola_peak(profile, offsets)
-        is_refined = inside & (np.abs(found + surface - coarse) < options.reach_steps)
+        is_refined = inside & (np.abs(found + surface - coarse) < options.max_correction_steps)
         if is_last:
             bend, apart = bend_at_centre(profile, spacing), peaks_apart(profiles[-1], spacing)
             seeing = n_seeing(seen, surface)
@@ -108,7 +108,7 @@ def refine(
             for window, narrow in zip(windows[:-1], profiles[:-1].sum(axis=1), strict=True):
                 sharp, ncc, known = parabola_peak(narrow, offsets)
                 of_sharp = peak_variance(ncc, bend_at_centre(narrow, spacing), seeing, (2 * int(window) + 1) ** 2)
-                found, noise = sharpened(found, variance, sharp, of_sharp, is_refined & known)
+                found, noise = refined_ties(found, variance, sharp, of_sharp, is_refined & known)
             found = weighed(found, is_refined, noise)
         height = np.where(is_refined & ~fixed, found + surface, height)
     return RefinedHeights(height, best, is_refined, surface, bend, apart, variance, fixed)
@@ -121,7 +121,7 @@ def peak_variance(ncc: FloatGrid, bend: FloatGrid, n_images: NDArray[np.integer]
     return np.asarray(noise / (np.maximum(bend, LEAST_PEAK) * window_cells * images), np.float32)
 
 
-def sharpened(
+def refined_ties(
     wide: FloatGrid, variance: FloatGrid, narrow: FloatGrid, of_narrow: FloatGrid, known: NDArray[np.bool_]
 ) -> tuple[FloatGrid, FloatGrid]:
     """Distances (r, c) from a smooth surface as wide windows find them, with as much of what narrow ones find beside
@@ -167,7 +167,7 @@ def default_window(step_cells: float) -> int:
     With a narrow base a step is many cells high and relief within a window a small part of it: noise rules and a large
     window averages it. With a wide base relief rules, and a large window smooths it away.
     """
-    return WIDE_WINDOW if step_cells > NARROW_BASE else NARROW_WINDOW
+    return WIDE_WINDOW if step_cells > NARROW_BASE_STEP_CELLS else NARROW_WINDOW
 
 
 def parabola_peak(profile: NDArray[np.float32], offsets: FloatGrid) -> tuple[FloatGrid, FloatGrid, NDArray[np.bool_]]:

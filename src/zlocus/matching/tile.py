@@ -38,7 +38,7 @@ from zlocus.matching.semiglobal import (
     SemiGlobalHeights,
     aggregate,
     jump_penalties,
-    lattice_indices,
+    level_indices,
     winner_takes_all_heights,
     winner_takes_all_indices,
 )
@@ -97,15 +97,17 @@ def match_tile(
     tile = read_tile(match_scene, core_window, config, method, choose_images)
     if len(tile.view_pixels) < PAIR:
         return TileResult(Surface.nothing(core_window))
-    coarsest = match_coarsest_level(tile)
-    border = border_of_overlap(tile, coarsest)
-    coarsest_level = coarsest.result.level
+    coarsest_match = match_coarsest_level(tile)
+    border = border_of_overlap(tile, coarsest_match)
+    coarsest_level = coarsest_match.result.level
     overlap_window = worth_matching(
-        coarsest.result.visible, coarsest.result.heights.vertex, border.covered, coarsest_level.window
+        coarsest_match.result.visible, coarsest_match.result.heights.vertex, border.covered, coarsest_level.window
     )
     if not core_window.at_level(coarsest_level.number, 0).meets(overlap_window):
-        return TileResult(Surface.nothing(core_window), coarsest.result.evaluations, coarsest.result.all_images)
-    results = match_finer_levels(tile, coarsest, overlap_window)
+        return TileResult(
+            Surface.nothing(core_window), coarsest_match.result.evaluations, coarsest_match.result.all_images
+        )
+    results = match_finer_levels(tile, coarsest_match, overlap_window)
     if method != "mvll":
         results[-1] = with_planes_of_segments(results[-1], config)
     refined = refined_surface(tile, results[-1], border)
@@ -113,7 +115,7 @@ def match_tile(
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
     surface = replace(surface, ortho=ortho_of_surface(tile, results, surface, refined.lattice_index))
-    return _tile_result(tile, results, surface, coarsest.pair_labels)
+    return _tile_result(tile, results, surface, coarsest_match.pair_labels)
 
 
 def _tile_result(
@@ -145,7 +147,7 @@ def read_tile(
         rows = preselected([match_scene.views[n] for n in numbers], ground_xy, middle, config.selection)
         numbers = [numbers[row] for row in rows]
     view_pixels = [
-        read_pixels(match_scene.views[n], windows[n], match_scene.levels, match_scene.grey[n]) for n in numbers
+        read_pixels(match_scene.views[n], windows[n], match_scene.levels, match_scene.grey_scales[n]) for n in numbers
     ]
     return TileInputs(match_scene, core_window, config, view_pixels, numbers, method, choose_images)
 
@@ -223,19 +225,21 @@ def pair_labels_for_choice(tile: TileInputs, coarsest_result: LevelResult | None
     return label_pairs_at_ties(tile, coarsest_result)
 
 
-def border_of_overlap(tile: TileInputs, coarsest: CoarsestMatch) -> BorderGround:
+def border_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> BorderGround:
     """What the coarsest level says about the ground at the borders of the images' overlap."""
-    result, level, prior = coarsest.result, coarsest.result.level, coarsest.prior
+    result, level, prior = coarsest_match.result, coarsest_match.result.level, coarsest_match.prior
     return border_ground(
         tile.view_pixels, result.tile_views, result.lattice, result.visible, result.heights.vertex,
         (prior.low, prior.high), level.window, level.number, level.n_steps, level.cell_m,
     )  # fmt: skip
 
 
-def match_finer_levels(tile: TileInputs, coarsest: CoarsestMatch, overlap_window: CellWindow) -> list[LevelResult]:
+def match_finer_levels(
+    tile: TileInputs, coarsest_match: CoarsestMatch, overlap_window: CellWindow
+) -> list[LevelResult]:
     """Match all finer levels inside a window of coarsest cells; results of all levels, the coarsest first."""
-    results, pair_labels = [coarsest.result], coarsest.pair_labels
-    coarsest_number = coarsest.result.level.number
+    results, pair_labels = [coarsest_match.result], coarsest_match.pair_labels
+    coarsest_number = coarsest_match.result.level.number
     for number in range(coarsest_number - 1, -1, -1):
         level = tile.level(number, overlap_window.finer(coarsest_number - number))
         prior = prior_from_coarser(tile, level, results[-1])
@@ -282,8 +286,8 @@ def match_level(
     if tile.method == "mvll":
         heights = winner_takes_all_heights(cost, search.lattice)
     else:
-        jump_penalties = penalties_from_edges(tile, level, search, covered, alike)
-        heights = semiglobal_heights(tile, level, search, cost, jump_penalties, visible)
+        penalties = penalties_from_edges(tile, level, search, covered, alike)
+        heights = semiglobal_heights(tile, level, search, cost, penalties, visible)
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
 
@@ -375,7 +379,7 @@ def semiglobal_heights(
     level: PyramidLevel,
     search: LevelSearch,
     cost: NDArray[np.uint8],
-    jump_penalties: NDArray[np.uint16],
+    penalties: NDArray[np.uint16],
     visible: NDArray[np.int32],
 ) -> SemiGlobalHeights:
     """Heights of a level under the semi-global constraint, slope indices.
@@ -384,11 +388,11 @@ def semiglobal_heights(
     is applied once more; this changes `cost`.
     """
     options, step_cells = tile.config.semiglobal, tile.match_scene.step_cells
-    heights = aggregate(cost, search.lattice, jump_penalties, step_cells, options, tile.is_pair)
+    heights = aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
     if search.smooth is not None and add_costs_of_rays(
         cost, search.tile_views, search.slope_surface, search.lattice, visible, heights.vertex, level.number
     ):
-        heights = aggregate(cost, search.lattice, jump_penalties, step_cells, options, tile.is_pair)
+        heights = aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
     return heights
 
 
@@ -396,7 +400,7 @@ def _level_result(
     level: PyramidLevel,
     search: LevelSearch,
     visible: NDArray[np.int32],
-    chosen: ChosenViews,
+    chosen_views: ChosenViews,
     cost: NDArray[np.uint8],
     heights: SemiGlobalHeights,
     alike: NDArray[np.float64] | None,
@@ -404,16 +408,16 @@ def _level_result(
     """The result of a level, with heights and visible height ranges converted from slope indices to level indices."""
     slope_cells = search.slope_surface.cells
     all_images = count_evaluations(visible, search.lattice)
-    evaluations = count_evaluations(chosen.matched, search.lattice) + chosen.evaluations
+    evaluations = count_evaluations(chosen_views.matched, search.lattice) + chosen_views.evaluations
     winner_takes_all = None
     if level.number:
-        winner_takes_all = lattice_indices(winner_takes_all_indices(cost, search.lattice, heights.best), slope_cells)
+        winner_takes_all = level_indices(winner_takes_all_indices(cost, search.lattice, heights.best), slope_cells)
     return LevelResult(
         level=level,
         tile_views=search.tile_views,
         slope_surface=search.slope_surface,
         lattice=search.lattice,
-        visible=above_base(chosen.helpful, slope_cells),
+        visible=above_base(chosen_views.helpful, slope_cells),
         heights=heights.on_lattice(slope_cells),
         winner_takes_all=winner_takes_all,
         evaluations=evaluations,

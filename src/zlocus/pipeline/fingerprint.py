@@ -55,7 +55,7 @@ def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:
         "names": [view.name for view in match_scene.views],
         "lattice": [*lattice, match_scene.n_steps, match_scene.levels],
         "overlap": vars(match_scene.overlap_window),
-        "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in match_scene.grey],
+        "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in match_scene.grey_scales],
     }
     digest = hashlib.sha256(json.dumps(setup, sort_keys=True).encode())
     for array in (match_scene.ties, match_scene.dem_limits):

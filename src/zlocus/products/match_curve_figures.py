@@ -200,7 +200,7 @@ def where_it_stops(report: PointReport, options: SelectionOptions) -> str:
 
 
 def _single_rows(report: PointReport) -> list[tuple[str, ...]]:
-    judged = report.curves.single
+    judged = report.curves.single_curves
     return [
         (name, *_judgement(judged, j), f"{report.heights_m[judged.peaks.peak[j]]:.2f}")
         for j, name in enumerate(report.search)
@@ -220,9 +220,9 @@ def _mean_rows(report: PointReport) -> list[tuple[str, ...]]:
     curves = report.curves
     rows: list[tuple[str, ...]] = []
     for j, name in enumerate(report.search):
-        sigma, peak = curves.sigma_steps[j], report.heights_m[curves.mean.peaks.peak[j]]
+        sigma, peak = curves.sigma_steps[j], report.heights_m[curves.mean_curves.peaks.peak[j]]
         end = "<- ends here" if j + 1 == curves.n_used else ""
-        rows.append((str(j + 1), name, *_judgement(curves.mean, j), _number(sigma, 3), f"{peak:.2f}", end))
+        rows.append((str(j + 1), name, *_judgement(curves.mean_curves, j), _number(sigma, 3), f"{peak:.2f}", end))
     return rows
 
 
@@ -282,7 +282,7 @@ def _write_csv(path: Path, report: PointReport) -> None:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(heads)
         for k, height in enumerate(report.heights_m):
-            values = np.concatenate([curves.single.values[:, k], curves.mean.values[:, k]])
+            values = np.concatenate([curves.single_curves.values[:, k], curves.mean_curves.values[:, k]])
             rows.writerow([f"{height:.4f}", *("" if np.isnan(v) else f"{v:.6f}" for v in values)])
 
 
@@ -315,9 +315,9 @@ def point_record(report: PointReport, options: SelectionOptions) -> dict[str, An
                 for j, name in enumerate(report.search)
             ],
         },
-        "curves": [{"image": name, **judged(curves.single, j)} for j, name in enumerate(report.search)],
+        "curves": [{"image": name, **judged(curves.single_curves, j)} for j, name in enumerate(report.search)],
         "means": [
-            {"added": name, **judged(curves.mean, j), "sigma_steps": float(curves.sigma_steps[j])}
+            {"added": name, **judged(curves.mean_curves, j), "sigma_steps": float(curves.sigma_steps[j])}
             for j, name in enumerate(report.search)
         ],
         "stop": {
@@ -329,7 +329,7 @@ def point_record(report: PointReport, options: SelectionOptions) -> dict[str, An
 
 def match_curves_figure(report: PointReport) -> Figure:
     """NCC with each search image, a panel each, in their order, the peak and its rival marked."""
-    judged, n = report.curves.single, len(report.search)
+    judged, n = report.curves.single_curves, len(report.search)
     figure, panels = _panels(n, (4.2, 2.5), share=True)
     for j, (axes, name) in enumerate(zip(panels, report.search, strict=True)):
         curve, peaks, label = judged.values[j], judged.peaks, int(judged.labels[j])
@@ -355,10 +355,10 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
     _frame(axes, report)
     curves = report.curves
     for j, name in enumerate(report.search[:n_images]):
-        values = curves.single.values[j]
+        values = curves.single_curves.values[j]
         colour, dashes = COLOURS[j % len(COLOURS)], DASHES[j // len(COLOURS) % len(DASHES)]
         axes.plot(report.heights_m, values, color=colour, linestyle=dashes, linewidth=0.9, label=as_written(name))
-    mean, j = curves.mean, n_images - 1
+    mean, j = curves.mean_curves, n_images - 1
     # The mean of one image is that image's own curve.
     steps = [curves.n_used] if n_images > curves.n_used else list(range(2, n_images))
     for k, m in enumerate(steps, 1):
