@@ -19,12 +19,12 @@ from zlocus.matching.image_space import (
     END_STEPS,
     BorderedImage,
     beyond_range,
+    build_image_match_scene,
     depth_options,
     fitting_block,
     hypotheses_of_heights,
     hypotheses_of_ties,
     image_space,
-    build_image_match_scene,
     shift_rates,
     widest_disparities,
 )
@@ -73,13 +73,13 @@ def test_disparities_are_those_of_the_longest_base():
 
 def test_a_step_is_half_a_pixel_in_the_most_sensitive_image():
     space = image_space(row_of_frames(0.0, 1.0, 3.0), "v0", (0.0, 0.0))
-    settled = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
-    assert settled.step_m == pytest.approx(0.5)
-    assert settled.origin_m == pytest.approx(4.0 - END_STEPS * 0.5)
-    assert settled.n_steps == 32 + 2 * END_STEPS
-    assert (settled.seen.row, settled.seen.col) == (0, 0)
-    assert settled.seen.rows >= 60
-    assert settled.seen.cols >= 80
+    match_scene = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
+    assert match_scene.step_m == pytest.approx(0.5)
+    assert match_scene.origin_m == pytest.approx(4.0 - END_STEPS * 0.5)
+    assert match_scene.n_steps == 32 + 2 * END_STEPS
+    assert (match_scene.overlap_window.row, match_scene.overlap_window.col) == (0, 0)
+    assert match_scene.overlap_window.rows >= 60
+    assert match_scene.overlap_window.cols >= 80
     # A third of the base, a third of the shift.
     rates = shift_rates(space, space.views[1], 12.0)
     np.testing.assert_allclose(rates[np.isfinite(rates)], 1 / 3, atol=1e-9)
@@ -88,17 +88,17 @@ def test_a_step_is_half_a_pixel_in_the_most_sensitive_image():
 def test_satellites_are_asked_for_heights_in_ground_pixels():
     space = image_space(satellites(), "nadir", (40.0, 60.0))
     assert hypotheses_of_heights(space, (40.0, 60.0)) == pytest.approx((-20.0, 20.0), rel=0.02)
-    settled = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
+    match_scene = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
     # The aft image looks 18 degrees apart along the track and 7 across: a ground pixel of height shifts it so much.
     along, across = np.tan(np.deg2rad([1.0, -3.0])) - np.tan(np.deg2rad([-17.0, 4.0]))
-    assert settled.step_m == pytest.approx(0.5 / np.hypot(along, across), rel=0.05)
+    assert match_scene.step_m == pytest.approx(0.5 / np.hypot(along, across), rel=0.05)
 
 
 def test_the_first_pixel_is_the_first_cell():
     space = image_space(satellites(), "fore", (40.0, 60.0))
-    settled = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
-    x, y = settled.transform(settled.seen, 0) * (0.5, 0.5)
-    np.testing.assert_allclose(settled.views[0].sensor.image_from_ground(np.array([[x, y, 3.0]])), BORDER_PX)
+    match_scene = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
+    x, y = match_scene.transform(match_scene.overlap_window, 0) * (0.5, 0.5)
+    np.testing.assert_allclose(match_scene.views[0].sensor.image_from_ground(np.array([[x, y, 3.0]])), BORDER_PX)
 
 
 def test_heights_limit_depths_where_every_ray_meets_them():
@@ -121,9 +121,9 @@ def test_ties_give_the_range_of_disparities():
 
 def test_the_added_steps_hold_no_heights():
     space = image_space(row_of_frames(0.0, 2.0), "v0", (0.0, 0.0))
-    settled = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
+    match_scene = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
     heights = np.array([[3.0, 3.8, 4.0, 12.0, 20.2, 20.5, np.nan]], np.float32)
-    np.testing.assert_array_equal(beyond_range(settled, heights), [[True, False, False, False, False, True, False]])
+    np.testing.assert_array_equal(beyond_range(match_scene, heights), [[True, False, False, False, False, True, False]])
 
 
 def test_borders_repeat_the_outermost_pixels():
@@ -143,10 +143,10 @@ def test_turned_images_are_tabulated_in_smaller_blocks():
     turned = FrameModel((2.0, 0.0, 0.0), rotation_from_angles(180.0, 9.0, 0.0), 400.0, (40.0, 30.0))
     views = (row_of_frames(0.0).views[0], view("t", turned))
     space = image_space(Scene(views, UTM), "v0", (0.0, 0.0))
-    settled = build_image_match_scene(space, (10.0, 40.0), NO_TIES, PyramidOptions())
-    assert fitting_block([settled], 32) in (8, 16)
+    match_scene = build_image_match_scene(space, (10.0, 40.0), NO_TIES, PyramidOptions())
+    assert fitting_block([match_scene], 32) in (8, 16)
     # Beyond what is in front of both cameras nothing helps.
-    assert fitting_block([replace(settled, origin_m=-2000.0, n_steps=8000)], 32) is None
+    assert fitting_block([replace(match_scene, origin_m=-2000.0, n_steps=8000)], 32) is None
 
 
 def test_the_widest_search_ends_where_no_other_view_sees():

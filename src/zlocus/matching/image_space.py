@@ -187,10 +187,10 @@ def build_image_match_scene(
     )
 
 
-def beyond_range(scene: MatchScene, height: NDArray[np.float32]) -> NDArray[np.bool_]:
+def beyond_range(match_scene: MatchScene, height: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Where hypotheses lie in the steps added by `build_image_match_scene`. height : (r, c)."""
-    low = scene.origin_m + (END_STEPS - 0.5) * scene.step_m
-    high = scene.origin_m + (scene.n_steps - END_STEPS + 0.5) * scene.step_m
+    low = match_scene.origin_m + (END_STEPS - 0.5) * match_scene.step_m
+    high = match_scene.origin_m + (match_scene.n_steps - END_STEPS + 0.5) * match_scene.step_m
     return np.asarray((height < low) | (height > high))
 
 
@@ -263,31 +263,31 @@ def hypotheses_of_ties(space: ImageSpace, ties: FloatArray, options: Orientation
     return max(low - margin, LEAST_DISPARITY_PX), high + margin
 
 
-def fitting_block(scenes: Sequence[MatchScene], block: int) -> int | None:
+def fitting_block(match_scenes: Sequence[MatchScene], block: int) -> int | None:
     """The largest block, halved as often as needed, over which projections are straight enough for their tables; None
     where even `SMALLEST_BLOCK` is too large.
 
     Images that are turned against each other bend the loci more within a block of pixels than a map grid does.
     """
-    while not all(_fits(scene, block) for scene in scenes):
+    while not all(_fits(match_scene, block) for match_scene in match_scenes):
         block //= 2
         if block < SMALLEST_BLOCK:
             return None
     return block
 
 
-def _fits(scene: MatchScene, block: int) -> bool:
-    step = scene.step_m * 2 ** (scene.levels - 1)
-    z_range = (scene.origin_m - 2 * step, scene.origin_m + scene.n_steps * scene.step_m + 18 * step)
+def _fits(match_scene: MatchScene, block: int) -> bool:
+    step = match_scene.step_m * 2 ** (match_scene.levels - 1)
+    z_range = (match_scene.origin_m - 2 * step, match_scene.z_range[1] + 18 * step)
     try:
-        for level in range(scene.levels):
-            window = scene.overlap_window.at_level(level, 0)
+        for level in range(match_scene.levels):
+            window = match_scene.overlap_window.at_level(level, 0)
             tolerance_px = 2**level * (COARSER_TABLE_PX if level else FINEST_TABLE_PX)
-            for view in scene.views:
+            for view in match_scene.views:
                 shape = (window.rows, window.cols)
                 projection_table(
                     view.sensor,
-                    scene.transform(window, level),
+                    match_scene.transform(window, level),
                     shape,
                     block,
                     z_range,

@@ -67,13 +67,15 @@ def run_plan(
     found = ties.orientation
     bounds = area_to_match(scene, z_range, found.xyz[supported(found.xyz, found.sigma_z_m)])
     grid = grid_from_bounds(bounds, cell, scene.crs)
-    settled = build_match_scene(scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.refined_xyz)
-    matched = grid.window.within(settled.overlap_window)
+    match_scene = build_match_scene(
+        scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.refined_xyz
+    )
+    matched = grid.window.within(match_scene.overlap_window)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
-    check_room(request.out or Path(), grid, settled, settled.has_colours)
-    tiles = plan_tiles(grid.window, settled.overlap_window, config.pyramid)
-    needs = tile_needs(settled, tiles, config)
+    check_room(request.out or Path(), grid, match_scene, match_scene.has_colours)
+    tiles = plan_tiles(grid.window, match_scene.overlap_window, config.pyramid)
+    needs = tile_needs(match_scene, tiles, config)
     tile_bytes = int(needs.n_bytes + WORKER_BYTES)
     fit = request.workers if request.memory_gb is None else int(request.memory_gb * 1e9 / tile_bytes)
     workers = max(min(request.workers, fit, len(tiles)), 1)
@@ -83,8 +85,8 @@ def run_plan(
         cell_m=cell,
         shape=(grid.window.rows, grid.window.cols),
         heights=z_range,
-        step_m=settled.step_m,
-        n_steps=settled.n_steps,
+        step_m=match_scene.step_m,
+        n_steps=match_scene.n_steps,
         n_tiles=len(tiles),
         tile_bytes=tile_bytes,
         workers=workers,
