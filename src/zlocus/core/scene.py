@@ -1,4 +1,4 @@
-"""What is matched, where, in which frame: views and the CRS they share."""
+"""Scene: views in a common frame, and the images they read their pixels from."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pyproj import CRS
 
 from zlocus.core.sensor_model import SensorModel
 
-# Views that a scene names at a prompt.
-MOST_NAMED = 8
+# The representation of a scene names at most this many views.
+MAX_NAMED_VIEWS = 8
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class ImageWindow:
 
 @dataclass(frozen=True)
 class HeldPixels:
-    """The parts of an image whose pixels its file holds. A sparse file leaves out the others, which are empty.
+    """The cells of an image of which its file holds pixels. A sparse file leaves out the other cells, which are empty.
 
-    cell_px : rows and columns of the parts that are told apart; shape : of the image, px; cells : (r, c) bool, whether
-    the file holds a pixel of the part.
+    cell_px : rows and columns of a cell; shape : rows and columns of the image; cells : (r, c) bool, whether the file
+    holds a pixel of a cell.
     """
 
     cell_px: tuple[int, int]
@@ -40,20 +40,19 @@ class HeldPixels:
 
     @property
     def regions(self) -> NDArray[np.int64]:
-        """The parts that it holds, (n, 4) first row, first column, and the first row and column beyond, px."""
+        """The cells that are held, (n, 4) px: first row and column, and the first row and column after the cell."""
         first = np.argwhere(self.cells) * self.cell_px
         return np.column_stack([first, np.minimum(first + self.cell_px, self.shape)])
 
     @cached_property
     def window(self) -> tuple[int, int, int, int]:
-        """First row, first column, rows and columns of the smallest window that holds all of them, px."""
+        """The smallest window that contains all cells that are held: first row, first column, rows and columns, px."""
         (top, left), (bottom, right) = self.regions[:, :2].min(axis=0), self.regions[:, 2:].max(axis=0)
         return int(top), int(left), int(bottom - top), int(right - left)
 
     def inside(self, windows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which windows hold a pixel, (n,) bool. windows : (n, 4) first row, first column, and the first row and column
-        beyond, px."""
-        # Sums over all cells above and to the left, of which four tell how many lie inside a window.
+        """Which windows contain a pixel that is held, (n,) bool. windows : (n, 4) px, as `regions`."""
+        # Sums over all cells above and to the left; four of them give the number of cells inside a window.
         sums = np.pad(self.cells.cumsum(axis=0, dtype=np.int64).cumsum(axis=1), ((1, 0), (1, 0)))
         first = windows[:, :2] // self.cell_px
         end = np.minimum(-(-windows[:, 2:] // self.cell_px), self.cells.shape)
@@ -61,7 +60,7 @@ class HeldPixels:
         return np.asarray(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left] > 0)
 
     def missing(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
-        """The pixels (r, c) of a window that are not held; None where all are."""
+        """The pixels (r, c) bool of a window that are not held; None where all are held."""
         (top, bottom), (left, right) = (
             (first // side, -(-(first + count) // side))
             for first, count, side in zip((row, col), (rows, cols), self.cell_px, strict=True)
@@ -86,7 +85,7 @@ class ImageSource(Protocol):
 
     @property
     def dtype(self) -> str:
-        """Data type of the file's pixels, as NumPy names it."""
+        """NumPy's name of the data type of the file's pixels."""
         ...
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
@@ -100,17 +99,17 @@ class SparseSource(Protocol):
 
     @property
     def held(self) -> HeldPixels | None:
-        """Those that it holds; None where it holds all, or does not say."""
+        """The cells that it holds; None where it holds all of them, or does not say."""
         ...
 
 
 def held_pixels(image: ImageSource) -> HeldPixels | None:
-    """The parts of an image whose pixels its file holds; None where that is all of it, as far as is known."""
+    """The cells of an image of which its file holds pixels; None where it holds all of them, as far as is known."""
     return image.held if isinstance(image, SparseSource) else None
 
 
 def held_window(image: ImageSource) -> tuple[int, int, int, int]:
-    """First row, first column, rows and columns of the part of an image that its file holds: of most, all of it."""
+    """First row, first column, rows and columns of the part of an image that its file holds; most files hold all."""
     held = held_pixels(image)
     return (0, 0, *image.shape) if held is None else held.window
 
@@ -125,14 +124,16 @@ class ColourSource(ImageSource, Protocol):
         ...
 
     def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
-        """Red, green and blue (3, r, c) of the same window, in the file's own numbers, of an image that has them."""
+        """Red, green and blue of a window, (3, r, c), in the numbers of the file. Only for an image that has colours."""
         ...
 
 
 @dataclass(frozen=True)
 class View:
-    """One image with its sensor model in the scene's frame. camera_files : what the model was read from, besides it;
-    date : of its exposure, where it is known."""
+    """One image with its sensor model in the frame of the scene.
+
+    camera_files : files beside the image from which the sensor model was read; date : of the exposure, where known.
+    """
 
     name: str
     path: Path
@@ -143,7 +144,7 @@ class View:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Every file that it is read from."""
+        """Every file from which the view is read."""
         return (self.path, *getattr(self.image, "sources", ()), *self.camera_files)
 
     def __repr__(self) -> str:
@@ -153,10 +154,10 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """Views that share a frame: projected easting, northing and ellipsoidal height in metres, or local x, y, z (up).
+    """Views in a common frame: projected easting, northing and ellipsoidal height in metres, or local x, y, z (up).
 
-    bounds : (xmin, ymin, xmax, ymax) of the area asked for, in `crs`; None is the ground seen by two views or more.
-    heights : (zmin, zmax) m, ellipsoidal, searched; None is found from the tie points.
+    bounds : (xmin, ymin, xmax, ymax) of the requested area, in `crs`; None: the ground that two views or more see.
+    heights : (zmin, zmax) m, ellipsoidal, height range to search; None: found from the tie points.
     """
 
     views: tuple[View, ...]
@@ -165,13 +166,13 @@ class Scene:
     heights: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
-        """In a line: a sensor alone has hundreds of numbers."""
-        names = [view.name for view in self.views[:MOST_NAMED]] + ["..."] * (len(self.views) > MOST_NAMED)
+        """One line, without the hundreds of numbers of the sensor models."""
+        names = [view.name for view in self.views[:MAX_NAMED_VIEWS]] + ["..."] * (len(self.views) > MAX_NAMED_VIEWS)
         frame = "a local frame" if is_local(self.crs) else self.crs.name
-        asked = [f"{name} {value}" for name in ("bounds", "heights") if (value := getattr(self, name)) is not None]
-        return f"Scene({len(self.views)} views: {', '.join(names)}; {'; '.join([frame, *asked])})"
+        requested = [f"{name} {value}" for name in ("bounds", "heights") if (value := getattr(self, name)) is not None]
+        return f"Scene({len(self.views)} views: {', '.join(names)}; {'; '.join([frame, *requested])})"
 
 
 def is_local(crs: CRS) -> bool:
-    """Whether a frame is local Cartesian axes at no known place of the Earth."""
+    """Whether a frame is local: Cartesian axes whose place on the Earth is not known."""
     return bool(crs.is_engineering)

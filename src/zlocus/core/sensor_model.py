@@ -1,4 +1,4 @@
-"""What every sensor can do: ground to image and, at a given height, image to ground."""
+"""The protocol of sensor models: ground to image and, at a given height, image to ground."""
 
 from __future__ import annotations
 
@@ -13,53 +13,53 @@ FloatArray = NDArray[np.float64]
 
 @runtime_checkable
 class SensorModel(Protocol):
-    """Ground <-> image for one exposure.
+    """Projection between ground and image for one exposure.
 
-    Image points are `xy` = (column, row) in pixels; (0, 0) is the centre of the first pixel.
-    Ground points are `xyz` in the scene's frame: easting, northing and ellipsoidal height in metres.
-    Points the model cannot map are NaN in the result, never an exception.
+    Image points are `xy` = (column, row) in pixels; (0, 0) is the centre of the first pixel. Ground points are `xyz` in
+    the frame of the scene: easting, northing and ellipsoidal height in metres. A point that the model cannot map is NaN
+    in the result; it raises no exception.
     """
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """Image position of ground points. xyz : (n, 3) m -> (n, 2) px."""
+        """Image points (n, 2) px of ground points. xyz : (n, 3) m."""
         ...
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
-        """Ground points seen by image positions at given heights. xy : (n, 2) px, z : (n,) m -> (n, 3) m."""
+        """Ground points (n, 3) m where the rays of image points meet given heights. xy : (n, 2) px; z : (n,) m."""
         ...
 
     def height_bounds(self) -> tuple[float, float] | None:
-        """Lowest and highest ellipsoidal height (m) the model was made for; None where it holds at any height."""
+        """Lowest and highest ellipsoidal height (m) for which the model is valid; None where it is at any height."""
         ...
 
 
 @runtime_checkable
 class Stationed(Protocol):
-    """A sensor that knows where it stood."""
+    """A sensor model that contains the position of its camera."""
 
     def station_height(self) -> float:
-        """Lowest height (m) of its projection centres, as ground points have heights."""
+        """Lowest height (m) of the projection centres, in the heights of ground points."""
         ...
 
 
 @runtime_checkable
 class Scanning(Protocol):
-    """A sensor whose image was taken in flight, line by line, so that it looks the same way all along."""
+    """A line scanner: its image was taken in flight, line by line, with parallel views along the flight."""
 
     def flight_time(self) -> float:
-        """How long that took, s."""
+        """Duration of the exposure of the whole image, s."""
         ...
 
 
 def bare(sensor: SensorModel) -> SensorModel:
-    """The sensor without the corrections laid over it."""
+    """The sensor model without its corrections."""
     while hasattr(sensor, "base"):
         sensor = sensor.base
     return sensor
 
 
 def lowest_station(sensors: Iterable[SensorModel]) -> float | None:
-    """Height (m) of the lowest projection centre; None where not all sensors know where they stood."""
+    """Height (m) of the lowest projection centre; None unless every sensor model contains its position."""
     heights = []
     for sensor in map(bare, sensors):
         if not isinstance(sensor, Stationed):
@@ -69,7 +69,10 @@ def lowest_station(sensors: Iterable[SensorModel]) -> float | None:
 
 
 def capped(z_range: tuple[float, float], station: float | None, clearance: float) -> tuple[float, float]:
-    """A range of heights (m) without those whose depth below a station is less than a share of the lowest's."""
+    """A height range (m) cut below a projection centre at height `station` (m); unchanged without one.
+
+    What lies nearer below the station than `clearance` times the depth of the lowest height is cut off.
+    """
     if station is None or z_range[0] >= station:
         return z_range
     return z_range[0], min(z_range[1], station - clearance * (station - z_range[0]))
