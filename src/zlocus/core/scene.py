@@ -124,7 +124,7 @@ class ColourSource(ImageSource, Protocol):
         ...
 
     def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
-        """Red, green and blue of a window, (3, r, c), in the numbers of the file. Only for an image that has colours."""
+        """Red, green and blue of a window, (3, r, c), in the numbers of the file; only where the image has colours."""
         ...
 
 
