@@ -16,6 +16,7 @@ from rasterio.warp import Resampling, reproject
 
 from evaluation_rasters import CRS, NORTH, WEST, grid, write
 from zlocus.core.errors import ConfigError, InputError
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.statistics import error_statistics
@@ -69,9 +70,9 @@ def test_missing_cells_count_against_completeness_and_within(tmp_path, hills):
     truth = hills(*grid(100))
     dsm = truth.copy()
     dsm[:50] = np.nan
-    result = evaluate(write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth), margin_m=0)
-    assert result.all.completeness == result.all.within == pytest.approx(0.5, abs=0.01)
-    assert result.all.rmse == 0
+    result = evaluate(write(tmp_path / "d.tif", dsm), Comparison(write(tmp_path / "t.tif", truth), margin_m=0))
+    assert result.statistics.completeness == result.statistics.within == pytest.approx(0.5, abs=0.01)
+    assert result.statistics.rmse == 0
 
 
 @pytest.mark.parametrize(
@@ -89,8 +90,10 @@ def test_nodata_is_no_height(tmp_path, hills, empty, nodata):
     truth = hills(*grid(60))
     dsm = truth.copy()
     dsm[:, 30:] = empty
-    result = evaluate(write(tmp_path / "d.tif", dsm, nodata=nodata), write(tmp_path / "t.tif", truth), margin_m=0)
-    assert result.all.completeness == pytest.approx(0.5, abs=0.02)
+    result = evaluate(
+        write(tmp_path / "d.tif", dsm, nodata=nodata), Comparison(write(tmp_path / "t.tif", truth), margin_m=0)
+    )
+    assert result.statistics.completeness == pytest.approx(0.5, abs=0.02)
 
 
 def test_either_side_of_an_edge_is_right(tmp_path):
@@ -102,9 +105,11 @@ def test_either_side_of_an_edge_is_right(tmp_path):
     for low_or_high in (10.0, 20.0):
         dsm = np.repeat(np.where(np.arange(40) < 20, 10.0, 20.0)[None], 40, axis=0).astype(np.float32)
         dsm[:, 20] = low_or_high
-        assert evaluate(write(tmp_path / "d.tif", dsm), reference, margin_m=0).all.rmse == 0
+        assert evaluate(write(tmp_path / "d.tif", dsm), Comparison(reference, margin_m=0)).statistics.rmse == 0
     dsm[:, 20] = 15.0
-    assert evaluate(write(tmp_path / "d.tif", dsm), reference, margin_m=0).all.rmse == pytest.approx(5 / math.sqrt(40))
+    assert evaluate(write(tmp_path / "d.tif", dsm), Comparison(reference, margin_m=0)).statistics.rmse == pytest.approx(
+        5 / math.sqrt(40)
+    )
 
 
 def test_without_an_edge_the_mean_of_the_block_is_right(tmp_path):
@@ -112,7 +117,7 @@ def test_without_an_edge_the_mean_of_the_block_is_right(tmp_path):
     truth[:, ::2] += 0.4
     reference = write(tmp_path / "t.tif", truth, from_origin(WEST, NORTH, 0.25, 0.25))
     dsm = write(tmp_path / "d.tif", np.full((40, 40), 10.4, np.float32))
-    assert evaluate(dsm, reference, margin_m=0).all.median == pytest.approx(0.2, abs=1e-5)
+    assert evaluate(dsm, Comparison(reference, margin_m=0)).statistics.median == pytest.approx(0.2, abs=1e-5)
 
 
 def test_classes_are_judged_apart(tmp_path, hills):
@@ -120,13 +125,13 @@ def test_classes_are_judged_apart(tmp_path, hills):
     classes = np.repeat(np.arange(4, dtype=np.uint8), 20)[:, None] * np.ones((1, 80), np.uint8)
     dsm = truth + np.where(classes == 2, 0.5, np.where(classes == 3, 2.0, 0.0)).astype(np.float32)
     result = evaluate(
-        write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth), margin_m=0,
-        classes=write(tmp_path / "c.tif", classes),
+        write(tmp_path / "d.tif", dsm), Comparison(write(tmp_path / "t.tif", truth), margin_m=0,
+        classes=write(tmp_path / "c.tif", classes)),
     )  # fmt: skip
-    assert [result.classes[name].n for name in ("ground", "building", "tree")] == [3200, 1600, 1600]
-    assert result.classes["ground"].rmse == 0
-    assert result.classes["building"].median == pytest.approx(0.5, abs=1e-4)
-    assert result.classes["tree"].within == 0
+    assert [result.class_statistics[name].n for name in ("ground", "building", "tree")] == [3200, 1600, 1600]
+    assert result.class_statistics["ground"].rmse == 0
+    assert result.class_statistics["building"].median == pytest.approx(0.5, abs=1e-4)
+    assert result.class_statistics["tree"].within == 0
 
 
 def test_margin_and_threshold(tmp_path, hills):
@@ -134,9 +139,11 @@ def test_margin_and_threshold(tmp_path, hills):
     dsm = truth + np.float32(0.3)
     dsm[10:90, 10:90] -= np.float32(0.3)
     paths = write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth)
-    assert evaluate(*paths, margin_m=5).all.n == 80 * 80
-    assert evaluate(*paths, margin_m=5).all.rmse == 0
-    assert evaluate(*paths, margin_m=0, threshold_m=0.2).all.within == pytest.approx(0.64)
+    assert evaluate(paths[0], Comparison(paths[1], margin_m=5)).statistics.n == 80 * 80
+    assert evaluate(paths[0], Comparison(paths[1], margin_m=5)).statistics.rmse == 0
+    assert evaluate(paths[0], Comparison(paths[1], margin_m=0, threshold_m=0.2)).statistics.within == pytest.approx(
+        0.64
+    )
 
 
 def test_align_finds_a_planted_shift_and_reports_it(tmp_path, hills):
@@ -145,14 +152,14 @@ def test_align_finds_a_planted_shift_and_reports_it(tmp_path, hills):
     moved = write(
         tmp_path / "d.tif", hills(*grid(160)) + np.float32(up), from_origin(WEST + east, NORTH + north, 0.5, 0.5)
     )
-    plain = evaluate(moved, truth)
-    aligned = evaluate(moved, truth, align=True)
+    plain = evaluate(moved, Comparison(truth))
+    aligned = evaluate(moved, Comparison(truth, align=True))
     assert plain.shift is None
-    assert plain.all.nmad > 0.2
+    assert plain.statistics.nmad > 0.2
     found = (aligned.shift.east_m, aligned.shift.north_m, aligned.shift.up_m)
     np.testing.assert_allclose(found, (east, north, up), atol=SHIFT_TOLERANCE_M)
-    assert aligned.all.nmad < 0.02
-    assert abs(aligned.all.median) < 0.01
+    assert aligned.statistics.nmad < 0.02
+    assert abs(aligned.statistics.median) < 0.01
     assert f"{aligned.shift.up_m:+.3f} m up" in evaluation_table(aligned)
 
 
@@ -167,9 +174,9 @@ def test_a_surface_in_another_crs(tmp_path, hills):
             rasterio.band(source, 1), other, dst_transform=at, dst_crs="EPSG:32633", dst_nodata=np.nan,
             resampling=Resampling.bilinear,
         )  # fmt: skip
-    result = evaluate(write(tmp_path / "d.tif", other, at, "EPSG:32633"), truth)
-    assert result.all.completeness > 0.99
-    assert result.all.rmse < 0.2
+    result = evaluate(write(tmp_path / "d.tif", other, at, "EPSG:32633"), Comparison(truth))
+    assert result.statistics.completeness > 0.99
+    assert result.statistics.rmse < 0.2
 
 
 def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
@@ -205,7 +212,7 @@ def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
         (InputError, "cannot be opened as a raster", (good, good, {"classes": text})),
     ):
         with pytest.raises(error, match=says) as caught:
-            evaluate(arguments[0], arguments[1], **arguments[2])
+            evaluate(arguments[0], Comparison(arguments[1], **arguments[2]))
         assert "\n" not in str(caught.value)
 
 
@@ -215,20 +222,20 @@ def test_undeclared_fills_of_whole_numbers_with_a_scale(tmp_path):
     scaled = write(tmp_path / "scaled.tif", stored)
     with rasterio.open(scaled, "r+") as file:
         file.scales = (0.1,)
-    result = evaluate(scaled, write(tmp_path / "r.tif", np.full((80, 80), 35, np.float32)), margin_m=0)
-    assert (result.all.completeness, result.all.rmse) == (0.75, pytest.approx(0, abs=1e-5))
+    result = evaluate(scaled, Comparison(write(tmp_path / "r.tif", np.full((80, 80), 35, np.float32)), margin_m=0))
+    assert (result.statistics.completeness, result.statistics.rmse) == (0.75, pytest.approx(0, abs=1e-5))
 
 
 def test_an_empty_surface_is_judged_not_refused(tmp_path, hills):
     good = write(tmp_path / "good.tif", hills(*grid(80)))
     empty = write(tmp_path / "empty.tif", np.full((80, 80), np.nan, np.float32))
-    result = evaluate(empty, good)
+    result = evaluate(empty, Comparison(good))
     lines = evaluation_table(result).splitlines()
-    assert "no error is known: nowhere do surface and reference both have a height" in lines
+    assert "no error is known: no cell has a height in both the surface and the reference" in lines
     assert "MVS3DM (single cells): completeness 0.00 %, median error -" in lines
     assert "nan" not in "\n".join(lines[1:])
-    assert "no error is known" not in evaluation_table(evaluate(good, good))
-    assert result.all.completeness == 0.0
+    assert "no error is known" not in evaluation_table(evaluate(good, Comparison(good)))
+    assert result.statistics.completeness == 0.0
     assert evaluation_table(result).splitlines()[1].split()[-1] == "-"
     assert (result.mvs3dm.completeness, result.as_dict()["mvs3dm_median_error"]) == (0.0, None)
     json.dumps(result.as_dict(), allow_nan=False)
@@ -242,20 +249,20 @@ def test_bands_of_slope_are_judged_apart(tmp_path):
     truth = np.tile(np.cumsum(rise) * 0.5, (60, 1)) + 0 * x
     dsm = truth + np.repeat([0.1, 0.2, 0.5], wide)
     paths = write(tmp_path / "d.tif", dsm.astype(np.float32)), write(tmp_path / "t.tif", truth.astype(np.float32))
-    result = evaluate(*paths, margin_m=0, threshold_m=0.15)
+    result = evaluate(paths[0], Comparison(paths[1], margin_m=0, threshold_m=0.15))
     # The rim has no slope, and where two planes meet it is between theirs: of 15.1 and of 37.9 degrees.
     columns = {"0-5": 0, "5-15": 18, "15-30": 20, "30-45": 1, "45-90": 19}
-    assert {name: result.slopes[name].n for name in columns} == {name: 58 * n for name, n in columns.items()}
-    assert result.slopes["unknown"].n == 60 * 60 - 58 * 58
-    assert result.slopes["5-15"].median == pytest.approx(0.1, abs=1e-4)
-    assert result.slopes["15-30"].median == pytest.approx(0.2, abs=1e-4)
-    assert result.slopes["45-90"].median == pytest.approx(0.5, abs=1e-4)
-    assert result.slopes["5-15"].within == 1
-    assert result.slopes["15-30"].within == 1 / 20
-    assert sum(band.n for band in result.slopes.values()) == result.all.n
-    names = list(evaluate(*paths, margin_m=0, slope_edges_deg=(12.5,)).slopes)
+    assert {name: result.slope_statistics[name].n for name in columns} == {name: 58 * n for name, n in columns.items()}
+    assert result.slope_statistics["unknown"].n == 60 * 60 - 58 * 58
+    assert result.slope_statistics["5-15"].median == pytest.approx(0.1, abs=1e-4)
+    assert result.slope_statistics["15-30"].median == pytest.approx(0.2, abs=1e-4)
+    assert result.slope_statistics["45-90"].median == pytest.approx(0.5, abs=1e-4)
+    assert result.slope_statistics["5-15"].within == 1
+    assert result.slope_statistics["15-30"].within == 1 / 20
+    assert sum(band.n for band in result.slope_statistics.values()) == result.statistics.n
+    names = list(evaluate(paths[0], Comparison(paths[1], margin_m=0, slope_edges_deg=(12.5,))).slope_statistics)
     assert names == ["0-12.5", "12.5-90", "unknown"]
-    assert evaluate(*paths, slope_edges_deg=()).slopes == {}
+    assert evaluate(paths[0], Comparison(paths[1], slope_edges_deg=())).slope_statistics == {}
 
 
 def test_a_slope_has_its_angle_whatever_its_direction(tmp_path):
@@ -284,11 +291,10 @@ def test_a_case_computed_by_hand(tmp_path):
     surface = np.array([[10.5, 12], [nan, 15]], np.float32)
     result = evaluate(
         write(tmp_path / "d.tif", surface, from_origin(WEST - 1, NORTH + 1, 2, 2)),
-        write(tmp_path / "r.tif", reference, from_origin(WEST, NORTH, 1, 1)),
-        margin_m=0,
+        Comparison(write(tmp_path / "r.tif", reference, from_origin(WEST, NORTH, 1, 1)), margin_m=0),
     )
     # Errors 0.5, 1, 0 / -, 1, 0 / -, (no reference), -3.
-    figures = result.all
+    figures = result.statistics
     assert (figures.n, figures.completeness, figures.within) == (8, 6 / 8, 3 / 8)
     assert (figures.median, figures.le90, figures.le95) == pytest.approx((0.25, 2.0, 2.5))
     assert figures.nmad == pytest.approx(1.4826 * 0.5)
@@ -303,9 +309,9 @@ def test_many_cells_are_judged_as_few_at_a_time(tmp_path, hills, monkeypatch):
     truth = hills(*grid(60))
     dsm = truth + np.linspace(-2, 2, 60, dtype=np.float32)
     paths = write(tmp_path / "d.tif", dsm), write(tmp_path / "t.tif", truth)
-    whole = evaluate(*paths, margin_m=3).mvs3dm
+    whole = evaluate(paths[0], Comparison(paths[1], margin_m=3)).mvs3dm
     monkeypatch.setattr("zlocus.evaluation.mvs3dm.CELLS_AT_A_TIME", 150)
-    assert evaluate(*paths, margin_m=3).mvs3dm == whole
+    assert evaluate(paths[0], Comparison(paths[1], margin_m=3)).mvs3dm == whole
     # Columns 15 to 44 are within 1 m, of columns 6 to 53 inside the margin.
     assert whole.completeness == 30 / 48
 
@@ -320,7 +326,9 @@ def test_the_definitions_of_mvs3dm(tmp_path):
     dsm[9, 9] -= np.float32(1.3)  # 1 m too low: not within 1 m
     truth[5, 6:8] = np.nan
     quarter = from_origin(WEST, NORTH, 0.25, 0.25)
-    result = evaluate(write(tmp_path / "d.tif", dsm, quarter), write(tmp_path / "t.tif", truth, quarter), margin_m=0)
+    result = evaluate(
+        write(tmp_path / "d.tif", dsm, quarter), Comparison(write(tmp_path / "t.tif", truth, quarter), margin_m=0)
+    )
     assert result.mvs3dm.completeness == (98 - 10 - 3 - 1) / 98
     assert result.mvs3dm.median_error_m == pytest.approx(0.3, abs=1e-5)
     assert result.as_dict()["mvs3dm_completeness"] == result.mvs3dm.completeness
@@ -332,13 +340,13 @@ def test_its_median_error_is_absolute_and_its_shift_removed(tmp_path, hills):
     signs = np.where((np.arange(100) % 2)[None], 0.5, -0.5) * np.ones((100, 1))
     dsm = write(tmp_path / "d.tif", (truth + signs).astype(np.float32))
     reference = write(tmp_path / "t.tif", truth)
-    result = evaluate(dsm, reference, margin_m=0)
-    assert result.all.median == pytest.approx(0, abs=1.0)
+    result = evaluate(dsm, Comparison(reference, margin_m=0))
+    assert result.statistics.median == pytest.approx(0, abs=1.0)
     assert result.mvs3dm.median_error_m == pytest.approx(0.5, abs=1e-4)
     high = write(tmp_path / "h.tif", truth + np.float32(30))
-    assert evaluate(high, reference).mvs3dm.completeness == 0
-    assert evaluate(high, reference, align=True).mvs3dm.completeness == 1
-    assert evaluate(high, reference, align=True).unshifted.median == pytest.approx(30, abs=1e-3)
+    assert evaluate(high, Comparison(reference)).mvs3dm.completeness == 0
+    assert evaluate(high, Comparison(reference, align=True)).mvs3dm.completeness == 1
+    assert evaluate(high, Comparison(reference, align=True)).unshifted_statistics.median == pytest.approx(30, abs=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -369,8 +377,8 @@ def test_agrees_with_the_independent_judge(tmp_path, shared_data, judge, align):
     ]  # fmt: skip
     command = [sys.executable, judge, *paths[:2], "--class", paths[2], "--json", *(["--align"] if align else [])]
     theirs = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    ours = evaluate(*paths[:2], classes=paths[2], align=align)
-    for name, figures in {"all": ours.all, **ours.classes}.items():
+    ours = evaluate(paths[0], Comparison(paths[1], classes=paths[2], align=align))
+    for name, figures in {"all": ours.statistics, **ours.class_statistics}.items():
         assert figures.n == theirs[name]["n"]
         mine = figures.completeness, figures.within, figures.median, figures.nmad, figures.rmse, figures.le90
         digits = (4, 4, 3, 3, 3, 3)

@@ -8,6 +8,7 @@ from pyproj import Transformer
 from rasterio.transform import from_origin
 
 from evaluation_rasters import CRS, NORTH, WEST, rolling, write
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.table import evaluation_table
 
@@ -32,37 +33,39 @@ def test_a_case_computed_by_hand(tmp_path):
     nan = np.nan
     surface = np.array([[1, 3, 5, nan, 9], [5, 7, nan, 11, 9], [nan, nan, 2, 2, nan], [nan, 4, 2, 2, 8]])
     reference = np.array([[4, 7, 8], [4, 2, 8]])
-    result = evaluate(laid(tmp_path / "d.tif", surface, 1), laid(tmp_path / "r.tif", reference, 2), margin_m=0)
+    result = evaluate(
+        laid(tmp_path / "d.tif", surface, 1), Comparison(laid(tmp_path / "r.tif", reference, 2), margin_m=0)
+    )
     # Means 4, 8 of two, 9 of two / none, for one of four is known; 2, none, for one of four is known.
     np.testing.assert_allclose(result.error_map.errors, [[0, 1, 1], [nan, 0, nan]], atol=1e-6)
-    assert (result.all.n, result.all.completeness) == (6, 4 / 6)
+    assert (result.statistics.n, result.statistics.completeness) == (6, 4 / 6)
     assert result.mvs3dm.completeness == 2 / 6
     assert result.mvs3dm.median_error_m == pytest.approx(0.5)
-    assert (result.mean_of, result.as_dict()["mean_of"]) == ((2, 2), [2, 2])
-    line = "the reference is coarser: compared is the mean of the surface at 2 x 2 places in each of its cells"
+    assert (result.places_per_block, result.as_dict()["mean_of"]) == ((2, 2), [2, 2])
+    line = "the reference is coarser: each of its cells is compared with the mean of the surface at 2 x 2 places in it"
     assert line in evaluation_table(result)
 
 
 @pytest.mark.parametrize(
-    ("cell_m", "mean_of"), [(0.7, None), (0.98, None), (1.0, (2, 2)), (1.3, (3, 3)), (90, (32, 32))]
+    ("cell_m", "places_per_block"), [(0.7, None), (0.98, None), (1.0, (2, 2)), (1.3, (3, 3)), (90, (32, 32))]
 )
-def test_cells_twice_as_large_are_compared_with_means(tmp_path, cell_m, mean_of):
+def test_cells_twice_as_large_are_compared_with_means(tmp_path, cell_m, places_per_block):
     n = round(180 / cell_m)
     dsm, reference = (
         laid(tmp_path / "d.tif", ground(360, 0.5), 0.5),
         laid(tmp_path / "r.tif", ground(n, cell_m), cell_m),
     )
-    result = evaluate(dsm, reference, margin_m=0)
-    assert result.mean_of == mean_of
-    assert ("coarser" in evaluation_table(result)) == (mean_of is not None)
+    result = evaluate(dsm, Comparison(reference, margin_m=0))
+    assert result.places_per_block == places_per_block
+    assert ("coarser" in evaluation_table(result)) == (places_per_block is not None)
 
 
 def test_noise_of_small_cells_is_no_error_of_large_ones(tmp_path):
     noise = np.random.default_rng(3).normal(0, 1.0, (400, 400))
     dsm = laid(tmp_path / "d.tif", ground(400, 0.5) + noise, 0.5)
-    result = evaluate(dsm, laid(tmp_path / "r.tif", ground(40, 5, part=10), 5))
+    result = evaluate(dsm, Comparison(laid(tmp_path / "r.tif", ground(40, 5, part=10), 5)))
     # A hundred cells: a tenth of their noise.
-    assert result.all.rmse == pytest.approx(0.1, abs=0.02)
+    assert result.statistics.rmse == pytest.approx(0.1, abs=0.02)
     assert result.mvs3dm.median_error_m == pytest.approx(0.6745 * 0.1, abs=0.02)
 
 
@@ -73,9 +76,9 @@ def test_either_side_of_an_edge_is_right_beside_small_cells_too(tmp_path):
     reference = laid(tmp_path / "t.tif", truth, 0.25)
     for wall in (203, 207):
         dsm = np.where(np.arange(400) < wall, 10.0, 20.0)[None] * np.ones((400, 1))
-        result = evaluate(laid(tmp_path / "d.tif", dsm, 0.05), reference, margin_m=0)
-        assert result.mean_of == (10, 10)
-        assert result.all.rmse == pytest.approx(0, abs=1e-6)
+        result = evaluate(laid(tmp_path / "d.tif", dsm, 0.05), Comparison(reference, margin_m=0))
+        assert result.places_per_block == (10, 10)
+        assert result.statistics.rmse == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("coregister", [None, "nuth-kaab"], ids=["search", "nuth-kaab"])
@@ -86,11 +89,11 @@ def test_a_shift_is_found_from_larger_cells(tmp_path, coregister, cell_m, noise_
     dsm = laid(tmp_path / "d.tif", ground(400, 0.5) + noise + 0.4, 0.5, planted)
     n = round(200 / cell_m)
     reference = laid(tmp_path / "r.tif", ground(n, cell_m, part=10), cell_m)
-    result = evaluate(dsm, reference, align=coregister is None, coregister=coregister)
+    result = evaluate(dsm, Comparison(reference, align=coregister is None, coregister=coregister))
     # Of a hundred cells a tenth of their noise, on slopes of 0.3 and 1300 blocks.
     tolerance_m = SHIFT_TOLERANCE_M + 3 * noise_m / 10 / 0.3 / 1300**0.5
     assert result.shift.enu_m == pytest.approx((*planted, 0.4), abs=tolerance_m)
-    assert result.all.rmse < SHIFT_TOLERANCE_M + 0.12 * noise_m
+    assert result.statistics.rmse < SHIFT_TOLERANCE_M + 0.12 * noise_m
     assert result.mvs3dm.median_error_m < SHIFT_TOLERANCE_M + 0.08 * noise_m
 
 
@@ -105,16 +108,16 @@ def test_larger_cells_in_degrees(tmp_path):
     reference = write(tmp_path / "r.tif", z.astype(np.float32), at, "EPSG:4326")
     noise = np.random.default_rng(5).normal(0, 1.0, (400, 400))
     assert shape == z.shape
-    result = evaluate(laid(tmp_path / "d.tif", ground(400, 0.5) + noise, 0.5), reference, margin_m=0)
-    assert result.mean_of == (32, 32)
-    assert result.all.completeness == 1
-    assert abs(result.all.median) < MEAN_TOLERANCE_M
-    assert result.all.rmse < 2 * MEAN_TOLERANCE_M
+    result = evaluate(laid(tmp_path / "d.tif", ground(400, 0.5) + noise, 0.5), Comparison(reference, margin_m=0))
+    assert result.places_per_block == (32, 32)
+    assert result.statistics.completeness == 1
+    assert abs(result.statistics.median) < MEAN_TOLERANCE_M
+    assert result.statistics.rmse < 2 * MEAN_TOLERANCE_M
 
 
 def test_many_blocks_are_looked_at_as_few_at_a_time(tmp_path, monkeypatch):
     dsm = laid(tmp_path / "d.tif", ground(200, 0.5), 0.5)
     reference = laid(tmp_path / "r.tif", ground(33, 3, part=6), 3)
-    whole = evaluate(dsm, reference)
+    whole = evaluate(dsm, Comparison(reference))
     monkeypatch.setattr("zlocus.evaluation.frame.PLACES_AT_A_TIME", 100)
-    assert evaluate(dsm, reference) == whole
+    assert evaluate(dsm, Comparison(reference)) == whole

@@ -18,6 +18,7 @@ from places import ROOT
 from zlocus.cli import evaluate as command
 from zlocus.cli.app import app
 from zlocus.evaluation import files
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.evaluation.slopes import SLOPE_EDGES_DEG
@@ -48,7 +49,7 @@ def test_the_folder_holds_figures_map_and_histogram(tmp_path, pair):
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in out.iterdir()) == sorted(files.NAMES)
     printed, kept = json.loads(result.stdout), json.loads((out / "evaluation.json").read_text())
-    assert kept == {"schema": 1} | printed
+    assert kept == {"schema": 2} | printed
     assert printed["all"]["within_m"] == {"0.3": 0.375, "1": 0.75}
     assert printed["all"]["within"] == 0.375
     assert printed["all"]["completeness"] == 0.75
@@ -76,7 +77,7 @@ def test_the_map_of_blocks_lies_on_blocks(tmp_path):
     reference = write(tmp_path / "r.tif", np.zeros((13, 13), np.float32), quarter)
     dsm = np.zeros((13, 13), np.float32)
     dsm[:5, 5:10] = 0.25
-    errors = evaluate(write(tmp_path / "d.tif", dsm, quarter), reference, margin_m=0).error_map
+    errors = evaluate(write(tmp_path / "d.tif", dsm, quarter), Comparison(reference, margin_m=0)).error_map
     np.testing.assert_array_equal(errors.errors, np.array([[0, 0.25], [0, 0]], np.float32))
     assert errors.geobox.transform.a == pytest.approx(0.5)
     assert errors.geobox.shape == (2, 2)
@@ -86,7 +87,7 @@ def test_the_histogram_shows_the_errors(tmp_path, pair):
     run(*pair, "--margin", 0, "-o", tmp_path / "out")
     picture = cv2.imread(str(tmp_path / "out" / "histogram.png"))
     assert picture.shape == (540, 900, 3)
-    result = evaluate(*pair, margin_m=0)
+    result = evaluate(pair[0], Comparison(pair[1], margin_m=0))
     axes = histogram_figure(result).axes[0]
     (bars,) = (patch for patch in axes.patches if hasattr(patch, "get_data"))
     values, edges, _ = bars.get_data()
@@ -100,7 +101,7 @@ def test_the_histogram_shows_the_errors(tmp_path, pair):
 @pytest.mark.parametrize(("threshold_m", "limits"), [(0.3, [-0.3, 0.3]), (5.0, [])])
 def test_the_histogram_has_limits_where_they_lie_inside(pair, threshold_m, limits):
     """Errors of 0 and 0.5 m: LE95 is 0.5 m, of which 1.25 times is shown."""
-    axes = histogram_figure(evaluate(*pair, margin_m=0, threshold_m=threshold_m)).axes[0]
+    axes = histogram_figure(evaluate(pair[0], Comparison(pair[1], margin_m=0, threshold_m=threshold_m))).axes[0]
     assert axes.get_xlim() == pytest.approx((-0.625, 0.625), abs=1e-4)
     upright = {line.get_label(): line.get_xdata()[0] for line in axes.lines if len(set(line.get_xdata())) == 1}
     assert sorted(x for label, x in upright.items() if not label.startswith("median")) == limits
@@ -111,14 +112,14 @@ def test_the_histogram_has_limits_where_they_lie_inside(pair, threshold_m, limit
 def test_a_surface_that_is_all_but_complete_is_not_100_percent(tmp_path, pair):
     surface = np.zeros((N, N), np.float32)
     surface[60, 60] = np.nan
-    nearly = evaluate(write(tmp_path / "nearly.tif", surface), pair[1], margin_m=0)
-    assert 0.9995 < nearly.all.completeness < 1
+    nearly = evaluate(write(tmp_path / "nearly.tif", surface), Comparison(pair[1], margin_m=0))
+    assert 0.9995 < nearly.statistics.completeness < 1
     assert histogram_figure(nearly).axes[0].get_title(loc="left").startswith("More than 99.9 % of")
 
 
 def test_a_histogram_of_nothing_says_so(tmp_path, pair):
     empty = write(tmp_path / "empty.tif", np.full((N, N), np.nan, np.float32))
-    figure = histogram_figure(evaluate(empty, pair[1]))
+    figure = histogram_figure(evaluate(empty, Comparison(pair[1])))
     assert [text.get_text() for text in figure.axes[0].texts] == ["no height where the reference has one"]
     assert run(empty, pair[1], "-o", tmp_path / "out").exit_code == 0
 
@@ -220,6 +221,6 @@ def test_the_page_names_every_option_and_figure(pair):
 
     options = {name for p in get_command(app).commands["evaluate"].params for name in p.opts if name.startswith("--")}
     assert all(f"`{name}" in page for name in options - {"--help"})
-    record = evaluate(*pair, align=True).as_dict()
+    record = evaluate(pair[0], Comparison(pair[1], align=True)).as_dict()
     named = {*record, *record["all"]}
     assert all(f"`{name}`" in page for name in named), [name for name in named if f"`{name}`" not in page]

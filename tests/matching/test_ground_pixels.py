@@ -18,6 +18,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import DsmRequest
 from zlocus.core.scene import ImageWindow, Scene, View
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.matching.ground_pixels import (
     ReducedImage,
@@ -141,6 +142,7 @@ def test_an_image_at_a_third_of_the_others_resolution(shared_data, tmp_path):
     inputs = (city / "img_n1.tif", at_a_third(city / "img_f1.tif", tmp_path / "f.tif"))
     request = DsmRequest(inputs=inputs, out=tmp_path / "out", report=False, products=())
     run_dsm(request, RunConfig(), SilentProgress())
-    found = evaluate(tmp_path / "out" / "dsm.tif", city / "truth_dsm.tif", more_thresholds_m=(10.0,)).all.as_dict()
+    comparison = Comparison(city / "truth_dsm.tif", more_thresholds_m=(10.0,))
+    found = evaluate(tmp_path / "out" / "dsm.tif", comparison).statistics.as_dict()
     assert found["completeness"] > LEAST_COMPLETE
     assert found["completeness"] - found["within_m"]["10"] < MOST_FAR_OFF

@@ -13,6 +13,7 @@ import pytest
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import progress_for
 from zlocus.core.requests import DsmRequest
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.dsm import run_dsm
@@ -50,7 +51,7 @@ def test_every_sensor_is_read_as_it_was(spec, scenes):
             assert view.image.shape == (rows, cols)
             rng = np.random.default_rng(1)
             xy = rng.uniform((0, 0), (cols, rows), (300, 2))
-            xyz = exposure.camera.ground_from_image(xy, rng.uniform(*spec.height_range, 300))
+            xyz = exposure.sensor.ground_from_image(xy, rng.uniform(*spec.height_range, 300))
             np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=EXACT_PX)
 
 
@@ -61,8 +62,8 @@ def test_all_sensors_together_are_no_worse_than_the_best_alone(scenes, tmp_path)
             DsmRequest(inputs=(scene,), out=tmp_path / kind, resolution=0.2), RunConfig(), progress_for(io.StringIO())
         )
         truth, classes = (scene.parent / name for name in ("truth_dsm.tif", "truth_class.tif"))
-        found = evaluate(tmp_path / kind / "dsm.tif", truth, classes=classes, threshold_m=TWO_PIXELS_M)
-        nmad[kind], within[kind] = found.classes["ground"].nmad, found.all.within
+        found = evaluate(tmp_path / kind / "dsm.tif", Comparison(truth, classes=classes, threshold_m=TWO_PIXELS_M))
+        nmad[kind], within[kind] = found.class_statistics["ground"].nmad, found.statistics.within
     assert nmad["mixed"] <= min(nmad[kind] for kind in SENSORS)
     assert within["mixed"] >= max(within[kind] for kind in SENSORS)
     views = json.loads((tmp_path / "mixed" / "run.json").read_text())["orientation"]["views"].values()

@@ -92,11 +92,12 @@ def evaluate(options: EvaluateOptions) -> None:
     if options.out is not None:
         check_not_input(options.out, options.dsm, options.reference, options.classes, options.geoid)
         check_output(options.out, options.overwrite, EVALUATION_FILES, "evaluation")
+    from zlocus.evaluation.comparison import Comparison
     from zlocus.evaluation.evaluate import evaluate as compare
     from zlocus.evaluation.files import write_evaluation
     from zlocus.evaluation.table import evaluation_table
 
-    evaluation = compare(options.dsm, options.reference, **arguments)
+    evaluation = compare(options.dsm, Comparison(options.reference, **arguments))
     if options.out is not None:
         write_evaluation(options.out, evaluation)
     print(json.dumps(evaluation.as_dict(), indent=2) if options.as_json else evaluation_table(evaluation))

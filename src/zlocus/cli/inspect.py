@@ -51,7 +51,7 @@ def inspect(options: InspectOptions) -> None:
         {"--align": options.align, "--coregister": options.coregister, "--geoid": options.geoid},
     )
     from zlocus.inspector.serving import inspect_surface
-    from zlocus.products.report.comparison import Comparison
+    from zlocus.evaluation.comparison import Comparison
 
     comparison = None
     if options.reference is not None:

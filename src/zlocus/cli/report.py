@@ -32,7 +32,7 @@ def report(options: ReportOptions) -> None:
     from zlocus.core.progress import SilentProgress
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import link_all
-    from zlocus.products.report.comparison import Comparison
+    from zlocus.evaluation.comparison import Comparison
     from zlocus.products.report.page import write_report
 
     comparison = None if options.reference is None else Comparison(options.reference, **arguments)

@@ -1,9 +1,8 @@
-"""A surface against a reference surface: how complete, how accurate, per class and slope, shifted or as it is."""
+"""Evaluation of a surface against a reference surface: completeness and accuracy, per class and per band of slope."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,27 +12,27 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
-from zlocus.evaluation import coregistration
 from zlocus.evaluation.alignment import best_shift
+from zlocus.evaluation.comparison import Comparison
+from zlocus.evaluation.coregistration import coregister
 from zlocus.evaluation.frame import Points, frame_of, points_on
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.mvs3dm import Mvs3dm, mvs3dm_figures
-from zlocus.evaluation.slopes import SLOPE_EDGES_DEG, slope_bands
+from zlocus.evaluation.slopes import slope_bands
 from zlocus.evaluation.statistics import ErrorStatistics, error_statistics
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
 from zlocus.evaluation.vertical import same_heights
 
-COREGISTRATIONS = (coregistration.METHOD,)
 SEARCH = "search"
 
 
 @dataclass(frozen=True)
 class Shift:
-    """What was removed before judging: the surface lies this much east, north and above the reference, in m.
+    """Position of the surface relative to the reference, m; it is removed before errors are computed.
 
-    method : that found it. steps, sigma_m : it took to converge, and its standard error, m; None for a search.
+    method : that found it. steps, sigma_m : iterations until convergence, and standard error, m; None for a search.
     """
 
     east_m: float
@@ -51,7 +50,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Errors of the blocks, where they lie. errors : (r, c) float32, surface less reference, m; NaN where unknown."""
+    """Errors of the blocks on their grid. errors : (r, c) float32, surface less reference, m; NaN where unknown."""
 
     geobox: GeoBox
     errors: NDArray[np.float32]
@@ -59,33 +58,34 @@ class ErrorMap:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of a surface against a reference: over all blocks, and per class where classes were given.
+    """Errors of a surface against a reference, over all blocks and over groups of them.
 
-    shift : removed first, None where the surface was judged as it is. threshold_m : limit of `within`.
-    slopes : figures by band of slope of the reference, degrees. mvs3dm : figures by the definitions of that benchmark.
-    unshifted : figures of all blocks before the shift was removed. heights : what those of surface and reference are
-    above by their files, None where one does not say; assumed : what was taken for granted of that, as a sentence;
-    places_assumed : of their coordinates. geoid_added_to : raster that a geoid's heights were added to. mean_of : of so
-    many places along the rows and columns of a block the mean was compared, the reference being coarser; None: of one.
-    error_map : for files.
+    statistics : of all blocks. class_statistics : by class, empty where no classes were given. shift : that was removed
+    first, None where none was. threshold_m : limit of `within`. slope_statistics : by band of the reference's slope,
+    degrees. mvs3dm : figures by the definitions of that benchmark. unshifted_statistics : of all blocks before the
+    shift was removed. vertical_datums : of surface and reference as their files state them, None where one does not.
+    assumed_datum, assumed_crs : what had to be assumed about the vertical datum and the coordinates, as sentences.
+    geoid_added_to : raster to whose heights the geoid's were added. places_per_block : rows and columns of places in a
+    block over which the surface was averaged, where the reference is coarser; None where each block has one place.
+    error_map : None of an evaluation without files.
     """
 
-    all: ErrorStatistics
-    classes: dict[str, ErrorStatistics]
+    statistics: ErrorStatistics
+    class_statistics: dict[str, ErrorStatistics]
     shift: Shift | None
     threshold_m: float
-    slopes: dict[str, ErrorStatistics] = field(default_factory=dict)
+    slope_statistics: dict[str, ErrorStatistics] = field(default_factory=dict)
     mvs3dm: Mvs3dm | None = None
-    unshifted: ErrorStatistics | None = None
-    heights: tuple[str | None, str | None] = (None, None)
-    assumed: str | None = None
-    places_assumed: str | None = None
+    unshifted_statistics: ErrorStatistics | None = None
+    vertical_datums: tuple[str | None, str | None] = (None, None)
+    assumed_datum: str | None = None
+    assumed_crs: str | None = None
     geoid_added_to: Path | None = None
-    mean_of: tuple[int, int] | None = None
+    places_per_block: tuple[int, int] | None = None
     error_map: ErrorMap | None = field(default=None, repr=False, compare=False)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The evaluation as JSON holds it."""
         shift, mvs3dm = self.shift, self.mvs3dm
         record: dict[str, Any] = {
             "threshold_m": self.threshold_m,
@@ -93,112 +93,82 @@ class Evaluation:
             "shift_method": None if shift is None else shift.method,
             "shift_steps": None if shift is None else shift.steps,
             "shift_sigma": None if shift is None else shift.sigma_m,
-            "dsm_heights": self.heights[0],
-            "reference_heights": self.heights[1],
-            "assumed": self.assumed,
-            "places_assumed": self.places_assumed,
+            "dsm_heights": self.vertical_datums[0],
+            "reference_heights": self.vertical_datums[1],
+            "assumed": self.assumed_datum,
+            "places_assumed": self.assumed_crs,
             "geoid_added_to": None if self.geoid_added_to is None else str(self.geoid_added_to),
-            "mean_of": None if self.mean_of is None else list(self.mean_of),
-            "all": self.all.as_dict(),
-            **{name: figures.as_dict() for name, figures in self.classes.items()},
-            "slopes_deg": {name: figures.as_dict() for name, figures in self.slopes.items()},
+            "mean_of": None if self.places_per_block is None else list(self.places_per_block),
+            "all": self.statistics.as_dict(),
+            **{name: statistics.as_dict() for name, statistics in self.class_statistics.items()},
+            "slopes_deg": {name: statistics.as_dict() for name, statistics in self.slope_statistics.items()},
         }
-        if self.unshifted is not None:
-            record["unshifted"] = self.unshifted.as_dict()
+        if self.unshifted_statistics is not None:
+            record["unshifted"] = self.unshifted_statistics.as_dict()
         if mvs3dm is not None:
             for name, value in (("completeness", mvs3dm.completeness), ("median_error", mvs3dm.median_error_m)):
                 record[f"mvs3dm_{name}"] = None if math.isnan(value) else value
         return record
 
 
-def evaluate(
-    dsm: Path,
-    reference: Path,
-    *,
-    classes: Path | None = None,
-    align: bool = False,
-    margin_m: float = 10.0,
-    threshold_m: float = 1.0,
-    more_thresholds_m: Sequence[float] = (),
-    slope_edges_deg: Sequence[float] = SLOPE_EDGES_DEG,
-    coregister: str | None = None,
-    geoid: Path | None = None,
-) -> Evaluation:
-    """Judge a surface by a reference surface, whose heights decide the area.
+def evaluate(dsm: Path, comparison: Comparison) -> Evaluation:
+    """Compare a surface with a reference surface; cells of the reference with a height are the area that counts.
 
-    The reference is taken in blocks of about 0.5 m, the surface looked up at their centres (nearest cell, reprojected
-    where the CRS differ); where the reference's cells are twice as large as its own or larger, its mean over the block.
-    A block's true height is its mean; where it holds an edge, either side is right. A cell
-    without height counts as missing, and as not within the threshold. With `align` the best shift, with
-    `coregister="nuth-kaab"` that of slope and aspect, is removed first, and heights are then looked up between cells.
-    geoid : see `vertical.same_heights`.
+    The reference is divided into blocks of about 0.5 m. The surface is sampled at the centre of each block (nearest
+    cell, reprojected where the CRS differ). Where the reference's cells are at least twice as large as the surface's,
+    the mean of the surface over the block is compared instead. The true height of a block is the mean of its cells; in
+    a block that holds an edge, either side counts as right. A cell without height counts as missing, and as not within
+    the threshold. A shift that the comparison asks for is removed first; heights are then interpolated between cells.
 
     Raises
     ------
     InputError
-        A file is missing, is not a raster of heights, or the two do not overlap, are above different things, or cannot
-        be co-registered.
+        A file is missing or is not a raster of heights; or the two do not overlap, have different vertical datums, or
+        cannot be co-registered.
     ConfigError
-        A margin, threshold or slope out of range, classes on another grid, or both kinds of alignment.
+        The raster of classes is on another grid, or a geoid is given that is not needed.
     """
-    check_options(margin_m, (threshold_m, *more_thresholds_m), align, coregister)
-    slope_bands(np.zeros(0), slope_edges_deg)
-    compared = same_heights(read_heights(dsm), read_heights(reference), geoid)
-    surface, heights = compared.surface, compared.reference
-    frame = frame_of(surface, heights)
-    truth = truth_blocks(heights, margin_m, None if classes is None else read_classes(classes, heights), frame)
-    points = points_on(surface, heights, frame, truth.xy, truth.size, truth.is_edge)
-    _check_overlap(surface, heights, points)
-    as_it_lies = truth.errors(points.heights(surface.nearest))
-    shift, errors = _aligned(surface, truth, points, align, coregister) or (None, as_it_lies)
+    compared = same_heights(read_heights(dsm), read_heights(comparison.reference), comparison.geoid)
+    surface, reference = compared.surface, compared.reference
+    frame = frame_of(surface, reference)
+    classes = None if comparison.classes is None else read_classes(comparison.classes, reference)
+    truth = truth_blocks(reference, comparison.margin_m, classes, frame)
+    points = points_on(surface, reference, frame, truth.xy, truth.size, truth.is_edge)
+    _check_overlap(surface, reference, points)
+    errors_unshifted = truth.errors(points.heights(surface.nearest))
+    aligned = _aligned(surface, truth, points, comparison)
+    shift, errors = (None, errors_unshifted) if aligned is None else aligned
 
-    def figures(members: NDArray[np.bool_] | slice) -> ErrorStatistics:
-        return error_statistics(errors[members], threshold_m, more_thresholds_m)
+    def statistics(errors: FloatArray) -> ErrorStatistics:
+        return error_statistics(errors, comparison.threshold_m, comparison.more_thresholds_m)
 
+    class_names = () if classes is None else tuple(CLASS_NAMES)
+    bands = slope_bands(truth.slope_deg, comparison.slope_edges_deg)
     return Evaluation(
-        all=figures(slice(None)),
-        classes={} if classes is None else {name: figures(truth.members(name)) for name in CLASS_NAMES},
+        statistics=statistics(errors),
+        class_statistics={name: statistics(errors[truth.members(name)]) for name in class_names},
         shift=shift,
-        threshold_m=threshold_m,
-        slopes={name: figures(band) for name, band in slope_bands(truth.slope_deg, slope_edges_deg).items()},
-        mvs3dm=mvs3dm_figures(surface, heights, frame, margin_m=margin_m, shift=shift.enu_m if shift else None),
-        unshifted=None if shift is None else error_statistics(as_it_lies, threshold_m, more_thresholds_m),
-        heights=compared.datums,
-        assumed=compared.assumed,
-        places_assumed=_places_assumed(surface, heights),
+        threshold_m=comparison.threshold_m,
+        slope_statistics={name: statistics(errors[band]) for name, band in bands.items()},
+        mvs3dm=mvs3dm_figures(surface, reference, frame, comparison.margin_m, shift.enu_m if shift else None),
+        unshifted_statistics=None if shift is None else statistics(errors_unshifted),
+        vertical_datums=compared.datums,
+        assumed_datum=compared.assumed,
+        assumed_crs=_assumed_crs(surface, reference),
         geoid_added_to=compared.converted,
-        mean_of=None if points.areas is None else points.areas.shape,
-        error_map=_error_map(truth, heights.horizontal, errors),
-    )  # fmt: skip
-
-
-def check_options(margin_m: float, thresholds_m: Sequence[float], align: bool, coregister: str | None) -> None:
-    """Refuse what no evaluation can be asked.
-
-    Raises
-    ------
-    ConfigError
-        A margin or threshold out of range, a co-registration that is not known, or both kinds of alignment.
-    """
-    if not margin_m >= 0:
-        raise ConfigError(f"--margin {margin_m:g} is negative. Give 0 or more metres.")
-    for threshold_m in thresholds_m:
-        if not threshold_m > 0:
-            raise ConfigError(f"--threshold {threshold_m:g} is not a size. Give a number of metres above 0.")
-    if coregister is not None and coregister not in COREGISTRATIONS:
-        raise ConfigError(f"--coregister {coregister} is not known. Give {' or '.join(COREGISTRATIONS)}.")
-    if align and coregister is not None:
-        raise ConfigError(f"--align and --coregister {coregister} both look for the shift. Leave one out.")
+        places_per_block=None if points.areas is None else points.areas.shape,
+        error_map=_error_map(truth, reference.horizontal, errors),
+    )
 
 
 def _aligned(
-    surface: HeightRaster, truth: TruthBlocks, points: Points, align: bool, coregister: str | None
+    surface: HeightRaster, truth: TruthBlocks, points: Points, comparison: Comparison
 ) -> tuple[Shift, FloatArray] | None:
-    """The shift found, and the errors (n,) m once it is removed; None where none was asked for."""
-    if coregister is not None:
-        found = coregistration.coregister(surface, truth, points)
-        shift = Shift(found.east_m, found.north_m, 0.0, coregister, found.steps, found.sigma_m)
-    elif align:
+    """The shift of the surface, and the errors (n,) m without it; None where the comparison asks for no shift."""
+    if comparison.coregister is not None:
+        fit = coregister(surface, truth, points)
+        shift = Shift(fit.east_m, fit.north_m, 0.0, comparison.coregister, fit.steps, fit.sigma_m)
+    elif comparison.align:
         shift = Shift(*best_shift(surface, truth, points), 0.0)
     else:
         return None
@@ -211,7 +181,7 @@ def _check_overlap(surface: HeightRaster, reference: HeightRaster, points: Point
     cell = surface.cells(points.xy)
     if not ((cell >= 0) & (cell < surface.z.shape)).all(axis=1).any():
         raise InputError(
-            f"{surface.path} ({_name(surface)}) and {reference.path} ({_name(reference)}) do not overlap. "
+            f"{surface.path} ({_crs_name(surface)}) and {reference.path} ({_crs_name(reference)}) do not overlap. "
             "Check the CRS of both."
         )
 
@@ -222,15 +192,14 @@ def _error_map(truth: TruthBlocks, crs: CRS | None, errors: FloatArray) -> Error
     return ErrorMap(GeoBox(truth.shape, truth.transform, None if crs is None else crs.to_wkt()), values)
 
 
-def _places_assumed(surface: HeightRaster, reference: HeightRaster) -> str | None:
-    """What was taken for granted of coordinates, as a sentence."""
-    silent = [str(raster.path) for raster in (surface, reference) if raster.horizontal is None]
-    if not silent:
+def _assumed_crs(surface: HeightRaster, reference: HeightRaster) -> str | None:
+    """What was assumed about coordinates, as a sentence; None where both files have a CRS."""
+    without_crs = [str(raster.path) for raster in (surface, reference) if raster.horizontal is None]
+    if not without_crs:
         return None
-    return (
-        f"{' and '.join(silent)} {'has' if len(silent) == 1 else 'have'} no CRS: coordinates were compared as they are"
-    )
+    verb = "has" if len(without_crs) == 1 else "have"
+    return f"{' and '.join(without_crs)} {verb} no CRS: coordinates were compared as they are"
 
 
-def _name(raster: HeightRaster) -> str:
+def _crs_name(raster: HeightRaster) -> str:
     return raster.crs.to_string()[:60] if raster.crs else "no CRS"

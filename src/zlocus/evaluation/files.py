@@ -1,4 +1,4 @@
-"""What an evaluation leaves in a folder: figures, a map of the errors, their histogram."""
+"""Files of an evaluation: statistics as JSON, a map of the errors and their histogram."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from zlocus.core.requests import EVALUATION_FILES
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.io.rasters import write_cog
-from zlocus.io.run_record import write_record, write_atomically
+from zlocus.io.run_record import write_atomically, write_record
 
 NAMES = (FIGURES, ERROR_MAP, HISTOGRAM) = EVALUATION_FILES
 DPI = 120
 
 
 def write_evaluation(out: Path, evaluation: Evaluation) -> None:
-    """Write `FIGURES`, `ERROR_MAP` and `HISTOGRAM` into a folder, each whole or not at all; the figures last.
+    """Write `FIGURES`, `ERROR_MAP` and `HISTOGRAM` into a folder, each complete or not at all; the figures last.
 
     Raises
     ------
     OutputError
-        Where they cannot be written.
+        A file cannot be written.
     """
     assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out} cannot be made: {error.strerror}. Choose another folder with -o.") from error
-    # They belong together: figures of another evaluation must not stay beside a new map.
+    # The figures of another evaluation must not stay beside a new map.
     try:
         (out / FIGURES).unlink(missing_ok=True)
     except OSError as error:

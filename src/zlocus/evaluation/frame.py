@@ -1,5 +1,6 @@
-"""One frame in metres for a surface and its reference: shifts and slopes are measured there, whatever the CRS; and the
-places where the surface is looked up.
+"""The common frame of a surface and its reference, in metres, and the places where the surface is sampled.
+
+Shifts and slopes are measured in the frame, whatever the CRS of the two rasters.
 """
 
 from __future__ import annotations
@@ -19,24 +20,24 @@ from zlocus.evaluation.heights import HeightRaster
 from zlocus.io.crs import is_on_earth, utm_zone
 from zlocus.sensors.earth_frame import WGS84, between
 
-# Web Mercator is out by a factor of two at 60 degrees; maps made for measuring by less than this.
-SCALE_TOLERANCE = 0.01
-# Half the distance over which a map is differentiated, m: curvature is not seen, rounding of degrees neither.
+# A map that is made for measuring is true to scale within this. Web Mercator is wrong by a factor of two at 60 degrees.
+MAX_SCALE_ERROR = 0.01
+# Half the distance over which a map is differentiated: neither its curvature nor the rounding of degrees matters.
 HALF_STEP_M = 5.0
-# From so many cells of the surface on, along a side, a cell of the reference is compared with their mean. So near to a
-# whole number, cells of two maps count as fitting.
-COARSER, FITTING = 2.0, 0.01
-# Places along a side of a larger cell at most: of cells of 90 m, 3 m apart.
-MOST_PLACES = 32
+# A cell of the reference this many times as large as the surface's, along a side, is compared with the mean of the
+# surface in it. A ratio this close to a whole number counts as whole.
+MIN_COARSER_RATIO, RATIO_TOLERANCE = 2.0, 0.01
+# Maximum number of places along a side of a larger cell; in cells of 90 m they are 3 m apart.
+MAX_PLACES_PER_SIDE = 32
 PLACES_AT_A_TIME = 1_000_000
 
 
 @dataclass(frozen=True)
 class Areas:
-    """The blocks around points, where they are looked up at many places.
+    """Blocks around points, each of which is sampled at several places.
 
-    steps : (2, 2) or (n, 2, 2) float64, change of (x, y) along a block's columns ([..., 0]) and rows ([..., 1]), 0 of
-    blocks that are looked up at their point alone. shape : places along rows and columns.
+    steps : (2, 2) or (n, 2, 2) float64, change of (x, y) along a block's columns ([..., 0]) and rows ([..., 1]); 0 for
+    blocks that are sampled at their point only. shape : number of places along rows and columns.
     """
 
     steps: FloatArray
@@ -44,17 +45,17 @@ class Areas:
 
     @property
     def places(self) -> FloatArray:
-        """Where they are in a block, (k, 2) columns and rows, in blocks from its point."""
+        """Offsets (k, 2) of the places from the point, in columns and rows, as fractions of the block."""
         down, across = ((np.arange(n) + 0.5) / n - 0.5 for n in self.shape)
         return np.column_stack([np.tile(across, len(down)), np.repeat(down, len(across))])
 
 
 @dataclass(frozen=True)
 class Points:
-    """Ground points in a surface's CRS, which can be moved by metres of the frame.
+    """Ground points in the surface's CRS, which can be moved by metres of the frame.
 
     xy : (n, 2) float64. per_metre : (n, 2, 2) float64, change of (x, y) by a metre to the east ([..., 0]) and to the
-    north ([..., 1]); None where the CRS is the frame. areas : None where heights are those at the points.
+    north ([..., 1]); None where the CRS is the frame. areas : None where heights are sampled at the points only.
     """
 
     xy: FloatArray
@@ -62,35 +63,35 @@ class Points:
     areas: Areas | None = None
 
     def heights(
-        self, look: Callable[[FloatArray], FloatArray], shift: Sequence[float] | FloatArray | None = None
+        self, sample: Callable[[FloatArray], FloatArray], shift: Sequence[float] | FloatArray | None = None
     ) -> FloatArray:
-        """Heights (n,) m at the points, shifted by (east, north) m, or the means of their areas.
+        """Heights (n,) m at the points, shifted by (east, north) m, or their means over the areas.
 
-        look : heights at places (n, 2), NaN where there is none. A mean is of the places that have a height, NaN where
-        fewer than half of them do.
+        sample : returns heights at places (n, 2), NaN where there is none. A mean is taken over the places that have a
+        height; it is NaN where fewer than half of them have one.
         """
-        at = self.xy if shift is None else self.moved(shift)
+        xy = self.xy if shift is None else self.moved(shift)
         if self.areas is None:
-            return look(at)
-        places, steps = self.areas.places, np.broadcast_to(self.areas.steps, (len(at), 2, 2))
-        means = np.full(len(at), np.nan)
+            return sample(xy)
+        places, steps = self.areas.places, np.broadcast_to(self.areas.steps, (len(xy), 2, 2))
+        means = np.full(len(xy), np.nan)
         n_at_a_time = max(1, PLACES_AT_A_TIME // len(places))
-        for first in range(0, len(at), n_at_a_time):
+        for first in range(0, len(xy), n_at_a_time):
             part = slice(first, first + n_at_a_time)
-            aside = np.einsum("nij,kj->nki", steps[part], places)
-            z = look((at[part, None] + aside).reshape(-1, 2)).reshape(-1, len(places))
+            offsets = np.einsum("nij,kj->nki", steps[part], places)
+            z = sample((xy[part, None] + offsets).reshape(-1, 2)).reshape(-1, len(places))
             n_known = np.isfinite(z).sum(axis=1)
             enough = 2 * n_known >= len(places)
             means[part][enough] = np.nansum(z[enough], axis=1) / n_known[enough]
         return means
 
     def moved(self, shift: Sequence[float] | FloatArray) -> FloatArray:
-        """The points (n, 2), shifted by (east, north) m of the frame."""
+        """Coordinates (n, 2) of the points, shifted by (east, north) m of the frame."""
         step = np.asarray(shift, float)
         return np.asarray(self.xy + (step if self.per_metre is None else self.per_metre @ step))
 
     def where(self, chosen: NDArray[np.bool_]) -> Points:
-        """Some of the points. chosen : (n,)."""
+        """The points that a mask selects. chosen : (n,) bool."""
         areas = self.areas
         if areas is not None and areas.steps.ndim == 3:
             areas = replace(areas, steps=areas.steps[chosen])
@@ -98,15 +99,15 @@ class Points:
 
 
 def frame_of(surface: HeightRaster, reference: HeightRaster) -> CRS | None:
-    """The map that east, north and slopes are measured on; None where a file has no CRS and coordinates are as given.
+    """The map on which shifts and slopes are measured; None where a file has no CRS, and coordinates are used as given.
 
-    The surface's CRS, else the reference's, if it is projected in metres and true to scale within 1 %; else the WGS84
-    UTM zone of the reference's centre.
+    It is the surface's CRS, or else the reference's, if that is projected, in metres and true to scale within 1 %.
+    Otherwise it is the WGS84 UTM zone of the reference's centre.
 
     Raises
     ------
     InputError
-        A CRS that PROJ cannot convert, or degrees beside a file without CRS.
+        PROJ cannot convert a CRS, or one file is in degrees and the other has no CRS.
     """
     mine, theirs = surface.horizontal, reference.horizontal
     if mine is None or theirs is None:
@@ -130,7 +131,7 @@ def frame_of(surface: HeightRaster, reference: HeightRaster) -> CRS | None:
 
 
 def in_metres(crs: CRS | None) -> bool:
-    """Whether coordinates are metres of a map; taken to be so where there is no CRS."""
+    """Whether coordinates are metres of a map; without a CRS they are assumed to be."""
     if crs is None:
         return True
     return not crs.is_geographic and all(abs(axis.unit_conversion_factor - 1.0) < 1e-9 for axis in crs.axis_info)
@@ -144,16 +145,18 @@ def points_on(
     block: int = 1,
     single: NDArray[np.bool_] | None = None,
 ) -> Points:
-    """Points of the reference (n, 2), in its CRS, as the surface has them; with the areas of their blocks where its
-    cells are at least `COARSER` times as large as the surface's.
+    """Points in the surface's CRS; with areas where the reference's cells are much larger than the surface's.
 
-    block : cells of the reference along a side. single : (n,) those that are looked up at the point alone.
+    xy : (n, 2), in the reference's CRS. block : cells of the reference along a side of a block. single : (n,) bool, the
+    points that are sampled at the point only. Much larger: at least `MIN_COARSER_RATIO` times.
     """
-    points = _points_alone(surface, reference, frame, xy)
+    points = _points_without_areas(surface, reference, frame, xy)
     across, down = cells_across(surface, reference)
-    if not math.sqrt(across * down) >= COARSER - FITTING:
+    if not math.sqrt(across * down) >= MIN_COARSER_RATIO - RATIO_TOLERANCE:
         return points
-    n_down, n_across = (int(np.clip(np.ceil(block * n - FITTING), 1, MOST_PLACES)) for n in (down, across))
+    n_down, n_across = (
+        int(np.clip(np.ceil(block * n - RATIO_TOLERANCE), 1, MAX_PLACES_PER_SIDE)) for n in (down, across)
+    )
     steps = grid_steps(reference, block, surface.horizontal, xy)
     if single is not None and single.any():
         steps = np.where(single[:, None, None], 0.0, steps)
@@ -161,7 +164,7 @@ def points_on(
 
 
 def cells_across(surface: HeightRaster, reference: HeightRaster) -> tuple[float, float]:
-    """Cells of the surface along the columns and rows of one of the reference, at its centre; NaN outside of a map."""
+    """Cells of the surface along the columns and rows of a reference cell, at the centre; NaN outside a map."""
     x, y = reference.centre
     step = grid_steps(reference, 1, surface.horizontal, np.array([[x, y]])).reshape(2, 2)
     cell = np.array([[surface.transform.a, surface.transform.b], [surface.transform.d, surface.transform.e]])
@@ -172,9 +175,10 @@ def cells_across(surface: HeightRaster, reference: HeightRaster) -> tuple[float,
 
 
 def grid_steps(reference: HeightRaster, size: int, target: CRS | None, xy: FloatArray) -> FloatArray:
-    """Change of (x, y) of a map by so many cells of a reference along its columns ([..., 0]) and rows ([..., 1]).
+    """Change of (x, y) on a map by `size` cells of a reference along its columns ([..., 0]) and rows ([..., 1]).
 
-    xy : (n, 2), of its own CRS, around which it is. (2, 2) where both have one CRS, or one has none; else (n, 2, 2).
+    xy : (n, 2), places in the reference's CRS at which it is computed. The result is (2, 2) where both have one CRS or
+    one has none, else (n, 2, 2).
     """
     t, theirs = reference.transform, reference.horizontal
     step = np.array([[t.a, t.b], [t.d, t.e]]) * size
@@ -184,7 +188,7 @@ def grid_steps(reference: HeightRaster, size: int, target: CRS | None, xy: Float
     return np.stack([after - before for after, before in ends], axis=-1)
 
 
-def _points_alone(surface: HeightRaster, reference: HeightRaster, frame: CRS | None, xy: FloatArray) -> Points:
+def _points_without_areas(surface: HeightRaster, reference: HeightRaster, frame: CRS | None, xy: FloatArray) -> Points:
     mine, theirs = surface.horizontal, reference.horizontal
     if frame is None or mine is None or theirs is None:
         return Points(xy)
@@ -199,12 +203,12 @@ def _points_alone(surface: HeightRaster, reference: HeightRaster, frame: CRS | N
 
 
 def converted(given: CRS, wanted: CRS, xy: FloatArray) -> FloatArray:
-    """Coordinates (n, 2) of one CRS in another."""
+    """Coordinates (n, 2) of a given CRS in another, wanted one."""
     return xy if given == wanted else np.column_stack(between(given, wanted).transform(xy[:, 0], xy[:, 1]))
 
 
 def unit_m(reference: HeightRaster, frame: CRS | None) -> tuple[float, float]:
-    """Metres of the frame in a unit of the reference's x and y, at its centre; (1, 1) for a map made for measuring."""
+    """Metres of the frame per unit of the reference's x and y, at its centre; (1, 1) for a map made for measuring."""
     theirs = reference.horizontal
     if frame is None or theirs is None or theirs == frame:
         return 1.0, 1.0
@@ -212,7 +216,7 @@ def unit_m(reference: HeightRaster, frame: CRS | None) -> tuple[float, float]:
     half = abs(reference.transform.a) / 2
     ends = converted(theirs, frame, np.array([[x - half, y], [x + half, y], [x, y - half], [x, y + half]]))
     width, height = np.hypot(*(ends[1::2] - ends[::2]).T) / (2 * half)
-    if in_metres(theirs) and max(abs(width - 1.0), abs(height - 1.0)) < SCALE_TOLERANCE:
+    if in_metres(theirs) and max(abs(width - 1.0), abs(height - 1.0)) < MAX_SCALE_ERROR:
         return 1.0, 1.0
     return float(width), float(height)
 
@@ -222,4 +226,4 @@ def _true_to_scale(crs: CRS, lon: float, lat: float) -> bool:
         factors = Proj(crs).get_factors(lon, lat)
     except (ProjError, CRSError):
         return False
-    return all(abs(scale - 1.0) < SCALE_TOLERANCE for scale in (factors.meridional_scale, factors.parallel_scale))
+    return all(abs(scale - 1.0) < MAX_SCALE_ERROR for scale in (factors.meridional_scale, factors.parallel_scale))

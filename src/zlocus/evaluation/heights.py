@@ -1,4 +1,4 @@
-"""A raster of heights, looked up at ground points."""
+"""A raster of heights, sampled at ground points."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.height_values import check_unit, is_fill
 from zlocus.io.open_raster import open_raster
 
-# What lies beyond is no height, whatever it means.
-LOWEST_M, HIGHEST_M = -1e4, 1e5
-# Row and column of a point that a map cannot show.
+# Values outside this range are not heights, whatever they mean.
+MIN_HEIGHT_M, MAX_HEIGHT_M = -1e4, 1e5
+# Row and column given to points without finite coordinates.
 OUTSIDE = -10.0
 
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Heights on a grid. z : (r, c) float64, m, NaN where there is none; description : of the band."""
+    """Heights on a grid. z : (r, c) float64, m, NaN where there is no height; description : of the band."""
 
     path: Path
     z: FloatArray
@@ -35,12 +35,12 @@ class HeightRaster:
 
     @cached_property
     def spatial(self) -> pyproj.CRS | None:
-        """The CRS with its heights, where it says what they are above.
+        """The CRS of the file, which may have a vertical part.
 
         Raises
         ------
         InputError
-            It is none that PROJ knows.
+            PROJ does not know the CRS.
         """
         if not self.crs:
             return None
@@ -58,13 +58,13 @@ class HeightRaster:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """x and y of the middle of the raster."""
+        """x and y of the centre of the raster."""
         rows, cols = self.z.shape
         x, y = self.transform * (cols / 2, rows / 2)
         return float(x), float(y)
 
     def nearest(self, xy: FloatArray) -> FloatArray:
-        """Height of the cell that holds each point. xy : (n, 2) in the raster's CRS -> (n,) m, NaN outside."""
+        """Height (n,) m of the cell that contains each point; NaN outside. xy : (n, 2) in the raster's CRS."""
         cell = np.floor(self.cells(xy)).astype(int)
         inside = np.all((cell >= 0) & (cell < self.z.shape), axis=1)
         z = np.full(len(xy), np.nan)
@@ -72,12 +72,12 @@ class HeightRaster:
         return z
 
     def bilinear(self, xy: FloatArray) -> FloatArray:
-        """Height between the four cell centres around each point; as `nearest` where one of the four is missing."""
+        """Height (n,) m interpolated between four cell centres; as `nearest` where one of the four has no height."""
         z = self.between_cells(xy)
         return np.where(np.isfinite(z), z, self.nearest(xy))
 
     def between_cells(self, xy: FloatArray) -> FloatArray:
-        """Height between the four cell centres around each point, NaN where one of the four is missing."""
+        """Height (n,) m interpolated between four cell centres; NaN where one of the four has no height."""
         cell = self.cells(xy) - 0.5
         corner = np.floor(cell).astype(int)
         down, right = (cell - corner).T
@@ -88,9 +88,9 @@ class HeightRaster:
         return np.where(inside, upper * (1 - down) + lower * down, np.nan)
 
     def cells(self, xy: FloatArray) -> FloatArray:
-        """(row, col) with (0, 0) at the outer corner of the first cell, outside for what is not finite.
+        """Fractional row and column (n, 2) of points (n, 2), from the outer corner of the first cell.
 
-        (n, 2) -> (n, 2).
+        Points that are not finite get a place outside the raster.
         """
         inverse = ~self.transform
         x, y = xy[:, 0], xy[:, 1]
@@ -100,12 +100,12 @@ class HeightRaster:
 
 
 def read_heights(path: Path) -> HeightRaster:
-    """The first band of a raster as heights.
+    """Heights from the first band of a raster.
 
     Raises
     ------
     InputError
-        The file is missing, cannot be read, is too small to hold a surface, or its unit is not the metre.
+        The file is missing or cannot be read, is too small for a surface, or its unit is not the metre.
     """
     with open_raster(path, "raster of heights") as source:
         stored, nodata, transform, crs = source.read(1), source.nodata, source.transform, source.crs
@@ -113,7 +113,7 @@ def read_heights(path: Path) -> HeightRaster:
         check_unit(source.units[0], path)
     if stored.dtype.kind == "c":
         raise InputError(f"{path} holds complex numbers, which are no heights. Check the file.")
-    with np.errstate(invalid="ignore"):  # some kinds of NaN
+    with np.errstate(invalid="ignore"):  # signalling NaN
         z = stored.astype(np.float64)
     if min(z.shape) < 2:
         raise InputError(f"{path} has {z.shape[0]} x {z.shape[1]} cells, too few for a surface. Check the file.")
@@ -122,5 +122,5 @@ def read_heights(path: Path) -> HeightRaster:
     z[is_fill(z)] = np.nan
     if (scale, offset) != (1.0, 0.0):
         z = z * scale + offset
-    z[(z < LOWEST_M) | (z > HIGHEST_M)] = np.nan
+    z[(z < MIN_HEIGHT_M) | (z > MAX_HEIGHT_M)] = np.nan
     return HeightRaster(path, z, transform, crs, description)

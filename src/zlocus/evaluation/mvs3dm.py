@@ -19,9 +19,11 @@ CELLS_AT_A_TIME = 1_000_000
 
 @dataclass(frozen=True)
 class Mvs3dm:
-    """completeness : share of the non-empty cells of the reference whose height is met within 1 m; a cell that the
-    surface leaves empty is not met. median_error_m : median of the absolute errors where both have a height, m, NaN
-    where that is nowhere.
+    """Figures of the MVS3DM benchmark.
+
+    completeness : share of the reference's cells with a height at which the surface's height is within 1 m; a cell that
+    the surface leaves empty counts as wrong. median_error_m : median of the absolute errors where both have a height,
+    m; NaN where no cell has both.
     """
 
     completeness: float
@@ -32,31 +34,30 @@ def mvs3dm_figures(
     surface: HeightRaster,
     reference: HeightRaster,
     frame: CRS | None,
-    *,
     margin_m: float,
     shift: tuple[float, float, float] | None,
 ) -> Mvs3dm:
-    """The benchmark's figures, over single cells of the reference: no blocks, no edges at which both sides are right.
+    """Figures over single cells of the reference: without blocks, and without edges at which both sides are right.
 
-    shift : (east, north, up) m to be removed from the surface first, None for the surface as it is (nearest cell).
-    Larger cells are compared with the mean of the surface in them, see `points_on`.
+    shift : (east, north, up), m, removed from the surface first; None: the surface as it is (nearest cell). Larger
+    cells of the reference are compared with the mean of the surface in them, see `points_on`.
     """
     unit = unit_m(reference, frame)
     rows_at_a_time = max(1, CELLS_AT_A_TIME // reference.z.shape[1])
-    n, n_met, found = 0, 0, [np.zeros(0, np.float32)]
+    n, n_within, errors_of_bands = 0, 0, [np.zeros(0, np.float32)]
     for first in range(0, reference.z.shape[0], rows_at_a_time):
         band = reference.z[first : first + rows_at_a_time]
         row, col = (place.astype(np.float64) + 0.5 for place in np.nonzero(np.isfinite(band)))
         xy = places(reference.transform, row + first, col)
         keep = inside_margin(reference, margin_m, unit, xy)
-        error = np.abs(_looked_up(surface, reference, frame, xy[keep], shift) - band[np.isfinite(band)][keep])
-        n, n_met = n + error.size, n_met + int(np.count_nonzero(error < WITHIN_M))
-        found.append(error[np.isfinite(error)].astype(np.float32))
-    errors = np.concatenate(found)
-    return Mvs3dm(n_met / n if n else math.nan, float(np.median(errors)) if errors.size else math.nan)
+        error = np.abs(_sampled(surface, reference, frame, xy[keep], shift) - band[np.isfinite(band)][keep])
+        n, n_within = n + error.size, n_within + int(np.count_nonzero(error < WITHIN_M))
+        errors_of_bands.append(error[np.isfinite(error)].astype(np.float32))
+    errors = np.concatenate(errors_of_bands)
+    return Mvs3dm(n_within / n if n else math.nan, float(np.median(errors)) if errors.size else math.nan)
 
 
-def _looked_up(
+def _sampled(
     surface: HeightRaster,
     reference: HeightRaster,
     frame: CRS | None,

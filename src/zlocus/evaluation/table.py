@@ -1,4 +1,4 @@
-"""An evaluation as a table for people."""
+"""An evaluation as a text table."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ ERROR_COLUMNS = ("median", "NMAD", "RMSE", "LE90", "LE95")
 
 
 def evaluation_table(evaluation: Evaluation) -> str:
-    """Lines of text: a row for all cells, one per class and per band of slope, errors in m; then what they mean.
+    """Text with a row for all cells, for each class and for each band of slope, errors in m; notes follow.
 
-    A shift that was removed is said, with the figures of the surface before.
+    Where a shift was removed, a row and a note give the statistics before and the shift.
     """
     rows = evaluation_rows(evaluation)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -24,25 +24,28 @@ def evaluation_table(evaluation: Evaluation) -> str:
 
 
 def evaluation_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
-    """The table's cells: the headings (the first is empty), then a row for each group of the reference's cells."""
+    """Headings of the table, the first one empty, then a row for each group of the reference's cells."""
     thresholds = _thresholds(evaluation)
     within = [f"< {limit:g} m" for limit in thresholds] if len(thresholds) > 1 else ["within"]
-    groups = {"all": evaluation.all}
-    if evaluation.unshifted is not None:
-        groups["as it lies"] = evaluation.unshifted
-    groups |= evaluation.classes | {_band_name(name): figures for name, figures in evaluation.slopes.items()}
+    groups = {"all": evaluation.statistics}
+    if evaluation.unshifted_statistics is not None:
+        groups["as it lies"] = evaluation.unshifted_statistics
+    bands = {_band_name(name): statistics for name, statistics in evaluation.slope_statistics.items()}
+    groups |= evaluation.class_statistics | bands
     return [("", "cells", "complete", *within, *ERROR_COLUMNS), *(_row(*group) for group in groups.items())]
 
 
 def _thresholds(evaluation: Evaluation) -> list[float]:
-    return [limit for limit, _ in evaluation.all.shares]
+    return [limit for limit, _ in evaluation.statistics.shares]
 
 
-def _row(name: str, figures: ErrorStatistics) -> tuple[str, ...]:
-    within = [share for _, share in figures.shares] or [figures.within]
-    shares = (f"{100 * share:.2f} %" for share in (figures.completeness, *within))
-    errors = (f"{e:.3f}" for e in (figures.median, figures.nmad, figures.rmse, figures.le90, figures.le95))
-    return (name, str(figures.n), *("-" if "nan" in text else text for text in (*shares, *errors)))
+def _row(name: str, statistics: ErrorStatistics) -> tuple[str, ...]:
+    within = [share for _, share in statistics.shares] or [statistics.within]
+    shares = (f"{100 * share:.2f} %" for share in (statistics.completeness, *within))
+    errors = (
+        f"{e:.3f}" for e in (statistics.median, statistics.nmad, statistics.rmse, statistics.le90, statistics.le95)
+    )
+    return (name, str(statistics.n), *("-" if "nan" in text else text for text in (*shares, *errors)))
 
 
 def _band_name(name: str) -> str:
@@ -50,9 +53,9 @@ def _band_name(name: str) -> str:
 
 
 def notes(evaluation: Evaluation) -> Iterator[str]:
-    """What the table's figures mean, what was assumed and what was removed, a line each."""
-    if evaluation.all.n and math.isnan(evaluation.all.median):
-        yield "no error is known: nowhere do surface and reference both have a height"
+    """Lines that explain the table: what its figures mean, what was assumed, and which shift was removed."""
+    if evaluation.statistics.n and math.isnan(evaluation.statistics.median):
+        yield "no error is known: no cell has a height in both the surface and the reference"
     if len(_thresholds(evaluation)) > 1:
         yield "< M m: share of all cells in error by less; errors in m"
     else:
@@ -63,13 +66,13 @@ def notes(evaluation: Evaluation) -> Iterator[str]:
             f"MVS3DM (single cells): completeness {100 * evaluation.mvs3dm.completeness:.2f} %, "
             f"median error {'-' if math.isnan(error_m) else f'{error_m:.3f} m'}"
         )
-    if evaluation.mean_of is not None:
-        down, across = evaluation.mean_of
+    if evaluation.places_per_block is not None:
+        down, across = evaluation.places_per_block
         yield (
-            f"the reference is coarser: compared is the mean of the surface at {down} x {across} places in each of its "
-            "cells, where half of them or more have a height"
+            f"the reference is coarser: each of its cells is compared with the mean of the surface at {down} x "
+            f"{across} places in it, where at least half of them have a height"
         )
-    for sentence in (evaluation.assumed, evaluation.places_assumed):
+    for sentence in (evaluation.assumed_datum, evaluation.assumed_crs):
         if sentence is not None:
             yield sentence
     if evaluation.geoid_added_to is not None:
@@ -80,5 +83,5 @@ def notes(evaluation: Evaluation) -> Iterator[str]:
 
 def _shift_line(shift: Shift) -> str:
     known = "" if shift.sigma_m is None else f", sigma {shift.sigma_m:.3f} m"
-    how = "" if shift.steps is None else f" ({shift.method}, {shift.steps} steps{known})"
-    return f"removed first: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, {shift.up_m:+.3f} m up{how}"
+    found_by = "" if shift.steps is None else f" ({shift.method}, {shift.steps} steps{known})"
+    return f"removed first: {shift.east_m:+.3f} m east, {shift.north_m:+.3f} m north, {shift.up_m:+.3f} m up{found_by}"

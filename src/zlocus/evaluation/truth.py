@@ -1,4 +1,4 @@
-"""A reference surface as blocks of about half a metre, each with the heights that count as right."""
+"""A reference surface as blocks of about half a metre, each with the heights that count as true."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from zlocus.evaluation.slopes import block_gradient, slope_deg
 from zlocus.io.open_raster import open_raster
 
 BLOCK_M = 0.5
-EDGE_SPREAD_M = 0.5
+# A block holds an edge where its heights differ by more than this.
+MAX_FLAT_SPREAD_M = 0.5
 CLASS_NAMES = {"ground": (0, 1), "building": (2,), "tree": (3,)}
 
 
@@ -26,10 +27,10 @@ CLASS_NAMES = {"ground": (0, 1), "building": (2,), "tree": (3,)}
 class TruthBlocks:
     """Blocks of a reference surface.
 
-    xy : (n, 2) float64, centres in the reference's CRS. heights : (n, k) float64, m, the block's cells.
-    classes : (n,) uint8 class of the block's first cell, or None. gradient : (n, 2) float64, m per metre east and north
-    of the frame, NaN where a neighbour has no height. cells : (n, 2) row and column of the block on the grid of all
-    blocks, which has `shape` and `transform`. size : cells of the reference along a side of a block.
+    xy : (n, 2) float64, centres in the reference's CRS. heights : (n, k) float64, m, of the block's cells.
+    classes : (n,) uint8, class of the block's first cell, or None. gradient : (n, 2) float64, metres per metre to the
+    east and north of the frame, NaN where a neighbour has no height. cells : (n, 2) row and column of the block on the
+    grid of all blocks, whose shape and transform follow. size : cells of the reference along a side of a block.
     """
 
     xy: FloatArray
@@ -43,27 +44,27 @@ class TruthBlocks:
 
     @property
     def mean(self) -> FloatArray:
-        """Mean height. (n,) m."""
+        """Mean height, (n,) m."""
         return np.asarray(self.heights.mean(axis=1))
 
     @property
     def is_edge(self) -> NDArray[np.bool_]:
-        """Blocks that hold a jump: either side of it is right. (n,)."""
-        return np.asarray(np.ptp(self.heights, axis=1) > EDGE_SPREAD_M)
+        """Whether a block holds an edge, either side of which counts as true, (n,)."""
+        return np.asarray(np.ptp(self.heights, axis=1) > MAX_FLAT_SPREAD_M)
 
     @property
     def slope_deg(self) -> FloatArray:
-        """Slope of the ground, degrees, NaN where a neighbour has no height. (n,)."""
+        """Slope of the ground, (n,) degrees; NaN where a neighbour has no height."""
         return slope_deg(self.gradient)
 
     def errors(self, z: FloatArray) -> FloatArray:
-        """Errors of heights z (n,) m at the centres: against the mean, at an edge against the nearest member."""
+        """Errors (n,) m of heights z (n,) m at the centres: against the mean, at an edge against the nearest cell."""
         nearest = np.abs(self.heights - np.nan_to_num(z)[:, None]).argmin(axis=1)
         member = np.take_along_axis(self.heights, nearest[:, None], axis=1)[:, 0]
         return z - np.where(self.is_edge, member, self.mean)
 
     def members(self, name: str) -> NDArray[np.bool_]:
-        """Blocks of a class of `CLASS_NAMES`. (n,)."""
+        """Whether a block belongs to a class of `CLASS_NAMES`, (n,)."""
         if self.classes is None:
             raise ValueError("these blocks were read without classes")
         return np.isin(self.classes, CLASS_NAMES[name])
@@ -72,14 +73,15 @@ class TruthBlocks:
 def truth_blocks(
     reference: HeightRaster, margin_m: float, classes: NDArray[np.uint8] | None, frame: CRS | None = None
 ) -> TruthBlocks:
-    """The blocks of a reference whose cells all have a height, away from its rim.
+    """Blocks of a reference whose cells all have a height, without a margin along the reference's edge.
 
-    classes : (r, c) on the reference's grid. frame : map in metres for slopes and sizes; None: that of the reference.
+    classes : (r, c) on the reference's grid, or None. frame : map in metres for slopes and
+    sizes; None: the reference's CRS.
 
     Raises
     ------
     InputError
-        A geographic reference without a frame, one without a height, or one the margin leaves nothing of.
+        The reference is geographic and has no frame, has no height, or is narrower than its margins.
     """
     if frame is None and reference.horizontal is not None and reference.horizontal.is_geographic:
         raise InputError(f"{reference.path} is in degrees ({reference.crs}). Reproject it to a CRS in metres first.")
@@ -104,7 +106,7 @@ def truth_blocks(
 
 
 def places(transform: Affine, row: FloatArray, col: FloatArray) -> FloatArray:
-    """Coordinates (n, 2) of places on a grid, (0, 0) being the outer corner of its first cell."""
+    """Coordinates (n, 2) of places on a grid, whose (0, 0) is the outer corner of its first cell."""
     x = transform.a * col + transform.b * row + transform.c
     y = transform.d * col + transform.e * row + transform.f
     return np.column_stack([x, y])
@@ -113,7 +115,7 @@ def places(transform: Affine, row: FloatArray, col: FloatArray) -> FloatArray:
 def inside_margin(
     reference: HeightRaster, margin_m: float, unit: tuple[float, float], xy: FloatArray
 ) -> NDArray[np.bool_]:
-    """Which points (n, 2) lie further from the rim of a reference than a margin. unit : metres of its x and y."""
+    """Whether points (n, 2) lie farther inside a reference than a margin. unit : metres per unit of x and y."""
     transform, x, y = reference.transform, xy[:, 0], xy[:, 1]
     left, top = transform.c, transform.f
     right, bottom = transform * (reference.z.shape[1], reference.z.shape[0])
@@ -122,14 +124,14 @@ def inside_margin(
 
 
 def read_classes(path: Path, reference: HeightRaster) -> NDArray[np.uint8]:
-    """Classes on the reference's grid. (r, c).
+    """Classes (r, c) on the reference's grid.
 
     Raises
     ------
     InputError
-        The file is missing, cannot be read or is empty of classes.
+        The file is missing or cannot be read.
     ConfigError
-        It lies on another grid.
+        The file is on another grid.
     """
     with open_raster(path, "raster of classes") as source:
         classes, transform = source.read(1), source.transform

@@ -1,4 +1,4 @@
-"""Heights above the same thing: refused where two files say that theirs are not, converted where a geoid is given."""
+"""Bring a surface and its reference to one vertical datum, or refuse to compare them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL_DESCRIPTION, check_heights
 
 @dataclass(frozen=True)
 class Compared:
-    """Two rasters whose heights may be subtracted.
+    """A surface and a reference with one vertical datum.
 
-    datums : what the files say that the heights of surface and reference are above, None for nothing. converted : that
-    of the two to whose heights the geoid's were added, None for neither.
+    datums : vertical datums of surface and reference as their files state them, None where a file states none.
+    converted : path of the one to whose heights the geoid's were added, None for neither.
     """
 
     surface: HeightRaster
@@ -27,27 +27,27 @@ class Compared:
 
     @property
     def assumed(self) -> str | None:
-        """What had to be taken for granted, as a sentence; None for nothing."""
+        """What had to be assumed about a vertical datum, as a sentence; None where nothing was."""
         mine, theirs = self.datums
         if self.converted is not None or (mine is None) == (theirs is None):
             return None
         silent, datum = (self.reference, mine) if theirs is None else (self.surface, theirs)
-        return f"{silent.path} does not say what its heights are above: taken to be {_above(datum)}, as of the other"
+        return f"{silent.path} does not state its vertical datum: taken to be {_above(datum)}, as of the other raster"
 
 
 def same_heights(surface: HeightRaster, reference: HeightRaster, geoid: Path | None) -> Compared:
-    """The two rasters above the same thing.
+    """Bring surface and reference to one vertical datum.
 
-    geoid : raster of its heights above the ellipsoid, m. They are added to the heights that are above a geoid: by its
-    CRS, or, where no CRS says it, those of the reference.
+    geoid : raster of geoid heights above the ellipsoid, m, or its name; None: no conversion. They are added to the
+    raster whose CRS has a geoid as vertical datum, or, where no CRS states one, to the reference.
 
     Raises
     ------
     InputError
-        The files say that their heights are above different things and no geoid is given that helps; heights that
-        are not in metres; or a geoid that does not reach as far as the heights.
+        The vertical datums differ and no suitable geoid is given, heights are not in metres, or the geoid raster does
+        not cover them.
     ConfigError
-        A geoid where both heights are above the same thing.
+        A geoid is given although both have the same vertical datum.
     """
     mine, theirs = datum_of(surface), datum_of(reference)
     if geoid is not None:
@@ -61,19 +61,19 @@ def same_heights(surface: HeightRaster, reference: HeightRaster, geoid: Path | N
 
 
 def datum_of(raster: HeightRaster) -> str | None:
-    """What a file says that its heights are above: `ELLIPSOID`, the name of a vertical CRS, or None for nothing.
+    """Vertical datum that a file states: `ELLIPSOID`, the name of a vertical CRS, or None.
 
     Raises
     ------
     InputError
-        Heights that are not in metres, or go down.
+        Heights are not in metres, or count downwards.
     """
     crs = raster.spatial
     if crs is not None:
         check_heights(crs, raster.path)
         vertical = vertical_part(crs)
         if vertical is not None:
-            # Geoids of files carry the file's name, whatever that is.
+            # A geoid raster's datum carries the name of its file, which may contain any word.
             is_ellipsoid = ELLIPSOID in vertical.name.lower() and "geoid" not in vertical.name.lower()
             return ELLIPSOID if is_ellipsoid else vertical.name
         if len(crs.axis_info) == 3 and (crs.is_geographic or crs.is_projected):
@@ -105,7 +105,7 @@ def _with_geoid(
 
 
 def _raised(raster: HeightRaster, geoid: Path) -> HeightRaster:
-    """The same heights above the ellipsoid."""
+    """The raster with heights above the ellipsoid."""
     if raster.horizontal is None:
         raise InputError(f"{raster.path} has no CRS, so no geoid can be added to it. Assign one (gdal_edit -a_srs).")
     datum = named_vertical_datum(str(geoid), "--geoid")

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from odc.geo.geobox import GeoBox
 
-from zlocus.evaluation.evaluate import Shift, check_options, evaluate
+from zlocus.evaluation.comparison import Comparison
+from zlocus.evaluation.evaluate import Shift, evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.vertical import same_heights
 from zlocus.io.open_raster import existing_file, open_raster
 from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.vertical import named_vertical_datum
-from zlocus.products.report.comparison import Comparison, full_colour_m
+from zlocus.products.report.comparison import saturated_error_m
 from zlocus.products.report.text import against_reference
 
 
@@ -41,7 +42,6 @@ def check_comparison(comparison: Comparison) -> None:
         There is no such file, or an option is out of range.
     """
     existing_file(comparison.reference, "reference")
-    check_options(comparison.margin_m, (comparison.threshold_m,), comparison.align, comparison.coregister)
     if comparison.geoid is not None:
         named_vertical_datum(str(comparison.geoid), "--geoid")
 
@@ -54,13 +54,13 @@ def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference
     InputError, ConfigError
         See `evaluate`.
     """
-    evaluation, name = evaluate(dsm, **vars(comparison)), comparison.reference.name
+    evaluation, name = evaluate(dsm, comparison), comparison.reference.name
     heights = comparable(dsm, comparison, evaluation.shift)
     crs = None if heights.horizontal is None else heights.horizontal.to_wkt()
     path, geobox = scratch / "reference.tif", GeoBox(heights.z.shape, heights.transform, crs)
     with RasterSink(path, geobox, RasterBands("float32", float("nan"), units="m")) as sink:
         sink.write(0, 0, heights.z.astype(np.float32))
-    return Reference(path, name, full_colour_m(evaluation), against_reference(evaluation, name))
+    return Reference(path, name, saturated_error_m(evaluation), against_reference(evaluation, name))
 
 
 def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> HeightRaster:

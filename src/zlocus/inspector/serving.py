@@ -16,7 +16,7 @@ from zlocus.core.errors import ConfigError, OutputError
 from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.server import application
-from zlocus.products.report.comparison import Comparison
+from zlocus.evaluation.comparison import Comparison
 
 # Answers under way are waited for so long.
 GRACE_S = 2

@@ -1,53 +1,36 @@
-"""The comparison with a reference: what `zlocus evaluate` says of the surface, as tables, histogram and map."""
+"""The report's section on a reference: the results of `zlocus evaluate` as table, histogram and map."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import Evaluation, evaluate
 from zlocus.evaluation.histogram import histogram_figure
-from zlocus.evaluation.slopes import SLOPE_EDGES_DEG
 from zlocus.evaluation.table import evaluation_rows, notes
 from zlocus.products.match_curve_figures import svg_of
 from zlocus.products.report import maps
 from zlocus.products.report import text as words
 
 HISTOGRAM_INCHES, SVG_DPI = (5.6, 4.2), 72
-# The map's colours are full at this many times the NMAD, and at least at the threshold.
-FULL_AT_NMAD = 3.0
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A reference to compare with, and all else that `evaluate` takes, by the same names."""
-
-    reference: Path
-    classes: Path | None = None
-    align: bool = False
-    margin_m: float = 10.0
-    threshold_m: float = 1.0
-    more_thresholds_m: Sequence[float] = ()
-    slope_edges_deg: Sequence[float] = SLOPE_EDGES_DEG
-    coregister: str | None = None
-    geoid: Path | None = None
+# The map's colours are saturated at this many times the NMAD, or at the threshold where that is larger.
+SATURATED_AT_NMAD = 3.0
 
 
 def comparison_part(out: Path, comparison: Comparison) -> dict[str, Any]:
-    """What the page shows of the surface in a folder beside a reference.
+    """Values of the template that compare the surface in a folder with a reference.
 
     Raises
     ------
     InputError, ConfigError
         See `evaluate`.
     """
-    evaluation = evaluate(out / "dsm.tif", **vars(comparison))
+    evaluation = evaluate(out / "dsm.tif", comparison)
     headings, *rows = evaluation_rows(evaluation)
     return {
         "sentence": words.against_reference(evaluation, comparison.reference.name), "name": comparison.reference.name,
@@ -63,10 +46,10 @@ def _sentence(note: str) -> str:
 
 def _histogram(evaluation: Evaluation) -> maps.Picture:
     figure = histogram_figure(evaluation, HISTOGRAM_INCHES)
-    figures = evaluation.statistics
+    statistics = evaluation.statistics
     alt = (
-        f"Histogram of the errors about their median {words.number(figures.median, 'm', 3)}, "
-        f"NMAD {words.number(figures.nmad, 'm', 3)}."
+        f"Histogram of the errors about their median {words.number(statistics.median, 'm', 3)}, "
+        f"NMAD {words.number(statistics.nmad, 'm', 3)}."
     )
     width, height = (round(SVG_DPI * side) for side in HISTOGRAM_INCHES)
     return maps.Picture(maps.data_uri(svg_of(figure).encode(), "image/svg+xml"), alt, width, height)
@@ -74,17 +57,17 @@ def _histogram(evaluation: Evaluation) -> maps.Picture:
 
 def _error_map(evaluation: Evaluation) -> tuple[maps.Picture, maps.Scale]:
     assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
-    return maps.error_picture(shrunk_means(evaluation.error_map.errors, maps.MAP_PX), full_colour_m(evaluation))
+    return maps.error_picture(shrunk_means(evaluation.error_map.errors, maps.MAP_PX), saturated_error_m(evaluation))
 
 
-def full_colour_m(evaluation: Evaluation) -> float:
-    """Size of an error from which a map's colours are full, m."""
+def saturated_error_m(evaluation: Evaluation) -> float:
+    """Size of an error, m, from which the map's colours are saturated."""
     nmad = np.nan_to_num(evaluation.statistics.nmad)
-    return float(f"{max(evaluation.threshold_m, FULL_AT_NMAD * nmad):.1g}")
+    return float(f"{max(evaluation.threshold_m, SATURATED_AT_NMAD * nmad):.1g}")
 
 
 def _scale_bar(evaluation: Evaluation) -> maps.ScaleBar | None:
-    """None where the reference's cells are in degrees."""
+    """Scale bar of the error map; None where the reference's cells are in degrees."""
     assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
     geobox = evaluation.error_map.geobox
     if geobox.crs is not None and geobox.crs.geographic:
@@ -93,7 +76,7 @@ def _scale_bar(evaluation: Evaluation) -> maps.ScaleBar | None:
 
 
 def shrunk_means(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Means of square blocks of cells (r, c) so that at most `side` are left a side; NaN where none is known."""
+    """Means of square blocks of cells (r, c), at most `side` blocks a side; NaN where a block has no known cell."""
     step = -(-max(values.shape) // side)
     rows, cols = (-(-n // step) for n in values.shape)
     padded = np.full((rows * step, cols * step), np.nan, np.float32)
