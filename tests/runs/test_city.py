@@ -1,4 +1,4 @@
-"""A part of the rendered town with exact truth: six views, all defaults."""
+"""Heights of a part of the rendered town from six views with default options, against the exact truth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import rasterio
 
 from rendered_scenes import run
 
-# Share of cells within 1 m of the truth; the whole town does better than this part, which holds towers.
+# Shares of the cells within 1 m of the truth. The whole town is more accurate than this part, which contains towers.
 WITHIN_M, GROUND, BUILDINGS, ALL = 1.0, 0.95, 0.75, 0.90
 NMAD_M = 0.2
 SIDE_M = 76.0
@@ -30,7 +30,7 @@ def town(shared_data, tmp_path_factory):
     out = run(inputs, tmp_path_factory.mktemp("town") / "out", heights=None, bounds=bounds).out
     with rasterio.open(out / "dsm.tif") as dsm:
         height = dsm.read(1)
-    # Four truth cells a cell: its height is their mean where they are alike, and no truth where they are not.
+    # A cell covers four cells of the truth. Its true height is their mean if they are alike; otherwise it has none.
     side = height.shape[0]
     parts = fine.reshape(side, 2, side, 2).swapaxes(1, 2).reshape(side, side, 4)
     kinds = kind.reshape(side, 2, side, 2).swapaxes(1, 2).reshape(side, side, 4)
@@ -41,7 +41,7 @@ def town(shared_data, tmp_path_factory):
 def test_heights_of_a_town(town):
     error, kind, out = town
     assert error.shape == (152, 152)
-    near = np.abs(error) < WITHIN_M  # an empty cell is not near
+    near = np.abs(error) < WITHIN_M  # False for an empty cell.
     ground, buildings = near[kind <= 1].mean(), near[kind == 2].mean()
     assert ground > GROUND
     assert buildings > BUILDINGS
@@ -52,8 +52,8 @@ def test_heights_of_a_town(town):
     assert json.loads((out / "run.json").read_text())["coverage"] > 0.97
 
 
-def test_pointing_without_errors_is_left_alone(town):
-    """The RPCs of the town are exact: corrections are noise, tenths of a pixel at most."""
+def test_exact_rpcs_are_corrected_by_noise_only(town):
+    """The RPCs of the town have no pointing errors, so corrections are tenths of a pixel at most."""
     views = json.loads((town[2] / "run.json").read_text())["orientation"]["views"]
     assert len(views) == 6
     assert max(np.abs(view["shift_px"]).max() for view in views.values()) < 0.2

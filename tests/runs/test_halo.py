@@ -1,4 +1,4 @@
-"""What a wider halo changes: next to nothing, so that heights do not depend on how the ground is cut into tiles."""
+"""A wider halo changes almost no cell, so heights do not depend on how the ground is divided into tiles."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ VIEWS = tuple(ViewSpec(name, along, across, 2.0, optics=CLEAR) for name, along, 
               (("n", 1.0, -4.0), ("f", 20.0, -4.0), ("b", -20.0, 3.0)))  # fmt: skip
 SPEC = SceneSpec(kind="city", seed=5, size=SIDE, relief_m=10.0, views=VIEWS, objects=Objects(35.0, 22.0, 0.0, 20.0))
 TILES = RunConfig(pyramid=PyramidOptions(tile=128, halo=32))
-# Cells that are near where the ground that views share ends, about.
+# Cells near the edge of the overlap of the views, which are not compared.
 BORDER = 60
-# Of the others, those that may move by more than half a step. (With the base surface of a level integrated over the
-# whole window of a tile, and what counts as an edge taken from it: 2.6 %.)
+# Largest share of the other cells that may change by more than half a step. (2.6 % change if the slanted support
+# surface and its edges are computed over the whole window of a tile.)
 CHANGED, FILLED = 3e-3, 0.95
 
 
@@ -31,7 +31,7 @@ def town(tmp_path_factory):
     return render_scene(SPEC, tmp_path_factory.mktemp("halo") / "scene")
 
 
-def test_a_wider_halo_changes_next_to_nothing(town, tmp_path):
+def test_a_wider_halo_changes_almost_no_cell(town, tmp_path):
     heights, images = [], tuple(town.images[view.name] for view in VIEWS)
     for halo in (32, 64):
         config = replace(TILES, pyramid=replace(TILES.pyramid, halo=halo))

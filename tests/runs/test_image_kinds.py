@@ -1,4 +1,4 @@
-"""Whole runs on images of every data type, with nodata, masks and several bands."""
+"""Whole runs on images of every data type, with no-data values, masks and several bands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rpc_fixtures import write_image
 
 
 def rewritten(images, folder, change, **profile):
-    """The same images with pixels changed, in another data type, with another nodata value."""
+    """Write the images again with changed pixels and another profile (data type, no-data value, compression)."""
     folder.mkdir()
     paths = []
     for name, path in images.paths.items():
@@ -31,12 +31,12 @@ def colours(pixels):
 
 
 def clear(name, pixels):
-    """An alpha band: one image is transparent in its middle."""
+    """An alpha band; the nadir image is transparent in its middle."""
     return with_hole(name, np.full(pixels.shape, 255.0), 0).astype(np.uint8)
 
 
 def by_gamma(name, pixels):
-    """The grey values of one image through a gamma curve, as a camera's JPEG has them; the others as they are."""
+    """Grey values of the nadir image after a gamma curve, as in the JPEG of a camera; those of the others unchanged."""
     return (byte(255 * (pixels / pixels.max()) ** 0.45, 4.0) if name == "nadir" else byte(pixels)).astype(np.uint8)
 
 
@@ -87,7 +87,7 @@ def test_kinds_of_images(images, tmp_path, variant):
 
 
 def test_masked_image(images, tmp_path):
-    """An internal mask hides part of one image: there the two others decide."""
+    """An internal mask covers part of one image; there the heights come from the two others."""
     paths = []
     for name, path in images("sine").paths.items():
         copy_raster(path, tmp_path / f"{name}.tif", driver="GTiff")

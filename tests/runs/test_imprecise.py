@@ -1,4 +1,4 @@
-"""Heights that are less precise than asked for stay empty, and say why."""
+"""Cells whose standard deviation exceeds checks.max_sigma_m stay empty and are marked IMPRECISE."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from zlocus.matching.quality import Quality
 
 
 @pytest.mark.parametrize("method", ["mvll-sgm", "gc3-sgm"])
-def test_heights_less_precise_than_asked_for_are_left_out(tmp_path, method):
+def test_heights_above_the_largest_sigma_are_removed(tmp_path, method):
     images = rendered(tmp_path / "images", "step")
     whole = run(images, tmp_path / "whole", method=method)
     height, sigma = (read(whole.out / f"{name}.tif")[0] for name in ("dsm", "sigma"))
     limit = float(np.nanquantile(sigma, 0.8))
-    config = replace(RunConfig(), checks=CheckOptions(most_sigma_m=limit))
+    config = replace(RunConfig(), checks=CheckOptions(max_sigma_m=limit))
     best = run(images, tmp_path / "best", config, method=method)
     kept, kept_sigma, quality, views = (read(best.out / f"{n}.tif")[0] for n in ("dsm", "sigma", "quality", "views"))
     left_out = (quality & Quality.IMPRECISE) != 0
@@ -29,9 +29,9 @@ def test_heights_less_precise_than_asked_for_are_left_out(tmp_path, method):
     assert not views[left_out].any()
 
 
-def test_what_is_left_out_can_be_interpolated(tmp_path):
+def test_removed_heights_can_be_interpolated(tmp_path):
     images = rendered(tmp_path / "images", "step")
-    config = replace(RunConfig(), checks=CheckOptions(most_sigma_m=0.3))
+    config = replace(RunConfig(), checks=CheckOptions(max_sigma_m=0.3))
     out = run(images, tmp_path / "out", config, fill="interpolate").out
     height, quality = (read(out / f"{name}.tif")[0] for name in ("dsm", "quality"))
     both = (quality & (Quality.IMPRECISE | Quality.FILLED)) == Quality.IMPRECISE | Quality.FILLED

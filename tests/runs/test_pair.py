@@ -1,4 +1,4 @@
-"""Options of scenes of two views: they apply to those, and to no others."""
+"""Options for scenes of two views apply to these and not to others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def heights(images, number: int, out, **options) -> np.ndarray:
 
 def test_a_pair_is_matched_with_the_penalty_of_pairs_and_all_grey_differences(images, tmp_path):
     plain = heights(images, 2, tmp_path / "plain")
-    other = heights(images, 2, tmp_path / "other", semiglobal=SemiGlobalOptions(p1_two=0))
+    other = heights(images, 2, tmp_path / "other", semiglobal=SemiGlobalOptions(p1_two_images=0))
     lighter = heights(images, 2, tmp_path / "lighter", cost=CostOptions(grey_weight=0.3))
     assert not np.array_equal(plain, other, equal_nan=True)
     assert not np.array_equal(plain, lighter, equal_nan=True)
@@ -34,8 +34,8 @@ def test_a_pair_is_matched_with_the_penalty_of_pairs_and_all_grey_differences(im
     np.testing.assert_array_equal(plain, lone)
 
 
-def test_three_views_are_not_touched_by_it(images, tmp_path):
+def test_options_for_two_views_do_not_change_three(images, tmp_path):
     plain = heights(images, 3, tmp_path / "plain")
     np.testing.assert_array_equal(
-        plain, heights(images, 3, tmp_path / "pairs", semiglobal=SemiGlobalOptions(p1_two=1000))
+        plain, heights(images, 3, tmp_path / "pairs", semiglobal=SemiGlobalOptions(p1_two_images=1000))
     )

@@ -1,4 +1,6 @@
-"""Runs that are killed, interrupted, starved or robbed of their inputs: nothing is lost, and the bytes are the same."""
+"""Runs that are killed, interrupted or lose memory or inputs: finished tiles are kept and the resumed run has the same
+bytes.
+"""
 
 from __future__ import annotations
 
@@ -44,19 +46,19 @@ from zlocus.matching.quality import Quality
 from zlocus.pipeline.execution.checkpoint import BEFORE, FOLDER
 from zlocus.pipeline.execution.tasks import ATTEMPTS
 
-# How many signals a run gets at random moments; benchmarks/acceptance.py asks for more.
+# Number of signals at random moments; benchmarks/acceptance.py sends more.
 SIGNALS = int(os.environ.get("ZLOCUS_SIGNALS", "8"))
 SEED = 20261122
 
 
 @pytest.fixture(scope="module")
 def straight(images, tmp_path_factory):
-    """The surface of a run that nothing happens to, in tiles of 64 cells."""
+    """The surface of a run without interruption, in tiles of 64 cells."""
     return run(images("sine"), tmp_path_factory.mktemp("straight") / "out", SMALL_TILES, workers=1, report=False).out
 
 
 def below(pid):
-    """All processes that a process has started."""
+    """All processes that a process has started, directly or not."""
     try:
         return psutil.Process(pid).children(recursive=True)
     except psutil.NoSuchProcess:
@@ -64,8 +66,10 @@ def below(pid):
 
 
 def test_signals_at_random_moments(images, straight, tmp_path):
-    """Of four kinds, to the command or to all its processes, at any moment of the time that is left; what is there then
-    is taken on. A run that is finished meanwhile begins anew."""
+    """Signals of four kinds interrupt the command or all its processes at random moments; the next run resumes.
+
+    If a run finishes before its signal, its folder is removed and the next run begins anew.
+    """
     out, rng = tmp_path / "out", random.Random(SEED)
     for _ in range(SIGNALS):
         process = started(command(images("sine"), out, tmp_path, "--workers", "2"))
@@ -94,16 +98,18 @@ def test_signals_at_random_moments(images, straight, tmp_path):
 
 
 def hidden(out):
-    """Files that are not complete."""
+    """Temporary files, whose names begin with a dot until they are complete."""
     return list(out.rglob(".*")) if out.exists() else []
 
 
-# What a signal is, whether all processes of the command get it, and with how many workers.
+# Signal, whether all processes of the command get it, and number of workers.
 INTERRUPTS = [(signal.SIGINT, True, 1), (signal.SIGTERM, True, 2), (signal.SIGHUP, False, 2)]
 
 
 @pytest.mark.parametrize(("number", "is_to_all", "workers"), INTERRUPTS)
-def test_a_signal_stops_within_seconds_and_is_taken_on(images, straight, tmp_path, number, is_to_all, workers):
+def test_a_signal_stops_the_run_within_seconds_and_the_run_is_resumed(
+    images, straight, tmp_path, number, is_to_all, workers
+):
     out = tmp_path / "out"
     process = started(command(images("sine"), out, tmp_path, "--workers", str(workers)))
     wait_for_tiles(out, 2, process)
@@ -128,7 +134,7 @@ def test_a_signal_stops_within_seconds_and_is_taken_on(images, straight, tmp_pat
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, number):
-    """As by a system that is short of memory: another takes its place, and its tile is made again."""
+    """As by a system that is short of memory: another worker takes its place and makes its tile again."""
     out = tmp_path / "out"
     process = started(command(images("sine"), out, tmp_path, "--workers", "2"))
     killed = []
@@ -151,7 +157,7 @@ def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, numbe
     assert all(event["again"] for event in events_of(out) if event["event"] == "tile failed")
 
 
-# What is stopped after the matching, at which of its calls, and files that are complete then.
+# Function in which the run is stopped after the matching, number of the call, and files that are complete by then.
 AFTERWARDS = {
     "zlocus.pipeline.tile_run.TileRun.assemble": (1, set()),
     # In the third of five rasters.
@@ -163,8 +169,8 @@ AFTERWARDS = {
 
 
 @pytest.mark.parametrize("step", AFTERWARDS)
-def test_what_is_stopped_after_the_matching_keeps_its_tiles(images, straight, tmp_path, monkeypatch, step):
-    """Each file is complete or not there, and the rasters of a surface are all there or none."""
+def test_a_run_that_is_stopped_after_the_matching_keeps_its_tiles(images, straight, tmp_path, monkeypatch, step):
+    """Each file is complete or missing, and the rasters of a surface are all there or all missing."""
     at, complete = AFTERWARDS[step]
     do, calls = pkgutil.resolve_name(step), []
 
@@ -191,7 +197,7 @@ def test_what_is_stopped_after_the_matching_keeps_its_tiles(images, straight, tm
 
 
 @pytest.mark.parametrize("option", ["--overwrite", "--no-resume"])
-def test_a_command_that_starts_anew_is_told_how_to_go_on(images, tmp_path, monkeypatch, option):
+def test_a_command_that_starts_anew_says_how_to_resume(images, tmp_path, monkeypatch, option):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
@@ -209,7 +215,7 @@ def events_of(out):
 
 
 def failing(monkeypatch, error, where=CENTRE):
-    """Makes the tile that holds a place fail."""
+    """Make the tile that contains a position fail."""
     match = zlocus.pipeline.tile_run.match_tile
 
     def fail(scene, core, *given):
@@ -238,7 +244,7 @@ def test_a_tile_that_fails_costs_no_other(images, straight, tmp_path, monkeypatc
     assert stop.value.exit_status == 3
     assert not (out / "dsm.tif").exists()
     assert n_finished(out) == 8
-    # The surface without it.
+    # The surface without the failed tile.
     with pytest.raises(StoppedError, match=r"They are empty in the surface \(FAILED in quality\.tif\)"):
         run(images("sine"), out, SMALL_TILES, workers=1, report=False, partial=True)
     quality, whole = read(out / "quality.tif")[0], read(straight / "quality.tif")[0]
@@ -250,13 +256,13 @@ def test_a_tile_that_fails_costs_no_other(images, straight, tmp_path, monkeypatc
         e for e in map(json.loads, (out / "events.jsonl").read_text().splitlines()) if e["event"] == "tile failed"
     ]
     assert len(failed) == 2 * attempts
-    # And with it, once it can be made.
+    # The surface with it, once it can be matched.
     monkeypatch.undo()
     run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     assert same(out, straight)
 
 
-def test_where_no_tile_is_made_nothing_is_left(images, tmp_path, monkeypatch):
+def test_if_the_first_tile_cannot_be_matched_no_folder_is_left(images, tmp_path, monkeypatch):
     def fail(*_):
         raise GeometryError("too bent.")
 
@@ -267,7 +273,7 @@ def test_where_no_tile_is_made_nothing_is_left(images, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_where_all_tiles_fail_the_log_says_why(images, tmp_path, monkeypatch):
+def test_if_all_tiles_fail_the_log_says_why(images, tmp_path, monkeypatch):
     def fail(*_):
         raise IndexError("index 7 is out of bounds")
 
@@ -278,7 +284,7 @@ def test_where_all_tiles_fail_the_log_says_why(images, tmp_path, monkeypatch):
     assert all("in fail" in e["trace"] for e in events_of(tmp_path / "out") if e["event"] == "tile failed")
 
 
-def test_ties_are_not_looked_for_again(images, straight, tmp_path, monkeypatch):
+def test_a_resumed_run_does_not_search_tie_points_again(images, straight, tmp_path, monkeypatch):
     out = stopped(images, tmp_path, monkeypatch)
 
     def looked_for(*_):
@@ -292,15 +298,15 @@ def test_ties_are_not_looked_for_again(images, straight, tmp_path, monkeypatch):
     assert not (out / FOLDER).exists()
 
 
-def test_ties_that_are_damaged_are_found_anew(images, straight, tmp_path, monkeypatch):
+def test_damaged_tie_points_are_searched_again(images, straight, tmp_path, monkeypatch):
     out = stopped(images, tmp_path, monkeypatch)
     (out / FOLDER / BEFORE).write_bytes(b"PK nothing")
     run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     assert same(out, straight)
 
 
-def test_image_space_goes_on_with_the_tiles_of_its_images(images, tmp_path, monkeypatch):
-    """Some are there, one of them damaged; the others are matched."""
+def test_image_space_resumes_with_the_tiles_of_its_images(images, tmp_path, monkeypatch):
+    """Tiles that are kept and undamaged are not matched again."""
     asked = {"method": "gc3-sgm", "report": False, "workers": 1}
     straight = run(images("sine"), tmp_path / "straight", SMALL_TILES, **asked).out
     match, matched = zlocus.pipeline.image_tiles.match_tile, []

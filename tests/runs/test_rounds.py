@@ -1,4 +1,4 @@
-"""The finest level is matched again with its own surface in the way of views, where there are views to spare."""
+"""The finest level is matched a second time, with occlusions by its own surface, if there are more than two views."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_three_views_have_two_rounds_on_request(images, tmp_path, levels_matched
     assert [call for call in levels_matched if call[0] == 0] == [(0, True, 2), (0, True, 1)]
 
 
-def test_two_views_have_one_and_none_is_hidden(images, tmp_path, levels_matched):
+def test_two_views_have_one_round_without_occlusions(images, tmp_path, levels_matched):
     run(images("step").inputs[:2], tmp_path / "out", TWO_ROUNDS)
     assert [call for call in levels_matched if call[0] == 0] == [(0, False, 2)]
 

@@ -1,4 +1,4 @@
-"""A hillside of 45 degrees, seen by six views: heights follow it, without stairs."""
+"""Heights of a hillside of 45 degrees, from six views, follow the slope and form no stairs."""
 
 from __future__ import annotations
 
@@ -61,11 +61,13 @@ def test_heights_of_a_hillside(hillside, tmp_path):
     error = errors_on(hillside, tmp_path / "out")
     assert nmad(error) < NMAD_M
     assert abs(np.nanmedian(error)) < BIAS_M
-    assert (np.abs(error) < WITHIN_M).mean() > WITHIN  # no height counts as wrong
+    assert (np.abs(error) < WITHIN_M).mean() > WITHIN  # An empty cell counts as wrong.
 
 
-def test_a_level_base_makes_stairs(hillside, tmp_path, monkeypatch):
-    """What the base surface is for: without it the same bar is missed, by heights a step of the stairs away."""
-    monkeypatch.setattr(SlopeSurface, "from_surface", lambda surface, block, _=None: SlopeSurface.flat(surface.shape, block))
+def test_a_flat_support_surface_makes_stairs(hillside, tmp_path, monkeypatch):
+    """Without the slanted support surface the same bar is missed, because heights jump between whole steps."""
+    monkeypatch.setattr(
+        SlopeSurface, "from_surface", lambda surface, block, _=None: SlopeSurface.flat(surface.shape, block)
+    )
     error = errors_on(hillside, tmp_path / "out")
     assert (np.abs(error) < WITHIN_M).mean() < WITHIN

@@ -1,4 +1,4 @@
-"""Whole runs with more images than are needed, one of them spoiled: which are used, what that saves, and its price."""
+"""Choice of images in whole runs with more images than needed, one of them bad: which are used, saving, accuracy."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from zlocus.synthetic.render import Optics
 from zlocus.synthetic.scenes import AFTERNOON, CLEAR, SceneSpec, ViewSpec
 
 GOOD_VIEWS = ("n1", "f1", "b1", "n2", "f2")
-SPOILED = "bad"
-# The most nadir view of all: it would lead, and be the reference of every block.
+BAD = "bad"
+# The view nearest to the nadir: chosen by geometry, it would be the reference image of every block.
 OTHER_DAY = Optics(gain=500.0, haze=300.0, blur_px=1.3, noise=0.15, noise_floor=120.0)
 VIEWS = (
     ViewSpec("n1", 1.0, -4.0, 2.0, optics=CLEAR),
@@ -29,20 +29,20 @@ VIEWS = (
     ViewSpec("b1", -20.0, -4.0, 2.0, optics=CLEAR),
     ViewSpec("n2", 0.0, 12.0, -1.5, optics=CLEAR),
     ViewSpec("f2", 22.0, 13.0, -1.5, optics=CLEAR),
-    ViewSpec(SPOILED, 0.0, 0.5, 0.0, sun=AFTERNOON, optics=OTHER_DAY),
+    ViewSpec(BAD, 0.0, 0.5, 0.0, sun=AFTERNOON, optics=OTHER_DAY),
 )
 SIDE = 176
 SPEC = SceneSpec(
     kind="city", seed=11, size=SIDE, relief_m=4.0, views=VIEWS,
     objects=Objects(35.0, 22.0, 0.0, 10.0, plain_roofs=1.0),
 )  # fmt: skip
-# Small blocks, so that there are some.
+# Small blocks, so that the small town has several.
 SMALL_BLOCKS = RunConfig(pyramid=PyramidOptions(block=16), selection=SelectionOptions(min_images_for_choice=3))
 USE_ALL = replace(SMALL_BLOCKS, selection=SelectionOptions(min_images=254, max_images=254))
-# Hardly any block has a tie point as near as this.
-LONELY = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, max_radii=1.0, min_images_for_choice=3))
+# Almost no block has a tie point within this radius.
+FAR_FROM_TIES = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, max_radii=1.0, min_images_for_choice=3))
 WITHIN_M, ROAD, BUILDING = 1.0, 1, 2
-# Cells that may be lost, of a few tens of thousands.
+# Largest share of cells that the choice of images may leave empty.
 COVERAGE = 0.005
 PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
 
@@ -68,8 +68,8 @@ def town(tmp_path_factory):
     return Town(scene, bounds, np.where(clear, parts.mean(axis=2), np.nan), np.where(clear, kinds[..., 0], 255))
 
 
-def surface(town, out, config=SMALL_BLOCKS, names=(*GOOD_VIEWS, SPOILED), **request):
-    """A run over the town on its cells. The spoiled image takes part, although no tie point supports it."""
+def surface(town, out, config=SMALL_BLOCKS, names=(*GOOD_VIEWS, BAD), **request):
+    """Run over the town on its cells. The bad image takes part, although no tie point supports it."""
     inputs = tuple(town.scene.images[name] for name in names)
     asked = {"bounds": town.bounds, "heights": (425.0, 470.0)} | request
     with pytest.MonkeyPatch.context() as patch:
@@ -79,7 +79,7 @@ def surface(town, out, config=SMALL_BLOCKS, names=(*GOOD_VIEWS, SPOILED), **requ
 
 @pytest.fixture
 def blocks_used(monkeypatch):
-    """By name of the view, the share of the finest level's blocks that are matched with it."""
+    """Share of the blocks of the finest level that are matched with each view, by its name."""
     found, choose = {}, zlocus.matching.tile.choose_views
     names, match = [], zlocus.matching.tile.match_tile
 
@@ -107,7 +107,7 @@ def blocks_used(monkeypatch):
 
 @pytest.fixture(scope="module")
 def guided(town, tmp_path_factory):
-    """A run with the choice of images, and one that uses all."""
+    """A run with the choice of images, and a run with all images."""
     folder = tmp_path_factory.mktemp("guided")
     return surface(town, folder / "some"), surface(town, folder / "all", USE_ALL)
 
@@ -116,14 +116,14 @@ def evaluations(out):
     return json.loads((out / "run.json").read_text())["evaluations"]
 
 
-def test_a_spoiled_image_is_used_by_fewer_blocks_than_any_other(town, tmp_path, blocks_used):
+def test_a_bad_image_is_used_by_fewer_blocks_than_any_other(town, tmp_path, blocks_used):
     surface(town, tmp_path / "out")
-    assert set(blocks_used) == {*GOOD_VIEWS, SPOILED}
-    assert blocks_used[SPOILED] < 0.5 * min(blocks_used[name] for name in GOOD_VIEWS)
-    assert blocks_used[SPOILED] < 0.2
+    assert set(blocks_used) == {*GOOD_VIEWS, BAD}
+    assert blocks_used[BAD] < 0.5 * min(blocks_used[name] for name in GOOD_VIEWS)
+    assert blocks_used[BAD] < 0.2
 
 
-def test_less_is_evaluated_than_all_images_would_take(guided):
+def test_the_choice_saves_evaluations(guided):
     some, every = (evaluations(out) for out in guided)
     assert some["done"] < 0.9 * some["all_images"]
     assert every["done"] == every["all_images"]
@@ -138,7 +138,7 @@ def test_no_cell_that_all_images_see_is_left_empty_by_the_choice(guided, town):
     assert abs(np.isfinite(some).mean() - np.isfinite(every).mean()) < COVERAGE
 
 
-def test_heights_do_not_suffer_from_the_choice(guided, town):
+def test_the_choice_does_not_lower_the_accuracy(guided, town):
     near = [np.abs(read(out / "dsm.tif")[0] - town.truth) < WITHIN_M for out in guided]
     judged = np.isfinite(town.truth)
     assert near[0][judged].mean() > near[1][judged].mean() - 0.005
@@ -146,7 +146,7 @@ def test_heights_do_not_suffer_from_the_choice(guided, town):
 
 
 def test_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a_height(town, tmp_path, monkeypatch):
-    """With a radius of three cells, blocks take the order of the scene; their plain cells have heights all the same."""
+    """With a radius of three cells, blocks take the order of the scene, and cells without texture still get heights."""
     rows, order = [], zlocus.matching.tile.order_views
 
     def watched(ranking, share, at, options):
@@ -157,7 +157,7 @@ def test_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a_height(t
         return found
 
     monkeypatch.setattr(zlocus.matching.tile, "order_views", watched)
-    height, _ = read(surface(town, tmp_path / "out", LONELY) / "dsm.tif")
+    height, _ = read(surface(town, tmp_path / "out", FAR_FROM_TIES) / "dsm.tif")
     assert rows[-1] > 0.8, "no feature point near most blocks"
     for kind, share in ((ROAD, 0.97), (BUILDING, 0.7)):
         cells = town.kind == kind
