@@ -11,11 +11,11 @@ from scipy.ndimage import gaussian_filter
 from kernel_scene import at_all_heights
 from rendered_scenes import PART, rendered, run
 from zlocus.core.options import PlaneOptions
-from zlocus.matching import tile
+from zlocus.matching import finest_level
 from zlocus.matching.kernels.plane_fitting import (
-    SPAN,
+    SLOPE_SPAN_CELLS,
     disagreement,
-    leave_out,
+    exclude_views,
     level_greys,
     plane_heights,
     plane_through,
@@ -124,7 +124,7 @@ def test_textured_ground_stays_as_it_is():
     np.testing.assert_array_equal(found.height[ground], before[ground])
 
 
-def test_a_view_of_another_day_is_left_out():
+def test_a_view_of_another_day_is_excluded():
     other = views((*PARALLAX, 0.2))
     start, rows, cols = other.layout[-1]
     other.pixels[start:] = np.random.default_rng(5).normal(0, 3, rows * cols)
@@ -202,7 +202,7 @@ def test_no_plane_where_the_views_agree_better_on_what_was_matched(bow, is_flat)
     assert found.is_planar[middle].mean() > 0.9 if is_flat else not found.is_planar[middle].any()
 
 
-@pytest.mark.parametrize("changed", [{"texture": 0.0}, {"least_cells": 5000}, {"most_slope_steps": 0.01}])
+@pytest.mark.parametrize("changed", [{"texture": 0.0}, {"min_cells": 5000}, {"max_slope_steps": 0.01}])
 def test_options_that_leave_no_plane(changed):
     assert not fitted(views(), level_roof(), replace(OPTIONS, **changed)).is_planar.any()
 
@@ -210,27 +210,27 @@ def test_options_that_leave_no_plane(changed):
 def test_segments_and_their_rims():
     plain = np.zeros((40, 50), bool)
     plain[5:15, 5:15], plain[20:24, 20:24], plain[30:38, 40:50] = True, True, True
-    found = plain_segments(plain, replace(OPTIONS, least_cells=50, most_cells=90))
+    found = plain_segments(plain, replace(OPTIONS, min_cells=50, max_cells=90))
     assert found.start.tolist() == [0, 110]
     assert found.is_core.sum() == 80
     assert set(found.row[~found.is_core]) <= set(range(29, 39))
     assert (found.of_cell == 0).all()
-    both = plain_segments(plain, replace(OPTIONS, least_cells=50))
+    both = plain_segments(plain, replace(OPTIONS, min_cells=50))
     assert np.bincount(both.of_cell, both.is_core).tolist() == [100, 80]
     assert np.bincount(both.of_cell).tolist() == [144, 10 * 11]
     assert plain_segments(np.zeros((9, 9), bool), OPTIONS).start.tolist() == [0]
 
 
-def test_each_view_is_looked_at_on_the_heights_so_far(monkeypatch, tmp_path):
+def test_segments_of_each_view_are_found_on_the_heights_so_far(monkeypatch, tmp_path):
     """Planes of the view before change them."""
     looked_at = []
 
-    def raised(views, ortho, known, seen, options, core):
+    def raised(views, ortho, known, visible, options, core):
         same = [view for view in range(3) if np.array_equal(ortho, ortho_image(views, known.height, view))]
         looked_at.append((same, float(known.height.mean())))
         return PlanarHeights(known.height + 1, known.is_planar)
 
-    monkeypatch.setattr(tile, "with_planes", raised)
+    monkeypatch.setattr(finest_level, "with_planes", raised)
     images = rendered(tmp_path, "sine").inputs[:3]
     run(images, tmp_path / "out", bounds=PART, report=False)
     assert [len(same) for same, _ in looked_at] == [1, 1]
@@ -259,7 +259,7 @@ def test_the_first_plane_passes_by_a_few_wrong_heights():
     middle, plane, out = np.array([row.mean(), col.mean()]), np.empty(3), np.empty(row.size)
     true = np.array([40.0, 1.5, -0.7])
     plane_heights(row, col, middle, true, out)
-    np.testing.assert_allclose(out[0], 40 - 9.5 / SPAN * 1.5 + 14.5 / SPAN * 0.7)
+    np.testing.assert_allclose(out[0], 40 - 9.5 / SLOPE_SPAN_CELLS * 1.5 + 14.5 / SLOPE_SPAN_CELLS * 0.7)
     wrong = out.copy()
     wrong[::6] += 25.0
     plane_through(row, col, middle, wrong, np.empty(row.size), np.empty(row.size), plane)
@@ -315,7 +315,7 @@ def test_disagreement_equals_its_slow_twin():
 
 @pytest.mark.parametrize(("costs", "left"), [((0.1,) * 5, 5), ((0.1,) * 4 + (9.0,), 4), ((0.1,) * 3 + (9.0,) * 2, 0),
                                              ((0.1, 0.1, 9.0), 0), ((0.1,) * 4 + (9.0, np.inf), 4)])  # fmt: skip
-def test_one_view_of_five_may_be_left_out(costs, left):
+def test_one_view_in_five_may_be_excluded(costs, left):
     visible = np.ones((len(costs), 4), bool)
-    assert leave_out(visible, np.repeat(np.array(costs)[:, None], 2, axis=1), 0.2) == left
+    assert exclude_views(visible, np.repeat(np.array(costs)[:, None], 2, axis=1), 0.2) == left
     assert (~visible).any(axis=1).tolist() == [cost == 9.0 for cost in costs]

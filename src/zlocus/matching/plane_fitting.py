@@ -1,42 +1,54 @@
-"""Planes through plain segments: roofs and other even ground whose cells alone have nothing to be matched by.
+"""Planes through segments without texture: roofs and other even ground that cannot be matched cell by cell.
 
-The semi-global constraint fills them with whatever costs least, level rather than sloped and off by a metre or two;
-their outline, and what little texture there is, pooled over the whole segment, knows better (method section 6).
+The semi-global constraint gives such cells the height of the least cost, which is level instead of sloped, and wrong by
+a metre or two. The outline of a segment and what little texture it has, taken together over the whole segment, give a
+better height (method section 6).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import PlaneOptions
-from zlocus.matching.kernels.plane_fitting import SPAN, fit_segments
+from zlocus.matching.kernels.plane_fitting import (
+    SLOPE_SPAN_CELLS,
+    FittedPlanes,
+    PlaneCells,
+    PlaneLimits,
+    fit_segments,
+)
 from zlocus.matching.local_contrast import ALL, Part, deviation, texture_unit
 from zlocus.matching.occlusion import sees
 from zlocus.matching.tile_views import TileViews
 
-TEXTURE, RIM, INNER = (3, 3), np.ones((3, 3), np.uint8), np.ones((3, 3), np.uint8)
-# By how much less the views may agree on a plane than on the heights before, as a share of what a plain core may have.
-MOST_WORSE = 0.25
+# Window in which the grey deviation of a cell is measured; rim around the plain cells, and what is eroded for the inner
+# cells.
+TEXTURE_WINDOW, RIM, INNER = (3, 3), np.ones((3, 3), np.uint8), np.ones((3, 3), np.uint8)
+# How much worse the views may agree on a plane than on the matched heights, as a share of `max_cost`.
+MAX_COST_INCREASE_SHARE = 0.25
+# Where the views agree better on a plane than on the matched heights, this share of the cells near it is enough.
+MIN_NEAR_SHARE_OF_BETTER_PLANE = 0.5
 
 
 @dataclass(frozen=True)
 class PlanarHeights:
-    """height : (r, c) float32 height indices, planes where `is_planar`, (r, c) bool."""
+    """height : (r, c) float32 height indices; is_planar : (r, c) bool, cells whose height is that of a plane."""
 
     height: NDArray[np.float32]
     is_planar: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Segments:
+class PlainSegments:
     """Cells of plain segments, one segment after the other.
 
-    start : (s + 1,) where each begins; row, col : (n,); is_core : (n,) whether a cell is plain itself, not beside one;
-    is_inner : (n,) whether those around it are too.
+    start : (s + 1,) where each begins; row, col : (n,); is_core : (n,) whether a cell is plain itself, not one of the
+    rim; is_inner : (n,) whether the cells around it are plain too.
     """
 
     start: NDArray[np.int64]
@@ -51,89 +63,131 @@ class Segments:
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
 
+class LabelledSegments(NamedTuple):
+    """labels : (r, c) int32, 1 to `count`, 0 where a cell belongs to no segment."""
+
+    labels: NDArray[np.int32]
+    count: int
+
+
+class RectangleSides(NamedTuple):
+    """Sides, in cells, of the rectangle with the same covariance as the cells of each segment, (count,) each."""
+
+    long: NDArray[np.float64]
+    short: NDArray[np.float64]
+
+
 def with_planes(
     views: TileViews,
     ortho: NDArray[np.float32],
     known: PlanarHeights,
-    seen: NDArray[np.int32],
+    visible: NDArray[np.int32],
     options: PlaneOptions,
     core: Part = ALL,
 ) -> PlanarHeights:
-    """Heights with planes in place of those of plain segments, where the views agree on a plane.
+    """Heights with planes in place of the heights of plain segments, where the views agree on a plane.
 
-    ortho : (r, c) grey values at the known heights, which are (r, c) height indices; cells that are planar stay; seen :
-    (3, i, r, c), see `coverage`; core : the cells whose texture is the unit. A plane is taken where most cells were
-    matched near it, or the views agree better on it, and where they agree on its core to the noise, not much less than
-    on the heights before: outlines may not.
+    ortho : (r, c) grey values on the known heights, NaN where not known; known : heights so far, as lattice indices;
+    cells that are planar already keep theirs; visible : (3, i, r, c), see `coverage`; core : the cells whose texture is
+    the unit.
+
+    A plane is accepted where most matched heights are near it, or the views agree better on it. In both cases the views
+    have to agree on its core to within the noise, and not much worse than on the matched heights; the rim need not
+    agree.
     """
-    height, shown = known.height, np.isfinite(ortho)
-    grey = np.where(shown, ortho, np.float32(0.0))
+    height, is_known = known.height, np.isfinite(ortho)
+    grey = np.where(is_known, ortho, np.float32(0.0))
     unit = texture_unit(ortho, core)
-    noise, is_plain = options.noise * unit, deviation(grey, TEXTURE) < options.texture * unit
-    found = plain_segments(is_plain & shown & ~known.is_planar, options)
-    n_segments, cells = len(found.start) - 1, (found.row, found.col)
-    if not (n_segments and noise > 0):
+    noise, is_plain = options.noise * unit, deviation(grey, TEXTURE_WINDOW) < options.texture * unit
+    segments = plain_segments(is_plain & is_known & ~known.is_planar, options)
+    if not (len(segments.start) > 1 and noise > 0):
         return known
-    before = height[cells].astype(np.float64)
-    after, visible = before.copy(), sees(seen[(slice(None), slice(None), *cells)], height[cells])
-    is_plain, planes, costs = np.zeros(n_segments, np.bool_), np.zeros((n_segments, 3)), np.zeros((n_segments, 2, 2))
-    fit_segments(
-        found.start, visible, found.is_core, *cells, before, views.pixels, views.layout, views.nodes, views.heights,
-        views.block, noise, options.most_cost, is_plain, planes, costs, after,
-    )  # fmt: skip
-    of_cell, is_near = found.of_cell, np.abs(after - before) < options.near_steps
-    near = np.bincount(of_cell, is_near & found.is_core, n_segments) / np.bincount(of_cell, found.is_core, n_segments)
-    better = costs[:, 1, 0] < costs[:, 0, 0]
-    taken = is_plain & (costs[:, 1, 1] < options.most_cost) & (near > np.where(better, 0.5, options.least_near))
-    taken &= costs[:, 1, 1] - costs[:, 0, 1] < MOST_WORSE * options.most_cost
-    taken &= np.hypot(planes[:, 1], planes[:, 2]) < options.most_slope_steps * SPAN
-    kept = taken[of_cell] & (found.is_inner | is_near) & (visible.sum(axis=0) >= 2)
+    row, col = segments.row, segments.col
+    before = height[row, col].astype(np.float64)
+    is_visible = sees(visible[:, :, row, col], height[row, col])
+    fitted = _fitted_planes(views, segments, before, is_visible, PlaneLimits(float(noise), options.max_cost))
+    is_near = np.abs(fitted.heights - before) < options.near_steps
+    is_accepted = accepted_planes(segments, fitted, is_near, options)
+    kept = is_accepted[segments.of_cell] & (segments.is_inner | is_near) & (is_visible.sum(axis=0) >= 2)
     result = PlanarHeights(height.copy(), known.is_planar.copy())
-    result.height[found.row[kept], found.col[kept]] = after[kept]
-    result.is_planar[found.row[kept], found.col[kept]] = True
+    result.height[row[kept], col[kept]] = fitted.heights[kept]
+    result.is_planar[row[kept], col[kept]] = True
     return result
 
 
-def plain_segments(is_plain: NDArray[np.bool_], options: PlaneOptions) -> Segments:
-    """Connected plain cells in the shape of a roof, and a rim of one cell around each.
+def _fitted_planes(
+    views: TileViews,
+    segments: PlainSegments,
+    height: NDArray[np.float64],
+    is_visible: NDArray[np.bool_],
+    limits: PlaneLimits,
+) -> FittedPlanes:
+    """The plane of every segment. height : (n,) matched height indices; is_visible : (i, n)."""
+    n_segments = len(segments.start) - 1
+    fitted = FittedPlanes(
+        np.zeros(n_segments, np.bool_), np.zeros((n_segments, 3)), np.zeros((n_segments, 2, 2)), height.copy()
+    )
+    cells = PlaneCells(segments.row, segments.col, height, segments.is_core, is_visible)
+    fit_segments(segments.start, cells, views.arrays, limits, fitted)
+    return fitted
 
-    A filled rectangle of any direction has twelve times the root of the determinant of its cells' covariance for an
-    area; nets of roads and what surrounds houses have far less, and no single plane.
+
+def accepted_planes(
+    segments: PlainSegments, fitted: FittedPlanes, is_near: NDArray[np.bool_], options: PlaneOptions
+) -> NDArray[np.bool_]:
+    """(s,) bool: segments whose plane replaces the matched heights; see `with_planes`. is_near : (n,), matched heights
+    near the plane."""
+    (all_before, core_before), (all_after, core_after) = fitted.costs[:, 0].T, fitted.costs[:, 1].T
+    of_cell, n_segments = segments.of_cell, len(segments.start) - 1
+    n_core = np.bincount(of_cell, segments.is_core, n_segments)
+    near_share = np.bincount(of_cell, is_near & segments.is_core, n_segments) / n_core
+    min_share = np.where(all_after < all_before, MIN_NEAR_SHARE_OF_BETTER_PLANE, options.min_near_share)
+    is_accepted = fitted.is_plain & (core_after < options.max_cost) & (near_share > min_share)
+    is_accepted &= core_after - core_before < MAX_COST_INCREASE_SHARE * options.max_cost
+    slope = np.hypot(fitted.planes[:, 1], fitted.planes[:, 2])
+    is_accepted &= slope < options.max_slope_steps * SLOPE_SPAN_CELLS
+    return np.asarray(is_accepted)
+
+
+def plain_segments(is_plain: NDArray[np.bool_], options: PlaneOptions) -> PlainSegments:
+    """Connected plain cells in the shape of a roof, with a rim of one cell around each segment. is_plain : (r, c).
+
+    The area of a filled rectangle of any direction is twelve times the root of the determinant of its cells'
+    covariance. Networks of roads and the ground around houses fill far less than this, and lie in no single plane.
     """
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(is_plain.astype(np.uint8), connectivity=4)
     area = statistics[:, cv2.CC_STAT_AREA]
-    fits = (area >= options.least_cells) & (area <= options.most_cells)
-    fits[0] = False
-    core, n_fitting = renumbered(labels, fits)
-    long, across = sides(core, n_fitting)
-    compact = (np.bincount(core.ravel(), minlength=n_fitting + 1)[1:] >= options.least_filled * long * across) & (
-        long <= options.longest_cells
-    )
-    core, n = renumbered(core, np.concatenate([[False], compact]))
+    has_size = (area >= options.min_cells) & (area <= options.max_cells)
+    has_size[0] = False
+    core, count = renumbered(labels, has_size)
+    long, short = rectangle_sides(core, count)
+    n_cells = np.bincount(core.ravel(), minlength=count + 1)[1:]
+    is_compact = (n_cells >= options.min_filled_share * long * short) & (long <= options.max_length_cells)
+    core, count = renumbered(core, np.concatenate([[False], is_compact]))
     whole = np.where(core > 0, core, cv2.dilate(core.astype(np.float32), RIM).astype(np.int32)).ravel()
     cells = np.flatnonzero(whole)
     cells = cells[np.argsort(whole[cells], kind="stable")]
-    start = np.concatenate([[0], np.cumsum(np.bincount(whole[cells], minlength=n + 1)[1:])])
+    start = np.concatenate([[0], np.cumsum(np.bincount(whole[cells], minlength=count + 1)[1:])])
     row, col = np.divmod(cells, is_plain.shape[1])
-    inner = cv2.erode((core > 0).astype(np.uint8), INNER).ravel()[cells] > 0
-    return Segments(start.astype(np.int64), row, col, core.ravel()[cells] > 0, inner)
+    is_inner = cv2.erode((core > 0).astype(np.uint8), INNER).ravel()[cells] > 0
+    return PlainSegments(start.astype(np.int64), row, col, core.ravel()[cells] > 0, is_inner)
 
 
-def renumbered(labels: NDArray[np.int32], kept: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
-    """Labels (r, c) of the kept ones alone, counted from 1, 0 elsewhere; and how many they are. kept : (labels,)."""
+def renumbered(labels: NDArray[np.int32], kept: NDArray[np.bool_]) -> LabelledSegments:
+    """The segments that are kept, counted from 1. labels : (r, c); kept : (number of labels,)."""
     number = np.zeros(len(kept), np.int32)
     number[kept] = np.arange(1, kept.sum() + 1)
-    return number[labels], int(kept.sum())
+    return LabelledSegments(number[labels], int(kept.sum()))
 
 
-def sides(labels: NDArray[np.int32], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Longer and shorter side, cells, of the rectangle with the covariance of each label's cells, (count,) each."""
+def rectangle_sides(labels: NDArray[np.int32], count: int) -> RectangleSides:
+    """Sides of the rectangle with the covariance of the cells of each label. labels : (r, c), 1 to count."""
     row, col = np.nonzero(labels)
     label = labels[row, col] - 1
     n = np.maximum(np.bincount(label, minlength=count), 1)
     y, x = (v - (np.bincount(label, v, count) / n)[label] for v in (row, col))
-    # The cells' own extent adds a twelfth.
+    # The extent of a cell itself adds a twelfth.
     yy, xx = (np.bincount(label, v * v, count) / n + 1 / 12 for v in (y, x))
     yx = np.bincount(label, y * x, count) / n
     half, spread = (yy + xx) / 2, np.hypot((yy - xx) / 2, yx)
-    return np.sqrt(12 * (half + spread)), np.sqrt(12 * np.maximum(half - spread, 0))
+    return RectangleSides(np.sqrt(12 * (half + spread)), np.sqrt(12 * np.maximum(half - spread, 0)))

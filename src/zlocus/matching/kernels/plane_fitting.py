@@ -1,26 +1,60 @@
-"""Planes through plain segments, whose cells say nothing alone: their grey values are fitted in all views at once.
+"""Planes through segments without texture, by least squares matching of their grey values in all views at once.
 
-Least squares matching of a whole segment (Grün 1985) with a plane of heights: inside, a plain roof fits at any height,
-but where a view's outline of the segment does not lie where the plane puts it, cells show what lies beside.
+A whole segment is matched with one plane of heights (Grün 1985). The inside of a plain roof fits at any height, but
+where the outline of the segment in a view does not lie where the plane puts it, the cells there show what lies beside
+the segment.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from zlocus.core.jit import kernel
 
-# Cells per unit of a plane's slopes: a slope then moves heights about as much as its height does.
-SPAN = 10.0
-ROUNDS_TO_START, ROUNDS = 8, 6
-NEAR_STEPS = 0.3  # a surface's noise: nearer cells all weigh the same at the start
-DAMPING, MOST_MOVED = 1e-2, 1.0
+# Unit of the slopes of a plane: over so many cells a change of a slope moves the heights as much as an equal change of
+# the plane's height does.
+SLOPE_SPAN_CELLS = 10.0
+# Iterations of the robust plane through the heights, and of the least squares matching that follows.
+START_ROUNDS, MATCHING_ROUNDS = 8, 6
+# Noise of the heights: in the robust plane all cells nearer than this weigh the same.
+HEIGHT_NOISE_STEPS = 0.3
+# Share of the mean diagonal that is added to the normal equations, and the largest change of a parameter in a round.
+DAMPING, MAX_CHANGE_STEPS = 1e-2, 1.0
+
+
+class PlaneCells(NamedTuple):
+    """Cells of plain segments, one segment after the other."""
+
+    row: np.ndarray  # (n,) i8: row in the tile
+    col: np.ndarray  # (n,) i8: column in the tile
+    height: np.ndarray  # (n,) f8: height index
+    is_core: np.ndarray  # (n,) b1: whether the cell is plain itself, not one of the rim around the plain cells
+    is_visible: np.ndarray  # (i,n) b1: views that see the cell
+
+
+class PlaneLimits(NamedTuple):
+    """What counts as noise."""
+
+    noise: float  # f8: grey difference between views that is noise
+    max_cost: float  # f8: cost of the core of a plain segment, in units of the noise squared
+
+
+class FittedPlanes(NamedTuple):
+    """Results for all segments, written."""
+
+    is_plain: np.ndarray  # (s,) b1: whether the core of a segment is plain in the views
+    planes: np.ndarray  # (s,k) f8: height in the middle, then slopes along rows and columns
+    costs: np.ndarray  # (s,k,k) f8: before and after the fit, each of all cells and of the core
+    heights: np.ndarray  # (n,) f8: height index of the plane at each cell
 
 
 # (3,3) f8, (3,) f8, f8, (3,) f8 -> None
 @kernel
 def solve_damped(normal, right, damping, out):
-    """Solve three normal equations, with a share of their mean diagonal added to it (Cramer); 0 where singular."""
+    """Solve three normal equations by Cramer's rule, with a share of the mean diagonal added to the diagonal; 0 where
+    they are singular."""
     more = damping * (normal[0, 0] + normal[1, 1] + normal[2, 2]) / 3.0 + 1e-9
     a, b, c = normal[0, 0] + more, normal[0, 1], normal[0, 2]
     d, e, f = normal[1, 1] + more, normal[1, 2], normal[2, 2] + more
@@ -36,19 +70,28 @@ def solve_damped(normal, right, damping, out):
 # (n,) i8, (n,) i8, (2,) f8, (3,) f8, (n,) f8 -> None
 @kernel
 def plane_heights(row, col, middle, plane, out):
-    """Heights of a plane (height in the middle, then slopes per SPAN cells) at the cells of a segment."""
+    """Heights of a plane (height in the middle, then slopes per SLOPE_SPAN_CELLS cells) at the cells of a segment."""
     for p in range(row.shape[0]):
-        out[p] = plane[0] + plane[1] * ((row[p] - middle[0]) / SPAN) + plane[2] * ((col[p] - middle[1]) / SPAN)
+        out[p] = (
+            plane[0]
+            + plane[1] * ((row[p] - middle[0]) / SLOPE_SPAN_CELLS)
+            + plane[2] * ((col[p] - middle[1]) / SLOPE_SPAN_CELLS)
+        )
 
 
 # (n,) i8, (n,) i8, (2,) f8, (n,) f8, (n,) f8, (3,3) f8, (3,) f8 -> None
 @kernel
 def normal_equations(row, col, middle, weight, value, normal, right):
-    """Sums of weight x x' and of value x over a segment, x = 1 and the two places in SPAN cells."""
+    """Sums of weight x x' and of value x over a segment, x = 1 and the two places in SLOPE_SPAN_CELLS cells."""
     normal[:] = 0.0
     right[:] = 0.0
     for p in range(row.shape[0]):
-        y, x, w, v = (row[p] - middle[0]) / SPAN, (col[p] - middle[1]) / SPAN, weight[p], value[p]
+        y, x, w, v = (
+            (row[p] - middle[0]) / SLOPE_SPAN_CELLS,
+            (col[p] - middle[1]) / SLOPE_SPAN_CELLS,
+            weight[p],
+            value[p],
+        )
         normal[0, 0] += w
         normal[0, 1] += w * y
         normal[0, 2] += w * x
@@ -63,23 +106,23 @@ def normal_equations(row, col, middle, weight, value, normal, right):
 # (n,) i8, (n,) i8, (2,) f8, (n,) f8, (n,) f8, (n,) f8, (3,) f8 -> None
 @kernel
 def plane_through(row, col, middle, height, weight, value, plane):
-    """The plane nearly through most heights of a segment: least squares, weights 1 / distance, again and again."""
+    """Robust plane through the heights of a segment: least squares, iterated with weights 1 / distance."""
     normal, right, at = np.empty((3, 3)), np.empty(3), np.empty(row.shape[0])
     weight[:] = 1.0
-    for _ in range(ROUNDS_TO_START):
+    for _ in range(START_ROUNDS):
         for p in range(row.shape[0]):
             value[p] = weight[p] * height[p]
         normal_equations(row, col, middle, weight, value, normal, right)
         solve_damped(normal, right, 0.0, plane)
         plane_heights(row, col, middle, plane, at)
         for p in range(row.shape[0]):
-            weight[p] = 1.0 / max(abs(height[p] - at[p]), NEAR_STEPS)
+            weight[p] = 1.0 / max(abs(height[p] - at[p]), HEIGHT_NOISE_STEPS)
 
 
 # (i,b,d,2,k) f8, (2,) f8, i8, (n,) i8, (n,) i8, (n,) f8, (i,n,4) f8 -> None
 @kernel
 def segment_loci(nodes, heights, block, row, col, height, locus):
-    """Where each view shows the cells of a segment, px, and by how much that moves per step, written to `locus`."""
+    """Write to `locus` where each view shows the cells of a segment, px, and by how much that moves per height step."""
     for p in range(row.shape[0]):
         b, d = row[p] // block, col[p] // block
         fr, fc = (row[p] - b * block) / block, (col[p] - d * block) / block
@@ -101,13 +144,17 @@ def segment_loci(nodes, heights, block, row, col, height, locus):
 # (p,) f4, (i,3) i8, (i,n,4) f8, (n,) f8, (n,) f8, (i,n) f8, (i,n) f8 -> None
 @kernel
 def segment_greys(pixels, layout, locus, start, height, grey, slope):
-    """Grey value of every view at the cells of a segment, bilinear, and its change per step. start : (n,) heights that
-    `locus` was made for; height : (n,) those asked for; grey, slope : (i, n), written."""
+    """Write the grey value of every view at the cells of a segment, bilinear, and its change per height step.
+
+    start : (n,) heights for which `locus` was computed; height : (n,) heights of the grey values; grey, slope : (i, n),
+    written.
+    """
     for i in range(layout.shape[0]):
         offset, n_rows, n_cols = layout[i, 0], layout[i, 1], layout[i, 2]
         for p in range(height.shape[0]):
             away = height[p] - start[p]
-            # Beyond the image its border goes on; where a table does not hold (NaN), what is read does not count.
+            # Beyond the image its outermost pixels are repeated. Where a projection table does not hold (NaN), what is
+            # read here does not count.
             x, y = locus[i, p, 0] + away * locus[i, p, 2], locus[i, p, 1] + away * locus[i, p, 3]
             x = min(x, n_cols - 1.001) if x > 0.0 else 0.0
             y = min(y, n_rows - 1.001) if y > 0.0 else 0.0
@@ -123,7 +170,7 @@ def segment_greys(pixels, layout, locus, start, height, grey, slope):
 # (n,) f8, i8 -> f8
 @kernel
 def median_of(values, n):
-    """Median of the first n values, which are sorted."""
+    """Median of the first n values; sorts them."""
     for j in range(1, n):
         value, k = values[j], j
         while k > 0 and values[k - 1] > value:
@@ -136,10 +183,11 @@ def median_of(values, n):
 # (i,n) f8, (i,n) f8, (i,n) b1, (n,) b1, f8, (n,) f8, (n,) f8, (i,2) f8 -> None
 @kernel
 def disagreement(grey, slope, visible, is_core, noise, weight, value, cost):
-    """How far the views' greys lie from their median, cell by cell, and what a step would change.
+    """Compare the grey values of the views with their median, cell by cell.
 
-    weight, value : (n,) float64, of the normal equations; cost : (i, 2), mean Huber loss of each view in units of noise
-    squared over all cells and over the core, infinite where it sees none; views that do not see a cell do not count.
+    weight, value : (n,) float64, terms of the normal equations, written; cost : (i, 2), written, mean Huber loss of
+    each view over all cells and over the core, in units of the noise squared, infinite where it sees none. Views that
+    do not see a cell do not count there.
     """
     n_views, seen = grey.shape[0], np.empty(grey.shape[0])
     cost[:] = 0.0
@@ -174,7 +222,7 @@ def disagreement(grey, slope, visible, is_core, noise, weight, value, cost):
 # (i,n) f8, (i,n) b1, (n,) b1 -> None
 @kernel
 def level_greys(grey, visible, is_core):
-    """Take off each view's grey what it is brighter over the core than the median of the views, on average."""
+    """Subtract from the grey values of each view its mean difference from the median of the views over the core."""
     n_views, seen = grey.shape[0], np.empty(grey.shape[0])
     total, n = np.zeros(n_views), np.zeros(n_views)
     for p in range(grey.shape[1]):
@@ -199,15 +247,17 @@ def level_greys(grey, visible, is_core):
 
 # (i,n) b1, (i,2) f8, f8 -> i8
 @kernel
-def leave_out(visible, cost, most_cost):
-    """Leave out the views in whose eyes a segment's core is not plain (another day's, say); how many are left, 0 where
-    they are fewer than four of five."""
+def exclude_views(visible, cost, max_cost):
+    """Exclude the views in which the core of a segment is not plain (a view of another day, for example).
+
+    Returns how many views are left, 0 where they are fewer than four in five.
+    """
     left, seeing = 0, 0
     for i in range(visible.shape[0]):
         if not np.isfinite(cost[i, 1]):
             continue
         seeing += 1
-        if cost[i, 1] < most_cost:
+        if cost[i, 1] < max_cost:
             left += 1
         else:
             visible[i] = False
@@ -217,7 +267,7 @@ def leave_out(visible, cost, most_cost):
 # (i,2) f8, i8 -> f8
 @kernel
 def mean_cost(cost, part):
-    """Mean of the costs of the views that see a segment."""
+    """Mean cost of the views that see a segment. part : 0 for all cells, 1 for the core."""
     total, n = 0.0, 0
     for i in range(cost.shape[0]):
         if np.isfinite(cost[i, part]):
@@ -226,31 +276,34 @@ def mean_cost(cost, part):
     return total / n if n else np.inf
 
 
-# (i,n) b1,(n) b1,(n) i8,(n) i8,(n) f8,(p) f4,(i,3) i8,(i,b,d,2,k) f8,(2) f8,i8,f8,f8,(3) f8,(2,2) f8,(n) f8 -> b1
+# PlaneCells, ViewArrays, PlaneLimits, (3,) f8, (2,2) f8, (n,) f8 -> b1
 @kernel
-def fit_segment(
-    visible, is_core, row, col, height, pixels, layout, nodes, heights, block, noise, most_cost, plane, costs, out
-):
-    """Plane of one segment on which the views agree best, from the plane through its heights; False where the core is
-    not plain. plane : (3,), costs : (2, 2), before and after, all and core, and out : (n,) its heights, are written."""
+def fit_segment(cells, views, limits, plane, costs, out):
+    """Find the plane of one segment on which the views agree best, starting from the plane through its heights.
+
+    Returns False where the core of the segment is not plain. cells : of the segment; views that are excluded are taken
+    off `cells.is_visible`; plane, costs, out : see `FittedPlanes`, written.
+    """
+    row, col, height, is_core, visible = cells.row, cells.col, cells.height, cells.is_core, cells.is_visible
+    pixels, layout, noise, max_cost = views.pixels, views.layout, limits.noise, limits.max_cost
     n, n_views = row.shape[0], layout.shape[0]
     middle = np.array([row.mean(), col.mean()])
     locus, grey, slope = np.empty((n_views, n, 4)), np.empty((n_views, n)), np.empty((n_views, n))
     weight, value, cost, moved = np.empty(n), np.empty(n), np.empty((n_views, 2)), np.empty(3)
     normal, right = np.empty((3, 3)), np.empty(3)
-    segment_loci(nodes, heights, block, row, col, height, locus)
+    segment_loci(views.nodes, views.heights, views.block, row, col, height, locus)
     segment_greys(pixels, layout, locus, height, height, grey, slope)
     level_greys(grey, visible, is_core)
     disagreement(grey, slope, visible, is_core, noise, weight, value, cost)
-    if not mean_cost(cost, 1) < most_cost:
-        if leave_out(visible, cost, most_cost) < 2:
+    if not mean_cost(cost, 1) < max_cost:
+        if exclude_views(visible, cost, max_cost) < 2:
             return False
         disagreement(grey, slope, visible, is_core, noise, weight, value, cost)
     costs[0] = mean_cost(cost, 0), mean_cost(cost, 1)
     now = np.empty(3)
     plane_through(row, col, middle, height, weight, value, now)
     costs[1] = np.inf
-    for _ in range(ROUNDS):
+    for _ in range(MATCHING_ROUNDS):
         plane_heights(row, col, middle, now, out)
         segment_greys(pixels, layout, locus, height, out, grey, slope)
         level_greys(grey, visible, is_core)
@@ -261,23 +314,20 @@ def fit_segment(
         normal_equations(row, col, middle, weight, value, normal, right)
         solve_damped(normal, right, DAMPING, moved)
         for k in range(3):
-            now[k] += min(max(moved[k], -MOST_MOVED), MOST_MOVED)
+            now[k] += min(max(moved[k], -MAX_CHANGE_STEPS), MAX_CHANGE_STEPS)
     plane_heights(row, col, middle, plane, out)
     return True
 
 
-# as fit_segment, with (s+1,) i8 first and (s,) b1, (s,3) f8, (s,2,2) f8, (n,) f8 last
+# (s,) i8, PlaneCells, ViewArrays, PlaneLimits, FittedPlanes -> None
 @kernel
-def fit_segments(
-    start, visible, is_core, row, col, height, pixels, layout, nodes, heights, block, noise, most_cost, is_plain,
-    planes, costs, out,
-):  # fmt: skip
-    """`fit_segment` of every segment. start : (s + 1,), where the cells of each begin among n; row, col : of the tile;
-    height : (n,) float64 indices; visible : (i, n), views that see a cell; is_core : (n,), cells that are not of the
-    rim; noise : grey difference that says little; most_cost : of the core of a plain segment, in noise squared."""
+def fit_segments(start, cells, views, limits, fitted):
+    """`fit_segment` of every segment. start : (s + 1,), where the cells of each segment begin."""
     for s in range(start.shape[0] - 1):
         a, b = start[s], start[s + 1]
-        is_plain[s] = fit_segment(
-            visible[:, a:b].copy(), is_core[a:b], row[a:b], col[a:b], height[a:b], pixels, layout, nodes,
-            heights, block, noise, most_cost, planes[s], costs[s], out[a:b],
+        of_segment = PlaneCells(
+            cells.row[a:b], cells.col[a:b], cells.height[a:b], cells.is_core[a:b], cells.is_visible[:, a:b].copy()
+        )  # fmt: skip
+        fitted.is_plain[s] = fit_segment(
+            of_segment, views, limits, fitted.planes[s], fitted.costs[s], fitted.heights[a:b]
         )  # fmt: skip
