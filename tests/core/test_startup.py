@@ -16,7 +16,7 @@ print(*sorted(heavy & set(sys.modules)))
 """
 COMMAND = """
 import gc, sys
-from zlocus.cli.app import app as cli
+from zlocus.cli import app as cli
 from zlocus.core import startup
 try:
     cli.main(["config"])

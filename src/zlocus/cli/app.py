@@ -6,14 +6,10 @@ once.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import typer
-
-# Threads that wait for the small matrices of a run cost more than they save; set before NumPy is imported.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from zlocus import __version__
 from zlocus.cli.cloud import CloudOptions, cloud
