@@ -70,13 +70,13 @@ def test_versions_name_what_heights_depend_on():
 def test_numbers_that_are_not_finite_become_null(tmp_path):
     write_record(tmp_path / "run.json", {"pairs": [{"px": float("nan")}, (np.float64("inf"), 1.5)], "n": 3})
     assert json.loads((tmp_path / "run.json").read_text()) == {
-        "schema": 1, "pairs": [{"px": None}, [None, 1.5]], "n": 3,
+        "schema": 2, "pairs": [{"px": None}, [None, 1.5]], "n": 3,
     }  # fmt: skip
 
 
 def test_a_record_is_whole_or_not_there(tmp_path):
     write_record(tmp_path / "run.json", {"coverage": 0.5})
-    assert json.loads((tmp_path / "run.json").read_text()) == {"schema": 1, "coverage": 0.5}
+    assert json.loads((tmp_path / "run.json").read_text()) == {"schema": 2, "coverage": 0.5}
     assert [p.name for p in tmp_path.iterdir()] == ["run.json"]
     (tmp_path / "taken.json").mkdir()
     with pytest.raises(OutputError, match=r"taken\.json cannot be written"):

@@ -1,4 +1,4 @@
-"""What is match_scene before tiling: step, leading view, levels, extent."""
+"""Match scene: order of the views, height step, levels."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions
 from zlocus.core.scene import Scene, View
 from zlocus.matching.ground_pixels import check_resolution, median_ground_pixel
-from zlocus.matching.match_scene import height_step, reference_first, levels_for, parallax_rate, cells_of_bounds, build_match_scene
-from zlocus.core.footprints import shared_ground
+from zlocus.matching.match_scene import build_match_scene, height_step, levels_for, parallax_rate, reference_first
 from zlocus.matching.radiometry import grey_scales
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.scenes import ViewSpec, demo_spec, exposures_of, steady
@@ -35,7 +34,7 @@ def scene(*views):
     return Scene(views, UTM)
 
 
-def test_the_most_nadir_view_leads():
+def test_the_most_nadir_view_is_the_reference_image():
     views = scene(view("aft", -20), view("mid", 3), view("fore", 12))
     assert [v.name for v in reference_first(views, 50.0, None)] == ["mid", "fore", "aft"]
     assert [v.name for v in reference_first(views, 50.0, "aft")] == ["aft", "mid", "fore"]
@@ -48,7 +47,7 @@ def test_order_of_images_does_not_matter():
     assert reference_first(scene(a, b, c), 50.0, None) == reference_first(scene(c, b, a), 50.0, None)
 
 
-def test_the_nadir_offset_is_the_tangent_of_the_view():
+def test_the_parallax_rate_is_the_tangent_of_the_view_angle():
     east, north = parallax_rate(view("v", along=20, across=-10), 50.0)
     assert -north == pytest.approx(np.tan(np.deg2rad(20)), rel=1e-3)
     assert -east == pytest.approx(np.tan(np.deg2rad(-10)), rel=1e-3)
@@ -70,7 +69,7 @@ def test_views_along_one_line_show_no_height():
 
 
 @pytest.mark.parametrize(("n_steps", "levels"), [(4, 3), (256, 3), (257, 4), (1024, 5), (10**6, 6)])
-def test_levels(n_steps, levels):
+def test_there_are_as_many_levels_as_make_the_range_short(n_steps, levels):
     assert levels_for(n_steps, PyramidOptions(max_coarsest_steps=64)) == levels
     assert levels_for(n_steps, PyramidOptions(max_levels=1)) == 1
 
@@ -83,27 +82,7 @@ def test_ground_pixel_and_resolution():
         check_resolution(0.04, views, 50.0, "--resolution")
 
 
-def test_shared_ground_is_what_two_views_see():
-    """80 m wide images 30 and 200 m apart: the third sees nothing of the others' ground."""
-    views = scene(view("a"), view("b", east=30.0), view("c", east=200.0))
-    xmin, ymin, xmax, ymax = shared_ground(views, (49.0, 51.0))
-    assert (xmin, xmax) == pytest.approx((CENTRE[0] - 10, CENTRE[0] + 40), abs=0.1)
-    assert (ymin, ymax) == pytest.approx((CENTRE[1] - 30, CENTRE[1] + 30), abs=0.1)
-    with pytest.raises(GeometryError, match="No two images"):
-        shared_ground(scene(view("a"), view("c", east=200.0)), (49.0, 51.0))
-
-
-def test_the_seen_window_is_whole_coarsest_cells():
-    window = cells_of_bounds((100.3, -7.0, 140.2, 21.0), (0.5, 0.5), 0.5, 4)
-    assert (window.row % 8, window.col % 8, window.rows % 8, window.cols % 8) == (0, 0, 0, 0)
-    west, north = 0.5 + window.col * 0.5, 0.5 - window.row * 0.5
-    assert west <= 100.3 < west + 4
-    assert north >= 21.0 > north - 4
-    assert west + window.cols * 0.5 >= 140.2
-    assert north - window.rows * 0.5 <= -7.0
-
-
-def test_a_settled_scene():
+def test_the_match_scene_of_two_views():
     views = scene(view("n", 2), view("f", 20))
     ties = np.random.default_rng(1).uniform(-20, 20, (60, 3)) + np.array([*CENTRE, 60.0])
     match_scene = build_match_scene(views, 0.5, (0.0, 0.0), (30.0, 90.0), ties, None, PyramidOptions())

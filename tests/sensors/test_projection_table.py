@@ -17,7 +17,7 @@ from zlocus.io.scene_file import open_scene
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.occlusion import coverage, covers, hide, left_out
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import FINEST_BENT_PX, MOST_LOST, ViewPixels, halved, read_pixels, tile_views
 from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
@@ -32,7 +32,7 @@ from zlocus.sensors.projection_table import (
     shown_table,
 )
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
-from zlocus.synthetic.scenes import demo_spec, exposures
+from zlocus.synthetic.scenes import demo_spec, exposures_of
 
 HEIGHTS = (20.0, 140.0)
 # Rounding of float32 grey values, in contrasts of the image.
@@ -148,7 +148,7 @@ def test_coverage_leaves_out_what_does_not_hold():
     views = tile_views([window, window], 0, grid(0.15, shape), shape, 32, (45.0, 0.5), (40.0, 60.0), 4, (45.0, 55.0))
     assert views.block < 32
     assert not views.holds.all()
-    base = BaseSurface.level(shape, views.block)
+    base = SlopeSurface.flat(shape, views.block)
     n = (-(-600 // views.block),) * 2
     lattice = HeightLattice(45.0, 0.5, shape, views.block, np.zeros(n, np.int64), np.full(n, 20))
     seen = covers(coverage(views, base, lattice))
@@ -246,9 +246,9 @@ def test_longest_runs():
 def unsteady():
     """Raw and level 1 models of a line that looks ahead from an unsteady flight."""
     spec = replace(demo_spec(), size=200, views=demo_spec().views[1:2])
-    (exposure,) = exposures(spec)
+    (exposure,) = exposures_of(spec)
     raw = line_scanner(exposure)
-    plane = RectifiedModel(raw, raw, exposure.camera.height, exposure.camera.plane_from_image)
+    plane = RectifiedModel(raw, raw, exposure.sensor.height, exposure.sensor.plane_from_image)
     return spec, raw, plane
 
 

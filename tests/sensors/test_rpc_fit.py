@@ -11,7 +11,7 @@ from zlocus.core.sensor_model import SensorModel
 from zlocus.sensors.rpc import RpcModel
 from zlocus.sensors.rpc_fit import fit_rpc
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
-from zlocus.synthetic.scenes import demo_spec, exposures, steady
+from zlocus.synthetic.scenes import demo_spec, exposures_of, steady
 
 UTM32 = CRS.from_epsg(32632)
 SHAPE = (700, 631)
@@ -48,8 +48,8 @@ def test_satellites_are_fitted_exactly(angles: tuple[float, float, float]) -> No
 
 def test_every_view_of_the_demo_is_fitted() -> None:
     spec = steady(demo_spec())
-    for exposure in exposures(spec):
-        assert fit_rpc(exposure.camera, exposure.shape, spec.crs, spec.height_range).max_error_px < SCANNER_PX
+    for exposure in exposures_of(spec):
+        assert fit_rpc(exposure.sensor, exposure.shape, spec.crs, spec.height_range).max_error_px < SCANNER_PX
 
 
 @pytest.mark.parametrize("wobble_rows", [6000.0, 700.0])

@@ -101,7 +101,7 @@ def test_level_1_keeps_places_on_its_plane_whatever_the_flight() -> None:
     x, y = plane_from_image.a * xy[:, 0] + plane_from_image.c, plane_from_image.e * xy[:, 1] + plane_from_image.f
     np.testing.assert_allclose(on_plane[:, :2], np.column_stack([x, y]), rtol=0, atol=1e-6)
     # Off the plane rays differ by what the flight turned and moved aside: a hundredth of a pixel on 20 m.
-    still = replace(camera, raw=replace(camera.raw, shake=None))
+    still = replace(camera, raw_camera=replace(camera.raw_camera, shake=None))
     above, steady = (each.ground_from_image(xy, np.array(460.0))[:, :2] for each in (camera, still))
     assert 1e-4 < np.std(above - steady, axis=0).max() < 0.02
     apart = camera.raw_from_image(xy) - still.raw_from_image(xy)

@@ -23,7 +23,7 @@ from zlocus.synthetic.__main__ import main
 from zlocus.synthetic.files import RenderedScene, render_scene
 from zlocus.synthetic.linescan import TrajectoryNoise, noisy, sampled, write_linescan_views, write_scene
 from zlocus.synthetic.rectify import rectified
-from zlocus.synthetic.scenes import SceneSpec, city_spec, demo_spec, exposures, with_ads40
+from zlocus.synthetic.scenes import SceneSpec, city_spec, demo_spec, exposures_of, with_ads40
 
 # Cubic splines through exact samples at 200 Hz (rows are 3 ms apart).
 READ_PX = 1e-6
@@ -41,16 +41,16 @@ def spec() -> SceneSpec:
 
 @pytest.fixture(scope="module")
 def rendered(spec, tmp_path_factory) -> RenderedScene:
-    return render_scene(spec, tmp_path_factory.mktemp("linescan") / "scene", linescan=TrajectoryNoise())
+    return render_scene(spec, tmp_path_factory.mktemp("linescan") / "scene", noise=TrajectoryNoise())
 
 
 def assert_exact(scene, spec, tolerance_px):
-    for view, exposure in zip(scene.views, exposures(spec), strict=True):
+    for view, exposure in zip(scene.views, exposures_of(spec), strict=True):
         rows, cols = exposure.shape
         rng = np.random.default_rng(0)
         low, high = (-AROUND_PX, -AROUND_PX), (cols + AROUND_PX, rows + AROUND_PX)
         xy = rng.uniform(low, high, (2000, 2))
-        xyz = exposure.camera.ground_from_image(xy, rng.uniform(*spec.height_range, 2000))
+        xyz = exposure.sensor.ground_from_image(xy, rng.uniform(*spec.height_range, 2000))
         assert isinstance(view.sensor, LineScanModel)
         np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=tolerance_px)
         np.testing.assert_allclose(view.sensor.ground_from_image(xy, xyz[:, 2]), xyz, rtol=0, atol=tolerance_px)
@@ -70,7 +70,7 @@ def test_what_is_read_is_the_exact_camera(spec, rendered):
 def test_the_demo_block_as_line_scanners(tmp_path):
     """Six images of three lines in two strips (Ji et al. 2014, table 2), written without rendering."""
     spec = demo_spec()
-    entries = write_linescan_views(spec, exposures(spec), tmp_path, TrajectoryNoise())
+    entries = write_linescan_views(spec, exposures_of(spec), tmp_path, TrajectoryNoise())
     write_scene(spec, entries, tmp_path / "scene.yaml")
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"ads40.csv", "scene.yaml", *(f"trajectory_{view.name}.csv" for view in spec.views)}
@@ -80,8 +80,8 @@ def test_the_demo_block_as_line_scanners(tmp_path):
 
 def test_level_1_of_an_unsteady_flight_is_read_as_it_was_flown(spec, tmp_path):
     unsteady = replace(spec, shaken=True, level=1)
-    seen_by = exposures(unsteady)
-    rendered = render_scene(replace(unsteady, views=unsteady.views[:2]), tmp_path / "scene", linescan=TrajectoryNoise())
+    seen_by = exposures_of(unsteady)
+    rendered = render_scene(replace(unsteady, views=unsteady.views[:2]), tmp_path / "scene", noise=TrajectoryNoise())
     scene = open_scene(rendered.inputs)
     for view, exposure in zip(scene.views, seen_by, strict=False):
         rows, cols = exposure.shape
@@ -89,17 +89,17 @@ def test_level_1_of_an_unsteady_flight_is_read_as_it_was_flown(spec, tmp_path):
         assert view.image.shape == (rows, cols)
         rng = np.random.default_rng(0)
         xy = rng.uniform((-AROUND_PX, -AROUND_PX), (cols + AROUND_PX, rows + AROUND_PX), (500, 2))
-        xyz = exposure.camera.ground_from_image(xy, rng.uniform(*spec.height_range, 500))
+        xyz = exposure.sensor.ground_from_image(xy, rng.uniform(*spec.height_range, 500))
         np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=SHAKEN_PX)
         with open_raster(rendered.images[view.name]) as image:
             assert (image.read(1) > 0).all()
     # The three lines of a strip fly together; the strips do not.
-    shakes = [exposure.taken.camera.shake for exposure in seen_by]
+    shakes = [exposure.taken.sensor.shake for exposure in seen_by]
     assert shakes[0] == shakes[1] == shakes[2] != shakes[3]
 
 
 def test_a_level_1_image_shows_what_the_raw_one_shows(spec):
-    exposure = exposures(replace(spec, shaken=True, level=1))[1]
+    exposure = exposures_of(replace(spec, shaken=True, level=1))[1]
     row, col = np.mgrid[: exposure.taken.shape[0], : exposure.taken.shape[1]]
 
     def grey(row, col):
@@ -107,9 +107,9 @@ def test_a_level_1_image_shows_what_the_raw_one_shows(spec):
 
     raw = np.rint(grey(row, col)).astype(np.uint16)
     raw[40, 50] = 0
-    found = rectified(raw, exposure.camera, exposure.shape)
+    found = rectified(raw, exposure.sensor, exposure.shape)
     row, col = np.mgrid[: exposure.shape[0], : exposure.shape[1]]
-    at = exposure.camera.raw_from_image(np.column_stack([col.ravel(), row.ravel()])).reshape(*exposure.shape, 2)
+    at = exposure.sensor.raw_from_image(np.column_stack([col.ravel(), row.ravel()])).reshape(*exposure.shape, 2)
     hole = (np.abs(at - (50, 40)) < 1.0).all(axis=2)
     near = (np.abs(at - (50, 40)) < 6.0).all(axis=2)
     assert (found[hole] == 0).all()
@@ -136,7 +136,7 @@ def test_a_surface_from_line_scanners(rendered, spec, tmp_path):
 
 
 def test_noise_is_as_large_as_it_says(spec):
-    camera = exposures(spec)[0].camera
+    camera = exposures_of(spec)[0].sensor
     exact = sampled(camera, 300)
     rng = np.random.default_rng(1)
     np.testing.assert_array_equal(noisy(exact, TrajectoryNoise(), rng).rotations, exact.rotations)
@@ -153,13 +153,13 @@ def test_noise_is_as_large_as_it_says(spec):
 def test_scenes_without_line_scanners(tmp_path, spec):
     satellites = city_spec(1, size=40)
     with pytest.raises(ConfigError, match="'satellite' is no line scanner"):
-        render_scene(satellites, tmp_path / "a", linescan=TrajectoryNoise())
+        render_scene(satellites, tmp_path / "a", noise=TrajectoryNoise())
     biased = replace(spec, views=(replace(spec.views[0], bias_row_px=1.0),))
     with pytest.raises(ConfigError, match="view n1 is one of RPCs"):
-        render_scene(biased, tmp_path / "a", linescan=TrajectoryNoise())
+        render_scene(biased, tmp_path / "a", noise=TrajectoryNoise())
     aside = replace(spec, views=(replace(spec.views[0], across_deg=35.0),))
     with pytest.raises(ConfigError, match=r"View n1 needs the columns 1\d{4} to"):
-        render_scene(aside, tmp_path / "a", linescan=TrajectoryNoise())
+        render_scene(aside, tmp_path / "a", noise=TrajectoryNoise())
     assert not (tmp_path / "a").exists()
 
 

@@ -25,7 +25,7 @@ from zlocus.synthetic.scenes import (
     build_ground,
     city_spec,
     demo_spec,
-    exposures,
+    exposures_of,
     hills_spec,
     with_pointing_errors,
 )
@@ -49,7 +49,7 @@ def spec() -> SceneSpec:
 
 @pytest.fixture(scope="module")
 def ground(spec: SceneSpec) -> SyntheticGround:
-    return build_ground(spec, exposures(spec))
+    return build_ground(spec, exposures_of(spec))
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +77,10 @@ def test_pixels_see_the_truth(folder: Path, spec: SceneSpec, ground: SyntheticGr
     The cell is the one that the ray enters where it ends (a point of a wall is on the border of two).
     """
     truth = read(folder / "truth_dsm.tif")
-    exposure = exposures(spec)[1]
+    exposure = exposures_of(spec)[1]
     xy = np.random.default_rng(3).uniform(20, 90, (4000, 2))
-    seen = seen_from(ground, exposure.camera, xy)
-    within = exposure.camera.ground_from_image(xy, seen[:, 2] - 0.001)
+    seen = seen_from(ground, exposure.sensor, xy)
+    within = exposure.sensor.ground_from_image(xy, seen[:, 2] - 0.001)
     row = np.floor((spec.north_m - within[:, 1]) / 0.25).astype(int)
     col = np.floor((within[:, 0] - spec.west_m) / 0.25).astype(int)
     inside = (row >= 0) & (row < CELLS) & (col >= 0) & (col < CELLS)
@@ -93,9 +93,9 @@ def test_pixels_see_the_truth(folder: Path, spec: SceneSpec, ground: SyntheticGr
 def test_pointing_errors_are_in_the_rpc_and_nowhere_else(folder: Path, spec: SceneSpec) -> None:
     """Row + 2.25, column - 1.5: what the file's RPC projects, against the exact camera."""
     corners = np.array([(spec.west_m + e, spec.north_m - n, z) for e in (0, 60) for n in (0, 60) for z in (430, 500)])
-    for exposure in exposures(spec):
+    for exposure in exposures_of(spec):
         model = RpcModel(read_rpc(folder / f"img_{exposure.view.name}.tif"), spec.crs)
-        error = model.image_from_ground(corners.astype(float)) - exposure.camera.image_from_ground(corners)
+        error = model.image_from_ground(corners.astype(float)) - exposure.sensor.image_from_ground(corners)
         expected = (exposure.view.bias_col_px, exposure.view.bias_row_px)
         np.testing.assert_allclose(error, np.broadcast_to(expected, error.shape), rtol=0, atol=RPC_PX)
 
@@ -115,11 +115,11 @@ def test_images_hold_all_terrain_of_the_area(folder: Path, spec: SceneSpec, grou
     xyz = np.column_stack(
         [spec.west_m + (cols + 0.5) * 0.25, spec.north_m - (rows + 0.5) * 0.25, ground.heights[cells][low_ground]]
     )
-    for exposure in exposures(spec):
+    for exposure in exposures_of(spec):
         image = read(folder / f"img_{exposure.view.name}.tif")
         assert image.shape == exposure.shape
         assert (image > 0).all()
-        xy = exposure.camera.image_from_ground(xyz)
+        xy = exposure.sensor.image_from_ground(xyz)
         assert xy.min() > 0.0
         assert (xy.max(axis=0) < np.array(exposure.shape[::-1]) - 1.0).all()
 
@@ -160,7 +160,7 @@ def test_everything_stands_on_the_ground(ground: SyntheticGround, spec: SceneSpe
     low, high = ground.height_range
     assert spec.height_range[0] <= low
     assert spec.terrain_range[0] + 25.0 < high <= spec.height_range[1]
-    terrain = build_ground(replace(spec, objects=Objects(0.0, 0.0, 0.0, 0.0)), exposures(spec))
+    terrain = build_ground(replace(spec, objects=Objects(0.0, 0.0, 0.0, 0.0)), exposures_of(spec))
     rise = ground.heights - terrain.heights
     flat = ground.classes <= ROAD
     np.testing.assert_array_equal(rise[flat], 0.0)
@@ -183,7 +183,7 @@ def test_roofs_are_planes(ground: SyntheticGround) -> None:
 
 def test_crops_stand_on_bare_ground_and_move_nothing(ground: SyntheticGround, spec: SceneSpec) -> None:
     crops = replace(spec, objects=replace(STANDING, crop_side_m=20.0))
-    planted = build_ground(crops, exposures(crops))
+    planted = build_ground(crops, exposures_of(crops))
     np.testing.assert_array_equal(planted.planes, ground.planes)
     np.testing.assert_array_equal(planted.classes, ground.classes)
     in_rows = (planted.materials["pattern"] == PATTERN_ROWS)[planted.material]
@@ -195,7 +195,7 @@ def test_crops_stand_on_bare_ground_and_move_nothing(ground: SyntheticGround, sp
 def test_rows_repeat_across_and_run_straight_along(spec: SceneSpec) -> None:
     """Three tenths of a period further only the weeds differ from those a whole period away."""
     crops = replace(spec, objects=replace(STANDING, crop_side_m=20.0))
-    ground = build_ground(crops, exposures(crops))
+    ground = build_ground(crops, exposures_of(crops))
     crop = ground.materials[-1]
     x, y = np.random.default_rng(2).uniform(50.0, 150.0, (2, 300))
 
@@ -214,7 +214,7 @@ def test_rows_repeat_across_and_run_straight_along(spec: SceneSpec) -> None:
 
 def test_terrain_slopes_are_those_of_its_heights() -> None:
     hilly = hills_spec(5, size=64, relief_m=30.0, objects=Objects(0.0, 0.0, 0.0, 0.0), views=VIEWS[:1])
-    ground = build_ground(hilly, exposures(hilly))
+    ground = build_ground(hilly, exposures_of(hilly))
     middle = 0.5 * (ground.heights[:, 2:] - ground.heights[:, :-2])
     np.testing.assert_allclose(ground.slopes[:, 1:-1, 0], middle, atol=0.01)
     middle = 0.5 * (ground.heights[2:] - ground.heights[:-2])
@@ -228,15 +228,15 @@ def test_the_demo_is_the_block_of_the_paper() -> None:
     side = spec.size * spec.gsd_m
     middle = np.array([(spec.west_m + side / 2, spec.north_m - side / 2, sum(spec.terrain_range) / 2)])
     assert [view.name for view in spec.views] == ["n1", "f1", "b1", "n2", "f2", "b2"]
-    for exposure in exposures(spec):
-        assert exposure.taken.camera.focal_m == 0.0625
-        assert exposure.camera.plane_from_image.determinant == pytest.approx(-(0.21**2))
-        xy = exposure.camera.image_from_ground(middle)
+    for exposure in exposures_of(spec):
+        assert exposure.taken.sensor.focal_m == 0.0625
+        assert exposure.sensor.plane_from_image.determinant == pytest.approx(-(0.21**2))
+        xy = exposure.sensor.image_from_ground(middle)
         np.testing.assert_allclose(xy[0], (exposure.shape[1] / 2, exposure.shape[0] / 2), atol=12.0)
-        ground = exposure.camera.ground_from_image(xy + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), middle[0, 2])
+        ground = exposure.sensor.ground_from_image(xy + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), middle[0, 2])
         assert np.linalg.norm(ground[1] - ground[0]) == pytest.approx(0.21, abs=1e-3)
         assert np.linalg.norm(ground[2] - ground[0]) == pytest.approx(0.21, abs=1e-3)
-        high = exposure.camera.ground_from_image(xy, middle[0, 2] + 100.0)[0] - ground[0]
+        high = exposure.sensor.ground_from_image(xy, middle[0, 2] + 100.0)[0] - ground[0]
         heading = np.deg2rad(exposure.view.heading_deg)
         forward, right = np.array([(np.sin(heading), np.cos(heading)), (np.cos(heading), -np.sin(heading))])
         ahead, aside = np.tan(np.deg2rad([exposure.view.along_deg, exposure.view.across_deg]))

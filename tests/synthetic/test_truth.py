@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from zlocus.synthetic.scenes import ADS40_VIEWS, build_ground, demo_spec, exposures, steady
+from zlocus.synthetic.scenes import ADS40_VIEWS, build_ground, demo_spec, exposures_of, steady
 from zlocus.synthetic.truth import image_positions, n_showing, write_truth
 
 # Positions are interpolated between the nodes of a grid.
@@ -24,12 +24,12 @@ def spec():
 
 @pytest.fixture(scope="module")
 def seen_by(spec):
-    return exposures(spec)
+    return exposures_of(spec)
 
 
 @pytest.fixture(scope="module")
 def ground(spec):
-    return build_ground(spec, exposures(steady(spec)))
+    return build_ground(spec, exposures_of(steady(spec)))
 
 
 def some_cells(ground, n=300):
@@ -43,7 +43,7 @@ def test_positions_in_images_are_those_of_the_exact_camera(ground, seen_by):
     cells, xyz = some_cells(ground)
     for exposure in seen_by:
         found = image_positions(ground, exposure)[cells]
-        np.testing.assert_allclose(found, exposure.camera.image_from_ground(xyz), rtol=0, atol=POSITION_PX)
+        np.testing.assert_allclose(found, exposure.sensor.image_from_ground(xyz), rtol=0, atol=POSITION_PX)
 
 
 def test_images_show_what_projects_inside_their_borders(ground, seen_by):
@@ -51,7 +51,7 @@ def test_images_show_what_projects_inside_their_borders(ground, seen_by):
     expected = np.zeros(len(xyz), int)
     near = np.zeros(len(xyz), bool)
     for exposure in seen_by:
-        xy = exposure.camera.image_from_ground(xyz)
+        xy = exposure.sensor.image_from_ground(xyz)
         last = np.array([exposure.shape[1] - 1, exposure.shape[0] - 1])
         expected += ((xy >= 0) & (xy <= last)).all(axis=1)
         near |= (np.minimum(np.abs(xy), np.abs(xy - last)) < POSITION_PX).any(axis=1)

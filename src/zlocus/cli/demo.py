@@ -27,7 +27,7 @@ def demo(options: DemoOptions) -> None:
     # The folder of an earlier demo may be used again, that of any other run may not.
     check_output(out, overwrite=any((out / name).exists() for name in (DEMO_ACCURACY, DEMO_BEGUN)))
     from zlocus.evaluation.table import evaluation_table
-    from zlocus.io.run_record import write_atomically
+    from zlocus.io.atomic_write import write_atomically
     from zlocus.pipeline.demo import run_demo
 
     result = run_demo(out, progress_for(sys.stderr))

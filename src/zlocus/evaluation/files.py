@@ -8,8 +8,9 @@ from zlocus.core.errors import OutputError
 from zlocus.core.requests import EVALUATION_FILES
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.histogram import histogram_figure
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.rasters import write_cog
-from zlocus.io.run_record import write_atomically, write_record
+from zlocus.io.run_record import write_record
 
 NAMES = (FIGURES, ERROR_MAP, HISTOGRAM) = EVALUATION_FILES
 DPI = 120

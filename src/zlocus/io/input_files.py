@@ -29,12 +29,14 @@ class InputFiles:
     states: Mapping[str, list[int]]
 
     @classmethod
-    def of(cls, files: Iterable[Path], scene: Scene | None = None, before: InputFiles | None = None) -> InputFiles:
+    def of(
+        cls, files: Iterable[Path], scene: Scene | None = None, earlier_inputs: InputFiles | None = None
+    ) -> InputFiles:
         """Record the state of some files; for those already read, the state at that time.
 
-        scene : its images carry the state of their files when they were opened; before : an earlier record.
+        scene : its images carry the state of their files when they were opened; earlier_inputs : an earlier record.
         """
-        known: dict[str, list[int]] = {} if before is None else dict(before.states)
+        known: dict[str, list[int]] = {} if earlier_inputs is None else dict(earlier_inputs.states)
         for view in () if scene is None else scene.views:
             if state := getattr(view.image, "state", ()):
                 known[str(view.path)] = list(state)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.core.errors import InputError, OutputError
+from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.atomic_write import atomic_file
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, MAX_MAGNITUDE, decimal, quoted, text_lines
 
@@ -122,11 +122,7 @@ def write_number_table(
     words = zip(*labels.values(), strict=True) if labels else [()] * len(numbers)
     rows = (",".join([*word, *map(repr, row)]) for word, row in zip(words, numbers, strict=True))
     text = "\n".join([f"# {comment}", ",".join([*(labels or ()), *columns]), *rows]) + "\n"
-    try:
-        with atomic_file(path) as part:
-            part.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def _rows(path: Path, what: str) -> list[tuple[int, str]]:

@@ -138,7 +138,7 @@ class BandReader(AbstractContextManager["BandReader"]):
         return Window(0, strip.row - strip.above, self._file.width, rows)
 
 
-def check_same_grid(bands: list[BandReader]) -> None:
+def check_same_grid(readers: list[BandReader]) -> None:
     """Check that rasters of one result lie on one grid.
 
     Raises
@@ -146,7 +146,7 @@ def check_same_grid(bands: list[BandReader]) -> None:
     InputError
         One of them does not.
     """
-    first = bands[0]
-    for band in bands[1:]:
-        if band.geobox.shape != first.geobox.shape or band.geobox.transform != first.geobox.transform:
-            raise InputError(f"{band.path} is not on the grid of {first.path}. Make both in one run.")
+    first = readers[0]
+    for reader in readers[1:]:
+        if reader.geobox.shape != first.geobox.shape or reader.geobox.transform != first.geobox.transform:
+            raise InputError(f"{reader.path} is not on the grid of {first.path}. Make both in one run.")

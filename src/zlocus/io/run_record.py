@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -15,10 +15,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from zlocus.core.errors import InputError, OutputError
+from zlocus.core.errors import InputError
 from zlocus.core.options import RunConfig
 from zlocus.core.resources import peak_memory_mb
-from zlocus.io.atomic_write import atomic_file
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.config import config_as_dict
 from zlocus.io.open_raster import gdal_name, is_remote
 from zlocus.io.safe_documents import read_json
@@ -91,7 +91,7 @@ def request_as_dict(request: Any) -> dict[str, Any]:
 
 
 def result_record(
-    request: Any, config: RunConfig, inputs: Sequence[Mapping[str, str | None]], watch: Stopwatch
+    request: Any, config: RunConfig, inputs: Sequence[Mapping[str, str | None]], stopwatch: Stopwatch
 ) -> dict[str, Any]:
     """The entries of run.json that all commands share: configuration, versions, inputs and stages.
 
@@ -101,7 +101,7 @@ def result_record(
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         "versions": versions_record(),
         "inputs": list(inputs),
-        "stages": watch.stages,
+        "stages": stopwatch.stages,
     }
 
 
@@ -144,22 +144,6 @@ def read_record(path: Path) -> dict[str, Any]:
             "Make the surface again, or use that version."
         )
     return record
-
-
-def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file under a temporary name, then rename it. write : writes to the path that it is given.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    try:
-        with atomic_file(path) as part:
-            write(part)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
 
 
 def finite_only(value: Any) -> Any:

@@ -28,12 +28,12 @@ from pydantic import Field, SerializeAsAny, field_validator, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.core.errors import ConfigError, InputError, OutputError, ZlocusError
+from zlocus.core.errors import ConfigError, InputError, ZlocusError
 from zlocus.core.scene import Scene, View, held_window, is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.atomic_write import atomic_file
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
-from zlocus.io.cameras.camera_kinds import KINDS, RpcCamera
+from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
 from zlocus.io.images import RasterImage, check_content, check_grey_values, open_image, with_plateau
@@ -176,22 +176,22 @@ class UsableViews:
 
 
 def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableViews:
-    """As `open_scene`, but views that cannot be used, or whose entry is wrong, are listed instead of raising an error.
+    """As `open_scene`, but views that cannot be used, or whose entry is wrong, are listed, not raised.
 
     Raises
     ------
     InputError, ConfigError
         No view can be opened: the scene file has another fault, an image is given twice, or the CRS is not usable.
     """
-    wrong: list[RefusedView] = []
-    scene_input = _inputs_of_scene(inputs, crs, wrong)
-    refused: dict[str, RefusedView] = {}
+    refused_entries: list[RefusedView] = []
+    scene_input = _inputs_of_scene(inputs, crs, refused_entries)
+    refused_by_name: dict[str, RefusedView] = {}
 
-    def attempt(entry: _ViewInput, step: Callable[[], T]) -> list[T]:
+    def attempt(entry: _ResolvedEntry, step: Callable[[], T]) -> list[T]:
         try:
             return [step()]
         except ZlocusError as error:
-            refused[entry.name] = RefusedView(entry.name, entry.path, str(error))
+            refused_by_name[entry.name] = RefusedView(entry.name, entry.path, str(error))
             return []
 
     opened = [
@@ -204,14 +204,19 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
     views = [] if frame is None else [v for each in opened for v in attempt(each.entry, partial(each.view, frame))]
     scene = scene_input.scene(views, frame) if views and frame is not None else None
     return UsableViews(
-        scene, (*wrong, *(refused[entry.name] for entry in scene_input.entries if entry.name in refused))
+        scene,
+        (
+            *refused_entries,
+            *(refused_by_name[entry.name] for entry in scene_input.entries if entry.name in refused_by_name),
+        ),
     )
 
 
-def read_scene_file(path: Path, wrong: list[RefusedView] | None = None) -> SceneFile:
+def read_scene_file(path: Path, refused: list[RefusedView] | None = None) -> SceneFile:
     """Read and check a `scene.yaml`, without opening its images and cameras.
 
-    wrong : list to which views with a wrong entry are added, and the file is read without them; None: they are errors.
+    refused : list to which views with a wrong entry are added, and the file is read without them; None: they are
+    errors.
 
     Raises
     ------
@@ -224,13 +229,13 @@ def read_scene_file(path: Path, wrong: list[RefusedView] | None = None) -> Scene
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
     views = document.get("views")
     if isinstance(views, list):
-        entries = [entry for i in range(len(views)) for entry in _view_entry(views, i, path, wrong)]
+        entries = [entry for i in range(len(views)) for entry in _view_entry(views, i, path, refused)]
         document = document | {"views": entries}
     return validate_document(SceneFile, document, path)
 
 
-def _view_entry(views: list[Any], index: int, path: Path, wrong: list[RefusedView] | None) -> list[ViewEntry]:
-    """The entry of a view of a scene file as a list; empty where it was added to `wrong`."""
+def _view_entry(views: list[Any], index: int, path: Path, refused: list[RefusedView] | None) -> list[ViewEntry]:
+    """The entry of a view of a scene file as a list; empty where it was added to `refused`."""
     view, where = views[index], f"views[{index}]"
     given = view if isinstance(view, dict) else {}
     try:
@@ -238,12 +243,12 @@ def _view_entry(views: list[Any], index: int, path: Path, wrong: list[RefusedVie
             view = given | {"camera": _camera(given["camera"], path, f"{where}.camera")}
         return [validate_document(ViewEntry, view, path, where)]
     except InputError as error:
-        if wrong is None:
+        if refused is None:
             raise
         name, image = given.get("name"), given.get("image")
         is_unique = isinstance(name, str) and sum(isinstance(v, dict) and v.get("name") == name for v in views) == 1
         file = path.parent / image if isinstance(image, str) else path
-        wrong.append(RefusedView(name if isinstance(name, str) and is_unique else where, file, str(error)))
+        refused.append(RefusedView(name if isinstance(name, str) and is_unique else where, file, str(error)))
         return []
 
 
@@ -256,15 +261,12 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
         The file cannot be written.
     """
     document = scene_file.model_dump(mode="json", by_alias=True, exclude_none=True)
-    try:
-        with atomic_file(path) as part:
-            part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
+    text = yaml.safe_dump(document, sort_keys=False)
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 @dataclass(frozen=True)
-class _ViewInput:
+class _ResolvedEntry:
     """A view before its image is opened. path : of the image."""
 
     name: str
@@ -277,7 +279,7 @@ class _ViewInput:
 class _SceneInput:
     """A scene before any image is opened. folder : base of relative paths of cameras; up, north : see `Frame`."""
 
-    entries: tuple[_ViewInput, ...]
+    entries: tuple[_ResolvedEntry, ...]
     folder: Path
     crs: CRS | None
     bounds: tuple[float, float, float, float] | None = None
@@ -295,7 +297,7 @@ class _SceneInput:
 class _OpenedView:
     """An opened image and its camera, before the CRS of the scene is known."""
 
-    entry: _ViewInput
+    entry: _ResolvedEntry
     image: RasterImage
     camera: OpenedCamera
 
@@ -305,15 +307,17 @@ class _OpenedView:
         return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, entry.date)
 
 
-def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, wrong: list[RefusedView] | None = None) -> _SceneInput:
+def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[RefusedView] | None = None) -> _SceneInput:
     paths = [Path(path) for path in inputs]
     scene_files = [path for path in paths if path.suffix.lower() in SCENE_SUFFIXES]
     if scene_files and len(paths) > 1:
         raise InputError(f"{scene_files[0]} is a scene file and stands alone. Give it alone, or images only.")
     if scene_files:
-        scene_input = _from_scene_file(scene_files[0], crs, wrong)
+        scene_input = _from_scene_file(scene_files[0], crs, refused)
     else:
-        entries = [_ViewInput(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)]
+        entries = [
+            _ResolvedEntry(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)
+        ]
         scene_input = _SceneInput(tuple(entries), Path(), crs)
     if scene_input.crs is not None and not is_local(scene_input.crs):
         scene_input = replace(scene_input, crs=checked_crs(scene_input.crs))
@@ -321,7 +325,7 @@ def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, wrong: list[Refuse
     return scene_input
 
 
-def _open_view(entry: _ViewInput, folder: Path) -> _OpenedView:
+def _open_view(entry: _ResolvedEntry, folder: Path) -> _OpenedView:
     image = open_image(entry.path)
     check_grey_values(image)
     check_content(image)
@@ -329,8 +333,8 @@ def _open_view(entry: _ViewInput, folder: Path) -> _OpenedView:
     return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
 
 
-def _from_scene_file(path: Path, crs: CRS | None, wrong: list[RefusedView] | None) -> _SceneInput:
-    scene_file = read_scene_file(path, wrong)
+def _from_scene_file(path: Path, crs: CRS | None, refused: list[RefusedView] | None) -> _SceneInput:
+    scene_file = read_scene_file(path, refused)
     frame = None if scene_file.frame is None else _frame_crs(scene_file.frame, path)
     if frame is not None and is_local(frame) and crs is not None:
         raise ConfigError(f"{path} has a local frame, which --crs cannot place on the Earth. Leave --crs out.")
@@ -338,7 +342,7 @@ def _from_scene_file(path: Path, crs: CRS | None, wrong: list[RefusedView] | Non
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
     named = None if scene_file.frame is None else scene_file.frame.crs
     entries = tuple(
-        _ViewInput(view.name, path.parent / view.image, view.camera.with_default_crs(named), view.date)
+        _ResolvedEntry(view.name, path.parent / view.image, view.camera.with_default_crs(named), view.date)
         for view in scene_file.views
     )
     bounds = None if scene_file.area is None else scene_file.area.bounds
@@ -441,6 +445,6 @@ def _camera(value: Any, path: Path, where: str) -> Any:
     if not isinstance(value, dict):
         return value
     kind = value.get("kind")
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise InputError(f"{path}: {where}.kind is {kind!r}. Allowed: {', '.join(KINDS)}.")
-    return validate_document(KINDS[kind], value, path, where)
+    if not isinstance(kind, str) or kind not in CAMERA_KINDS:
+        raise InputError(f"{path}: {where}.kind is {kind!r}. Allowed: {', '.join(CAMERA_KINDS)}.")
+    return validate_document(CAMERA_KINDS[kind], value, path, where)

@@ -136,8 +136,8 @@ def row_bands(n_rows: int) -> Iterator[tuple[int, int]]:
         yield row, min(BAND_ROWS, n_rows - row)
 
 
-def drop_pixels(window: ImageWindow, dropped: NDArray[np.bool_]) -> ImageWindow:
+def drop_pixels(image_window: ImageWindow, dropped: NDArray[np.bool_]) -> ImageWindow:
     """The window with some more pixels, (r, c) bool, made invalid."""
     if not dropped.any():
-        return window
-    return ImageWindow(np.where(dropped, np.float32(0.0), window.pixels), window.valid & ~dropped)
+        return image_window
+    return ImageWindow(np.where(dropped, np.float32(0.0), image_window.pixels), image_window.valid & ~dropped)

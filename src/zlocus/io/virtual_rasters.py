@@ -35,7 +35,7 @@ ADVICE = "Give the images themselves, or a list of plain files that lie on this 
 
 
 @dataclass(frozen=True)
-class _VrtText:
+class _VrtEntry:
     """A text in a VRT.
 
     name : its element or attribute, in lower case; inside : the element in which GDAL looks for its other properties.
@@ -95,7 +95,7 @@ def _check(path: Path, size: int, time_ns: int, above: tuple[Path, ...]) -> None
             _check_raw(path, entry.inside)
 
 
-def _entries(element: Element, above: Element | None = None) -> Iterator[_VrtText]:
+def _entries(element: Element, above: Element | None = None) -> Iterator[_VrtEntry]:
     """Yield all texts of a VRT. GDAL treats an attribute like a child element."""
     name = _name(element.tag)
     if name in ELEMENTS_WITHOUT_NAMES or name.endswith("srs"):
@@ -104,22 +104,22 @@ def _entries(element: Element, above: Element | None = None) -> Iterator[_VrtTex
         # Metadata may hold any text, except the files from which coordinates are read.
         key = element.attrib.get("key", "").lower()
         if key in FILE_ELEMENTS and element.text:
-            yield _VrtText(key, element.text.strip(), element)
+            yield _VrtEntry(key, element.text.strip(), element)
         return
     if text := (element.text or "").strip():
-        yield _VrtText(name, text, element if above is None or name in FILE_ELEMENTS else above)
+        yield _VrtEntry(name, text, element if above is None or name in FILE_ELEMENTS else above)
     for key, value in element.attrib.items():
-        yield _VrtText(_name(key), value.strip(), element)
+        yield _VrtEntry(_name(key), value.strip(), element)
     for child in element:
         yield from _entries(child, element)
 
 
-def _source(path: Path, entry: _VrtText) -> Path:
+def _source(path: Path, entry: _VrtEntry) -> Path:
     """The file that an entry names. Relative paths start at the VRT itself, not at a link to it, as GDAL has it."""
     return path.resolve().parent / entry.text if _is_relative(path, entry) else Path(entry.text)
 
 
-def _is_relative(path: Path, entry: _VrtText) -> bool:
+def _is_relative(path: Path, entry: _VrtEntry) -> bool:
     """Whether the path of an entry is relative to the VRT."""
     said = next((e.text for e in _entries(entry.inside) if e.name == "relativetovrt"), "0")
     if said not in ("0", "1"):
@@ -127,11 +127,11 @@ def _is_relative(path: Path, entry: _VrtText) -> bool:
     return said == "1"
 
 
-def _is_raw(entry: _VrtText) -> bool:
+def _is_raw(entry: _VrtEntry) -> bool:
     return entry.name == "subclass" and entry.text.lower() == "vrtrawrasterband"
 
 
-def _refuse_code(path: Path, entry: _VrtText) -> None:
+def _refuse_code(path: Path, entry: _VrtEntry) -> None:
     if entry.name == "pixelfunctionlanguage" and entry.text.lower() != "c":
         raise InputError(f"{path} is a list of files and holds code, which is not run. {ADVICE}")
 

@@ -12,7 +12,7 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from zlocus.core.options import ProductOptions
-from zlocus.io.run_record import write_atomically
+from zlocus.io.atomic_write import write_atomically
 from zlocus.products.hillshade import hillshade
 from zlocus.products.shade_kernel import BRIGHTEST, DARKEST
 

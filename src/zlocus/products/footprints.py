@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
 from zlocus.core.scene import is_local
-from zlocus.io.run_record import write_atomically
+from zlocus.io.atomic_write import write_atomically
 
 SIDE_PX, RIM_PX, CAPTION_PX = 900, 24, 40
 INK, PAPER, ALONE = (40, 40, 40), (255, 255, 255), (225, 225, 225)

@@ -14,10 +14,11 @@ import numpy as np
 from rasterio import DatasetReader
 
 from zlocus.core.scene import is_local
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.crs import crs_label
 from zlocus.io.open_raster import open_raster
 from zlocus.io.row_strips import BandReader
-from zlocus.io.run_record import read_record, write_atomically
+from zlocus.io.run_record import read_record
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zlocus.io.run_record import write_atomically
+from zlocus.io.atomic_write import write_atomically
 from zlocus.orientation.orientation import RefinedTies
 
 OBSERVATIONS = "observations.npz"

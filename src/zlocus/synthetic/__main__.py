@@ -1,4 +1,4 @@
-"""`python -m zlocus.synthetic -o FOLDER`: renders a scene with its truth."""
+"""`python -m zlocus.synthetic -o FOLDER`: render a scene with its truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Renders what the command line asks for; returns the exit status."""
+    """Render the scene that the command line describes, and return the exit status."""
     from zlocus.synthetic.files import render_scene
     from zlocus.synthetic.linescan import TrajectoryNoise
     from zlocus.synthetic.mixed import render_mixed_scene
@@ -43,27 +43,31 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
     parser.add_argument(
         "--kind", choices=("city", "hills", "demo", "mixed"), default="city",
-        help="mixed: the demo's kind of ground through three kinds of sensor; takes --seed and --size",
+        help="mixed: ground like that of the demo, seen by three kinds of sensor; uses --seed and --size",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
-    parser.add_argument("--views", type=int, help="render the first N views only")
+    parser.add_argument("--views", type=int, help="render only the first N views")
     parser.add_argument("--pointing", type=float, default=0.0, metavar="PX", help="largest pointing error of the RPCs")
     parser.add_argument(
         "--cameras", choices=("rpc", "linescan"), default="rpc",
-        help="RPCs, or an ADS40's focal plane and trajectories under a scene.yaml",
+        help="RPCs, or a scene.yaml with the focal plane and trajectories of an ADS40",
     )  # fmt: skip
     parser.add_argument(
         "--trajectory-noise", type=float, nargs=2, default=(0.0, 0.0), metavar=("M", "DEG"),
-        help="standard deviation of slow errors of the trajectories",
+        help="standard deviation of the slow errors of trajectories",
     )  # fmt: skip
-    parser.add_argument("--steady", action="store_true", help="line scanners of the demo: no shaking (as with RPCs)")
-    parser.add_argument("--level", type=int, choices=(0, 1), help="line scanners: raw, or resampled to a plane")
+    parser.add_argument(
+        "--steady", action="store_true", help="line scanners: a flight that does not shake (always so with RPCs)"
+    )
+    parser.add_argument(
+        "--level", type=int, choices=(0, 1), help="line scanners: 0 raw images, 1 images resampled to a plane"
+    )
     return parser
 
 
 def _spec(given: argparse.Namespace) -> SceneSpec:
-    """What the command line asks for."""
+    """The scene that the command line describes."""
     from zlocus.synthetic.scenes import LARGE_SIZE, city_spec, demo_spec, hills_spec, with_ads40, with_pointing_errors
 
     make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec}

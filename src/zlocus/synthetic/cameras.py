@@ -1,6 +1,7 @@
-"""Exact cameras for rendered scenes: straight rays in the scene's frame, whose easting, northing, height are Cartesian.
+"""Exact cameras of rendered scenes. Easting, northing and height are taken as Cartesian, and rays are straight in them.
 
-All are pushbroom: every image row has its own projection centre, so that rows are instants. All are `SensorModel`s.
+All are pushbroom cameras: every row has its own projection centre, because it is exposed at its own time. All are
+`SensorModel`s.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ def axes_of_heading(heading_deg: float) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class SatelliteCamera:
-    """A pushbroom satellite with constant view angles; both directions in closed form.
+    """A pushbroom satellite with constant view angles. Both projections have a closed form.
 
-    The image is flown over so that row 0 is the far end in flight direction (as north-up images have it).
+    Row 0 is the far end in flight direction, as in north-up images.
 
-    target : easting, northing and height (m) seen by `centre`; centre : (column, row) px of the target.
+    target : easting, northing and height (m) of a point; centre : its position (column, row) px in the image.
     gsd_m : ground pixel at the target's height. altitude_m : of the orbit above the target.
-    along_deg, across_deg : tangent angles from the nadir; positive looks forward, respectively to the right, from the
-    satellite. heading_deg : clockwise from north.
+    along_deg, across_deg : view angles from the nadir, positive forward and to the right of the satellite.
+    heading_deg : clockwise from north.
     """
 
     target: tuple[float, float, float]
@@ -45,7 +46,7 @@ class SatelliteCamera:
     altitude_m: float = 600_000.0
 
     def _frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Forward, right, and the offset (east, north) from the target to the projection centre of the centre row."""
+        """Forward and right unit vectors, and the offset (east, north) from target to projection centre of its row."""
         forward, right = axes_of_heading(self.heading_deg)
         look = np.tan(np.deg2rad(self.along_deg)) * forward + np.tan(np.deg2rad(self.across_deg)) * right
         return forward, right, -self.altitude_m * look
@@ -78,11 +79,12 @@ class SatelliteCamera:
 
 @dataclass(frozen=True)
 class Shake:
-    """How unsteady a flight is from row to row: sums of sines of random phase, the same for the same seed.
+    """Unsteadiness of a flight from row to row: sums of sines with random phases. Equal seeds give equal motion.
 
-    turn_deg : standard deviation of roll, pitch and yaw, amplitudes as 1 / frequency (what a stabilised mount leaves of
-    gusts and engines); offset_m : of the position along each axis, amplitudes as 1 / frequency^2. shortest_rows,
-    longest_rows : of the periods, which are spread evenly in between on a logarithmic scale.
+    turn_deg : standard deviation of roll, pitch and yaw, with amplitudes proportional to 1 / frequency (the motion that
+    remains behind a stabilised mount); offset_m : standard deviation of the position along each axis, with amplitudes
+    proportional to 1 / frequency^2; shortest_rows, longest_rows : shortest and longest period. The periods are spread
+    evenly on a logarithmic scale.
     """
 
     seed: tuple[int, ...]
@@ -92,7 +94,7 @@ class Shake:
     longest_rows: float = 1200.0
 
     def at(self, since: FloatArray) -> FloatArray:
-        """Offsets along three axes (m) and three turns (rad) at rows (n,) counted from anywhere: (n, 6)."""
+        """Offsets along three axes (m) and rotations about them (rad) at rows (n,), in that order: (n, 6)."""
         rng = np.random.default_rng([*self.seed, SHAKE_STREAM])
         shares = (np.arange(SHAKE_WAVES)[:, None] + rng.random((SHAKE_WAVES, 6))) / SHAKE_WAVES
         periods = self.shortest_rows * (self.longest_rows / self.shortest_rows) ** shares
@@ -105,15 +107,15 @@ class Shake:
 
 @dataclass(frozen=True)
 class LineScanner:
-    """One line of an airborne three-line scanner (ADS40): a straight flight with slow, smooth wobble, and shaken.
+    """One line of an airborne three-line scanner (ADS40) on a straight flight with a slow wobble and a faster shake.
 
-    The line sees `along_deg` ahead of the nadir (negative: behind). Rows are exposures, `advance_m` apart; row 0 is the
-    last one flown, so that images of a flight to the north are north-up.
+    Rows are exposures, `advance_m` apart. Row 0 is exposed last, so images of a flight to the north are north-up.
 
     position : easting, northing and height (m) of the projection centre at row `centre[1]`.
-    centre : (column, row) px; the column lies in the flight's vertical plane.
+    centre : (column, row) px; the column lies in the vertical plane of the flight.
+    along_deg : view angle of the line ahead of the nadir, negative behind it.
     wobble_m, wobble_deg : amplitudes of the position (each axis) and of roll, pitch and yaw; wobble_rows : their
-    period. shake : of the same flight, faster; None is none.
+    period. shake : faster motion of the same flight; None: no such motion.
     """
 
     position: tuple[float, float, float]
@@ -129,17 +131,21 @@ class LineScanner:
     shake: Shake | None = None
 
     def poses(self, row: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Projection centres (n, 3) m and rotations frame_from_camera (n, 3, 3) of rows (n,); camera axes are right,
-        forward and up at rest."""
+        """Projection centres (n, 3) m and rotations frame_from_camera (n, 3, 3) of rows (n,).
+
+        The camera's axes are right, forward and up, without wobble and shake.
+        """
         if self.shake is not None:
-            # Images ask for all columns of a row: what a row costs is computed once.
+            # All pixels of a row have the same pose, so it is computed once per row.
             row, where = np.unique(row, return_inverse=True)
             centre, frame_from_camera = self._poses(row, self.shake.at(row - self.centre[1]))
             return centre[where], frame_from_camera[where]
         return self._poses(row, np.zeros((1, 6)))
 
     def _poses(self, row: FloatArray, shaken: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Poses, with offsets to the right, forward and up (m) and roll, pitch and yaw (rad) to be added: (n, 6)."""
+        """Poses of rows. shaken : (n, 6) offsets to the right, forward and up (m), and roll, pitch and yaw (rad), to
+        add.
+        """
         forward, right = axes_of_heading(self.heading_deg)
         since = row - self.centre[1]
         phase = 2.0 * np.pi * since / self.wobble_rows
@@ -160,14 +166,17 @@ class LineScanner:
         return centre, np.asarray(rest @ turn)
 
     def _focal_plane(self, xyz: FloatArray, row: FloatArray) -> FloatArray:
-        """Where ground points (n, 3) fall in the focal plane at the instants of rows (n,): right, forward (n, 2) m."""
+        """Positions (n, 2) m, right and forward, of ground points (n, 3) in the focal plane, at the times of rows."""
         centre, frame_from_camera = self.poses(row)
         seen = np.einsum("nji,nj->ni", frame_from_camera, xyz - centre)
         return np.asarray(self.focal_m * seen[:, :2] / -seen[:, 2:])
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """See `SensorModel`. The row is where the point crosses the line: chord steps along the flight, whose slope is
-        that of the flight at rest (the wobble turns it by about a hundredth, so each step wins two digits)."""
+        """See `SensorModel`. The row is the one at which the point crosses the line in the focal plane.
+
+        It is found by steps along the flight with the slope of an unshaken flight. The wobble changes the slope by
+        about a hundredth, so each step adds two digits.
+        """
         xyz = np.asarray(xyz, float)
         line = self.focal_m * np.tan(np.deg2rad(self.along_deg))
         row = np.full(len(xyz), float(self.centre[1]))
@@ -204,28 +213,28 @@ class LineScanner:
 class RectifiedScanner:
     """A line scanner's image resampled to a plane (ADS40 level 1).
 
-    raw : the raw image's camera; raw_shape : its rows and columns; height : of the plane, m; plane_from_image : from
-    pixels (column, row), (0, 0) the centre of the first one, to easting and northing.
+    raw_camera, raw_shape : camera, rows and columns of the raw image; height : of the plane, m; plane_from_image : from
+    pixels (column, row), with (0, 0) at the centre of the first one, to easting and northing.
     """
 
-    raw: LineScanner
+    raw_camera: LineScanner
     raw_shape: tuple[int, int]
     height: float
     plane_from_image: Affine
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        on_plane = self.raw.ground_from_image(self.raw.image_from_ground(xyz), np.array(self.height))
+        on_plane = self.raw_camera.ground_from_image(self.raw_camera.image_from_ground(xyz), np.array(self.height))
         return _mapped(~self.plane_from_image, on_plane)
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        return self.raw.ground_from_image(self.raw_from_image(xy), z)
+        return self.raw_camera.ground_from_image(self.raw_from_image(xy), z)
 
     def raw_from_image(self, xy: FloatArray) -> FloatArray:
         """Positions (n, 2) px in the raw image."""
         on_plane = _mapped(self.plane_from_image, np.asarray(xy, float))
-        return self.raw.image_from_ground(np.column_stack([on_plane, np.full(len(on_plane), self.height)]))
+        return self.raw_camera.image_from_ground(np.column_stack([on_plane, np.full(len(on_plane), self.height)]))
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`: exact at any height."""
@@ -233,7 +242,7 @@ class RectifiedScanner:
 
 
 def _mapped(transform: Affine, xy: FloatArray) -> FloatArray:
-    """Points (n, 2 or more) through an affine map: (n, 2)."""
+    """Points (n, 2) after an affine transform of x and y. xy : (n, 2) or wider."""
     x, y = xy[:, 0], xy[:, 1]
     return np.column_stack([
         transform.a * x + transform.b * y + transform.c, transform.d * x + transform.e * y + transform.f

@@ -1,4 +1,4 @@
-"""Rendered scenes on disk: images as GeoTIFF with RPC tags or line scanner files, truth rasters, and `scene.json`."""
+"""Write rendered scenes: images as GeoTIFF with RPC tags or line scanner files, truth rasters, and `scene.json`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from zlocus.synthetic.cameras import RectifiedScanner
 from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
 from zlocus.synthetic.rectify import rectified
 from zlocus.synthetic.render import Sun, expose, render, sunlit
-from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures, steady
+from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures_of, steady
 from zlocus.synthetic.terrain import SyntheticGround
 from zlocus.synthetic.truth import write_truth
 
@@ -33,7 +33,7 @@ HEIGHT_MARGIN_M = 20.0
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """Where a scene was written. images : by name of the view; inputs : what `zlocus dsm` takes."""
+    """The files of a rendered scene. images : by name of the view; inputs : the inputs for `zlocus dsm`."""
 
     folder: Path
     images: dict[str, Path]
@@ -46,28 +46,28 @@ def render_scene(
     spec: SceneSpec,
     folder: Path,
     progress: Callable[[str], None] = lambda step: None,
-    linescan: TrajectoryNoise | None = None,
+    noise: TrajectoryNoise | None = None,
 ) -> RenderedScene:
-    """Renders all views of `spec` and writes them, the truth and `scene.json` into a new folder.
+    """Render all views of a scene and write them, the truth and `scene.json` into a new folder.
 
-    progress : called with a word before each step; linescan : cameras are written as line scanners with trajectories of
-    this noise, under a `scene.yaml`, not as RPC. The folder appears only when it is complete.
+    The folder appears only when it is complete. progress : called with a word before each step; noise : write cameras
+    as line scanners in a `scene.yaml`, with trajectories of this noise; None: write RPCs.
 
     Raises
     ------
     OutputError
-        Where the folder exists already, or cannot be written.
+        The folder exists already, or cannot be written.
     ConfigError
-        For line scanners of a scene that has none.
+        Line scanners are to be written, and the scene has none.
     """
     folder = Path(folder)
     with new_folder(folder) as part:
-        _write_scene(spec, part, progress, linescan)
-    return scene_files(spec, folder, linescan is not None)
+        _write_scene(spec, part, progress, noise)
+    return scene_files(spec, folder, noise is not None)
 
 
 def scene_files(spec: SceneSpec, folder: Path, is_linescan: bool) -> RenderedScene:
-    """The files of a scene that `render_scene` wrote. is_linescan : cameras were written as line scanners."""
+    """The files of a scene that `render_scene` has written. is_linescan : its cameras are line scanners."""
     images = {view.name: folder / image_name(view) for view in spec.views}
     inputs = (folder / "scene.yaml",) if is_linescan else tuple(images.values())
     return RenderedScene(folder, images, folder / "truth_dsm.tif", folder / "truth_class.tif", inputs)
@@ -75,12 +75,14 @@ def scene_files(spec: SceneSpec, folder: Path, is_linescan: bool) -> RenderedSce
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write to, which gets its name when all went well.
+    """Yield a temporary folder to write to; at the end of the block it is renamed to `folder`.
+
+    After an exception the temporary folder is removed.
 
     Raises
     ------
     OutputError
-        Where the folder exists already, or cannot be written.
+        The folder exists already, or cannot be written.
     """
     if folder.exists():
         raise OutputError(f"`{folder}` exists already: name a new folder for the rendered scene, or remove it.")
@@ -96,19 +98,17 @@ def new_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _write_scene(
-    spec: SceneSpec, folder: Path, progress: Callable[[str], None], linescan: TrajectoryNoise | None
-) -> None:
-    seen_by = exposures(spec)
-    if linescan is not None:
-        write_scene(spec, write_linescan_views(spec, seen_by, folder, linescan), folder / "scene.yaml")
+def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None], noise: TrajectoryNoise | None) -> None:
+    exposures = exposures_of(spec)
+    if noise is not None:
+        write_scene(spec, write_linescan_views(spec, exposures, folder, noise), folder / "scene.yaml")
     progress("terrain")
-    ground = build_ground(spec, exposures(steady(spec)))
-    write_truth(spec, ground, seen_by, folder)
+    ground = build_ground(spec, exposures_of(steady(spec)))
+    write_truth(spec, ground, exposures, folder)
     described = {}
-    for exposure, numbers in exposed(spec, ground, seen_by, progress):
+    for exposure, numbers in exposed(spec, ground, exposures, progress):
         view = exposure.view
-        fit = fit_exposure(spec, exposure) if linescan is None else None
+        fit = fit_exposure(spec, exposure) if noise is None else None
         write_image(folder / image_name(view), numbers, None if fit is None else fit.rpc)
         described[view.name] = {
             "along": view.along_deg, "across": view.across_deg, "heading": view.heading_deg,
@@ -122,34 +122,34 @@ def _write_scene(
 
 
 def exposed(
-    spec: SceneSpec, ground: SyntheticGround, seen_by: tuple[Exposure, ...], progress: Callable[[str], None]
+    spec: SceneSpec, ground: SyntheticGround, exposures: tuple[Exposure, ...], progress: Callable[[str], None]
 ) -> Iterator[tuple[Exposure, NDArray[np.integer]]]:
-    """Exposures and their images (r, c), one after the other; level 1 where they are rectified."""
+    """Yield each exposure and its rendered image (r, c); images of rectified scanners are resampled to level 1."""
     lit: dict[Sun, NDArray[np.bool_]] = {}
-    for index, exposure in enumerate(seen_by):
+    for index, exposure in enumerate(exposures):
         view, taken = exposure.view, exposure.taken
         progress(view.name)
         if view.sun not in lit:
             lit = {view.sun: sunlit(ground, view.sun)}
-        radiance = render(ground, taken.camera, taken.shape, view.sun, spec.samples, lit[view.sun])
+        radiance = render(ground, taken.sensor, taken.shape, view.sun, spec.samples, lit[view.sun])
         numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]))
-        if isinstance(exposure.camera, RectifiedScanner):
-            numbers = rectified(numbers, exposure.camera, exposure.shape)
+        if isinstance(exposure.sensor, RectifiedScanner):
+            numbers = rectified(numbers, exposure.sensor, exposure.shape)
         yield exposure, numbers
 
 
 def fit_exposure(spec: SceneSpec, exposure: Exposure) -> RpcFit:
-    """The RPC of an exposure, with the pointing error of its view put in."""
+    """The RPC fitted to the camera of an exposure, with the pointing error of its view added."""
     low, high = spec.height_range
-    fit = fit_rpc(exposure.camera, exposure.shape, spec.crs, (low - HEIGHT_MARGIN_M, high + HEIGHT_MARGIN_M))
+    fit = fit_rpc(exposure.sensor, exposure.shape, spec.crs, (low - HEIGHT_MARGIN_M, high + HEIGHT_MARGIN_M))
     view = exposure.view
     return RpcFit(fit.rpc.moved(column=view.bias_col_px, row=view.bias_row_px), fit.max_error_px)
 
 
 def write_image(path: Path, numbers: NDArray[np.integer], rpc: RpcCoefficients | None) -> None:
-    """A single-band GeoTIFF with RPC tags, if any: (0, 0) is the centre of the first pixel, 0 is nodata.
+    """Write an image (r, c) as GeoTIFF, with 0 as nodata.
 
-    numbers : (r, c).
+    rpc : written as RPC tag, with (0, 0) at the centre of the first pixel; None: no tag.
     """
     tags = None if rpc is None else RPC(
         height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,

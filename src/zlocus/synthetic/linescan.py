@@ -1,4 +1,4 @@
-"""Rendered line scanners as files: one focal plane, a trajectory per image with optional errors, and a `scene.yaml`."""
+"""Write rendered line scanners: a focal plane, a trajectory per image with optional errors, and a `scene.yaml`."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ NOISE_STREAM = 41
 
 @dataclass(frozen=True)
 class TrajectoryNoise:
-    """Errors put into written trajectories; none by default.
+    """Errors that are added to written trajectories; zero by default.
 
-    offset_m, turn_deg : standard deviation of slow errors along and about each of the camera's axes, drawn every
-    `every_s` and smooth in between (what is left of GNSS and IMU after adjustment); jitter_m, jitter_deg : of white
-    noise on each sample.
+    offset_m, turn_deg : standard deviation of slow errors along and about each axis of the camera, drawn every
+    `every_s` and smooth in between (as GNSS and IMU have them after adjustment); jitter_m, jitter_deg : standard
+    deviation of white noise of each sample.
     """
 
     offset_m: float = 0.0
@@ -45,23 +45,25 @@ class TrajectoryNoise:
 
 
 def image_name(view: ViewSpec) -> str:
-    """Name of the file of a view's image."""
+    """File name of the image of a view."""
     return f"img_{view.name}.tif"
 
 
 def write_linescan_views(
-    spec: SceneSpec, seen_by: tuple[Exposure, ...], folder: Path, noise: TrajectoryNoise
+    spec: SceneSpec, exposures: tuple[Exposure, ...], folder: Path, noise: TrajectoryNoise
 ) -> tuple[ViewEntry, ...]:
-    """Write the focal plane and the trajectories; returns the images' entries of a scene file, yet to be rendered.
+    """Write the focal plane and the trajectories, and return the entries of the images for a scene file.
+
+    The images themselves are written elsewhere.
 
     Raises
     ------
     ConfigError
-        For a scene whose cameras are no line scanners, do not fit on their lines, or have pointing errors of an RPC.
+        The cameras are no line scanners, images do not fit on their lines, or views have pointing errors of an RPC.
     """
     lines, entries, comment = {}, [], ""
-    for index, exposure in enumerate(seen_by):
-        camera, view = exposure.taken.camera, exposure.view
+    for index, exposure in enumerate(exposures):
+        camera, view = exposure.taken.sensor, exposure.view
         if not isinstance(camera, LineScanner):
             raise ConfigError(f"SceneSpec.camera = {spec.camera!r} is no line scanner: choose 'ads40'.")
         if view.bias_row_px or view.bias_col_px:
@@ -78,21 +80,21 @@ def write_linescan_views(
 
 
 def write_scene(spec: SceneSpec, entries: tuple[ViewEntry, ...], path: Path) -> None:
-    """A scene file of some views, in the CRS of the scene and with the heights that hold all of it."""
+    """Write a scene file of some views, with the CRS of the scene and the range of all its heights."""
     crs, heights = {"crs": f"EPSG:{spec.epsg}"}, spec.height_range
     scene = SceneFile.model_validate({"schema": 1, "frame": crs, "heights": heights, "views": entries})
     write_scene_file(path, scene)
 
 
 def focal_line(camera: LineScanner) -> FocalLine:
-    """The line of detectors of a camera; the one in the flight's vertical plane is `NADIR_COLUMN`."""
+    """The detectors of a camera. Detector `NADIR_COLUMN` lies in the vertical plane of the flight."""
     x_mm = 1e3 * camera.pixel_m * (np.arange(DETECTORS) - NADIR_COLUMN)
     y_mm = 1e3 * camera.focal_m * np.tan(np.deg2rad(camera.along_deg))
     return FocalLine(np.column_stack([x_mm, np.full(DETECTORS, y_mm)]), 1e3 * camera.focal_m)
 
 
 def sampled(camera: LineScanner, n_rows: int, samples_per_s: float = SAMPLES_PER_S) -> Trajectory:
-    """The flight of a camera around an image of n rows, in time: row 0, the last one flown, at 0 s."""
+    """The trajectory of a camera around an image of `n_rows` rows. Row 0, which is exposed last, is at 0 s."""
     interval = -camera.advance_m / SPEED_M_S
     start, end = interval * (n_rows + MARGIN_PX), -interval * MARGIN_PX
     times = np.arange(np.floor(start * samples_per_s), np.ceil(end * samples_per_s) + 1) / samples_per_s
@@ -101,7 +103,7 @@ def sampled(camera: LineScanner, n_rows: int, samples_per_s: float = SAMPLES_PER
 
 
 def noisy(trajectory: Trajectory, noise: TrajectoryNoise, rng: np.random.Generator) -> Trajectory:
-    """A trajectory with errors."""
+    """The trajectory with random errors added."""
     times = trajectory.times
     n_knots = max(int(np.ceil((times[-1] - times[0]) / noise.every_s)), 3) + 1
     slow = _sigmas(noise.offset_m, noise.turn_deg) * rng.standard_normal((n_knots, 6))
@@ -115,7 +117,7 @@ def _sigmas(offset_m: float, turn_deg: float) -> FloatArray:
 
 
 def _entry(spec: SceneSpec, exposure: Exposure, camera: LineScanner, line: str) -> LineScanCamera:
-    """The entry of a camera in the scene file."""
+    """The camera entry of an exposure for the scene file."""
     first, n_cols = NADIR_COLUMN - camera.centre[0], exposure.taken.shape[1]
     if not 0 <= first <= DETECTORS - n_cols:
         raise ConfigError(
@@ -126,12 +128,12 @@ def _entry(spec: SceneSpec, exposure: Exposure, camera: LineScanner, line: str) 
         calibration=FOCAL_PLANE, line=line, focal_mm=1e3 * camera.focal_m, first_column=int(first),
         trajectory=f"trajectory_{exposure.view.name}.csv", crs=f"EPSG:{spec.epsg}", rays="frame",
         times=RegularTimes(start=0.0, interval=-camera.advance_m / SPEED_M_S),
-        rectification=_rectification(exposure.camera) if isinstance(exposure.camera, RectifiedScanner) else None,
+        rectification=_rectification(exposure.sensor) if isinstance(exposure.sensor, RectifiedScanner) else None,
     )  # fmt: skip
 
 
 def _rectification(camera: RectifiedScanner) -> Rectification:
-    """The plane of a level 1 image; its file counts from the outer corner of the first pixel."""
+    """The plane of a level 1 image. In the file, pixels are counted from the outer corner of the first one."""
     corner = camera.plane_from_image * Affine.translation(-0.5, -0.5)
     a, b, c, d, e, f, *_ = corner
     return Rectification(height=camera.height, transform=(a, b, c, d, e, f), rows=camera.raw_shape[0])

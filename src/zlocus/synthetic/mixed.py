@@ -1,4 +1,4 @@
-"""One ground seen by three kinds of sensor, a strip each: an ADS40, a frame camera, and a satellite with RPC."""
+"""One ground in images of three kinds of sensor: an ADS40, a frame camera, and a satellite with RPCs."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from zlocus.synthetic.scenes import (
     ViewSpec,
     area_corners,
     build_ground,
-    exposures,
+    exposures_of,
     placed,
     steady,
 )
 from zlocus.synthetic.truth import write_truth
 
-# A mapping camera of 100 mm and 6 um, 3500 m above the ground: 0.21 m, three images along a strip 300 m to the west.
+# A mapping camera of 100 mm focal length and 6 um pixels, 3500 m above the ground: ground pixels of 0.21 m. It takes
+# three images along a strip 300 m to the west.
 FOCAL_PX, ABOVE_GROUND_M, ASIDE_M, BASE_M = 100.0 / 0.006, 3500.0, 300.0, 1300.0
 TILTS_DEG = ((0.8, -1.1, 91.0), (-0.5, 0.4, 89.2), (1.2, 0.7, 90.4))
 FRAME_OPTICS = replace(SOFTER, gain=900.0, haze=120.0)
@@ -43,18 +44,18 @@ SENSORS = ("linescan", "frame", "rpc")
 
 
 def mixed_exposures(spec: SceneSpec) -> dict[str, tuple[Exposure, ...]]:
-    """Three images of each sensor, by its kind. spec : of the ground and of the line scanner."""
+    """Three exposures of each sensor, by its kind. spec : the scene with its ground and the line scanner."""
     size = round(spec.size * spec.gsd_m / SATELLITE_GSD_M)
     above = replace(spec, camera="satellite", gsd_m=SATELLITE_GSD_M, truth_step_m=SATELLITE_GSD_M, size=size)
     return {
-        "linescan": exposures(replace(spec, camera="ads40", views=ADS40_VIEWS[:3])),
+        "linescan": exposures_of(replace(spec, camera="ads40", views=ADS40_VIEWS[:3])),
         "frame": tuple(_photograph(spec, number) for number in range(len(TILTS_DEG))),
-        "rpc": exposures(replace(above, views=SATELLITE_VIEWS)),
+        "rpc": exposures_of(replace(above, views=SATELLITE_VIEWS)),
     }
 
 
 def _photograph(spec: SceneSpec, number: int) -> Exposure:
-    """The part of an image of the mapping camera that shows the area; its strip goes north."""
+    """The part of an image of the mapping camera that shows the area. The strip goes north."""
     side, (low, high) = spec.size * spec.gsd_m, spec.terrain_range
     east, north = spec.west_m + side / 2 - ASIDE_M, spec.north_m - side / 2 + (number - 1) * BASE_M
     centre = (east, north, (low + high) / 2 + ABOVE_GROUND_M)
@@ -67,27 +68,28 @@ def _photograph(spec: SceneSpec, number: int) -> Exposure:
 def render_mixed_scene(
     spec: SceneSpec, folder: Path, progress: Callable[[str], None] = lambda step: None
 ) -> dict[str, Path]:
-    """Render the images of all sensors and the truth into a new folder; returns the scene files: of each sensor by its
-    kind, and of all of them as `mixed`.
+    """Render the images of all sensors and the truth into a new folder.
+
+    Returns the scene files: that of each sensor by its kind, and that of all sensors as `mixed`.
 
     Raises
     ------
     OutputError
-        Where the folder exists already, or cannot be written.
+        The folder exists already, or cannot be written.
     """
-    seen_by = mixed_exposures(spec)
+    exposures = mixed_exposures(spec)
     still = mixed_exposures(steady(spec))
     with new_folder(Path(folder)) as part:
         ground = build_ground(spec, tuple(exposure for group in still.values() for exposure in group))
-        # The rim that two images see is another one for every sensor; surfaces are compared over the area itself.
+        # The rim that two images show differs between the sensors, so surfaces are compared over the area only.
         write_truth(replace(spec, whole_truth=False), ground, (), part)
         entries = {
-            "linescan": write_linescan_views(spec, seen_by["linescan"], part, TrajectoryNoise()),
-            "frame": tuple(_frame_entry(exposure) for exposure in seen_by["frame"]),
-            "rpc": tuple(_rpc_entry(exposure) for exposure in seen_by["rpc"]),
+            "linescan": write_linescan_views(spec, exposures["linescan"], part, TrajectoryNoise()),
+            "frame": tuple(_frame_entry(exposure) for exposure in exposures["frame"]),
+            "rpc": tuple(_rpc_entry(exposure) for exposure in exposures["rpc"]),
         }
-        for exposure, numbers in exposed(spec, ground, sum(seen_by.values(), ()), progress):
-            fit = fit_exposure(spec, exposure) if exposure in seen_by["rpc"] else None
+        for exposure, numbers in exposed(spec, ground, sum(exposures.values(), ()), progress):
+            fit = fit_exposure(spec, exposure) if exposure in exposures["rpc"] else None
             write_image(part / image_name(exposure.view), numbers, None if fit is None else fit.rpc)
         for kind, views in (*entries.items(), ("mixed", sum(entries.values(), ()))):
             write_scene(spec, views, part / f"{kind}.yaml")
@@ -95,7 +97,7 @@ def render_mixed_scene(
 
 
 def _frame_entry(exposure: Exposure) -> ViewEntry:
-    camera = exposure.camera
+    camera = exposure.sensor
     assert isinstance(camera, FrameModel)
     rotation = tuple(tuple(row) for row in np.array(camera.camera_from_ground))
     entry = FrameCamera.model_validate({

@@ -1,4 +1,4 @@
-"""What people and nature put on bare terrain: roads, buildings with roofs and furniture, trees."""
+"""Objects on bare terrain: roads, buildings with roofs and roof furniture, trees, crops."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FIRST_BUILDING = FIRST_TREE + len(TREE_ALBEDOS)
 TRIES_PER_OBJECT = 25
 GAP_M = 2.5
 CLUMP_M = 0.3
-BALK_M = 2.0  # of bare ground between crops
+BALK_M = 2.0  # width of bare ground between fields of crops
 CROWN_RADIUS_M = (1.6, 4.8)
 ROUGHEST_CROWN = 0.75
 LEAF_CONTRAST = 0.08
@@ -40,12 +40,12 @@ EAVES_M = (4.5, 6.0, 7.5, 9.0, 10.5, 12.0)
 
 @dataclass(frozen=True)
 class Objects:
-    """How much stands on the ground. Densities are per hectare.
+    """Number and kind of the objects. Densities are per hectare.
 
-    plain_roofs : share of roofs without pattern, whose texture is hardly above the noise; the rest is striped or like
-    gravel, half and half. tower_m : lowest and highest tower, up to 2 m more. rough_m : standard deviation of the
-    height of grass and stones, cell by cell, where nothing else stands. crop_side_m : side of the squares of crops, in
-    rows that repeat, on what else is bare; 0: no crops.
+    plain_roofs : share of roofs without a pattern, whose texture is hardly above the noise; half of the others are
+    striped, half look like gravel. tower_m : lowest and highest height of towers; up to 2 m are added. rough_m :
+    standard deviation of the heights of single cells on bare ground (grass, stones). crop_side_m : side of square
+    fields of crops in periodic rows, on bare ground; 0: no crops.
     """
 
     road_spacing_m: float
@@ -61,7 +61,11 @@ class Objects:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Where an object stands, in the field. x, y : m east and south of the field's corner; length, width : m."""
+    """The footprint of an object.
+
+    x, y : its centre, m east and south of the corner of the height field; angle : of its length, rad; length, width :
+    m.
+    """
 
     x: float
     y: float
@@ -70,10 +74,10 @@ class Footprint:
     width: float
 
     def window(self, ground: SyntheticGround, margin_m: float) -> tuple[slice, slice] | None:
-        """Rows and columns around it, or None where it leaves the field."""
-        reach = 0.5 * np.hypot(self.length, self.width) + margin_m
-        first_row, first_col = (int((c - reach) // ground.step) for c in (self.y, self.x))
-        last_row, last_col = (int((c + reach) // ground.step) + 1 for c in (self.y, self.x))
+        """Rows and columns of the footprint with a margin; None where it leaves the height field."""
+        radius = 0.5 * np.hypot(self.length, self.width) + margin_m
+        first_row, first_col = (int((c - radius) // ground.step) for c in (self.y, self.x))
+        last_row, last_col = (int((c + radius) // ground.step) + 1 for c in (self.y, self.x))
         if min(first_row, first_col) < 0 or last_row > ground.heights.shape[0] or last_col > ground.heights.shape[1]:
             return None
         return slice(first_row, last_row), slice(first_col, last_col)
@@ -87,7 +91,7 @@ class Footprint:
 
 
 def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> SyntheticGround:
-    """Terrain with roads, then towers, other buildings and trees, none on another; crops on what is left bare."""
+    """The terrain with roads, towers, other buildings, trees and crops, in that order. Objects do not overlap."""
     rng = np.random.default_rng([seed, OBJECT_STREAM])
     painted = replace(ground, planes=ground.planes.copy(), material=ground.material.copy())
     materials = [ground.materials[0], plain_material(ROAD, PATTERN_GRAIN, 0.27, 0.03),
@@ -110,7 +114,7 @@ def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> Synthet
 
 
 def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Generator) -> None:
-    """Slightly bent roads both ways, 6 to 9 m wide, with a broken centre line."""
+    """Draw slightly bent roads in both directions, 6 to 9 m wide, with a dashed centre line."""
     for transposed in (False, True):
         material = ground.material.T if transposed else ground.material
         length, breadth = (n * ground.step for n in material.shape)
@@ -119,8 +123,8 @@ def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Genera
             middle = (k + rng.uniform(0.25, 0.75)) * spacing_m + rng.normal(0.0, 0.10) * (along - length / 2)
             middle += rng.uniform(1.0, 5.0) * np.sin(along / rng.uniform(25.0, 60.0) + rng.uniform(0.0, 6.0))
             half = rng.uniform(3.0, 4.5)
-            reach = int(half / ground.step) + 2
-            col = np.floor(middle / ground.step).astype(int)[:, None] + np.arange(-reach, reach + 1)[None, :]
+            half_cells = int(half / ground.step) + 2
+            col = np.floor(middle / ground.step).astype(int)[:, None] + np.arange(-half_cells, half_cells + 1)[None, :]
             off = np.abs((col + 0.5) * ground.step - middle[:, None])
             row = np.broadcast_to(np.arange(len(along))[:, None], col.shape)
             inside = (col >= 0) & (col < material.shape[1])
@@ -133,7 +137,7 @@ def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Genera
 def _place_building(
     ground: SyntheticGround, is_tower: bool, objects: Objects, index: int, rng: np.random.Generator
 ) -> list[NDArray[np.void]]:  # fmt: skip
-    """Puts a building where there is room for it. Returns its materials (empty where none was found)."""
+    """Place a building where there is room for it, and return its materials; empty where no room was found."""
     for _ in range(TRIES_PER_OBJECT):
         rows, cols = ground.heights.shape
         length, width = rng.uniform(12.0, 27.0), rng.uniform(10.0, 17.0)
@@ -160,7 +164,7 @@ def _build(
     ground: SyntheticGround, footprint: Footprint, window: tuple[slice, slice], height: float, is_tower: bool,
     plain_roofs: float, index: int, rng: np.random.Generator,
 ) -> list[NDArray[np.void]]:  # fmt: skip
-    """Roof, furniture and materials of one building."""
+    """Build roof and roof furniture of one building, and return its materials."""
     p, q = footprint.axes(ground, window)
     inside = (np.abs(p) <= footprint.length / 2) & (np.abs(q) <= footprint.width / 2)
     heights, slopes = ground.heights[window], ground.slopes[window]
@@ -189,7 +193,7 @@ def _build(
 def _building_material(
     footprint: Footprint, base: float, plain_roofs: float, rng: np.random.Generator
 ) -> NDArray[np.void]:
-    """Roof and walls: plain, striped or textured tops; rows of windows."""
+    """The material of a building: a plain, striped or textured roof, and walls with rows of windows."""
     patterned = (1.0 - plain_roofs) / 2
     pattern = int(rng.choice([PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_NATURAL], p=[plain_roofs, patterned, patterned]))
     contrast = {PATTERN_GRAIN: 0.006, PATTERN_STRIPES: rng.uniform(0.05, 0.25), PATTERN_NATURAL: 0.03}[pattern]
@@ -204,7 +208,7 @@ def _building_material(
 
 
 def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Generator) -> None:
-    """A rough crown: half an ellipsoid over a trunk's height, broken up into clumps; may touch other trees."""
+    """Place a tree: half an ellipsoid above the height of the trunk, broken up into clumps. Trees may touch."""
     for _ in range(TRIES_PER_OBJECT):
         rows, cols = ground.heights.shape
         radius = rng.uniform(*CROWN_RADIUS_M)
@@ -237,7 +241,7 @@ def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Gener
 def _plant_crops(
     ground: SyntheticGround, side_m: float, index: int, rng: np.random.Generator
 ) -> list[NDArray[np.void]]:
-    """Squares of straight rows, each of one direction and period, on bare ground. Returns their materials."""
+    """Plant square fields of crops on bare ground, each with one direction and period, and return their materials."""
     side, balk = round(side_m / ground.step), round(BALK_M / ground.step)
     materials: list[NDArray[np.void]] = []
     for row in range(0, ground.heights.shape[0], side):

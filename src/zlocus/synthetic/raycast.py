@@ -1,11 +1,12 @@
-"""Kernels that follow rays through a height field of small planes (see `terrain`) and say what they see.
+"""Kernels that follow rays through a height field of small planes (see `terrain`) and compute their radiance.
 
 Field coordinates: u (columns) and v (rows) in cells from the upper left corner of cell [0, 0], z in metres.
-`field` is the tuple (planes, block_tops) of a `SyntheticGround`; `look` is (material, materials, textures, lit), with
-lit from `sunlit_cells`. Both are read-only.
+All records are read-only.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +24,82 @@ from zlocus.synthetic.terrain import (
 )
 from zlocus.synthetic.textures import FRACTAL, GRASS, GRAVEL
 
-Field = tuple[NDArray[np.float32], NDArray[np.float32]]
-Look = tuple[NDArray[np.uint16], NDArray[np.void], NDArray[np.float32], NDArray[np.bool_]]
 MISS, TOP, WALL_U, WALL_V = 0, 1, 2, 3
 SKY = 0.27
-WEEDS = 0.15  # of natural texture in crops, beside rows of amplitude 1
-# Of natural ground, finer than a pixel: the rays of another view meet other grains.
+WEEDS = 0.15  # amplitude of natural texture in crops, where that of the rows is 1
+# Amplitude of a texture finer than a pixel on natural ground, so that rays of different images meet different grains.
 GRAIN = 0.5
 NEVER = 1e-30
 OFF_SURFACE_M = 0.02
 OFF_WALL_CELLS = 1.5
 
 
-# (6 x f8), f8, i8, i8, i8 -> (i8, i8, i8, i8)
+class HeightField(NamedTuple):
+    """The surface of a `SyntheticGround`."""
+
+    planes: NDArray[np.float32]  # (r,c,3) f4: height at the cell's centre, slopes per cell to the next column and row
+    block_tops: NDArray[np.float32]  # (br,bc) f4: upper bound of the planes in each block, m
+
+
+class Appearance(NamedTuple):
+    """What the cells of a `SyntheticGround` look like."""
+
+    material: NDArray[np.uint16]  # (r,c) u2: index into materials
+    materials: NDArray[np.void]  # (m,) MATERIAL
+    textures: NDArray[np.float32]  # (3,t,t) f4: see `natural_textures`
+    lit: NDArray[np.bool_]  # (r,c) b1: whether the sun lights the centre of a cell, see `sunlit_cells`
+
+
+class Light(NamedTuple):
+    """The sun, and the units of the field."""
+
+    sun_u: float  # f8: unit vector to the sun: east,
+    sun_v: float  # f8: south
+    sun_z: float  # f8: and up
+    step: float  # f8: m per cell
+    texel_m: float  # f8: m per texel
+    highest: float  # f8: a height above all of the field, m
+
+
+class Ray(NamedTuple):
+    """The points start + t * step for t in [0, 1], in field coordinates."""
+
+    u: float  # f8: start
+    v: float  # f8
+    z: float  # f8
+    du: float  # f8: step
+    dv: float  # f8
+    dz: float  # f8
+
+
+class Hit(NamedTuple):
+    """The first surface that a ray meets."""
+
+    kind: int  # i8: MISS, TOP of a cell, WALL_U or WALL_V: the side of a cell across u or v
+    t: float  # f8: parameter of the ray
+    i: int  # i8: row of the cell
+    j: int  # i8: and column
+    before_i: int  # i8: row of the cell before it on the ray
+    before_j: int  # i8: and column
+
+
+class Sampling(NamedTuple):
+    """How rays are taken from a table; see `render_rows`."""
+
+    spacing: float  # f8: px between nodes of the table
+    upper: float  # f8: height of the starts of rays, m
+    lower: float  # f8: height of their ends, m
+    samples: int  # i8: rays per pixel and axis
+
+
+# Ray, f8, i8, i8, i8 -> (i8, i8, i8, i8)
 @kernel
 def leave_block(ray, t, block_i, block_j, across):
-    """The cell that a ray enters where it leaves a block at t, across u or v (WALL_U, WALL_V), and the one before."""
-    u, v, _, du, dv, _ = ray
+    """The cell that a ray enters when it leaves a block, and the cell before: (i, j, before_i, before_j).
+
+    t : parameter of the ray there; across : the side through which it leaves, across u or v (WALL_U, WALL_V).
+    """
+    u, v, du, dv = ray.u, ray.v, ray.du, ray.dv
     if across == WALL_U:
         before_i = min(max(int(np.floor(v + dv * t)), block_i * BLOCK), block_i * BLOCK + BLOCK - 1)
         before_j = block_j * BLOCK + (BLOCK - 1 if du > 0.0 else 0)
@@ -49,19 +109,16 @@ def leave_block(ray, t, block_i, block_j, across):
     return before_i + (1 if dv > 0.0 else -1), before_j, before_i, before_j
 
 
-# (6 x f8), i8, i8, field -> (i8, f8, i8, i8, i8, i8)
+# Ray, i8, i8, HeightField -> Hit
 @kernel
 def march(ray, i, j, field):
-    """First surface that a ray meets, from cell [i, j] where it starts above the surface.
+    """The first surface that a ray meets. It starts in cell [i, j], above the surface.
 
-    ray : (u, v, z, du, dv, dz); the ray is start + t * step for t in [0, 1]. Returns what is met (MISS, TOP of a cell,
-    WALL_U or WALL_V: the side of a cell across u or v), t, the cell [i, j], and the cell before it.
-
-    Blocks whose tops are all below the ray are stepped over at once; in the others the ray goes from cell to cell
+    Blocks whose tops are all below the ray are crossed in one step. In other blocks the ray goes from cell to cell
     (Amanatides & Woo, 1987).
     """
-    u, v, z, du, dv, dz = ray
-    planes, block_tops = field
+    u, v, z, du, dv, dz = ray.u, ray.v, ray.z, ray.du, ray.dv, ray.dz
+    planes, block_tops = field.planes, field.block_tops
     rows, cols = planes.shape[0], planes.shape[1]
     step_j, ahead_j, per_u = (1, 1, 1.0 / du) if du > 0.0 else (-1, 0, 1.0 / min(du, -NEVER))
     step_i, ahead_i, per_v = (1, 1, 1.0 / dv) if dv > 0.0 else (-1, 0, 1.0 / min(dv, -NEVER))
@@ -76,7 +133,7 @@ def march(ray, i, j, field):
         block_end = min(block_u, block_v, 1.0)
         if z + dz * (block_end if dz < 0.0 else t) > block_tops[block_i, block_j]:
             if block_end >= 1.0:
-                return MISS, 1.0, i, j, i, j
+                return Hit(MISS, 1.0, i, j, i, j)
             t = block_end
             is_first = False
             entered = WALL_U if block_u <= block_v else WALL_V
@@ -91,12 +148,12 @@ def march(ray, i, j, field):
             above_t = dz - by_col * du - by_row * dv
             above = above_0 + t * above_t
             if above <= 0.0 and not is_first:
-                return entered, t, i, j, before_i, before_j
+                return Hit(entered, t, i, j, before_i, before_j)
             above_end = above_0 + end * above_t
             if above > 0.0 and above_end <= 0.0:
-                return TOP, t + (end - t) * above / (above - above_end), i, j, i, j
+                return Hit(TOP, t + (end - t) * above / (above - above_end), i, j, i, j)
             if end >= 1.0:
-                return MISS, 1.0, i, j, i, j
+                return Hit(MISS, 1.0, i, j, i, j)
             t = end
             is_first = False
             before_i, before_j = i, j
@@ -106,7 +163,7 @@ def march(ray, i, j, field):
             else:
                 i += step_i
                 entered = WALL_V
-    return MISS, 1.0, i, j, before_i, before_j
+    return Hit(MISS, 1.0, i, j, before_i, before_j)
 
 
 # (t,t) f4, f8, f8 -> f8
@@ -174,22 +231,19 @@ def wall_of_building(x, y, z, material):
     return albedo, east, south
 
 
-# (i8, f8, i8, i8, i8, i8), (6 x f8), field, look, (6 x f8) -> f8
+# Hit, Ray, HeightField, Appearance, Light -> f8
 @kernel
-def radiance(hit, ray, field, look, light):
-    """What a ray sees where it hit, in [0, 1] or so: albedo times sky light plus, where the sun reaches, sun light.
+def radiance(hit, ray, field, appearance, light):
+    """Radiance along a ray, about 0 to 1: albedo times sky light, plus sun light where the point is lit.
 
-    Shadows on tops are those of the cell's middle; on walls they are followed from the very point.
-
-    light : (sun_u, sun_v, sun_z, step, texel, highest): unit vector to the sun (east, south, up), m per cell, m per
-    texel, and a height above everything.
+    Shadow is tested at the cell's centre for tops, and at the point itself for walls.
     """
-    kind, t, i, j, before_i, before_j = hit
-    sun_u, sun_v, sun_z, step, texel_m, _ = light
-    material = look[1][look[0][i, j]]
-    u, v, z = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
+    t, i, j, before_i, before_j = hit.t, hit.i, hit.j, hit.before_i, hit.before_j
+    sun_u, sun_v, sun_z, step = light.sun_u, light.sun_v, light.sun_z, light.step
+    material = appearance.materials[appearance.material[i, j]]
+    u, v, z = ray.u + t * ray.du, ray.v + t * ray.dv, ray.z + t * ray.dz
     x, y = u * step, v * step
-    is_side = kind != TOP and (material.kind == BUILDING or material.kind == TREE)
+    is_side = hit.kind != TOP and (material.kind == BUILDING or material.kind == TREE)
     if is_side and material.kind == BUILDING:
         albedo, east, south = wall_of_building(x, y, z, material)
         cosine = sun_u * east + sun_v * south
@@ -197,79 +251,78 @@ def radiance(hit, ray, field, look, light):
         v += OFF_WALL_CELLS * south
         before_i, before_j = int(np.floor(v)), int(np.floor(u))
     else:
-        albedo = top_albedo(x, y, texel_m, material, look[2])
+        albedo = top_albedo(x, y, light.texel_m, material, appearance.textures)
         if is_side:
-            side = -sun_u * np.sign(ray[3]) if kind == WALL_U else -sun_v * np.sign(ray[4])
+            side = -sun_u * np.sign(ray.du) if hit.kind == WALL_U else -sun_v * np.sign(ray.dv)
             cosine = 0.5 * (side + sun_z)
         else:
-            by_col, by_row = field[0][i, j, 1] / step, field[0][i, j, 2] / step
+            by_col, by_row = field.planes[i, j, 1] / step, field.planes[i, j, 2] / step
             cosine = (sun_z - sun_u * by_col - sun_v * by_row) / np.sqrt(1.0 + by_col**2 + by_row**2)
     if cosine <= 0.0:
         return SKY * albedo
-    is_lit = not is_shaded(u, v, z, before_i, before_j, field, light) if is_side else look[3][i, j]
+    is_lit = not is_shaded(u, v, z, before_i, before_j, field, light) if is_side else appearance.lit[i, j]
     return albedo * (SKY + cosine) if is_lit else albedo * SKY
 
 
-# 3 x f8, i8, i8, field, (6 x f8) -> b1
+# f8, f8, f8, i8, i8, HeightField, Light -> b1
 @kernel
 def is_shaded(u, v, z, i, j, field, light):
-    """Whether anything stands between a point, above cell [i, j], and the sun."""
-    sun_u, sun_v, sun_z, step, _, highest = light
-    reach = highest - z
-    if reach <= 0.0:
+    """Whether the field blocks the sun from a point above cell [i, j]."""
+    climb = light.highest - z
+    if climb <= 0.0:
         return False
-    run = reach / sun_z / step
-    return march((u, v, z, sun_u * run, sun_v * run, reach), i, j, field)[0] != MISS
+    run = climb / light.sun_z / light.step
+    return march(Ray(u, v, z, light.sun_u * run, light.sun_v * run, climb), i, j, field).kind != MISS
 
 
-# i8, field, (6 x f8), (r,c) b1 -> none
+# i8, HeightField, Light, (r,c) b1 -> None
 @kernel
-def sunlit_cells(first_row: int, field: Field, light: tuple[float, ...], out: NDArray[np.bool_]) -> None:
-    """Fills `out` (r, c) bool, the field's rows from `first_row` on: whether nothing stands between the middle of a
-    cell and the sun."""
-    planes = field[0]
+def sunlit_cells(first_row: int, field: HeightField, light: Light, out: NDArray[np.bool_]) -> None:
+    """Fill `out` (r, c) bool, rows of the field from `first_row` on: whether the sun lights the centre of a cell."""
+    planes = field.planes
     for i in range(out.shape[0]):
         row = first_row + i
         for j in range(out.shape[1]):
             out[i, j] = not is_shaded(j + 0.5, row + 0.5, planes[row, j, 0] + OFF_SURFACE_M, row, j, field, light)
 
 
-# (n,6) f8, field -> (n,) i8, (n,3) f8
+# (n,6) f8, HeightField -> (n,) i8, (n,3) f8
 @kernel
-def cast_rays(rays: FloatArray, field: Field) -> tuple[NDArray[np.int64], FloatArray]:
-    """What rays meet (MISS, TOP, WALL_U, WALL_V) and where: (u, v, z).
+def cast_rays(rays: FloatArray, field: HeightField) -> tuple[NDArray[np.int64], FloatArray]:
+    """Kinds (n,) of surface that rays meet (MISS, TOP, WALL_U, WALL_V), and the points (n, 3) u, v, z; NaN for MISS.
 
-    rays : see `march`; all start above the field.
+    rays : (n, 6), see `march`; all start above the field.
     """
     kinds = np.zeros(len(rays), np.int64)
     places = np.full((len(rays), 3), np.nan)
     for n in range(len(rays)):
-        ray = (rays[n, 0], rays[n, 1], rays[n, 2], rays[n, 3], rays[n, 4], rays[n, 5])
-        kind, t, _, _, _, _ = march(ray, int(np.floor(ray[1])), int(np.floor(ray[0])), field)
-        kinds[n] = kind
-        if kind != MISS:
-            places[n, 0], places[n, 1], places[n, 2] = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
+        ray = Ray(rays[n, 0], rays[n, 1], rays[n, 2], rays[n, 3], rays[n, 4], rays[n, 5])
+        hit = march(ray, int(np.floor(ray.v)), int(np.floor(ray.u)), field)
+        kinds[n] = hit.kind
+        if hit.kind != MISS:
+            t = hit.t
+            places[n, 0], places[n, 1], places[n, 2] = ray.u + t * ray.du, ray.v + t * ray.dv, ray.z + t * ray.dz
     return kinds, places
 
 
-# i8, (a,b,4) f8, (f8, f8, f8, i8), field, look, (6 x f8), (r,c) f4 -> none
+# i8, (a,b,4) f8, Sampling, HeightField, Appearance, Light, (r,c) f4 -> None
 @kernel
 def render_rows(
     first_row: int,
     table: FloatArray,
-    sampling: tuple[float, float, float, int],
-    field: Field,
-    look: Look,
-    light: tuple[float, ...],
+    sampling: Sampling,
+    field: HeightField,
+    appearance: Appearance,
+    light: Light,
     out: NDArray[np.float32],
 ) -> None:
-    """Fills `out` (r, c) float32, the image's rows from `first_row` on, with the mean radiance of samples x samples
-    rays per pixel; 0 where one of them leaves the field.
+    """Fill `out` (r, c) float32, rows of the image from `first_row` on, with the radiance of pixels.
+
+    It is the mean of samples x samples rays per pixel; 0 where one of them leaves the field.
 
     table : (u, v) at the upper and at the lower height, at image positions (-1 + b * spacing, -1 + a * spacing).
-    sampling : (spacing px, upper m, lower m, samples).
     """
-    spacing, upper, lower, samples = sampling
+    spacing, upper, lower, samples = sampling.spacing, sampling.upper, sampling.lower, sampling.samples
     for row in range(out.shape[0]):
         for col in range(out.shape[1]):
             total = 0.0
@@ -288,10 +341,10 @@ def render_rows(
                 u1 += far * (left * table[a + 1, b, 2] + right * table[a + 1, b + 1, 2])
                 v1 = near * (left * table[a, b, 3] + right * table[a, b + 1, 3])
                 v1 += far * (left * table[a + 1, b, 3] + right * table[a + 1, b + 1, 3])
-                ray = (u0, v0, upper, u1 - u0, v1 - v0, lower - upper)
+                ray = Ray(u0, v0, upper, u1 - u0, v1 - v0, lower - upper)
                 hit = march(ray, int(np.floor(v0)), int(np.floor(u0)), field)
-                if hit[0] == MISS:
+                if hit.kind == MISS:
                     is_whole = False
                     break
-                total += radiance(hit, ray, field, look, light)
+                total += radiance(hit, ray, field, appearance, light)
             out[row, col] = total / (samples * samples) if is_whole else 0.0

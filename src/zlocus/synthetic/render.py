@@ -1,7 +1,7 @@
-"""Images of a `SyntheticGround` through any sensor model: rays, light, optics, noise, quantisation.
+"""Render images of a `SyntheticGround` for any sensor model: rays, light, optics, noise, quantisation.
 
-Rays are straight between two heights that enclose the ground, as all of the cameras here have them; for a sensor with
-bent rays (an RPC) the chord is followed.
+Rays are straight between two heights that enclose the ground, which is exact for the cameras of rendered scenes. For a
+sensor with curved rays (an RPC) the chord is used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,16 @@ from scipy.ndimage import gaussian_filter
 
 from zlocus.core.errors import GeometryError
 from zlocus.core.sensor_model import FloatArray, SensorModel
-from zlocus.synthetic.raycast import MISS, Field, Look, cast_rays, render_rows, sunlit_cells
+from zlocus.synthetic.raycast import (
+    MISS,
+    Appearance,
+    HeightField,
+    Light,
+    Sampling,
+    cast_rays,
+    render_rows,
+    sunlit_cells,
+)
 from zlocus.synthetic.terrain import SyntheticGround
 
 SPACINGS_PX = (64, 32, 16, 8, 4, 2, 1)
@@ -29,7 +38,7 @@ ROWS_PER_BAND = 64
 
 @dataclass(frozen=True)
 class Sun:
-    """Where the sun stands: azimuth clockwise from north, elevation above the horizon, degrees."""
+    """Direction to the sun: azimuth clockwise from north, elevation above the horizon, degrees."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -37,10 +46,10 @@ class Sun:
 
 @dataclass(frozen=True)
 class Optics:
-    """From radiance to numbers: DN = noisy(haze + gain x blurred radiance), quantised.
+    """Conversion of radiance to digital numbers (DN): haze + gain x blurred radiance, with noise, rounded.
 
-    blur_px : sigma of the point spread function. noise : relative to the signal above the haze; noise_floor : DN;
-    both are added in quadrature. n_clouds : soft bright discs.
+    blur_px : sigma of the point spread function. noise : standard deviation relative to the signal above the haze;
+    noise_floor : standard deviation in DN; both are added in quadrature. n_clouds : number of soft bright discs.
     """
 
     gain: float = 1100.0
@@ -60,23 +69,24 @@ def render(
     samples: int = 2,
     lit: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """Radiance (r, c) float32 of an image of `shape`: the mean of samples x samples rays per pixel; 0 where one of them
-    does not meet the ground. The result does not depend on the number of threads.
+    """Radiance (r, c) float32 of an image of `shape`. It does not depend on the number of threads.
 
-    lit : (r, c) bool of the field, `sunlit(ground, sun)` where it is known already.
+    A pixel is the mean of samples x samples rays; 0 where one of them does not meet the ground. lit : (r, c) bool of
+    the height field, `sunlit(ground, sun)` if it is known already.
     """
     lower, upper = _enclosing(ground)
     spacing, table = ray_table(ground, sensor, shape, (lower, upper))
-    look: Look = (ground.material, ground.materials, ground.textures, sunlit(ground, sun) if lit is None else lit)
-    sampling = (float(spacing), upper, lower, samples)
+    lit = sunlit(ground, sun) if lit is None else lit
+    appearance = Appearance(ground.material, ground.materials, ground.textures, lit)
+    sampling = Sampling(float(spacing), upper, lower, samples)
     out = np.empty(shape, np.float32)
     field, light = field_of(ground), _light(ground, sun)
-    _in_bands(lambda first, band: render_rows(first, table, sampling, field, look, light, band), out)
+    _in_bands(lambda first, band: render_rows(first, table, sampling, field, appearance, light, band), out)
     return out
 
 
 def sunlit(ground: SyntheticGround, sun: Sun) -> NDArray[np.bool_]:
-    """Whether the sun reaches the middle of each cell: (r, c) bool."""
+    """Whether the sun lights the centre of each cell, (r, c) bool."""
     out = np.empty(ground.heights.shape, np.bool_)
     field, light = field_of(ground), _light(ground, sun)
     _in_bands(lambda first, band: sunlit_cells(first, field, light, band), out)
@@ -84,38 +94,39 @@ def sunlit(ground: SyntheticGround, sun: Sun) -> NDArray[np.bool_]:
 
 
 def _in_bands(fill: Callable[[int, Any], None], out: NDArray[Any]) -> None:
-    """Calls fill(first_row, rows) for bands of rows of `out`, in threads (the kernels release the GIL)."""
+    """Call fill(first_row, rows) for bands of rows of `out`, in threads. The kernels release the GIL."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         firsts = range(0, len(out), ROWS_PER_BAND)
         list(pool.map(lambda first: fill(first, out[first : first + ROWS_PER_BAND]), firsts))
 
 
-def field_of(ground: SyntheticGround) -> Field:
-    """The arrays that the kernels of `raycast` call the field."""
-    return ground.planes, ground.block_tops
+def field_of(ground: SyntheticGround) -> HeightField:
+    """The surface of the ground, as kernels take it."""
+    return HeightField(ground.planes, ground.block_tops)
 
 
 def _steepest(ground: SyntheticGround) -> float:
-    """How far a plane of the field can rise above the centre of its cell, m."""
+    """Upper bound of the rise of a plane above the centre of its cell, m."""
     return float(max(np.abs(ground.slopes[..., k]).max() for k in (0, 1)))
 
 
 def _enclosing(ground: SyntheticGround) -> tuple[float, float]:
-    """Heights (m) below and above all of the field."""
+    """A height below and a height above all of the field, m."""
     low, high = ground.height_range
     slack = _steepest(ground) + HEIGHT_MARGIN_M
     return low - slack, high + slack
 
 
-def _light(ground: SyntheticGround, sun: Sun) -> tuple[float, ...]:
-    """What the kernels of `raycast` call the light."""
+def _light(ground: SyntheticGround, sun: Sun) -> Light:
+    """The sun and the units of the ground, as kernels take them."""
     azimuth, elevation = np.deg2rad(sun.azimuth_deg), np.deg2rad(sun.elevation_deg)
     to_sun = (np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation))
-    return (*map(float, to_sun), float(ground.step), float(ground.texel_m), _enclosing(ground)[1])
+    sun_u, sun_v, sun_z = map(float, to_sun)
+    return Light(sun_u, sun_v, sun_z, float(ground.step), float(ground.texel_m), _enclosing(ground)[1])
 
 
 def _field_from_image(ground: SyntheticGround, sensor: SensorModel, xy: FloatArray, z: float) -> FloatArray:
-    """Field coordinates (n, 2) in cells of image positions (n, 2) at height z."""
+    """Field coordinates (n, 2), in cells, of image positions (n, 2) px at height z."""
     xyz = sensor.ground_from_image(xy, np.full(len(xy), z))
     return np.column_stack([(xyz[:, 0] - ground.x0) / ground.step, (ground.y0 - xyz[:, 1]) / ground.step])
 
@@ -123,16 +134,16 @@ def _field_from_image(ground: SyntheticGround, sensor: SensorModel, xy: FloatArr
 def ray_table(
     ground: SyntheticGround, sensor: SensorModel, shape: tuple[int, int], z_range: tuple[float, float]
 ) -> tuple[int, FloatArray]:
-    """Rays on a coarse lattice of the image, between which they are interpolated bilinearly.
+    """Rays at the nodes of a coarse lattice in the image, for bilinear interpolation between them.
 
-    Returns the spacing (px) and (a, b, 4) float64: field coordinates at the upper and at the lower height, for image
-    positions (-1 + b * spacing, -1 + a * spacing). The spacing is the widest at which the middles of the lattice's
-    cells are right to TABLE_TOLERANCE_PX.
+    Returns the spacing (px) and a table (a, b, 4) float64: field coordinates at the upper and at the lower height, for
+    image positions (-1 + b * spacing, -1 + a * spacing). The spacing is the widest with an interpolation error below
+    TABLE_TOLERANCE_PX at the middles of the lattice's cells.
 
     Raises
     ------
     GeometryError
-        Where the sensor cannot map its own image, or bends too fast to be tabulated.
+        The sensor cannot map its own image, or its rays change too fast to be tabulated.
     """
     for spacing in SPACINGS_PX:
         rows, cols = (-1.0 + spacing * np.arange((n + 1) // spacing + 2, dtype=np.float64) for n in shape)
@@ -151,13 +162,13 @@ def ray_table(
 
 
 def _lattice(rows: FloatArray, cols: FloatArray) -> FloatArray:
-    """Image positions (n, 2) of a lattice, row by row."""
+    """Image positions (n, 2) px of the nodes of a lattice, row by row."""
     col, row = np.meshgrid(cols, rows)
     return np.column_stack([col.ravel(), row.ravel()])
 
 
 def seen_from(ground: SyntheticGround, sensor: SensorModel, xy: FloatArray) -> FloatArray:
-    """What image positions (n, 2) px see of the ground: (n, 3) easting, northing, height in m; NaN where nothing."""
+    """Ground points (n, 3) m seen at image positions (n, 2) px; NaN where a ray misses the ground."""
     lower, upper = _enclosing(ground)
     start, end = (_field_from_image(ground, sensor, xy, z) for z in (upper, lower))
     n = len(xy)
@@ -183,7 +194,7 @@ def expose(radiance: NDArray[np.float32], optics: Optics, rng: np.random.Generat
 
 
 def _add_clouds(signal: NDArray[np.float32], optics: Optics, rng: np.random.Generator) -> None:
-    """Soft bright discs, as wide as a fortieth to a sixteenth of the image."""
+    """Add soft bright discs with radii of a fortieth to a sixteenth of the image."""
     rows, cols = signal.shape
     for _ in range(optics.n_clouds):
         radius = rng.uniform(0.025, 0.06) * min(rows, cols)

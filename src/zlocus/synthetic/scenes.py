@@ -136,14 +136,14 @@ class Exposure:
     """A view with its exact camera and the rows and columns of its image."""
 
     view: ViewSpec
-    camera: SensorModel
+    sensor: SensorModel
     shape: tuple[int, int]
 
     @property
     def taken(self) -> Exposure:
         """The raw exposure, before it was resampled to a plane; the exposure itself if it was not resampled."""
-        if isinstance(self.camera, RectifiedScanner):
-            return replace(self, camera=self.camera.raw, shape=self.camera.raw_shape)
+        if isinstance(self.sensor, RectifiedScanner):
+            return replace(self, sensor=self.sensor.raw_camera, shape=self.sensor.raw_shape)
         return self
 
 
@@ -196,7 +196,7 @@ def with_pointing_errors(spec: SceneSpec, max_px: float) -> SceneSpec:
     return replace(spec, views=tuple(views))
 
 
-def exposures(spec: SceneSpec) -> tuple[Exposure, ...]:
+def exposures_of(spec: SceneSpec) -> tuple[Exposure, ...]:
     """The exposures of all views, with exact cameras, whose images show all terrain of the area."""
     corners = area_corners(spec)
     easting, northing, height = map(float, (corners.min(axis=0) + corners.max(axis=0)) / 2)
@@ -228,8 +228,7 @@ def placed(xy: FloatArray) -> tuple[tuple[float, float], tuple[int, int]]:
 
 
 def _level_1(view: ViewSpec, camera: LineScanner, middle: tuple[float, float, float], corners: FloatArray) -> Exposure:
-    """The exposure resampled to the plane at the height of `middle`, with rows across the flight. It shows `corners`.
-    """
+    """The exposure resampled to the plane at the height of `middle`, rows across the flight, showing `corners`."""
     forward, right = LEVEL_1_M * np.array(axes_of_heading(view.heading_deg))
     around_middle = Affine(right[0], -forward[0], middle[0], right[1], -forward[1], middle[1])
     rectified = RectifiedScanner(camera, (0, 0), middle[2], around_middle)
@@ -242,7 +241,7 @@ def _level_1(view: ViewSpec, camera: LineScanner, middle: tuple[float, float, fl
     ])  # fmt: skip
     first, raw_shape = placed(rectified.raw_from_image(outline))
     raw = replace(camera, centre=(-first[0], -first[1]))
-    return Exposure(view, replace(rectified, raw=raw, raw_shape=raw_shape), shape)
+    return Exposure(view, replace(rectified, raw_camera=raw, raw_shape=raw_shape), shape)
 
 
 def _camera(
@@ -263,14 +262,14 @@ def _camera(
     )  # fmt: skip
 
 
-def build_ground(spec: SceneSpec, images: tuple[Exposure, ...]) -> SyntheticGround:
+def build_ground(spec: SceneSpec, exposures: tuple[Exposure, ...]) -> SyntheticGround:
     """The ground of a scene: the area, and as much around it as any of the images can show.
 
     The positions of objects depend on the extent of the ground. Scenes that are to have the same ground must therefore
     be built with the same images, those of a steady flight (`steady`); other images may then miss some pixels at the
     rim.
     """
-    xyz = np.concatenate([_footprint(spec, exposure) for exposure in images])
+    xyz = np.concatenate([_footprint(spec, exposure) for exposure in exposures])
     step = spec.step_m
     # Cells from the area's upper left corner to the west, north, east and south.
     margin = np.ceil(np.array([
@@ -291,4 +290,4 @@ def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:
     rows, cols = exposure.shape
     along, across = np.linspace(-3.0, rows + 2.0, 9), np.linspace(-3.0, cols + 2.0, 9)
     xy = np.array([(c, r) for r in along for c in across])
-    return np.concatenate([exposure.camera.ground_from_image(xy, np.full(len(xy), z)) for z in spec.height_range])
+    return np.concatenate([exposure.sensor.ground_from_image(xy, np.full(len(xy), z)) for z in spec.height_range])

@@ -1,4 +1,4 @@
-"""Natural textures that repeat without a seam: gravel, grass and a fractal."""
+"""Natural textures that repeat without a seam: gravel, grass and fractal noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STROKE_LENGTH, STROKE_WIDTH = 11.0, 1.1
 
 
 def natural_textures(rng: np.random.Generator, size: int = TEXTURE_SIZE) -> NDArray[np.float32]:
-    """(3, t, t) float32, each of mean 0 and standard deviation 1; periodic. Gravel, grass, fractal."""
+    """Periodic textures (3, t, t) float32 of gravel, grass and fractal noise; mean 0 and standard deviation 1 each."""
     fine, coarse = (_stones(rng, size, max(2, n * size // TEXTURE_SIZE)) for n in STONES)
     fractal = fractal_surface(rng, (size, size), 1.0, longest=size / 8, exponent=1.1)
     gravel = _unit(fine) + 0.9 * _unit(coarse) + 0.3 * fractal
@@ -26,9 +26,10 @@ def natural_textures(rng: np.random.Generator, size: int = TEXTURE_SIZE) -> NDAr
 def fractal_surface(
     rng: np.random.Generator, shape: tuple[int, int], spacing: float, longest: float, exponent: float
 ) -> NDArray[np.float32]:
-    """Periodic noise whose amplitude falls as wavelength ** exponent below `longest` (in the unit of `spacing`).
+    """Periodic noise (r, c) float32 of mean 0 and standard deviation 1.
 
-    (r, c) float32, mean 0, standard deviation 1.
+    Its amplitude is proportional to wavelength ** exponent below the wavelength `longest`, which has the unit of
+    `spacing`.
     """
     rows = fft.fftfreq(shape[0], spacing)[:, None]
     cols = fft.rfftfreq(shape[1], spacing)[None, :]
@@ -43,7 +44,7 @@ def _unit(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _stones(rng: np.random.Generator, size: int, n: int) -> NDArray[np.float32]:
-    """Stones with dark joints: distances to the nearest and second nearest of n x n jittered points (Worley, 1996)."""
+    """Stones with dark gaps, from distances to the two nearest of n x n jittered points (Worley, 1996)."""
     jitter = rng.uniform(0.0, 1.0, (2, n, n)).astype(np.float32)
     brightness = rng.normal(0.0, 0.30, (n, n)).astype(np.float32)
     place = (np.arange(size, dtype=np.float32) + 0.5) * (n / size)
@@ -65,7 +66,7 @@ def _stones(rng: np.random.Generator, size: int, n: int) -> NDArray[np.float32]:
 
 
 def _strokes(rng: np.random.Generator, size: int) -> NDArray[np.float32]:
-    """Blades in several directions: sparse impulses drawn out by narrow Gaussians, in the Fourier domain."""
+    """Blades of grass in several directions: sparse impulses blurred by narrow Gaussians, in the Fourier domain."""
     rows = fft.fftfreq(size)[:, None]
     cols = fft.rfftfreq(size)[None, :]
     total = np.zeros((size, len(cols[0])), np.complex64)

@@ -1,4 +1,4 @@
-"""Truth rasters of a rendered scene: heights and classes of its area, or of all ground that two images see."""
+"""Truth rasters of a rendered scene: heights and classes of its area, or of all ground that two images show."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.scenes import Exposure, SceneSpec
 from zlocus.synthetic.terrain import SyntheticGround
 
-# A camera is evaluated at nodes this many cells and metres apart, and between them by interpolation. The error is below
-# 0.1 px, and decides for a cell beside the border of an image alone.
+# A camera is evaluated at nodes at this spacing, and interpolated in between. The error is below 0.1 px, so it matters
+# only for cells at the border of an image.
 NODE_CELLS, NODE_HEIGHT_M = 32, 10.0
 
 
-def write_truth(spec: SceneSpec, ground: SyntheticGround, seen_by: Sequence[Exposure], folder: Path) -> None:
+def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Exposure], folder: Path) -> None:
     """Write `truth_dsm.tif` and `truth_class.tif` at the step of the height field.
 
-    They cover the area of the scene; with `spec.whole_truth` all ground that two or more of the images `seen_by` show
-    instead, and then a height is NaN where fewer do. Occlusion is not regarded: an image shows what lies inside it.
+    They cover the area of the scene, or with `spec.whole_truth` all ground that two or more of the exposures show; then
+    heights are NaN where fewer do. Occlusion is ignored: an image shows every point that lies inside it.
     """
     known: NDArray[np.bool_] | None = None
     if spec.whole_truth:
-        known = n_showing(ground, seen_by) >= 2
+        known = n_showing(ground, exposures) >= 2
         rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         cells = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
     else:
@@ -52,10 +52,10 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, seen_by: Sequence[Expo
             file.set_band_description(1, description)
 
 
-def n_showing(ground: SyntheticGround, seen_by: Sequence[Exposure]) -> NDArray[np.uint8]:
-    """How many images show each cell of the ground inside their borders, (r, c) uint8, hidden or not."""
+def n_showing(ground: SyntheticGround, exposures: Sequence[Exposure]) -> NDArray[np.uint8]:
+    """Number of images inside whose borders each cell of the ground lies, (r, c) uint8, occluded or not."""
     count = np.zeros(ground.heights.shape, np.uint8)
-    for exposure in seen_by:
+    for exposure in exposures:
         xy = image_positions(ground, exposure)
         last = np.array([exposure.shape[1] - 1, exposure.shape[0] - 1])
         count += ((xy >= 0) & (xy <= last)).all(axis=-1)
@@ -63,7 +63,7 @@ def n_showing(ground: SyntheticGround, seen_by: Sequence[Exposure]) -> NDArray[n
 
 
 def image_positions(ground: SyntheticGround, exposure: Exposure) -> FloatArray:
-    """Where an image shows the cells of the ground, (r, c, 2) px, column and row; interpolated between nodes."""
+    """Image positions (r, c, 2) px, column and row, of the cells of the ground; interpolated between nodes."""
     rows, cols = ground.heights.shape
     low, high = ground.height_range
     levels = np.linspace(low, high, max(int(np.ceil((high - low) / NODE_HEIGHT_M)), 1) + 1)
@@ -76,7 +76,7 @@ def image_positions(ground: SyntheticGround, exposure: Exposure) -> FloatArray:
     below, place = np.empty((rows, cols, 2)), np.full((rows, cols, 2), np.nan)
     for k, level in enumerate(levels):
         nodes = np.column_stack([column.ravel(), row.ravel(), np.full(column.size, level)])
-        xy = exposure.camera.image_from_ground(nodes).reshape(*column.shape, 2)
+        xy = exposure.sensor.image_from_ground(nodes).reshape(*column.shape, 2)
         size = n_nodes[1] * NODE_CELLS, n_nodes[0] * NODE_CELLS
         here = cv2.resize(xy, size, interpolation=cv2.INTER_LINEAR)[NODE_CELLS : NODE_CELLS + rows]
         here = here[:, NODE_CELLS : NODE_CELLS + cols]

@@ -21,6 +21,7 @@ from zlocus.core.errors import InputError, OutputError
 from zlocus.core.scene import is_local
 from zlocus.io.cameras.linescan import LineScanCamera
 from zlocus.io.cameras.linescan_files import (
+    navigation_rotations,
     read_calibration,
     read_times,
     read_trajectory,
@@ -31,7 +32,6 @@ from zlocus.io.number_table import read_number_table, write_number_table
 from zlocus.io.scene_file import open_scene
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, east_north_up
 from zlocus.sensors.linescan import LineScanModel, RectifiedModel
-from zlocus.sensors.rotation import from_navigation
 from zlocus.sensors.trajectory import Trajectory
 
 SAME_PX = 1e-6
@@ -122,8 +122,20 @@ def level_flight():
     """Longitude, latitude (degrees) of a flight to the north-east, its height, and east-north-up from the camera."""
     s = (np.arange(4001) - 1500.0) * 0.2
     lon, lat = 11.3 + s * 1e-5, 47.2 + s * 0.7e-5
-    camera = from_navigation(*np.deg2rad([[1.0], [-2.0], [40.0]]))[0]
+    camera = navigation_rotations(*np.deg2rad([[1.0], [-2.0], [40.0]]))[0]
     return lon, lat, np.full(4001, 2440.0), camera
+
+
+def test_angles_of_an_aircraft():
+    """Columns are right, forward and up in east, north and up: nose up, right wing down, clockwise; and their order."""
+    turns = np.deg2rad(np.array([[0.0, 0.0, 90.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [90.0, 30.0, 0.0]]))
+    east, rolled, pitched, both = navigation_rotations(*turns.T)
+    s, c = np.sin(np.deg2rad(10.0)), np.cos(np.deg2rad(10.0))
+    np.testing.assert_allclose(east, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rolled, [[c, 0, s], [0, 1, 0], [-s, 0, c]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pitched, [[1, 0, 0], [0, c, -s], [0, s, c]], rtol=0, atol=1e-12)
+    # The nose keeps its pitch whatever the roll, which comes last.
+    np.testing.assert_allclose(both[:, 1], [0, np.sqrt(0.75), 0.5], rtol=0, atol=1e-12)
 
 
 def test_four_ways_to_write_one_flight(folder):

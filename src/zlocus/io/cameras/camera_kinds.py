@@ -1,4 +1,4 @@
-"""The kinds of camera in a `scene.yaml`. A new kind is one class in its own file, and a line in `KINDS`."""
+"""The kinds of camera in a `scene.yaml`. A new kind is one class in its own file, and a line in `CAMERA_KINDS`."""
 
 from __future__ import annotations
 
@@ -57,4 +57,4 @@ class RpcCamera(CameraEntry):
         return RpcSource(read_rpc(image, file), self.shift, () if file is None else (file,))
 
 
-KINDS: dict[str, type[CameraEntry]] = {"rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera}
+CAMERA_KINDS: dict[str, type[CameraEntry]] = {"rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera}

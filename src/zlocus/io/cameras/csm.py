@@ -23,7 +23,6 @@ from zlocus.io.safe_documents import read_json
 from zlocus.io.schema import FiniteNumber, StrictModel, WholeNumber, validate_document
 from zlocus.sensors.earth_frame import MAJOR_M, MINOR_M
 from zlocus.sensors.linescan import FocalLine, LineTimes
-from zlocus.sensors.rotation import from_quaternions
 from zlocus.sensors.trajectory import Trajectory
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
@@ -141,17 +140,17 @@ def convert_csm(path: Path, folder: Path, name: str) -> LineScanCamera:
         A file cannot be written.
     """
     scanner = read_csm(path)
-    calibration, trajectory, times = (f"{name}_{what}.csv" for what in ("focal_plane", "trajectory", "times"))
+    calibration, trajectory, times_name = (f"{name}_{what}.csv" for what in ("focal_plane", "trajectory", "times"))
     write_calibration(folder / calibration, {name: scanner.line}, f"from {path.name}")
     write_trajectory(folder / trajectory, scanner.trajectory, "s; m, geocentric; camera to geocentric", True)
-    given: RegularTimes | str = times
+    times: RegularTimes | str = times_name
     if len(scanner.lines.rows) == 2:
-        given = RegularTimes(start=float(scanner.lines.times[0]), interval=scanner.lines.interval)
+        times = RegularTimes(start=float(scanner.lines.times[0]), interval=scanner.lines.interval)
     else:
-        write_times(folder / times, scanner.lines, "row of the image; s")
+        write_times(folder / times_name, scanner.lines, "row of the image; s")
     return LineScanCamera(
         calibration=calibration, line=name, focal_mm=scanner.line.focal_mm, trajectory=trajectory, crs="EPSG:4978",
-        times=given,
+        times=times,
     )  # fmt: skip
 
 
@@ -208,7 +207,7 @@ def _toward_the_ground(state: CsmState, xy: FloatArray, time: float) -> tuple[Fl
     """
     at = np.array([time])
     sight = np.append(state.m_zDirection * xy[len(xy) // 2], state.m_focalLength)
-    outwards = float((from_quaternions(_quaternions(state, at))[0] @ sight) @ _positions(state, at)[0])
+    outwards = float((_rotations(state, at)[0] @ sight) @ _positions(state, at)[0])
     z = state.m_zDirection
     if outwards < 0:
         return np.array([z, -z]), np.array([1.0, -1.0, -1.0])
@@ -244,8 +243,15 @@ def _sampled(state: CsmState, lines: LineTimes, toward: FloatArray, line: FocalL
 
 
 def _poses(state: CsmState, times: FloatArray, toward: FloatArray) -> Trajectory:
-    geocentric_from_camera = from_quaternions(_quaternions(state, times)) * toward
+    geocentric_from_camera = _rotations(state, times) * toward
     return Trajectory(times, _positions(state, times), np.ascontiguousarray(geocentric_from_camera.mT))
+
+
+def _rotations(state: CsmState, times: FloatArray) -> FloatArray:
+    """Rotations from the camera's axes to geocentric axes at instants (n,) s: (n, 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(_quaternions(state, times)).as_matrix()
 
 
 def _positions(state: CsmState, times: FloatArray) -> FloatArray:

@@ -176,7 +176,7 @@ class FrameSource:
     given : CRS of its pose, None for that of the scene's frame; curved : see `FrameCamera`.
     """
 
-    model: FrameModel
+    sensor_in_own_crs: FrameModel
     image: Path
     given: CRS | None = None
     curved: bool = True
@@ -186,7 +186,7 @@ class FrameSource:
         """See `OpenedCamera`; the place below the projection centre, wherever the camera looks."""
         if self.given is None:
             return None
-        lon, lat = between(self.given, CRS.from_epsg(4326)).transform(*self.model.centre[:2])
+        lon, lat = between(self.given, CRS.from_epsg(4326)).transform(*self.sensor_in_own_crs.centre[:2])
         return (float(lon), float(lat)) if np.isfinite(lon) and np.isfinite(lat) else None
 
     def sensor(self, crs: CRS) -> SensorModel:
@@ -200,7 +200,7 @@ class FrameSource:
             The projection centre is no place in its CRS.
         """
         if is_local(crs):
-            return self.model
+            return self.sensor_in_own_crs
         given = self.given or crs
         if not self.curved:
             if given != crs:
@@ -208,10 +208,10 @@ class FrameSource:
                     f"The camera of {self.image} has earth: flat, which holds in {given.to_string()} only, not in "
                     f"{crs.to_string()}. Leave --crs out, or write earth: curved."
                 )
-            return self.model
-        model = self.model.on_earth(given, crs)
+            return self.sensor_in_own_crs
+        model = self.sensor_in_own_crs.on_earth(given, crs)
         if not np.isfinite([*model.centre, *model.camera_from_ground[0]]).all():
-            at = ", ".join(f"{v:.12g}" for v in self.model.centre)
+            at = ", ".join(f"{v:.12g}" for v in self.sensor_in_own_crs.centre)
             raise InputError(
                 f"The camera of {self.image} stands at {at}, which is no place in {given.to_string()}. Check its "
                 "centre and the CRS."

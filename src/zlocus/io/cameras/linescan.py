@@ -118,8 +118,10 @@ class LineScanCamera(CameraEntry):
         mounted = crs, self.rays, np.array(self.boresight), np.array(self.lever_arm)
         trajectory, *others = (read_trajectory(file, *mounted) for file in (files[1], *files[n_own:]))
         _check_covered(trajectory, lines, n_rows, files[1], image)
-        of_plane = others[0] if others else trajectory
-        return LineScanSource(line, lines, trajectory, of_plane, self.rays, crs, self.rectification, tuple(files))
+        plane_trajectory = others[0] if others else trajectory
+        return LineScanSource(
+            line, lines, trajectory, plane_trajectory, self.rays, crs, self.rectification, tuple(files)
+        )
 
     def with_default_crs(self, crs: str | None) -> LineScanCamera:
         """See `CameraEntry`. Only a trajectory in the scene's frame takes its CRS from it."""
@@ -152,13 +154,13 @@ def _check_covered(trajectory: Trajectory, lines: LineTimes, n_rows: int, file: 
 class LineScanSource:
     """A line scanner that has been read; see `LineScanCamera`.
 
-    of_plane : the trajectory with which a level 1 image was resampled.
+    plane_trajectory : the trajectory with which a level 1 image was resampled.
     """
 
     line: FocalLine
     lines: LineTimes
     trajectory: Trajectory
-    of_plane: Trajectory
+    plane_trajectory: Trajectory
     rays: Rays
     crs: CRS | None
     rectification: Rectification | None
@@ -184,9 +186,9 @@ class LineScanSource:
         if self.rectification is None:
             return raw
         plane_crs, over_plane = self.rectification.crs, raw
-        if plane_crs is not None or self.of_plane is not self.trajectory:
+        if plane_crs is not None or self.plane_trajectory is not self.trajectory:
             space = self._space(crs if plane_crs is None else CRS.from_user_input(plane_crs))
-            over_plane = LineScanModel(self.line, self.lines, self.of_plane, space)
+            over_plane = LineScanModel(self.line, self.lines, self.plane_trajectory, space)
         # GeoTIFF counts from the outer corner of the first pixel.
         plane_from_image = Affine(*self.rectification.transform) * Affine.translation(0.5, 0.5)
         return RectifiedModel(raw, over_plane, self.rectification.height, plane_from_image)

@@ -13,7 +13,6 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.number_table import NumberTable, read_number_table, write_number_table
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, between, east_north_up
 from zlocus.sensors.linescan import FocalLine, LineTimes
-from zlocus.sensors.rotation import from_navigation, from_photogrammetric, from_quaternions, to_photogrammetric
 from zlocus.sensors.trajectory import MIN_SAMPLES, Trajectory
 
 CALIBRATION, TRAJECTORY, TIMES = "focal plane calibration", "trajectory", "table of line times"
@@ -127,7 +126,9 @@ def read_trajectory(
     else:
         places, local = _on_earth(table, place, turn, crs)
         platform = local @ platform
-    camera = from_photogrammetric(*np.deg2rad(boresight_deg)[:, None])[0]
+    from scipy.spatial.transform import Rotation
+
+    camera = Rotation.from_euler("XYZ", boresight_deg, degrees=True).as_matrix()
     return Trajectory(
         table.columns["time"] + 0.0, places + platform @ lever_arm, np.ascontiguousarray((platform @ camera).mT)
     )
@@ -149,13 +150,14 @@ def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str, eve
 def write_trajectory(path: Path, trajectory: Trajectory, comment: str, quaternions: bool = False) -> None:
     """Write a trajectory as `read_trajectory` reads it, without boresight and lever arm: x, y, z of its own axes, and
     the camera's omega, phi, kappa or quaternions in them."""
-    turn: tuple[str, ...] = OMEGA_PHI_KAPPA
-    if quaternions:
-        from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation
 
-        turn, turns = QUATERNION, Rotation.from_matrix(trajectory.rotations.mT).as_quat()
+    turn: tuple[str, ...] = OMEGA_PHI_KAPPA
+    rotations = Rotation.from_matrix(trajectory.rotations.mT)
+    if quaternions:
+        turn, turns = QUATERNION, rotations.as_quat()
     else:
-        turns = np.rad2deg(to_photogrammetric(trajectory.rotations.mT))
+        turns = rotations.as_euler("XYZ", degrees=True)
     values = np.column_stack([trajectory.times, trajectory.centres, turns])
     write_number_table(path, dict(zip(("time", *POSITION_COLUMNS["projected"], *turn), values.T, strict=True)), comment)
 
@@ -197,14 +199,29 @@ def _of_line(table: NumberTable, name: str | None) -> NumberTable:
 
 def _platform(table: NumberTable, turn: tuple[str, ...]) -> FloatArray:
     """Rotations from the platform's axes to local ones, (n, 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     if turn == QUATERNION:
         quaternions = table.stacked(turn)
         wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > UNIT_LENGTH_TOLERANCE)
         if len(wrong):
             raise table.refuse(int(wrong[0]), "the quaternion qx, qy, qz, qw is not of length 1; mend it")
-        return from_quaternions(quaternions)
-    build = from_photogrammetric if turn == OMEGA_PHI_KAPPA else from_navigation
-    return build(*np.deg2rad(table.stacked(turn)).T)
+        return Rotation.from_quat(quaternions).as_matrix()
+    if turn == OMEGA_PHI_KAPPA:
+        return Rotation.from_euler("XYZ", table.stacked(turn), degrees=True).as_matrix()
+    return navigation_rotations(*np.deg2rad(table.stacked(turn)).T)
+
+
+def navigation_rotations(roll: FloatArray, pitch: FloatArray, heading: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) from an aircraft's axes (right, forward, up) to east, north and up.
+
+    roll, pitch, heading : (n,) rad. heading is clockwise from north, pitch is positive nose up, and roll is positive
+    right wing down; they turn, in the order heading, pitch, roll, about the moved axes down, right and forward
+    (ARINC 705).
+    """
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("ZXY", np.column_stack([-heading, pitch, roll])).as_matrix()
 
 
 def _on_earth(

@@ -9,8 +9,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from zlocus.core.errors import InputError, OutputError
-from zlocus.io.atomic_write import atomic_file
+from zlocus.core.errors import InputError
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.safe_text import (
     BYTE_ORDER_MARK,
     MAX_MAGNITUDE,
@@ -151,11 +151,7 @@ def write_rpc_txt(path: Path, rpc: RpcCoefficients) -> None:
     lines = [f"{name}: {value!r} {unit}" for name, value, unit in zip(SCALARS, scalars, units, strict=True)]
     for name, terms in zip(POLYNOMIALS, (rpc.line_num, rpc.line_den, rpc.samp_num, rpc.samp_den), strict=True):
         lines += [f"{name}_{i}: {value!r}" for i, value in enumerate(terms, 1)]
-    try:
-        with atomic_file(path) as part:
-            part.write_text("\n".join(lines) + "\n", encoding="ascii")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}. Choose a folder you may write to.") from error
+    write_atomically(path, lambda part: part.write_text("\n".join(lines) + "\n", encoding="ascii"))
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, path: Path) -> tuple[float, ...]:

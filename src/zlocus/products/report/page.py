@@ -16,7 +16,8 @@ from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.comparison import Comparison
-from zlocus.io.run_record import read_record, write_atomically
+from zlocus.io.atomic_write import write_atomically
+from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
