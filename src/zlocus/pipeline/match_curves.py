@@ -17,7 +17,8 @@ from zlocus.orientation.orientation import supported
 from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.setup import open_inputs, orient_views, set_up_run, supported_views
-from zlocus.products.match_curve_figures import PointReport, loci, point_text, write_point
+from zlocus.products.match_curve_figures import write_point
+from zlocus.products.point_report import PointReport, loci, point_text
 
 # A pixel is followed to the ground in at most this many rounds, until its height changes by less than this.
 MAX_ROUNDS, HEIGHT_TOLERANCE_M = 20, 0.01

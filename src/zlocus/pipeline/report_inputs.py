@@ -27,7 +27,8 @@ from zlocus.matching.tile import rank_tile
 from zlocus.orientation.parameter_groups import kind_of
 from zlocus.pipeline.setup import RunSetup
 from zlocus.products.footprints import write_footprints
-from zlocus.products.match_curve_figures import PointReport, mean_figure, point_record, svg_of
+from zlocus.products.match_curve_figures import mean_figure, svg_of
+from zlocus.products.point_report import PointReport, point_record
 from zlocus.products.report.example_cells import FAILED, RULE, ChosenCell, chosen_cells
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, REPORT
 from zlocus.products.report.page import write_report

@@ -188,11 +188,8 @@ def set_up_run(
     corrected = orientation.apply(opened.scene)
     scene = supported_views(corrected, orientation)
     z_range = search_range(request, scene, orientation, config, progress)
-    grid = _grid(request, opened.like, scene, orientation, z_range)
-    match_scene = build_match_scene(
-        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
-        orientation.refined_xyz,
-    )  # fmt: skip
+    grid = grid_of_run(request, opened.like, scene, orientation, z_range)
+    match_scene = match_scene_of_run(request, scene, orientation, z_range, grid, config)
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)
     match_scene = _limited_by_dem(request, match_scene, scene.crs, config)
@@ -251,7 +248,7 @@ def doubts_from_dem(
     )
 
 
-def _grid(
+def grid_of_run(
     request: SetupRequest,
     like: GeoBox | None,
     scene: Scene,
@@ -269,6 +266,21 @@ def _grid(
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     bounds = request.bounds or area_to_match(scene, z_range, ties)
     return grid_from_bounds(bounds, cell_m, scene.crs)
+
+
+def match_scene_of_run(
+    request: SetupRequest,
+    scene: Scene,
+    orientation: Orientation,
+    z_range: tuple[float, float],
+    grid: Grid,
+    config: RunConfig,
+) -> MatchScene:
+    """The match scene of the views that take part, on the lattice of a grid. scene : with corrected cameras."""
+    return build_match_scene(
+        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
+        orientation.refined_xyz,
+    )  # fmt: skip
 
 
 def _limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:

@@ -11,19 +11,15 @@ from typing import Any
 from shapely import box
 
 from zlocus.core.errors import GeometryError
-from zlocus.core.footprints import area_to_match
-from zlocus.core.grid import grid_from_bounds
 from zlocus.core.options import RunConfig
-from zlocus.core.requests import DoctorRequest
+from zlocus.core.requests import DoctorRequest, SetupRequest
 from zlocus.core.resources import WORKER_BYTES
 from zlocus.core.scene import Scene
-from zlocus.matching.ground_pixels import check_resolution, default_cell
-from zlocus.matching.match_scene import build_match_scene
-from zlocus.orientation.orientation import supported
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
 from zlocus.pipeline.doctor.ties import QuickTies
 from zlocus.pipeline.execution.plan import plan_tiles, tile_needs
 from zlocus.pipeline.required_space import check_room
+from zlocus.pipeline.setup import grid_of_run, match_scene_of_run
 
 # Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
 ROUGHLY = 3.0
@@ -54,22 +50,16 @@ class RunPlan:
 def run_plan(
     request: DoctorRequest, config: RunConfig, scene: Scene, ties: QuickTies, outlines: Sequence[Any]
 ) -> RunPlan:
-    """The plan of a surface. scene : its cameras corrected; outlines : footprint of each view.
+    """The plan of a surface. scene : with corrected cameras; outlines : footprint of each view.
 
     Raises
     ------
     ConfigError, GeometryError, OutputError
-        Where a run would stop for the same reason.
+        A run would stop for the same reason.
     """
-    z_range, z = ties.z_range, sum(ties.z_range) / 2
-    cell = request.resolution or default_cell(scene, z)
-    check_resolution(cell, scene, z, "--resolution")
-    found = ties.orientation
-    bounds = area_to_match(scene, z_range, found.xyz[supported(found.xyz, found.sigma_z_m)])
-    grid = grid_from_bounds(bounds, cell, scene.crs)
-    match_scene = build_match_scene(
-        scene, cell, grid.anchor, z_range, found.xyz, None, config.pyramid, found.refined_xyz
-    )
+    setup_request, z_range = SetupRequest.of(request), ties.z_range
+    grid = grid_of_run(setup_request, None, scene, ties.orientation, z_range)
+    match_scene = match_scene_of_run(setup_request, scene, ties.orientation, z_range, grid, config)
     matched = grid.window.within(match_scene.overlap_window)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
@@ -79,10 +69,10 @@ def run_plan(
     tile_bytes = int(needs.n_bytes + WORKER_BYTES)
     fit = request.workers if request.memory_gb is None else int(request.memory_gb * 1e9 / tile_bytes)
     workers = max(min(request.workers, fit, len(tiles)), 1)
-    area = box(*bounds)
-    view_cells = sum(outline.intersection(area).area for outline in outlines) / cell**2
+    area = box(*grid.geobox.boundingbox.bbox)
+    view_cells = sum(outline.intersection(area).area for outline in outlines) / grid.cell_m**2
     return RunPlan(
-        cell_m=cell,
+        cell_m=grid.cell_m,
         shape=(grid.window.rows, grid.window.cols),
         heights=z_range,
         step_m=match_scene.step_m,
