@@ -30,7 +30,10 @@ DEMO_WORKERS = 2
 
 @dataclass(frozen=True)
 class DemoResult:
-    """out : folder of the products; evaluations : against the truth, within two ground pixels and within 1 m."""
+    """Result of the demo.
+
+    out : folder of the products; evaluations : against the truth, within two ground pixels and within 1 m.
+    """
 
     out: Path
     evaluations: tuple[Evaluation, ...]
@@ -39,7 +42,7 @@ class DemoResult:
 def run_demo(out: Path, progress: Progress) -> DemoResult:
     """Render the built-in block (line scanners, six images in two strips), match it, and compare it with its truth.
 
-    A demo that was stopped goes on with the scene and the tiles that are there; one that was finished starts anew.
+    An interrupted demo resumes with its scene and its finished tiles; a finished demo starts anew.
 
     Raises
     ------
@@ -66,11 +69,11 @@ def run_demo(out: Path, progress: Progress) -> DemoResult:
 
 
 def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene:
-    """The scene of a demo which was stopped, whose tiles are then left as they are; else a new one."""
+    """The scene of an interrupted demo, whose tiles stay; else a newly rendered scene."""
     from zlocus.synthetic.files import render_scene, scene_files
     from zlocus.synthetic.linescan import TrajectoryNoise
 
-    # The files say how the aircraft flew, which is what the images saw.
+    # The trajectory files describe the flight exactly as it was rendered.
     flown = TrajectoryNoise()
     made_of = hashlib.sha256(repr((spec, flown, versions_record())).encode()).hexdigest()
     folder, begun, finished = out / "scene", out / DEMO_BEGUN, out / DEMO_ACCURACY
@@ -81,7 +84,7 @@ def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene
             progress.note(f"The scene in {folder} is that of a demo which was stopped: it is not rendered again.")
             return scene_files(spec, folder, is_linescan=True)
     with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
-        # From here on the folder is a demo's, whose scene is not complete.
+        # From here on the folder belongs to a demo whose scene is not complete.
         write_record(begun, {})
         finished.unlink(missing_ok=True)
         for name in (FINISHED, *held_files(out)):
@@ -94,7 +97,7 @@ def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene
 
 
 def _is_scene_of(begun: Path, made_of: str) -> bool:
-    """Whether a demo that was begun has rendered its scene, and this one."""
+    """Whether an interrupted demo has rendered its scene, and with the same specification."""
     with suppress(InputError):  # damaged
         return bool(read_record(begun).get("scene_sha256") == made_of)
     return False

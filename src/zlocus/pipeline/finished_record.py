@@ -1,4 +1,4 @@
-"""finished.json: what a finished run depends on, and the checksum of each of its products."""
+"""finished.json: everything that a finished run depends on, and the checksums of its products."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from zlocus.products.stac_item import PRODUCTS
 
 ITEM = "item.json"
 SCHEMA = 1
-# The log of events is for watching a run: nothing depends on it.
+# The event log only informs, so it is not checked.
 CHECKED = (*(product.name for product in PRODUCTS if product.name != EVENTS), ITEM)
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished run.
+    """The record of a finished run.
 
     key : all that it depends on, by name, empty where the file is damaged; checksums : of each of its products, by the
     name of the file; shortcoming : why it is no success unless that is accepted, "" where it is one.
@@ -51,7 +51,7 @@ def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "") -> 
 
 
 def read_finished(out: Path) -> Finished | None:
-    """What `write_finished` wrote; None where there is no such file."""
+    """Read the record that `write_finished` wrote; None where there is no such file."""
     if not (out / FINISHED).exists():
         return None
     damaged = Finished({}, {})
@@ -69,7 +69,7 @@ def read_finished(out: Path) -> Finished | None:
 
 
 def update_finished(out: Path, names: Iterable[str]) -> None:
-    """Take the checksums of products that were made again, if the folder holds a finished run; the others stay.
+    """Record the checksums of products that were made again, if the folder holds a finished run; others stay.
 
     Raises
     ------
@@ -84,12 +84,12 @@ def update_finished(out: Path, names: Iterable[str]) -> None:
 
 
 def comparable(key: Mapping[str, Any]) -> dict[str, Any]:
-    """A key as it comes back from the file."""
+    """A key in the form in which it is read from the file."""
     return dict(json.loads(json.dumps(finite_only(dict(key)))))
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a product: of its bytes; of a GeoPackage that of its rows, for programs write to it that only look."""
+    """SHA-256 of the bytes of a product, or of the rows of a GeoPackage, whose bytes change when programs only read it."""
     if path.suffix == ".gpkg" and (found := _checksum_of_layers(path)):
         return found
     with path.open("rb") as file:
@@ -100,7 +100,7 @@ def _checksum_of_layers(path: Path) -> str:
     """SHA-256 of the rows of all layers of a GeoPackage; "" where it cannot be read as one."""
     digest = hashlib.sha256()
     try:
-        # As it is, without looking for what another program is writing to it.
+        # Read-only, without the journal of another program that may be writing.
         address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(address, uri=True)) as database:
             layers = "SELECT table_name, srs_id FROM gpkg_contents WHERE data_type = 'features' ORDER BY table_name"

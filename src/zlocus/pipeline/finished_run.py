@@ -23,13 +23,13 @@ from zlocus.products.tie_observations import OBSERVATIONS, read_observations, wr
 # Products that only matching makes.
 MATCHED = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", RANKING, RECORD)
 TIES = "ties.gpkg"
-# Products that are made of the tie points, which are kept, or found again.
+# Products made from the tie points, which are kept or found again.
 OF_TIES = (TIES, OBSERVATIONS, FOOTPRINTS, CURVES)
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Products of a finished run that are not there.
+    """Products of a finished run that are missing.
 
     matched : names of the files that only matching makes; of_ties : of those that the tie points make; maps : of maps,
     as --products has them; report, item : whether that is missing.
@@ -43,14 +43,15 @@ class Missing:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of all of them that can be made without matching."""
+        """Names of the missing files that can be made without matching."""
         ends = (REPORT,) * self.report + (ITEM,) * self.item
         return (*self.of_ties, *(FILES[name] for name in self.maps), *ends)
 
 
 def finished_run(request: DsmRequest, checkpoint: TileCheckpoint) -> Finished | None:
-    """The finished run that a request's folder holds, where it is the one asked for; None where it holds none, or may
-    be overwritten.
+    """The record of the finished run in a request's folder, if it is the requested one.
+
+    None where the folder holds no finished run, or may be overwritten.
 
     checkpoint : of the request; where it has tiles of the same run, that one was allowed to replace what is there.
 
@@ -83,7 +84,7 @@ def finished_run(request: DsmRequest, checkpoint: TileCheckpoint) -> Finished | 
 
 
 def missing_products(request: DsmRequest, found: Finished, progress: Progress) -> Missing:
-    """What is missing of a finished run, and of what is asked for now.
+    """Find the products that are missing from a finished run, or requested now in addition.
 
     Raises
     ------
@@ -116,8 +117,10 @@ def missing_products(request: DsmRequest, found: Finished, progress: Progress) -
 
 
 def whole_again(request: DsmRequest, found: Finished, missing: Missing, progress: Progress) -> DsmRequest:
-    """The request of a run that is made again because of what only matching makes, with the maps and the page that were
-    added later."""
+    """The request of a run that is repeated because products are missing that only matching makes.
+
+    It includes the maps and the report that were added to the finished run later.
+    """
     progress.note(
         f"The finished run in {request.out} lacks {', '.join(missing.matched)}, which only matching makes: it is made "
         "again."
@@ -129,7 +132,7 @@ def whole_again(request: DsmRequest, found: Finished, missing: Missing, progress
 def make_missing(
     request: DsmRequest, config: RunConfig, opened: OpenedInputs, found: Finished, missing: Missing, progress: Progress
 ) -> None:
-    """Make products of a finished run that are missing, and take their checksums; nothing else changes.
+    """Make the missing products of a finished run, and record their checksums; nothing else changes.
 
     Raises
     ------
@@ -160,7 +163,7 @@ def make_missing(
 def _make_of_ties(
     request: DsmRequest, config: RunConfig, opened: OpenedInputs, names: Sequence[str], progress: Progress
 ) -> None:
-    """Make again what is made of the tie points; those are looked for again where they were not kept."""
+    """Make the missing products of the tie points, which are found again where they were not kept."""
     from zlocus.pipeline.report_inputs import ReportedRun, write_shown
 
     out, record = request.out, read_record(request.out / RECORD)
@@ -185,6 +188,6 @@ def _make_of_ties(
 
 
 def _time_of_matching(record: dict[str, Any]) -> float:
-    """How long matching took in a run, s."""
+    """Wall time of the matching of a run, s."""
     times = [stage["wall_s"] for stage in record.get("stages", []) if stage.get("name") == "match"]
     return float(times[0]) if times else 0.0

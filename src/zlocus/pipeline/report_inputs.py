@@ -36,13 +36,13 @@ from zlocus.products.report.sampling import Survey, survey
 from zlocus.products.report.tables import MOST_MATRIX
 from zlocus.products.tie_layers import counted_pairs, label_counts
 
-# Pairs grow with the square of their number.
+# The number of pairs grows with the square of the number of views.
 MOST_VIEWS_PAIRED = 60
-# Curves are not begun after this share of the time that matching took, or this time where that is longer.
+# Time limit for the curves: this share of the time of matching, but at least this time.
 TIME_SHARE, LEAST_TIME_S = 0.02, 10.0
-# Where a run ranked no images they are compared in so many places a side, each of so many blocks a side.
+# Where a run ranked no images, pairs are labelled at this many places along each side, each this many blocks wide.
 SAMPLE_PLACES, SAMPLE_BLOCKS = 3, 2
-# Cells around one within which tie points are looked for.
+# Distance in cells within which tie points around a cell are used.
 SHOWN_WITHIN_CELLS = 512
 NOT_SHOWN = "Fewer than two images show this cell, and the window around it, at the height looked at."
 
@@ -79,8 +79,10 @@ def write_shown(
     progress: Progress,
     names: Collection[str] = (FOOTPRINTS, CURVES),
 ) -> None:
-    """footprints.geojson and curves.json, or a note. match_s : time that matching took, which bounds that of curves;
-    names : which of the two."""
+    """Write footprints.geojson and curves.json; a note says where that fails.
+
+    match_s : time of the matching, which limits the time for curves; names : which of the two files.
+    """
     most_s = max(LEAST_TIME_S, TIME_SHARE * match_s)
     if FOOTPRINTS in names:
         _tried(FOOTPRINTS, lambda: write_views(out / FOOTPRINTS, run), progress)
@@ -89,13 +91,13 @@ def write_shown(
 
 
 def try_report(out: Path, progress: Progress) -> None:
-    """report.html, or a note."""
+    """Write report.html; a note says where that fails."""
     with progress.stage("Report"):
         _tried(REPORT, lambda: write_report(out), progress)
 
 
 def _tried(name: str, write: Callable[[], Any], progress: Progress) -> None:
-    """Write a file, or note why there is none: a surface that is complete does not fail for its report."""
+    """Write a file, or note why it is missing: a complete surface does not fail because of its report."""
     try:
         write()
     except Exception as error:
@@ -103,7 +105,7 @@ def _tried(name: str, write: Callable[[], Any], progress: Progress) -> None:
 
 
 def write_views(path: Path, run: ReportedRun) -> None:
-    """Footprints at the median height of the ties, with what is known of each image and of each pair that overlaps."""
+    """Write footprints at the median height of the tie points, with properties of images and of overlapping pairs."""
     views = run.scene.views
     z = float(np.median(run.ties[:, 2])) if len(run.ties) else middle_height(run.match_scene)
     geometry = [view_geometry(view, z) for view in views]
@@ -132,7 +134,7 @@ def write_views(path: Path, run: ReportedRun) -> None:
 
 
 def write_curves(path: Path, folder: Path, run: ReportedRun, config: RunConfig, most_s: float) -> None:
-    """Match curves of chosen cells of the surface in a folder; one that cannot be made leaves a sentence."""
+    """Write match curves of example cells of the surface in a folder; where one cannot be made, its error is written."""
     found, start, cells = survey(folder), time.perf_counter(), []
     chosen = chosen_cells(found)
     for cell in chosen:
@@ -146,7 +148,7 @@ def write_curves(path: Path, folder: Path, run: ReportedRun, config: RunConfig, 
 
 
 def tried_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str, Any]:
-    """What curves.json says of the labels of pairs, with an error where none can be given."""
+    """The labels of pairs for curves.json, or the error that prevents them."""
     try:
         return sampled_labels(run, config, most_s)
     except Exception as error:  # a table less, not a surface
@@ -178,7 +180,7 @@ def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[s
 
 
 def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
-    """Windows of `side` cells around tie points that are spread over the scene, each far from those before it."""
+    """Windows of `side` cells around tie points spread over the scene; each lies far from the earlier ones."""
     xy = (match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
     first, size = (
         (match_scene.overlap_window.col, match_scene.overlap_window.row),
@@ -191,7 +193,7 @@ def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     share = (np.arange(SAMPLE_PLACES) + 0.5) / SAMPLE_PLACES
     places = low + np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * (high - low)
     nearest = [int(np.hypot(*(xy - place).T).argmin()) for place in places]
-    # Whatever the time allows, the places are spread.
+    # Places are ordered so that the first few are already spread over the scene.
     order = [nearest[len(nearest) // 2]]
     while rest := [tie for tie in nearest if tie not in order]:
         order.append(max(rest, key=lambda tie: min(float(np.hypot(*(xy[tie] - xy[old]))) for old in order)))
@@ -200,7 +202,7 @@ def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
 
 
 def shown_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
-    """What curves.json says of a cell, or of the first of the others that can be shown."""
+    """The record of a cell for curves.json, or of the first alternative cell that can be shown."""
     first = tried_cell(cell, found, run, config)
     for row, col in cell.others if "error" in first else ():
         other = tried_cell(replace(cell, row=row, col=col), found, run, config)
@@ -210,7 +212,7 @@ def shown_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunCon
 
 
 def tried_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
-    """What curves.json says of a cell, with an error where no curve can be made."""
+    """The record of a cell for curves.json, with an error where no curve can be made."""
     x, y = found.transform * (cell.col + 0.5, cell.row + 0.5)
     i, j = ((at - found.first) // found.stride for at in (cell.row, cell.col))
     height_m = float(found.height[i, j])
@@ -228,19 +230,19 @@ def tried_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunCon
 
 
 def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
-    """Record and figure of a cell's curves."""
+    """Record and figure of the match curves of a cell."""
     match_scene = run.match_scene
     asked = f"The cell at row {cell.row}, column {cell.col}"
     looked = curves_at(asked, None, match_scene, place_of_cell(xy, height_m, run), config, SHOWN_WITHIN_CELLS)
     report = PointReport.of(asked, looked, match_scene, run.scene.crs)
-    # Where no height was found all that could help is shown.
+    # Where no height was found, all images are shown.
     n_images = len(report.search) if cell.kind == FAILED else report.curves.n_used
     figure = mean_figure(report, n_images, is_small=True)
     return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
 
 
 def place_of_cell(xy: FloatArray, height_m: float, run: ReportedRun) -> Place:
-    """A cell with middle (2,) m at its height in dsm.tif, or at that of the ties nearby where it has none."""
+    """A cell with its centre (2,) m at its height in dsm.tif, or at that of the nearest tie points."""
     match_scene = run.match_scene
     if math.isfinite(height_m):
         z, source = height_m + float(run.undulation(xy[None])[0]), "that of the surface"
@@ -252,16 +254,16 @@ def place_of_cell(xy: FloatArray, height_m: float, run: ReportedRun) -> Place:
 
 
 def middle_height(match_scene: MatchScene) -> float:
-    """The middle of the heights searched, m."""
+    """The middle of the height range, m."""
     return match_scene.origin_m + match_scene.n_steps * match_scene.step_m / 2
 
 
 def said(error: Exception) -> str:
-    """An error in a sentence."""
+    """An error as a sentence."""
     words = " ".join(str(error).split())
     return words if isinstance(error, ZlocusError) else f"{type(error).__name__}: {words}".rstrip(": ") + "."
 
 
 def rounded(value: float) -> float | None:
-    """A number for JSON."""
+    """A rounded number for JSON; None where it is not finite."""
     return round(float(value), 4) if math.isfinite(value) else None

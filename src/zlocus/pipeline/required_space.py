@@ -1,4 +1,4 @@
-"""Whether the disk has room for a surface, told from the headers of the images and the grid before any work."""
+"""Check, before any work, that the disk has room for a surface; from the headers of the images and the grid."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from zlocus.products.rasters import COLOURS
 # Bytes of a cell in a finished tile: height and sigma (float32), quality (uint16), images used (uint8); and of each
 # band of its ortho-image (float32). Finished tiles are kept, not compressed, until the surface is complete.
 TILE_CELL_BYTES, TILE_BAND_BYTES = 11, 4
-# The same of the cells of the rasters, which wait on disk until each raster is whole; the ortho-image has a mask, and
+# Bytes of a cell in the rasters, which are kept on disk until each raster is complete; the ortho-image has a mask, and
 # bands of the images' own data type.
 RASTER_CELL_BYTES = 12
-# Smaller surfaces are begun whatever room there is: they are soon made, and finished tiles are kept if the disk fills.
+# Smaller surfaces are started whatever the space: they take little time, and finished tiles are kept if the disk fills.
 LEAST_REFUSED_BYTES = 1e9
-# Before the tie points are known, a surface is refused when it takes so many times the room there is.
+# Before the tie points are known, a surface is refused only where it needs this many times the free space.
 MARGIN_BEFORE_TIES = 2.0
 
 
@@ -136,14 +136,14 @@ def _check(out: Path, shape: tuple[int, int], cell_m: float, n_bytes: float, mar
 
 @dataclass(frozen=True)
 class _Disk:
-    """folder : on it, that is there."""
+    """A disk. folder : an existing folder on it; free_bytes : free space."""
 
     folder: Path
     free_bytes: int
 
 
 def _disk_of(out: Path) -> _Disk | None:
-    """The disk that a folder is on, or will be; None where it does not say how large it is."""
+    """The disk of a folder that exists or will be made; None where its size is unknown."""
     folder = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
     try:
         found = shutil.disk_usage(folder)

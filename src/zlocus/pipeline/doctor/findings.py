@@ -1,4 +1,4 @@
-"""What the doctor found, in sentences, and how bad it is."""
+"""Findings of the doctor: sentences, each with a level of severity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """level : `STOPS` a run; makes a `POOR` surface; or worth a `NOTE`. about : views concerned, or none."""
+    """One finding. level : `STOPS` a run, makes a `POOR` surface, or is a `NOTE`; about : names of the views concerned."""
 
     level: str
     sentence: str
@@ -23,11 +23,11 @@ class Finding:
 
 
 def poor(name: str, sentence: str) -> Finding:
-    """What makes one view poor."""
+    """A finding that one view will make a poor surface."""
     return Finding(POOR, f"{name}: {sentence}", (name,))
 
 
 def worst(findings: Iterable[Finding]) -> str:
-    """The worst level of all findings, `NOTE` without any."""
+    """The most severe level of all findings; `NOTE` where there are none."""
     levels = {finding.level for finding in findings}
     return next((level for level in (STOPS, POOR) if level in levels), NOTE)

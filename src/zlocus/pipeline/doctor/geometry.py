@@ -1,4 +1,4 @@
-"""What footprints, overlaps and base-to-height let expect, and whether a camera agrees with itself."""
+"""Findings about footprints, overlaps and base-to-height ratios, and about cameras that contradict themselves."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from zlocus.core.footprints import PairGeometry, ViewGeometry
 from zlocus.pipeline.doctor.findings import POOR, Finding, poor
 
-# Limits of what is told.
+# Limits beyond which a finding is made.
 CLOSING_PX = 0.05
 NARROW, WIDE = 0.1, 1.2
 PIXEL_SHARE = 0.2  # by which an ordinary match is off
@@ -20,7 +20,7 @@ FINER = 3.0
 def geometry_findings(
     names: Sequence[str], views: Sequence[ViewGeometry], pairs: Sequence[PairGeometry]
 ) -> list[Finding]:
-    """What cameras and bases let expect, in sentences."""
+    """Findings about cameras, overlaps and base-to-height ratios."""
     told = []
     for name, view in zip(names, views, strict=True):
         if view.lost > 0:
@@ -44,7 +44,7 @@ def geometry_findings(
 
 
 def base_findings(names: Sequence[str], views: Sequence[ViewGeometry], pairs: Sequence[PairGeometry]) -> list[Finding]:
-    """What the directions of view let expect of the heights."""
+    """Findings about the precision that the viewing directions allow."""
     known = [pair for pair in pairs if math.isfinite(pair.base_to_height)]
     if not known:
         return []

@@ -1,4 +1,4 @@
-"""What a full run would take: cells, tiles, memory and time."""
+"""Plan of a full run: cells, tiles, memory and time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from zlocus.pipeline.execution.plan import plan_tiles, tile_needs
 from zlocus.pipeline.required_space import check_room
 from zlocus.pipeline.setup import grid_of_run, match_scene_of_run
 
-# Other machines, ranges of heights and kinds of ground: the time may be so many times shorter or longer.
+# Factor by which the time may be shorter or longer, on other machines, height ranges and kinds of ground.
 ROUGHLY = 3.0
 
 
 @dataclass(frozen=True)
 class RunPlan:
-    """A run with the options given.
+    """Plan of a run with the given options.
 
     cell_m, shape : of the products; heights, step_m, n_steps : of the search; tile_bytes : memory of one tile;
     workers : tiles at a time, as asked and as memory and tiles allow; machine_bytes : memory of this machine, None
@@ -87,7 +87,7 @@ def run_plan(
 
 
 def machine_memory_bytes() -> int | None:
-    """Memory of this machine; None where it does not say."""
+    """Memory of this machine; None where it is unknown."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
@@ -95,7 +95,7 @@ def machine_memory_bytes() -> int | None:
 
 
 def plan_findings(plan: RunPlan, memory_gb: float | None) -> list[Finding]:
-    """Whether memory will do, in sentences."""
+    """Findings about the memory that the plan needs."""
     tile_gb, needed = plan.tile_bytes / 1e9, plan.tile_bytes * plan.workers
     smaller = "set a smaller pyramid.tile in --config"
     if memory_gb is not None and tile_gb > memory_gb:

@@ -1,4 +1,4 @@
-"""The plane that most of a local frame's tie points lie on: a wall, which the frame's z should stand on."""
+"""The plane on which most tie points of a local frame lie, such as a wall; z should be perpendicular to it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from zlocus.sensors.frame import FrameModel
 
 TRIPLES, SEED, FEWEST_TIES = 500, 0, 50
 ENOUGH_TIES = 2000  # that choose among the planes, about: up to twice as many
-# Distance from the plane, as a share of the ties' median distance from their middle, and share of the ties within it.
+# A tie point lies on the plane within this share of the median distance of all ties from their centre; and the share of
+# ties that must lie on it.
 NEAR_SHARE, LEAST_ON_PLANE = 0.02, 0.3
-# Cells that are tilted more than this against a wall see it at a slant.
+# A finding is made where cells are tilted by more than this angle against the wall.
 MOST_TILT_DEG = 15.0
 
 
 def plane_findings(scene: Scene, inputs: Sequence[Path], found: Orientation) -> list[Finding]:
-    """Whether another direction than the frame's would suit what the images show; named in the axes of the file."""
+    """A finding where another direction of z would suit the scene better, given in the axes of the input file."""
     centres = [view.sensor.centre for view in scene.views if isinstance(view.sensor, FrameModel)]
     ties = found.xyz[supported(found.xyz, found.sigma_z_m)]
     if not is_local(scene.crs) or not centres or len(ties) < FEWEST_TIES:
@@ -48,8 +49,10 @@ def plane_findings(scene: Scene, inputs: Sequence[Path], found: Orientation) -> 
 
 
 def main_plane(xyz: FloatArray) -> tuple[FloatArray, float]:
-    """Unit normal (3,) of the plane that most points (n, 3) are near, and their share: the best of planes through three
-    points each, fitted to those near it."""
+    """Unit normal (3,) of the plane on which most points (n, 3) lie, and the share of these points.
+
+    The best of many planes through three points each, fitted to the points that lie on it.
+    """
     triples = xyz[np.random.default_rng(SEED).integers(len(xyz), size=(TRIPLES, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normals, axis=1)

@@ -1,4 +1,4 @@
-"""Image quality from windows spread over an image: nodata, saturation, black borders, blur."""
+"""Image quality, measured in windows spread over an image: no-data pixels, saturation, black borders, blur."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIDE_PX, MOST_WINDOWS = 512, 4  # windows along an axis
 STRONG_PERCENT = 90.0
 FEWEST_EDGES = 50
 BROADEST_PX = 8.0
-# Limits of what is told.
+# Limits beyond which a finding is made.
 SATURATED, BLACK, EMPTY = 0.02, 0.02, 0.3
 BLURRED_PX = 2.0
 BLURRED_BESIDE_OTHERS = 2.0
@@ -26,7 +26,7 @@ BLURRED_BESIDE_OTHERS = 2.0
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Shares of the pixels looked at.
+    """Quality of an image, as shares of the pixels that were examined.
 
     nodata : not valid; saturated : of the valid ones, at the greatest value; black : of the valid ones, exactly 0;
     edge_px : sigma of the Gaussian by which a sharp edge is blurred, across the worse axis, NaN where there are no
@@ -53,7 +53,7 @@ def image_quality(image: ImageSource) -> ImageQuality:
     n_pixels = sum(window.valid.size for window in windows)
     if not len(values):
         return ImageQuality(1.0, 0.0, 0.0, math.nan)
-    # Weighted sums of colours are not whole numbers, though their bands are.
+    # Weighted sums of colour bands are not whole numbers, although the bands are.
     slack = 0.5 if np.dtype(image.dtype).kind in "iu" else 0.0
     edges = []
     for turned in (False, True):
@@ -68,7 +68,7 @@ def image_quality(image: ImageSource) -> ImageQuality:
 
 
 def sample_windows(shape: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
-    """First row, first column, rows and columns of windows spread over an image, all of it where it is small."""
+    """First row, first column, rows and columns of windows spread over an image; one window where it is small."""
     sides = [min(SIDE_PX, length) for length in shape]
     counts = [min(math.ceil(length / SIDE_PX), MOST_WINDOWS) for length in shape]
     starts = [
@@ -79,7 +79,7 @@ def sample_windows(shape: tuple[int, int]) -> Iterator[tuple[int, int, int, int]
 
 
 def edge_ratios(pixels: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How much of the change over six columns happens over the inner two, (k,), at edges across the columns.
+    """Share (k,) of the grey-value change over six columns that happens over the inner two, at vertical edges.
 
     An edge is where the change over two columns is the greatest of three neighbours, and that over six is among the
     strongest of the window.
@@ -101,7 +101,7 @@ def edge_ratios(pixels: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 
 
 def edge_width(ratios: NDArray[np.float32]) -> float:
-    """Sigma (px) of the blur of a step edge whose median ratio this is; NaN where there are too few edges.
+    """Standard deviation (px) of the blur that gives step edges this median ratio; NaN where edges are too few.
 
     A step blurred by sigma s changes by erf(d / (s sqrt 2)) over d pixels to both sides.
     """
@@ -113,7 +113,7 @@ def edge_width(ratios: NDArray[np.float32]) -> float:
 
 
 def quality_findings(names: Sequence[str], found: Sequence[ImageQuality]) -> list[Finding]:
-    """What the images' quality lets expect, in sentences."""
+    """Findings about the quality of the images."""
     findings = []
     edges = np.array([each.edge_px for each in found])
     for i, (name, quality) in enumerate(zip(names, found, strict=True)):
@@ -126,7 +126,7 @@ def quality_findings(names: Sequence[str], found: Sequence[ImageQuality]) -> lis
 
 
 def grey_sentences(quality: ImageQuality) -> Iterator[str]:
-    """What is wrong with an image's grey values."""
+    """Findings about the grey values of an image."""
     if quality.saturated > SATURATED:
         yield (
             f"{percent(quality.saturated)} of its pixels have the image's greatest value. Where it is saturated there "
@@ -140,7 +140,7 @@ def grey_sentences(quality: ImageQuality) -> Iterator[str]:
 
 
 def blur_sentences(quality: ImageQuality, usual_px: float) -> Iterator[str]:
-    """What is wrong with an image's sharpness. usual_px : edge width of the other images, 0 where not known."""
+    """Findings about the sharpness of an image. usual_px : edge width of the other images, 0 where unknown."""
     width = f"{quality.edge_px:.1f} px wide (sigma)"
     if math.isnan(quality.edge_px):
         yield "no edges were found in it, so that little can be matched, and its blur is not known."
@@ -157,5 +157,5 @@ def blur_sentences(quality: ImageQuality, usual_px: float) -> Iterator[str]:
 
 
 def percent(share: float) -> str:
-    """A share as a person says it."""
+    """A share as text."""
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.1f} %"

@@ -24,7 +24,7 @@ VERDICT_WORDS = {STOPS: "fails", POOR: "doubtful", NOTE: "good"}
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found, as far as the inputs let it be found.
+    """Result of the doctor, as far as the inputs could be examined.
 
     views, quality : of the same length, None for an image that cannot be read; geometry : as long as views, or empty;
     pairs : of views that share ground; refused : views that could not be opened.
@@ -41,17 +41,17 @@ class Diagnosis:
 
     @property
     def will_fail(self) -> bool:
-        """Whether a run would stop."""
+        """Whether a run would fail."""
         return worst(self.findings) == STOPS
 
     @property
     def names(self) -> list[str]:
-        """Of the views."""
+        """Names of the views."""
         return [view.name for view in self.views]
 
     @property
     def text(self) -> str:
-        """A report to be read."""
+        """The report as text."""
         quick = (
             "" if self.ties is None or not self.ties.is_quick else "Ties are of a quick pass: a run finds more of them."
         )
@@ -62,7 +62,7 @@ class Diagnosis:
         return "\n\n".join([part for part in parts if part] + [VERDICTS[worst(self.findings)]])
 
     def as_dict(self) -> dict[str, Any]:
-        """For doctor.json."""
+        """The content of doctor.json."""
         return {
             "verdict": VERDICT_WORDS[worst(self.findings)],
             "findings": [
@@ -77,7 +77,7 @@ class Diagnosis:
         }
 
     def view_record(self, number: int) -> dict[str, Any]:
-        """What is known of a view."""
+        """The record of a view."""
         view, quality = self.views[number], self.quality[number]
         record: dict[str, Any] = {
             "path": str(view.path),
@@ -109,7 +109,7 @@ class Diagnosis:
         return record
 
     def pair_record(self, pair: PairGeometry) -> dict[str, Any]:
-        """What is known of a pair."""
+        """The record of a pair of views."""
         found = self.tied(pair)
         return {
             "views": [self.names[i] for i in pair.views],
@@ -121,11 +121,11 @@ class Diagnosis:
         }
 
     def oriented(self, number: int) -> ViewOrientation | None:
-        """What the ties say of a view."""
+        """The orientation of a view; None where there is none."""
         return None if self.ties is None else self.ties.orientation.views[number]
 
     def tied(self, pair: PairGeometry) -> PairOrientation | None:
-        """What the ties say of a pair; None without any."""
+        """The orientation of a pair of views; None where no tie points connect it."""
         found = () if self.ties is None else self.ties.orientation.pairs
         wanted = {self.names[i] for i in pair.views}
         return next((each for each in found if set(each.views) == wanted), None)
@@ -199,7 +199,7 @@ def _plan_record(plan: RunPlan) -> dict[str, Any]:
 
 
 def _table(heading: str, rows: Iterator[Sequence[str]]) -> str:
-    """Rows of cells under a heading, columns aligned; nothing without a row."""
+    """A table as lines of text: rows under a heading, with aligned columns; no lines without a row."""
     cells = list(rows)
     if len(cells) < 2:
         return ""
@@ -213,7 +213,7 @@ def _unit(value: float, unit: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A rough time: 8 s, 5 min, 3.5 h."""
+    """A duration, rounded roughly: 8 s, 5 min, 3.5 h."""
     if seconds < 90:
         return f"{max(seconds, 1):.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

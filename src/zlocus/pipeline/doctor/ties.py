@@ -1,4 +1,4 @@
-"""A quick pass over the tie points: fewer features than a run takes, the same adjustment and residuals."""
+"""A quick search for tie points, with fewer features than in a run and the same adjustment."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from zlocus.pipeline.height_range import range_below_cameras, range_from_ties
 from zlocus.pipeline.setup import MIN_VIEWS, orient_views
 
 QUICK_FEATURES = 4000
-# Images above this size are reduced by twice as much as for a run.
+# Images above this size are reduced twice as much as in a run.
 LARGE_MPX, LARGE_DETAIL = 4.0, 1.0 / 16.0
-# Limits of what is told.
+# Limits beyond which a finding is made.
 EXPECTED_OVERLAP = 0.2
 FEW_TIES = 30
 NEAR_LIMIT = 0.7
@@ -27,8 +27,11 @@ NEAR_LIMIT = 0.7
 
 @dataclass(frozen=True)
 class QuickTies:
-    """orientation : as a run finds it; z_range : heights (m) that a run would search; is_quick : with fewer features
-    than a run."""
+    """Result of the quick search.
+
+    orientation : as in a run; z_range : heights (m) that a run would search; is_quick : whether fewer features were
+    used than in a run.
+    """
 
     orientation: Orientation
     z_range: tuple[float, float]
@@ -36,7 +39,7 @@ class QuickTies:
 
 
 def quick_options(options: OrientationOptions, scene: Scene) -> OrientationOptions:
-    """The options with fewer features, and less detail of large images."""
+    """The options with fewer features, and with large images reduced more."""
     largest = max(math.prod(held_window(view.image)[2:]) for view in scene.views) / 1e6
     detail = options.full_detail_mpx * (LARGE_DETAIL if largest > LARGE_MPX else 1.0)
     return replace(
@@ -47,7 +50,7 @@ def quick_options(options: OrientationOptions, scene: Scene) -> OrientationOptio
 
 
 def quick_ties(scene: Scene, config: RunConfig, asked: tuple[float, float] | None, progress: Progress) -> QuickTies:
-    """Ties and the heights that a run would search; with all features where few tie not every image.
+    """Tie points, and the heights that a run would search. All features are used where a few do not tie every image.
 
     asked : heights (m) of the request or of the scene file.
 
@@ -86,7 +89,7 @@ def _ties(
 def tie_findings(
     names: Sequence[str], found: Orientation, pairs: Sequence[PairGeometry], options: OrientationOptions
 ) -> list[Finding]:
-    """What the ties let expect, in sentences."""
+    """Findings about the tie points."""
     findings = []
     excluded = {each.name: each.reason for each in found.excluded_images}
     for view in found.views:
