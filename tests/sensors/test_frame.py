@@ -15,7 +15,7 @@ from pyproj import CRS, Proj, Transformer
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.camera_kinds import FrameCamera
-from zlocus.io.schema import validated
+from zlocus.io.schema import validate_document
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 
@@ -101,14 +101,14 @@ def test_moved_shifts_the_image():
 )
 def test_cameras_that_make_no_sense_are_refused(tmp_path, changes, says):
     with pytest.raises(InputError, match=says):
-        validated(FrameCamera, GOOD | changes, tmp_path / "scene.yaml", "views[0].camera")
+        validate_document(FrameCamera, GOOD | changes, tmp_path / "scene.yaml", "views[0].camera")
 
 
 def test_the_camera_entry_becomes_the_model(tmp_path):
-    entry = validated(FrameCamera, GOOD | {"angles": [1, 2, 3]}, tmp_path / "scene.yaml")
+    entry = validate_document(FrameCamera, GOOD | {"angles": [1, 2, 3]}, tmp_path / "scene.yaml")
     source = entry.read(tmp_path, tmp_path / "a.tif")
     assert source.centre((100, 100)) is None
-    assert source.model == FrameModel((0, 0, 0), rotation_from_angles(1, 2, 3), 500.0, (10.0, 20.0))
+    assert source.sensor_in_own_crs == FrameModel((0, 0, 0), rotation_from_angles(1, 2, 3), 500.0, (10.0, 20.0))
 
 
 LENSES = {

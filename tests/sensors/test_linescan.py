@@ -8,6 +8,7 @@ from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Transformer
+from scipy.spatial.transform import Rotation
 
 from flights import (
     ADVANCE_M,
@@ -29,7 +30,6 @@ from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.earth_frame import WGS84_EARTH, FrameSpace
 from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes, RectifiedModel
 from zlocus.sensors.projection_table import projection_table
-from zlocus.sensors.rotation import from_navigation, from_photogrammetric
 from zlocus.sensors.trajectory import Drift, Trajectory
 
 ROUND_TRIP_PX = 1e-6
@@ -127,7 +127,7 @@ def test_the_axes_of_the_image_system_do_not_matter(line):
     """A focal plane drawn in turned axes, and a camera turned back, are the same camera."""
     model = scanner(Flight(10.0, wobble_deg=0.2), line)
     x, y = line.xy_mm[-1] - line.xy_mm[0]
-    turn = from_photogrammetric(np.zeros(1), np.zeros(1), np.arctan2([y], [x]))[0]
+    turn = Rotation.from_euler("Z", np.arctan2(y, x)).as_matrix()
     straight = FocalLine(line.xy_mm @ turn[:2, :2], FOCAL_MM)
     path = model.trajectory
     turned = LineScanModel(
@@ -280,18 +280,6 @@ def test_a_drift_between_its_knots():
     drift = Drift(np.array([0.0, 1.0, 3.0]), np.arange(18.0).reshape(3, 6))
     np.testing.assert_allclose(drift.at(drift.knots), drift.values, rtol=0, atol=1e-12)
     np.testing.assert_allclose(drift.at(np.array([-5.0, 9.0])), drift.values[[0, -1]], rtol=0, atol=1e-12)
-
-
-def test_angles_of_an_aircraft():
-    """Columns are right, forward and up in east, north and up: nose up, right wing down, clockwise; and their order."""
-    turns = np.deg2rad(np.array([[0.0, 0.0, 90.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [90.0, 30.0, 0.0]]))
-    east, rolled, pitched, both = from_navigation(*turns.T)
-    s, c = np.sin(np.deg2rad(10.0)), np.cos(np.deg2rad(10.0))
-    np.testing.assert_allclose(east, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(rolled, [[c, 0, s], [0, 1, 0], [-s, 0, c]], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(pitched, [[1, 0, 0], [0, c, -s], [0, s, c]], rtol=0, atol=1e-12)
-    # The nose keeps its pitch whatever the roll, which comes last.
-    np.testing.assert_allclose(both[:, 1], [0, np.sqrt(0.75), 0.5], rtol=0, atol=1e-12)
 
 
 def test_geocentric_there_and_back_as_pyproj():

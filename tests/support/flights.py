@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS
 
+from zlocus.io.cameras.linescan_files import navigation_rotations
 from zlocus.sensors.earth_frame import WGS84_EARTH, EarthSpace, FrameSpace, east_north_up
 from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes
-from zlocus.sensors.rotation import from_navigation
 from zlocus.sensors.trajectory import Trajectory
 
 UTM = CRS.from_epsg(32632)
@@ -46,7 +46,7 @@ class Flight:
         centres = np.column_stack([CENTRE[0] + east, CENTRE[1] + north, np.full(len(row), FLIGHT_M)])
         centres += self.wobble_m * np.column_stack([wave[3], wave[4], wave[3]])
         roll, pitch, yaw = np.deg2rad(self.wobble_deg) * np.array(wave[:3])
-        return centres, from_navigation(roll, pitch, heading + yaw + np.deg2rad(self.crab))
+        return centres, navigation_rotations(roll, pitch, heading + yaw + np.deg2rad(self.crab))
 
     def trajectory(self, margin=4500.0, every_rows=1.6):
         row = np.arange(-margin, ROWS + margin, every_rows)
@@ -77,7 +77,7 @@ def on_earth(heading, along, base, lon, lat):
     ahead = local @ [np.sin(heading), np.cos(heading), 0.0]
     start = WGS84_EARTH.cartesian_from_ground(np.array([[lon, lat, base + 2000.0]]))
     centres = start + ((row - ROWS / 2) * ADVANCE_M)[:, None] * ahead
-    camera = local @ from_navigation(np.zeros(1), np.zeros(1), np.array([heading]))[0]
+    camera = local @ navigation_rotations(np.zeros(1), np.zeros(1), np.array([heading]))[0]
     trajectory = Trajectory(row * INTERVAL_S, centres, np.broadcast_to(camera.T, (len(row), 3, 3)))
     lines = LineTimes.regular(0.0, INTERVAL_S, ROWS)
     return LineScanModel(focal_line(along), lines, trajectory, EarthSpace(crs)), local

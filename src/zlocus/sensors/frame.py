@@ -10,7 +10,6 @@ from pyproj import CRS
 from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.distortion import Distortion
 from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace, Space
-from zlocus.sensors.rotation import from_photogrammetric, from_vectors
 
 Row = tuple[float, float, float]
 
@@ -90,10 +89,15 @@ class FrameModel:
         return replace(self, principal_point=(self.principal_point[0] + column, self.principal_point[1] + row))
 
     def corrected(self, offset: FloatArray, turn: FloatArray) -> FrameModel:
-        """The camera moved along its own axes by offset (3,) m and turned about them by turn (3,) rad: a vector, right,
-        down, forwards, of its length."""
+        """The camera moved and turned along and about its own axes: right, down, forwards.
+
+        offset : (3,) m; turn : (3,) rad, a rotation vector (its length is the angle).
+        """
+        # SciPy's rotations cost 0.2 s to import, and few runs need them here.
+        from scipy.spatial.transform import Rotation
+
         centre = np.array(self.centre) + np.asarray(offset, float) @ self.rotation
-        rows = from_vectors(-np.asarray(turn, float)[None])[0] @ self.rotation
+        rows = Rotation.from_rotvec(-np.asarray(turn, float)).as_matrix() @ self.rotation
         return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
 
     def turned(self, rotation: FloatArray) -> FrameModel:
@@ -133,7 +137,9 @@ def rotation_from_angles(omega: float, phi: float, kappa: float) -> tuple[Row, R
     to the right, y up and z backwards: R = Rx(omega) Ry(phi) Rz(kappa) (Kraus 2007, section 2.1). All zero looks
     straight down with the top of the image to the north.
     """
-    from_image = from_photogrammetric(*np.deg2rad([[omega], [phi], [kappa]]))[0]
+    from scipy.spatial.transform import Rotation
+
+    from_image = Rotation.from_euler("XYZ", [omega, phi, kappa], degrees=True).as_matrix()
     return as_rows(np.diag([1.0, -1.0, -1.0]) @ from_image.T)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.sensors.rotation import from_vectors
 
 MIN_SAMPLES = 4
 # Beyond an end, the mean motion of its last `MEAN_SECONDS` goes on; the turning eases off within `EASE_SECONDS`.
@@ -65,6 +64,8 @@ class Trajectory:
     def _run_on(self, end: int, way: int) -> tuple[FloatArray, FloatArray]:
         """Samples (k, 13), time, rotation and centre, beyond the first (0, -1) or last (-1, 1) of the trajectory,
         outwards, and the velocity (3,) there."""
+        from scipy.spatial.transform import Rotation
+
         away = np.abs(self.times - self.times[end])
         inner = int(np.argmin(np.where(away >= min(MEAN_SECONDS, away.max()), away, np.inf)))
         span = self.times[end] - self.times[inner]
@@ -74,7 +75,7 @@ class Trajectory:
         velocity = (self.centres[end] - self.centres[inner]) / span
         since = way * EASE_SECONDS * np.arange(1, EASE_SAMPLES + 1) / EASE_SAMPLES
         eased = since * (1 - np.abs(since) / (2 * EASE_SECONDS))
-        rotations = from_vectors(eased[:, None] * rate) @ self.rotations[end]
+        rotations = Rotation.from_rotvec(eased[:, None] * rate).as_matrix() @ self.rotations[end]
         centres = self.centres[end] + since[:, None] * velocity
         return np.column_stack([self.times[end] + since, rotations.reshape(-1, 9), centres]), velocity
 
@@ -121,7 +122,9 @@ class Drift:
 
     def corrected(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory with the drift added at its samples."""
+        from scipy.spatial.transform import Rotation
+
         drift = self.at(trajectory.times)
         offset = np.einsum("nji,nj->ni", trajectory.rotations, drift[:, :3])
-        turned = from_vectors(-drift[:, 3:]) @ trajectory.rotations
+        turned = Rotation.from_rotvec(-drift[:, 3:]).as_matrix() @ trajectory.rotations
         return Trajectory(trajectory.times, trajectory.centres + offset, turned)

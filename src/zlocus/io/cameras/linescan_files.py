@@ -10,6 +10,7 @@ from pyproj import CRS
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
+from zlocus.io.crs import is_in_metres
 from zlocus.io.number_table import NumberTable, read_number_table, write_number_table
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, EarthSpace, between, east_north_up
 from zlocus.sensors.linescan import FocalLine, LineTimes
@@ -177,8 +178,8 @@ def _one_of(table: NumberTable, choices: tuple[tuple[str, ...], ...]) -> tuple[s
     """The group of column names of which the table has some; it must be exactly one."""
     given = [names for names in choices if any(name in table.columns for name in names)]
     if len(given) != 1:
-        said = " or ".join(", ".join(names) for names in choices)
-        raise InputError(f"The {table.what} {table.path} must have the columns {said}, one of these only.")
+        allowed = " or ".join(", ".join(names) for names in choices)
+        raise InputError(f"The {table.what} {table.path} must have the columns {allowed}, one of these only.")
     return given[0]
 
 
@@ -190,8 +191,10 @@ def _of_line(table: NumberTable, name: str | None) -> NumberTable:
         return table
     if name not in held:
         advice = f"Write line: with one of {', '.join(held)}" if held else "Leave line: out, or add that column"
-        said = "names no line" if name is None else f"asks for the line {name!r}"
-        raise InputError(f"The {table.what} {table.path} has {len(held)} named lines, and the scene {said}. {advice}.")
+        problem = "names no line" if name is None else f"asks for the line {name!r}"
+        raise InputError(
+            f"The {table.what} {table.path} has {len(held)} named lines, and the scene {problem}. {advice}."
+        )
     rows = np.flatnonzero([line == name for line in lines])
     columns = {key: values[rows] for key, values in table.columns.items()}
     return NumberTable(table.path, table.what, columns, {}, tuple(table.lines[row] for row in rows))
@@ -260,8 +263,7 @@ def _checked(table: NumberTable, place: tuple[str, ...], crs: CRS | None) -> CRS
         if crs is None:
             raise InputError(f"The {table.what} {table.path} has x, y, z. Name their crs in the scene file.")
         fits = crs.is_geocentric or crs.is_projected
-    metres = crs.is_geographic or all(abs(axis.unit_conversion_factor - 1.0) < 1e-9 for axis in crs.axis_info)
-    if not fits or crs.is_compound or not metres:
+    if not fits or crs.is_compound or not (crs.is_geographic or is_in_metres(crs)):
         raise InputError(
             f"The {table.what} {table.path} has {', '.join(place)}, which {crs.name} is not for. Allowed: a projected "
             "CRS in metres or EPSG:4978 for x, y, z; a geographic one for lon, lat, height; heights are ellipsoidal."

@@ -162,8 +162,8 @@ def _text_images(path: Path, cameras: dict[int, _ColmapCamera]) -> list[Imported
 
 def _announced(line: str, what: str, before: int | None) -> int | None:
     """The number of cameras or images that a comment of COLMAP announces; `before` for other comments."""
-    found = re.match(rf"#\s*Number of {what}:\s*(\d{{1,18}})\b", line)
-    return int(found[1]) if found else before
+    match = re.match(rf"#\s*Number of {what}:\s*(\d{{1,18}})\b", line)
+    return int(match[1]) if match else before
 
 
 def _check_count(announced: int | None, count: int, what: str, path: Path) -> None:
@@ -191,9 +191,9 @@ class _BinaryReader:
     def values(self, form: str) -> tuple[Any, ...]:
         form = "<" + form
         self._check(struct.calcsize(form))
-        found = struct.unpack_from(form, self._content, self._at)
+        values = struct.unpack_from(form, self._content, self._at)
         self._at += struct.calcsize(form)
-        return found
+        return values
 
     def name(self) -> str:
         end = self._content.find(b"\0", self._at)
