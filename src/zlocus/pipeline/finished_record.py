@@ -89,7 +89,7 @@ def comparable(key: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of the bytes of a product, or of the rows of a GeoPackage, whose bytes change when programs only read it."""
+    """SHA-256 of a product's bytes, or of a GeoPackage's rows, because its bytes change when programs only read it."""
     if path.suffix == ".gpkg" and (found := _checksum_of_layers(path)):
         return found
     with path.open("rb") as file:

@@ -121,7 +121,7 @@ def with_heights(
     """
     if vertical_datum.geoid is not None and is_local(scene.crs):
         raise GeometryError(
-            f"The scene's frame is local, where no place is above {vertical_datum.surface}. Leave --vertical out."
+            f"The scene's frame is local, where no place is above {vertical_datum.surface_name}. Leave --vertical out."
         )
     if heights is None or vertical_datum.geoid is None:
         return scene if heights is None else replace(scene, heights=heights)

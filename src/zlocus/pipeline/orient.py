@@ -117,7 +117,7 @@ def control_points(request: OrientRequest, scene: Scene) -> GroundControl:
     vertical = control_datum(request)
     if vertical.geoid is not None and is_local(scene.crs):
         raise GeometryError(
-            f"The scene's frame is local, where no place is above {vertical.surface}. Leave --control-vertical out."
+            f"The scene's frame is local, where no place is above {vertical.surface_name}. Leave --control-vertical out."
         )
     return read_control(request.control, scene.views, vertical, scene.crs)
 

@@ -103,7 +103,7 @@ def write_maps(
         known = np.isfinite(xyz).all(axis=-1)
         xyz[known, 2] -= vertical_datum.undulation(xyz[known, :2], crs)
         z[row : row + rows] = xyz[..., 2]
-    above = "" if is_local(crs) else f" above {vertical_datum.surface}"
+    above = "" if is_local(crs) else f" above {vertical_datum.surface_name}"
     write_map(out / f"{name}_height.tif", z, f"height{above} of what the pixel shows", "m")
     if isinstance(space.rays, DepthRays):
         with np.errstate(divide="ignore", invalid="ignore"):

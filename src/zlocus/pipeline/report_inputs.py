@@ -134,7 +134,7 @@ def write_views(path: Path, run: ReportedRun) -> None:
 
 
 def write_curves(path: Path, folder: Path, run: ReportedRun, config: RunConfig, most_s: float) -> None:
-    """Write match curves of example cells of the surface in a folder; where one cannot be made, its error is written."""
+    """Write match curves of example cells of the surface in a folder; a cell without curves gets its error."""
     found, start, cells = survey(folder), time.perf_counter(), []
     chosen = chosen_cells(found)
     for cell in chosen:

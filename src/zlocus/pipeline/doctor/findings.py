@@ -15,7 +15,7 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding. level : `STOPS` a run, makes a `POOR` surface, or is a `NOTE`; about : names of the views concerned."""
+    """One finding. level : `STOPS` a run, makes a `POOR` surface, or is a `NOTE`; about : names of its views."""
 
     level: str
     sentence: str
