@@ -61,7 +61,7 @@ def centres(geobox):
 def test_the_ellipsoid_needs_nothing():
     datum = named_vertical_datum("ellipsoid")
     assert datum == ELLIPSOIDAL
-    assert (datum.crs, datum.files, datum.surface) == (None, (), "the ellipsoid")
+    assert (datum.crs, datum.files, datum.surface_name) == (None, (), "the ellipsoid")
     assert not datum.undulation(centres(GRID), UTM).any()
     heights = np.ones(GRID.shape, np.float32)
     assert datum.heights_from_ellipsoidal(heights, GRID) is heights

@@ -46,6 +46,11 @@ def is_on_earth(crs: CRS) -> bool:
     return True
 
 
+def is_in_metres(crs: CRS) -> bool:
+    """Whether all axes of a CRS are in metres."""
+    return all(abs(axis.unit_conversion_factor - 1.0) <= 1e-9 for axis in crs.axis_info)
+
+
 def checked_crs(crs: CRS) -> CRS:
     """The horizontal part of a projected CRS in metres.
 
@@ -60,7 +65,7 @@ def checked_crs(crs: CRS) -> CRS:
     if not flat.is_projected:
         kind = "geographic (degrees)" if flat.is_geographic else "not projected"
         raise ConfigError(f"{named} is {kind}. {advice}, or leave --crs out.")
-    if any(abs(axis.unit_conversion_factor - 1.0) > 1e-9 for axis in flat.axis_info):
+    if not is_in_metres(flat):
         raise ConfigError(f"{named} is in {flat.axis_info[0].unit_name}. {advice}.")
     if not is_on_earth(flat):
         raise ConfigError(f"The CRS {quoted(crs.to_string())} cannot be converted to places on the Earth. {advice}.")

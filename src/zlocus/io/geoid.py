@@ -103,10 +103,10 @@ class GeoidRaster:
         x, y = between(crs.to_2d(), self.crs).transform(xy[0], xy[1])
         a, b, _, d, e = self.transform[:5]
         around = np.array([[x, y], [x + a, y + d], [x + b, y + e]])
-        there = np.column_stack(
+        ground_xy = np.column_stack(
             between(crs.to_2d(), self.crs).transform(around[:, 0], around[:, 1], direction="INVERSE")
         )
-        return float(np.hypot(*(there[1:] - there[0]).T).min())
+        return float(np.hypot(*(ground_xy[1:] - ground_xy[0]).T).min())
 
     @property
     def _is_around(self) -> bool:

@@ -49,11 +49,11 @@ def read_json(path: Path, start: str | None = None, advice: str = EXPORT_AGAIN) 
         return float(text) if math.isfinite(float(text)) else refuse(text)
 
     def table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) < len(pairs):
+        mapping = dict(pairs)
+        if len(mapping) < len(pairs):
             keys = [key for key, _ in pairs]
             raise ValueError(f"it holds {quoted(next(key for key in keys if keys.count(key) > 1))} twice in one place")
-        return found
+        return mapping
 
     text = read_text(path)
     if start is not None:

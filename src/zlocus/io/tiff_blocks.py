@@ -84,9 +84,9 @@ def held_in_blocks(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
                 f"{path} is truncated: it has {size} bytes, and pixels of row {row} on lie behind its end. Copy it "
                 "again from its source."
             )
-        there = (offsets > 0) | (lengths > 0)
-        if not there.all():
-            is_sparse, number = True, number[there]
+        is_stored = (offsets > 0) | (lengths > 0)
+        if not is_stored.all():
+            is_sparse, number = True, number[is_stored]
         held[number // n_across // down, number % n_across // across] = True
     return HeldPixels((rows * down, cols * across), source.shape, held) if is_sparse else None
 

@@ -79,9 +79,9 @@ def border_plateau(image: ImageSource) -> BorderPlateau | None:
         here = is_other.any(axis=0)
         first_other[here] = np.minimum(first_other[here], row + is_other[:, here].argmax(axis=0))
         last_other[here] = row + count - 1 - is_other[::-1, here].argmax(axis=0)
-    found = BorderPlateau(value, left, right, first_other.astype(np.int64), (rows - 1 - last_other).astype(np.int64))
-    is_large = found.n_pixels >= MIN_PLATEAU_SHARE * rows * cols
-    return found if is_large and found.n_pixels >= MIN_SHARE_OF_VALUE * n_of_value else None
+    plateau = BorderPlateau(value, left, right, first_other.astype(np.int64), (rows - 1 - last_other).astype(np.int64))
+    is_large = plateau.n_pixels >= MIN_PLATEAU_SHARE * rows * cols
+    return plateau if is_large and plateau.n_pixels >= MIN_SHARE_OF_VALUE * n_of_value else None
 
 
 def _value_at_border(image: ImageSource) -> float | None:

@@ -64,7 +64,7 @@ class VerticalDatum:
     crs: CRS | None = None
 
     @property
-    def surface(self) -> str:
+    def surface_name(self) -> str:
         """The surface in words, for descriptions: "the ellipsoid", "the EGM96 geoid"."""
         if self.geoid is None:
             return "the ellipsoid"
@@ -141,8 +141,8 @@ class VerticalDatum:
             for size in (xmax - xmin, ymax - ymin)
         )
         x, y = np.meshgrid(np.linspace(xmin, xmax, n_x), np.linspace(ymin, ymax, n_y))
-        found = self.undulation(np.column_stack([x.ravel(), y.ravel()]), crs)
-        return float(found.min()), float(found.max())
+        undulation = self.undulation(np.column_stack([x.ravel(), y.ravel()]), crs)
+        return float(undulation.min()), float(undulation.max())
 
     def compound_crs(self, horizontal: CRS) -> CRS:
         """The compound CRS of a map and this datum; for the ellipsoid the horizontal CRS alone.
@@ -164,7 +164,7 @@ class VerticalDatum:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of run.json."""
-        record: dict[str, Any] = {"heights_above": self.surface}
+        record: dict[str, Any] = {"heights_above": self.surface_name}
         if self.crs is not None and self.geoid is not None:
             code = self.crs.to_epsg()
             record |= {"crs": self.crs.name if code is None else f"EPSG:{code}", "geoid": str(self.geoid.path)}
@@ -173,7 +173,7 @@ class VerticalDatum:
 
 ELLIPSOIDAL = VerticalDatum(ELLIPSOID)
 # Band description of a surface with ellipsoidal heights, which its CRS cannot express.
-ELLIPSOIDAL_DESCRIPTION = f"height above {ELLIPSOIDAL.surface}"
+ELLIPSOIDAL_DESCRIPTION = f"height above {ELLIPSOIDAL.surface_name}"
 
 
 def named_vertical_datum(given: str, option: str = "--vertical") -> VerticalDatum:

@@ -121,10 +121,10 @@ def _source(path: Path, entry: _VrtEntry) -> Path:
 
 def _is_relative(path: Path, entry: _VrtEntry) -> bool:
     """Whether the path of an entry is relative to the VRT."""
-    said = next((e.text for e in _entries(entry.inside) if e.name == "relativetovrt"), "0")
-    if said not in ("0", "1"):
-        raise InputError(f"{path} is a list of files in which relativeToVRT is {quoted(said)}, not 0 or 1. {ADVICE}")
-    return said == "1"
+    flag = next((e.text for e in _entries(entry.inside) if e.name == "relativetovrt"), "0")
+    if flag not in ("0", "1"):
+        raise InputError(f"{path} is a list of files in which relativeToVRT is {quoted(flag)}, not 0 or 1. {ADVICE}")
+    return flag == "1"
 
 
 def _is_raw(entry: _VrtEntry) -> bool:

@@ -1,4 +1,4 @@
-"""The rasters of a run, written tile by tile."""
+"""The rasters of a surface, written tile by tile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 
 
 class SurfaceRasters:
-    """The rasters of a `Surface`, on one grid, complete when the context ends, else not there.
+    """Writer of the rasters of a `Surface` on one grid. The files appear when the context ends without an error.
 
     dsm.tif, sigma.tif, quality.tif, views.tif and ortho.tif. vertical : what the heights of dsm.tif are above; its CRS
     says so, and those of the others, which hold no heights, are horizontal.
@@ -45,7 +45,7 @@ class SurfaceRasters:
 
         with ExitStack() as undo:
             undo.push(self._stack)
-            above = f"height above {vertical.surface}"
+            above = f"height above {vertical.surface_name}"
             box = vertical.compound_geobox(geobox)
             self._dsm = sink("dsm.tif", "float32", above, box=box, nodata=float("nan"), units="m")
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
@@ -55,7 +55,7 @@ class SurfaceRasters:
             undo.pop_all()
 
     def write(self, row: int, col: int, surface: Surface) -> None:
-        """Put a block of cells with its first cell at (row, col) of the grid."""
+        """Write a block of cells whose first cell is (row, col) of the grid."""
         self._dsm.write(row, col, self._vertical.heights_from_ellipsoidal(surface.height, self._geobox, row, col))
         self._sigma.write(row, col, surface.sigma)
         self._quality.write(row, col, surface.quality)
@@ -76,7 +76,7 @@ class SurfaceRasters:
         try:
             self._stack.__exit__(kind, error, trace)
         except BaseException:
-            # Some were complete already: a set of products that do not belong together helps nobody.
+            # Some files may be complete already, but a set of rasters that do not belong together is of no use.
             for path in self._paths:
                 with suppress(OSError):
                     path.unlink()
@@ -84,7 +84,7 @@ class SurfaceRasters:
 
 
 def as_source(values: NDArray[np.float32], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Grey values in the data type of the images, rounded and kept in range."""
+    """Grey values in the data type of the images, rounded and clipped to its range."""
     if dtype.kind == "f":
         return values.astype(dtype)
     info = np.iinfo(dtype.name)

@@ -168,8 +168,8 @@ class LineScanner:
     def _focal_plane(self, xyz: FloatArray, row: FloatArray) -> FloatArray:
         """Positions (n, 2) m, right and forward, of ground points (n, 3) in the focal plane, at the times of rows."""
         centre, frame_from_camera = self.poses(row)
-        seen = np.einsum("nji,nj->ni", frame_from_camera, xyz - centre)
-        return np.asarray(self.focal_m * seen[:, :2] / -seen[:, 2:])
+        in_camera = np.einsum("nji,nj->ni", frame_from_camera, xyz - centre)
+        return np.asarray(self.focal_m * in_camera[:, :2] / -in_camera[:, 2:])
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`. The row is the one at which the point crosses the line in the focal plane.
@@ -199,8 +199,8 @@ class LineScanner:
         )
         centre, frame_from_camera = self.poses(xy[:, 1])
         towards = np.einsum("nij,nj->ni", frame_from_camera, ray)
-        reach = (z - centre[:, 2]) / towards[:, 2]
-        ground: FloatArray = centre + reach[:, None] * towards
+        ray_scale = (z - centre[:, 2]) / towards[:, 2]
+        ground: FloatArray = centre + ray_scale[:, None] * towards
         ground[:, 2] = z
         return ground
 

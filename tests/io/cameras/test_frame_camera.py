@@ -169,4 +169,4 @@ def test_the_entry_of_the_documents(tmp_path):
     start = page.index("```\ncamera:") + 4
     entry = yaml.safe_load(page[start : page.index("```", start)])["camera"]
     camera = FrameCamera.model_validate(entry)
-    assert camera.read(tmp_path, tmp_path / "a.tif").model.camera_from_ground == rotation_from_angles(0.3, -1.1, 92.0)
+    assert camera.read(tmp_path, tmp_path / "a.tif").sensor_in_own_crs.camera_from_ground == rotation_from_angles(0.3, -1.1, 92.0)

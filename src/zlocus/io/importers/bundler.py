@@ -61,12 +61,12 @@ def read_bundler(request: ImportRequest) -> ImportedCameras:
 
 def _counts(lines: Iterator[tuple[int, str]], path: Path) -> tuple[int, int]:
     line_number, line = next(lines, (2, ""))
-    found = re.fullmatch(r"\s*(\d{1,12})\s+(\d{1,12})\s*", line)
-    if found is None:
+    match = re.fullmatch(r"\s*(\d{1,12})\s+(\d{1,12})\s*", line)
+    if match is None:
         raise InputError(
             f"{path}: line {line_number} is {quoted(line)}, not the numbers of cameras and points. {EXPORT_AGAIN}"
         )
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def _exposure(lines: Iterator[tuple[int, str]], name: str, path: Path) -> ImportedExposure | None:

@@ -37,14 +37,14 @@ class MapPoses:
             The map has no such place.
         """
         lon, lat, height = self.earth.ground_from_cartesian(centre[None])[0]
-        found = np.array([*between(self.earth.crs, self.target).transform(lon, lat), height])
-        if not np.isfinite(found).all():
+        position = np.array([*between(self.earth.crs, self.target).transform(lon, lat), height])
+        if not np.isfinite(position).all():
             raise InputError(
                 f"{path}: {quoted(where)} is at longitude {lon:.6g}, latitude {lat:.6g}, which is no place in "
                 f"{self.target.to_string()}. Give another --crs."
             )
-        _, axes = self.earth.pose(self.target, found)
-        return found, np.asarray(rotation @ axes.T)
+        _, axes = self.earth.pose(self.target, position)
+        return position, np.asarray(rotation @ axes.T)
 
 
 def map_poses(geographic: CRS, crs: str | None, centre: FloatArray) -> MapPoses:

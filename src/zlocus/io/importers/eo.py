@@ -95,13 +95,13 @@ def _heading(fields: Sequence[str]) -> list[str] | None:
 def _checked_heading(heading: Sequence[str], path: Path) -> dict[str, int]:
     order = {}
     for name, spellings in COLUMNS.items():
-        found = [i for i, column in enumerate(heading) if column in spellings]
-        if len(found) != 1:
+        columns = [i for i, column in enumerate(heading) if column in spellings]
+        if len(columns) != 1:
             raise InputError(
-                f"{path} has {len(found) or 'no'} columns for {name} in its heading {quoted(' '.join(heading))}. Name "
-                f"each of {', '.join(COLUMNS)} once, or leave the heading out."
+                f"{path} has {len(columns) or 'no'} columns for {name} in its heading {quoted(' '.join(heading))}. "
+                f"Name each of {', '.join(COLUMNS)} once, or leave the heading out."
             )
-        order[name] = found[0]
+        order[name] = columns[0]
     return order
 
 

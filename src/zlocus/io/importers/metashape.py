@@ -20,7 +20,7 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import InputError
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.crs import is_on_earth
+from zlocus.io.crs import is_in_metres, is_on_earth
 from zlocus.io.importers.base import (
     ImportedCameras,
     ImportedExposure,
@@ -85,7 +85,7 @@ def _placed(exposures: list[ImportedExposure], chunk: Element, request: ImportRe
         return ImportedCameras(path, tuple(exposures))
     geographic = crs.geodetic_crs
     assert geographic is not None, "_chunk_crs sees to it"
-    own = request.crs or (scene_file_crs(crs) if _is_metric_map(crs) else None)
+    own = request.crs or (scene_file_crs(crs) if crs.is_projected and is_in_metres(crs) else None)
     poses = map_poses(geographic, own, exposures[0].centre)
     placed = []
     for shot in exposures:
@@ -111,10 +111,6 @@ def _chunk_crs(chunk: Element, path: Path) -> CRS | None:
     return crs.to_2d()
 
 
-def _is_metric_map(crs: CRS) -> bool:
-    return crs.is_projected and all(abs(axis.unit_conversion_factor - 1) < 1e-9 for axis in crs.axis_info)
-
-
 def _exposure(entry: Element, sensors: dict[str | None, Element], chunk: Element, path: Path) -> ImportedExposure:
     label = entry.get("label") or ""
     where = f"camera {quoted(label)}"
@@ -132,15 +128,15 @@ def _exposure(entry: Element, sensors: dict[str | None, Element], chunk: Element
 def _similarity(entry: Element, chunk: Element, path: Path) -> _Similarity:
     """The transform of the camera's component, in older files that of the chunk; the identity where there is none."""
     component = entry.get("component_id")
-    found = next(
+    transform = next(
         (c.find("transform") for c in chunk.iterfind("components/component") if c.get("id") == component), None
     )
-    found = chunk.find("transform") if found is None else found
-    if found is None:
+    transform = chunk.find("transform") if transform is None else transform
+    if transform is None:
         if _chunk_crs(chunk, path) is not None:
             raise InputError(f"{path} has no transform of the chunk, so its place is not known. {EXPORT_AGAIN}")
         return _Similarity(np.eye(3), np.zeros(3), 1.0)
-    parts = {key: (found.findtext(key) or "").strip() for key in ("rotation", "translation", "scale")}
+    parts = {key: (transform.findtext(key) or "").strip() for key in ("rotation", "translation", "scale")}
     scale = read_number(parts["scale"] or "1", path, "the scale of the chunk")
     if not scale > 0:
         raise InputError(f"{path}: the scale of the chunk is {scale:g}, and must be above 0. {EXPORT_AGAIN}")

@@ -101,19 +101,19 @@ def _camera(exposure: ImportedExposure, image: Path, path: Path, earth: dict[str
 
 def _image_paths(exposures: Sequence[ImportedExposure], path: Path, given: Path | None) -> list[Path]:
     """The paths of the images: in the given folder, else in or near the folder of the cameras."""
-    base = path if path.is_dir() else path.parent
-    folders = [given] if given is not None else [base / name for name in FOLDERS]
+    start = path if path.is_dir() else path.parent
+    folders = [given] if given is not None else [start / name for name in FOLDERS]
     for folder in folders:
         if _find_image(exposures[0].image, folder) is not None:
-            found = {exposure.image: _find_image(exposure.image, folder) for exposure in exposures}
-            missing = [name for name, image in found.items() if image is None]
+            paths_by_name = {exposure.image: _find_image(exposure.image, folder) for exposure in exposures}
+            missing = [name for name, image in paths_by_name.items() if image is None]
             if missing:
                 raise InputError(
                     f"{folder} lacks {len(missing)} of {len(exposures)} images of {path}, first {quoted(missing[0])}. "
                     "Add them, or give another folder with --images."
                 )
-            return [image for image in found.values() if image is not None]
-    where = str(given) if given is not None else f"{base} and images beside it"
+            return [image for image in paths_by_name.values() if image is not None]
+    where = str(given) if given is not None else f"{start} and images beside it"
     raise InputError(
         f"The image {quoted(exposures[0].image)} of {path} is not in {where}. Give the folder with --images."
     )
