@@ -29,7 +29,7 @@ from zlocus.core.sensor_model import SensorModel
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.earth_frame import WGS84_EARTH, FrameSpace
 from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes, RectifiedModel
-from zlocus.sensors.projection_table import projection_table
+from zlocus.sensors.projection_table import TableRequest, projection_table
 from zlocus.sensors.trajectory import Drift, Trajectory
 
 ROUND_TRIP_PX = 1e-6
@@ -220,7 +220,7 @@ def test_a_trajectory_that_ends_with_the_image_stays_smooth():
     for row in (0.0, ROWS - 1.0):
         x, y, _ = model.ground_from_image(np.array([[300.0, row]]), np.array([GROUND_M]))[0]
         grid = Affine(0.2, 0.0, x - 30.0, 0.0, -0.2, y + 30.0)
-        projection_table(model, grid, (300, 300), 32, (GROUND_M - 10.0, GROUND_M + 80.0))
+        projection_table(model, TableRequest(grid, (300, 300), 32, (GROUND_M - 10.0, GROUND_M + 80.0)))
 
 
 def test_is_a_sensor_model_and_can_be_shifted():

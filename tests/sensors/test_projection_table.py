@@ -26,10 +26,11 @@ from zlocus.sensors.projection_table import (
     HIGHEST_DEGREE,
     TOLERANCE_PX,
     UNSTEADY_DEGREE,
+    TableRequest,
+    in_powers_of_t,
     longest_run,
     projection_table,
-    shifted,
-    shown_table,
+    projection_table_where_shown,
 )
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 from zlocus.synthetic.scenes import demo_spec, exposures_of
@@ -73,7 +74,7 @@ def worst_gap(sensor, table, transform, shape, block, n=4000):
 def test_steep_and_wide_views(sensor, cell_m):
     shape, block = (150, 203), 32
     transform = grid(cell_m, shape)
-    table = projection_table(sensor, transform, shape, block, HEIGHTS)
+    table = projection_table(sensor, TableRequest(transform, shape, block, HEIGHTS))
     assert table.nodes.shape == (6, 8, 2, 4)
     assert worst_gap(sensor, table, transform, shape, block) < TOLERANCE_PX
 
@@ -83,7 +84,7 @@ def test_real_satellite_models(shared_data):
     scene = open_scene(sorted((shared_data / "pleiades_triplet_calanques").glob("img_0*.tif")))
     transform = Affine(0.5, 0, 698_000.0, 0, -0.5, 4_793_000.0)
     for view in scene.views:
-        table = projection_table(view.sensor, transform, (700, 700), 32, (50.0, 350.0))
+        table = projection_table(view.sensor, TableRequest(transform, (700, 700), 32, (50.0, 350.0)))
         assert worst_gap(view.sensor, table, transform, (700, 700), 32) < TOLERANCE_PX
 
 
@@ -91,8 +92,8 @@ def test_blocks_too_large_are_refused():
     """A scanner that shakes within a block."""
     shape = (512, 512)
     with pytest.raises(GeometryError, match=r"of 256 cells is .* Use a smaller block"):
-        projection_table(airborne(0.3), grid(0.4, shape), shape, 256, HEIGHTS)
-    projection_table(airborne(0.3), grid(0.4, shape), shape, 8, HEIGHTS)
+        projection_table(airborne(0.3), TableRequest(grid(0.4, shape), shape, 256, HEIGHTS))
+    projection_table(airborne(0.3), TableRequest(grid(0.4, shape), shape, 8, HEIGHTS))
 
 
 def test_a_sensor_that_maps_nothing_shows_nothing():
@@ -100,7 +101,7 @@ def test_a_sensor_that_maps_nothing_shows_nothing():
         def image_from_ground(self, xyz):
             return np.full((len(xyz), 2), np.nan)
 
-    table = projection_table(Blind(), grid(0.5, (64, 64)), (64, 64), 32, HEIGHTS)
+    table = projection_table(Blind(), TableRequest(grid(0.5, (64, 64)), (64, 64), 32, HEIGHTS))
     assert not table.holds.any()
     assert np.isfinite(table.nodes).all()
 
@@ -129,7 +130,7 @@ def test_what_a_lens_cannot_see_is_not_seen():
     ]
     whole = np.all(known, axis=0).reshape(x.shape)
     assert 0.1 < whole.mean() < 0.9
-    table = projection_table(sensor, transform, shape, block, (45.0, 55.0), 2.0, IMAGE, HIGHEST_DEGREE)
+    table = projection_table(sensor, TableRequest(transform, shape, block, (45.0, 55.0), 2.0, HIGHEST_DEGREE), IMAGE)
     assert np.isfinite(table.nodes).all()
     corners = whole[:-1, :-1] & whole[1:, :-1] & whole[:-1, 1:] & whole[1:, 1:]
     assert not (table.holds & ~corners).any()
@@ -200,27 +201,26 @@ def test_each_block_is_tabulated_over_the_heights_at_which_it_is_shown(omega):
     shape, block, sensor = (500, 500), 2, drone(omega=omega)
     transform = grid(0.4, shape)
     heights = (25.0, 140.0)
+    request = TableRequest(transform, shape, block, heights, FINEST_BENT_PX, HIGHEST_DEGREE)
     with pytest.raises(GeometryError):
-        projection_table(sensor, transform, shape, block, heights, FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE)
-    table = shown_table(
-        sensor, transform, shape, block, heights, FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE, True, MOST_LOST
-    )
+        projection_table(sensor, request, IMAGE)
+    table = projection_table_where_shown(sensor, request, IMAGE, MOST_LOST, may_drop_heights=True)
     errors, left_out = shown_errors(table, sensor, transform, shape, block, IMAGE)
     assert len(errors) > 300
     assert errors.max() < 1.5 * FINEST_BENT_PX
     assert left_out < 0.25
-    low = shown_table(
-        sensor, transform, shape, block, (25.0, 90.0), FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE, True, MOST_LOST
+    low = projection_table_where_shown(
+        sensor, replace(request, z_range=(25.0, 90.0)), IMAGE, MOST_LOST, may_drop_heights=True
     )
     assert shown_errors(low, sensor, transform, shape, block, IMAGE)[1] < 0.02
 
 
 def test_what_is_too_bent_is_refused_unless_it_may_be_left_out():
     shape, sensor = (200, 200), drone()
-    more = (grid(1.0, shape), shape, 4, (25.0, 140.0), FINEST_BENT_PX, IMAGE, HIGHEST_DEGREE)
+    request = TableRequest(grid(1.0, shape), shape, 4, (25.0, 140.0), FINEST_BENT_PX, HIGHEST_DEGREE)
     with pytest.raises(GeometryError, match=r"of 4 cells is .* Use a smaller block or fewer heights"):
-        shown_table(sensor, *more, False, MOST_LOST)
-    table = shown_table(sensor, *more, True, 1.0)
+        projection_table_where_shown(sensor, request, IMAGE, MOST_LOST, may_drop_heights=False)
+    table = projection_table_where_shown(sensor, request, IMAGE, 1.0, may_drop_heights=True)
     assert table.lost.any()
     assert table.holds.any()
     assert np.isfinite(table.nodes).all()
@@ -229,7 +229,7 @@ def test_what_is_too_bent_is_refused_unless_it_may_be_left_out():
 def test_polynomials_of_a_part_of_the_heights_are_those_of_all():
     local = np.random.default_rng(1).normal(size=(5, 2, 8))
     middle, half = np.linspace(-0.5, 0.5, 5), np.linspace(0.2, 0.5, 5)
-    moved, t = shifted(local, middle, half), 0.37
+    moved, t = in_powers_of_t(local, middle, half), 0.37
     s = (t - middle) / half
     expected = np.einsum("cxp,cp->cx", local, s[:, None] ** np.arange(8))
     np.testing.assert_allclose(moved @ t ** np.arange(8), expected, rtol=1e-9)
@@ -256,9 +256,9 @@ def test_raw_lines_of_an_unsteady_flight_need_a_high_degree(unsteady):
     spec, raw, plane = unsteady
     shape, z = (64, 64), (430.0, 500.0)
     around = Affine(0.2, 0.0, spec.west_m + 10.0, 0.0, -0.2, spec.north_m - 10.0)
-    assert projection_table(plane, around, shape, 16, z).holds.all()
+    assert projection_table(plane, TableRequest(around, shape, 16, z)).holds.all()
     with pytest.raises(GeometryError, match="px from the exact model"):
-        projection_table(raw, around, shape, 4, z, FINEST_BENT_PX, degree=HIGHEST_DEGREE)
+        projection_table(raw, TableRequest(around, shape, 4, z, FINEST_BENT_PX, HIGHEST_DEGREE))
     pixels = np.zeros((300, 300), np.float32)
     window = ViewPixels(raw, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
     views = tile_views([window], 0, around, shape, 32, (430.0, 0.5), z, 4)
@@ -284,13 +284,13 @@ def test_blocks_from_which_a_view_is_left_out_are_named():
     shape, pixels = (64, 64), np.zeros((912, 1368), np.float32)
     sensor = replace(drone(), centre=(*CENTRE, 130.0))
     window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
-    table = projection_table(sensor, grid(0.5, shape), shape, 8, (15.0, 128.0), 0.01, IMAGE, 3, 1.0)
+    table = projection_table(sensor, TableRequest(grid(0.5, shape), shape, 8, (15.0, 128.0), 0.01, 3), IMAGE, 1.0)
     assert table.lost.any()
     # Ground 80 m ahead is in the image from 100 m above it, and beyond the fold of the distortion from 3 m.
     ahead = grid(0.5, shape) * Affine.translation(0.0, -160.0)
     for z, is_shown in ((55.0, True), (152.0, False)):
         assert np.isfinite(drone().image_from_ground(np.array([[*(ahead * (32.5, 32.5)), z]]))).all() == is_shown
-    both = projection_table(drone(), ahead, shape, 8, (30.0, 153.0), 2.0, IMAGE, 7, 1.0)
+    both = projection_table(drone(), TableRequest(ahead, shape, 8, (30.0, 153.0), 2.0, 7), IMAGE, 1.0)
     assert (both.lost & ~both.holds).mean() > 0.8
     assert not (table.lost & table.holds).any()
     views = tile_views([window], 0, grid(0.5, shape), shape, 32, (15.0, 0.5), (15.0, 60.0), 4)

@@ -24,7 +24,7 @@ from zlocus.matching.tile_views import COARSER_TABLE_PX, FINEST_TABLE_PX
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.image_rays import DepthRays, HeightRays, PixelModel, Rays
-from zlocus.sensors.projection_table import projection_table
+from zlocus.sensors.projection_table import TableRequest, projection_table
 
 SAMPLES = 7
 ANCHOR = (-0.5, 0.5)
@@ -283,17 +283,11 @@ def _fits(match_scene: MatchScene, block: int) -> bool:
         for level in range(match_scene.levels):
             window = match_scene.overlap_window.at_level(level, 0)
             tolerance_px = 2**level * (COARSER_TABLE_PX if level else FINEST_TABLE_PX)
+            request = TableRequest(
+                match_scene.transform(window, level), (window.rows, window.cols), block, z_range, tolerance_px
+            )
             for view in match_scene.views:
-                shape = (window.rows, window.cols)
-                projection_table(
-                    view.sensor,
-                    match_scene.transform(window, level),
-                    shape,
-                    block,
-                    z_range,
-                    tolerance_px,
-                    (0, 0, *view.image.shape),
-                )
+                projection_table(view.sensor, request, (0, 0, *view.image.shape))
     except GeometryError:
         return False
     return True

@@ -21,8 +21,9 @@ from zlocus.sensors.projection_table import (
     HIGHEST_DEGREE,
     UNSTEADY_DEGREE,
     ProjectionTable,
+    TableRequest,
     projection_table,
-    shown_table,
+    projection_table_where_shown,
 )
 
 FloatImage = NDArray[np.float32]
@@ -237,7 +238,9 @@ def _fitting_tables(
         blocks.append(blocks[-1] // 2)
     large = [b for b in blocks if b > SMALL_BLOCK]
     for cells, z_range, degree in ((block, z_ranges[0], DEGREE), *((b, z_ranges[1], HIGHER_DEGREE) for b in large)):
-        tables = _tables_over_all_heights(views, transform, shape, cells, z_range, near * 2.0**level, degree)
+        tables = _tables_over_all_heights(
+            views, TableRequest(transform, shape, cells, z_range, near * 2.0**level, degree)
+        )
         if tables is not None:
             return tables, cells
     is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in views)
@@ -248,14 +251,14 @@ def _fitting_tables(
     attempts += [(SMALL_BLOCK, far, HIGHEST_DEGREE, LITTLE_LOST), (SMALLEST_BLOCK, far, HIGHEST_DEGREE, 0.0)]
     attempts += [(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MOST_LOST)]
     for cells, px, degree, lost in attempts:
+        request = TableRequest(transform, shape, cells, z_ranges[1], px * 2.0**level, degree)
         try:
             return [
-                shown_table(
-                    view.sensor, transform, shape, cells, z_ranges[1], px * 2.0**level, (*view.origin, *view.shape),
-                    degree, lost > 0.0, max(lost, LITTLE_LOST),
+                projection_table_where_shown(
+                    view.sensor, request, (*view.origin, *view.shape), max(lost, LITTLE_LOST), lost > 0.0
                 )
                 for view in views
-            ], cells  # fmt: skip
+            ], cells
         except GeometryError as error:
             bent = error
     if not is_scanning:
@@ -265,21 +268,13 @@ def _fitting_tables(
     )
 
 
-def _tables_over_all_heights(
-    views: Sequence[ViewPixels],
-    transform: Affine,
-    shape: tuple[int, int],
-    block: int,
-    z_range: tuple[float, float],
-    tolerance_px: float,
-    degree: int,
-) -> list[ProjectionTable] | None:
+def _tables_over_all_heights(views: Sequence[ViewPixels], request: TableRequest) -> list[ProjectionTable] | None:
     """A table per view; None where one of them does not hold, or not wherever its window shows something."""
     tables = []
     for view in views:
         window = (*view.origin, *view.shape)
         try:
-            table = projection_table(view.sensor, transform, shape, block, z_range, tolerance_px, window, degree)
+            table = projection_table(view.sensor, request, window)
         except GeometryError:
             return None
         if table.lost.any():

@@ -1,4 +1,10 @@
-"""Projection of a block of ground cells, tabulated: exact models are never evaluated per cell."""
+"""Projection tables: image positions of a grid of ground cells as polynomials in height, at the corners of blocks.
+
+Exact sensor models are never evaluated per cell. A table evaluates them at the corners of blocks of cells and at a few
+heights; kernels interpolate between these. `projection_table` tabulates each block over all heights.
+`projection_table_where_shown` tabulates each block over the heights at which the image shows it, for cameras so close
+to the ground that a block leaves the image from one height to the next.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +18,74 @@ from numpy.typing import NDArray
 from zlocus.core.errors import GeometryError
 from zlocus.core.sensor_model import FloatArray, SensorModel
 
+BoolArray = NDArray[np.bool_]
+# A part of an image: first row, first column, number of rows, number of columns, px.
+ImagePart = tuple[int, int, int, int]
+
 TOLERANCE_PX = 0.01
 DEGREE = 3
 # For cameras so close that their scale changes a lot from the lowest to the highest ground.
 HIGHER_DEGREE, HIGHEST_DEGREE = 7, 11
-# For raw lines of an unsteady flight: each height on a slanted ray is another exposure. (Beyond about 35 the
-# coefficients lose their digits.)
+# For raw lines of an unsteady flight, in which each height on an oblique ray belongs to another exposure. Above a
+# degree of about 35 the coefficients lose their significant digits.
 UNSTEADY_DEGREE = 31
-# Where a corner is put that the sensor cannot map: in no image, and finite, as the kernels need it.
+# Position of corners that the sensor cannot map: outside of every image, and finite, because the kernels need that.
 NOWHERE_PX = -1e9
-CHECKED = (-1.0, -0.7, 0.0, 0.7, 1.0)
+# Heights t at which a table over all heights is compared with the exact model.
+CHECKED_T = (-1.0, -0.7, 0.0, 0.7, 1.0)
+# Number of heights at which the visibility of blocks is sampled. At these and between them a table is compared with the
+# exact model.
+N_SAMPLED_HEIGHTS = 33
+# Chebyshev coefficients below this share of the tolerance are set to zero: as polynomials over a short part of the
+# heights they would be large numbers that cancel.
+NEGLIGIBLE_SHARE = 0.02
+# The four corners of all blocks, as slices of an array of corners.
+CORNERS = tuple((slice(i, n), slice(j, m)) for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None)))
+
+
+@dataclass(frozen=True)
+class TableRequest:
+    """What a projection table covers, and how exact it must be.
+
+    transform : of the ground grid, from (column, row) of cell corners to x and y; shape : rows and columns of cells;
+    block : cells along the side of a block; z_range : lowest and highest height, m; tolerance_px : largest distance
+    from the exact model; degree : of the polynomials in height.
+    """
+
+    transform: Affine
+    shape: tuple[int, int]
+    block: int
+    z_range: tuple[float, float]
+    tolerance_px: float = TOLERANCE_PX
+    degree: int = DEGREE
+
+    @property
+    def corner_rows(self) -> FloatArray:
+        """(b + 1,) rows of the cells at the corners of blocks."""
+        return self.block * np.arange(-(-self.shape[0] // self.block) + 1, dtype=np.float64)
+
+    @property
+    def corner_cols(self) -> FloatArray:
+        """(d + 1,) columns of the cells at the corners of blocks."""
+        return self.block * np.arange(-(-self.shape[1] // self.block) + 1, dtype=np.float64)
+
+    @property
+    def z_mid(self) -> float:
+        """Middle of the heights, m."""
+        return (self.z_range[0] + self.z_range[1]) / 2
+
+    @property
+    def z_half(self) -> float:
+        """Half the range of heights, at least 0.5 m."""
+        return max((self.z_range[1] - self.z_range[0]) / 2, 0.5)
+
+    def error(self, gap_px: float) -> GeometryError:
+        """The error of a table that is `gap_px` from the exact model."""
+        return GeometryError(
+            f"A projection table of {self.block} cells is {gap_px:.3g} px from the exact model (allowed "
+            f"{self.tolerance_px} px) between heights {self.z_range[0]:.0f} and {self.z_range[1]:.0f} m. Use a smaller "
+            "block or fewer heights."
+        )
 
 
 @dataclass(frozen=True)
@@ -30,106 +94,94 @@ class ProjectionTable:
 
     nodes : (b + 1, d + 1, 2, n) float64, px: corner row, corner column, (x, y), coefficients of 1, t, t^2, ... with
     t = (z - z_mid) / z_half. The corner (b, d) is the centre of cell (b block, d block); between corners positions are
-    bilinear. holds : (b, d) bool, blocks in which that is so; the others are not in the image, or the sensor cannot map
-    all of them: they count as not seen. lost : (b, d) bool, those that the image may show, at some of the heights,
-    where the table does not hold. ends : (b, d, 2), lowest and highest t over which a block's polynomials hold.
+    bilinear. holds : (b, d) bool, blocks in which these positions are exact to the tolerance; the other blocks are not
+    in the image, or the sensor cannot map all of them, and they count as not visible. lost : (b, d) bool, blocks that
+    the image may show, at some of the heights, although the table does not hold there. ends : (b, d, 2), lowest and
+    highest t at which the polynomials of a block hold.
     """
 
     nodes: FloatArray
     z_mid: float
     z_half: float
-    holds: NDArray[np.bool_]
-    lost: NDArray[np.bool_]
+    holds: BoolArray
+    lost: BoolArray
     ends: FloatArray
 
 
 def projection_table(
-    sensor: SensorModel,
-    transform: Affine,
-    shape: tuple[int, int],
-    block: int,
-    z_range: tuple[float, float],
-    tolerance_px: float = TOLERANCE_PX,
-    window: tuple[int, int, int, int] | None = None,
-    degree: int = DEGREE,
-    most_lost: float = 0.0,
+    sensor: SensorModel, request: TableRequest, window: ImagePart | None = None, max_lost_share: float = 0.0
 ) -> ProjectionTable:
-    """Tabulate `sensor` over a grid of cells between two heights.
+    """Projection table of a sensor in which each block is tabulated over all heights.
 
-    transform : of the grid (cell corners to ground); shape : cells (r, c); block : cells between corners; z_range : m;
-    window : the part of the image (row, col, rows, cols) that counts, None is all that the sensor maps;
-    degree : of the polynomials; most_lost : share of the blocks in which the table need not hold, shown or not:
-    they count as not seen.
+    window : the part of the image that counts, None is all that the sensor maps; max_lost_share : share of the blocks
+    in which the table need not hold.
 
     Raises
     ------
     GeometryError
-        Where the table is further than `tolerance_px` from the exact model at the centres of more blocks that the
-        window shows (then a smaller block or a shorter range is needed).
+        The table is further than the tolerance from the exact model, at the centres of more blocks that the window
+        shows than `max_lost_share` allows. A smaller block or a shorter range of heights is needed.
     """
-    rows = block * np.arange(-(-shape[0] // block) + 1, dtype=np.float64)
-    cols = block * np.arange(-(-shape[1] // block) + 1, dtype=np.float64)
-    z_mid, z_half = (z_range[0] + z_range[1]) / 2, max((z_range[1] - z_range[0]) / 2, 0.5)
+    rows, cols, z_mid, z_half = request.corner_rows, request.corner_cols, request.z_mid, request.z_half
+    degree = request.degree
     t = np.cos((np.arange(degree + 1) + 0.5) * np.pi / (degree + 1))
     fit = np.linalg.inv(np.vander(t, increasing=True))
-    positions = np.stack([project_cells(sensor, transform, rows, cols, z_mid + z_half * v) for v in t], axis=-1)
+    positions = _project_at_heights(sensor, request.transform, rows, cols, np.array([z_mid + z_half * v for v in t]))
     shown = np.zeros(positions.shape[:2], bool) if window is None else _shows_any(positions, window)
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
-    whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    shows = shown[:-1, :-1] | shown[1:, :-1] | shown[:-1, 1:] | shown[1:, 1:]
+    whole = np.logical_and.reduce([known[corner] for corner in CORNERS])
+    shows = np.logical_or.reduce([shown[corner] for corner in CORNERS])
     ends = np.broadcast_to((-np.inf, np.inf), (*whole.shape, 2))
     table = ProjectionTable(nodes, z_mid, z_half, whole, ~whole & shows, ends)
-    gaps = table_gaps(table, sensor, transform, block)
+    gaps = _gaps_over_all_heights(table, sensor, request)
     unmapped = (~whole | np.isnan(gaps)) & shows
-    bad = table.holds & (gaps > tolerance_px)
+    bad = table.holds & (gaps > request.tolerance_px)
     if bad.any() and window is not None:
         bad &= _may_show(table, gaps, window)
-    if bad.sum() > most_lost * bad.size:
-        raise projection_error(block, float(gaps[bad].max()), tolerance_px, z_range)
-    return replace(table, holds=table.holds & (gaps <= tolerance_px), lost=bad | unmapped)
+    if bad.sum() > max_lost_share * bad.size:
+        raise request.error(float(gaps[bad].max()))
+    return replace(table, holds=table.holds & (gaps <= request.tolerance_px), lost=bad | unmapped)
 
 
-def projection_error(block: int, gap_px: float, tolerance_px: float, z_range: tuple[float, float]) -> GeometryError:
-    """What is wrong with a table."""
-    return GeometryError(
-        f"A projection table of {block} cells is {gap_px:.3g} px from the exact model (allowed {tolerance_px} px) "
-        f"between heights {z_range[0]:.0f} and {z_range[1]:.0f} m. Use a smaller block or fewer heights."
-    )
+def projection_table_where_shown(
+    sensor: SensorModel, request: TableRequest, window: ImagePart, max_lost_share: float, may_drop_heights: bool
+) -> ProjectionTable:
+    """Projection table of a sensor in which each block is tabulated over the heights at which the image shows it.
 
+    Heights at which the table is further than the tolerance from the exact model are dropped, and with them the heights
+    beyond. window : the part of the image that counts; max_lost_share : share of what the window shows (blocks times
+    heights) that may be dropped or not be mapped; may_drop_heights : False refuses to drop any.
 
-def table_gaps(table: ProjectionTable, sensor: SensorModel, transform: Affine, block: int) -> FloatArray:
-    """Largest distance (b, d) px of the table from the exact model at block centres, at both ends of the heights and
-    between the nodes; NaN where the sensor cannot map a centre."""
-    n_b, n_d = table.holds.shape
-    rows = block * (np.arange(n_b, dtype=np.float64) + 0.5)
-    cols = block * (np.arange(n_d, dtype=np.float64) + 0.5)
-    centre = 0.25 * (table.nodes[:-1, :-1] + table.nodes[1:, :-1] + table.nodes[:-1, 1:] + table.nodes[1:, 1:])
-    worst = np.zeros((n_b, n_d))
-    for t in CHECKED:
-        exact = project_cells(sensor, transform, rows, cols, table.z_mid + t * table.z_half)
-        worst = np.maximum(worst, np.linalg.norm(centre @ t ** np.arange(centre.shape[-1]) - exact, axis=-1))
-    return worst
-
-
-def _shows_any(positions: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Whether any of the n positions (b, d, 2, n) lies in a window, (b, d)."""
-    row, col, n_rows, n_cols = window
-    x, y = positions[:, :, 0], positions[:, :, 1]
-    inside = (x >= col) & (x <= col + n_cols - 1) & (y >= row) & (y <= row + n_rows - 1)
-    return np.asarray(inside.any(axis=-1))
-
-
-def _may_show(table: ProjectionTable, gaps: FloatArray, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Blocks (b, d) that a window may show: by the boxes around their corners at all heights, widened by the gaps."""
-    at = np.stack([table.nodes @ t ** np.arange(table.nodes.shape[-1]) for t in CHECKED])
-    low, high = at.min(axis=0), at.max(axis=0)
-    corners = [(slice(i, n_i), slice(j, n_j)) for i, n_i in ((0, -1), (1, None)) for j, n_j in ((0, -1), (1, None))]
-    low = np.min([low[corner] for corner in corners], axis=0) - gaps[..., None]
-    high = np.max([high[corner] for corner in corners], axis=0) + gaps[..., None]
-    row, col, n_rows, n_cols = window
-    return np.asarray(((high >= (col, row)) & (low <= (col + n_cols - 1, row + n_rows - 1))).all(axis=-1))
+    Raises
+    ------
+    GeometryError
+        More is dropped than `max_lost_share` or `may_drop_heights` allow.
+    """
+    rows, cols, z_mid, z_half = request.corner_rows, request.corner_cols, request.z_mid, request.z_half
+    t = np.linspace(-1.0, 1.0, N_SAMPLED_HEIGHTS)
+    shown = shown_blocks(_project_at_heights(sensor, request.transform, rows, cols, z_mid + z_half * t), window)
+    first, last = _corner_runs(shown)
+    nodes = _fitted_nodes(sensor, request, np.stack([t[first], t[last]], axis=-1))
+    fine = np.linspace(-1.0, 1.0, 2 * N_SAMPLED_HEIGHTS - 1)
+    gaps = _gaps_at_heights(nodes, sensor, request, fine)
+    begins, stops = (2 * f([k[corner] for corner in CORNERS], axis=0) for f, k in ((np.max, first), (np.min, last)))
+    at = np.arange(len(fine))
+    holds = _with_midpoints(shown.around) & (at >= begins[..., None]) & (at <= stops[..., None])
+    holds &= gaps <= request.tolerance_px
+    low, high = longest_run(holds)
+    some = holds.any(axis=-1)
+    kept = some[..., None] & (at >= low[..., None]) & (at <= high[..., None])
+    bent = shown.near & ~kept[..., ::2]
+    is_too_much = (shown.missed | bent).sum() > max_lost_share * (shown.near | shown.missed).sum()
+    if (bent.any() and not may_drop_heights) or is_too_much:
+        raise request.error(float(np.nanmax(gaps[..., ::2][shown.near], initial=0.0)))
+    # A block that is shown at the lowest or highest height is shown beyond it too.
+    low_t, high_t = np.where(low == 0, -np.inf, fine[low]), np.where(high == at[-1], np.inf, fine[high])
+    ends = np.stack([np.where(some, low_t, np.inf), np.where(some, high_t, -np.inf)], axis=-1)
+    lost = np.asarray((shown.missed | bent).any(axis=-1))
+    return ProjectionTable(nodes, z_mid, z_half, some, lost, ends)
 
 
 def project_cells(sensor: SensorModel, transform: Affine, rows: FloatArray, cols: FloatArray, z: float) -> FloatArray:
@@ -140,111 +192,99 @@ def project_cells(sensor: SensorModel, transform: Affine, rows: FloatArray, cols
     return sensor.image_from_ground(xyz).reshape(len(rows), len(cols), 2)
 
 
-BoolArray = NDArray[np.bool_]
-# Heights at which it is looked whether an image shows a block; there and between them, whether its table is exact.
-SAMPLES = 33
-CORNERS = tuple((slice(i, n), slice(j, m)) for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None)))
-# Coefficients this small (share of the tolerance) are dropped: over a short part of the heights they would be large
-# numbers that cancel.
-NEGLIGIBLE = 0.02
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Where an image shows blocks, (b, d, s) at s heights. near : blocks that may be in the image and whose corners the
-    sensor maps; around : these, and as many at the heights before and after, between which a block leaves the image;
-    missed : blocks that may be in it though a corner is not mapped."""
-
-    near: BoolArray
-    around: BoolArray
-    missed: BoolArray
-
-
-def shown_table(
-    sensor: SensorModel,
-    transform: Affine,
-    shape: tuple[int, int],
-    block: int,
-    z_range: tuple[float, float],
-    tolerance_px: float,
-    window: tuple[int, int, int, int],
-    degree: int,
-    may_bend: bool,
-    most_lost: float,
-) -> ProjectionTable:
-    """Tabulate `sensor` over a grid of cells, each block over the heights at which `window` shows it.
-
-    See `projection_table`. Heights at which a block is too bent are left out, and with them those beyond. may_bend :
-    whether that may be; most_lost : share of what the window shows (blocks by heights) that may be left out.
-
-    Raises
-    ------
-    GeometryError
-        Where more is left out.
-    """
-    rows = block * np.arange(-(-shape[0] // block) + 1, dtype=np.float64)
-    cols = block * np.arange(-(-shape[1] // block) + 1, dtype=np.float64)
-    z_mid, z_half = (z_range[0] + z_range[1]) / 2, max((z_range[1] - z_range[0]) / 2, 0.5)
-    t = np.linspace(-1.0, 1.0, SAMPLES)
-    shown = shown_at(_at_heights(sensor, transform, rows, cols, z_mid + z_half * t), window)
-    first, last = corner_runs(shown)
-    ends = np.stack([t[first], t[last]], axis=-1)
-    nodes = fitted(sensor, transform, rows, cols, ends, (z_mid, z_half), degree, NEGLIGIBLE * tolerance_px)
-    fine = np.linspace(-1.0, 1.0, 2 * SAMPLES - 1)
-    middle = np.mean([nodes[corner] for corner in CORNERS], axis=0)
-    exact = _at_heights(sensor, transform, rows[:-1] + block / 2, cols[:-1] + block / 2, z_mid + z_half * fine)
-    gaps = np.linalg.norm(middle @ np.vander(fine, degree + 1, increasing=True).T - exact, axis=2)
-    begins, stops = (2 * f([k[corner] for corner in CORNERS], axis=0) for f, k in ((np.max, first), (np.min, last)))
-    at = np.arange(len(fine))
-    holds = between(shown.around) & (at >= begins[..., None]) & (at <= stops[..., None]) & (gaps <= tolerance_px)
-    low, high = longest_run(holds)
-    some = holds.any(axis=-1)
-    kept = some[..., None] & (at >= low[..., None]) & (at <= high[..., None])
-    bent = shown.near & ~kept[..., ::2]
-    if (bent.any() and not may_bend) or (shown.missed | bent).sum() > most_lost * (shown.near | shown.missed).sum():
-        raise projection_error(block, float(np.nanmax(gaps[..., ::2][shown.near], initial=0.0)), tolerance_px, z_range)
-    # What reaches the ends of the heights goes on beyond them.
-    low_t, high_t = np.where(low == 0, -np.inf, fine[low]), np.where(high == at[-1], np.inf, fine[high])
-    limits = np.stack([np.where(some, low_t, np.inf), np.where(some, high_t, -np.inf)], axis=-1)
-    lost = np.asarray((shown.missed | bent).any(axis=-1))
-    return ProjectionTable(nodes, z_mid, z_half, some, lost, limits)
-
-
-def _at_heights(
+def _project_at_heights(
     sensor: SensorModel, transform: Affine, rows: FloatArray, cols: FloatArray, heights: FloatArray
 ) -> FloatArray:
     """Image positions (b, d, 2, s) px of cells at heights (s,) m."""
     return np.stack([project_cells(sensor, transform, rows, cols, float(z)) for z in heights], axis=-1)
 
 
-def shown_at(positions: FloatArray, window: tuple[int, int, int, int]) -> Shown:
-    """Where a window shows the blocks between corners at positions (b + 1, d + 1, 2, s) px, NaN where unknown: by the
-    box around the corners that are known."""
+def _gaps_over_all_heights(table: ProjectionTable, sensor: SensorModel, request: TableRequest) -> FloatArray:
+    """Largest distance (b, d) px of a table from the exact model at block centres, over the heights `CHECKED_T`; NaN
+    where the sensor cannot map a centre."""
+    n_b, n_d = table.holds.shape
+    rows = request.block * (np.arange(n_b, dtype=np.float64) + 0.5)
+    cols = request.block * (np.arange(n_d, dtype=np.float64) + 0.5)
+    centre = 0.25 * (table.nodes[:-1, :-1] + table.nodes[1:, :-1] + table.nodes[:-1, 1:] + table.nodes[1:, 1:])
+    worst = np.zeros((n_b, n_d))
+    for t in CHECKED_T:
+        exact = project_cells(sensor, request.transform, rows, cols, table.z_mid + t * table.z_half)
+        worst = np.maximum(worst, np.linalg.norm(centre @ t ** np.arange(centre.shape[-1]) - exact, axis=-1))
+    return worst
+
+
+def _gaps_at_heights(nodes: FloatArray, sensor: SensorModel, request: TableRequest, t: FloatArray) -> FloatArray:
+    """Distance (b, d, s) px of polynomials from the exact model at block centres and heights t (s,); NaN where the
+    sensor cannot map a centre."""
+    rows, cols = request.corner_rows[:-1] + request.block / 2, request.corner_cols[:-1] + request.block / 2
+    middle = np.mean([nodes[corner] for corner in CORNERS], axis=0)
+    exact = _project_at_heights(sensor, request.transform, rows, cols, request.z_mid + request.z_half * t)
+    return np.asarray(np.linalg.norm(middle @ np.vander(t, request.degree + 1, increasing=True).T - exact, axis=2))
+
+
+def _shows_any(positions: FloatArray, window: ImagePart) -> BoolArray:
+    """Corners (b, d) of which any of the n positions (b, d, 2, n) px lies in a window."""
+    row, col, n_rows, n_cols = window
+    x, y = positions[:, :, 0], positions[:, :, 1]
+    inside = (x >= col) & (x <= col + n_cols - 1) & (y >= row) & (y <= row + n_rows - 1)
+    return np.asarray(inside.any(axis=-1))
+
+
+def _may_show(table: ProjectionTable, gaps: FloatArray, window: ImagePart) -> BoolArray:
+    """Blocks (b, d) that a window may show: the box around their corners at all heights, widened by the gaps (b, d) px,
+    meets the window."""
+    at = np.stack([table.nodes @ t ** np.arange(table.nodes.shape[-1]) for t in CHECKED_T])
+    low, high = at.min(axis=0), at.max(axis=0)
+    low = np.min([low[corner] for corner in CORNERS], axis=0) - gaps[..., None]
+    high = np.max([high[corner] for corner in CORNERS], axis=0) + gaps[..., None]
+    row, col, n_rows, n_cols = window
+    return np.asarray(((high >= (col, row)) & (low <= (col + n_cols - 1, row + n_rows - 1))).all(axis=-1))
+
+
+@dataclass(frozen=True)
+class ShownBlocks:
+    """Which blocks an image shows at s heights, (b, d, s) bool each.
+
+    near : blocks that may be in the image and whose four corners the sensor maps; around : these, and the same blocks
+    at the heights before and after, between which a block enters or leaves the image; missed : blocks that may be in the
+    image although the sensor does not map one of their corners.
+    """
+
+    near: BoolArray
+    around: BoolArray
+    missed: BoolArray
+
+
+def shown_blocks(positions: FloatArray, window: ImagePart) -> ShownBlocks:
+    """Which blocks a window shows: those whose box around the known corners meets the window.
+
+    positions : (b + 1, d + 1, 2, s) px, of the corners at s heights, NaN where unknown.
+    """
     row, col, n_rows, n_cols = window
     known = np.asarray(np.isfinite(positions).all(axis=2))
     here = known[:, :, None]
-    least = np.min([np.where(here, positions, np.inf)[corner] for corner in CORNERS], axis=0)
-    most = np.max([np.where(here, positions, -np.inf)[corner] for corner in CORNERS], axis=0)
+    low = np.min([np.where(here, positions, np.inf)[corner] for corner in CORNERS], axis=0)
+    high = np.max([np.where(here, positions, -np.inf)[corner] for corner in CORNERS], axis=0)
     first, last = np.array([col, row])[:, None], np.array([col + n_cols - 1, row + n_rows - 1])[:, None]
-    meets = ((most >= first) & (least <= last)).all(axis=2)
+    meets = ((high >= first) & (low <= last)).all(axis=2)
     whole = np.logical_and.reduce([known[corner] for corner in CORNERS])
     near = meets & whole
     around = near.copy()
     around[..., 1:] |= near[..., :-1]
     around[..., :-1] |= near[..., 1:]
-    return Shown(near, around & whole, meets & ~whole)
+    return ShownBlocks(near, around & whole, meets & ~whole)
 
 
-def between(flags: BoolArray) -> BoolArray:
-    """Flags (..., s) at heights, and between each two for which both are set: (..., 2 s - 1)."""
+def _with_midpoints(flags: BoolArray) -> BoolArray:
+    """Flags (..., s) at heights with one more flag between each two heights, set where both are: (..., 2 s - 1)."""
     out = np.empty((*flags.shape[:-1], 2 * flags.shape[-1] - 1), bool)
     out[..., ::2], out[..., 1::2] = flags, flags[..., :-1] & flags[..., 1:]
     return out
 
 
-def corner_runs(shown: Shown) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last of the longest run of heights (b + 1, d + 1) at which a block around each corner is shown; the
-    first is the higher one where there is none."""
+def _corner_runs(shown: ShownBlocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last height index (b + 1, d + 1) of the longest run of heights at which a block around each corner is
+    shown. Where there is none, the first index is the larger one."""
     n_b, n_d, n = shown.around.shape
     around = np.zeros((n_b + 1, n_d + 1, n), bool)
     for corner in CORNERS:
@@ -257,26 +297,21 @@ def corner_runs(shown: Shown) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def longest_run(flags: BoolArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last index (...) of the longest run of set flags (..., s); zeros where there is none."""
     run = np.zeros(flags.shape[:-1], np.int64)
-    most, last = run.copy(), run.copy()
+    longest, last = run.copy(), run.copy()
     for k in range(flags.shape[-1]):
         run = np.where(flags[..., k], run + 1, 0)
-        longer = run > most
-        most, last = np.where(longer, run, most), np.where(longer, k, last)
-    return np.maximum(last - most + 1, 0), last
+        is_longer = run > longest
+        longest, last = np.where(is_longer, run, longest), np.where(is_longer, k, last)
+    return np.maximum(last - longest + 1, 0), last
 
 
-def fitted(
-    sensor: SensorModel,
-    transform: Affine,
-    rows: FloatArray,
-    cols: FloatArray,
-    ends: FloatArray,
-    heights: tuple[float, float],
-    degree: int,
-    negligible_px: float,
-) -> FloatArray:
-    """Polynomials in t (b + 1, d + 1, 2, n) px through Chebyshev nodes between the ends of each corner, (b + 1, d + 1,
-    2); NOWHERE_PX where it has none. heights : z_mid and z_half."""
+def _fitted_nodes(sensor: SensorModel, request: TableRequest, ends: FloatArray) -> FloatArray:
+    """Polynomials in t (b + 1, d + 1, 2, n) px through Chebyshev nodes between the ends of each corner.
+
+    ends : (b + 1, d + 1, 2), lowest and highest t of each corner; where the lowest is larger, the corner has none and
+    its polynomial is the constant NOWHERE_PX.
+    """
+    rows, cols, transform, degree = request.corner_rows, request.corner_cols, request.transform, request.degree
     nodes = np.zeros((len(rows), len(cols), 2, degree + 1))
     nodes[..., 0] = NOWHERE_PX
     at = ends[..., 0] <= ends[..., 1]
@@ -286,25 +321,24 @@ def fitted(
     b, d = np.nonzero(at)
     col, row = cols[d] + 0.5, rows[b] + 0.5
     x, y = transform.a * col + transform.b * row + transform.c, transform.d * col + transform.e * row + transform.f
-    z = heights[0] + heights[1] * (middle[:, None] + half[:, None] * s)
+    z = request.z_mid + request.z_half * (middle[:, None] + half[:, None] * s)
     xyz = np.column_stack([np.repeat(x, len(s)), np.repeat(y, len(s)), z.ravel()])
     values = sensor.image_from_ground(xyz).reshape(-1, len(s), 2)
     waves = np.linalg.solve(chebyshev.chebvander(s, degree), values)
     tail = np.cumsum(np.abs(waves)[:, ::-1], axis=1)[:, ::-1].max(axis=2)
-    waves[tail < negligible_px] = 0.0
-    powers = np.array([np.pad(chebyshev.cheb2poly(row), (0, degree - k)) for k, row in enumerate(_units(degree))])
-    local = np.einsum("cnx,np->cxp", waves, powers)
-    nodes[at] = shifted(local, middle, half)
+    waves[tail < NEGLIGIBLE_SHARE * request.tolerance_px] = 0.0
+    local = np.einsum("cnx,np->cxp", waves, _powers_from_chebyshev(degree))
+    nodes[at] = in_powers_of_t(local, middle, half)
     nodes[at] = np.where(np.isfinite(nodes[at]).all(axis=(1, 2), keepdims=True), nodes[at], NOWHERE_PX)
     return nodes
 
 
-def _units(degree: int) -> list[FloatArray]:
-    """Coefficients of each Chebyshev polynomial up to a degree, (k + 1,) each."""
-    return [np.eye(k + 1)[k] for k in range(degree + 1)]
+def _powers_from_chebyshev(degree: int) -> FloatArray:
+    """(n, n) coefficients of 1, s, s^2, ... of each Chebyshev polynomial up to a degree."""
+    return np.array([np.pad(chebyshev.cheb2poly(np.eye(k + 1)[k]), (0, degree - k)) for k in range(degree + 1)])
 
 
-def shifted(local: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
+def in_powers_of_t(local: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
     """Polynomials (c, 2, n) in (t - middle) / half as polynomials in t, by Horner's scheme. middle, half : (c,)."""
     out = np.zeros_like(local)
     a, b = (1.0 / half)[:, None, None], (-middle / half)[:, None, None]
