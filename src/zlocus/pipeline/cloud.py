@@ -68,11 +68,11 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     check_output(request.out, request.overwrite)
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
-        opened = open_inputs(SetupRequest.of(request), progress, "later")
-        scene, vertical = opened.scene, opened.vertical_datum
+        opened_inputs = open_inputs(SetupRequest.of(request), progress, "later")
+        scene, vertical = opened_inputs.scene, opened_inputs.vertical_datum
         references = reference_names(scene, request.references)
         check_room_for_pixels(request.out, scene, references)
-        inputs = InputFiles.of(opened.files, scene, before)
+        inputs = InputFiles.of(opened_inputs.files, scene, before)
     config = depth_options(config) if is_by_depth(scene) else config
     with watch.stage("orient"):
         setup = set_up_images(scene, config, progress)

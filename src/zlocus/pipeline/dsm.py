@@ -44,7 +44,7 @@ from zlocus.pipeline.surface_products import (
     write_report_inputs,
 )
 from zlocus.pipeline.tile_run import Plan, Tally, TileRun, planned, tile_job, workers_for
-from zlocus.products.derived import check_maps
+from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD
 
 
@@ -77,25 +77,25 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         cameras are in grave doubt.
     """
     check_output(request.out, request.overwrite, may_be_same=True)
-    started: list[TileRun] = []
+    tile_runs: list[TileRun] = []
     try:
         with compression_threads(request.workers or cores()):
-            return _run_stages(request, config, progress, started)
+            return _run_stages(request, config, progress, tile_runs)
     except OutputError as error:
-        if not any(tile_run.checkpoint.finished and tile_run.checkpoint.is_there for tile_run in started):
+        if not any(tile_run.checkpoint.finished and tile_run.checkpoint.is_there for tile_run in tile_runs):
             raise
-        n, checkpoint = len(started[0].checkpoint.finished), started[0].checkpoint
+        n, checkpoint = len(tile_runs[0].checkpoint.finished), tile_runs[0].checkpoint
         raise StoppedError(f"{error} The {n} finished tiles are kept: {checkpoint.how_to_resume}.") from error
     except KeyboardInterrupt:
-        for tile_run in started:
+        for tile_run in tile_runs:
             tile_run.tell_interrupted(progress)
         raise
 
 
-def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, started: list[TileRun]) -> DsmResult:
-    """See `run_dsm`. started : takes the run of the tiles once it starts, for messages after an interrupt."""
+def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile_runs: list[TileRun]) -> DsmResult:
+    """See `run_dsm`. tile_runs : takes the run of the tiles once it starts, for messages after an interrupt."""
     watch = Stopwatch()
-    check_maps(request.products, config.products, may_have_terrain(request))
+    check_derived(request.products, config.products, may_have_terrain(request))
     if request.report:
         importlib.import_module("zlocus.pipeline.report_inputs")  # a fault there must show now, not after the matching
     with watch.stage("open"), progress.stage("Opening images"):
@@ -105,22 +105,22 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, star
         if not missing.matched:
             return _already_finished(request, config, run, missing, progress)
         request = whole_again(request, run.finished, missing, progress)
-    opened, inputs, checkpoint, out, tally = run.opened, run.inputs, run.checkpoint, request.out, Tally()
+    opened_inputs, inputs, checkpoint, out, tally = run.opened_inputs, run.inputs, run.checkpoint, request.out, Tally()
     with watch.stage("orient"):
-        ties = known_ties(checkpoint, opened.scene, progress)
+        ties = known_ties(checkpoint, opened_inputs.scene, progress)
         orientation = orient_views(
-            opened.scene, config.orientation, progress, threads=request.workers, known_ties=ties
+            opened_inputs.scene, config.orientation, progress, threads=request.workers, known_ties=ties
         )  # fmt: skip
         note_orientation(orientation, progress)
     with watch.stage("setup"):
-        setup = set_up_run(SetupRequest.of(request), opened, orientation, config, progress)
+        setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
         progress.note(str(plan))
     job, digest = tile_job(request, setup, config, run.polygons), digest_of(setup.match_scene, orientation)
     tile_run = TileRun(job, tiles, checkpoint, EventLog(out))
     with made_folder(out), checkpoint.open(digest, {} if orientation.ties is None else orientation.ties.arrays()):
-        started.append(tile_run)
+        tile_runs.append(tile_run)
         with watch.stage("match") as elsewhere:
             make = tile_maker(request, job, checkpoint, setup, plan, tally, progress)
             failed = tile_run.run(plan, workers_for(plan, make, progress), progress, elsewhere)
@@ -130,15 +130,15 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, star
             checksums = inputs.record(len(checkpoint.finished))
         with watch.stage("write"):
             remove_earlier_products(out)
-            with surface_rasters(request, setup, opened.vertical_datum) as rasters:
+            with surface_rasters(request, setup, opened_inputs.vertical_datum) as rasters:
                 tile_run.assemble(failed, rasters, tally, progress)
                 inputs.check(len(checkpoint.finished))  # a terrain model that fills gaps is read again here
     with watch.stage("points"):
-        write_points(out, setup, tally.ranked, opened.vertical_datum)
+        write_points(out, setup, tally.labelled_ties, opened_inputs.vertical_datum)
     if request.report:
-        write_report_inputs(out, setup, opened.vertical_datum, config, watch, progress)
+        write_report_inputs(out, setup, opened_inputs.vertical_datum, config, watch, progress)
         remove_outdated_curves(out, inputs, progress)
-    record = run_record(request, config, setup, opened.vertical_datum, checksums, tally)
+    record = run_record(request, config, setup, opened_inputs.vertical_datum, checksums, tally)
     write_maps(request, config, watch, record | {"setup_sha256": digest, "stages": watch.stages}, progress)
     tile_run.end(failed, tally)
     shortcoming = shortcoming_of(tally, setup.doubts, out, progress)
@@ -151,8 +151,8 @@ def _checked_plan(request: DsmRequest, config: RunConfig, run: OpenRun, setup: R
     """How the tiles are worked on, after the checks that need the grid: disk space, geoid and polygons."""
     check_room(request.out, setup.grid, setup.match_scene, has_colours(request, setup))
     plan = planned(setup.match_scene, tiles, config, request)
-    run.opened.vertical_datum.check_covers(
-        matched_area(setup.grid, setup.match_scene.overlap_window), run.opened.scene.crs
+    run.opened_inputs.vertical_datum.check_covers(
+        matched_area(setup.grid, setup.match_scene.overlap_window), run.opened_inputs.scene.crs
     )
     check_polygons(request, setup, run.polygons.inside)
     return plan
@@ -163,7 +163,7 @@ def _already_finished(
 ) -> DsmResult:
     """The result of a run whose surface is there already, after products that are missing were made."""
     assert run.finished is not None, "callers make sure"
-    make_missing(request, config, run.opened, run.finished, missing, progress)
+    make_missing(request, config, run.opened_inputs, run.finished, missing, progress)
     run.checkpoint.remove()  # where a run was stopped between its last file and its end
     coverage = float(read_record(request.out / RECORD)["coverage"])
     return _accepted(request, DsmResult(request.out, coverage, was_finished=True), run.finished.shortcoming)

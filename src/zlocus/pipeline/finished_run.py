@@ -15,7 +15,7 @@ from zlocus.pipeline.execution.checkpoint import TileCheckpoint, difference
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import ITEM, Finished, checksum, comparable, read_finished, update_finished
 from zlocus.pipeline.setup import OpenedInputs, orient_views, set_up_run
-from zlocus.products.derived import FILES, link_all, make_maps
+from zlocus.products.derived import FILES, link_all, write_derived
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.tie_layers import write_ties
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations, write_observations
@@ -63,14 +63,14 @@ def finished_run(request: DsmRequest, checkpoint: TileCheckpoint) -> Finished | 
     out = request.out
     if request.overwrite:
         return None
-    found, held = read_finished(out), held_files(out)
-    if found is None:
+    finished, held = read_finished(out), held_files(out)
+    if finished is None:
         if held and not checkpoint.is_of_this_run:
             raise OutputError(
                 f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite."
             )
         return None
-    differs = difference(found.key, comparable(checkpoint.key)) if found.key else f"its {FINISHED} is damaged"
+    differs = difference(finished.key, comparable(checkpoint.key)) if finished.key else f"its {FINISHED} is damaged"
     if differs:
         if checkpoint.is_of_this_run:
             return None
@@ -80,10 +80,10 @@ def finished_run(request: DsmRequest, checkpoint: TileCheckpoint) -> Finished | 
             f"{out} holds this run, already finished, which --no-resume asks not to take. Leave --no-resume out, or "
             "add --overwrite to make it anew."
         )
-    return found
+    return finished
 
 
-def missing_products(request: DsmRequest, found: Finished, progress: Progress) -> Missing:
+def missing_products(request: DsmRequest, finished: Finished, progress: Progress) -> Missing:
     """Find the products that are missing from a finished run, or requested now in addition.
 
     Raises
@@ -92,8 +92,8 @@ def missing_products(request: DsmRequest, found: Finished, progress: Progress) -
         A product is not what the run wrote.
     """
     out, gone, other = request.out, set[str](), list[str]()
-    with progress.stage("Checking products", len(found.checksums)) as stage:
-        for name, digest in found.checksums.items():
+    with progress.stage("Checking products", len(finished.checksums)) as stage:
+        for name, digest in finished.checksums.items():
             if not (out / name).is_file():
                 gone.add(name)
             elif checksum(out / name) != digest:
@@ -116,7 +116,7 @@ def missing_products(request: DsmRequest, found: Finished, progress: Progress) -
     )
 
 
-def whole_again(request: DsmRequest, found: Finished, missing: Missing, progress: Progress) -> DsmRequest:
+def whole_again(request: DsmRequest, finished: Finished, missing: Missing, progress: Progress) -> DsmRequest:
     """The request of a run that is repeated because products are missing that only matching makes.
 
     It includes the maps and the report that were added to the finished run later.
@@ -125,12 +125,17 @@ def whole_again(request: DsmRequest, found: Finished, missing: Missing, progress
         f"The finished run in {request.out} lacks {', '.join(missing.matched)}, which only matching makes: it is made "
         "again."
     )
-    maps = tuple(name for name in FILES if name in request.products or FILES[name] in found.checksums)
-    return replace(request, products=maps, report=request.report or REPORT in found.checksums)
+    maps = tuple(name for name in FILES if name in request.products or FILES[name] in finished.checksums)
+    return replace(request, products=maps, report=request.report or REPORT in finished.checksums)
 
 
 def make_missing(
-    request: DsmRequest, config: RunConfig, opened: OpenedInputs, found: Finished, missing: Missing, progress: Progress
+    request: DsmRequest,
+    config: RunConfig,
+    opened_inputs: OpenedInputs,
+    finished: Finished,
+    missing: Missing,
+    progress: Progress,
 ) -> None:
     """Make the missing products of a finished run, and record their checksums; nothing else changes.
 
@@ -144,14 +149,14 @@ def make_missing(
         return
     try:
         if missing.of_ties:
-            _make_of_ties(request, config, opened, missing.of_ties, progress)
+            _make_of_ties(request, config, opened_inputs, missing.of_ties, progress)
         if missing.maps:
-            make_maps(out, missing.maps, config.products, progress)
+            write_derived(out, missing.maps, config.products, progress)
         if missing.report:
             from zlocus.pipeline.report_inputs import try_report
 
             try_report(out, progress)
-        if missing.item or set(missing.files) - set(found.checksums):
+        if missing.item or set(missing.files) - set(finished.checksums):
             link_all(out, progress)
     finally:
         update_finished(out, (*missing.files, ITEM))
@@ -161,28 +166,28 @@ def make_missing(
 
 
 def _make_of_ties(
-    request: DsmRequest, config: RunConfig, opened: OpenedInputs, names: Sequence[str], progress: Progress
+    request: DsmRequest, config: RunConfig, opened_inputs: OpenedInputs, names: Sequence[str], progress: Progress
 ) -> None:
     """Make the missing products of the tie points, which are found again where they were not kept."""
     from zlocus.pipeline.report_inputs import ReportedRun, write_shown
 
     out, record = request.out, read_record(request.out / RECORD)
-    known = read_observations(out, len(opened.scene.views))
+    known = read_observations(out, len(opened_inputs.scene.views))
     orientation = orient_views(
-        opened.scene, config.orientation, progress, threads=request.workers, known_ties=known
+        opened_inputs.scene, config.orientation, progress, threads=request.workers, known_ties=known
     )  # fmt: skip
-    setup = set_up_run(SetupRequest.of(request), opened, orientation, config, progress)
+    setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
     if digest_of(setup.match_scene, orientation) != record.get("setup_sha256"):
         raise OutputError(
             f"{', '.join(names)} of {out} cannot be made again, for cameras and heights came out otherwise than in the "
             "run, as they may on another machine. Add --overwrite to make the whole run anew."
         )
     if TIES in names:
-        write_ties(out / TIES, orientation, setup.scene, opened.vertical_datum)
+        write_ties(out / TIES, orientation, setup.scene, opened_inputs.vertical_datum)
     if OBSERVATIONS in names and orientation.ties is not None:
         write_observations(out, orientation.ties)
     if shown := [name for name in names if name in (FOOTPRINTS, CURVES)]:
-        run = ReportedRun.of(setup, opened.vertical_datum)
+        run = ReportedRun.of(setup, opened_inputs.vertical_datum)
         with progress.stage("Match curves"):
             write_shown(out, run, config, _time_of_matching(record), progress, shown)
 

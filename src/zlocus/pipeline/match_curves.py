@@ -35,11 +35,11 @@ def run_curves(request: CurvesRequest, config: RunConfig, progress: Progress) ->
     check_output(request.out, request.overwrite)
     setup_request = SetupRequest.of(request)
     with progress.stage("Opening images"):
-        opened = open_inputs(setup_request, progress)
-        check_views(request, opened.scene)
-    orientation = orient_views(opened.scene, config.orientation, progress)
+        opened_inputs = open_inputs(setup_request, progress)
+        check_views(request, opened_inputs.scene)
+    orientation = orient_views(opened_inputs.scene, config.orientation, progress)
     note_orientation(orientation, progress)
-    setup = set_up_run(setup_request, opened, orientation, config, progress)
+    setup = set_up_run(setup_request, opened_inputs, orientation, config, progress)
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     place = requested_place(request, supported_views(setup.scene, orientation), setup.match_scene, ties)
     with progress.stage("Match curves"):

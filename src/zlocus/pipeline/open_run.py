@@ -23,19 +23,19 @@ from zlocus.pipeline.finished_run import finished_run
 from zlocus.pipeline.required_space import check_room_before_ties, check_room_for_pixels
 from zlocus.pipeline.setup import OpenedInputs, RunSetup, open_inputs
 from zlocus.pipeline.tile_run import Polygons
-from zlocus.products.derived import FILES, check_maps
+from zlocus.products.derived import FILES, check_derived
 
 
 @dataclass(frozen=True)
 class OpenRun:
     """A run whose files are open.
 
-    opened : what the request names; inputs : all files, with their states when the run began; checkpoint : finished
-    tiles; polygons : of the requested area; finished : the record of the same run, where it has finished already, else
-    None.
+    opened_inputs : what the request names; inputs : all files, with their states when the run began; checkpoint :
+    finished tiles; polygons : of the requested area; finished : the record of the same run, where it has finished
+    already, else None.
     """
 
-    opened: OpenedInputs
+    opened_inputs: OpenedInputs
     inputs: InputFiles
     checkpoint: TileCheckpoint
     polygons: Polygons
@@ -53,15 +53,15 @@ def open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> Open
         The folder holds another run and may not be overwritten, or there is no room for the surface.
     """
     before = InputFiles.of(request.inputs)
-    opened = open_inputs(SetupRequest.of(request), progress)
-    inputs = InputFiles.of(opened.files, opened.scene, before)
+    opened_inputs = open_inputs(SetupRequest.of(request), progress)
+    inputs = InputFiles.of(opened_inputs.files, opened_inputs.scene, before)
     key = key_of(request, config, inputs)
     checkpoint = TileCheckpoint.of(request.out, key, request.resume, request.overwrite, inputs.check)
-    finished, polygons = finished_run(request, checkpoint), _area_polygons(request, opened.scene.crs)
+    finished, polygons = finished_run(request, checkpoint), _area_polygons(request, opened_inputs.scene.crs)
     if finished is None:
-        check_maps(request.products, config.products)
-        _check_room_first(request, opened, checkpoint)
-    return OpenRun(opened, inputs, checkpoint, polygons, finished)
+        check_derived(request.products, config.products)
+        _check_room_first(request, opened_inputs, checkpoint)
+    return OpenRun(opened_inputs, inputs, checkpoint, polygons, finished)
 
 
 def may_have_terrain(request: DsmRequest) -> bool:
@@ -76,13 +76,13 @@ def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
     return Polygons(area, mask)
 
 
-def _check_room_first(request: DsmRequest, opened: OpenedInputs, checkpoint: TileCheckpoint) -> None:
+def _check_room_first(request: DsmRequest, opened_inputs: OpenedInputs, checkpoint: TileCheckpoint) -> None:
     """Refuse, before images are read, a run that memory or the disk has no room for."""
     if request.method == "gc3-sgm":
-        check_room_for_pixels(request.out, opened.scene, [view.name for view in opened.scene.views])
+        check_room_for_pixels(request.out, opened_inputs.scene, [view.name for view in opened_inputs.scene.views])
     if not checkpoint.finished:
-        like = None if opened.like is None else opened.like.shape.yx
-        check_room_before_ties(request.out, opened.scene, request.resolution, request.bounds, like)
+        like = None if opened_inputs.like is None else opened_inputs.like.shape.yx
+        check_room_before_ties(request.out, opened_inputs.scene, request.resolution, request.bounds, like)
 
 
 def known_ties(checkpoint: TileCheckpoint, scene: Scene, progress: Progress) -> RefinedTies | None:

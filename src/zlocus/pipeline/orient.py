@@ -51,11 +51,11 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     check_output(request.out, request.overwrite)
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
-        opened = open_inputs(SetupRequest.of(request), progress, "unless local")
-        scene = opened.scene
+        opened_inputs = open_inputs(SetupRequest.of(request), progress, "unless local")
+        scene = opened_inputs.scene
         control = None if request.control is None else control_points(request, scene)
         terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
-    inputs = InputFiles.of([*opened.files, *control_files(request)], scene, before)
+    inputs = InputFiles.of([*opened_inputs.files, *control_files(request)], scene, before)
     with watch.stage("orient"):
         options = options_of_command(config.orientation, request.cameras)
         orientation = orient_views(scene, options, progress, control=control, terrain=terrain)
@@ -117,7 +117,8 @@ def control_points(request: OrientRequest, scene: Scene) -> GroundControl:
     vertical = control_datum(request)
     if vertical.geoid is not None and is_local(scene.crs):
         raise GeometryError(
-            f"The scene's frame is local, where no place is above {vertical.surface_name}. Leave --control-vertical out."
+            f"The scene's frame is local, where no place is above {vertical.surface_name}. Leave --control-vertical "
+            "out."
         )
     return read_control(request.control, scene.views, vertical, scene.crs)
 

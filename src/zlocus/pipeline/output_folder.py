@@ -9,7 +9,7 @@ from pathlib import Path
 
 from zlocus.core.errors import OutputError
 from zlocus.core.requests import FINISHED
-from zlocus.products.derived import remove_maps
+from zlocus.products.derived import remove_derived
 from zlocus.products.report.file_names import forget_report
 from zlocus.products.tie_observations import OBSERVATIONS
 
@@ -42,7 +42,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 def remove_earlier_products(out: Path) -> None:
     """Remove the products of an earlier run, so that old and new products never stand together."""
-    remove_maps(out)
+    remove_derived(out)
     forget_report(out)
     for name in (FINISHED, "run.json", "ties.gpkg", OBSERVATIONS):
         (out / name).unlink(missing_ok=True)

@@ -39,20 +39,20 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     check_output(request.out, request.overwrite)
     setup_request, watch, before = SetupRequest.of(request), Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
-        opened = open_inputs(setup_request, progress, "unless local")
-        inputs = InputFiles.of(opened.files, opened.scene, before)
+        opened_inputs = open_inputs(setup_request, progress, "unless local")
+        inputs = InputFiles.of(opened_inputs.files, opened_inputs.scene, before)
     with watch.stage("orient"):
-        orientation = orient_views(opened.scene, config.orientation, progress)
-        check_ties(orientation, opened.scene)
+        orientation = orient_views(opened_inputs.scene, config.orientation, progress)
+        check_ties(orientation, opened_inputs.scene)
         note_orientation(orientation, progress)
     with watch.stage("rank"):
-        setup = set_up_run(setup_request, opened, orientation, config, progress)
-        ranked = rank_tiles(setup, request.workers, config, progress)
+        setup = set_up_run(setup_request, opened_inputs, orientation, config, progress)
+        labelled_ties = rank_tiles(setup, request.workers, config, progress)
     names, checksums = [view.name for view in setup.match_scene.views], inputs.record()
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", orientation, setup.scene)
-        write_ranking(request.out / "ranking.gpkg", ranked, names, setup.scene.crs)
-        counts = label_counts(ranked, len(names))
+        write_ranking(request.out / "ranking.gpkg", labelled_ties, names, setup.scene.crs)
+        counts = label_counts(labelled_ties, len(names))
         write_record(request.out / "ranking.json", ranking_record(counts, names))
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     return ranking_table(counts, names)
@@ -60,14 +60,14 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
 
 def rank_tiles(setup: RunSetup, workers: int, config: RunConfig, progress: Progress) -> list[LabelledTies]:
     """Labels of every pair of images at the tie points, tile by tile; tiles without tie points give none."""
-    match_scene, ranked = setup.match_scene, []
+    match_scene, labelled_ties = setup.match_scene, []
     tiles = plan_tiles(setup.grid.window, match_scene.overlap_window, config.pyramid)
     with progress.stage("Ranking", len(tiles)) as stage:
         for tile, tile_labels in run_all(lambda t: rank_tile(match_scene, t.core_window, config), tiles, workers):
             if tile_labels is not None:
-                ranked.append(LabelledTies.of(tile_labels, match_scene.ties, tile.core_window))
+                labelled_ties.append(LabelledTies.of(tile_labels, match_scene.ties, tile.core_window))
             stage.advance()
-    return ranked
+    return labelled_ties
 
 
 def ranking_record(counts: NDArray[np.int64], names: Sequence[str]) -> dict[str, Any]:

@@ -135,12 +135,12 @@ def write_views(path: Path, run: ReportedRun) -> None:
 
 def write_curves(path: Path, folder: Path, run: ReportedRun, config: RunConfig, most_s: float) -> None:
     """Write match curves of example cells of the surface in a folder; a cell without curves gets its error."""
-    found, start, cells = survey(folder), time.perf_counter(), []
-    chosen = chosen_cells(found)
+    surface_survey, start, cells = survey(folder), time.perf_counter(), []
+    chosen = chosen_cells(surface_survey)
     for cell in chosen:
         if time.perf_counter() - start > most_s:
             break
-        cells.append(shown_cell(cell, found, run, config))
+        cells.append(shown_cell(cell, surface_survey, run, config))
     record = {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells}
     if not (folder / RANKING).exists() and len(run.match_scene.views) <= MOST_MATRIX:
         record["labels"] = tried_labels(run, config, most_s)
@@ -201,42 +201,45 @@ def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     return [CellWindow(int(row), int(col), side, side).within(match_scene.overlap_window) for col, row in cells]
 
 
-def shown_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
+def shown_cell(chosen_cell: ChosenCell, surface_survey: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
     """The record of a cell for curves.json, or of the first alternative cell that can be shown."""
-    first = tried_cell(cell, found, run, config)
-    for row, col in cell.others if "error" in first else ():
-        other = tried_cell(replace(cell, row=row, col=col), found, run, config)
+    first = tried_cell(chosen_cell, surface_survey, run, config)
+    for row, col in chosen_cell.others if "error" in first else ():
+        other = tried_cell(replace(chosen_cell, row=row, col=col), surface_survey, run, config)
         if "error" not in other:
             return other
     return first
 
 
-def tried_cell(cell: ChosenCell, found: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
+def tried_cell(chosen_cell: ChosenCell, surface_survey: Survey, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
     """The record of a cell for curves.json, with an error where no curve can be made."""
-    x, y = found.transform * (cell.col + 0.5, cell.row + 0.5)
-    i, j = ((at - found.first) // found.stride for at in (cell.row, cell.col))
-    height_m = float(found.height[i, j])
+    x, y = surface_survey.transform * (chosen_cell.col + 0.5, chosen_cell.row + 0.5)
+    i, j = ((at - surface_survey.first) // surface_survey.stride for at in (chosen_cell.row, chosen_cell.col))
+    height_m = float(surface_survey.height[i, j])
     record = {
-        "kind": cell.kind, "why": cell.why, "row": cell.row, "col": cell.col, "x": x, "y": y,
-        "height_m": height_m, "sigma_m": float(found.sigma[i, j]),
-        "quality": int(found.quality[i, j]),
+        "kind": chosen_cell.kind, "why": chosen_cell.why, "row": chosen_cell.row, "col": chosen_cell.col,
+        "x": x, "y": y,
+        "height_m": height_m, "sigma_m": float(surface_survey.sigma[i, j]),
+        "quality": int(surface_survey.quality[i, j]),
     }  # fmt: skip
     try:
-        return record | curves_of(cell, np.array([x, y]), height_m, run, config)
+        return record | curves_of(chosen_cell, np.array([x, y]), height_m, run, config)
     except GeometryError:
         return record | {"error": NOT_SHOWN}
     except Exception as error:  # a picture less, not a surface
         return record | {"error": said(error)}
 
 
-def curves_of(cell: ChosenCell, xy: FloatArray, height_m: float, run: ReportedRun, config: RunConfig) -> dict[str, Any]:
-    """Record and figure of the match curves of a cell."""
+def curves_of(
+    chosen_cell: ChosenCell, xy: FloatArray, height_m: float, run: ReportedRun, config: RunConfig
+) -> dict[str, Any]:
+    """Record and figure of the match curves of a chosen_cell."""
     match_scene = run.match_scene
-    asked = f"The cell at row {cell.row}, column {cell.col}"
+    asked = f"The cell at row {chosen_cell.row}, column {chosen_cell.col}"
     looked = curves_at(asked, None, match_scene, place_of_cell(xy, height_m, run), config, SHOWN_WITHIN_CELLS)
     report = PointReport.of(asked, looked, match_scene, run.scene.crs)
     # Where no height was found, all images are shown.
-    n_images = len(report.search) if cell.kind == FAILED else report.curves.n_used
+    n_images = len(report.search) if chosen_cell.kind == FAILED else report.curves.n_used
     figure = mean_figure(report, n_images, is_small=True)
     return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
 

@@ -174,7 +174,7 @@ def opencv_in_one_thread() -> Iterator[None]:
 
 
 def set_up_run(
-    request: SetupRequest, opened: OpenedInputs, orientation: Orientation, config: RunConfig, progress: Progress
+    request: SetupRequest, opened_inputs: OpenedInputs, orientation: Orientation, config: RunConfig, progress: Progress
 ) -> RunSetup:
     """Choose views, height range, grid and match scene of a scene whose orientation is known.
 
@@ -185,10 +185,10 @@ def set_up_run(
     GeometryError, ConfigError
         Heights, area or resolution that cannot be used.
     """
-    corrected = orientation.apply(opened.scene)
+    corrected = orientation.apply(opened_inputs.scene)
     scene = supported_views(corrected, orientation)
     z_range = search_range(request, scene, orientation, config, progress)
-    grid = grid_of_run(request, opened.like, scene, orientation, z_range)
+    grid = grid_of_run(request, opened_inputs.like, scene, orientation, z_range)
     match_scene = match_scene_of_run(request, scene, orientation, z_range, grid, config)
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)

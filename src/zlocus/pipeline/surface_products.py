@@ -23,7 +23,7 @@ from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.messages import check_doubts
 from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import Tally
-from zlocus.products.derived import link_all, make_maps
+from zlocus.products.derived import link_all, write_derived
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import CURVES
 from zlocus.products.tie_layers import write_ranking, write_ties
@@ -44,15 +44,15 @@ def surface_rasters(request: DsmRequest, setup: RunSetup, vertical_datum: Vertic
     return SurfaceRasters(request.out, setup.grid.geobox, dtype, vertical_datum, has_colours(request, setup))
 
 
-def write_points(out: Path, setup: RunSetup, ranked: list[LabelledTies], vertical_datum: VerticalDatum) -> None:
+def write_points(out: Path, setup: RunSetup, labelled_ties: list[LabelledTies], vertical_datum: VerticalDatum) -> None:
     """Write tie points (ties.gpkg), their image observations, and the ranking of images where there is one."""
     orientation, scene = setup.orientation, setup.scene
     write_ties(out / "ties.gpkg", orientation, scene, vertical_datum)
     if orientation.ties is not None:
         write_observations(out, orientation.ties)
-    if ranked:
+    if labelled_ties:
         names = [view.name for view in setup.match_scene.views]
-        write_ranking(out / "ranking.gpkg", ranked, names, scene.crs, vertical_datum)
+        write_ranking(out / "ranking.gpkg", labelled_ties, names, scene.crs, vertical_datum)
 
 
 def write_report_inputs(
@@ -99,7 +99,7 @@ def write_maps(
     failed: ZlocusError | None = None
     with stopwatch.stage("products"):
         try:
-            make_maps(request.out, request.products, config.products, progress)
+            write_derived(request.out, request.products, config.products, progress)
         except ZlocusError as error:
             failed = error
     write_record(request.out / "run.json", record)

@@ -38,7 +38,8 @@ from zlocus.products.rasters import SurfaceRasters
 
 # Processes take about two seconds to start, and so are not worth it for less work than this, s.
 SHORT_S = 15.0
-NAMED = 3  # failed tiles in a message
+# A message names at most this many failed tiles.
+MAX_NAMED_TILES = 3
 
 
 @dataclass(frozen=True)
@@ -109,14 +110,14 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
 
 @dataclass
 class Tally:
-    """Counts over the cells of all tiles inside the requested area; ranked : labels of tie points, tile by tile."""
+    """Counts over the requested cells of all tiles. labelled_ties : labels of tie points, tile by tile."""
 
     n_seen: int = 0
     n_matched: int = 0
     n_left_out: int = 0
     evaluations: int = 0
     all_images: int = 0
-    ranked: list[LabelledTies] = field(default_factory=list)
+    labelled_ties: list[LabelledTies] = field(default_factory=list)
 
     def add(self, tile_product: TileProduct) -> None:
         """Add the counts of a tile."""
@@ -128,8 +129,8 @@ class Tally:
         self.n_left_out += int((asked & ((quality & np.uint16(Quality.IMAGE_EXCLUDED)) != 0)).sum())
         self.evaluations += tile_product.evaluations
         self.all_images += tile_product.all_images
-        if tile_product.ranked is not None:
-            self.ranked.append(tile_product.ranked)
+        if tile_product.labelled_ties is not None:
+            self.labelled_ties.append(tile_product.labelled_ties)
 
     @property
     def coverage(self) -> float:
@@ -159,7 +160,7 @@ class TileRun:
         """Number of finished tiles of the surface; the checkpoint may also hold tiles of images."""
         return sum(name_of(tile) in self.checkpoint.finished for tile in self.tiles)
 
-    def check(self, failed: Sequence[Outcome], partial: bool) -> None:
+    def check(self, failed_outcomes: Sequence[Outcome], partial: bool) -> None:
         """Stop the run where tiles failed, unless an incomplete surface is accepted and there is at least one tile.
 
         Raises
@@ -169,22 +170,22 @@ class TileRun:
         ZlocusError
             All of them failed, for this reason.
         """
-        if not failed:
+        if not failed_outcomes:
             return
-        self.log.add("stopped", failed=len(failed))
+        self.log.add("stopped", failed=len(failed_outcomes))
         if not self.n_there:
-            first = failed[0].failure
+            first = failed_outcomes[0].failure
             if first is not None and first.error is not None:
                 self.log.remove()
                 raise first.error
-            raise StoppedError(f"{self._not_all(failed)} Nothing was made.")
+            raise StoppedError(f"{self._not_all(failed_outcomes)} Nothing was made.")
         if not partial:
             raise StoppedError(
-                f"{self._not_all(failed)} The others are kept in {self.checkpoint.folder}: give the same command again "
-                "to try those once more, or add --partial for a surface without them."
+                f"{self._not_all(failed_outcomes)} The others are kept in {self.checkpoint.folder}: give the same "
+                "command again to try those once more, or add --partial for a surface without them."
             )
 
-    def end(self, failed: Sequence[Outcome], tally: Tally) -> None:
+    def end(self, failed_outcomes: Sequence[Outcome], tally: Tally) -> None:
         """Write the end of the run to its log.
 
         Raises
@@ -192,20 +193,20 @@ class TileRun:
         StoppedError
             Tiles failed; they are empty in the surface.
         """
-        self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed))
-        if failed:
+        self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed_outcomes))
+        if failed_outcomes:
             raise StoppedError(
-                f"{self._not_all(failed)} They are empty in the surface (FAILED in quality.tif): give the same command "
-                "again to try them once more."
+                f"{self._not_all(failed_outcomes)} They are empty in the surface (FAILED in quality.tif): give the same "
+                "command again to try them once more."
             )
 
-    def _not_all(self, failed: Sequence[Outcome]) -> str:
+    def _not_all(self, failed_outcomes: Sequence[Outcome]) -> str:
         said = [
             f"{place_of(self.tile_job.match_scene, outcome.task.core_window)}: {_reason(outcome.failure)}"
-            for outcome in failed[:NAMED]
+            for outcome in failed_outcomes[:MAX_NAMED_TILES]
         ]
-        more = f"; and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
-        return f"{len(failed)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
+        more = f"; and {len(failed_outcomes) - MAX_NAMED_TILES} more" if len(failed_outcomes) > MAX_NAMED_TILES else ""
+        return f"{len(failed_outcomes)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
 
     def run(
         self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, worker_usage: WorkerUsage
@@ -221,7 +222,7 @@ class TileRun:
         """
         worked = [tile for tile in self.tiles if tile.core_window.rows and tile.core_window.cols]
         todo = [tile for tile in worked if not self.checkpoint.holds(name_of(tile))]
-        failed: list[Outcome] = []
+        failed_outcomes: list[Outcome] = []
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
             if not self.n_there:
                 self.log.remove()
@@ -234,8 +235,8 @@ class TileRun:
                 for outcome in run_tasks(ready, todo):
                     self._took(outcome, stage, worker_usage, is_elsewhere=not isinstance(ready, Here))
                     if outcome.failure is not None and outcome.is_final:
-                        failed.append(outcome)
-        return failed
+                        failed_outcomes.append(outcome)
+        return failed_outcomes
 
     def _took(self, outcome: Outcome, stage: Stage, worker_usage: WorkerUsage, is_elsewhere: bool) -> None:
         tile: Tile = outcome.task
@@ -266,7 +267,9 @@ class TileRun:
             done = f"{self.n_there} of {len(self.tiles)} tiles"
             progress.note(f"{done} are finished and kept: {self.checkpoint.how_to_resume}.")
 
-    def assemble(self, failed: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress) -> None:
+    def assemble(
+        self, failed_outcomes: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress
+    ) -> None:
         """Write all tiles in a fixed order, whatever the order in which they were made; failed tiles are empty.
 
         Raises
@@ -274,7 +277,7 @@ class TileRun:
         StoppedError
             A tile that was finished is damaged.
         """
-        lost = {outcome.task for outcome in failed}
+        lost = {outcome.task for outcome in failed_outcomes}
         with progress.stage("Writing", len(self.tiles)) as stage:
             for tile in self.tiles:
                 product = self._failed(tile) if tile in lost else self._finished(tile)
@@ -296,8 +299,8 @@ class TileRun:
 
     def _failed(self, tile: Tile) -> TileProduct:
         nothing = Surface.nothing(tile.kept_window)
-        failed = replace(nothing, quality=np.full_like(nothing.quality, Quality.FAILED))
-        return self.tile_job.product(tile, TileResult(failed.part(tile.core_window, tile.kept_window)))
+        empty = replace(nothing, quality=np.full_like(nothing.quality, Quality.FAILED))
+        return self.tile_job.product(tile, TileResult(empty.part(tile.core_window, tile.kept_window)))
 
 
 def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: Polygons) -> TileJob:
@@ -332,15 +335,15 @@ def name_of(tile: Tile) -> str:
     return f"{tile.kept_window.row}_{tile.kept_window.col}"
 
 
-def place_of(match_scene: MatchScene, core: CellWindow) -> str:
+def place_of(match_scene: MatchScene, core_window: CellWindow) -> str:
     """Bounds of a tile on the ground, as text."""
-    transform = match_scene.transform(core, 0)
-    (west, north), (east, south) = transform * (0, 0), transform * (core.cols, core.rows)
+    transform = match_scene.transform(core_window, 0)
+    (west, north), (east, south) = transform * (0, 0), transform * (core_window.cols, core_window.rows)
     return f"E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
 
 
 def _reason(failure: Failure | None) -> str:
-    assert failure is not None, "of those that failed"
+    assert failure is not None, "callers pass failed outcomes only"
     if failure.trace:
         return f"{failure.reason} (a fault of zlocus, not of the input: report it with what {NAME} says of it)"
     return failure.reason
@@ -381,14 +384,14 @@ class Terrain:
 class TileProduct:
     """What a run keeps of a tile.
 
-    surface : of its kept cells; evaluations, all_images : see `TileResult`; ranked : tie points with their labels, None
-    where images were not chosen.
+    surface : of its kept cells; evaluations, all_images : see `TileResult`; labelled_ties : tie points with their
+    labels, None where images were not chosen.
     """
 
     surface: Surface
     evaluations: int = 0
     all_images: int = 0
-    ranked: LabelledTies | None = None
+    labelled_ties: LabelledTies | None = None
 
     def arrays(self) -> Arrays:
         """The product as named arrays, for the checkpoint."""
@@ -397,8 +400,12 @@ class TileProduct:
             "height": surface.height, "sigma": surface.sigma, "quality": surface.quality, "views": surface.views,
             "ortho": surface.ortho, "evaluations": np.array([self.evaluations, self.all_images], np.int64),
         }  # fmt: skip
-        if self.ranked is not None:
-            found |= {"xyz": self.ranked.xyz, "labels": self.ranked.labels, "which": self.ranked.views}
+        if self.labelled_ties is not None:
+            found |= {
+                "xyz": self.labelled_ties.xyz,
+                "labels": self.labelled_ties.labels,
+                "which": self.labelled_ties.views,
+            }
         return found
 
     @classmethod
@@ -406,8 +413,10 @@ class TileProduct:
         """The product from its named arrays."""
         surface = Surface(*(arrays[name] for name in ("height", "sigma", "quality", "views", "ortho")))
         done, every = (int(n) for n in arrays["evaluations"])
-        ranked = LabelledTies(*(arrays[name] for name in ("xyz", "labels", "which"))) if "xyz" in arrays else None
-        return cls(surface, done, every, ranked)
+        labelled_ties = (
+            LabelledTies(*(arrays[name] for name in ("xyz", "labels", "which"))) if "xyz" in arrays else None
+        )
+        return cls(surface, done, every, labelled_ties)
 
 
 @dataclass(frozen=True)
@@ -440,7 +449,7 @@ class TileJob:
             surface = filled_from(
                 surface, read_dem(self.terrain.path, geobox, self.terrain.vertical_datum, may_miss=True)
             )
-        ranked = None
+        labelled_ties = None
         if result.tile_labels is not None:
-            ranked = LabelledTies.of(result.tile_labels, self.match_scene.ties, tile.core_window)
-        return TileProduct(surface, result.evaluations, result.all_images, ranked)
+            labelled_ties = LabelledTies.of(result.tile_labels, self.match_scene.ties, tile.core_window)
+        return TileProduct(surface, result.evaluations, result.all_images, labelled_ties)

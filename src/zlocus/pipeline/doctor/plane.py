@@ -23,10 +23,10 @@ NEAR_SHARE, LEAST_ON_PLANE = 0.02, 0.3
 MOST_TILT_DEG = 15.0
 
 
-def plane_findings(scene: Scene, inputs: Sequence[Path], found: Orientation) -> list[Finding]:
+def plane_findings(scene: Scene, inputs: Sequence[Path], orientation: Orientation) -> list[Finding]:
     """A finding where another direction of z would suit the scene better, given in the axes of the input file."""
     centres = [view.sensor.centre for view in scene.views if isinstance(view.sensor, FrameModel)]
-    ties = found.xyz[supported(found.xyz, found.sigma_z_m)]
+    ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     if not is_local(scene.crs) or not centres or len(ties) < FEWEST_TIES:
         return []
     normal, share = main_plane(ties)

@@ -112,11 +112,11 @@ def edge_width(ratios: NDArray[np.float32]) -> float:
     return float(np.interp(np.median(ratios), ratio, sigma))
 
 
-def quality_findings(names: Sequence[str], found: Sequence[ImageQuality]) -> list[Finding]:
+def quality_findings(names: Sequence[str], qualities: Sequence[ImageQuality]) -> list[Finding]:
     """Findings about the quality of the images."""
     findings = []
-    edges = np.array([each.edge_px for each in found])
-    for i, (name, quality) in enumerate(zip(names, found, strict=True)):
+    edges = np.array([each.edge_px for each in qualities])
+    for i, (name, quality) in enumerate(zip(names, qualities, strict=True)):
         others = np.delete(edges, i)
         usual = float(np.median(others[np.isfinite(others)])) if np.isfinite(others).any() else 0.0
         findings += [poor(name, sentence) for sentence in (*grey_sentences(quality), *blur_sentences(quality, usual))]

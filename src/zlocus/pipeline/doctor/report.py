@@ -131,15 +131,15 @@ class Diagnosis:
         return next((each for each in found if set(each.views) == wanted), None)
 
 
-def _view_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
+def _view_rows(diagnosis: Diagnosis) -> Iterator[Sequence[str]]:
     yield (
         "name", "sensor", "rows x cols", "ground pixel", "nodata", "saturated", "black", "edges", "ties", "off before",
         "off after",
     )  # fmt: skip
     greys: tuple[str, ...]
     ties: tuple[str, ...]
-    for i, view in enumerate(found.views):
-        quality, oriented = found.quality[i], found.oriented(i)
+    for i, view in enumerate(diagnosis.views):
+        quality, oriented = diagnosis.quality[i], diagnosis.oriented(i)
         greys = ("-",) * 4
         if quality is not None:
             shares = (percent(share) for share in (quality.nodata, quality.saturated, quality.black))
@@ -147,40 +147,40 @@ def _view_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
         ties = ("-",) * 3
         if oriented is not None:
             ties = (str(oriented.n_ties), *(_unit(each.median, "px") for each in (oriented.before, oriented.after)))
-        pixel = _unit(found.geometry[i].ground_px_m, "m") if found.geometry else "-"
+        pixel = _unit(diagnosis.geometry[i].ground_px_m, "m") if diagnosis.geometry else "-"
         rows, cols = view.image.shape
         yield view.name, kind_of(view.sensor), f"{rows} x {cols}", pixel, *greys, *ties
-    for refused in found.refused:
+    for refused in diagnosis.refused:
         yield (refused.name, "cannot be used", *("-",) * 9)
 
 
-def _pair_rows(found: Diagnosis) -> Iterator[Sequence[str]]:
+def _pair_rows(diagnosis: Diagnosis) -> Iterator[Sequence[str]]:
     yield "pair", "overlap", "base-to-height", "ties", "off before", "off after"
-    largest = sorted(found.pairs, key=lambda pair: -pair.overlap)
+    largest = sorted(diagnosis.pairs, key=lambda pair: -pair.overlap)
     for pair in largest[:MOST_PAIRS]:
-        tied = found.tied(pair)
-        ties = ("-" if found.ties is None else "0", "-", "-")
+        tied = diagnosis.tied(pair)
+        ties = ("-" if diagnosis.ties is None else "0", "-", "-")
         if tied is not None:
             ties = (
                 str(tied.n_ties),
                 _unit(tied.epipolar_distance_before_px, "px"),
                 _unit(tied.epipolar_distance_after_px, "px"),
             )
-        names = " - ".join(found.names[i] for i in pair.views)
+        names = " - ".join(diagnosis.names[i] for i in pair.views)
         yield names, percent(pair.overlap), f"{pair.base_to_height:.2f}", *ties
     if len(largest) > MOST_PAIRS:
         yield f"and {len(largest) - MOST_PAIRS} pairs that overlap less (see doctor.json)", *("",) * 5
 
 
-def _plan_lines(found: Diagnosis) -> Iterator[str]:
-    plan = found.plan
+def _plan_lines(diagnosis: Diagnosis) -> Iterator[str]:
+    plan = diagnosis.plan
     if plan is None:
         return
     low, high = plan.heights
     rows, cols = plan.shape
     memory = f"{plan.tile_bytes * plan.workers / 1e9:.2f} GB"
     machine = "" if plan.machine_bytes is None else f"; this machine has {plan.machine_bytes / 1e9:.1f} GB"
-    which = "A full run of the images that can be used" if found.refused else "A full run"
+    which = "A full run of the images that can be used" if diagnosis.refused else "A full run"
     yield "\n".join(
         [
             which,

@@ -97,7 +97,12 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
 
 
 def examined(
-    request: DoctorRequest, config: RunConfig, scene: Scene, usable: UsableViews, findings: Findings, progress: Progress
+    request: DoctorRequest,
+    config: RunConfig,
+    scene: Scene,
+    usable_views: UsableViews,
+    findings: Findings,
+    progress: Progress,
 ) -> Diagnosis:
     """All findings about the views that could be opened."""
     names = [view.name for view in scene.views]
@@ -132,7 +137,14 @@ def examined(
             findings.entries += plane_findings(corrected, request.inputs, ties.orientation)
             plan = planned(request, config, corrected, ties, geometry, findings)
     return Diagnosis(
-        scene.views, tuple(quality), geometry, pairs, ties, plan, usable.refused, tuple(dict.fromkeys(findings.entries))
+        scene.views,
+        tuple(quality),
+        geometry,
+        pairs,
+        ties,
+        plan,
+        usable_views.refused,
+        tuple(dict.fromkeys(findings.entries)),
     )
 
 

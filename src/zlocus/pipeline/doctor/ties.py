@@ -78,21 +78,23 @@ def _ties(
     progress: Progress,
     is_quick: bool,
 ) -> QuickTies:
-    found = orient_views(replace(scene, heights=asked), options, progress)
-    corrected = found.apply(scene)
+    orientation = orient_views(replace(scene, heights=asked), options, progress)
+    corrected = orientation.apply(scene)
     z_range = (
-        range_from_ties(corrected, found, options) if asked is None else range_below_cameras(scene, asked, progress)
+        range_from_ties(corrected, orientation, options)
+        if asked is None
+        else range_below_cameras(scene, asked, progress)
     )
-    return QuickTies(found, z_range, is_quick)
+    return QuickTies(orientation, z_range, is_quick)
 
 
 def tie_findings(
-    names: Sequence[str], found: Orientation, pairs: Sequence[PairGeometry], options: OrientationOptions
+    names: Sequence[str], orientation: Orientation, pairs: Sequence[PairGeometry], options: OrientationOptions
 ) -> list[Finding]:
     """Findings about the tie points."""
     findings = []
-    excluded = {each.name: each.reason for each in found.excluded_images}
-    for view in found.views:
+    excluded = {each.name: each.reason for each in orientation.excluded_images}
+    for view in orientation.views:
         moved = max(map(abs, view.shift_px))
         if view.name in excluded:
             sentence = f"it takes no part: {excluded[view.name]}"
@@ -106,10 +108,10 @@ def tie_findings(
         else:
             continue
         findings.append(poor(view.name, sentence))
-    if len(found.views) - len(excluded) < MIN_VIEWS:
+    if len(orientation.views) - len(excluded) < MIN_VIEWS:
         findings.append(Finding(STOPS, "No two images are held together by tie points: a run will match nothing."))
-    findings += [Finding(STOPS if doubt.is_grave else POOR, doubt.sentence) for doubt in found.doubts]
-    tied = {frozenset(pair.views) for pair in found.pairs}
+    findings += [Finding(STOPS if doubt.is_grave else POOR, doubt.sentence) for doubt in orientation.doubts]
+    tied = {frozenset(pair.views) for pair in orientation.pairs}
     for pair in pairs:
         a, b = (names[i] for i in pair.views)
         if pair.overlap > EXPECTED_OVERLAP and frozenset((a, b)) not in tied and not {a, b} & excluded.keys():
