@@ -1,4 +1,4 @@
-"""Files that are whole or not there, whatever ends their writing."""
+"""Atomic writing: after any interruption a file is complete or missing."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_an_interrupt_leaves_nothing_half_written(tmp_path, monkeypatch, what):
     assert path.read_text() != "before"
 
 
-def test_a_folder_that_goes_meanwhile_is_no_second_error(tmp_path):
+def test_a_folder_that_disappears_meanwhile_causes_no_second_error(tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(FileNotFoundError), atomic_file(folder / "file"):

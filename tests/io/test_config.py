@@ -82,7 +82,7 @@ def test_comments_say_what_in_which_unit_and_range():
     assert "# Deep down.\n[middle.leaf]\n" in text
 
 
-def test_every_option_stands_in_the_file():
+def test_every_option_is_in_the_file():
     def names(options, prefix=""):
         for f in fields(options):
             value = getattr(options, f.name)

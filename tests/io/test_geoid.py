@@ -1,4 +1,4 @@
-"""Undulations against hand-computed ones and against PROJ's own reading of its grids."""
+"""Undulations compared with values computed by hand and with those of PROJ."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ def test_national_heights_of_the_aerial_block(shared_data):
     assert dem_datum(dem, "ellipsoid").geoid is None
 
 
-def test_dem_elsewhere(tmp_path):
+def test_a_dem_that_does_not_cover_the_grid_is_refused(tmp_path):
     path, _ = degree_plane(tmp_path / "dem.tif")
     for bounds in ((600000, 4790000, 600400, 4790300), (690000, 5790000, 690400, 5790300)):
         away = GeoBox.from_bbox(bounds, crs="EPSG:32631", resolution=2)
@@ -208,12 +208,12 @@ def test_edges_are_straight_in_the_crs_of_their_file(tmp_path):
     assert (inside != (lat > 43.1)).mean() < 0.005
 
 
-def test_area_elsewhere_is_empty(tmp_path):
+def test_an_area_outside_the_grid_is_empty(tmp_path):
     path = write_polygons(tmp_path / "a.gpkg", shapely.box(0, 0, 1, 1), driver="GPKG")
     assert not cells_inside(read_polygons(path, grid_crs(GRID)), GRID).any()
 
 
-def test_vectors_that_are_no_area(tmp_path):
+def test_vector_files_without_an_area_are_refused(tmp_path):
     (tmp_path / "notes.geojson").write_text("not a vector file")
     (tmp_path / "empty.geojson").write_text('{"type": "FeatureCollection", "features": []}')
     points = write_polygons(tmp_path / "p.gpkg", shapely.points([[1.0, 2.0]]), geometry_type="Point", driver="GPKG")

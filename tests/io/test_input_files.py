@@ -1,4 +1,4 @@
-"""Inputs that change while a run reads them: no surface is made of two, and run.json tells of what was matched."""
+"""Inputs that change during a run: the run stops, and run.json never names a content that was not matched."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def n_tiles(out):
     return len([name for name in names(out / FOLDER) if name.endswith(".npz") and name != "before.npz"])
 
 
-def test_an_image_that_is_replaced_ends_the_run_and_is_never_mixed(copied, elsewhere, tmp_path, monkeypatch):
+def test_a_run_stops_when_an_image_is_replaced(copied, elsewhere, tmp_path, monkeypatch):
     straight, out = asked(copied, tmp_path / "straight").out, tmp_path / "out"
     after_tiles(monkeypatch, 3, lambda: rewrite(copied[0], elsewhere))
     says = rf"The input .*{copied[0].name} was replaced or written to .* 3 finished tiles"
@@ -101,7 +101,7 @@ def test_an_image_that_is_replaced_ends_the_run_and_is_never_mixed(copied, elsew
         assert (out / name).read_bytes() == (straight / name).read_bytes()
 
 
-def test_an_image_that_is_replaced_by_one_of_another_size_is_named(copied, elsewhere, tmp_path, monkeypatch):
+def test_an_image_replaced_by_one_of_another_size_is_named(copied, elsewhere, tmp_path, monkeypatch):
     """Each tile fails then, but the message tells why, and the status is that of a run that was stopped."""
 
     def smaller():
@@ -118,7 +118,7 @@ def test_an_image_that_is_replaced_by_one_of_another_size_is_named(copied, elsew
 
 
 @pytest.mark.parametrize("change", ["replaced", "gone"])
-def test_an_image_that_changes_after_the_last_tile_ends_the_run(copied, elsewhere, tmp_path, monkeypatch, change):
+def test_a_run_stops_when_an_image_changes_after_the_last_tile(copied, elsewhere, tmp_path, monkeypatch, change):
     check, out = TileRun.check, tmp_path / "out"
 
     def changing(self, *given):
@@ -137,7 +137,7 @@ def test_an_image_that_changes_after_the_last_tile_ends_the_run(copied, elsewher
     assert (out / "dsm.tif").exists()
 
 
-def test_an_image_that_changes_while_tie_points_are_looked_for_leaves_nothing(copied, tmp_path, monkeypatch):
+def test_a_run_writes_nothing_when_an_image_changes_during_the_search_for_tie_points(copied, tmp_path, monkeypatch):
     settle = zlocus.pipeline.dsm.set_up_run
     monkeypatch.setattr(zlocus.pipeline.dsm, "set_up_run", lambda *given: [os.utime(copied[2]), settle(*given)][1])
     with pytest.raises(StoppedError, match=rf"{copied[2].name} was replaced or written to"):
@@ -186,7 +186,7 @@ def test_the_checksum_is_that_of_the_image_that_was_matched(copied, elsewhere, t
     assert f"{copied[0]} has changed since the surface was matched" in said.getvalue()
 
 
-def test_a_terrain_model_that_changes_is_an_input_too(copied, tmp_path, monkeypatch):
+def test_a_run_stops_when_the_dem_changes(copied, tmp_path, monkeypatch):
     dem = asked(copied, tmp_path / "dem", bounds=PART).out / "dsm.tif"
     after_tiles(monkeypatch, 0, lambda: os.utime(dem))
     with pytest.raises(StoppedError, match=r"dsm\.tif was replaced or written to"):
@@ -194,7 +194,7 @@ def test_a_terrain_model_that_changes_is_an_input_too(copied, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("stage", ["cloud", "orient", "ties", "rank"])
-def test_other_commands_write_nothing_of_inputs_that_changed(copied, tmp_path, monkeypatch, stage):
+def test_other_commands_write_nothing_when_an_input_changes(copied, tmp_path, monkeypatch, stage):
     out, progress = tmp_path / "out", progress_for(io.StringIO())
     run_stage = {
         "cloud": lambda: run_cloud(CloudRequest(copied, out, heights=HEIGHTS), RunConfig(), progress),
@@ -209,7 +209,7 @@ def test_other_commands_write_nothing_of_inputs_that_changed(copied, tmp_path, m
     assert not out.exists()
 
 
-def test_what_changed_is_found_and_missing_files_come_last(tmp_path):
+def test_changed_files_are_listed_with_missing_ones_last(tmp_path):
     paths = [tmp_path / name for name in "abcd"]
     for path in paths:
         path.write_text(path.name)

@@ -1,4 +1,4 @@
-"""What coverage-guided fuzzing kept of every format (`fuzz.py`): bytes that reach code of their own, and old faults."""
+"""Seeds of coverage-guided fuzzing (`fuzz.py`) for every format: inputs that reach rare code, and earlier faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SEEDS = TESTS / "fuzz_seeds"
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_was_found_is_read_or_refused(name, tmp_path):
+def test_every_seed_is_read_or_refused(name, tmp_path):
     case, seeds = CASES[name], sorted((SEEDS / name).iterdir())
     assert seeds, "python tests/support/fuzz.py finds some"
     path = case.write(tmp_path)

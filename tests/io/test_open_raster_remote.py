@@ -1,4 +1,4 @@
-"""Images that are elsewhere: read by window through a server, whole never."""
+"""Images on a server: read by window, never as a whole."""
 
 from __future__ import annotations
 
@@ -72,6 +72,6 @@ def test_a_list_of_images_on_their_server(images, served, where):
         here.unlink()
 
 
-def test_what_is_not_there_is_said(served):
+def test_a_missing_remote_file_is_named(served):
     with pytest.raises(InputError, match=r"nothing\.tif cannot be opened as a raster"):
         open_image(Path(f"/vsicurl/{served}/nothing.tif"))

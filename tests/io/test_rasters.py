@@ -189,7 +189,7 @@ def test_statistics_under_a_mask_band_by_band(tmp_path):
     np.testing.assert_allclose(statistics_of(tmp_path / "ortho.tif"), expected, rtol=DIGITS)
 
 
-def test_no_statistics_of_nothing(tmp_path):
+def test_a_band_without_valid_cells_has_no_statistics(tmp_path):
     write_cog(tmp_path / "a.tif", np.full(GRID.shape, np.nan, np.float32), GRID, nodata=np.nan)
     with rasterio.open(tmp_path / "a.tif") as file:
         assert not [name for name in file.tags(1) if name.startswith("STATISTICS")]

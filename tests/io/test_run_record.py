@@ -40,7 +40,7 @@ def test_stages_are_timed():
     assert busy["cpu_s"] >= 0.05
 
 
-def test_peak_memory_grows_by_what_is_held():
+def test_peak_memory_grows_with_an_array():
     before = peak_memory_mb()
     held = np.ones(60_000_000, np.uint8)
     assert peak_memory_mb() >= before
@@ -48,7 +48,7 @@ def test_peak_memory_grows_by_what_is_held():
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc, which Linux has")
-def test_peak_memory_is_not_that_of_who_started_the_process():
+def test_peak_memory_is_not_that_of_the_parent_process():
     held = np.ones(600_000_000, np.uint8)
     words = [sys.executable, "-c", "from zlocus.core.resources import peak_memory_mb; print(peak_memory_mb())"]
     found = float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
@@ -74,7 +74,7 @@ def test_numbers_that_are_not_finite_become_null(tmp_path):
     }  # fmt: skip
 
 
-def test_a_record_is_whole_or_not_there(tmp_path):
+def test_a_record_is_written_atomically(tmp_path):
     write_record(tmp_path / "run.json", {"coverage": 0.5})
     assert json.loads((tmp_path / "run.json").read_text()) == {"schema": 2, "coverage": 0.5}
     assert [p.name for p in tmp_path.iterdir()] == ["run.json"]
@@ -84,7 +84,7 @@ def test_a_record_is_whole_or_not_there(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.json", "taken.json"]
 
 
-def test_a_request_is_what_json_can_hold():
+def test_a_request_is_converted_to_json_values():
     request = RankRequest((Path("a.tif"), Path("b.tif")), Path("out"), heights=(1.0, 2.0))
     record = request_as_dict(request)
     assert json.loads(json.dumps(record)) == {

@@ -1,4 +1,4 @@
-"""Last lines without an end: read where all numbers are written alike, else refused."""
+"""Last lines without a line end: read where all numbers have the same digits, otherwise refused."""
 
 from __future__ import annotations
 

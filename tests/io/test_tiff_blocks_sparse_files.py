@@ -1,4 +1,4 @@
-"""Images in sparse files, which hold few of their pixels: done, or refused in a sentence, from headers, in seconds."""
+"""Images in sparse files, which store few of their pixels: processed, or refused in a sentence, within seconds."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_large_images_are_refused_only_where_the_disk_is_too_small(images, tmp_p
     {"blockysize": 1, "interleave": "pixel"},
 ])  # fmt: skip
 @pytest.mark.parametrize("at_once", [1 << 20, 5])
-def test_the_list_of_blocks_is_what_gdal_finds(tmp_path, profile, at_once, monkeypatch):
+def test_the_list_of_blocks_agrees_with_gdal(tmp_path, profile, at_once, monkeypatch):
     """In each order of bytes and of bands, few values at a time or all."""
     monkeypatch.setattr("zlocus.io.tiff_blocks.VALUES_AT_ONCE", at_once)
     path, rng = tmp_path / "a.tif", np.random.default_rng(3)
@@ -177,14 +177,14 @@ def test_the_list_of_blocks_is_what_gdal_finds(tmp_path, profile, at_once, monke
     np.testing.assert_array_equal(held.cells, expected)
 
 
-def test_a_file_that_holds_all_its_blocks_says_nothing(images):
+def test_a_file_that_stores_all_blocks_is_not_sparse(images):
     for path in images("sine").inputs:
         image = open_image(path)
         assert image.held is None
         assert held_window(image) == (0, 0, *image.shape)
 
 
-def test_many_blocks_are_told_apart_in_cells_of_several(tmp_path, monkeypatch):
+def test_many_blocks_are_grouped_into_cells(tmp_path, monkeypatch):
     monkeypatch.setattr("zlocus.io.tiff_blocks.MAX_CELLS_PER_AXIS", 4)
     path = tmp_path / "a.tif"
     with rasterio.open(
@@ -228,7 +228,7 @@ def test_windows_that_hold_pixels_by_hand():
     assert held.window == (rows.min(), cols.min(), np.ptp(rows) + 1, np.ptp(cols) + 1)
 
 
-def test_features_are_looked_for_where_the_file_holds_pixels(images, tmp_path):
+def test_features_are_searched_in_the_stored_parts_only(images, tmp_path):
     side = 100_000
     (path,) = [sparse(images("sine").paths["nadir"], tmp_path / "a.tif", side, [(512, 256), (99_000, 60_000)])]
     image = open_image(path)

@@ -1,4 +1,4 @@
-"""Pixels that hold no grey value although no tag says so: absurd numbers, and borders of one value."""
+"""Pixels without a grey value that no tag declares: too large values, and plateaus at the border."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ def test_a_turned_border_of_one_value_is_found_whole(value):
 
 
 @given(st.integers(0, 250), st.integers(0, 350), st.integers(1, 60), st.integers(1, 60))
-def test_a_window_of_a_plateau_is_the_part_of_the_whole(row, col, rows, cols):
+def test_a_window_of_a_plateau_is_a_part_of_the_whole_plateau(row, col, rows, cols):
     pixels, outside = with_turned_border(textured(), 0)
     found = border_plateau(ArrayImage(pixels))
     rows, cols = min(rows, 300 - row), min(cols, 420 - col)
     np.testing.assert_array_equal(found.covers(row, col, rows, cols), outside[row : row + rows, col : col + cols])
 
 
-def test_an_ordinary_image_has_none_and_is_hardly_read():
+def test_an_ordinary_image_has_no_plateau_and_few_pixels_are_read():
     image = ArrayImage(textured((2000, 2400)))
     assert border_plateau(image) is None
     assert image.n_read < 0.001 * image.pixels.size
@@ -101,7 +101,7 @@ def test_an_image_that_is_saturated_everywhere_has_no_border():
     assert border_plateau(ArrayImage(pixels)) is None
 
 
-def test_a_plateau_goes_on_behind_pixels_that_a_tag_declares():
+def test_a_plateau_continues_behind_declared_nodata():
     pixels, outside = with_turned_border(textured(), 0)
     valid = np.ones(pixels.shape, bool)
     valid[:, :3] = False
@@ -110,7 +110,7 @@ def test_a_plateau_goes_on_behind_pixels_that_a_tag_declares():
     np.testing.assert_array_equal(found.covers(0, 0, *pixels.shape) & valid, outside & valid)
 
 
-def test_an_image_of_one_value_has_no_other_pixel():
+def test_an_image_of_one_value_is_a_plateau_as_a_whole():
     found = border_plateau(ArrayImage(np.full((50, 60), 7, np.uint16)))
     assert isinstance(found, BorderPlateau)
     assert found.n_pixels == 50 * 60
@@ -141,7 +141,7 @@ def test_numbers_larger_than_grey_values_are_left_out_and_counted(tmp_path, dtyp
     assert window.pixels[~expected].max() == 0.0
 
 
-def test_a_declared_nodata_value_may_be_absurd(tmp_path):
+def test_a_declared_nodata_value_may_be_larger_than_any_grey_value(tmp_path):
     pixels = textured().astype(np.float32)
     pixels[:40] = -3.4e38
     image = open_image(written(tmp_path / "a.tif", pixels, nodata=float(pixels[0, 0])))
@@ -149,7 +149,7 @@ def test_a_declared_nodata_value_may_be_absurd(tmp_path):
     assert not image.read(0, 0, *pixels.shape).valid[:40].any()
 
 
-def test_an_image_of_absurd_numbers_is_refused_in_a_sentence(tmp_path):
+def test_an_image_of_too_large_values_is_refused(tmp_path):
     image = open_image(written(tmp_path / "a.tif", textured().astype(np.float32) * np.float32(1e18)))
     with pytest.raises(InputError, match=r"a\.tif holds values up to 2e\+21, which cannot be grey values\. Scale them"):
         check_grey_values(image)
@@ -179,7 +179,7 @@ def changed(images, folder, change):
 
 
 @pytest.mark.parametrize("value", [3e38, 1e18, -1e30])
-def test_a_pixel_of_an_absurd_value_ends_no_run(images, tmp_path, value):
+def test_a_pixel_with_a_too_large_value_does_not_stop_a_run(images, tmp_path, value):
     def spoil(pixels):
         pixels = pixels.astype(np.float32)
         pixels[70, 75] = value

@@ -1,4 +1,4 @@
-"""What heights are above: names, grids that are there or missing, CRS as files hold them, and cells however cut."""
+"""Vertical datums: their names, installed and missing grids, CRSs of files, and heights of cells and points."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def centres(geobox):
     return np.column_stack([x.ravel(), y.ravel()])
 
 
-def test_the_ellipsoid_needs_nothing():
+def test_the_ellipsoid_needs_no_file():
     datum = named_vertical_datum("ellipsoid")
     assert datum == ELLIPSOIDAL
     assert (datum.crs, datum.files, datum.surface_name) == (None, (), "the ellipsoid")
@@ -71,7 +71,7 @@ def test_the_ellipsoid_needs_nothing():
 
 
 @pytest.mark.parametrize("name", KNOWN)
-def test_a_grid_that_is_missing_is_no_guess(no_grids, name):
+def test_a_missing_grid_is_an_error(no_grids, name):
     """Also where a file of that name would be found by PROJ over the network."""
     with pytest.raises(ConfigError) as error:
         named_vertical_datum(name)
@@ -172,7 +172,9 @@ def test_the_datum_of_a_file_is_in_its_crs(proj_grid, tmp_path):
     assert of("EPSG:32631+5773").files == (proj_grid,)
     with pytest.raises(ConfigError, match=r"dem\.tif has EGM2008 heights by its CRS, which needs PROJ's grid us_nga_"):
         of("EPSG:4326+3855")
-    with pytest.raises(InputError, match=r"no geoid for \(NAVD88 height, by its CRS\)\. Give its geoid with --dem-vert"):
+    with pytest.raises(
+        InputError, match=r"no geoid for \(NAVD88 height, by its CRS\)\. Give its geoid with --dem-vert"
+    ):
         of("EPSG:4269+5703")
     for crs, says in (("EPSG:4326+6360", "in US survey foot"), ("EPSG:32631+5831", "go down")):
         with pytest.raises(InputError, match=says):

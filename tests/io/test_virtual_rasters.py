@@ -1,4 +1,4 @@
-"""Virtual rasters from people who mean harm: no server is asked, no code runs, no file is read that holds no pixels."""
+"""Malicious virtual rasters: no server is contacted, no code runs, and no file without pixels is read."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ import pytest
 from typer.testing import CliRunner
 
 from damage_cases import CASES
-from rendered_scenes import rendered
 from zlocus.cli.app import app
 
 # What is done to a file: cut in the middle, in UTF-16, a number that is none, nothing left of it.
@@ -23,13 +22,6 @@ IMPORTED = {
     "bundler": "bundler", "bundler-list": "bundler", "eo": "eo",
     "colmap-binary-cameras": "colmap", "colmap-binary-images": "colmap",
 }  # fmt: skip
-
-
-@pytest.fixture(scope="session")
-def good(tmp_path_factory):
-    """Two images that match."""
-    images = rendered(tmp_path_factory.mktemp("good"), "plane")
-    return images.paths["nadir"], images.paths["fore"]
 
 
 def refused(folder, *arguments):
@@ -112,27 +104,27 @@ def test_a_camera_beside_its_image(tmp_path, name, damage):
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_control_points(tmp_path, good, damage):
+def test_control_points(tmp_path, good_pair, damage):
     path = CASES["control"].write(tmp_path)
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
-    assert "control.csv" in refused(tmp_path, "orient", *good, "--control", path, "-o", tmp_path / "out")
+    assert "control.csv" in refused(tmp_path, "orient", *good_pair, "--control", path, "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize(("name", "damage"), with_damages(["dem", "like", "area-geojson", "area-gpkg"]))
-def test_side_files(tmp_path, good, name, damage):
+def test_side_files(tmp_path, good_pair, name, damage):
     path = CASES[name].write(tmp_path)
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     option = f"--{name.split('-')[0]}"
     heights = [] if name == "dem" else ["--heights", 20, 90]
-    assert path.name in refused(tmp_path, "dsm", *good, *heights, option, path, "-o", tmp_path / "out")
+    assert path.name in refused(tmp_path, "dsm", *good_pair, *heights, option, path, "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize("damage", [name for name in DAMAGES if name != "empty"])
 @pytest.mark.parametrize("command", ["dsm", "doctor"])
-def test_options(tmp_path, good, command, damage):
+def test_options(tmp_path, good_pair, command, damage):
     path = CASES["config-toml"].write(tmp_path)
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
-    assert "config.toml" in refused(tmp_path, command, *good, "--config", path, "-o", tmp_path / "out")
+    assert "config.toml" in refused(tmp_path, command, *good_pair, "--config", path, "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize("damage", [name for name in DAMAGES if name != "utf-16"])

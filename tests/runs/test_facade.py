@@ -1,4 +1,4 @@
-"""A wall photographed from the side, in a local frame: cameras of files, turned by a declared up, to a surface."""
+"""A wall photographed from the side, in a local frame: imported cameras, turned by --up and --north, to a surface."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def errors(out):
     return z - analytic_height(KIND, x, y), x, y
 
 
-def test_the_wall_is_found(surface):
+def test_the_surface_is_the_wall(surface):
     """Coordinates are those of the wall: x along it, y up it, z out of it."""
     error, *_ = errors(surface)
     found = np.isfinite(error)
@@ -68,7 +68,7 @@ def test_the_wall_is_found(surface):
     assert abs(np.median(error[found])) < 0.05
 
 
-def test_the_report_says_where_it_cannot_say_where(surface):
+def test_the_report_names_the_local_frame(surface):
     text = (surface / "report.html").read_text(encoding="utf-8")
     assert "of a local frame, which has no place on the Earth" in text
     assert "y is up" in text
@@ -78,7 +78,7 @@ def test_the_report_says_where_it_cannot_say_where(surface):
     assert len(re.findall(r"<h3>Typical", text)) == 3
 
 
-def test_the_area_is_what_ties_and_two_images_show(surface):
+def test_the_area_is_what_two_images_show_near_the_tie_points(surface):
     """Not the many times larger ground far behind the wall that two images share at the lowest heights."""
     error, *_ = errors(surface)
     assert np.isfinite(error).mean() > 0.5
@@ -135,7 +135,7 @@ def test_doctor_names_the_wall(tmp_path):
     assert "lie on a plane" not in (tmp_path / "right" / "doctor.json").read_text()
 
 
-def test_norths_that_are_none(facade, tmp_path):
+def test_invalid_norths_are_refused(facade, tmp_path):
     for axes in ((OUT, 2 * OUT), (OUT, -OUT)):
         up, north = axes
         result = command("import", "colmap", facade, "--up", *up, "--north", *north, "-o", tmp_path / "s.yaml")

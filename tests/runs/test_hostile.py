@@ -1,4 +1,4 @@
-"""Inputs from people who mean harm: nothing is written elsewhere, nothing of theirs runs, no archive is followed."""
+"""Malicious inputs: nothing is written outside the output folder, no code runs, and no archive is opened."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ TAKEN_FOR_HTML = (
 )
 
 
-def test_the_inspector_makes_no_html_of_words():
+def test_the_inspector_inserts_texts_as_text_only():
     """All that its page shows is put there as text."""
     scripts = sorted((Path(zlocus.inspector.__file__).parent / "static" / "js").glob("*.js"))
     assert len(scripts) > 5
@@ -181,7 +181,7 @@ def test_archives_are_not_followed(images, tmp_path, prefix):
 
 
 @pytest.mark.parametrize("name", ["a.zip", "zip.tif", "a.shz", "a.gpkg.zip"])
-def test_an_archive_under_any_name_is_no_input(images, tmp_path, name):
+def test_an_archive_is_refused_whatever_its_name(images, tmp_path, name):
     area = tmp_path / "area.gpkg"
     pyogrio.raw.write(area, np.array([box(0, 0, 9, 9).wkb], object), [], [], geometry_type="Polygon", crs="EPSG:32632")
     with zipfile.ZipFile(tmp_path / name, "w") as file:
@@ -202,7 +202,7 @@ WMS = """<GDAL_WMS><Service name="TMS"><ServerUrl>http://127.0.0.1:9/${z}/${x}/$
 <SizeX>256</SizeX><SizeY>256</SizeY></DataWindow><BandsCount>1</BandsCount></GDAL_WMS>"""
 
 
-def test_a_list_of_other_files_is_one_by_its_name_only(images, tmp_path):
+def test_a_virtual_raster_is_read_only_with_the_suffix_vrt(images, tmp_path):
     """A virtual raster reads what it names: a user may mean that, and then calls it .vrt."""
     text = VRT.format(images("sine").inputs[0])
     for name in ("img.vrt", "img.tif", "img"):
@@ -214,7 +214,7 @@ def test_a_list_of_other_files_is_one_by_its_name_only(images, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["img.tif", "img.xml", "img.vrt", "img.wms"])
-def test_no_service_is_asked(tmp_path, name):
+def test_no_service_is_contacted(tmp_path, name):
     (tmp_path / name).write_text(WMS)
     with pytest.raises(InputError):
         open_image(tmp_path / name)

@@ -1,4 +1,4 @@
-"""One rendered ground seen by three kinds of sensor: exact cameras; a surface of all is no worse than of one."""
+"""One rendered ground and three kinds of sensor: exact cameras, and a surface from all that is as good as the best."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def scenes(spec, tmp_path_factory) -> dict[str, Path]:
     return render_mixed_scene(spec, tmp_path_factory.mktemp("mixed") / "scene")
 
 
-def test_every_sensor_is_read_as_it_was(spec, scenes):
+def test_every_sensor_reads_back_as_its_exact_camera(spec, scenes):
     seen_by = mixed_exposures(spec)
     assert set(scenes) == {*SENSORS, "mixed"}
     assert len(open_scene([scenes["mixed"]]).views) == 9

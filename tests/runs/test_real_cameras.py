@@ -1,4 +1,4 @@
-"""Real frame images: what importers make of their cameras, and whether pairs agree on a surface they did not make."""
+"""Real frame images: their imported cameras, and the agreement of image pairs on an independent surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small valid file of every format that zlocus reads, how it is read, and what it says."""
+"""A small valid file of every format that zlocus reads, its reader, and the values in it."""
 
 from __future__ import annotations
 
@@ -228,16 +228,17 @@ def _write_control(folder: Path) -> Path:
 
 
 def _read_control(path: Path) -> Leaves:
-    found = read_control(path, _views())
+    control = read_control(path, _views())
     points = {
-        name: [found.xyz[i], np.nan_to_num(found.sigma_m[i], nan=-1.0), found.is_check[i]]
-        for i, name in enumerate(found.names)
+        name: [control.xyz[i], np.nan_to_num(control.sigma_m[i], nan=-1.0), control.is_check[i]]
+        for i, name in enumerate(control.names)
     }
-    seen = {
-        (found.names[point], int(view)): xy
-        for view, point, xy in zip(found.observations.view, found.observations.point, found.observations.xy, strict=True)
+    rows = control.observations
+    positions = {
+        (control.names[point], int(view)): xy
+        for view, point, xy in zip(rows.view, rows.point, rows.xy, strict=True)
     }
-    return leaves({"points": points, "seen": seen})
+    return leaves({"points": points, "seen": positions})
 
 
 def _write_toml(folder: Path) -> Path:

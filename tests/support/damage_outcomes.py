@@ -1,4 +1,4 @@
-"""What a damaged file says, or what is said of it."""
+"""The outcome of reading a damaged file: its values, or the sentence that refuses it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readers fed with bytes that reach ever more of their code: coverage-guided fuzzing of every format.
+"""Coverage-guided fuzzing of the readers of every format.
 
     python -m pip install atheris
     python tests/support/fuzz.py --seconds 3600             # of all formats together

@@ -1,4 +1,4 @@
-"""Geoids for tests, written as users have them."""
+"""Geoid rasters for tests, in the formats that users have."""
 
 from __future__ import annotations
 

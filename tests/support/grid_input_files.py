@@ -1,4 +1,4 @@
-"""Small rasters and polygon files that a run is given beside its images."""
+"""Small rasters and polygon files as inputs of a run beside its images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A LAS file against the rules of LAS 1.4 R15, from its bytes alone."""
+"""Check the bytes of a LAS file against the rules of LAS 1.4 R15."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""Serves parts of the files of a folder, as stores of images do: a process of its own, for GDAL does not let another
-thread of its process work while it waits. `python range_server.py FOLDER` prints its port."""
+"""Serve byte ranges of the files of a folder, as image stores do. `python range_server.py FOLDER` prints the port.
+
+It is a separate process, because GDAL blocks the other threads of its own process while it waits.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exact cameras: there and back, and the directions that their angles mean."""
+"""Exact cameras: ground to image and back, and the directions of their angles."""
 
 from __future__ import annotations
 

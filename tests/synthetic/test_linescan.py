@@ -1,4 +1,4 @@
-"""Rendered line-scanner scenes: what is read back is the exact camera, and noise moves it as much as it says."""
+"""Rendered line scanners: files read back as the exact camera, and noise has the stated size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays against closed forms and against a slow twin; light, optics and noise."""
+"""Rays compared with closed forms and with a slow twin; light, optics and noise."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def rim_of_sphere(kind: str, east: NDArray[np.float64], north: NDArray[np.float6
     return (kind == "sphere") & (np.abs(np.hypot(east, north) - rim) < STEP)
 
 
-def test_what_a_step_hides() -> None:
+def test_a_step_occludes_the_ground_behind_it() -> None:
     """A camera that looks east from the west sees all; one that looks west misses 15 m times the tangent."""
     ground = analytic_ground("step", CENTRE, STEP, SHAPE)
     for across, hidden in ((15.0, 0.0), (-15.0, 15.0 * np.tan(np.deg2rad(15.0)))):

@@ -1,4 +1,4 @@
-"""Whole scenes: terrain, objects, and what lies on disk."""
+"""Whole scenes: terrain, objects, and the files of a scene."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_pointing_errors_are_in_the_rpc_and_nowhere_else(folder: Path, spec: Sce
         np.testing.assert_allclose(error, np.broadcast_to(expected, error.shape), rtol=0, atol=RPC_PX)
 
 
-def test_the_description_says_what_was_put_in(folder: Path, ground: SyntheticGround) -> None:
+def test_the_description_holds_the_specification(folder: Path, ground: SyntheticGround) -> None:
     text = json.loads((folder / "scene.json").read_text())
     assert text["views"]["f"]["bias_row_col"] == [2.25, -1.5]
     assert text["views"]["f"]["along"] == 20.0
@@ -143,7 +143,7 @@ def test_a_folder_that_exists_is_left_alone(spec: SceneSpec, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("error", "raised"), [(OSError("disk full"), OutputError), (KeyboardInterrupt(), KeyboardInterrupt)]
 )
-def test_nothing_half_written_stays(
+def test_no_partial_folder_remains(
     error: BaseException, raised: type, spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
@@ -155,7 +155,7 @@ def test_nothing_half_written_stays(
     assert not list(tmp_path.iterdir())
 
 
-def test_everything_stands_on_the_ground(ground: SyntheticGround, spec: SceneSpec) -> None:
+def test_objects_stand_on_the_ground(ground: SyntheticGround, spec: SceneSpec) -> None:
     assert set(np.unique(ground.classes)) == {0, ROAD, BUILDING, TREE}
     low, high = ground.height_range
     assert spec.height_range[0] <= low
@@ -260,7 +260,7 @@ def test_pointing_errors_are_drawn_within_their_range() -> None:
         ({"views": (VIEWS[0], VIEWS[0])}, "different names"),
     ],
 )
-def test_specifications_that_make_no_sense(changes: dict[str, object], message: str) -> None:
+def test_invalid_specifications_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         city_spec(1, **changes)
 

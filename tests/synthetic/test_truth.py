@@ -1,4 +1,4 @@
-"""The truth of a scene over all ground that two images see."""
+"""Truth rasters over all ground that two images show."""
 
 from __future__ import annotations
 

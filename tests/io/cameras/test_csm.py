@@ -1,4 +1,4 @@
-"""CSM states: against usgscsm's own formulas written out, and what is refused."""
+"""CSM states, compared with the formulas of usgscsm, and states that are refused."""
 
 from __future__ import annotations
 
@@ -26,8 +26,12 @@ def usgscsm_sight(s, line, sample):
     """Centre and (unsigned) direction as UsgsAstroLsSensorModel::losToEcf has them, at CSM's line and sample."""
     piece = max(np.searchsorted(s["m_intTimeLines"], line, side="right") - 1, 0)
     time = s["m_intTimeStartTimes"][piece] + s["m_intTimes"][piece] * (line - s["m_intTimeLines"][piece] + 0.5)
-    centre = lagrange_interpolated(np.reshape(s["m_positions"], (-1, 3)), s["m_t0Ephem"], s["m_dtEphem"], np.array([time]), 8)[0]
-    q = lagrange_interpolated(np.reshape(s["m_quaternions"], (-1, 4)), s["m_t0Quat"], s["m_dtQuat"], np.array([time]), 8)[0]
+    centre = lagrange_interpolated(
+        np.reshape(s["m_positions"], (-1, 3)), s["m_t0Ephem"], s["m_dtEphem"], np.array([time]), 8
+    )[0]
+    q = lagrange_interpolated(
+        np.reshape(s["m_quaternions"], (-1, 4)), s["m_t0Quat"], s["m_dtQuat"], np.array([time]), 8
+    )[0]
     x, y, z, w = q / np.linalg.norm(q)
     body = np.array([
         [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -1,4 +1,4 @@
-"""Frame cameras of a scene file: every entry, what is refused, maps, and the up axis."""
+"""Frame cameras of a scene file: all keys, refused values, maps, and the up axis."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_without_a_frame_the_map_is_found(tmp_path):
         scene(tmp_path, content)
 
 
-def test_a_centre_that_is_nowhere(tmp_path):
+def test_a_centre_that_its_crs_cannot_express_is_refused(tmp_path):
     with pytest.raises(InputError, match="no place in EPSG:32631"):
         scene(tmp_path, document(centre=[7e8, 4_790_230.0, 1450.0]))
 
@@ -131,7 +131,7 @@ def test_kinds_that_do_not_fit_together(tmp_path):
 @pytest.mark.parametrize(
     ("up", "says"), [([0, 0, 0], "not 0"), ([1, 0], "is missing"), ([0, 0, float("inf")], "finite")]
 )
-def test_ups_that_are_none(tmp_path, up, says):
+def test_invalid_ups_are_refused(tmp_path, up, says):
     with pytest.raises(InputError, match=says):
         scene(tmp_path, document({"local": True, "up": up}))
     with pytest.raises(InputError, match="up is for local: true"):
@@ -169,4 +169,6 @@ def test_the_entry_of_the_documents(tmp_path):
     start = page.index("```\ncamera:") + 4
     entry = yaml.safe_load(page[start : page.index("```", start)])["camera"]
     camera = FrameCamera.model_validate(entry)
-    assert camera.read(tmp_path, tmp_path / "a.tif").sensor_in_own_crs.camera_from_ground == rotation_from_angles(0.3, -1.1, 92.0)
+    assert camera.read(tmp_path, tmp_path / "a.tif").sensor_in_own_crs.camera_from_ground == rotation_from_angles(
+        0.3, -1.1, 92.0
+    )

@@ -1,4 +1,4 @@
-"""Files of line scanners: what they mean, and one sentence for what is wrong with them."""
+"""Files of line scanners: their meaning, and one sentence for each fault."""
 
 from __future__ import annotations
 
@@ -384,7 +384,7 @@ def test_what_is_written_reads_back_equal(tmp_path):
         write_number_table(tmp_path / "none" / "t.csv", columns, "")
 
 
-def test_what_is_asked_for_stays_asked_for_whatever_is_read_first():
+def test_defaults_do_not_depend_on_the_order_of_imports():
     """Up to 2.11 pydantic lends the defaults of one model to another, in the order in which they are imported."""
     code = (
         "import zlocus.io.scene_file\n"

@@ -1,4 +1,4 @@
-"""RPC readers. A file of each format says: the centre of the first pixel is (0, 0)."""
+"""RPC readers: in every format the centre of the first pixel becomes (0, 0)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras of other programs: projected as these programs do, pixel by pixel, and counted from the right pixel."""
+"""Imported cameras project as the other programs do, in the pixel convention of zlocus."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_the_scene_file_is_relative_and_whole(tmp_path):
     assert open_scene([out]).views[0].path.samefile(written.folder / "images/a.tif")
 
 
-def test_a_scene_file_is_not_replaced_without_leave(tmp_path):
+def test_a_scene_file_is_replaced_only_with_overwrite(tmp_path):
     written = files.write_colmap(tmp_path / "p")
     out = tmp_path / "scene.yaml"
     out.write_text("mine")
@@ -244,7 +244,7 @@ def test_a_fault_is_named(tmp_path, kind, write, name, old, new, says):
     assert not (folder / "scene.yaml").exists()
 
 
-def test_options_that_say_nothing_are_refused(tmp_path):
+def test_options_that_do_not_apply_are_refused(tmp_path):
     folder = files.write_colmap(tmp_path / "p").folder
     out = folder / "scene.yaml"
     for request, says in (
