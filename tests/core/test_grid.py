@@ -8,7 +8,7 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
 from zlocus.core.errors import ConfigError, GeometryError
-from zlocus.core.grid import grid_from_bounds, grid_from_geobox
+from zlocus.core.grid import CellWindow, cells_of_bounds, grid_from_bounds, grid_from_geobox
 
 UTM = CRS.from_epsg(32632)
 
@@ -48,7 +48,7 @@ def test_bounds_on_cell_edges_stay(col, row, cell):
     st.floats(0.5, 90),
     st.sampled_from([0.3, 0.5, 1.7]),
 )
-def test_bounds_lie_inside_and_no_cell_is_idle(x, y, width, height, cell):
+def test_the_grid_contains_the_bounds_and_no_cell_lies_outside_them(x, y, width, height, cell):
     grid = grid_from_bounds((x, y, x + width, y + height), cell, UTM)
     xmin, ymin, xmax, ymax = grid.geobox.boundingbox.bbox
     near = 1e-5 * cell
@@ -59,7 +59,7 @@ def test_bounds_lie_inside_and_no_cell_is_idle(x, y, width, height, cell):
     check_lattice(grid)
 
 
-def test_an_area_without_a_cell():
+def test_an_area_without_a_cell_is_refused():
     with pytest.raises(GeometryError, match="holds no cell"):
         grid_from_bounds((1.0, 1.0, 1.0 + 1e-9, 1.0 + 1e-9), 1.0, UTM)
 
@@ -88,6 +88,23 @@ def test_a_raster_on_multiples_of_its_cells_shares_the_lattice_of_bounds(cell, c
 @pytest.mark.parametrize(
     "transform", [Affine(0.5, 0, 0, 0, -0.7, 0), Affine(0.5, 0.1, 0, 0, -0.5, 0), Affine(0.5, 0, 0, 0, 0.5, 0)]
 )
-def test_grids_that_are_not_north_up_and_square(transform):
+def test_a_raster_that_is_not_north_up_with_square_cells_is_refused(transform):
     with pytest.raises(ConfigError, match=r"like\.tif is not north up with square cells"):
         grid_from_geobox(box(transform), "like.tif")
+
+
+def test_bounds_of_a_window_of_the_lattice():
+    grid = grid_from_bounds((100.0, 200.0, 110.0, 205.0), 0.5, UTM)
+    assert grid.bounds(grid.window) == (100.0, 200.0, 110.0, 205.0)
+    first = grid.window
+    assert grid.bounds(CellWindow(first.row + 2, first.col - 4, 3, 6)) == (98.0, 202.5, 101.0, 204.0)
+
+
+def test_cells_of_bounds_are_whole_coarsest_cells():
+    window = cells_of_bounds((100.3, -7.0, 140.2, 21.0), (0.5, 0.5), 0.5, 4)
+    assert (window.row % 8, window.col % 8, window.rows % 8, window.cols % 8) == (0, 0, 0, 0)
+    west, north = 0.5 + window.col * 0.5, 0.5 - window.row * 0.5
+    assert west <= 100.3 < west + 4
+    assert north >= 21.0 > north - 4
+    assert west + window.cols * 0.5 >= 140.2
+    assert north - window.rows * 0.5 <= -7.0

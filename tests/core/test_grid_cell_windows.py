@@ -17,7 +17,7 @@ def cells(window):
 
 
 @given(WINDOWS, WINDOWS)
-def test_the_common_part_and_its_place(one, other):
+def test_the_part_inside_another_window_and_its_place_in_an_array(one, other):
     shared = one.within(other)
     assert cells(shared) == cells(one) & cells(other)
     names = np.array([[(r, c) for c in range(other.cols)] for r in range(other.rows)]).reshape(
@@ -41,7 +41,7 @@ def test_a_coarser_level_covers_the_same_ground(window, level, halo):
 
 
 @given(WINDOWS, WINDOWS)
-def test_what_holds_two_windows(one, other):
+def test_the_smallest_window_that_contains_two(one, other):
     both = one.around(other)
     assert cells(one) | cells(other) <= cells(both)
     assert one.meets(other) == bool(cells(one) & cells(other)) == other.meets(one)

@@ -80,7 +80,7 @@ def test_limits_are_options():
     assert labels_of(curve((40, 0.35), (60, 0.3)), curve((40, 0.2), (60, 0.15))) == [POOR, POOR]
 
 
-def test_a_rival_is_two_pixels_away():
+def test_the_second_peak_is_at_least_two_pixels_away():
     near, far = curve((40, 0.95), (43, 0.9)), curve((40, 0.95), (44, 0.9))
     assert labels_of(near, far) == [GOOD, FAIR]
     assert np.isnan(curve_peaks(near[None], STEP_PX, OPTIONS).rho2[0])
@@ -90,7 +90,7 @@ def test_a_rival_is_two_pixels_away():
     assert labels_of(near, near, step_px=np.array([0.5, 1.0])) == [GOOD, FAIR]
 
 
-def test_the_shoulder_of_the_peak_and_plateaus_are_no_rivals():
+def test_shoulders_and_plateaus_are_no_second_peaks():
     slope = np.linspace(0.95, 0.15, 40)
     assert labels_of(np.r_[slope[::-1], slope]) == [GOOD]
     assert labels_of(curve((40, 0.95), (60, 0.9), (61, 0.9))) == [GOOD]
@@ -103,7 +103,7 @@ def test_of_two_equal_peaks_neither_is_distinct():
 
 
 @pytest.mark.parametrize("at", [0, N_HEIGHTS - 1])
-def test_ends_are_never_good_and_no_rivals(at):
+def test_a_peak_at_an_end_is_never_good_and_no_second_peak(at):
     assert labels_of(curve((at, 0.99))) == [FAIR]
     assert labels_of(curve((at, 0.6))) == [FAIR]
     assert labels_of(curve((at, 0.4))) == [POOR]
@@ -111,13 +111,13 @@ def test_ends_are_never_good_and_no_rivals(at):
 
 
 @pytest.mark.parametrize("beside", [-1, 1])
-def test_what_is_not_seen_has_ends_too(beside):
+def test_the_visible_part_of_a_curve_has_ends_too(beside):
     at_gap, rival_at_gap = curve((40, 0.99), (41, 0.2), (39, 0.2)), curve((20, 0.95), (40, 0.9))
     at_gap[40 + beside] = rival_at_gap[40 + beside] = np.nan
     assert labels_of(at_gap, rival_at_gap) == [FAIR, GOOD]
 
 
-def test_a_curve_that_is_hardly_seen_is_never_good():
+def test_a_curve_with_few_visible_heights_is_never_good():
     hidden = curve((60, 0.95))
     hidden[:40] = np.nan
     assert labels_of(hidden) == [GOOD]
@@ -126,7 +126,7 @@ def test_a_curve_that_is_hardly_seen_is_never_good():
     assert labels_of(hidden, options=SelectionOptions(min_visible_share=0.0)) == [GOOD]
 
 
-def test_a_curve_that_is_not_seen_is_poor():
+def test_a_curve_without_visible_heights_is_poor():
     unseen = np.full((1, N_HEIGHTS), np.nan)
     peaks = curve_peaks(unseen, STEP_PX, OPTIONS)
     assert np.isnan([peaks.rho1[0], peaks.rho2[0]]).all()
@@ -134,7 +134,7 @@ def test_a_curve_that_is_not_seen_is_poor():
     assert labels_of(*unseen) == [POOR]
 
 
-def test_rivals_without_positive_correlation():
+def test_second_peaks_without_positive_correlation():
     negative, none = curve((40, 0.7), (60, -0.6), floor=-0.9), curve((40, 0.7), (60, 0.0))
     assert labels_of(negative, none) == [FAIR, GOOD]
     assert labels_of(negative, none, options=SelectionOptions(negative_second_peak="infinite")) == [GOOD, GOOD]

@@ -1,4 +1,4 @@
-"""Progressive matching: the mean built image by image, its stop, and what is never evaluated."""
+"""Progressive matching: the mean built image by image, its stop, and images that are never evaluated."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_each_cell_stops_by_itself():
     np.testing.assert_array_equal(found.mean_ncc[0], GOOD_ALONE)
 
 
-def test_images_that_do_not_enter_are_not_evaluated():
+def test_images_that_do_not_cover_a_cell_are_not_evaluated():
     ncc = np.array([[BAD, GOOD_ALONE], [GOOD_ALONE, BAD], [BAD, BAD]])
     volume = Volume(ncc)
     seen = np.array([[False, True, True], [False, False, False]])
@@ -152,7 +152,7 @@ def test_images_that_do_not_enter_are_not_evaluated():
     assert found.label.tolist() == [GOOD, POOR]
 
 
-def test_a_view_that_is_hidden_at_some_heights_does_not_drag_the_mean():
+def test_occluded_heights_of_an_image_do_not_lower_the_mean():
     hidden = curve((40, 0.1))
     hidden[:50] = np.nan
     found = matched(Volume(np.array([[hidden], [curve((40, 0.95))]])), plan_of([[0, 1]], np.ones((1, 2), bool)))
@@ -164,7 +164,7 @@ def test_a_view_that_is_hidden_at_some_heights_does_not_drag_the_mean():
     assert found.evaluations == 2 * N_HEIGHTS
 
 
-def test_rivals_are_judged_by_the_most_sensitive_image_of_the_mean():
+def test_second_peaks_are_judged_by_the_most_sensitive_image_of_the_mean():
     """Eight steps are a pixel in the narrow image, and four in the wide one, which resolves the rival."""
     twin = curve((40, 0.95), (48, 0.93))
     ncc = np.array([[twin], [twin]])
@@ -251,7 +251,7 @@ def test_cells_outside_the_sample_do_not_decide():
     assert not found.is_stopped.any()
 
 
-def test_a_cell_that_has_stopped_stays_so():
+def test_a_cell_that_has_stopped_stays_stopped():
     """The first image is enough for one cell, the second for the other, and spoils the first."""
     ncc = np.array([[GOOD_ALONE, BAD], [curve((10, 0.9), floor=0.0), curve((10, 0.99), floor=-0.9)], [BAD, BAD]])
     found = matched(Volume(ncc), plan_of([[0, 1, 2]], np.ones((2, 3), bool), block=[0, 0]))
@@ -260,7 +260,7 @@ def test_a_cell_that_has_stopped_stays_so():
     assert found.label[0] != GOOD
 
 
-def test_cells_that_no_image_is_left_for_do_not_hold_their_block_up():
+def test_cells_without_further_images_do_not_delay_their_block():
     seen = np.ones((4, 3), bool)
     seen[3, 1:] = False
     seen[2] = False
@@ -270,7 +270,7 @@ def test_cells_that_no_image_is_left_for_do_not_hold_their_block_up():
     assert found.n_images.tolist() == [1, 1, 0, 1]
 
 
-def test_a_block_that_nothing_sees_adds_nothing():
+def test_a_block_that_no_image_covers_adds_none():
     found = matched(block_volume(1, 3), plan_of([[0, 1, 2]], np.zeros((3, 3), bool), block=np.zeros(3, int)))
     assert (found.n_added.tolist(), found.evaluations, found.saved) == ([0], 0, 0.0)
 

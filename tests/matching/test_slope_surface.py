@@ -1,4 +1,4 @@
-"""The base surface: as steep as the ground, blind to buildings, and what projects along it."""
+"""Slanted support surface: as steep as the ground, without buildings, and projections along it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from kernel_scene import at_all_heights, kernel_scene
 from zlocus.matching.kernels.cost_volume import plane_grid
-from zlocus.matching.slope_surface import DAMPING, PATCH, ROUNDS, SlopeSurface, CoarserSlope, patch_medians, relaxed
+from zlocus.matching.slope_surface import DAMPING, PATCH, ROUNDS, CoarserSlope, SlopeSurface, patch_medians, relaxed
 from zlocus.matching.tile_views import TileViews
 
 BLOCK = 16
@@ -35,19 +35,19 @@ def views_of(scene):
                       scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
 
 
-def test_sheared_views_project_where_the_base_lies():
-    """Index k of the base, at a node that lies `up` steps above the lattice's origin, is k + up of the lattice."""
+def test_views_along_the_slope_take_slope_indices():
+    """At a node where the surface has level index `up`, slope index k is level index k + up."""
     scene = kernel_scene()
     up = np.random.default_rng(4).uniform(-30, 30, scene.nodes.shape[1:3])
-    base = SlopeSurface(up, scene.block, scene.shape, scene.block)
-    sheared = base.along(views_of(scene))
-    assert sheared.nodes.shape == scene.nodes.shape
+    slope_surface = SlopeSurface(up, scene.block, scene.shape, scene.block)
+    slope_views = slope_surface.along(views_of(scene))
+    assert slope_views.nodes.shape == scene.nodes.shape
     start, step = scene.heights
     grid, plain = np.empty(8), np.empty(8)
     for view in range(scene.n_views):
         for b, d in np.ndindex(scene.nodes.shape[1] - 1, scene.nodes.shape[2] - 1):
             for k in (-7, 0, 19.25):
-                corner = sheared.nodes[:, b : b + 2, d : d + 2]
+                corner = slope_views.nodes[:, b : b + 2, d : d + 2]
                 plane_grid(corner, view, start + k * step, scene.block, 0, grid)
                 for i, j in np.ndindex(2, 2):
                     t = start + (k + up[b + i, d + j]) * step
@@ -59,7 +59,7 @@ def test_sheared_views_project_where_the_base_lies():
 
 
 @pytest.mark.parametrize("shape", [SHAPE, (64, 72), (5, 9)])
-def test_small_blocks_have_the_base_of_whole_patches(shape):
+def test_small_blocks_have_the_slope_of_whole_patches(shape):
     """Medians over a few cells would follow noise."""
     surface = plane(0.7, -0.4, shape) + np.random.default_rng(2).normal(size=shape).astype(np.float32)
     small, whole = SlopeSurface.from_surface(surface, PATCH // 2), SlopeSurface.from_surface(surface, PATCH)
@@ -67,16 +67,16 @@ def test_small_blocks_have_the_base_of_whole_patches(shape):
     np.testing.assert_allclose(small.cells, whole.cells, rtol=0, atol=FLOAT32_STEPS)
 
 
-def test_a_level_base_changes_nothing():
+def test_a_flat_surface_changes_nothing():
     scene = kernel_scene()
-    views, base = views_of(scene), SlopeSurface.flat(scene.shape, scene.block)
-    assert base.nodes.shape == scene.nodes.shape[1:3]
-    np.testing.assert_array_equal(base.along(views).nodes, views.nodes)
-    assert base.cells.shape == base.relief.shape == scene.shape
-    assert base.padded(5).shape == (scene.shape[0] + 10, scene.shape[1] + 10)
-    assert (base.padded(5) == 0).all()
-    assert (base.relief == 0).all()
-    assert not base.is_steep(ALL)
+    views, slope_surface = views_of(scene), SlopeSurface.flat(scene.shape, scene.block)
+    assert slope_surface.nodes.shape == scene.nodes.shape[1:3]
+    np.testing.assert_array_equal(slope_surface.along(views).nodes, views.nodes)
+    assert slope_surface.cells.shape == slope_surface.relief.shape == scene.shape
+    assert slope_surface.padded(5).shape == (scene.shape[0] + 10, scene.shape[1] + 10)
+    assert (slope_surface.padded(5) == 0).all()
+    assert (slope_surface.relief == 0).all()
+    assert not slope_surface.is_steep(ALL)
 
 
 def corners_of(by_row, by_col, shape, patch=PATCH):
@@ -91,7 +91,7 @@ def test_a_plane_that_has_its_slopes_stays():
 
 
 def relaxed_slowly(corners, by_row, by_col, patch):
-    """Plain-loop twin of `relaxed`: every corner moves to where the mean of its neighbours asks for it, or nearly."""
+    """Slow twin of `relaxed`: a corner moves most of the way to the mean of what its neighbours' slopes predict."""
     rows, cols = by_row.shape
 
     def around(values, patches):
@@ -121,8 +121,8 @@ def test_slopes_that_no_surface_has_are_shared_out(shape):
     np.testing.assert_allclose(found, relaxed_slowly(corners.copy(), by_row, by_col, PATCH), rtol=0, atol=STEPS)
 
 
-def test_a_corner_hears_of_patches_nearby_alone():
-    """So heights do not depend on where a tile ends."""
+def test_a_corner_depends_on_patches_nearby_only():
+    """So that heights do not depend on where a tile ends."""
     rng = np.random.default_rng(3)
     corners, slopes = rng.normal(size=(20, 25)), rng.normal(size=(2, 19, 24))
     other = slopes.copy()
@@ -134,7 +134,7 @@ def test_a_corner_hears_of_patches_nearby_alone():
 
 
 @pytest.mark.parametrize(("row", "col"), [(0.0, 0.0), (-16.0, -4.5)])
-def test_the_coarser_base_on_finer_cells(row, col):
+def test_the_coarser_slope_on_finer_cells(row, col):
     """A plane of the coarser level, continued: in cells half as large, and steps half as high."""
     coarse = SlopeSurface(corners_of(0.6, -0.2, (6, 7)), PATCH, (48, 56), PATCH)
     found = CoarserSlope(coarse, row, col).corners((9, 11), PATCH)
@@ -142,31 +142,35 @@ def test_the_coarser_base_on_finer_cells(row, col):
     np.testing.assert_allclose(found, 2 * (0.6 * down[:, None] - 0.2 * across + 5.0), rtol=0, atol=STEPS)
 
 
-def test_long_slopes_are_those_of_the_coarser_base():
+def test_long_slopes_are_those_of_the_coarser_level():
     """Where the surface is level, as far as its patches tell, the slope that the coarser level found stays."""
     coarse = SlopeSurface(corners_of(0.0, 0.5, (10, 10)), PATCH, (80, 80), PATCH)
-    base = SlopeSurface.from_surface(np.full((64, 96), 40.0, np.float32), BLOCK, CoarserSlope(coarse, 0.0, 0.0))
-    middle = np.diff(base.patch_corners, axis=1)[2:-2, 5:-5]
-    assert (base.patch_corners == np.rint(base.patch_corners)).all()
+    slope_surface = SlopeSurface.from_surface(
+        np.full((64, 96), 40.0, np.float32), BLOCK, CoarserSlope(coarse, 0.0, 0.0)
+    )
+    middle = np.diff(slope_surface.patch_corners, axis=1)[2:-2, 5:-5]
+    assert (slope_surface.patch_corners == np.rint(slope_surface.patch_corners)).all()
     np.testing.assert_allclose(middle, PATCH * 0.5, rtol=0, atol=WHOLE_STEPS)
 
 
 @pytest.mark.parametrize("block", [16, 32, 12])
 @pytest.mark.parametrize(("by_row", "by_col"), [(1.5, 0.0), (-0.4, 2.0)])
-def test_along_a_slope(by_row, by_col, block):
-    """Everywhere, also where the last blocks are cut off by the tile's border and where no slope is known."""
+def test_the_surface_follows_a_slope_everywhere(by_row, by_col, block):
+    """Also where the border cuts the last blocks, and where no slope is known."""
     surface = plane(by_row, by_col)
-    base = SlopeSurface.from_surface(surface, block)
+    slope_surface = SlopeSurface.from_surface(surface, block)
     rise = block * max(abs(by_row), abs(by_col))
-    assert base.is_steep(ALL) == (rise > 8)
+    assert slope_surface.is_steep(ALL) == (rise > 8)
     for axis, slope in enumerate((by_row, by_col)):
-        np.testing.assert_allclose(np.diff(base.cells, axis=axis), slope, rtol=0, atol=WHOLE_STEPS / base.patch)
+        np.testing.assert_allclose(
+            np.diff(slope_surface.cells, axis=axis), slope, rtol=0, atol=WHOLE_STEPS / slope_surface.patch
+        )
     # Whole steps are all that it misses the plane by, from one end to the other.
-    n_patches = np.subtract(base.patch_corners.shape, 1)
-    away = base.patch_corners - corners_of(by_row, by_col, n_patches, base.patch)
+    n_patches = np.subtract(slope_surface.patch_corners.shape, 1)
+    away = slope_surface.patch_corners - corners_of(by_row, by_col, n_patches, slope_surface.patch)
     assert np.ptp(away) <= WHOLE_STEPS + LOST * rise
-    assert base.cells.shape == SHAPE
-    assert base.cells.dtype == np.float32
+    assert slope_surface.cells.shape == SHAPE
+    assert slope_surface.cells.dtype == np.float32
 
 
 def hillside(wavelength=64.0, height=8.0):
@@ -177,69 +181,69 @@ def hillside(wavelength=64.0, height=8.0):
 
 
 def test_patches_follow_a_rough_hillside():
-    """Windows see what slope the base leaves: along the patches it is two fifths of that along whole blocks at most."""
+    """The slope that remains above the surface is at most two fifths of what whole blocks would leave."""
     surface = hillside()
-    base = SlopeSurface.from_surface(surface, 32)
+    slope_surface = SlopeSurface.from_surface(surface, 32)
 
     def left_over(cells):
         by_row, by_col = np.gradient((cells - surface)[16:-16, 16:-16])
         return np.hypot(by_row, by_col).mean()
 
-    by_patches, by_blocks = left_over(base.cells), left_over(base.cells - base.relief)
+    by_patches, by_blocks = left_over(slope_surface.cells), left_over(slope_surface.cells - slope_surface.relief)
     assert by_blocks > 0.3
     assert by_patches < 0.4 * by_blocks
 
 
 def test_relief_is_what_lies_above_the_corners_of_blocks():
-    base = SlopeSurface.from_surface(hillside()[:150, :187], 32)
-    relief = base.relief
-    assert base.nodes.shape == (6, 7)
-    assert base.patch_corners.shape == (21, 25)
+    slope_surface = SlopeSurface.from_surface(hillside()[:150, :187], 32)
+    relief = slope_surface.relief
+    assert slope_surface.nodes.shape == (6, 7)
+    assert slope_surface.patch_corners.shape == (21, 25)
     assert (relief[::32, ::32] == 0).all()
     assert np.abs(relief).max() > 3
     for r, c in ((5, 9), (33, 64), (31, 100), (149, 186)):
         b, d, p, q = r // 32, c // 32, r % 32 / 32, c % 32 / 32
-        top = (1 - q) * base.nodes[b, d] + q * base.nodes[b, d + 1]
-        low = (1 - q) * base.nodes[b + 1, d] + q * base.nodes[b + 1, d + 1]
+        top = (1 - q) * slope_surface.nodes[b, d] + q * slope_surface.nodes[b, d + 1]
+        low = (1 - q) * slope_surface.nodes[b + 1, d] + q * slope_surface.nodes[b + 1, d + 1]
         blocks = (1 - p) * top + p * low
-        assert relief[r, c] == pytest.approx(base.cells[r, c] - blocks, abs=FLOAT32_STEPS)
+        assert relief[r, c] == pytest.approx(slope_surface.cells[r, c] - blocks, abs=FLOAT32_STEPS)
 
 
 def test_a_block_that_patches_do_not_divide_is_one_patch():
-    base = SlopeSurface.from_surface(hillside(), 12)
-    assert base.patch == base.block == 12
-    np.testing.assert_array_equal(base.nodes, base.patch_corners)
-    assert (base.relief == 0).all()
-    assert np.ptp(base.cells) > 50
+    slope_surface = SlopeSurface.from_surface(hillside(), 12)
+    assert slope_surface.patch == slope_surface.block == 12
+    np.testing.assert_array_equal(slope_surface.nodes, slope_surface.patch_corners)
+    assert (slope_surface.relief == 0).all()
+    assert np.ptp(slope_surface.cells) > 50
 
 
 def test_a_tile_too_small_to_know_slopes_is_level():
     surface = np.random.default_rng(1).normal(0, 30, (8, 5)).astype(np.float32)
-    base = SlopeSurface.from_surface(surface, BLOCK)
-    assert base.cells.shape == (8, 5)
-    assert np.ptp(base.cells) < FLOAT32_STEPS
+    slope_surface = SlopeSurface.from_surface(surface, BLOCK)
+    assert slope_surface.cells.shape == (8, 5)
+    assert np.ptp(slope_surface.cells) < FLOAT32_STEPS
 
 
 def level_above(by_col=0.0):
-    """The base of the coarser level on half as many cells as `SHAPE`."""
+    """The slanted support surface of the coarser level on half as many cells as `SHAPE`."""
     shape = (SHAPE[0] // 2 + 1, SHAPE[1] // 2)
     n_patches = [-(-n // PATCH) for n in shape]
     return CoarserSlope(SlopeSurface(corners_of(0.0, by_col, n_patches), PATCH, shape, PATCH), 0.0, 0.0)
 
 
 @pytest.mark.parametrize("above", ["level", None])
-def test_a_building_on_level_ground_leaves_the_base_nearly_level(above):
+def test_a_building_on_level_ground_leaves_the_surface_nearly_level(above):
     surface = np.full(SHAPE, 40.0, np.float32)
     surface[20:43, 30:61] = 130.0
     surface[50:53, 5:100] = 70.0
-    base = SlopeSurface.from_surface(surface, BLOCK, level_above() if above else None)
-    assert max(np.abs(np.diff(base.nodes, axis=axis)).max() for axis in (0, 1)) < 0.5
-    assert np.abs(base.relief).max() < 0.5
-    assert not base.is_steep(ALL)
+    slope_surface = SlopeSurface.from_surface(surface, BLOCK, level_above() if above else None)
+    assert max(np.abs(np.diff(slope_surface.nodes, axis=axis)).max() for axis in (0, 1)) < 0.5
+    assert np.abs(slope_surface.relief).max() < 0.5
+    assert not slope_surface.is_steep(ALL)
 
 
 def test_a_jump_in_a_slope_adds_nothing_to_it():
-    """A terrace wall across a hill: the base rises by the slope, not by the wall."""
+    """A terrace wall across a hill: the surface rises by the slope, not by the wall."""
     surface = plane(0.0, 1.0)
     surface[:, 52:] += 60.0
     nodes = SlopeSurface.from_surface(surface, BLOCK, level_above(by_col=1.0)).nodes
@@ -252,11 +256,11 @@ def test_values_of_cells_and_of_their_border(shape, patch, half):
     """Bilinear between the corners of patches, and on from the outermost ones."""
     n_b, n_d = (-(-n // patch) for n in shape)
     corners = np.random.default_rng(2).normal(0, 50, (n_b + 1, n_d + 1))
-    base = SlopeSurface(corners, patch, shape, patch)
-    found = base.padded(half)
+    slope_surface = SlopeSurface(corners, patch, shape, patch)
+    found = slope_surface.padded(half)
     assert found.dtype == np.float32
     assert found.shape == (shape[0] + 2 * half, shape[1] + 2 * half)
-    np.testing.assert_array_equal(found[half : half + shape[0], half : half + shape[1]], base.cells)
+    np.testing.assert_array_equal(found[half : half + shape[0], half : half + shape[1]], slope_surface.cells)
     for r, c in np.ndindex(found.shape):
         row, col = r - half, c - half
         b, d = min(max(row // patch, 0), n_b - 1), min(max(col // patch, 0), n_d - 1)
@@ -267,7 +271,7 @@ def test_values_of_cells_and_of_their_border(shape, patch, half):
 
 
 def test_medians_of_patches():
-    """Of the cells there are, in patches that the border cuts."""
+    """Patches that the border cuts have the median of their remaining cells."""
     values = np.random.default_rng(3).normal(size=(37, 21)).astype(np.float32)
     found = patch_medians(values, PATCH)
     assert found.shape == (5, 3)

@@ -12,9 +12,9 @@ from reference import selection as plain
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.view_ranking import (
-    OrderSource,
     FeaturePoints,
     NeighbourSearch,
+    OrderSource,
     SearchGeometry,
     candidate_images,
     order_images,
@@ -63,12 +63,12 @@ def test_the_count_is_an_option():
     # Nearest to P1, B1 is better there; to P3, F1; to P2, both are good, and P1 or P3 decides.
     [(AROUND[0], B1), (AROUND[2], F1), (AROUND[1] + (0, -2), B1), (AROUND[1] + (0, 2), F1)],
 )
-def test_equals_are_settled_at_the_nearest_point_then_the_next(at, first):
+def test_equal_images_are_ordered_at_the_nearest_point_then_the_next(at, first):
     found = order_of(features(AROUND, TABLE_3), at)
     assert found.images[0, :2].tolist() == [first, F1 + B1 - first]
 
 
-def test_last_equals_are_settled_by_the_scene_then_as_they_stand():
+def test_images_equal_everywhere_keep_the_order_of_the_scene():
     xy = np.vstack([AROUND, [[1000.0, 0.0]]])
     found = order_of(features(xy, np.vstack([TABLE_3, [0, 0, 0, 0, 1]])), (0, 0))
     assert found.images[0, 3:].tolist() == [F2, N2]
@@ -92,7 +92,7 @@ def test_many_neighbours_do_not_overflow():
     assert found.images.tolist() == [[1, 0], [0, 1]]
 
 
-def test_ties_are_settled_by_the_nearest_forty():
+def test_equal_images_are_ordered_by_the_nearest_forty_points():
     n = 42
     labels = np.zeros((n, 2), np.int8)
     labels[39:41, 1] = 1, -1
@@ -160,7 +160,7 @@ def test_the_corners_of_the_triangle_by_distance():
            [[3.0, 3.0]] * 5],
     ids=["none", "one", "two", "a line", "one place"],
 )  # fmt: skip
-def test_no_triangle_can_be_made(xy):
+def test_points_without_a_triangle_count_as_the_nearest(xy):
     xy = np.array(xy)
     assert triangulated(xy) is None
     found = order_of(features(xy, np.ones((len(xy), 2))), (1, 1), options=TIN)
@@ -177,7 +177,7 @@ def test_outside_all_triangles_the_nearest_features_count():
 
 @given(arrays.arrays(np.float64, (8, 2), elements=st.integers(0, 60).map(float)),
        arrays.arrays(np.float64, (4, 2), elements=st.integers(-5, 65).map(float)))  # fmt: skip
-def test_the_triangle_holds_the_cell_and_is_delaunay(xy, at):
+def test_the_triangle_contains_the_cell_and_is_delaunay(xy, at):
     near = NeighbourSearch(xy, TIN).of(at)
     assume((near.order_source == OrderSource.NEIGHBOURS).any())
     for cell in np.flatnonzero(near.order_source == OrderSource.NEIGHBOURS):

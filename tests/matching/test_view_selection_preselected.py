@@ -1,4 +1,4 @@
-"""Of many views, those worth reading for a tile."""
+"""Of many views, those that are read for a tile."""
 
 from __future__ import annotations
 

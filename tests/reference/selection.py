@@ -1,4 +1,4 @@
-"""Labels, order and stop of search images in plain loops."""
+"""Slow twins of the labels, the order and the stop of search images, in plain loops."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import math
 
 
 def peaks(curve, step_px, options):
-    """(rho1, rho2, whether it is open) of one match curve; None for a correlation that is not there."""
-    seen = [k for k, value in enumerate(curve) if not math.isnan(value)]
-    if not seen:
+    """(rho1, rho2, whether the curve is open) of one match curve; None for a missing correlation."""
+    visible = [k for k, value in enumerate(curve) if not math.isnan(value)]
+    if not visible:
         return None, None, True
-    peak = max(seen, key=lambda k: (curve[k], -k))
+    peak = max(visible, key=lambda k: (curve[k], -k))
     rho2 = None
-    for k in seen:
-        if k - 1 in seen and k + 1 in seen and curve[k] > curve[k - 1] and curve[k] > curve[k + 1]:
-            is_rival = round(abs(k - peak) * step_px, 6) >= options.second_peak_distance_px
-            if is_rival and (rho2 is None or curve[k] > rho2):
+    for k in visible:
+        if k - 1 in visible and k + 1 in visible and curve[k] > curve[k - 1] and curve[k] > curve[k + 1]:
+            is_second_peak = round(abs(k - peak) * step_px, 6) >= options.second_peak_distance_px
+            if is_second_peak and (rho2 is None or curve[k] > rho2):
                 rho2 = curve[k]
-    is_open = peak - 1 not in seen or peak + 1 not in seen or len(seen) / len(curve) < options.min_visible_share
+    is_short = len(visible) / len(curve) < options.min_visible_share
+    is_open = peak - 1 not in visible or peak + 1 not in visible or is_short
     return curve[peak], rho2, is_open
 
 
@@ -70,12 +71,12 @@ def order(labels, neighbours, options):
     )
 
 
-def matched(volume, order_of, seen, step_px, options):
+def matched(volume, order_of, visible, step_px, options):
     """(curve, images used, whether it stopped) of one cell by the paper's rule. volume : [image][height]."""
     used = []
     curve = [math.nan] * len(volume[0])
     for image in order_of:
-        if not seen[image]:
+        if not visible[image]:
             continue
         used.append(image)
         for k in range(len(curve)):
