@@ -26,9 +26,10 @@ from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.occlusion import lowest_visible
 from zlocus.matching.kernels.resample import resample_plane
 from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
+from zlocus.matching.kernels.shared_records import ViewArrays
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.spline import spline_coefficients
-from zlocus.matching.kernels.subpixel import CUBIC, tile_ortho, tile_profile
+from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling, tile_ortho, tile_profile
 from zlocus.matching.subpixel import smoothed
 from zlocus.products.hillshade import hillshade
 
@@ -213,11 +214,12 @@ def least_case(count: int | None, side: int = SGM_SIDE) -> Case:
 def profile_case(side: int = SIDE) -> Case:
     """Correlations at three offsets around a surface, cubic resampling, windows 5 x 5 and 9 x 9, three views."""
     half, offsets = 4, np.linspace(-0.5, 0.5, 3).astype(np.float32)
-    surface, seen, (pixels, *scene) = np.pad(rolling(side), half, mode="edge"), all_seen(3, side), views(3, side)
-    out, windows = np.empty((2, 1, len(offsets), side, side), np.float32), np.array([2, half])
+    surface, visible = np.pad(rolling(side), half, mode="edge"), all_seen(3, side)
+    out, arrays = np.empty((2, 1, len(offsets), side, side), np.float32), ViewArrays(*views(3, side), BLOCK)
+    sampling = ProfileSampling(CUBIC, offsets, np.array([2, half]), np.float32(0))
 
     def call():
-        tile_profile(pixels, CUBIC, *scene, surface, offsets, BLOCK, windows, seen, np.float32(0), out)
+        tile_profile(arrays, surface, sampling, visible, out)
 
     return Case(call, out[0].size * 3, "cell, offset and image")
 
@@ -291,8 +293,8 @@ def spline_case() -> Case:
 
 def ortho_case(side: int = SIDE) -> Case:
     """Ortho-image of one view on a surface, bilinear."""
-    surface, scene, out = rolling(side), views(1, side), np.empty((side, side), np.float32)
-    return Case(lambda: tile_ortho(*scene, surface, 0, BLOCK, out), out.size, "cell")
+    surface, arrays, out = rolling(side), ViewArrays(*views(1, side), BLOCK), np.empty((side, side), np.float32)
+    return Case(lambda: tile_ortho(arrays, surface, 0, out), out.size, "cell")
 
 
 def test_resample(benchmark):

@@ -4,9 +4,9 @@
     python benchmarks/precision.py judge [FOLDER ...] [--views 6 3 2] [-o OUT]
 
 `fit` renders the scenes of TRAINING, or takes the FOLDERs given, runs `zlocus dsm` on them with six, three and two
-views, and writes src/zlocus/surface/calibration.py, or FILE. Runs with fewer than N cells of a kind (seen by a pair,
-or by more images) do not count. `judge` runs `zlocus dsm` on folders with img_*.tif, truth_dsm.tif and truth_class.tif
-(default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and trees, the share
+views, and writes src/zlocus/matching/precision_calibration.py, or FILE. Runs with fewer than N cells of a kind (seen by
+a pair, or by more images) do not count. `judge` runs `zlocus dsm` on folders with img_*.tif, truth_dsm.tif and
+truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and trees, the share
 of true errors within one and two sigma (68 and 95 % of a normal distribution); the share within one sigma in each
 quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the largest sigma is
 dropped. Draws calibration.png.
@@ -36,11 +36,11 @@ from zlocus.evaluation.alignment import best_shift
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
-from zlocus.matching import tile
+from zlocus.matching import finest_level, tile
 from zlocus.matching.precision import is_split
-from zlocus.pipeline import tile_run as job
+from zlocus.pipeline import tile_run
 
-CALIBRATION = Path(__file__).resolve().parents[1] / "src" / "zlocus" / "surface" / "calibration.py"
+CALIBRATION = Path(__file__).resolve().parents[1] / "src" / "zlocus" / "matching" / "precision_calibration.py"
 SIZE, POINTING_PX = 520, 2.0
 # (kind, seed): those that calibrate, and those that judge.
 TRAINING = (("city", 61), ("city", 62), ("city", 63), ("hills", 61), ("hills", 62))
@@ -50,17 +50,23 @@ MARGIN_M, LARGE_ERROR_M = 10.0, 1.0
 KNOTS, SMOOTHNESS, LEAST_ERROR_STEPS = 9, 0.02, 1e-3
 # What is asked of one and of two sigma, and what each weighs; of each run at least and at most so many cells, each
 # class so much.
-# Signs that may only raise sigma (1) or lower it (-1).
-DIRECTION = {"noise": 1, "apart": 1, "rough": 1, "own": 1, "uneven": 1, "moved": 1, "bend": -1, "ncc": -1, "rival": -1}
+# Predictors that may only raise sigma (1) or lower it (-1).
+DIRECTION = {
+    "noise": 1, "group_distance": 1, "roughness": 1, "cell_roughness": 1, "spread": 1, "refinement": 1,
+    "curvature": -1, "ncc": -1, "uniqueness": -1,
+}  # fmt: skip
 ASKED = ((0.68, 0.0, 1.0), (0.94, float(np.log(2.0)), 2.0))
 FEWEST, CELLS, CLASS_WEIGHT = 5000, 60000, {"ground": 1.0, "building": 0.4, "tree": 0.3}
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Cells of a run with known errors: signs, error_m, kind (index in CLASS_NAMES), (n,) each; step_m of heights."""
+    """Cells of a run with known errors: predictors, error_m, kind (index in CLASS_NAMES), (n,) each.
 
-    signs: dict[str, np.ndarray]
+    step_m : height step of the run.
+    """
+
+    predictors: dict[str, np.ndarray]
     is_refined: np.ndarray
     error_m: np.ndarray
     kind: np.ndarray
@@ -78,30 +84,30 @@ class Judged:
 
 @contextmanager
 def watched(found: list[tuple[Any, ...]]):
-    """Adds (window, core, signs, is_refined, scene) of every tile that is matched."""
-    predict, finish, match = tile.sigma_steps, tile._finish, job.match_tile
+    """Add (window, core window, predictors, is_refined, match scene) of every tile that is matched to `found`."""
+    predict, refine, match = finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile
     last: dict[str, Any] = {}
 
-    def predicted(signs, refined):
-        last.update(signs=signs, is_refined=refined.is_refined)
-        return predict(signs, refined)
+    def predicted(predictors, refined):
+        last.update(predictors=predictors, is_refined=refined.is_refined)
+        return predict(predictors, refined)
 
-    def finished(scene, pixels, result, *rest):
-        last["window"] = result.window
-        return finish(scene, pixels, result, *rest)
+    def refined(tile_inputs, result, *rest):
+        last["window"] = result.level.window
+        return refine(tile_inputs, result, *rest)
 
-    def matched(scene, core, *rest):
+    def matched(match_scene, core_window, *rest):
         last.clear()
-        result = match(scene, core, *rest)
+        result = match(match_scene, core_window, *rest)
         if "window" in last:
-            found.append((last["window"], core, last["signs"], last["is_refined"], scene))
+            found.append((last["window"], core_window, last["predictors"], last["is_refined"], match_scene))
         return result
 
-    tile.sigma_steps, tile._finish, job.match_tile = predicted, finished, matched
+    finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile = predicted, refined, matched
     try:
         yield
     finally:
-        tile.sigma_steps, tile._finish, job.match_tile = predict, finish, match
+        finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile = predict, refine, match
 
 
 def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]]:
@@ -142,7 +148,7 @@ def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
     truth, xy, errors = errors_of(folder, out / "dsm.tif")
     kind = kinds(truth)
     parts = []
-    for window, core, signs, is_refined, scene in tiles:
+    for window, core, predictors, is_refined, scene in tiles:
         col = np.floor((xy[:, 0] - scene.anchor[0]) / scene.cell_m).astype(int)
         row = np.floor((scene.anchor[1] - xy[:, 1]) / scene.cell_m).astype(int)
         inside = np.isfinite(errors)
@@ -150,7 +156,7 @@ def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
                              (row, window.row, window.rows), (col, window.col, window.cols)):  # fmt: skip
             inside &= (at >= first) & (at < first + n)
         cell = row[inside] - window.row, col[inside] - window.col
-        parts.append(({k: v[cell] for k, v in signs.items()}, is_refined[cell], errors[inside], kind[inside]))
+        parts.append(({k: v[cell] for k, v in predictors.items()}, is_refined[cell], errors[inside], kind[inside]))
     return Sample(
         {k: np.concatenate([part[0][k] for part in parts]) for k in parts[0][0]},
         *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)), tiles[0][4].step_m,
@@ -184,7 +190,7 @@ def fit(samples: list[Sample], fewest: int = FEWEST) -> dict[str, Any]:
     CannotRun
         Where no run has as many cells of one of the two kinds.
     """
-    split = [is_split(one.signs) for one in samples]
+    split = [is_split(one.predictors) for one in samples]
     return {
         "SPLIT": fit_model(enough(samples, split, fewest, "more than a pair of images")),
         "PAIR": fit_model(enough(samples, [~rows for rows in split], fewest, "a single pair of images")),
@@ -213,8 +219,8 @@ def enough(samples: list[Sample], rows: list[np.ndarray], fewest: int, kind: str
 
 def part(one: Sample, rows: np.ndarray) -> Sample:
     """Some cells of a sample."""
-    signs = {k: v[rows] for k, v in one.signs.items()}
-    return Sample(signs, one.is_refined[rows], one.error_m[rows], one.kind[rows], one.step_m)
+    predictors = {k: v[rows] for k, v in one.predictors.items()}
+    return Sample(predictors, one.is_refined[rows], one.error_m[rows], one.kind[rows], one.step_m)
 
 
 def fit_model(samples: list[Sample]) -> dict[str, Any]:
@@ -228,7 +234,7 @@ def fit_model(samples: list[Sample]) -> dict[str, Any]:
         factor = np.array(list(CLASS_WEIGHT.values())) / np.maximum(share, 0.01)
         weights.append(factor[one.kind[few]])
     rows = list(zip(samples, chosen, strict=True))
-    pooled = {k: np.concatenate([s.signs[k][r] for s, r in rows]) for k in samples[0].signs}
+    pooled = {k: np.concatenate([s.predictors[k][r] for s, r in rows]) for k in samples[0].predictors}
     refined = np.concatenate([s.is_refined[r] for s, r in rows])
     target = np.concatenate([np.log(np.abs(s.error_m[r]) / s.step_m + LEAST_ERROR_STEPS) for s, r in rows])
     weight = np.concatenate(weights)
@@ -273,15 +279,15 @@ def write(model: dict[str, Any], path: Path) -> None:
         '"""Curves of the precision model, made by benchmarks/precision.py; not to be edited."""', "",
         "from __future__ import annotations", "",
         "# fmt: off",
-        "# The logarithm of sigma: a constant; what is added where a height was not refined; and by sign: position of",
-        "# the first knot, spacing of the knots, logarithm of the factor at each.",
+        "# The logarithm of sigma: a constant; what is added where a height was not refined; and for each predictor",
+        "# the position of the first knot, the spacing of the knots, and the logarithm of the factor at each knot.",
         "Model = tuple[float, float, dict[str, tuple[float, float, tuple[float, ...]]]]",
     ]  # fmt: skip
     for kind, one in model.items():
         lines.append(f"{kind}: Model = ({one['constant']:.4f}, {one['not_refined']:.4f}, {{")
         for name, (first, spacing, curve) in one["curves"].items():
             if not np.isfinite([first, spacing, *curve]).all():
-                raise ValueError(f"The curve of {name} is not finite: look at its signs before anything is written.")
+                raise ValueError(f"The curve of {name} is not finite: look at its values before anything is written.")
             lines.append(f'    "{name}": ({first:.5g}, {spacing:.5g}, ({", ".join(f"{v:.4f}" for v in curve)})),')
         lines.append("})")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -289,11 +295,11 @@ def write(model: dict[str, Any], path: Path) -> None:
 
 def predicted_sigma(model: dict[str, Any], one: Sample) -> np.ndarray:
     """Sigma of a sample by a model, m (n,)."""
-    split, total = is_split(one.signs), np.zeros(len(one.error_m))
+    split, total = is_split(one.predictors), np.zeros(len(one.error_m))
     for kind, rows in (("SPLIT", split), ("PAIR", ~split)):
         total[rows] = model[kind]["constant"] + np.where(one.is_refined[rows], 0, model[kind]["not_refined"])
         for name, (first, spacing, curve) in model[kind]["curves"].items():
-            total[rows] += hats(one.signs[name][rows], first, spacing) @ curve
+            total[rows] += hats(one.predictors[name][rows], first, spacing) @ curve
     return np.exp(total) * one.step_m
 
 

@@ -19,19 +19,19 @@ def judged(**changed):
     """Reasons of 7 x 9 good cells, of which the one at AT differs."""
     values = {
         "best": 50,
-        "margin": 500,
+        "uniqueness": 500,
         "height": 50.2,
         "ncc": 0.9,
         "refined": True,
         "covering": 3,
         "seeing": 3,
-        "apart": 0.5,
+        "group_distance": 0.5,
     }
     arrays = {name: np.full((7, 9), value) for name, value in values.items()}
     for name, value in changed.items():
         arrays[name][AT] = value
     best = arrays["best"].astype(np.int32)
-    heights = SemiGlobalHeights(best, best, arrays["margin"].astype(np.uint16), best.astype(np.float32))
+    heights = SemiGlobalHeights(best, best, arrays["uniqueness"].astype(np.uint16), best.astype(np.float32))
     height, nothing = arrays["height"].astype(np.float32), np.zeros((7, 9), np.float32)
     refined = RefinedHeights(
         height,
@@ -43,8 +43,8 @@ def judged(**changed):
         nothing,
         nothing.astype(bool),
     )
-    apart = arrays["apart"].astype(np.float32)
-    return judge(heights, refined, arrays["covering"], arrays["seeing"], apart, 99, OPTIONS)
+    group_distance = arrays["group_distance"].astype(np.float32)
+    return judge(heights, refined, arrays["covering"], arrays["seeing"], group_distance, 99, OPTIONS)
 
 
 def test_good_cells_have_no_reason():
@@ -61,8 +61,8 @@ def test_good_cells_have_no_reason():
         ({"best": 110}, Quality.RANGE_END),
         ({"ncc": 0.19}, Quality.NO_MATCH | Quality.WEAK),
         ({"ncc": 0.49}, Quality.WEAK),
-        ({"apart": 1.01}, Quality.DISPUTED),
-        ({"margin": 63}, Quality.AMBIGUOUS),
+        ({"group_distance": 1.01}, Quality.DISPUTED),
+        ({"uniqueness": 63}, Quality.AMBIGUOUS),
         ({"refined": False}, Quality.UNREFINED),
     ],
 )
@@ -73,7 +73,7 @@ def test_a_reason(changed, reason):
     assert (quality == 0).all()
 
 
-@pytest.mark.parametrize("changed", [{"best": 1}, {"best": 98}, {"ncc": 0.51}, {"margin": 64}, {"seeing": 2}])
+@pytest.mark.parametrize("changed", [{"best": 1}, {"best": 98}, {"ncc": 0.51}, {"uniqueness": 64}, {"seeing": 2}])
 def test_just_good_enough(changed):
     assert (judged(**changed) == 0).all()
 

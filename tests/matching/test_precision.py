@@ -1,4 +1,4 @@
-"""Standard deviations of heights: signs, the additive model, and whether they hold on a scene of known truth."""
+"""Standard deviations of heights: predictors, the additive model, and whether they hold on a scene of known truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from zlocus.matching.kernels.precision import add_curve
 from zlocus.matching.match_curve import predicted_sigma
-from zlocus.matching.precision import LEAST_STEPS, is_split, sigma_steps, signs_of_precision, spread_around
+from zlocus.matching.precision import MIN_ROUGHNESS_STEPS, is_split, sigma_steps, spread_around, uncertainty_predictors
 from zlocus.matching.precision_calibration import PAIR, SPLIT
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.subpixel import RefinedHeights, peak_variance
@@ -25,13 +25,13 @@ def refined(**changed) -> RefinedHeights:
         "ncc": 0.9,
         "is_refined": True,
         "smooth": 20.0,
-        "bend": 0.4,
-        "apart": 0.1,
+        "curvature": 0.4,
+        "group_distance": 0.1,
         "is_fixed": False,
     }
     arrays = {k: np.full(SHAPE, v, bool if k.startswith("is_") else np.float32) for k, v in values.items()}
     arrays |= changed
-    return RefinedHeights(**arrays, variance=peak_variance(arrays["ncc"], arrays["bend"], np.full(SHAPE, 4), 49))
+    return RefinedHeights(**arrays, variance=peak_variance(arrays["ncc"], arrays["curvature"], np.full(SHAPE, 4), 49))
 
 
 def semi_global(height) -> SemiGlobalHeights:
@@ -39,13 +39,13 @@ def semi_global(height) -> SemiGlobalHeights:
     return SemiGlobalHeights(best, best, np.full(SHAPE, 500, np.uint16), np.asarray(height, np.float32))
 
 
-def signs(found: RefinedHeights, n_seeing=4, vertex=None):
+def predictors(found: RefinedHeights, n_seeing=4, vertex=None):
     heights = semi_global(found.height if vertex is None else vertex)
-    return signs_of_precision(heights, found, np.full(SHAPE, n_seeing))
+    return uncertainty_predictors(heights, found, np.full(SHAPE, n_seeing))
 
 
 def sigma(found: RefinedHeights, **kwargs) -> np.ndarray:
-    return sigma_steps(signs(found, **kwargs), found)
+    return sigma_steps(predictors(found, **kwargs), found)
 
 
 @given(
@@ -63,45 +63,45 @@ def test_curves_are_piecewise_linear(curve, first, spacing, values):
 
 
 def test_noise_is_the_predicted_sigma():
-    """Of a curve with that peak and bend, see `zlocus.matching.match_curve`."""
+    """Of a curve with that peak and curvature, see `zlocus.matching.match_curve`."""
     curve = 0.9 - 0.2 * (np.arange(-4, 5.0) / 2) ** 2
     of_curve = predicted_sigma(curve[None, ::2], np.full((1, 5), 4), 49)
-    found = signs(refined())["noise"]
+    found = predictors(refined())["noise"]
     np.testing.assert_allclose(np.exp(found), of_curve[0], rtol=LOGARITHM)
 
 
-def test_signs_of_a_step_stand_beside_it():
+def test_predictors_of_a_step_stand_beside_it():
     height = np.full(SHAPE, 20.0, np.float32)
     height[:, 15:] = 40.0
-    found = signs(refined(height=height, smooth=height))
-    np.testing.assert_allclose(found["jump"][:, [12, 17]], np.log(0.1), rtol=0, atol=LOGARITHM)
-    np.testing.assert_allclose(found["jump"][:, [13, 16]], np.log(20.1), rtol=0, atol=LOGARITHM)
-    np.testing.assert_allclose(found["ledge"][:, [11, 18]], np.log(20.1), rtol=0, atol=LOGARITHM)
-    np.testing.assert_allclose(found["uneven"][:, 20], np.log(LEAST_STEPS), rtol=0, atol=0.2)
-    assert (found["uneven"][:, 14] > np.log(5)).all()
-    rough = signs(refined(height=height))["rough"]
-    np.testing.assert_allclose(rough[:, 20], np.log(20 + LEAST_STEPS), rtol=0, atol=LOGARITHM)
-    moved = signs(refined(), vertex=np.full(SHAPE, 20.7))["moved"]
+    found = predictors(refined(height=height, smooth=height))
+    np.testing.assert_allclose(found["range_5"][:, [12, 17]], np.log(0.1), rtol=0, atol=LOGARITHM)
+    np.testing.assert_allclose(found["range_5"][:, [13, 16]], np.log(20.1), rtol=0, atol=LOGARITHM)
+    np.testing.assert_allclose(found["range_9"][:, [11, 18]], np.log(20.1), rtol=0, atol=LOGARITHM)
+    np.testing.assert_allclose(found["spread"][:, 20], np.log(MIN_ROUGHNESS_STEPS), rtol=0, atol=0.2)
+    assert (found["spread"][:, 14] > np.log(5)).all()
+    rough = predictors(refined(height=height))["roughness"]
+    np.testing.assert_allclose(rough[:, 20], np.log(20 + MIN_ROUGHNESS_STEPS), rtol=0, atol=LOGARITHM)
+    moved = predictors(refined(), vertex=np.full(SHAPE, 20.7))["refinement"]
     np.testing.assert_allclose(moved, np.log(0.75), rtol=0, atol=LOGARITHM)
 
 
 def test_groups_of_images_speak_for_the_cells_around():
-    apart = np.full(SHAPE, np.nan, np.float32)
-    apart[12, 15] = 0.6
-    found = signs(refined(apart=apart))
+    group_distance = np.full(SHAPE, np.nan, np.float32)
+    group_distance[12, 15] = 0.6
+    found = predictors(refined(group_distance=group_distance))
     near = np.zeros(SHAPE, bool)
     near[9:16, 12:19] = True
     np.testing.assert_array_equal(is_split(found), near)
-    np.testing.assert_allclose(found["apart"][near], np.log(0.6), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(found["group_distance"][near], np.log(0.6), rtol=0, atol=1e-3)
 
 
-def test_every_sign_has_a_curve_and_every_cell_a_sigma():
+def test_every_predictor_has_a_curve_and_every_cell_a_sigma():
     """Whatever is unknown: no round of refinement, no image, no peak."""
     nothing = refined(
-        apart=np.full(SHAPE, np.nan, np.float32), bend=np.zeros(SHAPE, np.float32), ncc=np.full(SHAPE, -1, np.float32),
-        is_refined=np.zeros(SHAPE, bool),
+        group_distance=np.full(SHAPE, np.nan, np.float32), curvature=np.zeros(SHAPE, np.float32),
+        ncc=np.full(SHAPE, -1, np.float32), is_refined=np.zeros(SHAPE, bool),
     )  # fmt: skip
-    assert set(signs(nothing)) == set(PAIR[2]) == set(SPLIT[2])
+    assert set(predictors(nothing)) == set(PAIR[2]) == set(SPLIT[2])
     for n_seeing in (0, 1, 2, 200):
         found = sigma(nothing, n_seeing=n_seeing)
         assert found.dtype == np.float32
@@ -112,11 +112,11 @@ def test_every_sign_has_a_curve_and_every_cell_a_sigma():
 @pytest.mark.parametrize("is_known", [(12, 15), (slice(None), slice(None)), (slice(0), slice(0))])
 def test_each_cell_has_the_sigma_of_its_model(is_known):
     """Some cells of either model, all of one, all of the other; half of them refined."""
-    rng, apart = np.random.default_rng(0), np.full(SHAPE, np.nan, np.float32)
-    apart[is_known] = 0.3
+    rng, group_distance = np.random.default_rng(0), np.full(SHAPE, np.nan, np.float32)
+    group_distance[is_known] = 0.3
     height = rng.normal(20, 1, SHAPE).astype(np.float32)
-    found = refined(apart=apart, height=height, is_refined=rng.random(SHAPE) < 0.5)
-    said = signs(found)
+    found = refined(group_distance=group_distance, height=height, is_refined=rng.random(SHAPE) < 0.5)
+    said = predictors(found)
     split, sigmas = is_split(said), sigma_steps(said, found)
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         constant, not_refined, curves = model
@@ -130,13 +130,13 @@ def test_each_cell_has_the_sigma_of_its_model(is_known):
     ("better", "worse"),
     [
         ({"ncc": 0.95}, {"ncc": 0.6}),
-        ({"bend": 0.8}, {"bend": 0.1}),
-        ({"apart": 0.05}, {"apart": 0.8}),
+        ({"curvature": 0.8}, {"curvature": 0.1}),
+        ({"group_distance": 0.05}, {"group_distance": 0.8}),
         ({"smooth": 20.05}, {"smooth": 21.5}),
     ],
 )
-def test_worse_signs_give_a_larger_sigma(better, worse):
-    """Each alone, others unchanged: signs that go together share the effect between them."""
+def test_worse_predictors_give_a_larger_sigma(better, worse):
+    """Each alone, others unchanged: predictors that go together share the effect between them."""
     small, large = (
         sigma(refined(**{k: np.full(SHAPE, v, np.float32) for k, v in one.items()}))[INNER] for one in (better, worse)
     )

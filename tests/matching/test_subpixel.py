@@ -10,15 +10,16 @@ from scipy.ndimage import spline_filter
 from rendered_scenes import CENTRE, FIELD, GSD_M, LOOKS, SIZE_PX, camera
 from zlocus.core.options import RefineOptions
 from zlocus.matching.subpixel import (
-    FARTHEST_APART,
-    bend_at_centre,
-    parabola_peak,
+    MAX_GROUP_DISTANCE_STEPS,
+    MeasuredDistances,
+    combined_windows,
+    curvature_at_centre,
+    group_distances,
+    lee_filtered,
+    parabola_peaks,
     peak_variance,
-    peaks_apart,
     refine,
-    sharpened,
     smoothed,
-    weighed,
 )
 from zlocus.matching.tile_views import ViewPixels, tile_views
 from zlocus.synthetic.render import Sun, render
@@ -32,7 +33,7 @@ def test_the_parabola_through_three_samples():
     offsets = np.linspace(-1.5, 1.5, 7, dtype=np.float32)
     peaks = np.array([[-0.9, 0.0, 0.26, 0.74]], np.float32)
     profile = 0.8 - 0.3 * (offsets[:, None, None] - peaks) ** 2
-    at, value, inside = parabola_peak(profile, offsets)
+    at, value, inside = parabola_peaks(profile, offsets)
     np.testing.assert_allclose(at, peaks, rtol=0, atol=1e-5)
     np.testing.assert_allclose(value, 0.8, rtol=0, atol=1e-6)
     assert inside.all()
@@ -41,7 +42,7 @@ def test_the_parabola_through_three_samples():
 def test_a_maximum_at_an_end_is_not_believed():
     offsets = np.linspace(-1, 1, 5, dtype=np.float32)
     profile = np.stack([offsets, -offsets, 0 * offsets], axis=1)[:, None, :].astype(np.float32)
-    at, _, inside = parabola_peak(profile, offsets)
+    at, _, inside = parabola_peaks(profile, offsets)
     assert not inside.any()
     assert np.isfinite(at).all()
     assert np.abs(at).max() <= 1.0
@@ -52,13 +53,13 @@ def test_bend_and_distance_of_two_parabolas():
     x, spacing = np.array([-0.5, 0.0, 0.5], np.float32)[:, None, None], np.float32(0.5)
     peaks = np.array([[[-0.3, 0.0, 0.2]], [[0.1, 0.4, 0.2]]], np.float32)
     profiles = np.stack([0.8 - 0.3 * (x - peaks[0]) ** 2, 0.7 - 0.5 * (x - peaks[1]) ** 2])
-    np.testing.assert_allclose(bend_at_centre(profiles[0], spacing), 0.6, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(bend_at_centre(-profiles[0], spacing), 0.0)
-    np.testing.assert_allclose(peaks_apart(profiles, spacing), [[0.4, 0.4, 0.0]], rtol=0, atol=1e-5)
-    assert np.isnan(peaks_apart(np.stack([profiles[0], 0 * profiles[0]]), spacing)).all(), "a group of no pair"
-    assert np.isnan(peaks_apart(np.stack([profiles[0], -profiles[0]]), spacing)).all(), "a pit has no peak"
+    np.testing.assert_allclose(curvature_at_centre(profiles[0], spacing), 0.6, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(curvature_at_centre(-profiles[0], spacing), 0.0)
+    np.testing.assert_allclose(group_distances(profiles, spacing), [[0.4, 0.4, 0.0]], rtol=0, atol=1e-5)
+    assert np.isnan(group_distances(np.stack([profiles[0], 0 * profiles[0]]), spacing)).all(), "a group of no pair"
+    assert np.isnan(group_distances(np.stack([profiles[0], -profiles[0]]), spacing)).all(), "a pit has no peak"
     nearly_flat = 0.5 + 0.1 * x - 1e-4 * x**2 + np.zeros((1, 1, 3), np.float32)
-    assert (peaks_apart(np.stack([profiles[0], nearly_flat]), spacing) == FARTHEST_APART).all()
+    assert (group_distances(np.stack([profiles[0], nearly_flat]), spacing) == MAX_GROUP_DISTANCE_STEPS).all()
 
 
 @pytest.mark.parametrize("n_samples", [3, 4, 7])
@@ -67,7 +68,7 @@ def test_peaks_of_any_profile(n_samples):
     rng, offsets = np.random.default_rng(n_samples), np.linspace(-0.6, 0.6, n_samples, dtype=np.float32)
     profile = rng.random((n_samples, 8, 9)).astype(np.float32)
     profile[:, :, :3] = np.round(2 * profile[:, :, :3]) / 2
-    at, value, inside = parabola_peak(profile, offsets)
+    at, value, inside = parabola_peaks(profile, offsets)
     for cell in np.ndindex(8, 9):
         y = profile[:, *cell].astype(float)
         k = min(max(int(y.argmax()), 1), n_samples - 2)
@@ -79,10 +80,10 @@ def test_peaks_of_any_profile(n_samples):
         assert value[cell] == pytest.approx(y[k] - 0.25 * lean * shift, abs=1e-4)
 
 
-def test_peaks_apart_of_any_profiles():
+def test_differences_of_groups_of_any_profiles():
     rng, spacing = np.random.default_rng(0), np.float32(0.4)
     profiles = rng.random((2, 3, 8, 9)).astype(np.float32)
-    found, known = peaks_apart(profiles, spacing), 0
+    found, known = group_distances(profiles, spacing), 0
     for cell in np.ndindex(8, 9):
         low, middle, high = profiles[:, :, *cell].astype(float).T
         bend = 2 * middle - low - high
@@ -90,7 +91,8 @@ def test_peaks_apart_of_any_profiles():
             assert np.isnan(found[cell])
             continue
         vertex = (high - low) / (2 * bend)
-        assert found[cell] == pytest.approx(min(abs(vertex[0] - vertex[1]) * spacing, FARTHEST_APART), abs=1e-3)
+        expected = min(abs(vertex[0] - vertex[1]) * spacing, MAX_GROUP_DISTANCE_STEPS)
+        assert found[cell] == pytest.approx(expected, abs=1e-3)
         known += 1
     assert 10 < known < 70
 
@@ -99,7 +101,7 @@ def test_a_peak_beyond_the_largest_sample_lies_between_the_samples():
     """Of three samples the largest is an end one; the parabola's vertex still lies within them, or it does not."""
     offsets = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
     peaks = np.array([[0.3, -0.45, 0.55]], np.float32)
-    at, _, inside = parabola_peak(0.8 - 0.3 * (offsets[:, None, None] - peaks) ** 2, offsets)
+    at, _, inside = parabola_peaks(0.8 - 0.3 * (offsets[:, None, None] - peaks) ** 2, offsets)
     np.testing.assert_allclose(at[0, :2], peaks[0, :2], rtol=0, atol=1e-5)
     assert inside.tolist() == [[True, True, False]]
 
@@ -111,17 +113,17 @@ def test_variance_of_a_peak():
     assert np.isfinite(peak_variance(grid, 0 * grid, np.array([[0]]), 49)).all()
 
 
-def test_noise_about_a_smooth_surface_is_taken_off_and_relief_kept():
+def test_noise_about_a_smooth_surface_is_reduced_and_relief_kept():
     """White noise of a variance that is known shrinks about its mean, which stays; so does relief, which is larger."""
     rng = np.random.default_rng(5)
     away = (0.4 + rng.normal(0.0, 0.1, (60, 120))).astype(np.float32)
     away[:, 60:] += np.float32(2.0) * (np.arange(60) // 6 % 2 - np.float32(0.5))
     known = np.ones(away.shape, bool)
-    found = weighed(away, known, np.full(away.shape, 0.01, np.float32))
+    found = lee_filtered(away, known, np.full(away.shape, 0.01, np.float32))
     assert np.abs(found[:, :50] - 0.4).mean() < 0.3 * np.abs(away[:, :50] - 0.4).mean()
     assert abs(found[:, :50].mean() - 0.4) < 0.01
     np.testing.assert_allclose(found[:, 70:], away[:, 70:], rtol=0, atol=0.05)
-    np.testing.assert_allclose(weighed(away, known, np.zeros(away.shape, np.float32)), away, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(lee_filtered(away, known, np.zeros(away.shape, np.float32)), away, rtol=0, atol=1e-6)
 
 
 def test_what_does_not_count_says_nothing_of_the_spread():
@@ -129,9 +131,9 @@ def test_what_does_not_count_says_nothing_of_the_spread():
     away = np.full((40, 40), 0.1, np.float32) * np.where(np.arange(40) % 2, 1, -1).astype(np.float32)
     known, variance = np.ones(away.shape, bool), np.full(away.shape, 0.005, np.float32)
     away[10:30, 10:30:3] = 0.0
-    expected = weighed(away, known & (away != 0), variance)
+    expected = lee_filtered(away, known & (away != 0), variance)
     away[10:30, 10:30:3], known[10:30, 10:30:3] = 5.0, False
-    np.testing.assert_allclose(weighed(away, known, variance)[known], expected[known], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(lee_filtered(away, known, variance)[known], expected[known], rtol=0, atol=1e-6)
 
 
 def test_narrow_windows_count_where_they_find_relief():
@@ -142,12 +144,12 @@ def test_narrow_windows_count_where_they_find_relief():
     narrow[:, 60:] += np.float32(0.5) * (np.arange(60) // 3 % 2 - np.float32(0.5))
     known = np.ones(wide.shape, bool)
     variance, of_narrow = (np.full(wide.shape, value, np.float32) for value in (0.002, 0.004))
-    found, together = sharpened(wide, variance, narrow, of_narrow, known)
+    found, together = combined_windows(MeasuredDistances(wide, variance), MeasuredDistances(narrow, of_narrow), known)
     assert np.abs(found - wide)[:, :50].mean() < 0.2 * np.abs(narrow - wide)[:, :50].mean()
     np.testing.assert_allclose(found[:, 70:], narrow[:, 70:], rtol=0, atol=0.05)
     assert (together[:, :50] < 0.0022).all()
     assert (together[:, 70:] > 0.0035).all()
-    nothing, same = sharpened(wide, variance, narrow, of_narrow, ~known)
+    nothing, same = combined_windows(MeasuredDistances(wide, variance), MeasuredDistances(narrow, of_narrow), ~known)
     np.testing.assert_array_equal(nothing, wide)
     np.testing.assert_array_equal(same, variance)
 
@@ -157,7 +159,7 @@ def test_relief_is_small():
     wide, known = np.zeros((40, 40), np.float32), np.ones((40, 40), bool)
     narrow = np.where(np.arange(40) % 4 == 0, np.float32(0.8), np.float32(0.01)) * np.ones_like(wide)
     variance, of_narrow = (np.full(wide.shape, value, np.float32) for value in (0.001, 0.003))
-    found, _ = sharpened(wide, variance, narrow, of_narrow, known)
+    found, _ = combined_windows(MeasuredDistances(wide, variance), MeasuredDistances(narrow, of_narrow), known)
     np.testing.assert_allclose(found, 0.0, rtol=0, atol=1e-6)
 
 
@@ -205,8 +207,8 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
     assert found.is_refined[inner].mean() > 0.99
     assert abs(np.median(found.height[inner]) - 20 - fraction) < STEPS
     assert np.median(found.ncc) > 0.95
-    assert (found.bend[inner] > 0).all()
-    assert np.median(found.apart[inner]) < 0.1
+    assert (found.curvature[inner] > 0).all()
+    assert np.median(found.group_distance[inner]) < 0.1
     assert np.median(found.variance[inner]) < STEPS**2
 
 
@@ -220,12 +222,13 @@ def test_what_is_too_far_keeps_the_coarse_height(plane):
     seen = np.zeros((3, len(LOOKS), *shape), np.int32)
     seen[1] = 50
     coarse = np.full(shape, 32.0, np.float32)
-    found = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=1, reach_steps=0.1))
+    options = RefineOptions(rounds=1, max_correction_steps=0.1)
+    found = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, options)
     kept = found.height[~found.is_refined]
     assert kept.size > 100
     assert (kept == 32.0).all()
     none = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=0))
     assert (none.height == 32.0).all()
     assert not none.is_refined.any()
-    assert np.isnan(none.apart).all()
-    assert (none.bend == 0).all()
+    assert np.isnan(none.group_distance).all()
+    assert (none.curvature == 0).all()

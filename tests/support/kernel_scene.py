@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.shared_records import ViewArrays
 
 HIDDEN = 2**30
 IMAGE_SHAPE = (61, 97)
@@ -28,6 +29,11 @@ class KernelScene:
     @property
     def n_views(self):
         return len(self.images)
+
+    @property
+    def arrays(self):
+        """The record that kernels take."""
+        return ViewArrays(self.pixels, self.layout, self.nodes, self.heights, self.block)
 
     def blocks(self):
         """Block row and column, and the rows and columns of its cells."""
@@ -90,3 +96,13 @@ def rough_surface(shape, seed=0, high=25.0):
     """(r, c) float32: half of the cells at 0, the others anywhere up to `high`."""
     rng = np.random.default_rng(seed)
     return (rng.integers(0, 2, shape) * high * rng.random(shape)).astype(np.float32)
+
+
+def random_cost(lattice, seed=0, high=129):
+    """(v,) uint8 costs of a lattice, below `high`."""
+    return np.random.default_rng(seed).integers(0, high, lattice.size).astype(np.uint8)
+
+
+def random_p2(shape, seed=0):
+    """(4, r, c) uint16 penalties of jumps from the west, north-west, north and north-east."""
+    return np.random.default_rng(seed).integers(60, 241, (4, *shape)).astype(np.uint16)

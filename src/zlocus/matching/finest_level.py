@@ -16,7 +16,7 @@ from zlocus.matching.local_contrast import texture_unit
 from zlocus.matching.occlusion import covers, left_out, n_seeing
 from zlocus.matching.overlap import BorderGround, unsupported
 from zlocus.matching.plane_fitting import PlanarHeights, with_planes
-from zlocus.matching.precision import sigma_steps, signs_of_precision, spread_around
+from zlocus.matching.precision import sigma_steps, spread_around, uncertainty_predictors
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.subpixel import refine
 from zlocus.matching.surface import Surface
@@ -66,12 +66,13 @@ def refined_surface(tile: TileInputs, result: LevelResult, border: BorderGround)
     )  # fmt: skip
     n_covering = covers(result.visible).sum(axis=0)
     n_views = n_seeing(result.visible, refined.height)
-    signs = signs_of_precision(result.heights, refined, n_views)
+    predictors = uncertainty_predictors(result.heights, refined, n_views)
     last_index = match_scene.n_steps - 1
-    quality = judge(result.heights, refined, n_covering, n_views, np.exp(signs["apart"]), last_index, config.checks)
+    group_distance = np.exp(predictors["group_distance"])
+    quality = judge(result.heights, refined, n_covering, n_views, group_distance, last_index, config.checks)
     _mark_overlap(quality, result, border, refined.height)
     height = result.lattice.metres(refined.height)
-    sigma = sigma_steps(signs, refined)
+    sigma = sigma_steps(predictors, refined)
     is_noise = border.is_near(result.level.window) & (spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps)
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)
     sigma *= np.float32(match_scene.step_m)

@@ -1,4 +1,4 @@
-"""Decides which heights are kept, and says why others are not."""
+"""Quality flags of the heights: which cells have no height or a doubtful one, and why."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from zlocus.matching.quality import Quality
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.subpixel import RefinedHeights
 
-JUMP_STEPS = 3.0
-AROUND = np.ones((3, 3), np.uint8)
+# Height difference between neighbouring cells from which on both are marked as next to a jump.
+MAX_DIFFERENCE_WITHOUT_JUMP_STEPS = 3.0
+NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 def judge(
@@ -20,15 +21,16 @@ def judge(
     refined: RefinedHeights,
     n_covering: NDArray[np.integer],
     n_seeing: NDArray[np.integer],
-    apart: NDArray[np.float32],
+    group_distance: NDArray[np.float32],
     last_index: int,
     options: CheckOptions,
 ) -> NDArray[np.uint16]:
-    """Reasons of every cell, (r, c) uint16.
+    """Quality flags of every cell, (r, c) uint16, see `Quality`.
 
-    n_covering : images that cover the cell at any height; n_seeing : images that see the surface there; apart : (r, c)
-    float32 steps, between the heights of two groups of pairs of images, around the cell (what matching from another
-    reference image checks where there is one); last_index : highest height index of the scene.
+    n_covering : (r, c), images that cover the cell at any height; n_seeing : (r, c), images that see the surface there;
+    group_distance : (r, c) float32 steps, distance between the heights of two groups of image pairs around the cell
+    (it takes the place of a cross-consistency check, which needs a reference image); last_index : highest height index
+    of the scene.
     """
     quality = np.zeros(heights.best.shape, np.uint16)
 
@@ -37,12 +39,13 @@ def judge(
 
     mark(n_covering < 2, Quality.UNSEEN)
     mark((n_covering >= 2) & (n_seeing < 2), Quality.OCCLUDED)
-    seen = n_seeing >= 2
-    mark(seen & ((heights.best <= 0) | (heights.best >= last_index)), Quality.RANGE_END)
-    mark(seen & (refined.ncc < options.min_ncc), Quality.NO_MATCH)
-    mark(seen & (refined.ncc < options.weak_ncc), Quality.WEAK)
+    is_seen = n_seeing >= 2
+    mark(is_seen & ((heights.best <= 0) | (heights.best >= last_index)), Quality.RANGE_END)
+    mark(is_seen & (refined.ncc < options.min_ncc), Quality.NO_MATCH)
+    mark(is_seen & (refined.ncc < options.weak_ncc), Quality.WEAK)
     mark(heights.uniqueness < options.min_uniqueness, Quality.AMBIGUOUS)
-    mark(cv2.dilate(refined.height, AROUND) - cv2.erode(refined.height, AROUND) > JUMP_STEPS, Quality.JUMP)
+    local_range = cv2.dilate(refined.height, NEIGHBOURS) - cv2.erode(refined.height, NEIGHBOURS)
+    mark(local_range > MAX_DIFFERENCE_WITHOUT_JUMP_STEPS, Quality.JUMP)
     mark(~refined.is_refined, Quality.UNREFINED)
-    mark(seen & (apart > options.disputed_steps), Quality.DISPUTED)
+    mark(is_seen & (group_distance > options.disputed_steps), Quality.DISPUTED)
     return quality

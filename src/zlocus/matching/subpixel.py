@@ -1,8 +1,9 @@
-"""Sub-step heights: the measure itself, a few fractions of a step around a smooth surface that the windows follow."""
+"""Sub-step heights: the correlation at fractions of a step around a smooth surface, which the windows follow."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,53 +11,85 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import RefineOptions
 from zlocus.matching.height_lattice import NARROW_BASE_STEP_CELLS
+from zlocus.matching.kernels.shared_records import ViewArrays
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
-from zlocus.matching.kernels.subpixel import CUBIC, LINEAR, profile_peaks, tile_profile, vertices_apart
+from zlocus.matching.kernels.subpixel import (
+    CUBIC,
+    LINEAR,
+    ProfileSampling,
+    profile_peaks,
+    tile_profile,
+    vertex_distances,
+)
 from zlocus.matching.occlusion import n_seeing
 from zlocus.matching.tile_views import TileViews
 
 FloatGrid = NDArray[np.float32]
-# Heights measured around the surface, in steps: wide in the first round, then three beside the peak.
+# Heights of the samples around the surface, in steps: far apart in the first round, then three close to the peak.
 FIRST_OFFSETS = np.linspace(-1.0, 1.0, 3, dtype=np.float32)
 LATER_OFFSETS = np.linspace(-0.5, 0.5, 3, dtype=np.float32)
-# Of a peak's variance by `peak_variance`, which knows nothing of what disturbs several images alike.
+# Factor of the variance of a peak by `peak_variance`, which does not include what disturbs several images alike.
 NOISE_FACTOR = 2.5
-LARGEST_RELIEF = np.float32(0.5)  # steps within a window
-SPREAD_CELLS = 15  # around a cell, over which heights spread about the smooth surface
-SPACINGS = (1, 2, 4)
-SLOPE_REACH = 8
-WIDE_WINDOW, NARROW_WINDOW = 9, 7
-FARTHEST_APART, LEAST_BEND = np.float32(3.0), np.float32(1e-6)
-LEAST_PEAK, LEAST_NOISE = np.float32(1e-3), np.float32(1e-3)  # bend per step squared; 1 - NCC
+# Largest relief within a window; heights that differ more come from another peak.
+MAX_RELIEF_STEPS = np.float32(0.5)
+# Side of the window in which the spread of heights about the smooth surface is computed.
+SPREAD_CELLS = 15
+# Distances of the cells of a smoothing pass, and over which slopes are computed.
+SMOOTHING_SPACINGS_CELLS, SLOPE_DISTANCE_CELLS = (1, 2, 4), 8
+# Sides of the correlation window for narrow and wide bases.
+NARROW_BASE_WINDOW_CELLS, WIDE_BASE_WINDOW_CELLS = 9, 7
+# Largest distance of the peaks of two groups of image pairs that is told apart; curvature below which there is no peak.
+MAX_GROUP_DISTANCE_STEPS, MIN_CURVATURE = np.float32(3.0), np.float32(1e-6)
+# Limits in `peak_variance`: curvature of a peak per step squared, and 1 - NCC.
+MIN_PEAK_CURVATURE, MIN_DECORRELATION = np.float32(1e-3), np.float32(1e-3)
 
 
 @dataclass(frozen=True)
 class RefinedHeights:
-    """Sub-step heights and what the measure looks like around them, all (r, c).
+    """Sub-step heights and the shape of the correlation around them, all (r, c).
 
-    height : float32 height indices; ncc : float32, the measure there; is_refined : bool, False where the semi-global
-    height was kept; smooth : float32 height indices, the surface that the last windows followed; bend : float32,
-    curvature of the measure per step squared, 0 where it has no peak; apart : float32 steps, distance of the peaks of
-    two groups of pairs of views, NaN where a group has none; variance : float32 steps squared, see `peak_variance`;
-    is_fixed : bool, cells that kept their heights because they were told to.
+    height : float32 height indices; ncc : float32, mean NCC there; is_refined : bool, False where the semi-global
+    height was kept; smooth : float32 height indices, the surface that the last windows followed; curvature : float32,
+    of the correlation peak per step squared, 0 where there is none; group_distance : float32 steps, distance between
+    the peaks of two groups of image pairs, NaN where a group has none; variance : float32 steps squared, see
+    `peak_variance`; is_fixed : bool, cells whose heights were not to be changed.
     """
 
     height: FloatGrid
     ncc: FloatGrid
     is_refined: NDArray[np.bool_]
     smooth: FloatGrid
-    bend: FloatGrid
-    apart: FloatGrid
+    curvature: FloatGrid
+    group_distance: FloatGrid
     variance: FloatGrid
     is_fixed: NDArray[np.bool_]
 
 
+class ProfilePeaks(NamedTuple):
+    """Peaks of correlation profiles, all (r, c).
+
+    position : float32, height above the surface in steps; value : float32, NCC there; is_inside : bool, whether the
+    peak lies between the first and the last sample.
+    """
+
+    position: FloatGrid
+    value: FloatGrid
+    is_inside: NDArray[np.bool_]
+
+
+class MeasuredDistances(NamedTuple):
+    """distance : (r, c) float32 steps, from a smooth surface; variance : (r, c) float32 steps squared, of its noise."""
+
+    distance: FloatGrid
+    variance: FloatGrid
+
+
 def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
-    """Median, then means along the slope that do not reach across jumps."""
+    """Smooth surface (r, c): the median, then means along the slope that do not reach across jumps."""
     out = np.asarray(cv2.medianBlur(np.ascontiguousarray(surface), 5), np.float32)
     by_row, by_col = np.empty_like(out), np.empty_like(out)
-    for spacing in SPACINGS:
-        slopes(out, SLOPE_REACH, by_row, by_col)
+    for spacing in SMOOTHING_SPACINGS_CELLS:
+        slopes(out, SLOPE_DISTANCE_CELLS, by_row, by_col)
         smooth = np.empty_like(out)
         smooth_surface(out, by_row, by_col, spacing, np.float32(jump_steps), smooth)
         out = smooth
@@ -67,127 +100,173 @@ def refine(
     views: TileViews,
     coefficients: NDArray[np.float32],
     coarse: FloatGrid,
-    seen: NDArray[np.int32],
+    visible: NDArray[np.int32],
     step_cells: float,
     options: RefineOptions,
-    fixed: NDArray[np.bool_] | None = None,
+    is_fixed: NDArray[np.bool_] | None = None,
 ) -> RefinedHeights:
-    """Refine height indices `coarse` (r, c) float32.
+    """Refine the height indices `coarse` (r, c) float32 to fractions of a step.
 
-    coefficients : of cubic B-splines, as `views` has pixels. Each round smooths the surface, measures the mean NCC at a
-    few fractions of a step around it and puts a parabola through the best three: linear values of the images will do
-    for all rounds but the last. Windows that follow a noisy surface would see a different place in each image, hence
-    the smoothing; a refined height further than `max_correction_steps` from the semi-global one is not believed. What the last
-    round finds counts by how much of it is noise: what narrow windows find beside wide ones (see `refined_ties`), then
-    what either finds beside the smooth surface (see `weighed`). step_cells : height of a step over the side of a
-    cell; fixed : (r, c), cells that are measured like the others and keep their heights.
+    Each round smooths the surface, computes the mean NCC at a few fractions of a step around it, and takes the maximum
+    of the parabola through the samples. The surface is smoothed because windows that follow a noisy surface would show
+    a different place in each image. Linear interpolation of the images is enough for all rounds but the last. A refined
+    height that is more than `max_correction_steps` from the semi-global height is rejected. In the last round the noise
+    of the result is reduced: first by what wide windows find beside narrow ones (see `combined_windows`), then towards
+    the smooth surface (see `lee_filtered`).
+
+    coefficients : (p,) cubic B-spline coefficients, arranged as the pixels of `views`; visible : (3, i, r, c), see
+    `coverage`; step_cells : height step divided by the side of a cell; is_fixed : (r, c), cells whose correlation is
+    computed like that of the others, but whose heights stay.
     """
-    fixed = np.zeros(coarse.shape, np.bool_) if fixed is None else fixed
+    is_fixed = np.zeros(coarse.shape, np.bool_) if is_fixed is None else is_fixed
     half = (options.window or default_window(step_cells)) // 2
     height, is_refined = coarse.astype(np.float32), np.zeros(coarse.shape, bool)
-    surface, best, bend = height, np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.float32)
-    apart, variance = np.full(coarse.shape, np.nan, np.float32), np.ones(coarse.shape, np.float32)
+    surface, ncc, curvature = height, np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.float32)
+    group_distance, variance = np.full(coarse.shape, np.nan, np.float32), np.ones(coarse.shape, np.float32)
     for number in range(options.rounds):
         surface, is_last = smoothed(height, options.jump_steps), number == options.rounds - 1
-        offsets = FIRST_OFFSETS if number == 0 else LATER_OFFSETS
-        windows = np.unique([(half + 1) // 2, half]) if is_last else np.array([half])
-        profiles = np.empty((len(windows), 2 if is_last else 1, len(offsets), *coarse.shape), np.float32)
-        values, degree = (coefficients, CUBIC) if is_last else (views.pixels, LINEAR)
-        tile_profile(
-            values, degree, views.layout, views.nodes, views.heights, np.pad(surface, half, mode="edge"), offsets,
-            views.block, windows, seen, np.float32(0.0), profiles,
-        )  # fmt: skip
-        profile, spacing = profiles[-1].sum(axis=0), offsets[1] - offsets[0]
-        found, best, inside = parabola_peak(profile, offsets)
-        is_refined = inside & (np.abs(found + surface - coarse) < options.max_correction_steps)
+        sampling = _sampling(half, number == 0, is_last)
+        arrays = views.arrays._replace(pixels=coefficients) if is_last else views.arrays
+        profiles = profiles_around(arrays, surface, sampling, 2 if is_last else 1, visible)
+        profile = profiles[-1].sum(axis=0)
+        peaks = parabola_peaks(profile, sampling.offsets)
+        distance, ncc = peaks.position, peaks.value
+        is_refined = peaks.is_inside & (np.abs(distance + surface - coarse) < options.max_correction_steps)
         if is_last:
-            bend, apart = bend_at_centre(profile, spacing), peaks_apart(profiles[-1], spacing)
-            seeing = n_seeing(seen, surface)
-            variance = peak_variance(best, bend, seeing, (2 * half + 1) ** 2)
-            noise = variance
-            for window, narrow in zip(windows[:-1], profiles[:-1].sum(axis=1), strict=True):
-                sharp, ncc, known = parabola_peak(narrow, offsets)
-                of_sharp = peak_variance(ncc, bend_at_centre(narrow, spacing), seeing, (2 * int(window) + 1) ** 2)
-                found, noise = refined_ties(found, variance, sharp, of_sharp, is_refined & known)
-            found = weighed(found, is_refined, noise)
-        height = np.where(is_refined & ~fixed, found + surface, height)
-    return RefinedHeights(height, best, is_refined, surface, bend, apart, variance, fixed)
+            spacing = sampling.offsets[1] - sampling.offsets[0]
+            curvature = curvature_at_centre(profile, spacing)
+            group_distance = group_distances(profiles[-1], spacing)
+            n_images = n_seeing(visible, surface)
+            variance = peak_variance(ncc, curvature, n_images, (2 * half + 1) ** 2)
+            wide = MeasuredDistances(distance, variance)
+            reduced = _with_narrow_window(wide, profiles[:-1].sum(axis=1), sampling, n_images, is_refined)
+            distance = lee_filtered(reduced.distance, is_refined, reduced.variance)
+        height = np.where(is_refined & ~is_fixed, distance + surface, height)
+    return RefinedHeights(height, ncc, is_refined, surface, curvature, group_distance, variance, is_fixed)
 
 
-def peak_variance(ncc: FloatGrid, bend: FloatGrid, n_images: NDArray[np.integer], window_cells: int) -> FloatGrid:
-    """Variance of the place of the measure's peak, steps squared: see `zlocus.matching.match_curve.predicted_sigma`."""
-    noise = 2 * np.maximum(1 - ncc, LEAST_NOISE)
-    images = np.maximum(n_images, 1).astype(np.float32)
-    return np.asarray(noise / (np.maximum(bend, LEAST_PEAK) * window_cells * images), np.float32)
+def _sampling(half: int, is_first: bool, is_last: bool) -> ProfileSampling:
+    """How a round samples the correlation. half : half width of the window; the last round has a narrower one too."""
+    return ProfileSampling(
+        degree=CUBIC if is_last else LINEAR,
+        offsets=FIRST_OFFSETS if is_first else LATER_OFFSETS,
+        windows=np.unique([(half + 1) // 2, half]) if is_last else np.array([half]),
+        noise_variance=np.float32(0.0),
+    )
 
 
-def refined_ties(
-    wide: FloatGrid, variance: FloatGrid, narrow: FloatGrid, of_narrow: FloatGrid, known: NDArray[np.bool_]
-) -> tuple[FloatGrid, FloatGrid]:
-    """Distances (r, c) from a smooth surface as wide windows find them, with as much of what narrow ones find beside
-    them as is relief: the share of the spread of their differences that is not noise. And the variance of both.
+def profiles_around(
+    views: ViewArrays, surface: FloatGrid, sampling: ProfileSampling, n_groups: int, visible: NDArray[np.int32]
+) -> NDArray[np.float32]:
+    """Correlation around a surface (r, c): (w, g, j, r, c) by window, group of image pairs and offset.
 
-    variance, of_narrow : (r, c), of the noise of either; known : (r, c), where both are to be believed. Narrow windows
-    lie in wide ones, whose noise they share: the variance of their difference is the difference of theirs. Source: as
-    `weighed`.
+    The sum over the groups is the mean NCC over all pairs.
     """
-    beside = np.where(known & (np.abs(narrow - wide) < LARGEST_RELIEF), narrow - wide, np.float32(0.0))
-    more = np.maximum(of_narrow - variance, np.float32(0.0))
-    share_known = np.maximum(_around(known.astype(np.float32)), np.float32(1e-3))
-    noise = _around(np.where(known, more, np.float32(0.0))) / share_known
-    spread = _around(beside * beside) / share_known
+    profiles = np.empty((len(sampling.windows), n_groups, len(sampling.offsets), *surface.shape), np.float32)
+    tile_profile(views, np.pad(surface, int(sampling.windows[-1]), mode="edge"), sampling, visible, profiles)
+    return profiles
+
+
+def _with_narrow_window(
+    wide: MeasuredDistances,
+    profiles: NDArray[np.float32],
+    sampling: ProfileSampling,
+    n_images: NDArray[np.integer],
+    is_refined: NDArray[np.bool_],
+) -> MeasuredDistances:
+    """Distances of wide windows combined with those of the narrower window, where the sampling has one.
+
+    profiles : (w - 1, j, r, c), of the narrower window and all pairs; n_images, is_refined : (r, c).
+    """
+    result, spacing = wide, sampling.offsets[1] - sampling.offsets[0]
+    for window, profile in zip(sampling.windows[:-1], profiles, strict=True):
+        peaks = parabola_peaks(profile, sampling.offsets)
+        curvature = curvature_at_centre(profile, spacing)
+        variance = peak_variance(peaks.value, curvature, n_images, (2 * int(window) + 1) ** 2)
+        result = combined_windows(wide, MeasuredDistances(peaks.position, variance), is_refined & peaks.is_inside)
+    return result
+
+
+def peak_variance(ncc: FloatGrid, curvature: FloatGrid, n_images: NDArray[np.integer], window_cells: int) -> FloatGrid:
+    """Variance of the position of a correlation peak, (r, c) steps squared.
+
+    See `zlocus.matching.match_curve.predicted_sigma`. window_cells : number of cells of the window.
+    """
+    noise = 2 * np.maximum(1 - ncc, MIN_DECORRELATION)
+    images = np.maximum(n_images, 1).astype(np.float32)
+    return np.asarray(noise / (np.maximum(curvature, MIN_PEAK_CURVATURE) * window_cells * images), np.float32)
+
+
+def combined_windows(wide: MeasuredDistances, narrow: MeasuredDistances, known: NDArray[np.bool_]) -> MeasuredDistances:
+    """Distances of wide windows with the relief that narrow windows find beside them.
+
+    The difference of the two is multiplied by the share of its spread that is not noise. known : (r, c), cells where
+    both are valid. Narrow windows lie within wide ones and share their noise, so the variance of the difference is the
+    difference of the variances. Source: as for `lee_filtered`.
+    """
+    difference = narrow.distance - wide.distance
+    relief = np.where(known & (np.abs(difference) < MAX_RELIEF_STEPS), difference, np.float32(0.0))
+    added = np.maximum(narrow.variance - wide.variance, np.float32(0.0))
+    share_known = np.maximum(_mean_around(known.astype(np.float32)), np.float32(1e-3))
+    noise = _mean_around(np.where(known, added, np.float32(0.0))) / share_known
+    spread = _mean_around(relief * relief) / share_known
     share = np.clip(1 - np.float32(NOISE_FACTOR) * noise / np.maximum(spread, np.float32(1e-9)), 0, 1)
-    together = variance + np.where(known, share * share * more, np.float32(0.0))
-    return np.asarray(wide + share * beside, np.float32), np.asarray(together, np.float32)
+    variance = wide.variance + np.where(known, share * share * added, np.float32(0.0))
+    return MeasuredDistances(
+        np.asarray(wide.distance + share * relief, np.float32), np.asarray(variance, np.float32)
+    )  # fmt: skip
 
 
-def weighed(away: FloatGrid, known: NDArray[np.bool_], variance: FloatGrid) -> FloatGrid:
-    """Distances (r, c) from a smooth surface: their mean around the cell, and what they differ from it multiplied by
-    the share of their spread that is not noise.
+def lee_filtered(distance: FloatGrid, known: NDArray[np.bool_], variance: FloatGrid) -> FloatGrid:
+    """Distances (r, c) from a smooth surface with less noise: the mean around the cell, plus the difference from it
+    multiplied by the share of the spread that is not noise.
 
-    known : (r, c), distances that count; variance : (r, c), of their noise. Source: Lee (1980), "Digital image
+    known : (r, c), cells whose distances count; variance : (r, c), of their noise. Source: Lee (1980), "Digital image
     enhancement and noise filtering by use of local statistics", equation 9.
     """
-    share = np.maximum(_around(known.astype(np.float32)), np.float32(1e-3))
-    counted = np.where(known, away, np.float32(0.0))
-    mean = _around(counted) / share
-    spread = _around(counted * counted) / share - mean * mean
+    share = np.maximum(_mean_around(known.astype(np.float32)), np.float32(1e-3))
+    counted = np.where(known, distance, np.float32(0.0))
+    mean = _mean_around(counted) / share
+    spread = _mean_around(counted * counted) / share - mean * mean
     signal = 1 - np.float32(NOISE_FACTOR) * variance / np.maximum(spread, np.float32(1e-9))
-    return np.asarray(mean + (away - mean) * np.clip(signal, 0, 1), np.float32)
+    return np.asarray(mean + (distance - mean) * np.clip(signal, 0, 1), np.float32)
 
 
-def _around(values: FloatGrid) -> FloatGrid:
-    """Means over `SPREAD_CELLS`."""
+def _mean_around(values: FloatGrid) -> FloatGrid:
+    """Means over `SPREAD_CELLS` around every cell."""
     return np.asarray(cv2.blur(values, (SPREAD_CELLS, SPREAD_CELLS), borderType=cv2.BORDER_REFLECT), np.float32)
 
 
 def default_window(step_cells: float) -> int:
-    """Side of the window where none is asked for.
+    """Side of the correlation window where the option is unset, in cells.
 
-    With a narrow base a step is many cells high and relief within a window a small part of it: noise rules and a large
-    window averages it. With a wide base relief rules, and a large window smooths it away.
+    With a narrow base a height step is many cells high, and the relief within a window is a small part of a step: noise
+    prevails, and a large window averages it. With a wide base relief prevails, and a large window smooths it away.
     """
-    return WIDE_WINDOW if step_cells > NARROW_BASE_STEP_CELLS else NARROW_WINDOW
+    return NARROW_BASE_WINDOW_CELLS if step_cells > NARROW_BASE_STEP_CELLS else WIDE_BASE_WINDOW_CELLS
 
 
-def parabola_peak(profile: NDArray[np.float32], offsets: FloatGrid) -> tuple[FloatGrid, FloatGrid, NDArray[np.bool_]]:
-    """Position and value of the maximum of equally spaced samples (j, r, c), and whether it lies between them."""
+def parabola_peaks(profile: NDArray[np.float32], offsets: FloatGrid) -> ProfilePeaks:
+    """Maxima of equally spaced samples (j, r, c), by the parabola through the three around the largest one; j >= 3."""
     shape = profile.shape[1:]
     position, value, is_inside = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.bool_)
     columns = np.ascontiguousarray(profile).reshape(len(profile), -1)
     profile_peaks(columns, offsets, position.ravel(), value.ravel(), is_inside.ravel())
-    return position, value, is_inside
+    return ProfilePeaks(position, value, is_inside)
 
 
-def bend_at_centre(profile: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
-    """Curvature per step squared of three samples (3, r, c) at a spacing in steps, 0 where they have no peak. (r, c)"""
-    bend = (2 * profile[1] - profile[0] - profile[2]) / spacing**2
-    return np.asarray(np.maximum(bend, 0), np.float32)
+def curvature_at_centre(profile: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
+    """Curvature (r, c) per step squared of three samples (3, r, c), `spacing` steps apart; 0 where there is no peak."""
+    curvature = (2 * profile[1] - profile[0] - profile[2]) / spacing**2
+    return np.asarray(np.maximum(curvature, 0), np.float32)
 
 
-def peaks_apart(profiles: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
-    """Distance in steps, at most FARTHEST_APART, of the vertices of two groups' parabolas, through three samples (2, 3,
-    r, c) at a spacing in steps; NaN where a group has no peak. (r, c)"""
-    apart, columns = np.empty(profiles.shape[2:], np.float32), np.ascontiguousarray(profiles).reshape(2, 3, -1)
-    vertices_apart(columns, spacing, LEAST_BEND, FARTHEST_APART, apart.ravel())
-    return apart
+def group_distances(profiles: NDArray[np.float32], spacing: np.float32) -> FloatGrid:
+    """Distance between the peaks of two groups of image pairs, (r, c) steps; NaN where a group has no peak.
+
+    The peaks are vertices of parabolas through three samples (2, 3, r, c), `spacing` steps apart. Distances are at most
+    MAX_GROUP_DISTANCE_STEPS.
+    """
+    difference, columns = np.empty(profiles.shape[2:], np.float32), np.ascontiguousarray(profiles).reshape(2, 3, -1)
+    vertex_distances(columns, spacing, MIN_CURVATURE, MAX_GROUP_DISTANCE_STEPS, difference.ravel())
+    return difference

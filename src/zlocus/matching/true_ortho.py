@@ -28,7 +28,7 @@ EDGE = np.ones((3, 3), np.uint8)
 def ortho_image(views: TileViews, surface: NDArray[np.float32], view: int = 0) -> NDArray[np.float32]:
     """One view, by default the leading one, on a surface of height indices (r, c), as `views` has its pixels."""
     out = np.empty(surface.shape, np.float32)
-    tile_ortho(views.pixels, views.layout, views.nodes, views.heights, surface, view, views.block, out)
+    tile_ortho(views.arrays, surface, view, out)
     return out
 
 

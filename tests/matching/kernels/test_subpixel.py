@@ -13,7 +13,15 @@ from reference import agreement
 from reference.projection import bilinear, cubic, positions
 from zlocus.matching.kernels.cost_volume import flat_cells, plane_grid
 from zlocus.matching.kernels.resample import RUN
-from zlocus.matching.kernels.subpixel import CUBIC, LINEAR, block_profile, resample_surface, tile_ortho, tile_profile
+from zlocus.matching.kernels.subpixel import (
+    CUBIC,
+    LINEAR,
+    ProfileSampling,
+    block_profile,
+    resample_surface,
+    tile_ortho,
+    tile_profile,
+)
 
 # Float32 images with a spread of 1.4 grey values.
 GREY = 1e-4
@@ -55,10 +63,8 @@ def test_profiles(n_views, half):
     seen[0, 1, 3:9], seen[1, 0, :, :5] = HIDDEN, 3
     windows = np.array([1, half])
     groups = np.empty((2, 2, 3, *scene.shape), np.float32)
-    tile_profile(
-        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, offsets, scene.block, windows,
-        seen, np.float32(0.0), groups,
-    )  # fmt: skip
+    sampling = ProfileSampling(CUBIC, offsets, windows, np.float32(0.0))
+    tile_profile(scene.arrays._replace(pixels=coefficients(scene)), surface, sampling, seen, groups)
     out = groups.sum(axis=1)
     for (b, d, rows, cols), (w, window) in product(scene.blocks(), enumerate(windows)):
         trim = half - window
@@ -84,10 +90,8 @@ def test_profiles(n_views, half):
 def test_profile_of_one_block():
     scene = kernel_scene(3, (9, 11), 16)
     surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 1, 1, 9, 11), np.float32)
-    block_profile(
-        coefficients(scene), CUBIC, scene.layout, scene.nodes, scene.heights, surface, np.zeros(1, np.float32), 16,
-        np.array([2]), scene.all_seen(), np.float32(0.0), out,
-    )  # fmt: skip
+    sampling = ProfileSampling(CUBIC, np.zeros(1, np.float32), np.array([2]), np.float32(0.0))
+    block_profile(scene.arrays._replace(pixels=coefficients(scene)), surface, sampling, scene.all_seen(), out)
     expected = agreement.profile(
         scene.images, scene.nodes, scene.heights, surface.astype(float), 0.0, 16, 2, scene.all_seen()
     )
@@ -101,7 +105,7 @@ def test_ortho_image():
     for view in range(3):
         nodes = scene.nodes.copy()
         nodes[..., 3] = 0.0  # three grids stand for a quadratic exactly
-        tile_ortho(scene.pixels, scene.layout, nodes, scene.heights, surface, view, scene.block, out)
+        tile_ortho(scene.arrays._replace(nodes=nodes), surface, view, out)
         for b, d, rows, cols in scene.blocks():
             t = scene.heights[0] + surface[rows, cols].astype(float) * scene.heights[1]
             xy = positions(nodes[view, b : b + 2, d : d + 2], t, t.shape, scene.block)

@@ -1,9 +1,11 @@
-"""The measure close to a surface, with windows that follow it: for heights finer than the lattice.
+"""Correlation close to a surface, with windows that follow it: for heights finer than the steps of the lattice.
 
-Blocks are flat (see `agreement.py`), so that the passes over their cells are long loops, which vectorise.
+The cells of a block are stored flat (see `cost_volume.py`), so that passes over them are long loops, which vectorise.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,18 +13,29 @@ from zlocus.core.jit import kernel
 from zlocus.matching.kernels.cost_volume import HIDDEN, flat_cells, flat_visibility, plane_grid
 from zlocus.matching.kernels.ncc import SLACK, add_pairs, window_moments
 from zlocus.matching.kernels.resample import RUN, gather
+from zlocus.matching.kernels.shared_records import ViewArrays
 
 LINEAR, CUBIC = 1, 3
+
+
+class ProfileSampling(NamedTuple):
+    """How the correlation is sampled around a surface."""
+
+    degree: int  # i8: LINEAR for grey values, CUBIC for spline coefficients
+    offsets: np.ndarray  # (j,) f4: heights of the samples above the surface, in steps
+    windows: np.ndarray  # (w,) i8: half widths of the windows, ascending
+    noise_variance: np.float32  # f4: grey values squared, added to the variance of every window
 
 
 # (3,8) f8, (3,) i8, i8, (2,14) f4 -> (2,) i8
 @kernel
 def surface_path(grids, layout, degree, path):
-    """Where one view sees a block of cells, as polynomials: for x and y, the bilinear coefficients (1, column, row,
-    both) of 1, u and u^2, then lowest and highest position; px from the whole pixel (column, row) that is returned.
+    """Write where one view shows a block of cells, as polynomials in the height u.
 
-    grids : (3, 8), positions at u = -1, 0 and 1, see `plane_grid`; degree : of the interpolation, whose pixels have to
-    lie inside the image; path : (2, 14), written.
+    path : (2, 14), written, for x and y: the bilinear coefficients (1, column, row, both) of 1, u and u^2, then the
+    lowest and the highest position. Positions are px from a whole pixel (column, row), which is returned. grids :
+    (3, 8), positions at u = -1, 0 and 1, see `plane_grid`; degree : of the interpolation, whose pixels have to lie
+    inside the image.
     """
     before, after = (1, 3.01) if degree == CUBIC else (0, 1.01)
     origin = np.empty(2, np.int64)
@@ -42,8 +55,8 @@ def surface_path(grids, layout, degree, path):
 # (14,) f4, (2,p) f4, (p,) f4, i8, i8, (n,) f4 -> None
 @kernel
 def positions_along(path, cells, level, first, end, out):
-    """Positions of a run of cells on one axis. path : see `surface_path`; cells : (2, p), rows and columns;
-    level : u."""
+    """Write the positions of a run of cells on one axis. path : see `surface_path`; cells : (2, p), rows and columns;
+    level : heights u."""
     a, b, c, d = path[0], path[1], path[2], path[3]
     by_a, by_b, by_c, by_d = path[4], path[5], path[6], path[7]
     bend_a, bend_b, bend_c, bend_d = path[8], path[9], path[10], path[11]
@@ -60,7 +73,7 @@ def positions_along(path, cells, level, first, end, out):
 # (n,) f4, i8, (n,) f4, (4,n) f4 -> None
 @kernel
 def spline_weights(position, n, whole, weights):
-    """Whole pixel and the four cubic B-spline weights around each of a run of positions."""
+    """Write the whole pixel and the four cubic B-spline weights of each of a run of positions."""
     one, half, sixth = np.float32(1.0), np.float32(0.5), np.float32(1.0 / 6.0)
     two_thirds = np.float32(2.0 / 3.0)
     w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
@@ -78,7 +91,7 @@ def spline_weights(position, n, whole, weights):
 # (2,n) f4, i8, i4, i4, (n,) u4 -> None
 @kernel
 def pixel_indices(whole, n, origin, n_cols, index):
-    """Index in an image, from `origin` on, of whole pixels (columns, rows)."""
+    """Write the index in an image, counted from `origin`, of whole pixels (columns, rows)."""
     cols, rows = whole[0], whole[1]
     for j in range(n):
         index[j] = np.uint32(np.int32(np.int32(rows[j]) * n_cols) + np.int32(cols[j]) + origin)
@@ -87,7 +100,7 @@ def pixel_indices(whole, n, origin, n_cols, index):
 # (p,) f4, i8, (n,) u4, (4,n) f4, (4,n) f4, i8, (n,) f4 -> None
 @kernel
 def spline_gather(image, n_cols, index, across, down, n, out):
-    """Weighted sums of the 4 x 4 pixels from each index on."""
+    """Write the weighted sum of the 4 x 4 pixels that begin at each index."""
     one, two, three, stride = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(n_cols)
     for j in range(n):
         p = np.uint64(index[j])
@@ -105,7 +118,7 @@ def spline_gather(image, n_cols, index, across, down, n, out):
 # (2,n) f4, i8, (2,n) f4, (2,n) f4 -> None
 @kernel
 def fractions(position, n, whole, fraction):
-    """Whole pixels and what is beyond them, of a run of positions (x, y)."""
+    """Write the whole pixels and the fractions of a run of positions (x, y)."""
     for axis in range(2):
         at, pixel, beyond = position[axis], whole[axis], fraction[axis]
         for j in range(n):
@@ -116,12 +129,12 @@ def fractions(position, n, whole, fraction):
 # (p,) f4, (3,) i8, (3,8) f8, (2,p) f4, (p,) f4, i8, (p,) f4 -> None
 @kernel
 def resample_surface(pixels, layout, grids, cells, level, degree, out):
-    """Image values on cells that are each at a height of its own: bilinear, or cubic B-spline from coefficients.
+    """Write the image values on cells at individual heights: bilinear, or cubic B-spline from coefficients.
 
     pixels : (p,) float32, pixels or B-spline coefficients of all images; layout : see `resample_plane`; grids : (3, 8)
     positions at levels -1, 0 and 1 (see `plane_grid`); cells : (2, p) float32, rows and columns; level : (p,) float32
-    in [-1, 1]: positions are quadratic in it; degree : LINEAR or CUBIC; out : (p,) or longer. Positions are float32
-    from a whole-pixel origin near the grid; those outside the image are moved to its border.
+    in [-1, 1], heights, in which positions are quadratic; degree : LINEAR or CUBIC; out : (p,) or longer. Positions are
+    float32, counted from a whole pixel near the grid; those outside the image are moved to its edge.
     """
     path, n_cols = np.empty((2, 14), np.float32), layout[2]
     origin = surface_path(grids, layout, degree, path)
@@ -147,16 +160,18 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
             gather(pixels, layout, index, across, pairs, out[first:end])
 
 
-# (p) f4, i8, (i,3) i8, (i,2,2,2,4) f8, (2) f8, (r,c) f4, (j) f4, i8, (w) i8, (3,i,r,c) i4, f4, (w,g,j,r,c) f4 -> None
+# ViewArrays, (r,c) f4, ProfileSampling, (3,i,r,c) i4, (w,g,j,r,c) f4 -> None
 @kernel
-def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, windows, seen, floor, out):
-    """Mean NCC over all pairs of the views that see the surface, at `surface` + `offsets`; windows follow the surface.
+def block_profile(views, surface, sampling, visible, out):
+    """Write the mean NCC over all pairs of the views that see the surface, at the offsets of the sampling from it.
 
-    surface : (r + 2 half, c + 2 half) float32 height indices, border included; offsets : (j,) float32, in steps;
-    windows : (w,) half widths, ascending, the last is `half`; seen : (3, i, r, c) int32, see `block_costs`; out : (w,
-    g, j, r, c) float32, written; 0 where fewer than two views see the cell. The pairs are dealt to g groups (see
-    `add_pairs`); their sum is the mean over all.
+    The windows follow the surface. surface : (r + 2 half, c + 2 half) float32 height indices, with the cells around the
+    block that its windows need (half is the last half width); visible : (3, i, r, c) int32, see `block_costs`; out :
+    (w, g, j, r, c) float32, 0 where fewer than two views see the cell. The pairs are divided into g groups (see
+    `add_pairs`); the sum over the groups is the mean over all pairs.
     """
+    pixels, layout, nodes, heights, block = views.pixels, views.layout, views.nodes, views.heights, views.block
+    offsets, windows, degree, floor = sampling.offsets, sampling.windows, sampling.degree, sampling.noise_variance
     n_windows, n_groups, rows, cols = out.shape[0], out.shape[1], out.shape[3], out.shape[4]
     n_views, half = layout.shape[0], windows[-1]
     width = cols + 2 * half
@@ -172,23 +187,23 @@ def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, bloc
         for r in range(rows):
             for c in range(cols):
                 z = surface[r + half, c + half]
-                if not (max(seen[0, i, r, c], seen[2, i, r, c]) <= z <= seen[1, i, r, c]):
+                if not (max(visible[0, i, r, c], visible[2, i, r, c]) <= z <= visible[1, i, r, c]):
                     at_surface[0, i, r, c] = HIDDEN
     flat_visibility(at_surface, half, flat, pairs)
     if pairs.max() == 0.0:
         out[:] = 0.0
         return
     centre = np.float64(0.5) * (surface.min() + offsets.min() + surface.max() + offsets.max())
-    reach = max(np.float64(0.5) * (surface.max() + offsets.max() - surface.min() - offsets.min()), 0.01)
+    span = max(np.float64(0.5) * (surface.max() + offsets.max() - surface.min() - offsets.min()), 0.01)
     for j in range(offsets.shape[0]):
         for r in range(surface.shape[0]):
             for c in range(width):
-                level[r * width + c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(reach)
+                level[r * width + c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(span)
         for i in range(n_views):
             if flat[i, 0].min() == HIDDEN:
                 continue
             for m in range(3):
-                t = heights[0] + (centre + (m - 1) * reach) * heights[1]
+                t = heights[0] + (centre + (m - 1) * span) * heights[1]
                 plane_grid(nodes, i, t, block, half, grids[m])
             resample_surface(pixels, layout[i], grids, cells, level, degree, planes[i])
             planes[i] -= planes[i, half * width + half]
@@ -206,29 +221,32 @@ def block_profile(pixels, degree, layout, nodes, heights, surface, offsets, bloc
                         out[w, g, j, r, c] = agreed[w, g, p] * pairs[p]
 
 
-# as block_profile, over every block of a tile; surface : (r + 2 half, c + 2 half)
+# as block_profile, over every block of a tile
 @kernel
-def tile_profile(pixels, degree, layout, nodes, heights, surface, offsets, block, windows, seen, floor, out):
+def tile_profile(views, surface, sampling, visible, out):
     """`block_profile` of every block of a tile; out : (w, g, j, r, c)."""
-    n_rows, n_cols, half = out.shape[3], out.shape[4], windows[-1]
+    n_rows, n_cols, half, block, nodes = out.shape[3], out.shape[4], sampling.windows[-1], views.block, views.nodes
     for br in range((n_rows + block - 1) // block):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
+            of_block = ViewArrays(
+                views.pixels, views.layout, nodes[:, br : br + 2, bc : bc + 2], views.heights, block
+            )  # fmt: skip
             block_profile(
-                pixels, degree, layout, nodes[:, br : br + 2, bc : bc + 2], heights,
-                surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], offsets, block, windows, seen[:, :, r0:r1, c0:c1],
-                floor, out[:, :, :, r0:r1, c0:c1],
+                of_block, surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], sampling, visible[:, :, r0:r1, c0:c1],
+                out[:, :, :, r0:r1, c0:c1],
             )  # fmt: skip
 
 
-# (p,) f4, (i,3) i8, (i,b,d,2,4) f8, (2,) f8, (r,c) f4, i8, i8, (r,c) f4 -> None
+# ViewArrays, (r,c) f4, i8, (r,c) f4 -> None
 @kernel
-def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
-    """Image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c), written."""
+def tile_ortho(views, surface, view, out):
+    """Write the image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c)."""
+    pixels, layout, nodes, heights, block = views.pixels, views.layout, views.nodes, views.heights, views.block
     n_rows, n_cols = surface.shape
     low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
-    middle, reach = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
+    middle, span = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
     grids, level, grey = np.empty((3, 8)), np.empty(block * block, np.float32), np.empty(block * block, np.float32)
     cells, last_width = flat_cells((block, block)), block
     for br in range((n_rows + block - 1) // block):
@@ -236,14 +254,14 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
             for m in range(3):
-                plane_grid(nodes[:, br : br + 2, bc : bc + 2], view, middle + (m - 1) * reach, block, 0, grids[m])
+                plane_grid(nodes[:, br : br + 2, bc : bc + 2], view, middle + (m - 1) * span, block, 0, grids[m])
             width, n = c1 - c0, (r1 - r0) * (c1 - c0)
             if cells.shape[1] != n or last_width != width:
                 cells, last_width = flat_cells((r1 - r0, width)), width
             for r in range(r0, r1):
                 for c in range(width):
                     index = heights[0] + surface[r, c0 + c] * heights[1]
-                    level[(r - r0) * width + c] = (index - middle) / reach
+                    level[(r - r0) * width + c] = (index - middle) / span
             resample_surface(pixels, layout[view], grids, cells, level[:n], LINEAR, grey[:n])
             out[r0:r1, c0:c1] = grey[:n].reshape((r1 - r0, width))
 
@@ -251,8 +269,10 @@ def tile_ortho(pixels, layout, nodes, heights, surface, view, block, out):
 # (j,n) f4, (j,) f4, (n,) f4, (3,n) f4 -> None
 @kernel
 def around_largest(profile, offsets, position, three):
-    """The three samples around the largest one of each cell, at an end the three there, and the offset of the middle
-    one. See `profile_peaks`; three : (3, n), written."""
+    """Write the three samples around the largest one of each cell (at an end, the three there) and the middle offset.
+
+    See `profile_peaks`; three : (3, n).
+    """
     for p in range(position.shape[0]):
         best = 0
         for j in range(1, profile.shape[0]):
@@ -265,9 +285,11 @@ def around_largest(profile, offsets, position, three):
 # (j,n) f4, (j,) f4, (n,) f4, (n,) f4, (n,) b1 -> None
 @kernel
 def profile_peaks(profile, offsets, position, value, is_inside):
-    """Position and value of the maximum of equally spaced samples by the parabola through the three around the largest
-    one (at an end, the three at that end), and whether there is one between the first and the last. profile : (j, n), a
-    cell a column, j >= 3."""
+    """Write position and value of the maximum of equally spaced samples, and whether it lies between first and last.
+
+    The maximum is that of the parabola through the three samples around the largest one (at an end, the three there).
+    profile : (j, n), a column for each cell, j >= 3.
+    """
     three, spacing = profile, offsets[1] - offsets[0]
     if profile.shape[0] == 3:
         position[:] = offsets[1]
@@ -286,19 +308,23 @@ def profile_peaks(profile, offsets, position, value, is_inside):
 
 # f4, f4, f4, f4 -> f4
 @kernel
-def vertex_of(left, here, right, least):
-    """Vertex of the parabola through three samples, in spacings from the middle one; NaN where they do not bend by more
-    than `least` to a maximum."""
-    bend = np.float32(2.0) * here - left - right
-    return (right - left) / (np.float32(2.0) * bend) if bend > least else np.float32(np.nan)
+def vertex_of(left, here, right, min_curvature):
+    """Vertex of the parabola through three samples, in spacings from the middle one; NaN where its curvature towards a
+    maximum is not larger than `min_curvature`."""
+    curvature = np.float32(2.0) * here - left - right
+    return (right - left) / (np.float32(2.0) * curvature) if curvature > min_curvature else np.float32(np.nan)
 
 
 # (2,3,n) f4, f4, f4, f4, (n,) f4 -> None
 @kernel
-def vertices_apart(profiles, spacing, least, farthest, out):
-    """Distance of the vertices of two groups' parabolas through three samples, at most `farthest`; NaN where one has
-    none. profiles : (2, 3, n), a cell a column; least : see `vertex_of`; out : (n,), written."""
+def vertex_distances(profiles, spacing, min_curvature, max_difference, out):
+    """Write the distance between the vertices of two groups' parabolas through three samples; NaN where one has none.
+
+    profiles : (2, 3, n), a column for each cell; min_curvature : see `vertex_of`; max_difference : larger distances are
+    set to it; out : (n,).
+    """
     a, b, c, d, e, f = profiles[0, 0], profiles[0, 1], profiles[0, 2], profiles[1, 0], profiles[1, 1], profiles[1, 2]
     for p in range(out.shape[0]):
-        apart = abs(vertex_of(a[p], b[p], c[p], least) - vertex_of(d[p], e[p], f[p], least)) * spacing
-        out[p] = farthest if apart > farthest else apart
+        vertex_a, vertex_b = vertex_of(a[p], b[p], c[p], min_curvature), vertex_of(d[p], e[p], f[p], min_curvature)
+        difference = abs(vertex_a - vertex_b) * spacing
+        out[p] = max_difference if difference > max_difference else difference
