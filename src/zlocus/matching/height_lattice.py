@@ -78,12 +78,12 @@ class HeightLattice:
         widths = np.minimum(self.block, cols - self.block * np.arange(n_d))
         by_block = self.count * widths
         length = by_block.sum(axis=1)
-        base = np.concatenate([[0], np.cumsum(length * heights)])[:-1]
+        row_start = np.concatenate([[0], np.cumsum(length * heights)])[:-1]
         start = np.cumsum(by_block, axis=1) - by_block
         wide = (n_b, n_d)
-        return np.stack([np.broadcast_to(base[:, None], wide), np.broadcast_to(length[:, None], wide), start]).astype(
-            np.int64
-        )
+        return np.stack(
+            [np.broadcast_to(row_start[:, None], wide), np.broadcast_to(length[:, None], wide), start]
+        ).astype(np.int64)
 
     @cached_property
     def layout(self) -> VolumeLayout:

@@ -88,7 +88,7 @@ class PyramidLevel:
     """One level of the pyramid over a tile.
 
     number : 0 is the finest; window : its cells, halo included; core : rows and columns of the window that belong to
-    the tile's core (what is decided for a whole tile is computed from them alone, so that it does not depend on the
+    the tile's core (decisions for the whole tile are computed from these cells only, so that they do not depend on the
     halo); transform : from cell corners to the ground; cell_m : side of a cell; origin_m, step_m : height of level
     index 0, and height step of the level; n_steps : steps of the scene's height range.
     """

@@ -41,7 +41,7 @@ MIN_PARALLAX_RATE_PX = 1e-4
 class MatchScene:
     """What all tiles of a scene share.
 
-    views : oriented, the reference image (the most nadir one, or the one asked for) first; anchor : easting and
+    views : oriented, the reference image (the requested or the most nadir one) first; anchor : easting and
     northing of the north-west corner of cell (0, 0); cell_m : side of a finest cell; origin_m, step_m, n_steps :
     lattice of heights at the finest level; levels : of the pyramid; overlap_window : finest cells that two views may
     cover; grey_scales : grey scale of each image; ties : (n, 3) ground points, to which the search ranges of their

@@ -240,7 +240,7 @@ def _stopping_point(
 class Place:
     """A place whose cell is matched.
 
-    xyz : (3,) m, the point asked for, at the height around which it is matched; height_from : where that height comes
+    xyz : (3,) m, the requested point, at the height around which it is matched; height_from : where that height comes
     from, in words; cell : row and column of the finest lattice; middle : (2,) m, of the cell.
     """
 

@@ -89,7 +89,7 @@ def _widen_to_ties(match_scene: MatchScene, level: PyramidLevel, low: FloatGrid,
 
 
 def table_range(level: PyramidLevel) -> tuple[float, float]:
-    """Heights (m) between which a level's projections may be asked for: its height range and a few steps more."""
+    """Lowest and highest height (m) of a level's projection tables: its height range, extended by a few steps."""
     return (
         level.origin_m - TABLE_STEPS_BELOW * level.step_m,
         level.origin_m + (level.n_steps + TABLE_STEPS_ABOVE) * level.step_m,

@@ -38,8 +38,8 @@ STEEP_STEPS = 8.0
 class CoarserSlope:
     """The slanted support surface of the coarser level under a window of the finer level.
 
-    slope_surface : in cells and steps of the coarser level; row, col : of its first cell, in coarser cells from the
-    first cell of the finer window, of which half the row and column is taken off.
+    slope_surface : in cells and level indices of the coarser level; row, col : of the coarser window, minus half the
+    row and column of the finer window.
     """
 
     slope_surface: SlopeSurface
