@@ -183,11 +183,11 @@ def test_a_product_can_be_added(tmp_path):
 from zlocus.core.options import ProductOptions
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import product_names
-from zlocus.products.derived import make_maps
+from zlocus.products.derived import write_derived
 from zlocus.products.stac_item import PRODUCTS
 
 assert "height_counts.csv" in {product.name for product in PRODUCTS}
-make_maps(Path(), product_names("height_counts"), ProductOptions(), SilentProgress())
+write_derived(Path(), product_names("height_counts"), ProductOptions(), SilentProgress())
 """,
         tmp_path,
     )

@@ -209,9 +209,9 @@ def test_notebooks_run(path):
     outputs = [output for cell in code for output in cell.outputs]
     said = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
     shares = dict(re.findall(r"^(.*?)within 1 m: ([\d.]+)", said, re.MULTILINE))
-    alone = shares.pop("census, each cell alone  ", "0")
+    winner_takes_all = shares.pop("census, winner takes all ", "0")
     assert shares
-    assert all(float(share) > max(LEAST_WITHIN, float(alone)) for share in shares.values()), said
+    assert all(float(share) > max(LEAST_WITHIN, float(winner_takes_all)) for share in shares.values()), said
     assert any("image/png" in output.get("data", {}) for output in outputs)
 
 
