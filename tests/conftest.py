@@ -77,3 +77,12 @@ def images(tmp_path_factory):
         return made[kind]
 
     return of
+
+
+@pytest.fixture(scope="session")
+def good_pair(tmp_path_factory):
+    """Paths of two images that match, for commands whose other inputs are bad."""
+    from rendered_scenes import rendered
+
+    images = rendered(tmp_path_factory.mktemp("good"), "plane")
+    return images.paths["nadir"], images.paths["fore"]

@@ -9,13 +9,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
 import pytest
 
+from interrupted_runs import STOPS_WITHIN_S, children_of, wait_until
 from places import SUPPORT
 from zlocus.cli.app import app
 from zlocus.cli.exit_status import explained
@@ -23,7 +23,6 @@ from zlocus.core.requests import DEMO_BEGUN
 from zlocus.core.signals import ENDING
 from zlocus.pipeline.execution import precompile as warm
 
-STOPS_WITHIN_S = 5.0
 # Signals do what they do in a process that was not started to ignore them.
 HEARS = """
 import signal
@@ -77,17 +76,6 @@ def ended(words) -> tuple[int, str, str]:
     with started(words) as process:
         out, error = process.communicate(timeout=6 * STOPS_WITHIN_S)
         return process.returncode, out, error
-
-
-def below(process) -> list[psutil.Process]:
-    return psutil.Process(process.pid).children(recursive=True)
-
-
-def wait_until(condition):
-    end = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < end, "waited for too long"
-        time.sleep(0.01)
 
 
 def is_deaf(process) -> bool:
@@ -259,8 +247,8 @@ def test_workers_say_nothing_and_end_with_the_command(number, whole_group, are_w
     with started(program(WORKERS.format(tests=str(SUPPORT)))) as process:
         assert process.stdout.readline() == "here\n"
         # What starts them, what watches what they share, and themselves.
-        wait_until(lambda: len(below(process)) >= (4 if are_working else 2))
-        children = below(process)
+        wait_until(lambda: len(children_of(process.pid)) >= (4 if are_working else 2))
+        children = children_of(process.pid)
         if not are_working:
             assert any(is_deaf(child) for child in children) or sys.platform != "linux"
         (os.killpg if whole_group else os.kill)(process.pid, number)
@@ -274,8 +262,8 @@ def test_workers_say_nothing_and_end_with_the_command(number, whole_group, are_w
 def test_workers_end_when_the_command_is_killed():
     """In the middle of a task: nobody waits for its result."""
     with started(program(WORKERS.format(tests=str(SUPPORT)))) as process:
-        wait_until(lambda: len(below(process)) >= 4)
-        children = below(process)
+        wait_until(lambda: len(children_of(process.pid)) >= 4)
+        children = children_of(process.pid)
         process.kill()
         assert process.communicate(timeout=STOPS_WITHIN_S)[1] == ""
         assert_gone(children)
@@ -287,7 +275,7 @@ def test_a_demo_that_is_ended_while_it_renders(tmp_path):
     code = f"{HEARS}\nfrom zlocus.__main__ import run; run()"
     with started([sys.executable, "-c", code, "demo", "-o", str(out)]) as process:
         wait_until(lambda: (out / DEMO_BEGUN).exists() and list(out.glob("scene.part/*")))
-        children = below(process)
+        children = children_of(process.pid)
         assert len(children) == 3
         process.send_signal(signal.SIGTERM)
         _, error = process.communicate(timeout=STOPS_WITHIN_S)

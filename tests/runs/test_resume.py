@@ -31,6 +31,7 @@ from interrupted_runs import (
     RASTERS,
     STOPS_WITHIN_S,
     check_end,
+    children_of,
     command,
     n_finished,
     same,
@@ -57,14 +58,6 @@ def straight(images, tmp_path_factory):
     return run(images("sine"), tmp_path_factory.mktemp("straight") / "out", SMALL_TILES, workers=1, report=False).out
 
 
-def below(pid):
-    """All processes that a process has started, directly or not."""
-    try:
-        return psutil.Process(pid).children(recursive=True)
-    except psutil.NoSuchProcess:
-        return []
-
-
 def test_signals_at_random_moments(images, straight, tmp_path):
     """Signals of four kinds interrupt the command or all its processes at random moments; the next run resumes.
 
@@ -77,7 +70,7 @@ def test_signals_at_random_moments(images, straight, tmp_path):
         number, is_to_all = rng.choice([*ENDING, signal.SIGKILL]), rng.random() < 0.5
         wait_for_tiles(out, before + wanted, process)
         time.sleep(rng.uniform(0.0, 1.0))
-        children = below(process.pid)
+        children = children_of(process.pid)
         with suppress(ProcessLookupError):
             (os.killpg if is_to_all else os.kill)(process.pid, number)
         said = process.communicate(timeout=STOPS_WITHIN_S)[1]
@@ -113,7 +106,7 @@ def test_a_signal_stops_the_run_within_seconds_and_the_run_is_resumed(
     out = tmp_path / "out"
     process = started(command(images("sine"), out, tmp_path, "--workers", str(workers)))
     wait_for_tiles(out, 2, process)
-    children, start = below(process.pid), time.monotonic()
+    children, start = children_of(process.pid), time.monotonic()
     (os.killpg if is_to_all else os.kill)(process.pid, number)
     _, stderr = process.communicate(timeout=STOPS_WITHIN_S)
     assert time.monotonic() - start < STOPS_WITHIN_S
@@ -140,7 +133,7 @@ def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, numbe
     killed = []
 
     def is_one_killed():
-        for child in below(process.pid):
+        for child in children_of(process.pid):
             with suppress(psutil.NoSuchProcess):
                 if child.ppid() != process.pid and not killed and n_finished(out):
                     child.send_signal(number)
@@ -418,7 +411,7 @@ GOES = {
     ),
     "zlocus.io.rasters._check_written": (1, r"ortho\.tif cannot be written"),
     "zlocus.pipeline.surface_products.write_observations": (1, r"observations\.npz cannot be written: No such file"),
-    "zlocus.pipeline.surface_products.make_maps": (1, r"run\.json cannot be written: No such file"),
+    "zlocus.pipeline.surface_products.write_derived": (1, r"run\.json cannot be written: No such file"),
     "zlocus.pipeline.surface_products.link_all": (1, r"There is no raster \S*dsm\.tif"),
 }
 

@@ -1,4 +1,4 @@
-"""Commands that are started, watched and interrupted."""
+"""Commands of tests that are started, watched and interrupted."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import subprocess
 import sys
 import time
 
+import psutil
+
 from rendered_scenes import HEIGHTS
 from zlocus.pipeline.execution.checkpoint import DONE, FOLDER
 
 
 def command(images, out, folder, *more):
-    """The same as a command line."""
+    """The command line of `zlocus dsm` on images, in tiles of 64 cells."""
     options = folder / "options.toml"
     options.write_text("[pyramid]\ntile = 64\n")
     asked = ["--crs", "EPSG:32632", "--resolution", "0.5", "--heights", *map(str, HEIGHTS), "--no-report"]
@@ -21,24 +23,34 @@ def command(images, out, folder, *more):
 
 
 def started(words):
-    """A command in a session of its own, which signals reach even where this process was started to ignore them."""
+    """Start a command in a session of its own, where signals reach it even if this process ignores them."""
     return subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=hears,
+        preexec_fn=accept_signals,
     )  # fmt: skip
 
 
+def children_of(pid):
+    """All processes that a process has started, directly or not."""
+    try:
+        return psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
 def n_finished(out):
+    """Number of the finished tiles of a run."""
     done = out / FOLDER / DONE
     return len(done.read_bytes().splitlines()) if done.exists() else 0
 
 
 def wait_for_tiles(out, wanted, process):
+    """Wait until a run has finished so many tiles, or has ended."""
     wait_until(lambda: process.poll() is not None or n_finished(out) >= wanted)
 
 
 def check_end(status, number, said):
-    """Of a process that was sent a signal, unless it ended before."""
+    """Check status and last message of a process that was sent a signal; it may have ended before."""
     if number == signal.SIGKILL:
         assert status in (0, -number)
         return
@@ -50,15 +62,18 @@ def check_end(status, number, said):
 
 
 def same(out, straight):
+    """Whether the rasters of two results have the same bytes."""
     return all((out / f"{name}.tif").read_bytes() == (straight / f"{name}.tif").read_bytes() for name in RASTERS)
 
 
-def hears():
+def accept_signals():
+    """Let the ending signals end this process."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL)
 
 
 def wait_until(condition, seconds=120.0):
+    """Wait until a condition holds; fail after some seconds."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited for too long"

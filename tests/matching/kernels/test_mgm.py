@@ -9,20 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kernel_scene import even_lattice, ragged_lattice
+from kernel_scene import even_lattice, ragged_lattice, random_cost, random_p2
 from reference.semiglobal import dense, more_global_path_sums
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.mgm import sweep_quarter
-from zlocus.matching.semiglobal import more_global_path_sums as aggregated
 from zlocus.matching.semiglobal import heights_of_sums
-
-
-def random_cost(lattice, seed=0, high=129):
-    return np.random.default_rng(seed).integers(0, high, lattice.size).astype(np.uint8)
-
-
-def random_p2(shape, seed=0):
-    return np.random.default_rng(seed).integers(60, 241, (4, *shape)).astype(np.uint16)
+from zlocus.matching.semiglobal import more_global_path_sums as aggregated
 
 
 def twin(cost, lattice, p1, p2):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kernel_scene import even_lattice, ragged_lattice
+from kernel_scene import even_lattice, ragged_lattice, random_cost, random_p2
 from reference.semiglobal import dense, path_sums, winner
 from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
 
@@ -28,14 +28,6 @@ def picked(total, lattice):
     margin, vertex = np.empty(lattice.shape, np.uint16), np.empty(lattice.shape, np.float32)
     winners(total, lattice.layout, best, second, margin, vertex)
     return best, second, margin, vertex
-
-
-def random_cost(lattice, seed=0, high=129):
-    return np.random.default_rng(seed).integers(0, high, lattice.size).astype(np.uint8)
-
-
-def random_p2(shape, seed=0):
-    return np.random.default_rng(seed).integers(60, 241, (4, *shape)).astype(np.uint16)
 
 
 @pytest.mark.parametrize(
