@@ -37,8 +37,8 @@ def nearest_descriptors(low, high, in_a, xy, in_b, max_px, ratio):
         if best < 0 or not np.isfinite(distance[i, best]):
             continue
         elsewhere = np.abs(xy - xy[best]).max(axis=1) > SAME_PLACE_PX
-        rival = min(distance[i, elsewhere].min(initial=np.inf), UNRELATED_DISTANCE)
-        if distance[i, best] < ratio * rival:
+        second_best = min(distance[i, elsewhere].min(initial=np.inf), UNRELATED_DISTANCE)
+        if distance[i, best] < ratio * second_best:
             best_a[i] = best
     return best_a, best_b
 

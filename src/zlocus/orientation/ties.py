@@ -16,7 +16,7 @@ from zlocus.core.scene import Scene, View, held_window
 from zlocus.core.footprints import ground_box
 from zlocus.core.sensor_model import FloatArray, lowest_station
 from zlocus.orientation.epipolar import EpipolarCurves, Sightlines, epipolar_offsets, trace
-from zlocus.orientation.kernels.descriptors import nearest_descriptors
+from zlocus.orientation.kernels.descriptors import CurveSegments, SecondFeatures, nearest_descriptors
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.sift import Features, detect_all, part_grid, parts, reduction
 from zlocus.orientation.triangulate import Observations
@@ -282,17 +282,17 @@ def likely_range(z: FloatArray) -> tuple[float, float]:
 
 
 def match_along_curves(
-    loci: EpipolarCurves, in_a: Features, in_b: Features, max_px: float, ratio: float
+    curves: EpipolarCurves, features_a: Features, features_b: Features, max_px: float, ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Feature numbers (k,), (k,) of mutual best matches at most `max_px` from their locus.
+    """Numbers (k,) and (k,) of the features that match each other best, within `max_px` of the epipolar curve.
 
-    A match is taken where its descriptor distance is below `ratio` times that of the best rival elsewhere near
-    the locus. Features are looked up in cells of a grid, so time grows with their number, not its square.
+    A match is accepted where its descriptor distance is below `ratio` times that of the second-best match elsewhere
+    near the curve. Features are looked up in the cells of a grid, so that time grows with their number, not its square.
     """
-    best_of_a, best_of_b = np.empty(len(in_a), np.int64), np.empty(len(in_b), np.int64)
-    nearest_descriptors(
-        loci.low, loci.high, in_a.descriptors, in_b.xy, in_b.descriptors, max_px, ratio, best_of_a, best_of_b
-    )
+    best_of_a, best_of_b = np.empty(len(features_a), np.int64), np.empty(len(features_b), np.int64)
+    segments = CurveSegments(curves.low, curves.high, features_a.descriptors)
+    second = SecondFeatures(features_b.xy, features_b.descriptors)
+    nearest_descriptors(segments, second, max_px, ratio, best_of_a, best_of_b)
     first = np.flatnonzero(best_of_a >= 0)
     first = first[best_of_b[best_of_a[first]] == first]
     return first, best_of_a[first]

@@ -246,8 +246,8 @@ class ShownBlocks:
     """Which blocks an image shows at s heights, (b, d, s) bool each.
 
     near : blocks that may be in the image and whose four corners the sensor maps; around : these, and the same blocks
-    at the heights before and after, between which a block enters or leaves the image; missed : blocks that may be in the
-    image although the sensor does not map one of their corners.
+    at the heights before and after, between which a block enters or leaves the image; missed : blocks that may be in
+    the image although the sensor does not map one of their corners.
     """
 
     near: BoolArray

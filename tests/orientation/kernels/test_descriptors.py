@@ -10,6 +10,8 @@ from zlocus.orientation.kernels.descriptors import (
     CELL_PX,
     SAME_PLACE_PX,
     UNRELATED_DISTANCE,
+    CurveSegments,
+    SecondFeatures,
     dot,
     is_clear,
     is_near,
@@ -48,7 +50,7 @@ def random_scene(n=60, k=300, length_px=300.0):
 def test_nearest_descriptors_are_those_of_all_pairs(max_px):
     low, high, in_a, xy, in_b = random_scene()
     best_a, best_b = np.empty(len(low), np.int64), np.empty(len(xy), np.int64)
-    nearest_descriptors(low, high, in_a, xy, in_b, max_px, 0.8, best_a, best_b)
+    nearest_descriptors(CurveSegments(low, high, in_a), SecondFeatures(xy, in_b), max_px, 0.8, best_a, best_b)
     expected_a, expected_b = plain.nearest_descriptors(low, high, in_a, xy, in_b, max_px, 0.8)
     np.testing.assert_array_equal(best_a, expected_a)
     np.testing.assert_array_equal(best_b, expected_b)
@@ -59,7 +61,8 @@ def test_nearest_descriptors_are_those_of_all_pairs(max_px):
 def test_nothing_to_compare_is_no_match():
     low, high, in_a, _, _ = random_scene(8, 16)
     best_a, best_b = np.empty(8, np.int64), np.empty(0, np.int64)
-    nearest_descriptors(low, high, in_a, np.empty((0, 2)), np.empty((0, 128), np.float32), 30.0, 0.8, best_a, best_b)
+    nothing = SecondFeatures(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    nearest_descriptors(CurveSegments(low, high, in_a), nothing, 30.0, 0.8, best_a, best_b)
     assert (best_a == -1).all()
 
 

@@ -1,21 +1,44 @@
-"""Nearest descriptors among the features that lie near a segment."""
+"""Search for the SIFT feature of nearest descriptor along an epipolar curve, which a straight segment stands for."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.core.jit import kernel
+from zlocus.core.sensor_model import FloatArray
 
+# Features are sorted into square cells, of which only those along the segment are searched.
 CELL_PX = 64.0
-CORNER = 1.5
-SAME_PLACE_PX = 2.0  # a rival this near is another orientation of the same feature
-UNRELATED_DISTANCE = 0.9  # between RootSIFT descriptors of different ground; random pairs measure 0.9 to 1.2
+# A point beyond an end of a segment and beside it at the same time is up to sqrt(2) times the search distance away.
+CORNER_FACTOR = 1.5
+# Features closer than this are one feature with several orientations, and do not compete with each other.
+SAME_PLACE_PX = 2.0
+# Distance of RootSIFT descriptors of different ground. Random pairs have 0.9 to 1.2.
+UNRELATED_DISTANCE = 0.9
+
+
+class CurveSegments(NamedTuple):
+    """Segments in the second image, one for each feature of the first image, and the descriptors of these features."""
+
+    low: FloatArray  # (n,2) f8: end at the lowest height, px; NaN where there is no segment
+    high: FloatArray  # (n,2) f8: end at the highest height, px
+    descriptors: NDArray[np.float32]  # (n,d) f4: of unit length
+
+
+class SecondFeatures(NamedTuple):
+    """Features of the second image."""
+
+    xy: FloatArray  # (k,2) f8: px
+    descriptors: NDArray[np.float32]  # (k,d) f4: of unit length
 
 
 # (k) f4, (k) f4 -> f4
 @kernel
 def dot(a, b):
-    """Product of two vectors, summed in four parts so that no addition waits for the one before."""
+    """Dot product of two vectors, summed in four parts so that no addition waits for the one before."""
     one, two, three, four = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     whole = len(a) // 4 * 4
     for k in range(0, whole, 4):
@@ -31,7 +54,11 @@ def dot(a, b):
 # (k,2) f8, (2) f8, i8, i8, (c) i8, (k) i8 -> None
 @kernel
 def sort_into_cells(xy, corner, rows, cols, start, order):
-    """Numbers of points (k, 2), one cell of a grid after the other: `start` (rows cols + 1) of each, `order` (k)."""
+    """Sort points (k, 2) into the cells of a grid with its first cell at `corner`, px.
+
+    order : (k,) receives the numbers of the points, cell after cell, row by row; start : (rows * cols + 1,) receives the
+    place in `order` at which each cell begins.
+    """
     cell = np.empty(len(xy), np.int64)
     start[:] = 0
     for k in range(len(xy)):
@@ -49,7 +76,10 @@ def sort_into_cells(xy, corner, rows, cols, start, order):
 # (2) f8, (2) f8, (2) f8, f8 -> b1
 @kernel
 def is_near(low, high, point, max_px):
-    """Whether a point lies within `max_px` along and across of a segment; one without length counts as level."""
+    """Whether a point lies within `max_px` of a segment, both along it beyond its ends and across it.
+
+    A segment without length is taken as horizontal.
+    """
     by_x, by_y = high[0] - low[0], high[1] - low[1]
     length = np.sqrt(by_x * by_x + by_y * by_y)
     by_x, by_y = (by_x / length, by_y / length) if length > 1e-9 else (1.0, 0.0)
@@ -61,42 +91,44 @@ def is_near(low, high, point, max_px):
 # (2) f8, (2) f8, f8, f8 -> (2) f8
 @kernel
 def span_in_row(low, high, top, max_px):
-    """Least and largest x of what lies within `max_px` along and across of a segment, in a row of cells from y = `top`.
-
-    Beyond an end and beside it at once, a point is up to 1.4 times as far away.
-    """
-    reach = CORNER * max_px
+    """Smallest and largest x, in the row of cells that begins at y = `top`, of points that `is_near` can accept."""
+    margin = CORNER_FACTOR * max_px
     x0, x1, by_y = low[0], high[0], high[1] - low[1]
     if abs(by_y) > 1e-9:
-        one = min(max((top - reach - low[1]) / by_y, 0.0), 1.0)
-        other = min(max((top + CELL_PX + reach - low[1]) / by_y, 0.0), 1.0)
+        one = min(max((top - margin - low[1]) / by_y, 0.0), 1.0)
+        other = min(max((top + CELL_PX + margin - low[1]) / by_y, 0.0), 1.0)
         x0, x1 = low[0] + one * (high[0] - low[0]), low[0] + other * (high[0] - low[0])
-    return np.array([min(x0, x1) - reach, max(x0, x1) + reach])
+    return np.array([min(x0, x1) - margin, max(x0, x1) + margin])
 
 
 # (k,2) f8, (m) i8, (m) f4, i8, f8 -> b1
 @kernel
 def is_clear(xy, near, distance, n_near, ratio):
-    """Whether the nearest of some candidates clearly beats the best one at another place."""
+    """Whether the best match is clearly better than the second-best match at another place.
+
+    near, distance : (m,), of which the first `n_near` hold the numbers of the candidates and the distances of their
+    descriptors; ratio : the best distance must be below this share of the second best.
+    """
     best = np.argmin(distance[:n_near])
-    rival = np.float32(UNRELATED_DISTANCE)
+    second_best = np.float32(UNRELATED_DISTANCE)
     for k in range(n_near):
         away_x = abs(xy[near[k], 0] - xy[near[best], 0])
         away_y = abs(xy[near[k], 1] - xy[near[best], 1])
         if max(away_x, away_y) > SAME_PLACE_PX:
-            rival = min(rival, distance[k])
-    return distance[best] < ratio * rival
+            second_best = min(second_best, distance[k])
+    return distance[best] < ratio * second_best
 
 
-# (n,2) f8, (n,2) f8, (n,d) f4, (k,2) f8, (k,d) f4, f8, f8, (n) i8, (k) i8 -> None
+# CurveSegments, SecondFeatures, f8, f8, (n) i8, (k) i8 -> None
 @kernel
-def nearest_descriptors(low, high, in_a, xy, in_b, max_px, ratio, best_a, best_b):
-    """For each segment the feature near it of the nearest descriptor, and for each feature that of the segments.
+def nearest_descriptors(segments, features, max_px, ratio, best_a, best_b):
+    """Find for each segment the feature near it with the nearest descriptor, and for each feature the segment.
 
-    low, high : (n, 2) px, NaN where there is no segment; in_a : (n, d), in_b : (k, d) descriptors of unit length; xy :
-    (k, 2) px of the features. best_a : (n,), -1 where none is near or the best one is not clear, see `is_clear`;
-    best_b : (k,), -1 where no segment is near.
+    max_px : largest distance of a feature from its segment; ratio : see `is_clear`. best_a : (n,) receives the number of
+    a feature, -1 where none is near or the best match is not clear; best_b : (k,) receives the number of a segment, -1
+    where none is near.
     """
+    low, high, in_a, xy, in_b = segments.low, segments.high, segments.descriptors, features.xy, features.descriptors
     best_a[:] = -1
     best_b[:] = -1
     if not len(xy):
@@ -110,8 +142,8 @@ def nearest_descriptors(low, high, in_a, xy, in_b, max_px, ratio, best_a, best_b
     for i in range(len(low)):
         if not (np.isfinite(low[i]).all() and np.isfinite(high[i]).all()):
             continue
-        top = min(low[i, 1], high[i, 1]) - CORNER * max_px
-        bottom = max(low[i, 1], high[i, 1]) + CORNER * max_px
+        top = min(low[i, 1], high[i, 1]) - CORNER_FACTOR * max_px
+        bottom = max(low[i, 1], high[i, 1]) + CORNER_FACTOR * max_px
         first, last = int(np.floor((top - corner[1]) / CELL_PX)), int(np.floor((bottom - corner[1]) / CELL_PX))
         n_near = 0
         for row in range(max(first, 0), min(last, rows - 1) + 1):
