@@ -169,6 +169,6 @@ def image_record(matched_pixels: MatchedPixels) -> dict[str, Any]:
         "steps": match_scene.n_steps,
     }
     if isinstance(rays, DepthRays):
-        span = (match_scene.origin_m, match_scene.origin_m + match_scene.n_steps * match_scene.step_m)
+        span = (match_scene.height_origin, match_scene.height_origin + match_scene.n_steps * match_scene.height_step)
         return record | {"disparities_px": [round(v, 3) for v in span], "disparity_times_depth_px_m": rays.scale}
-    return record | {"step_m": match_scene.step_m * getattr(rays, "unit", 1.0)}
+    return record | {"step_m": match_scene.height_step * getattr(rays, "unit", 1.0)}

@@ -49,7 +49,7 @@ def key_of(request: DsmRequest, config: RunConfig, inputs: InputFiles) -> dict[s
 
 def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:
     """SHA-256 of the run setup: corrections of cameras, lattices, grey values and tie points."""
-    lattice = [*match_scene.anchor, match_scene.cell_m, match_scene.origin_m, match_scene.step_m]
+    lattice = [*match_scene.anchor, match_scene.cell_size, match_scene.height_origin, match_scene.height_step]
     setup = {
         "orientation": orientation.as_dict(),
         "names": [view.name for view in match_scene.views],

@@ -1,7 +1,7 @@
 """The height range that a run searches: as requested, around a terrain model, or found from the tie points.
 
 `search_range` decides, in this order: `--heights` or the heights of the scene file; `--dem`, extended by
-`pyramid.dem_down_m` and `pyramid.dem_up_m`; else the tie points (`zlocus.orientation.orientation.height_range`). A
+`pyramid.dem_down_m` and `pyramid.dem_up_m`; else the tie points (`zlocus.orientation.tie_heights.height_range`). A
 range never reaches up to the lowest camera. Before tie points are known, `possible_heights` says at which heights views
 are compared at all.
 """
@@ -24,7 +24,8 @@ from zlocus.core.sensor_model import capped, lowest_station
 from zlocus.io.grid_inputs import dem_datum, read_dem
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.ground_pixels import median_ground_pixel
-from zlocus.orientation.orientation import Orientation, height_range
+from zlocus.orientation.orientation import Orientation
+from zlocus.orientation.tie_heights import height_range
 
 N_POSSIBLE_HEIGHTS = 5
 # Land on Earth lies between these heights above the ellipsoid.

@@ -45,7 +45,8 @@ from zlocus.matching.match_scene import MIN_LEVELS, MatchScene
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
-from zlocus.orientation.orientation import Orientation, supported
+from zlocus.orientation.orientation import Orientation
+from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.plan import Tile, plan_tiles
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
@@ -338,7 +339,7 @@ def tile_name(number: int, tile: Tile) -> str:
 def matched_pixels(image_scene: ImageScene, surface: Surface) -> MatchedPixels:
     """The surface of a reference image without the heights that lie beyond the requested range."""
     match_scene = image_scene.match_scene
-    middle = match_scene.origin_m + match_scene.n_steps * match_scene.step_m / 2
+    middle = match_scene.height_origin + match_scene.n_steps * match_scene.height_step / 2
     matched = MatchedPixels(MatchedImage(image_scene.image_space, surface.height, middle), match_scene, surface)
     for row in range(0, len(surface.height), ROWS_AT_ONCE):
         rows = slice(row, row + ROWS_AT_ONCE)
@@ -392,7 +393,7 @@ def heights_for_grid(
 
 def pixel_heights(checked: MatchedPixels, unchecked: MatchedPixels, z: float) -> PixelHeights:
     """A matched image as the ground grid takes it. z : height (m) at which its ground pixel is measured."""
-    space, step, middle = checked.image.space, checked.match_scene.step_m, checked.image.middle
+    space, step, middle = checked.image.space, checked.match_scene.height_step, checked.image.middle
     rows, cols = checked.image.height.shape
     half_step = np.array([[middle - step / 2], [middle + step / 2]], np.float32)
     low, high = (space.ground(rows // 2, hypothesis[None], cols // 2)[0, 0, 2] for hypothesis in half_step)
@@ -408,7 +409,7 @@ def grid_tile(
         return TileResult(Surface.nothing(core_window))
     halo = config.pyramid.halo
     window = core_window.at_level(0, halo)
-    z_range = (match_scene.origin_m, match_scene.origin_m + match_scene.n_steps * match_scene.step_m)
+    z_range = (match_scene.height_origin, match_scene.height_origin + match_scene.n_steps * match_scene.height_step)
     cells = Cells((window.rows, window.cols), match_scene.transform(window, 0), z_range)
     surface = gridded(grid_images.images, cells, grid_images.all_matched).precise(config.checks.max_sigma_m)
     if fill == "interpolate":

@@ -13,7 +13,7 @@ from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.point_match import NEAREST_TIES, Place, cell_of, curves_at, height_nearby
-from zlocus.orientation.orientation import supported
+from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.setup import open_inputs, orient_views, set_up_run, supported_views

@@ -15,7 +15,7 @@ from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest
 from zlocus.core.scene import Scene
 from zlocus.io.grid_inputs import cells_inside, read_polygons
 from zlocus.io.input_files import InputFiles
-from zlocus.orientation.orientation import RefinedTies
+from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.fingerprint import key_of
 from zlocus.pipeline.finished_record import Finished

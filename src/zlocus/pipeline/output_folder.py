@@ -10,7 +10,7 @@ from pathlib import Path
 from zlocus.core.errors import OutputError
 from zlocus.core.requests import FINISHED
 from zlocus.products.derived import remove_derived
-from zlocus.products.report.file_names import forget_report
+from zlocus.products.report.file_names import remove_report
 from zlocus.products.tie_observations import OBSERVATIONS
 
 # Names of files that are not complete yet; they contain the number of the process that writes them.
@@ -43,7 +43,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 def remove_earlier_products(out: Path) -> None:
     """Remove the products of an earlier run, so that old and new products never stand together."""
     remove_derived(out)
-    forget_report(out)
+    remove_report(out)
     for name in (FINISHED, "run.json", "ties.gpkg", OBSERVATIONS):
         (out / name).unlink(missing_ok=True)
     # Incomplete files of runs that were killed. This run has none yet, and no other run writes here at the same time.

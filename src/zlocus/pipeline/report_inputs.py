@@ -32,8 +32,8 @@ from zlocus.products.point_report import PointReport, point_record
 from zlocus.products.report.example_cells import FAILED, RULE, ChosenCell, chosen_cells
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, REPORT
 from zlocus.products.report.page import write_report
-from zlocus.products.report.sampling import Survey, survey
-from zlocus.products.report.tables import MOST_MATRIX
+from zlocus.products.report.sampling import Survey, survey_rasters
+from zlocus.products.report.tables import MAX_MATRIX_IMAGES
 from zlocus.products.tie_layers import counted_pairs, label_counts
 
 # The number of pairs grows with the square of the number of views.
@@ -135,14 +135,14 @@ def write_views(path: Path, run: ReportedRun) -> None:
 
 def write_curves(path: Path, folder: Path, run: ReportedRun, config: RunConfig, most_s: float) -> None:
     """Write match curves of example cells of the surface in a folder; a cell without curves gets its error."""
-    surface_survey, start, cells = survey(folder), time.perf_counter(), []
+    surface_survey, start, cells = survey_rasters(folder), time.perf_counter(), []
     chosen = chosen_cells(surface_survey)
     for cell in chosen:
         if time.perf_counter() - start > most_s:
             break
         cells.append(shown_cell(cell, surface_survey, run, config))
     record = {"rule": RULE, "n_chosen": len(chosen), "most_s": most_s, "cells": cells}
-    if not (folder / RANKING).exists() and len(run.match_scene.views) <= MOST_MATRIX:
+    if not (folder / RANKING).exists() and len(run.match_scene.views) <= MAX_MATRIX_IMAGES:
         record["labels"] = tried_labels(run, config, most_s)
     write_record(path, record)
 
@@ -181,7 +181,7 @@ def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[s
 
 def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     """Windows of `side` cells around tie points spread over the scene; each lies far from the earlier ones."""
-    xy = (match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
+    xy = (match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_size
     first, size = (
         (match_scene.overlap_window.col, match_scene.overlap_window.row),
         (match_scene.overlap_window.cols, match_scene.overlap_window.rows),
@@ -258,7 +258,7 @@ def place_of_cell(xy: FloatArray, height_m: float, run: ReportedRun) -> Place:
 
 def middle_height(match_scene: MatchScene) -> float:
     """The middle of the height range, m."""
-    return match_scene.origin_m + match_scene.n_steps * match_scene.step_m / 2
+    return match_scene.height_origin + match_scene.n_steps * match_scene.height_step / 2
 
 
 def said(error: Exception) -> str:

@@ -40,7 +40,9 @@ from zlocus.io.vertical import VerticalDatum, named_vertical_datum
 from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.orientation import Orientation, RefinedTies, orient, supported
+from zlocus.orientation.orientation import Orientation, orient
+from zlocus.orientation.tie_refinement import RefinedTies
+from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.height_range import heights_below_cameras, possible_heights, search_range, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names

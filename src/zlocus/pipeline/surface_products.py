@@ -155,7 +155,7 @@ def _heights_record(setup: RunSetup) -> dict[str, Any]:
     """The heights searched, and the reference image of the scene."""
     return {
         "range_m": [round(z, 3) for z in setup.z_range],
-        "step_m": setup.match_scene.step_m,
+        "step_m": setup.match_scene.height_step,
         "levels": setup.match_scene.levels,
         "reference_image": setup.match_scene.views[0].name,
     }

@@ -196,8 +196,8 @@ class TileRun:
         self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed_outcomes))
         if failed_outcomes:
             raise StoppedError(
-                f"{self._not_all(failed_outcomes)} They are empty in the surface (FAILED in quality.tif): give the same "
-                "command again to try them once more."
+                f"{self._not_all(failed_outcomes)} They are empty in the surface (FAILED in quality.tif): give the "
+                "same command again to try them once more."
             )
 
     def _not_all(self, failed_outcomes: Sequence[Outcome]) -> str:

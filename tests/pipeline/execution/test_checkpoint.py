@@ -110,7 +110,7 @@ def test_tiles_of_another_run_are_refused(tmp_path, change, says):
 def test_cameras_that_came_out_otherwise_are_noticed(tmp_path):
     filled(tmp_path, settled="one")
     again = store(tmp_path)
-    with pytest.raises(OutputError, match="2 finished tiles for which cameras and heights came out otherwise"):
+    with pytest.raises(OutputError, match="2 finished tiles for other cameras and heights"):
         again.open("other").__enter__()
     assert set(store(tmp_path).finished) == {"0_0", "0_64"}
 

@@ -75,7 +75,7 @@ def run_plan(
         cell_m=grid.cell_m,
         shape=(grid.window.rows, grid.window.cols),
         heights=z_range,
-        step_m=match_scene.step_m,
+        step_m=match_scene.height_step,
         n_steps=match_scene.n_steps,
         n_tiles=len(tiles),
         tile_bytes=tile_bytes,

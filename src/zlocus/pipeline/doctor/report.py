@@ -10,7 +10,7 @@ from typing import Any
 from zlocus.core.footprints import PairGeometry, ViewGeometry
 from zlocus.core.scene import View
 from zlocus.io.scene_file import RefusedView
-from zlocus.orientation.orientation import PairOrientation, ViewOrientation
+from zlocus.orientation.tie_residuals import PairOrientation, ViewOrientation
 from zlocus.orientation.parameter_groups import kind_of
 from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding, worst
 from zlocus.pipeline.doctor.plan import ROUGHLY, RunPlan

@@ -91,7 +91,7 @@ def tiny_scene() -> MatchScene:
     """Two images of noise over 96 x 96 cells."""
     views = tuple(View(f"v{i}", Path(f"v{i}"), Noise(i), SlantedCamera(0.5 * i)) for i in range(2))
     return MatchScene(
-        views=views, anchor=(0.0, 0.0), cell_m=1.0, origin_m=0.0, step_m=1.0, n_steps=16, levels=2,
+        views=views, anchor=(0.0, 0.0), cell_size=1.0, height_origin=0.0, height_step=1.0, n_steps=16, levels=2,
         overlap_window=CellWindow(0, 0, SIDE, SIDE), grey_scales=(GreyScale(0.0, 1.0),) * 2, ties=np.zeros((0, 3)),
     )  # fmt: skip
 
