@@ -40,9 +40,9 @@ from zlocus.inspector.server import page_files
 from zlocus.inspector.serving import checked_address, fragment_of, listening
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
-from zlocus.products.match_curve_figures import PointReport, point_record
+from zlocus.products.point_report import PointReport, point_record
 from zlocus.evaluation.comparison import Comparison
-from zlocus.products.report.maps import GROUPS, groups_of
+from zlocus.products.report.maps import FLAG_GROUPS, groups_of
 from zlocus.products.tie_observations import OBSERVATIONS
 
 # Of what is rounded for the page: correlations, heights.
@@ -204,7 +204,7 @@ def test_layers_are_clear_where_the_surface_is_empty(page, out, layer):
     assert not drawn[rows:, :, 3].any()
     assert not drawn[:, cols:, 3].any()
     with rasterio.open(out / "quality.tif") as file:
-        has_reason = groups_of(file.read(1).astype(np.int64)) < len(GROUPS)
+        has_reason = groups_of(file.read(1).astype(np.int64)) < len(FLAG_GROUPS)
     if layer == "hillshade":
         assert shown[known].mean() > 0.95  # at holes it needs neighbours
     elif layer == "quality":

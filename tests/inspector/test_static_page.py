@@ -18,7 +18,7 @@ from rendered_scenes import SMALL_TILES, run
 from zlocus.inspector.restored_run import restored
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
-from zlocus.products.match_curve_figures import PointReport
+from zlocus.products.point_report import PointReport
 from zlocus.evaluation.comparison import Comparison
 
 LAYERS = ["hillshade", "ortho", "height", "sigma", "views", "quality", "difference"]

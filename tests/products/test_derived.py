@@ -26,7 +26,7 @@ from zlocus.core.requests import DEFAULT_PRODUCTS, PRODUCTS, product_names
 from zlocus.io.config import config_as_dict
 from zlocus.io.crs import local_frame
 from zlocus.io.rasters import write_cog
-from zlocus.products.derived import FILES, link_all, make_maps, remove_maps
+from zlocus.products.derived import FILES, link_all, remove_derived, write_derived
 
 GRID = GeoBox((60, 80), Affine(1.0, 0, 500000, 0, -1.0, 4000000), "EPSG:32632")
 SURFACE = {"dsm.tif", "ortho.tif", "quality.tif", "sigma.tif", "views.tif"}
@@ -56,7 +56,7 @@ def names_in(folder):
 
 @pytest.mark.parametrize("wanted", [(), *[(name,) for name in PRODUCTS], PRODUCTS])
 def test_what_is_asked_for_is_made_and_linked(surface, wanted):
-    make_maps(surface, wanted, ProductOptions(), SilentProgress())
+    write_derived(surface, wanted, ProductOptions(), SilentProgress())
     link_all(surface, SilentProgress())
     made = {FILES[name] for name in wanted}
     assert names_in(surface) == SURFACE | made | {"item.json"}
@@ -65,7 +65,7 @@ def test_what_is_asked_for_is_made_and_linked(surface, wanted):
 
 
 def test_every_product_opens_and_is_valid(surface):
-    make_maps(surface, PRODUCTS, ProductOptions(), SilentProgress())
+    write_derived(surface, PRODUCTS, ProductOptions(), SilentProgress())
     rasters = sorted(surface.glob("*.tif"))
     assert len(rasters) == 7
     for path in rasters:
@@ -87,7 +87,7 @@ def test_products_have_the_crs_of_their_surface(tmp_path, crs):
         profile.pop(name, None)
     with rasterio.open(tmp_path / "dsm.tif", "w", **(profile | {"driver": "COG", "crs": crs})) as file:
         file.write(z)
-    make_maps(tmp_path, PRODUCTS, ProductOptions(), SilentProgress())
+    write_derived(tmp_path, PRODUCTS, ProductOptions(), SilentProgress())
     with rasterio.open(tmp_path / "dtm.tif") as file:
         assert CRS(file.crs.to_wkt()) == CRS(crs)
     # A hillshade holds no heights.
@@ -107,7 +107,7 @@ def test_a_map_that_fails_costs_no_other(surface, monkeypatch):
 
     monkeypatch.setitem(maps._MAKERS, "hillshade", broken)
     with pytest.raises(ConfigError, match="no luck"):
-        make_maps(surface, PRODUCTS, ProductOptions(), SilentProgress())
+        write_derived(surface, PRODUCTS, ProductOptions(), SilentProgress())
     assert {"dtm.tif", "contours.gpkg", "surface.laz"} <= {path.name for path in surface.iterdir()}
     assert not (surface / "hillshade.tif").exists()
 
@@ -115,13 +115,13 @@ def test_a_map_that_fails_costs_no_other(surface, monkeypatch):
 def test_contours_of_the_terrain_need_it(surface):
     options = ProductOptions(contours_of="dtm", contour_interval_m=1.0)
     with pytest.raises(ConfigError, match=r"Add dtm to --products"):
-        make_maps(surface, ("contours",), options, SilentProgress())
+        write_derived(surface, ("contours",), options, SilentProgress())
     assert names_in(surface) == SURFACE
-    make_maps(surface, ("contours", "dtm"), options, SilentProgress())
+    write_derived(surface, ("contours", "dtm"), options, SilentProgress())
     of_terrain = pyogrio.read_info(surface / "contours.gpkg")["features"]
-    make_maps(surface, ("contours",), options, SilentProgress())
+    write_derived(surface, ("contours",), options, SilentProgress())
     assert pyogrio.read_info(surface / "contours.gpkg")["features"] == of_terrain
-    make_maps(surface, ("contours",), ProductOptions(contour_interval_m=1.0), SilentProgress())
+    write_derived(surface, ("contours",), ProductOptions(contour_interval_m=1.0), SilentProgress())
     # The house of 8 m adds at least its seven heights.
     assert pyogrio.read_info(surface / "contours.gpkg")["features"] >= of_terrain + 7
 
@@ -131,21 +131,21 @@ def test_in_a_local_frame_a_note_says_why_there_is_no_item(tmp_path, capsys):
     said = []
     progress = SilentProgress()
     progress.note = said.append
-    make_maps(tmp_path, PRODUCTS, ProductOptions(), progress)
+    write_derived(tmp_path, PRODUCTS, ProductOptions(), progress)
     link_all(tmp_path, progress)
     assert said == ["No item.json: the frame is local, and STAC is about places on the Earth."]
     assert names_in(tmp_path) == SURFACE | set(FILES.values())
 
 
 def test_maps_of_an_earlier_surface_go(surface):
-    make_maps(surface, PRODUCTS, ProductOptions(), SilentProgress())
+    write_derived(surface, PRODUCTS, ProductOptions(), SilentProgress())
     (surface / "notes.txt").write_text("mine")
-    remove_maps(surface)
+    remove_derived(surface)
     assert names_in(surface) == SURFACE | {"notes.txt"}
-    remove_maps(surface)
+    remove_derived(surface)
     (surface / "dtm.tif").mkdir()
     with pytest.raises(OutputError, match=r"dtm\.tif is of an earlier run and cannot be removed"):
-        remove_maps(surface)
+        remove_derived(surface)
 
 
 def test_names_of_products():

@@ -109,7 +109,7 @@ def test_far_from_all_ground_there_is_none(town):
 
 def test_large_grids_are_filtered_on_larger_blocks(town, monkeypatch):
     folder, ground, _ = town
-    monkeypatch.setattr(dtm, "MOST_CELLS", 2500)
+    monkeypatch.setattr(dtm, "MAX_BLOCKS", 2500)
     found = made(folder)
     assert np.abs(found - ground)[HOUSE].max() < 2 * UNDER_A_HOUSE_M
 

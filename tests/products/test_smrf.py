@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zlocus.core.options import ProductOptions
-from zlocus.products.smrf import between_blocks, block_least, block_mean, membrane, opened, outside_of, rises, terrain
+from zlocus.products.smrf import between_blocks, block_mean, block_min, membrane, opened, outside_of, rises, terrain
 
 OPTIONS = ProductOptions(ground_window_m=15.0)
 CELL_M = 1.0
@@ -127,7 +127,7 @@ def test_a_membrane_over_tilted_ground_is_tilted():
 def test_blocks_by_hand():
     z = np.array([[1, 2, 9], [3, np.nan, np.nan], [np.nan, np.nan, 4]], np.float32)
     np.testing.assert_array_equal(block_mean(z, 2), [[2, 9], [np.nan, 4]])
-    np.testing.assert_array_equal(block_least(z, 2), [[1, 9], [np.nan, 4]])
+    np.testing.assert_array_equal(block_min(z, 2), [[1, 9], [np.nan, 4]])
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 5])

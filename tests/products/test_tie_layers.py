@@ -17,7 +17,8 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.scene import Scene, View
 from zlocus.io.crs import local_frame
 from zlocus.matching.pair_labels import NOT_RANKED, LabelledTies, PairLabels, TileLabels
-from zlocus.orientation.orientation import Orientation, Residuals, ViewOrientation
+from zlocus.orientation.orientation import Orientation
+from zlocus.orientation.tie_residuals import Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.products import tie_layers as points
 from zlocus.products.tie_layers import column_names, labels_in, write_ranking, write_ties
@@ -93,7 +94,7 @@ def test_ranking_has_a_row_per_point_and_reference(tmp_path):
 
 
 def test_labels_of_very_many_images_are_one_text(tmp_path, monkeypatch):
-    monkeypatch.setattr(points, "MOST_COLUMNS", 2)
+    monkeypatch.setattr(points, "MAX_COLUMNS", 2)
     names, xyz = ["a", "b,c", "A=1"], np.array([[CENTRE[0] + GSD_M, CENTRE[1], 51.0], [*CENTRE, 50.0]])
     all_three = np.array([[[-1, 1, 0], [1, -1, NOT_RANKED], [0, -1, -1]]], np.int8)
     ranked = [

@@ -37,14 +37,14 @@ def products(options: ProductsOptions) -> None:
     from zlocus.io.config import read_config
     from zlocus.io.open_raster import existing_file
     from zlocus.pipeline.finished_record import ITEM, update_finished
-    from zlocus.products.derived import FILES, link_all, make_maps
+    from zlocus.products.derived import FILES, link_all, write_derived
 
     existing_file(options.out / "dsm.tif", "surface")
     product_options = (
         run_options(options.out / "run.json") if options.config is None else read_config(options.config).products
     )
     progress = progress_for(sys.stderr)
-    make_maps(options.out, chosen, product_options, progress)
+    write_derived(options.out, chosen, product_options, progress)
     link_all(options.out, progress)
     update_finished(options.out, (*(FILES[name] for name in chosen), ITEM))
     print(f"{options.out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")

@@ -22,15 +22,8 @@ from zlocus.inspector.restored_run import Restored
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.point_match import PlaceCurves, curves_at
 from zlocus.pipeline.report_inputs import NOT_SHOWN, SHOWN_WITHIN_CELLS, place_of_cell
-from zlocus.products.match_curve_figures import (
-    STRETCH_PERCENT,
-    Locus,
-    PointReport,
-    loci,
-    point_record,
-    what_order_rests_on,
-    where_it_stops,
-)
+from zlocus.products.match_curve_figures import STRETCH_PERCENT
+from zlocus.products.point_report import Locus, PointReport, loci, point_record, what_order_rests_on, where_it_stops
 from zlocus.products.report.maps import data_uri
 
 # Cells a side that are shown around a window, most first: an image's end may cut the larger ones.
@@ -167,11 +160,11 @@ def image_records(place_curves: PlaceCurves, found: list[Locus]) -> list[dict[st
 def neighbour_records(place_curves: PlaceCurves, match_scene: MatchScene, config: RunConfig) -> dict[str, Any]:
     """The tie points that order the images, on the ground, with their labels."""
     order, options = place_curves.curves.order, config.selection
-    xy = match_scene.anchor + order.xy * match_scene.cell_m * (1.0, -1.0)
+    xy = match_scene.anchor + order.xy * match_scene.cell_size * (1.0, -1.0)
     return {
-        "by": options.neighbours, "radius_m": options.radius_px * match_scene.cell_m,
+        "by": options.neighbours, "radius_m": options.radius_px * match_scene.cell_size,
         "points": [
-            {"x": float(x), "y": float(y), "distance_m": float(away * match_scene.cell_m), "labels": labels.tolist()}
+            {"x": float(x), "y": float(y), "distance_m": float(away * match_scene.cell_size), "labels": labels.tolist()}
             for (x, y), away, labels in zip(xy, order.distance, order.labels, strict=True)
         ],
     }  # fmt: skip

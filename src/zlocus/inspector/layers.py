@@ -50,15 +50,15 @@ def layers_of(folder: SurfaceFolder) -> dict[str, Layer]:
 
 def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
     """Surface less reference."""
-    full_m = reference.full_m
+    saturated_m = reference.saturated_m
 
     def draw(patch: Patch) -> Rgba:
         # A single cell of each where the map is near: means would differ at every edge.
         found, true = read_patch(folder.path("dsm"), patch, False), read_patch(reference.path, patch, False, folder)
-        return with_opacity(error_map(found.values[0] - true.values[0], full_m), found.known & true.known)
+        return with_opacity(error_map(found.values[0] - true.values[0], saturated_m), found.known & true.known)
 
-    line = error_map(np.linspace(-full_m, full_m, maps.STOPS, dtype=np.float32)[None], full_m)[0]
-    ticks = [f"{value:+g}" if value else "0" for value in np.linspace(-full_m, full_m, maps.TICKS)]
+    line = error_map(np.linspace(-saturated_m, saturated_m, maps.STOPS, dtype=np.float32)[None], saturated_m)[0]
+    ticks = [f"{value:+g}" if value else "0" for value in np.linspace(-saturated_m, saturated_m, maps.TICKS)]
     legend = scale(f"surface less {reference.name}, m", ", ".join(maps.css(colour) for colour in line), ticks)
     return Layer("difference", "Difference to the reference", legend, draw)
 
@@ -186,19 +186,19 @@ def _views(folder: SurfaceFolder) -> Layer:
 
 def _quality(folder: SurfaceFolder) -> Layer:
     """Reasons; clear where nothing is to be said, so that what lies below is seen."""
-    colours = np.array([*(colour for *_, colour in maps.GROUPS), maps.PLAIN[1]], np.uint8)[:, ::-1]
+    colours = np.array([*(colour for *_, colour in maps.FLAG_GROUPS), maps.NO_FLAG[1]], np.uint8)[:, ::-1]
     colours[0] = GREY
     groups = maps.groups_of(np.arange(1 << 16))
 
     def draw(patch: Patch) -> Rgba:
         cells = read_patch(folder.path("quality"), patch, False)
         group = groups[cells.values[0]]
-        drawn = with_opacity(colours[group], cells.known & (group < len(maps.GROUPS)))
+        drawn = with_opacity(colours[group], cells.known & (group < len(maps.FLAG_GROUPS)))
         # What was not asked for, or cannot be seen, is no more than a shade.
         drawn[..., 3][group == 0] //= SHADE
         return drawn
 
-    items = [(maps.css(colours[k]), meaning) for k, (meaning, *_) in enumerate(maps.GROUPS)]
+    items = [(maps.css(colours[k]), meaning) for k, (meaning, *_) in enumerate(maps.FLAG_GROUPS)]
     return Layer("quality", "Reasons", classes("why there is no height, or one to be checked", items), draw)
 
 

@@ -24,12 +24,12 @@ class Reference:
     """Heights that those of the surface can be compared with.
 
     path : raster of them, on their own grid, above what those of the surface are, any shift between the two removed;
-    name : of the file given; full_m : size of a difference from which colours are full; sentence : how the two compare.
+    name : of the file given; saturated_m : size of a difference from which colours are full; sentence : how the two compare.
     """
 
     path: Path
     name: str
-    full_m: float
+    saturated_m: float
     sentence: str
 
 

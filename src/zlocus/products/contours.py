@@ -90,23 +90,23 @@ class _LineStore:
     """Lines on disk, so that memory holds only their places. level : height of a line, in intervals."""
 
     file: BinaryIO
-    whole: dict[int, list[StoredLine]] = field(default_factory=lambda: defaultdict(list))
-    pieces: dict[int, list[StoredLine]] = field(default_factory=lambda: defaultdict(list))
+    whole_lines: dict[int, list[StoredLine]] = field(default_factory=lambda: defaultdict(list))
+    line_pieces: dict[int, list[StoredLine]] = field(default_factory=lambda: defaultdict(list))
 
     def put(self, line: FloatArray) -> StoredLine:
         """Write a line (n, 2) at the end of the file."""
-        stored = StoredLine(line[0, 1], line[0, 0], len(line), self.file.seek(0, 2))
+        stored_line = StoredLine(line[0, 1], line[0, 0], len(line), self.file.seek(0, 2))
         self.file.write(np.ascontiguousarray(line).tobytes())
-        return stored
+        return stored_line
 
-    def get(self, stored: StoredLine) -> FloatArray:
+    def get(self, stored_line: StoredLine) -> FloatArray:
         """Read a line (n, 2)."""
-        self.file.seek(stored.offset)
-        return np.frombuffer(self.file.read(stored.n_points * POINT_BYTES)).reshape(-1, 2)
+        self.file.seek(stored_line.offset)
+        return np.frombuffer(self.file.read(stored_line.n_points * POINT_BYTES)).reshape(-1, 2)
 
     def levels(self) -> list[int]:
         """Heights that have a line, in intervals, from low to high."""
-        return sorted(self.whole.keys() | self.pieces.keys())
+        return sorted(self.whole_lines.keys() | self.line_pieces.keys())
 
 
 def contours(
@@ -131,22 +131,22 @@ def contours(
                 is_cut = not is_closed and _snap_ends(line, z, level * interval_m + TRACED_ABOVE_M)
                 line += (0.0, strip.row)
                 if is_cut:
-                    store.pieces[level].append(store.put(line))
+                    store.line_pieces[level].append(store.put(line))
                 else:
                     _keep(store, level, line, min_ring_cells)
         for level in store.levels():
-            pieces = store.pieces.pop(level, [])
+            pieces = store.line_pieces.pop(level, [])
             for line in _joined([store.get(piece) for piece in pieces]):
                 _keep(store, level, line, min_ring_cells)
-            for stored in sorted(store.whole.pop(level, [])):
-                yield level, store.get(stored)
+            for stored_line in sorted(store.whole_lines.pop(level, [])):
+                yield level, store.get(stored_line)
 
 
 def _keep(store: _LineStore, level: int, line: FloatArray, min_ring_cells: float) -> None:
     """Store a whole line (n, 2), normalised, unless it is a point or a short ring."""
     line = _normalised(line)
     if len(line) > 1 and not _is_ring_below(line, min_ring_cells):
-        store.whole[level].append(store.put(line))
+        store.whole_lines[level].append(store.put(line))
 
 
 def _joined(pieces: list[FloatArray]) -> Iterator[FloatArray]:

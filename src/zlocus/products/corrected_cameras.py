@@ -34,44 +34,47 @@ SCENE = "scene.yaml"
 
 @dataclass(frozen=True)
 class WrittenCamera:
-    """entry : for the scene file; fit_px : largest error of an RPC that was fitted, None where it is exact."""
+    """A camera that was written.
+
+    entry : for the scene file; fit_px : largest error of an RPC that was fitted, None where the camera is exact.
+    """
 
     entry: CameraEntry
     fit_px: float | None = None
 
 
-def write_cameras(out: Path, inputs: Sequence[Path], oriented: Scene) -> dict[str, Any]:
-    """Write the cameras of a corrected scene and a `scene.yaml` to a folder; what was written, by view.
+def write_cameras(out: Path, inputs: Sequence[Path], scene: Scene) -> dict[str, Any]:
+    """Write the cameras of a corrected scene and a `scene.yaml` to a folder; return the entry of each view by name.
 
-    inputs : of the scene; a scene file's cameras keep all that was not corrected.
+    inputs : of the scene. Cameras of a scene file keep all that was not corrected.
 
     Raises
     ------
     OutputError
-        Where the folder cannot be written.
+        The folder cannot be written.
     ConfigError
-        For a shift of a line scanner's image, which its files cannot express.
+        The image of a line scanner was shifted, which its files cannot express.
     """
     entries = given_cameras(inputs)
     (out / FOLDER).mkdir(exist_ok=True)
     views, record = [], {}
-    for view, name in zip(oriented.views, file_names([v.name for v in oriented.views]), strict=True):
+    for view, name in zip(scene.views, file_names([v.name for v in scene.views]), strict=True):
         camera, folder = entries.get(view.name, (RpcCamera(), Path()))
-        written = write_camera(out, name, camera, folder, view, oriented)
+        written = write_camera(out, name, camera, folder, view, scene)
         image = relative(view.path, out)
         views.append(ViewEntry(name=view.name, image=image, camera=written.entry, date=view.date))
         record[view.name] = written.entry.model_dump(mode="json", exclude_none=True)
         if written.fit_px is not None:
             record[view.name]["rpc_fit_max_px"] = written.fit_px
-    frame = {"local": True} if is_local(oriented.crs) else {"crs": oriented.crs.to_string()}
-    area = None if oriented.bounds is None else {"bounds": oriented.bounds}
-    described = {"schema": 1, "frame": frame, "area": area, "heights": oriented.heights, "views": tuple(views)}
+    frame = {"local": True} if is_local(scene.crs) else {"crs": scene.crs.to_string()}
+    area = None if scene.bounds is None else {"bounds": scene.bounds}
+    described = {"schema": 1, "frame": frame, "area": area, "heights": scene.heights, "views": tuple(views)}
     write_scene_file(out / SCENE, SceneFile.model_validate(described))
     return record
 
 
 def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]:
-    """The cameras of a scene file by view, and the folder their paths start at; none of images alone."""
+    """Cameras of a scene file by view, with the folder where their paths start; empty where images are the input."""
     (first, *_) = inputs
     if first.suffix.lower() not in SCENE_SUFFIXES:
         return {}
@@ -79,7 +82,7 @@ def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]
 
 
 def write_camera(out: Path, name: str, camera: CameraEntry, folder: Path, view: View, scene: Scene) -> WrittenCamera:
-    """Write the camera of a view. camera : as it was given, with paths from `folder`."""
+    """Write the camera of a view. camera : of the input, with paths that start at `folder`."""
     if isinstance(camera, FrameCamera):
         return WrittenCamera(frame_entry(camera, view.sensor, scene))
     if isinstance(camera, LineScanCamera):
@@ -91,8 +94,10 @@ def write_camera(out: Path, name: str, camera: CameraEntry, folder: Path, view: 
 
 
 def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
-    """The corrected RPC of a view: exact where it is shifted, else fitted over the image and the RPC's heights, with
-    the largest error, px."""
+    """Corrected RPC of a view, and the largest error of its fit, px.
+
+    A shifted RPC is exact, and the error is None. Other corrections are fitted over the image and the RPC's heights.
+    """
     sensor, shift = view.sensor, np.zeros(2)
     while isinstance(sensor, ShiftedModel):
         shift += [sensor.column, sensor.row]
@@ -106,7 +111,7 @@ def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
 
 
 def frame_entry(camera: FrameCamera, sensor: SensorModel, scene: Scene) -> FrameCamera:
-    """A frame camera in the scene's frame, its pose relative to the map's axes at its centre."""
+    """Entry of a frame camera in the scene's frame, with its pose relative to the map's axes at its centre."""
     while isinstance(sensor, ShiftedModel):
         assert isinstance(sensor.base, FrameModel), "one shift is laid over a camera"
         sensor = sensor.base.moved(sensor.column, sensor.row)
@@ -126,7 +131,10 @@ def frame_entry(camera: FrameCamera, sensor: SensorModel, scene: Scene) -> Frame
 def write_scanner(
     out: Path, name: str, camera: LineScanCamera, folder: Path, view: View, scene: Scene
 ) -> LineScanCamera:
-    """A line scanner with its corrected trajectory, which is that of the projection centre and the camera's axes."""
+    """Write the corrected trajectory of a line scanner and return its entry.
+
+    The trajectory is that of the projection centre and of the camera's axes.
+    """
     sensor = view.sensor
     if not isinstance(sensor, LineScanModel | RectifiedModel):
         raise ConfigError(
@@ -153,7 +161,7 @@ def write_scanner(
 
 
 def relative(path: Path, folder: Path) -> str:
-    """A path from a folder, as a scene file names it; absolute where there is no way."""
+    """A path relative to a folder, as scene files have it; absolute where none exists."""
     try:
         return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     except ValueError:  # another drive

@@ -1,4 +1,4 @@
-"""What is made of a finished surface, as far as it is asked for: terrain, hillshade, contours, points."""
+"""Products derived from a finished surface: terrain, hillshade, contours and points."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from zlocus.products.dtm import write_dtm
 from zlocus.products.hillshade import write_hillshade
 from zlocus.products.stac_item import write_item
 
-# By the names of --products, in the order of making: contours may be those of the terrain.
+# Files by the names of --products, in the order in which they are made: contours may need the terrain.
 FILES = {"dtm": "dtm.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg", "laz": "surface.laz"}
 
 
-def make_maps(folder: Path, names: Collection[str], options: ProductOptions, progress: Progress) -> None:
-    """Make products of the rasters in a folder, each whole or not at all, and the others where one fails.
+def write_derived(folder: Path, names: Collection[str], options: ProductOptions, progress: Progress) -> None:
+    """Derive products from the rasters in a folder, each complete or not at all; where one fails, the others are made.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def make_maps(folder: Path, names: Collection[str], options: ProductOptions, pro
     OutputError
         A file cannot be written.
     """
-    check_maps(names, options, (folder / FILES["dtm"]).exists())
+    check_derived(names, options, (folder / FILES["dtm"]).exists())
     wanted = [name for name in FILES if name in names]
     failures = []
     with progress.stage("Products", len(wanted)) as stage:
@@ -45,24 +45,24 @@ def make_maps(folder: Path, names: Collection[str], options: ProductOptions, pro
 
 
 def link_all(folder: Path, progress: Progress) -> None:
-    """The item that links all files of a folder, or a note why there is none.
+    """Write the item that links all files of a folder, or note why there is none.
 
     Raises
     ------
     InputError, OutputError
-        As `write_item`.
+        See `write_item`.
     """
     if not write_item(folder):
         progress.note("No item.json: the frame is local, and STAC is about places on the Earth.")
 
 
-def check_maps(names: Collection[str], options: ProductOptions, has_terrain: bool = False) -> None:
-    """Refuse, before any work, products that need another. has_terrain : whether it is there already.
+def check_derived(names: Collection[str], options: ProductOptions, has_terrain: bool = False) -> None:
+    """Refuse products that need a missing one, before any work. has_terrain : whether the folder holds a terrain.
 
     Raises
     ------
     ConfigError
-        Contours of a terrain that is not made.
+        Contours of the terrain are wanted, and there is no terrain.
     """
     if "contours" in names and options.contours_of == "dtm" and "dtm" not in names and not has_terrain:
         raise ConfigError(
@@ -71,8 +71,8 @@ def check_maps(names: Collection[str], options: ProductOptions, has_terrain: boo
         )
 
 
-def remove_maps(folder: Path) -> None:
-    """Remove what an earlier run made of its surface, before another surface takes its place.
+def remove_derived(folder: Path) -> None:
+    """Remove the derived products of an earlier run, before another surface takes its place.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def _contours(folder: Path, path: Path, options: ProductOptions) -> None:
 
 
 def _laz(folder: Path, path: Path, options: ProductOptions) -> None:
-    # laspy is not needed otherwise.
+    # Only this product needs laspy.
     from zlocus.products.surface_points import write_surface_points
 
     write_surface_points(folder, path)

@@ -1,4 +1,4 @@
-"""hillshade.tif: how bright the surface is under a sun."""
+"""hillshade.tif: the brightness of the surface under a sun."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.row_strips import STRIP_ROWS, BandReader, strips_of
 from zlocus.products.shade_kernel import shade_cells
 
-NO_SHADE = 0
+NO_DATA = 0
 
 
 def write_hillshade(dsm: Path, path: Path, options: ProductOptions, strip_rows: int = STRIP_ROWS) -> None:
-    """The hillshade of a raster of heights: uint8, 1 (in shade) to 255 (facing the sun), 0 without height.
+    """Write the hillshade of a raster of heights: uint8, 1 (in shade) to 255 (facing the sun), 0 without height.
 
-    strip_rows : rows worked on at a time; they change no byte.
+    strip_rows : rows that are processed at a time; they change no byte.
 
     Raises
     ------
@@ -29,23 +29,23 @@ def write_hillshade(dsm: Path, path: Path, options: ProductOptions, strip_rows: 
         The hillshade cannot be written.
     """
     with (
-        BandReader(dsm) as heights,
+        BandReader(dsm) as reader,
         RasterSink(
-            path, heights.horizontal_geobox, RasterBands("uint8", NO_SHADE, ("hillshade",), average_overviews=True)
+            path, reader.horizontal_geobox, RasterBands("uint8", NO_DATA, ("hillshade",), average_overviews=True)
         ) as sink,
     ):
-        for strip in strips_of(heights.geobox.shape[0], 1, strip_rows):
-            z = heights.read(strip)
-            shade = hillshade(z, heights.cell_m, options.sun_azimuth_deg, options.sun_altitude_deg)
+        for strip in strips_of(reader.geobox.shape[0], 1, strip_rows):
+            z = reader.read(strip)
+            shade = hillshade(z, reader.cell_m, options.sun_azimuth_deg, options.sun_altitude_deg)
             sink.write(strip.row, 0, shade[strip.own])
 
 
 def hillshade(z: NDArray[np.float32], cell_m: float, azimuth_deg: float, altitude_deg: float) -> NDArray[np.uint8]:
-    """Brightness of a surface that scatters light evenly, (r, c): 1 + 254 cos of the angle between normal and sun, 1
-    where it is turned away, 0 without height; as gdaldem writes it.
+    """Brightness (r, c) of a surface that scatters light evenly, as gdaldem computes it.
 
-    z : (r, c) m, NaN where empty. Source: Horn (1981), Proc. IEEE 69(1), Lambertian shading of section V; for slopes
-    see `horn_slopes`.
+    It is 1 + 254 cos of the angle between normal and sun, 1 where the surface is turned away, and 0 without height.
+    z : (r, c) m, NaN where empty. Source: Horn (1981), Proc. IEEE 69(1), Lambertian shading of section V; slopes are
+    those of `horn_slopes`.
     """
     azimuth, altitude = math.radians(azimuth_deg), math.radians(altitude_deg)
     flat = math.cos(altitude)

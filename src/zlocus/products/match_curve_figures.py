@@ -22,9 +22,9 @@ from zlocus.products.point_report import (
     LABELS,
     Locus,
     PointReport,
-    number_text,
+    decimal,
     point_record,
-    signed_text,
+    signed,
     write_csv,
 )
 
@@ -75,7 +75,7 @@ def match_curves_figure(report: PointReport) -> Figure:
         if np.isfinite(peaks.rho2[j]):
             axes.axhline(peaks.rho2[j], color="#777777", linewidth=0.8, linestyle=":")
         axes.set_title(as_written(f"{j + 1}. {report.reference} – {name}"), fontsize=9, loc="left")
-        rho = f"{signed_text(label)} {LABELS[label]}   ρ1 {number_text(peaks.rho1[j], 2)}   ratio {number_text(peaks.ratio[j], 2)}"
+        rho = f"{signed(label)} {LABELS[label]}   ρ1 {decimal(peaks.rho1[j], 2)}   ratio {decimal(peaks.ratio[j], 2)}"
         axes.text(0.02, 0.03, rho, transform=axes.transAxes, fontsize=8, color=LABEL_COLOURS[label])
     _labelled(figure, "Correlation with each search image (x: peak, dotted: secondary peak ρ2)")
     return figure
@@ -104,11 +104,9 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
     peak = mean.peaks.peak[j]
     axes.plot(report.heights_m[peak], mean.peaks.rho1[j], "x", color="black", markersize=9, markeredgewidth=2)
     label, height = int(mean.labels[j]), report.heights_m[peak]
-    figures = (
-        f"ρ1 {number_text(mean.peaks.rho1[j], 3)}, ratio {number_text(mean.peaks.ratio[j], 2)}, peak {height:.2f} m"
-    )
+    figures = f"ρ1 {decimal(mean.peaks.rho1[j], 3)}, ratio {decimal(mean.peaks.ratio[j], 2)}, peak {height:.2f} m"
     which = "all search images" if n_images == len(report.search) else f"{n_images} of {len(report.search)} images"
-    title = f"{report.reference} with {which}: {signed_text(label)} {LABELS[label]}, {figures}"
+    title = f"{report.reference} with {which}: {signed(label)} {LABELS[label]}, {figures}"
     if is_small:
         figure.legend(loc="outside lower center", fontsize=8, frameon=False, ncols=2)
         axes.set_xlabel("height, m", fontsize=9)  # the figure's own would be under the legend

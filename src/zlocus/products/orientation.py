@@ -1,4 +1,4 @@
-"""orientation.json: what the orientation found, per image, sensor and control point (see docs/how-to/orient.md)."""
+"""orientation.json: results of the orientation per image, sensor and control point (see docs/how-to/orient.md)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray
 from zlocus.orientation.bundle_adjustment import BundleAdjustment
-from zlocus.orientation.orientation import Orientation, Residuals
+from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.parameter_groups import ParameterGroup
+from zlocus.orientation.tie_residuals import Residuals
 
 DIGITS = 6
 
 
 def orientation_record(orientation: Orientation, scene: Scene) -> dict[str, Any]:
-    """The report as JSON can hold it."""
+    """The results as JSON holds them."""
     record = {"crs": scene.crs.to_string(), **orientation.as_dict()}
     if orientation.bundle_adjustment is None:
         return record
@@ -39,7 +40,7 @@ def orientation_record(orientation: Orientation, scene: Scene) -> dict[str, Any]
 
 
 def sensors_record(orientation: Orientation, bundle_adjustment: BundleAdjustment) -> dict[str, Any]:
-    """Residuals of all images of a kind of sensor."""
+    """Residuals of the images of each kind of sensor."""
     adjustment, record = bundle_adjustment.adjustment, {}
     kinds = np.array([view.sensor for view in orientation.views])
     for kind in np.unique(kinds):
@@ -84,7 +85,7 @@ def described(group: ParameterGroup, values: FloatArray) -> dict[str, float | No
 
 
 def control_record(bundle_adjustment: BundleAdjustment) -> dict[str, Any]:
-    """Errors of control and check points: where the adjustment put them less where they are known to be."""
+    """Errors of control and check points: adjusted position less known position."""
     control, error = bundle_adjustment.control, bundle_adjustment.control_points - bundle_adjustment.control.xyz
     points = {}
     for i, name in enumerate(control.names):
@@ -108,7 +109,7 @@ def control_record(bundle_adjustment: BundleAdjustment) -> dict[str, Any]:
 
 
 def terrain_record(off_m: FloatArray) -> dict[str, Any]:
-    """Heights of the ties less those of the terrain."""
+    """Statistics of the ties' heights less those of the terrain."""
     known = off_m[np.isfinite(off_m)]
     if not len(known):
         return {"n": 0}
@@ -118,5 +119,5 @@ def terrain_record(off_m: FloatArray) -> dict[str, Any]:
 
 
 def rounded(value: float) -> float | None:
-    """A number for JSON."""
+    """A number for JSON; None in place of NaN and infinity."""
     return round(float(value), DIGITS) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""The products of image space: a height map per image, and all points as LAZ and PLY."""
+"""Products of image space: a height map per image, and all points as LAZ and PLY."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from zlocus.core.scene import is_local
 from zlocus.io.rasters import write_cog
 
 LAZ_STEP_M = 0.001
-# Dimensions beside those of the format. Descriptions have 32 signs at most.
+# Extra dimensions of the points. Their descriptions have at most 32 characters.
 SIGMA, VIEWS = "sigma_m", "n_images"
-LAZ_REACH_M = 2**31 * LAZ_STEP_M
+MAX_LAZ_EXTENT_M = 2**31 * LAZ_STEP_M
 OFFSET_STEP_M = 1000.0
 PLY_POINT = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
 PLY_PROPERTIES = ("double x", "double y", "double z", "uchar red", "uchar green", "uchar blue")
 
 
 class PointCloud:
-    """cloud.laz and cloud.ply, written point by point; complete when the context ends, else not there.
+    """Writer of cloud.laz and cloud.ply. Both files appear when the context ends without an error.
 
-    n_points : how many will be written, which PLY wants to know first; crs : None where the frame is local.
+    n_points : number of points that will be written, which the header of PLY states; crs : of the scene.
     """
 
     def __init__(self, folder: Path, n_points: int, crs: CRS) -> None:
@@ -58,8 +58,11 @@ class PointCloud:
         sigma_m: NDArray[np.floating],
         n_images: NDArray[np.uint8],
     ) -> None:
-        """Add points. source : number of the image they come from; xyz : (n, 3) m; rgb : (n, 3), white is 65535;
-        sigma_m : (n,) m, standard deviation; n_images : (n,), images used."""
+        """Add points.
+
+        source : number of their image; xyz : (n, 3) m; rgb : (n, 3), white is 65535; sigma_m : (n,) m, standard
+        deviation; n_images : (n,), number of images used.
+        """
         try:
             laz, ply = self._files(xyz)
             points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=laz.header)
@@ -74,14 +77,14 @@ class PointCloud:
             ply.write(records.tobytes())
         except OverflowError as error:
             raise OutputError(
-                f"{self._paths[0]} cannot hold points that lie further apart than {LAZ_REACH_M / 1000:.0f} km. Give "
-                "narrower --heights."
+                f"{self._paths[0]} cannot hold points that lie further apart than {MAX_LAZ_EXTENT_M / 1000:.0f} km. "
+                "Give narrower --heights."
             ) from error
         except (OSError, LaspyException) as error:
             raise self._failed(error) from error
 
     def _files(self, xyz: NDArray[np.float64]) -> tuple[laspy.LasWriter, BinaryIO]:
-        """Both files, begun with the first points, which tell where the cloud is."""
+        """Both files; they are opened with the first points, which give the offset of the coordinates."""
         if self._laz is None or self._ply is None:
             header = laspy.LasHeader(point_format=7, version="1.4")
             header.scales = np.full(3, LAZ_STEP_M)
@@ -123,7 +126,7 @@ class PointCloud:
 
 
 def add_precision(header: laspy.LasHeader, of: str) -> None:
-    """Make room for a standard deviation and a number of images with every point. of : what it is of, 32 signs."""
+    """Add dimensions for a standard deviation and a number of images. of : description of the former, 32 characters."""
     header.add_extra_dims([
         laspy.ExtraBytesParams(SIGMA, np.float32, of),
         laspy.ExtraBytesParams(VIEWS, np.uint8, "images used"),
@@ -131,13 +134,13 @@ def add_precision(header: laspy.LasHeader, of: str) -> None:
 
 
 def add_crs(header: laspy.LasHeader, crs: CRS) -> None:
-    """Put a CRS into a header as LAS 1.4 has it: WKT of OGC 01-009, which is WKT 1 (laspy itself writes WKT 2)."""
+    """Write a CRS to a header as LAS 1.4 requires: WKT of OGC 01-009, which is WKT 1 (laspy writes WKT 2)."""
     header.vlrs.append(WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")))
     header.global_encoding.wkt = True
 
 
 def ply_header(n_points: int, crs: CRS | None) -> str:
-    """What stands before the points of a binary PLY file."""
+    """Header of a binary PLY file."""
     lines = ["ply", "format binary_little_endian 1.0", f"comment zlocus {__version__}"]
     if crs is not None:
         lines.append(f"comment crs {_plain(crs)}")
@@ -146,7 +149,7 @@ def ply_header(n_points: int, crs: CRS | None) -> str:
 
 
 def _plain(crs: CRS) -> str:
-    """A CRS in one line of ASCII: its code, or those of its horizontal and vertical parts, or else WKT."""
+    """A CRS in one line of ASCII: its code, the codes of its horizontal and vertical parts, or WKT."""
     codes = [part.to_epsg() for part in crs.sub_crs_list or [crs]]
     if None not in codes:
         return "EPSG:" + "+".join(map(str, codes))
@@ -154,7 +157,7 @@ def _plain(crs: CRS) -> str:
 
 
 def write_map(path: Path, values: NDArray[np.generic], description: str, units: str = "") -> None:
-    """A raster of an image's pixels, (r, c), with no place on the ground; NaN where floating and empty."""
+    """Write values (r, c) of an image's pixels as a raster without a place on the ground; NaN in floats is no data."""
     nodata = float("nan") if values.dtype.kind == "f" else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -163,10 +166,10 @@ def write_map(path: Path, values: NDArray[np.generic], description: str, units: 
 
 
 def file_names(names: Sequence[str]) -> list[str]:
-    """What files of views are called: their names without signs that files may not have, all different."""
-    found: list[str] = []
+    """Names for files of views: without characters that files may not have, and all different."""
+    unique: list[str] = []
     for name in names:
         plain = re.sub(r"[^\w.-]+", "_", name).strip(".") or "view"
         tried = (plain if k == 1 else f"{plain}_{k}" for k in count(1))
-        found.append(next(new for new in tried if new.casefold() not in {old.casefold() for old in found}))
-    return found
+        unique.append(next(new for new in tried if new.casefold() not in {old.casefold() for old in unique}))
+    return unique

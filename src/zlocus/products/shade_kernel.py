@@ -1,4 +1,4 @@
-"""Slopes of a surface with holes, and how bright it is under a sun."""
+"""Slopes and brightness of a surface with holes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DARKEST, BRIGHTEST = 1.0, 255.0
 # f8, f8, f8 -> f8
 @kernel
 def across(centre, one, other):
-    """Height at a neighbour less that opposite to it; one that is missing is mirrored through the centre."""
+    """Height of a neighbour less that of the opposite one; a missing one is mirrored through the centre."""
     if np.isnan(one):
         one = 2.0 * centre - other
     elif np.isnan(other):
@@ -23,7 +23,7 @@ def across(centre, one, other):
 # f8, f8, f8, f8 -> f8
 @kernel
 def known(first, second, third, fourth):
-    """The first of the values that is known."""
+    """The first value that is known."""
     if not np.isnan(first):
         return first
     if not np.isnan(second):
@@ -34,12 +34,12 @@ def known(first, second, third, fourth):
 # (r,c) f8, i8, i8, (2) f8 -> None
 @kernel
 def horn_slopes(z, r, c, out):
-    """Differences of height to east and to north over eight cells, `out`, from the eight neighbours of a cell, whose
-    height is known; rows go south.
+    """Write the differences of height to east and north over eight cells to `out`, from a cell's eight neighbours.
 
-    Source: Horn (1981), the weighted differences of section III (weights 1, 2, 1 over 8 cells). Beside holes, where he
-    has no value: a missing neighbour is mirrored through the centre, and a pair that is missing altogether is told by
-    the other pairs, or even. On planes that is exact wherever two directions are known.
+    The height of the cell is known; rows go south. Source: Horn (1981), the weighted differences of section III
+    (weights 1, 2, 1 over 8 cells). He has no value beside holes. Here a missing neighbour is mirrored through the
+    centre; a pair of which both are missing is computed from the other pairs, or counts as level. On planes this is
+    exact wherever two directions are known.
     """
     here = z[r, c]
     e, n = across(here, z[r, c + 1], z[r, c - 1]), across(here, z[r - 1, c], z[r + 1, c])
@@ -55,7 +55,7 @@ def horn_slopes(z, r, c, out):
 # (r,c) f8, f8, (3) f8, (a,b) u1 -> None
 @kernel
 def shade_cells(ringed, cell_m, sun, out):
-    """Brightness, 1 + 254 cos of the angle between normal and sun, 1 where it is turned away, 0 without height.
+    """Write the brightness: 1 + 254 cos of the angle between normal and sun, 1 in shade, 0 without height.
 
     ringed : (r + 2, c + 2) m, heights with a ring of NaN; sun : east, north and up, of length 1; out : (r, c).
     """

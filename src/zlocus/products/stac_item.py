@@ -62,7 +62,7 @@ PRODUCTS = (
 )
 
 
-class Footprint(NamedTuple):
+class GridFootprint(NamedTuple):
     """Outline of a grid on the Earth. geometry : GeoJSON, in degrees; bbox : west, south, east and north, degrees."""
 
     geometry: dict[str, Any]
@@ -116,7 +116,7 @@ def write_item(folder: Path) -> bool:
     return True
 
 
-def footprint_of(file: DatasetReader) -> Footprint:
+def footprint_of(file: DatasetReader) -> GridFootprint:
     """Outline of a raster on the Earth, counter-clockwise.
 
     An outline that crosses the date line is cut in two, and its west is larger than its east. Source: RFC 7946, 3.1.6,
@@ -129,7 +129,7 @@ def footprint_of(file: DatasetReader) -> Footprint:
     low, high = (np.array([end(part[0], axis=0) for part in parts]) for end in (np.min, np.max))
     # The eastern hemisphere's part has the larger longitudes, and the box begins in it.
     bbox = (low[:, 0].max(), low[:, 1].min(), high[:, 0].min(), high[:, 1].max())
-    return Footprint(geometry, [float(degrees) for degrees in bbox])
+    return GridFootprint(geometry, [float(degrees) for degrees in bbox])
 
 
 def bands_of(path: Path) -> list[dict[str, Any]]:

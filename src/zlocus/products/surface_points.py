@@ -15,19 +15,28 @@ from zlocus.core.errors import OutputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.row_strips import STRIP_ROWS, BandReader, Strip, check_same_grid, strips_of
-from zlocus.products.point_cloud import LAZ_REACH_M, LAZ_STEP_M, OFFSET_STEP_M, SIGMA, VIEWS, add_crs, add_precision
+from zlocus.products.point_cloud import (
+    LAZ_STEP_M,
+    MAX_LAZ_EXTENT_M,
+    OFFSET_STEP_M,
+    SIGMA,
+    VIEWS,
+    add_crs,
+    add_precision,
+)
 
-# Grey values from which on points are white, in standard deviations above the mean; of 8 bits: all are shown.
+# Points are white from this many standard deviations above the mean grey value. Images of 8 bits are not stretched.
 WHITE_DEVIATIONS = 3.0
 SOURCES = ("dsm.tif", "sigma.tif", "views.tif", "ortho.tif")
 
 
 def write_surface_points(folder: Path, path: Path, strip_rows: int = STRIP_ROWS) -> int:
-    """A point at the centre of each cell that has a height, from north to south and west to east; their number.
+    """Write a point at the centre of each cell that has a height, and return their number.
 
-    LAS 1.4, format 7, in steps of 1 mm, with the colours of the ortho-image and two dimensions more: `sigma_m`,
-    float32, the height's standard deviation (NaN where it was interpolated), and `n_images`, uint8, images used. CRS in
-    the header unless the frame is local. folder : of the rasters; strip_rows : rows worked on at a time.
+    Points are ordered from north to south and from west to east. The file is LAS 1.4, format 7, in steps of 1 mm, with
+    the colours of the ortho-image and two extra dimensions: `sigma_m`, float32, the standard deviation of the height
+    (NaN where it was interpolated), and `n_images`, uint8, the number of images used. The header has the CRS unless the
+    frame is local. folder : of the rasters; strip_rows : rows that are processed at a time.
 
     Raises
     ------
@@ -39,30 +48,30 @@ def write_surface_points(folder: Path, path: Path, strip_rows: int = STRIP_ROWS)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with (
-            BandReader(folder / SOURCES[0]) as heights, BandReader(folder / SOURCES[1]) as sigmas,
-            BandReader(folder / SOURCES[2]) as views, BandReader(folder / SOURCES[3]) as ortho,
+            BandReader(folder / SOURCES[0]) as height_reader, BandReader(folder / SOURCES[1]) as sigma_reader,
+            BandReader(folder / SOURCES[2]) as views_reader, BandReader(folder / SOURCES[3]) as ortho_reader,
         ):  # fmt: skip
-            check_same_grid([heights, sigmas, views, ortho])
-            white = _white_level(ortho)
-            with laspy.open(part, "w", header=_header(heights), do_compress=True) as laz:
-                for strip in strips_of(heights.geobox.shape[0], 0, strip_rows):
-                    z = heights.read(strip)
+            check_same_grid([height_reader, sigma_reader, views_reader, ortho_reader])
+            white = _white_level(ortho_reader)
+            with laspy.open(part, "w", header=_header(height_reader), do_compress=True) as laz:
+                for strip in strips_of(height_reader.geobox.shape[0], 0, strip_rows):
+                    z = height_reader.read(strip)
                     known = np.isfinite(z)
                     if not known.any():
                         continue
                     points = laspy.ScaleAwarePointRecord.zeros(int(known.sum()), header=laz.header)
-                    points.x, points.y = _centres(heights, strip)[:, known]
+                    points.x, points.y = _centres(height_reader, strip)[:, known]
                     points.z = z[known].astype(np.float64)
-                    points.red, points.green, points.blue = _colours(ortho, strip, white)[:, known]
+                    points.red, points.green, points.blue = _colours(ortho_reader, strip, white)[:, known]
                     points.return_number[:], points.number_of_returns[:] = 1, 1
-                    points[SIGMA], points[VIEWS] = sigmas.read(strip)[known], views.read(strip)[known]
+                    points[SIGMA], points[VIEWS] = sigma_reader.read(strip)[known], views_reader.read(strip)[known]
                     laz.write_points(points)
                 n_points = int(laz.header.point_count)
         os.replace(part, path)
     except OverflowError as error:
         raise OutputError(
-            f"{path} cannot hold points that lie further apart than {LAZ_REACH_M / 1000:.0f} km. Give a smaller area, "
-            "or leave laz out of --products."
+            f"{path} cannot hold points that lie further apart than {MAX_LAZ_EXTENT_M / 1000:.0f} km. Give a smaller "
+            "area, or leave laz out of --products."
         ) from error
     except (OSError, LaspyException) as error:
         reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
@@ -72,40 +81,40 @@ def write_surface_points(folder: Path, path: Path, strip_rows: int = STRIP_ROWS)
     return n_points
 
 
-def _header(heights: BandReader) -> laspy.LasHeader:
-    """What stands before the points, the same for any run on a grid but for the day."""
+def _header(height_reader: BandReader) -> laspy.LasHeader:
+    """Header of the file; runs on the same grid differ only in its date."""
     header = laspy.LasHeader(point_format=7, version="1.4")
-    box = heights.geobox.extent.boundingbox
+    box = height_reader.geobox.extent.boundingbox
     header.scales = np.full(3, LAZ_STEP_M)
-    middle = np.array([(box.left + box.right) / 2, (box.bottom + box.top) / 2, heights.statistic("MEAN") or 0.0])
+    middle = np.array([(box.left + box.right) / 2, (box.bottom + box.top) / 2, height_reader.statistic("MEAN") or 0.0])
     header.offsets = np.floor(middle / OFFSET_STEP_M) * OFFSET_STEP_M
     header.generating_software = f"zlocus {__version__}"
     add_precision(header, "standard deviation of height, m")
-    crs = heights.crs
+    crs = height_reader.crs
     if crs is not None and not is_local(crs):
         add_crs(header, crs)
     return header
 
 
-def _centres(heights: BandReader, strip: Strip) -> FloatArray:
-    """Easting and northing of the cells of a strip, (2, r, c) m."""
-    transform, cols = heights.geobox.transform, heights.geobox.shape[1]
+def _centres(height_reader: BandReader, strip: Strip) -> FloatArray:
+    """Easting and northing of a strip's cells, (2, r, c) m."""
+    transform, cols = height_reader.geobox.transform, height_reader.geobox.shape[1]
     x = transform.c + transform.a * (np.arange(cols) + 0.5)
     y = transform.f + transform.e * (np.arange(strip.row, strip.row + strip.rows) + 0.5)
     return np.stack(np.broadcast_arrays(x, y[:, None]))
 
 
-def _white_level(ortho: BandReader) -> float:
-    """The grey value that is shown white."""
-    if ortho.dtype == "uint8":
+def _white_level(ortho_reader: BandReader) -> float:
+    """Grey value that is shown as white."""
+    if ortho_reader.dtype == "uint8":
         return 255.0
-    mean, deviation, largest = (ortho.statistic(name) or 0.0 for name in ("MEAN", "STDDEV", "MAXIMUM"))
+    mean, deviation, largest = (ortho_reader.statistic(name) or 0.0 for name in ("MEAN", "STDDEV", "MAXIMUM"))
     return max(min(largest, mean + WHITE_DEVIATIONS * deviation), 1e-6)
 
 
-def _colours(ortho: BandReader, strip: Strip, white: float) -> NDArray[np.uint16]:
-    """Red, green and blue of the cells of a strip, (3, r, c), white 65535; black where the ortho-image has none."""
-    bands, valid = ortho.read_bands(strip)
+def _colours(ortho_reader: BandReader, strip: Strip, white: float) -> NDArray[np.uint16]:
+    """Red, green and blue of a strip's cells, (3, r, c), white is 65535; black where the ortho-image is empty."""
+    bands, valid = ortho_reader.read_bands(strip)
     rgb = bands[:3] if len(bands) >= 3 else np.repeat(bands[:1], 3, axis=0)
     share = np.clip(rgb.astype(np.float64) / white, 0.0, 1.0)
     return np.where(valid, np.rint(share * 65535.0), 0.0).astype(np.uint16)

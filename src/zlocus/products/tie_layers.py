@@ -1,4 +1,4 @@
-"""ties.gpkg and ranking.gpkg: what the tie points are, and what they say of the images, as layers of points."""
+"""ties.gpkg and ranking.gpkg: tie points, and how well images match there, as layers of points."""
 
 from __future__ import annotations
 
@@ -22,53 +22,54 @@ from zlocus.matching.pair_labels import NOT_RANKED, LabelledTies
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.triangulate import project_points
 
-# Geometries of shapely's (n,) and their columns, (n,) each.
+# Shapely geometries (n,) and their columns, (n,) each.
 Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
 LABELS = ("good", "fair", "poor")
-# Columns of labels begin so.
+# Prefix of the columns with labels, and name of the column that holds all labels as text.
 LABEL, TEXT = "label_", "labels"
-# Images that have a column each; the labels of more are one text: SQLite has no more than 2000 columns.
-MOST_COLUMNS = 100
+# More images than this do not get a column each but one text, because SQLite has at most 2000 columns.
+MAX_COLUMNS = 100
 
 
-def write_ties(path: Path, orientation: Orientation, oriented: Scene, vertical: VerticalDatum = ELLIPSOIDAL) -> None:
-    """Layer `ties`: one 3-D point per tie, in the scene's frame, its height above `vertical`.
+def write_ties(path: Path, orientation: Orientation, scene: Scene, vertical_datum: VerticalDatum = ELLIPSOIDAL) -> None:
+    """Write the layer `ties`: one 3-D point per tie, in the scene's frame, with its height above `vertical_datum`.
 
     Columns: height_m; sigma_z_m, its standard deviation; n_images; images, their names with commas between;
-    residual_px, the largest distance of an observation from the projected point. Ties whose rays do not meet, and those
-    where a geoid's raster has no value, are left out.
-    oriented : the scene with the orientation applied.
+    residual_px, the largest distance of an observation from the projected point. Ties whose rays do not meet are left
+    out, and so are those where the geoid raster has no value. scene : with the orientation applied.
 
     Raises
     ------
     OutputError
-        Where the file cannot be written.
+        The file cannot be written.
     """
     seen, xyz = orientation.observations, orientation.xyz
-    away = np.hypot(*(seen.xy - project_points([view.sensor for view in oriented.views], seen, xyz)).T)
+    away = np.hypot(*(seen.xy - project_points([view.sensor for view in scene.views], seen, xyz)).T)
     residual = np.zeros(len(xyz))
     np.maximum.at(residual, seen.point, np.nan_to_num(away))
     n_images = np.bincount(seen.point, minlength=len(xyz)).astype(np.int32)
     names: list[list[str]] = [[] for _ in xyz]
     order = np.lexsort((seen.view, seen.point))
     for point, view in zip(seen.point[order].tolist(), seen.view[order].tolist(), strict=True):
-        names[point].append(oriented.views[view].name)
-    xyz = vertical.points_from_ellipsoidal(xyz, oriented.crs)
+        names[point].append(scene.views[view].name)
+    xyz = vertical_datum.points_from_ellipsoidal(xyz, scene.crs)
     kept = np.isfinite(xyz).all(axis=1)
     images = np.array([",".join(parts) for parts in names], dtype=object)
     columns: dict[str, NDArray[np.generic]] = {
         "height_m": xyz[:, 2], "sigma_z_m": orientation.sigma_z_m, "n_images": n_images, "images": images,
         "residual_px": residual,
     }  # fmt: skip
-    crs = vertical.compound_crs(oriented.crs)
+    crs = vertical_datum.compound_crs(scene.crs)
     write_points(path, "ties", xyz[kept], {name: column[kept] for name, column in columns.items()}, crs)
 
 
-def label_counts(ranked: Sequence[LabelledTies], n_views: int) -> NDArray[np.int64]:
-    """How often each label was given, (3, i, i) int64: good, fair and poor, of the search image (last axis) against the
-    reference; 0 where the two were not compared."""
+def label_counts(labelled_ties: Sequence[LabelledTies], n_views: int) -> NDArray[np.int64]:
+    """Counts (3, i, i) int64 of the labels good, fair and poor of the search image (last axis) against the reference.
+
+    0 where the two were not compared.
+    """
     counts = np.zeros((3, n_views, n_views), np.int64)
-    for part in ranked:
+    for part in labelled_ties:
         at = np.ix_(part.views, part.views)
         for k, is_label in enumerate((part.labels == GOOD, part.labels == FAIR, part.labels < FAIR)):
             counts[k][at] += is_label.sum(axis=0)
@@ -77,7 +78,7 @@ def label_counts(ranked: Sequence[LabelledTies], n_views: int) -> NDArray[np.int
 
 
 def counted_pairs(counts: NDArray[np.int64], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Per pair of images that were compared, the points and their labels, which are the same either way round.
+    """Number of points and counts of labels of each pair of images that was compared, in either order.
 
     counts : of `label_counts`; names : of the scene's images.
     """
@@ -89,26 +90,30 @@ def counted_pairs(counts: NDArray[np.int64], names: Sequence[str]) -> list[dict[
 
 
 def write_ranking(
-    path: Path, ranked: Sequence[LabelledTies], names: Sequence[str], crs: CRS, vertical: VerticalDatum = ELLIPSOIDAL
+    path: Path,
+    labelled_ties: Sequence[LabelledTies],
+    names: Sequence[str],
+    crs: CRS,
+    vertical_datum: VerticalDatum = ELLIPSOIDAL,
 ) -> None:
-    """Layer `ranking`: one 3-D point per ranked tie point and reference, from south-west to north-east.
+    """Write the layer `ranking`: one 3-D point per ranked tie point and reference, from south-west to north-east.
 
     Columns: reference; height_m; n_good, search images labelled 1 there; label_NAME of every image, NULL where it is
-    the reference or was not compared; of more than `MOST_COLUMNS` images instead labels, NAME=LABEL of those that were
-    compared, with commas between. names : of the scene's images. vertical : what the heights written are above; points
-    where its raster has no value are left out.
+    the reference or was not compared; of more than `MAX_COLUMNS` images instead labels, NAME=LABEL of those that were
+    compared, with commas between. names : of the scene's images. vertical_datum : of the heights that are written;
+    points where its raster has no value are left out.
 
     Raises
     ------
     OutputError
-        Where the file cannot be written.
+        The file cannot be written.
     """
-    is_wide = len(names) <= MOST_COLUMNS
-    parts = [part.rows(len(names)) if is_wide else part.texts(names) for part in ranked]
+    is_wide = len(names) <= MAX_COLUMNS
+    parts = [part.rows(len(names)) if is_wide else part.texts(names) for part in labelled_ties]
     labels_of_none = np.zeros((0, len(names)), np.int16) if is_wide else np.zeros(0, object)
     nothing = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int32), labels_of_none)
     xyz, reference, n_good, labels = (np.concatenate(arrays) for arrays in zip(nothing, *parts, strict=True))
-    xyz = vertical.points_from_ellipsoidal(xyz, crs)
+    xyz = vertical_datum.points_from_ellipsoidal(xyz, crs)
     order = np.lexsort((reference, xyz[:, 1], xyz[:, 0]))
     order = order[np.isfinite(xyz[order, 2])]
     xyz, reference, n_good, labels = xyz[order], reference[order], n_good[order], labels[order]
@@ -121,24 +126,24 @@ def write_ranking(
             columns[name], nulls[name] = labels[:, i].copy(), labels[:, i] == NOT_RANKED
     else:
         columns[TEXT] = labels
-    write_points(path, "ranking", xyz, columns, vertical.compound_crs(crs), nulls)
+    write_points(path, "ranking", xyz, columns, vertical_datum.compound_crs(crs), nulls)
 
 
 def labels_in(text: str) -> dict[str, int]:
-    """Labels by the names of images, of the column `TEXT`."""
+    """Labels by names of images, from a text of the column `TEXT`."""
     return {name: int(label) for name, _, label in (part.rpartition("=") for part in text.split(",") if part)}
 
 
 def column_names(names: Sequence[str]) -> list[str]:
-    """Columns of images, all different in a format that takes A and a for one."""
-    found: list[str] = []
+    """Columns of images, all different even where A and a count as equal, as they do in SQLite."""
+    columns: list[str] = []
     for name in names:
         column, k = LABEL + name, 1
-        while column.casefold() in {old.casefold() for old in found}:
+        while column.casefold() in {old.casefold() for old in columns}:
             k += 1
             column = f"{LABEL}{name}_{k}"
-        found.append(column)
-    return found
+        columns.append(column)
+    return columns
 
 
 def write_points(
@@ -149,8 +154,10 @@ def write_points(
     crs: CRS,
     nulls: dict[str, NDArray[np.bool_]] | None = None,
 ) -> None:
-    """A GeoPackage of one layer of 3-D points, whole or not at all. xyz : (n, 3) m; columns, nulls : (n,) each, NULL
-    where NaN or in `nulls`; a local frame has no CRS."""
+    """Write a GeoPackage with one layer of 3-D points, complete or not at all.
+
+    xyz : (n, 3) m; columns, nulls : (n,) each, NULL where NaN or where `nulls` is set; a local frame has no CRS.
+    """
     from shapely import points
 
     write_features(path, layer, "Point Z", [(points(xyz), columns)], crs, nulls)
@@ -164,20 +171,21 @@ def write_features(
     crs: CRS,
     nulls: dict[str, NDArray[np.bool_]] | None = None,
 ) -> None:
-    """A GeoPackage of one layer, whole or not at all. batches : one or more; nulls : of a single one; the rest as in
-    `write_points`.
+    """Write a GeoPackage with one layer, complete or not at all.
+
+    batches : one or more; nulls : only where there is one batch; the rest as in `write_points`.
 
     Raises
     ------
     OutputError
-        Where the file cannot be written.
+        The file cannot be written.
     """
-    # With pandas, where a command has not put it away (`startup.py`), a third of a second.
+    # The import takes a third of a second where it also imports pandas.
     import pyogrio.raw
     from pyogrio.errors import DataLayerError, DataSourceError
     from shapely import to_wkb
 
-    # GDAL minds another ending.
+    # GDAL requires this ending.
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.gpkg")
     try:
         with warnings.catch_warnings():

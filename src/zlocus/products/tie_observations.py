@@ -1,4 +1,4 @@
-"""observations.npz: where tie points were seen in the images, from which the cameras of a run come out again."""
+"""observations.npz: image positions of the tie points, from which a run's corrected cameras can be computed again."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.io.atomic_write import write_atomically
-from zlocus.orientation.orientation import RefinedTies
+from zlocus.orientation.tie_refinement import RefinedTies
 
 OBSERVATIONS = "observations.npz"
 
 
-def write_observations(folder: Path, ties: RefinedTies) -> None:
+def write_observations(folder: Path, refined_ties: RefinedTies) -> None:
     """Write the observations of a run into its folder.
 
     Raises
     ------
     OutputError
-        Where the file cannot be written.
+        The file cannot be written.
     """
     content = io.BytesIO()
-    np.savez_compressed(content, **ties.arrays())  # type: ignore[arg-type]
+    np.savez_compressed(content, **refined_ties.arrays())  # type: ignore[arg-type]
     write_atomically(folder / OBSERVATIONS, lambda part: part.write_bytes(content.getbuffer()))
 
 
 def read_observations(folder: Path, n_views: int) -> RefinedTies | None:
-    """What `write_observations` wrote of a scene with so many views; None where it is missing or damaged."""
+    """Observations that `write_observations` wrote, of a scene with `n_views` views; None where missing or damaged."""
     try:
         with np.load(folder / OBSERVATIONS, allow_pickle=False) as file:
             return RefinedTies.of(dict(file), n_views)

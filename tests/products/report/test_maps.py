@@ -174,7 +174,7 @@ def scene_with(xy: np.ndarray):
     from types import SimpleNamespace
 
     ties = np.column_stack([xy[:, 0], -xy[:, 1], np.full(len(xy), 10.0)])
-    return SimpleNamespace(ties=ties, anchor=(0.0, 0.0), cell_m=1.0, overlap_window=CellWindow(0, 0, 800, 1000))
+    return SimpleNamespace(ties=ties, anchor=(0.0, 0.0), cell_size=1.0, overlap_window=CellWindow(0, 0, 800, 1000))
 
 
 def test_places_of_a_sample_are_spread_and_inside():

@@ -38,7 +38,7 @@ from zlocus.products.report import text as words
 from zlocus.products.report.comparison import shrunk_means
 from zlocus.products.report.example_cells import DOUBTFUL, FAILED, TYPICAL, chosen_cells
 from zlocus.products.report.page import write_report
-from zlocus.products.report.sampling import survey
+from zlocus.products.report.sampling import survey_rasters
 from zlocus.products.tie_layers import write_ranking
 
 SECTIONS = [
@@ -162,9 +162,9 @@ def test_its_figures_are_those_of_the_record(made):
 
 
 def test_counts_are_those_of_the_rasters(made):
-    found, (quality, _), (height, _) = survey(made), read(made / "quality.tif"), read(made / "dsm.tif")
+    found, (quality, _), (height, _) = survey_rasters(made), read(made / "quality.tif"), read(made / "dsm.tif")
     record = json.loads((made / "run.json").read_text())
-    assert found.n_heights / found.n_seen == pytest.approx(record["coverage"], abs=1e-6)
+    assert found.n_heights / found.n_covered == pytest.approx(record["coverage"], abs=1e-6)
     assert found.n_heights == np.isfinite(height).sum()
     for row in words.reasons(found):
         assert row.n == ((quality & Quality[row.name]) != 0).sum() > 0
@@ -439,7 +439,7 @@ def test_rasters_of_different_grids_are_refused(out):
     with rasterio.open(out / "sigma.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as file:
         file.transform = Affine(1.0, 0.0, 7.0, 0.0, -1.0, 0.0)
     with pytest.raises(InputError, match=r"sigma\.tif is not on the grid of dsm\.tif"):
-        survey(out)
+        survey_rasters(out)
 
 
 def test_a_page_that_cannot_be_written_is_a_sentence(out, monkeypatch):
@@ -489,7 +489,7 @@ def test_doubtful_cells_are_of_the_most_common_warnings():
 
 
 def test_cells_at_regular_distances_over_all_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(survey_module, "MOST_SIDE", 100)
+    monkeypatch.setattr(survey_module, "MAX_SAMPLED_SIDE", 100)
     rng = np.random.default_rng(3)
     rows, cols = 1037, 613
     profile = {"driver": "GTiff", "width": cols, "height": rows, "count": 1, "crs": "EPSG:32632",
@@ -503,14 +503,14 @@ def test_cells_at_regular_distances_over_all_blocks(tmp_path, monkeypatch):
     for name, array in values.items():
         with rasterio.open(tmp_path / f"{name}.tif", "w", dtype=array.dtype.name, **profile) as file:
             file.write(array, 1)
-    found = survey(tmp_path)
+    found = survey_rasters(tmp_path)
     assert found.stride == 11
     for name, kept in (("dsm", found.height), ("sigma", found.sigma), ("quality", found.quality),
                        ("views", found.views)):  # fmt: skip
         np.testing.assert_array_equal(kept, values[name][found.first :: 11, found.first :: 11])
     counts = Counter(values["quality"].ravel().tolist())
-    assert found.n_asked == rows * cols - counts[1] - counts[17]
-    assert found.n_seen == found.n_asked - counts[2]
+    assert found.n_requested == rows * cols - counts[1] - counts[17]
+    assert found.n_covered == found.n_requested - counts[2]
     assert found.count(Quality.OUTSIDE) == counts[1] + counts[17]
     assert found.count(Quality.NO_MATCH) == counts[16] + counts[272]
     assert found.count(Quality.WEAK) == counts[272]
@@ -522,7 +522,7 @@ def test_labels_of_pairs(tmp_path, monkeypatch, most_columns):
     """Whether images have a column each, or are too many for that."""
     from pyproj import CRS
 
-    monkeypatch.setattr("zlocus.products.tie_layers.MOST_COLUMNS", most_columns)
+    monkeypatch.setattr("zlocus.products.tie_layers.MAX_COLUMNS", most_columns)
     names = ["nadir", "fore", "aft"]
     labels = np.zeros((4, 3, 3), np.int8)
     labels[:, 0, 1] = [1, 1, 1, -1]
@@ -549,12 +549,12 @@ def test_reasons_are_said_as_the_documents_say_them():
 
 def test_every_reason_has_a_colour_of_its_group():
     group = maps.groups_of(np.array([0, *(int(flag) for flag in Quality)]))
-    assert group[0] == len(maps.GROUPS)
+    assert group[0] == len(maps.FLAG_GROUPS)
     for flag, k in zip(Quality, group[1:], strict=True):
-        assert flag.name in maps.GROUPS[k][0] or flag in (Quality.OUTSIDE, Quality.UNSEEN)
+        assert flag.name in maps.FLAG_GROUPS[k][0] or flag in (Quality.OUTSIDE, Quality.UNSEEN)
     both = maps.groups_of(np.array([int(Quality.NO_MATCH | Quality.FILLED), int(Quality.FILLED)]))
     assert both[0] == both[1]  # filled, whatever was the matter
-    colours = [colour for _, _, colour in maps.GROUPS] + [maps.PLAIN[1]]
+    colours = [colour for _, _, colour in maps.FLAG_GROUPS] + [maps.NO_FLAG[1]]
     assert len(set(colours)) == len(colours)
 
 

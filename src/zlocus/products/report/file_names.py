@@ -1,4 +1,4 @@
-"""Names of the report, and of the files of a run that it is made of."""
+"""Names of the report and of the files of a run from which it is made."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ REPORT, RECORD, CURVES, FOOTPRINTS, RANKING = (
 )  # fmt: skip
 
 
-def forget_report(out: Path) -> None:
-    """Remove the report of an earlier run, which is not this one's."""
+def remove_report(out: Path) -> None:
+    """Remove the report of an earlier run and the files that were made for it."""
     for name in (REPORT, CURVES, FOOTPRINTS):
         (out / name).unlink(missing_ok=True)

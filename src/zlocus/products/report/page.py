@@ -1,4 +1,4 @@
-"""report.html: what a run made, where, how precise and why not everywhere, as one page that needs no other file."""
+"""report.html: the report of a run as one page that needs no other file."""
 
 from __future__ import annotations
 
@@ -23,28 +23,31 @@ from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
 from zlocus.products.report.comparison import comparison_part
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
-from zlocus.products.report.sampling import Survey, survey
+from zlocus.products.report.sampling import Survey, survey_rasters
 
 NEEDED = ("config", "versions", "inputs", "stages", "orientation", "grid", "heights", "coverage")
 QUANTILES = (10, 25, 50, 75, 90)
 LABEL_WORDS = {1: "good", 0: "fair", -1: "poor"}
 KIND_WORDS = {"typical": "Typical", "doubtful": "Doubtful", "failed": "No height"}
-MOST_NUMBERED = 40
-DRAWN = 1000.0
-# Width and height of a number in the drawing, and places on each side of an outline at which it may stand.
-NUMBER_BOX, PER_SIDE = np.array([56.0, 44.0]), 8
-# Of outlines and their numbers, told apart on white by all eyes.
-COLOURS = ("#0072b2", "#b03a00", "#00704f", "#8f3f71", "#8a6100", "#5b4bb5", "#8b3a2b", "#444444")
-# Of a small figure of match curves.
+MAX_NUMBERED_OUTLINES = 40
+DRAWING_SIDE = 1000.0
+# Width and height of a number in the drawing, and places on each side of an outline where it may stand.
+NUMBER_BOX, PLACES_PER_SIDE = np.array([56.0, 44.0]), 8
+# Colours of outlines and their numbers, which colour-blind readers can distinguish on white.
+OUTLINE_COLOURS = ("#0072b2", "#b03a00", "#00704f", "#8f3f71", "#8a6100", "#5b4bb5", "#8b3a2b", "#444444")
+# Width and height of a small figure of match curves.
 SVG_PX = (355, 336)
-# Folded tables are printed too. Nothing else needs it.
+# The only script of the page opens folded tables before printing.
 SCRIPT = 'addEventListener("beforeprint",()=>document.querySelectorAll("details").forEach(d=>{d.open=true}));'
 
 
 @dataclass(frozen=True)
 class Outline:
-    """An image on the ground. number : in the table of images; points : of SVG; colour : CSS; at : where its number
-    stands, None where there is no room."""
+    """Outline of an image on the ground.
+
+    number : of the image in the table of images; points : SVG coordinates; colour : CSS; at : place of its number, None
+    where there is no room.
+    """
 
     number: int
     name: str
@@ -54,7 +57,7 @@ class Outline:
 
 
 def write_report(out: Path, comparison: Comparison | None = None) -> Path:
-    """Write report.html of the run in a folder, from the files there, whole or not at all; returns its path.
+    """Write report.html of the run in a folder, complete or not at all, and return its path.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def write_report(out: Path, comparison: Comparison | None = None) -> Path:
     ConfigError
         See `evaluate`.
     OutputError
-        Where it cannot be written.
+        The report cannot be written.
     """
     text = rendered(context(out, comparison))
     write_atomically(out / REPORT, lambda part: part.write_text(text, encoding="utf-8"))
@@ -71,7 +74,7 @@ def write_report(out: Path, comparison: Comparison | None = None) -> Path:
 
 
 def rendered(values: Mapping[str, Any]) -> str:
-    """The page of what `context` gives."""
+    """The page, rendered from the values of `context`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -83,32 +86,32 @@ def rendered(values: Mapping[str, Any]) -> str:
 
 
 def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
-    """All that the page shows."""
+    """Values of the page's template."""
     run = run_record(out)
-    found, crs = survey(out), CRS.from_user_input(run["grid"]["crs"])
+    survey, crs = survey_rasters(out), CRS.from_user_input(run["grid"]["crs"])
     if is_local(crs):
-        found = replace(found, above="z of the local frame")
-    sigma = found.sigma[np.isfinite(found.sigma)]
+        survey = replace(survey, height_name="z of the local frame")
+    sigma = survey.sigma[np.isfinite(survey.sigma)]
     quantiles = {q: float(np.percentile(sigma, q)) for q in QUANTILES} if sigma.size else {}
-    where, frame = words.place(found, crs)
+    where, frame = words.place(survey, crs)
     light = run["config"]["options"]["products"]
     sun_deg = (light["sun_azimuth_deg"], light["sun_altitude_deg"])
     views = run["orientation"]["views"]
     reference = None if comparison is None else comparison_part(out, comparison)
-    paragraph = words.summary(found, run, crs, quantiles)
+    paragraph = words.summary(survey, run, crs, quantiles)
     if reference is not None:
         paragraph += " " + reference["sentence"]
     return {
         "title": out.resolve().name, "version": run["versions"]["zlocus"], "summary": paragraph, "where": where,
-        "frame": frame, "is_local": is_local(crs), "run": run, "found": found,
-        "footprints": footprints_part(out / FOOTPRINTS, found, crs, list(views)),
-        "heights": maps.height_map(out, found, sun_deg), "sun": words.sun(*sun_deg),
-        "corners": words.corners(found, is_local(crs)), "bar": maps.scale_bar(found.shape[1] * found.cell_m),
+        "frame": frame, "is_local": is_local(crs), "run": run, "survey": survey,
+        "footprints": footprints_part(out / FOOTPRINTS, survey, crs, list(views)),
+        "heights": maps.height_map(out, survey, sun_deg), "sun": words.sun(*sun_deg),
+        "corners": words.corners(survey, is_local(crs)), "bar": maps.scale_bar(survey.shape[1] * survey.cell_m),
         "ortho": maps.ortho_map(out), "created": words.when(run.get("created")),
         "sigma": maps.sigma_map(out),
         "quantiles": [(f"{q} %", words.size(value, "m")) for q, value in quantiles.items()],
-        "used": maps.views_map(found), "reasons": words.reasons(found), "reasons_map": maps.reasons_map(found),
-        "absent": words.listed([str(flag.name) for flag in Quality if not found.count(flag)]),
+        "used": maps.views_map(survey), "reasons": words.reasons(survey), "reasons_map": maps.reasons_map(survey),
+        "absent": words.listed([str(flag.name) for flag in Quality if not survey.count(flag)]),
         "images": tables.image_rows(views), **pairs_part(out, run), "curves": curves_part(out / CURVES, run),
         "reference": reference, "stages": tables.stage_rows(run["stages"]),
         "request": tables.request_rows(run["config"]["request"]),
@@ -122,7 +125,7 @@ def run_record(out: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        It is missing, damaged, or of something else.
+        It is missing, damaged, or not of a surface.
     """
     path = out / RECORD
     if not path.is_file():
@@ -131,21 +134,21 @@ def run_record(out: Path) -> dict[str, Any]:
     missing = [key for key in NEEDED if key not in run]
     if missing:
         raise InputError(
-            f"{path} lacks {', '.join(missing)}: it is of no surface, or damaged. Give the folder of a `zlocus dsm`."
+            f"{path} lacks {', '.join(missing)}: it is not of a surface, or damaged. Give the folder of a `zlocus dsm`."
         )
     return run
 
 
-def footprints_part(path: Path, found: Survey, crs: CRS, names: Sequence[str]) -> dict[str, Any] | None:
-    """Outlines of images and surface for a drawing of `DRAWN` a side, y down; None without footprints."""
+def footprints_part(path: Path, survey: Survey, crs: CRS, names: Sequence[str]) -> dict[str, Any] | None:
+    """Outlines of images and surface in a drawing of `DRAWING_SIDE` a side, y down; None without footprints."""
     rings = footprint_rings(path, crs)
     if not rings or not set(rings) <= set(names):
         return None
-    rows, cols = found.shape
-    area = np.array([found.transform * corner for corner in ((0, 0), (cols, 0), (cols, rows), (0, rows))])
+    rows, cols = survey.shape
+    area = np.array([survey.transform * corner for corner in ((0, 0), (cols, 0), (cols, rows), (0, rows))])
     everything = np.concatenate([area, *rings.values()])
     low, high = everything.min(axis=0), everything.max(axis=0)
-    scale = DRAWN / max(*(high - low), 1e-9)
+    scale = DRAWING_SIDE / max(*(high - low), 1e-9)
     width, height = (high - low) * scale
 
     def drawn(xy: FloatArray) -> FloatArray:
@@ -155,10 +158,10 @@ def footprints_part(path: Path, found: Survey, crs: CRS, names: Sequence[str]) -
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in drawn(xy))
 
     shown = [(i, name) for i, name in enumerate(names) if name in rings]
-    is_numbered = len(shown) <= MOST_NUMBERED
+    is_numbered = len(shown) <= MAX_NUMBERED_OUTLINES
     places = number_places([drawn(rings[name]) for _, name in shown]) if is_numbered else [None] * len(shown)
     shapes = [
-        Outline(i + 1, name, points(rings[name]), COLOURS[i % len(COLOURS)], at)
+        Outline(i + 1, name, points(rings[name]), OUTLINE_COLOURS[i % len(OUTLINE_COLOURS)], at)
         for (i, name), at in zip(shown, places, strict=True)
     ]
     return {
@@ -168,31 +171,31 @@ def footprints_part(path: Path, found: Survey, crs: CRS, names: Sequence[str]) -
 
 
 def number_places(rings: Sequence[FloatArray]) -> list[tuple[float, float] | None]:
-    """Where the number of each outline stands, on the outline and on no other number; None where there is no room.
+    """Place of each outline's number, on the outline and clear of other numbers; None where there is no room.
 
-    rings : outlines (n, 2) in units of the drawing. Each takes the place of its outline that is farthest from the
+    rings : outlines (n, 2) in units of the drawing. Each number takes the place on its outline that is farthest from the
     numbers before it.
     """
     placed: list[FloatArray] = []
-    found: list[tuple[float, float] | None] = []
+    places: list[tuple[float, float] | None] = []
     for ring in rings:
-        steps = np.arange(PER_SIDE) / PER_SIDE
+        steps = np.arange(PLACES_PER_SIDE) / PLACES_PER_SIDE
         closed = np.concatenate([ring, ring[:1]])
         at = (closed[:-1, None] + steps[:, None] * np.diff(closed, axis=0)[:, None]).reshape(-1, 2)
-        # Of a box that holds two digits: below 1 two of them overlap.
+        # Distances are in boxes that hold two digits; boxes closer than 1 overlap.
         apart = [np.abs((at - other) / NUMBER_BOX).max(axis=1) for other in placed]
         room = np.min(apart, axis=0) if apart else np.full(len(at), np.inf)
         best = int(room.argmax())
         if room[best] < 1:
-            found.append(None)
+            places.append(None)
             continue
         placed.append(at[best])
-        found.append((round(float(at[best, 0]), 1), round(float(at[best, 1]), 1)))
-    return found
+        places.append((round(float(at[best, 0]), 1), round(float(at[best, 1]), 1)))
+    return places
 
 
 def footprint_rings(path: Path, crs: CRS) -> dict[str, FloatArray]:
-    """Outline of each image in the surface's CRS, (n, 2) m, by name; those without one are left out."""
+    """Outlines (n, 2) m of the images by name, in the surface's CRS; images without an outline are left out."""
     rings = {}
     back = None if is_local(crs) else Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     for feature in features(path, "image"):
@@ -203,16 +206,16 @@ def footprint_rings(path: Path, crs: CRS) -> dict[str, FloatArray]:
 
 
 def features(path: Path, kind: str) -> list[dict[str, Any]]:
-    """Those of a kind in footprints.geojson; none without the file."""
+    """Features of one kind in footprints.geojson; none without the file."""
     if not path.exists():
         return []
     return [each for each in read_record(path)["features"] if each["properties"]["kind"] == kind]
 
 
 def pairs_part(out: Path, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Matrices of labels and of pairs, and why there is none."""
+    """Matrices of labels and of pairs, or the reasons why there are none."""
     names = list(run["orientation"]["views"])
-    if len(names) > tables.MOST_MATRIX:
+    if len(names) > tables.MAX_MATRIX_IMAGES:
         why = f"There are {len(names)} images, too many for a matrix."
         return {"labels": None, "n_sampled": 0, "no_labels": f"{why} See {RANKING}.", "pairs": None, "no_pairs": why}
     labels, n_sampled, why = label_part(out, names)
@@ -225,8 +228,7 @@ def pairs_part(out: Path, run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def label_part(out: Path, names: Sequence[str]) -> tuple[tables.Matrix | None, int, str]:
-    """The matrix of labels, at how many points it is a sample (0 where images were ranked everywhere), and why there is
-    none."""
+    """Matrix of labels, number of sampled points (0 where images were ranked everywhere), and why there is no matrix."""
     labels = tables.label_matrix(out / RANKING, names)
     sample = read_record(out / CURVES).get("labels", {}) if (out / CURVES).exists() else {}
     if labels is not None or not sample:
@@ -238,7 +240,7 @@ def label_part(out: Path, names: Sequence[str]) -> tuple[tables.Matrix | None, i
 
 
 def curves_part(path: Path, run: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Cells with their curves; None without any."""
+    """Example cells with their match curves; None without curves.json."""
     if not path.exists():
         return None
     record = read_record(path)
@@ -249,7 +251,7 @@ def curves_part(path: Path, run: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said of a cell and its curves."""
+    """Values of the template for a cell and its match curves."""
     names = [str(flag.name) for flag in Quality if cell["quality"] & flag]
     lines = [
         f"Row {cell['row']}, column {cell['col']} of the grid, at {cell['x']:.1f}, {cell['y']:.1f} m. "
@@ -267,7 +269,7 @@ def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any
     says = (
         f"The mean of {n} of {len(point['means'])} search images with {point['reference']} is "
         f"{LABEL_WORDS[mean['label']]}: largest correlation {words.number(mean['rho1'])}, "
-        f"{words.number(mean['ratio'])} times its rival, at {words.number(mean['peak_m'], 'm')}."
+        f"{words.number(mean['ratio'])} times its secondary peak, at {words.number(mean['peak_m'], 'm')}."
     )
     uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
     alt = f"Correlation against height at this cell. {says}"

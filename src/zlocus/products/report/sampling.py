@@ -1,4 +1,4 @@
-"""What the rasters of a run hold: counts over all cells, and cells at regular distances."""
+"""Survey of a run's rasters: counts over all cells, and a sample of cells at regular distances."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from zlocus.io.open_raster import open_raster
 from zlocus.matching.quality import Quality
 
 RASTERS = ("dsm", "sigma", "quality", "views")
-MOST_SIDE = 1500
+MAX_SAMPLED_SIDE = 1500
 N_CODES = 1 << 16
-NOT_SEEN = Quality.OUTSIDE | Quality.UNSEEN
+NOT_COVERED = Quality.OUTSIDE | Quality.UNSEEN
 
 
 @dataclass(frozen=True)
 class Survey:
-    """Counts of cells, and every `stride`-th row and column of the rasters.
+    """Counts over all cells, and every `stride`-th row and column of the rasters.
 
-    shape : rows and columns of the grid; transform : cell corners to ground; above : what band 1 of dsm.tif says its
-    heights are; codes : (65536,) int64, how many cells have a value of quality.tif; n_heights : cells with a height;
-    n_used : (256,) int64, how many cells rest on so many images; lowest_m, highest_m : of all heights, NaN without any.
-    height, sigma : (r, c) float32 m, NaN where there is none; quality : (r, c) uint16; views : (r, c) uint8; cell
-    [i, j] of these is [first + i * stride, first + j * stride] of the grid.
+    shape : rows and columns of the grid; transform : cell corners to ground; height_name : description of the heights in
+    dsm.tif; codes : (65536,) int64, number of cells with each value of quality.tif; n_heights : number of cells with a
+    height; n_used : (256,) int64, number of cells that were matched with each number of images; lowest_m, highest_m :
+    of all heights, NaN without any. height, sigma : (r, c) float32 m, NaN where there is none; quality : (r, c) uint16;
+    views : (r, c) uint8, number of images. Cell [i, j] of these is [first + i * stride, first + j * stride] of the grid.
     """
 
     shape: tuple[int, int]
     transform: Affine
-    above: str
+    height_name: str
     codes: NDArray[np.int64]
     n_heights: int
     n_used: NDArray[np.int64]
@@ -54,41 +54,41 @@ class Survey:
 
     @property
     def first(self) -> int:
-        """First row and column of those kept."""
+        """First row and column of the grid that are sampled."""
         return self.stride // 2
 
     @property
-    def n_asked(self) -> int:
-        """Cells inside the area asked for."""
+    def n_requested(self) -> int:
+        """Number of cells inside the requested area."""
         return self.count_without(Quality.OUTSIDE)
 
     @property
-    def n_seen(self) -> int:
-        """Cells inside the area that two images or more cover."""
-        return self.count_without(NOT_SEEN)
+    def n_covered(self) -> int:
+        """Number of cells inside the area that two images or more cover."""
+        return self.count_without(NOT_COVERED)
 
     @property
     def n_matched(self) -> int:
-        """Cells with a height that was not filled in."""
+        """Number of cells whose height was matched, not filled."""
         return self.n_heights - self.count(Quality.FILLED)
 
     def count(self, flag: Quality) -> int:
-        """Cells with a reason, inside the area asked for, or of those outside where that is the reason."""
+        """Number of cells of the requested area that have a flag; for OUTSIDE, of the whole grid."""
         which = np.arange(N_CODES)
         has = (which & int(flag)) != 0
         return int(self.codes[has if flag is Quality.OUTSIDE else has & ((which & int(Quality.OUTSIDE)) == 0)].sum())
 
-    def count_without(self, flags: Quality) -> int:
-        """Cells that have none of some reasons."""
-        return int(self.codes[(np.arange(N_CODES) & int(flags)) == 0].sum())
+    def count_without(self, quality: Quality) -> int:
+        """Number of cells that have none of some flags. quality : the flags, combined."""
+        return int(self.codes[(np.arange(N_CODES) & int(quality)) == 0].sum())
 
     def grid_cell(self, i: int, j: int) -> tuple[int, int]:
-        """Row and column of the grid of a cell that was kept."""
+        """Row and column in the grid of a sampled cell."""
         return self.first + i * self.stride, self.first + j * self.stride
 
 
-def survey(folder: Path) -> Survey:
-    """Look at every cell of the rasters in a folder once, block by block.
+def survey_rasters(folder: Path) -> Survey:
+    """Read every cell of the rasters in a folder once, block by block.
 
     Raises
     ------
@@ -101,15 +101,15 @@ def survey(folder: Path) -> Survey:
         for name, file in files.items():
             if (file.shape, file.transform) != (dsm.shape, dsm.transform):
                 raise InputError(f"{folder / name}.tif is not on the grid of dsm.tif. Make the surface again.")
-        return _looked_at(files)
+        return _survey_of(files)
 
 
-def _looked_at(files: dict[str, rasterio.DatasetReader]) -> Survey:
+def _survey_of(files: dict[str, rasterio.DatasetReader]) -> Survey:
     dsm = files["dsm"]
     rows, cols = dsm.shape
-    stride = -(-max(rows, cols) // MOST_SIDE)
-    kept_rows, kept_cols = (len(range(stride // 2, n, stride)) for n in (rows, cols))
-    kept = {name: np.zeros((kept_rows, kept_cols), file.dtypes[0]) for name, file in files.items()}
+    stride = -(-max(rows, cols) // MAX_SAMPLED_SIDE)
+    n_rows, n_cols = (len(range(stride // 2, n, stride)) for n in (rows, cols))
+    sampled = {name: np.zeros((n_rows, n_cols), file.dtypes[0]) for name, file in files.items()}
     codes, n_used = np.zeros(N_CODES, np.int64), np.zeros(256, np.int64)
     n_heights, lowest, highest = 0, np.inf, -np.inf
     for _, window in dsm.block_windows(1):
@@ -120,23 +120,23 @@ def _looked_at(files: dict[str, rasterio.DatasetReader]) -> Survey:
         if known.size:
             n_heights += known.size
             lowest, highest = min(lowest, float(known.min())), max(highest, float(known.max()))
-        _keep(kept, cells, window, stride)
+        _sample(sampled, cells, window, stride)
     is_any = n_heights > 0
     return Survey(
-        shape=(rows, cols), transform=dsm.transform, above=dsm.descriptions[0] or "height", codes=codes,
+        shape=(rows, cols), transform=dsm.transform, height_name=dsm.descriptions[0] or "height", codes=codes,
         n_heights=n_heights, n_used=n_used, lowest_m=lowest if is_any else np.nan,
-        highest_m=highest if is_any else np.nan, stride=stride, height=kept["dsm"], sigma=kept["sigma"],
-        quality=kept["quality"], views=kept["views"],
+        highest_m=highest if is_any else np.nan, stride=stride, height=sampled["dsm"], sigma=sampled["sigma"],
+        quality=sampled["quality"], views=sampled["views"],
     )  # fmt: skip
 
 
-def _keep(
-    kept: dict[str, NDArray[np.generic]], cells: dict[str, NDArray[np.generic]], window: Window, stride: int
+def _sample(
+    sampled: dict[str, NDArray[np.generic]], cells: dict[str, NDArray[np.generic]], window: Window, stride: int
 ) -> None:
-    """Put those cells of a block that are kept into their place."""
-    # The first row and column at or behind the block's that is kept.
+    """Copy the sampled cells of a block to their place."""
+    # The first sampled row and column at or after the start of the block.
     i, j = (-(-(start - stride // 2) // stride) for start in (window.row_off, window.col_off))
     down, across = stride // 2 + i * stride - window.row_off, stride // 2 + j * stride - window.col_off
     for name, block in cells.items():
         part = block[down::stride, across::stride]
-        kept[name][i : i + part.shape[0], j : j + part.shape[1]] = part
+        sampled[name][i : i + part.shape[0], j : j + part.shape[1]] = part

@@ -16,19 +16,21 @@ from zlocus.matching.match_curve import FAIR, GOOD, POOR
 from zlocus.products.report.text import NONE, STAGES, number, percent, seconds, whole_percent
 from zlocus.products.tie_layers import LABEL, LABELS, TEXT, column_names, labels_in
 
-# Poor to good, blue and orange being told apart by all eyes.
+# Colours of poor and good matches; blue and orange can be distinguished by colour-blind readers.
 POOR_COLOUR, GOOD_COLOUR = np.array([230, 159, 0]), np.array([86, 180, 233])
-MOST_MATRIX = 60
-# Of a column of a matrix: a letter, what is around them, and the letters of its figures.
-LETTER_PX, PADDING_PX, LEAST_LETTERS = 9, 16, 5
-# Widths of pages at which the style of the page tells tables apart; the last stands for any.
+MAX_MATRIX_IMAGES = 60
+# Width of a letter in a matrix, padding of a column, and minimum number of letters in a column.
+LETTER_PX, PADDING_PX, MIN_LETTERS = 9, 16, 5
+# Narrowest page, and page widths below which the style shows a hint to scroll; the last stands for any width.
 NARROWEST_PX, PAGES_PX = 360, (400, 600, 700, 1100, 9999)
 
 
 @dataclass(frozen=True)
 class ImageRow:
-    """Residuals of an image's ties before and after; before, after : median, rms, 90th percentile; bars : widths of
-    both medians, percent."""
+    """Residuals of an image's ties before and after the orientation.
+
+    before, after : median, rms and 90th percentile; bars : widths of both medians, percent.
+    """
 
     number: int
     name: str
@@ -41,8 +43,8 @@ class ImageRow:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A cell of a matrix. colour : CSS, "" for none; title : what it says, in words."""
+class MatrixCell:
+    """A cell of a matrix. colour : CSS, "" for none; title : its meaning in words."""
 
     text: str
     colour: str = ""
@@ -51,23 +53,22 @@ class Cell:
 
 @dataclass(frozen=True)
 class Matrix:
-    """A row and a column for every name."""
+    """A matrix with a row and a column for every name."""
 
     names: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    cell_rows: tuple[tuple[MatrixCell, ...], ...]
 
     @property
     def wider_than(self) -> int:
-        """Width of the page, px, up to which the matrix is wider than it, about, of `PAGES_PX`; 0 where it always
-        fits."""
-        lengths = [max(len(name), LEAST_LETTERS) for name in self.names]
+        """Page width of `PAGES_PX` up to which the matrix is wider than the page, about; 0 where it always fits."""
+        lengths = [max(len(name), MIN_LETTERS) for name in self.names]
         width = LETTER_PX * (sum(lengths) + max(lengths)) + PADDING_PX * (len(lengths) + 2)
         return 0 if width <= NARROWEST_PX else min(page for page in PAGES_PX if page >= width or page == PAGES_PX[-1])
 
 
 @dataclass(frozen=True)
 class StageRow:
-    """What a stage took; bar : share of the wall time, percent."""
+    """Time and memory of a stage. bar : share of the wall time, percent."""
 
     name: str
     does: str
@@ -79,7 +80,7 @@ class StageRow:
 
 @dataclass(frozen=True)
 class OptionRow:
-    """An option, its value, and its default where it is another."""
+    """An option, its value, its default where that differs, and its meaning."""
 
     name: str
     value: str
@@ -88,7 +89,7 @@ class OptionRow:
 
 
 def image_rows(views: Mapping[str, Mapping[str, Any]]) -> list[ImageRow]:
-    """Residuals of all images, from run.json."""
+    """Residuals of all images, from `orientation.views` of run.json."""
     widest = max(
         (view[key]["median"] or 0.0 for view in views.values() for key in ("residual_before_px", "residual_after_px")),
         default=0.0,
@@ -97,7 +98,7 @@ def image_rows(views: Mapping[str, Mapping[str, Any]]) -> list[ImageRow]:
     for i, (name, view) in enumerate(views.items(), 1):
         before, after = view["residual_before_px"], view["residual_after_px"]
         bars = tuple(100 * (each["median"] or 0.0) / (widest or 1.0) for each in (before, after))
-        # Adding 0 makes a zero of -0.
+        # Adding 0 turns -0 into 0.
         shift = ", ".join(f"{round(value, 2) + 0.0:+.2f}" for value in view["shift_px"])
         row = ImageRow(
             i, name, view["sensor"], view["n_ties"], shift, _residuals(before), _residuals(after), (bars[0], bars[1])
@@ -106,43 +107,44 @@ def image_rows(views: Mapping[str, Mapping[str, Any]]) -> list[ImageRow]:
     return rows
 
 
-def _residuals(found: Mapping[str, float | None]) -> tuple[str, str, str]:
-    median, rms, percent90 = (number(found[key], "", 3) for key in ("median", "rms", "percent90"))
+def _residuals(residuals: Mapping[str, float | None]) -> tuple[str, str, str]:
+    median, rms, percent90 = (number(residuals[key], "", 3) for key in ("median", "rms", "percent90"))
     return median, rms, percent90
 
 
 def pair_matrix(
     names: Sequence[str], pairs: Sequence[Mapping[str, Any]], overlaps: Sequence[Mapping[str, Any]]
 ) -> Matrix:
-    """Above the diagonal base-to-height, below it the distance of the ties from the loci after orientation, px.
+    """Matrix with the base-to-height ratio above the diagonal, and below it the distance of ties from their loci, px.
 
-    pairs : of run.json's orientation; overlaps : of footprints.geojson.
+    pairs : of run.json's orientation, from which the distances after orientation come; overlaps : of
+    footprints.geojson.
     """
     place = {name: i for i, name in enumerate(names)}
-    cells = [[Cell(NONE, title=f"{a} and {b}: nothing known") for b in names] for a in names]
+    cells = [[MatrixCell(NONE, title=f"{a} and {b}: not known") for b in names] for a in names]
     for i in range(len(names)):
-        cells[i][i] = Cell("", "#dddddd")
+        cells[i][i] = MatrixCell("", "#dddddd")
     for overlap in overlaps:
         i, j = sorted(place[name] for name in overlap["views"])
         says = f"{names[i]} and {names[j]}: base-to-height {number(overlap['base_to_height'])}, "
         says += f"{percent(overlap['overlap'] or 0.0, 1.0)} of the smaller footprint shared"
-        cells[i][j] = Cell(number(overlap["base_to_height"]), title=says)
+        cells[i][j] = MatrixCell(number(overlap["base_to_height"]), title=says)
     for pair in pairs:
         i, j = sorted(place[name] for name in pair["views"])
         before, after = (number(pair[f"epipolar_distance_{when}_px"], "px", 3) for when in ("before", "after"))
         says = f"{names[i]} and {names[j]}: {pair['n_ties']} ties, off by {before} before and {after} after"
-        cells[j][i] = Cell(number(pair["epipolar_distance_after_px"], "", 3), title=says)
+        cells[j][i] = MatrixCell(number(pair["epipolar_distance_after_px"], "", 3), title=says)
     return Matrix(tuple(names), tuple(tuple(row) for row in cells))
 
 
 def label_matrix(path: Path, names: Sequence[str]) -> Matrix | None:
-    """For each reference (row) and search image (column) the share of tie points whose match curve is good.
+    """Share of tie points with a good match curve, for each reference image (row) and search image (column).
 
-    None where there is no ranking, or one of other images.
+    None where there is no ranking, or where it is of other images.
     """
     if not path.exists():
         return None
-    import pyogrio.raw  # a quarter of a second
+    import pyogrio.raw  # takes a quarter of a second
     from pyogrio.errors import DataLayerError, DataSourceError
 
     try:
@@ -158,7 +160,7 @@ def label_matrix(path: Path, names: Sequence[str]) -> Matrix | None:
 
 
 def _counts_of_columns(held: Mapping[str, Any], names: Sequence[str]) -> NDArray[np.int64] | None:
-    """How often each label was given (i, i, 3), of search image (second) against reference; None of other images."""
+    """Counts (i, i, 3) of the labels of a search image (second axis) against the reference; None for other images."""
     columns = column_names(names)
     if set(columns) != {name for name in held if name.startswith(LABEL)}:
         return None
@@ -171,7 +173,7 @@ def _counts_of_columns(held: Mapping[str, Any], names: Sequence[str]) -> NDArray
 
 
 def _counts_of_texts(held: Mapping[str, Any], names: Sequence[str]) -> NDArray[np.int64] | None:
-    """The same where labels are texts."""
+    """Counts as of `_counts_of_columns`, where labels are texts."""
     place = {name.replace(",", " "): i for i, name in enumerate(names)}
     counts = np.zeros((len(names), len(names), len(LABELS)), np.int64)
     for reference, text in zip(held["reference"], held[TEXT], strict=True):
@@ -184,9 +186,9 @@ def _counts_of_texts(held: Mapping[str, Any], names: Sequence[str]) -> NDArray[n
 
 
 def sampled_matrix(pairs: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Matrix | None:
-    """The same of the points at which a run that ranked no images compared them; None where that is of other images.
+    """Matrix as of `label_matrix`, from the sample of a run that ranked no images; None where it is of other images.
 
-    pairs : of curves.json, with the labels of each pair, which are the same either way round.
+    pairs : of curves.json, with the labels of each pair, in either order.
     """
     place = {name: i for i, name in enumerate(names)}
     counts = np.zeros((len(names), len(names), len(LABELS)), int)
@@ -199,23 +201,23 @@ def sampled_matrix(pairs: Sequence[Mapping[str, Any]], names: Sequence[str]) -> 
     return Matrix(tuple(names), tuple(rows))
 
 
-def _label_cell(reference: str, search: str, counts: Sequence[int]) -> Cell:
-    """What the labels of a search image against a reference are. counts : of those that are good, fair and poor."""
+def _label_cell(reference: str, search: str, counts: Sequence[int]) -> MatrixCell:
+    """Cell for the labels of a search image against a reference image. counts : of good, fair and poor labels."""
     if reference == search:
-        return Cell("", "#dddddd")
+        return MatrixCell("", "#dddddd")
     total = sum(counts)
     if not total:
-        return Cell(NONE, title=f"{search} was never compared with {reference}")
+        return MatrixCell(NONE, title=f"{search} was never compared with {reference}")
     good, fair, poor = (percent(n, total) for n in counts)
     mean = (counts[0] - counts[2]) / total
     end = GOOD_COLOUR if mean > 0 else POOR_COLOUR
     colour = np.rint(255 + abs(mean) * (end - 255)).astype(int)
     says = f"{search} against {reference}: good at {good}, fair at {fair}, poor at {poor} of {total} tie points"
-    return Cell(whole_percent(counts[0], total), f"rgb({colour[0]},{colour[1]},{colour[2]})", says)
+    return MatrixCell(whole_percent(counts[0], total), f"rgb({colour[0]},{colour[1]},{colour[2]})", says)
 
 
 def stage_rows(stages: Sequence[Mapping[str, Any]]) -> list[StageRow]:
-    """What each stage took, and all of them."""
+    """Time and memory of each stage, and of all stages."""
     total = sum(stage["wall_s"] for stage in stages)
     rows = [
         StageRow(
@@ -229,12 +231,12 @@ def stage_rows(stages: Sequence[Mapping[str, Any]]) -> list[StageRow]:
 
 
 def request_rows(request: Mapping[str, Any]) -> list[OptionRow]:
-    """What was asked for on the command line."""
+    """The request: arguments and options of the command line."""
     return [OptionRow(name, plain(value), "", "") for name, value in request.items()]
 
 
 def option_rows(options: Mapping[str, Any]) -> list[OptionRow]:
-    """Every option of every stage, with its meaning and, where it was changed, its default."""
+    """Every option of every stage with its meaning and, where the value differs, its default."""
     known = {name: (default, meaning) for name, default, meaning in _known(RunConfig())}
     rows = []
     for name, value in _flat(options):
@@ -252,7 +254,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _known(options: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """Name, default and meaning of every option."""
+    """Yield name, default and meaning of every option."""
     for f in fields(options):
         value = getattr(options, f.name)
         if is_dataclass(value):
@@ -263,7 +265,7 @@ def _known(options: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
 
 
 def plain(value: Any) -> str:
-    """A value of an option as it is read."""
+    """A value of an option in words."""
     if value is None:
         return "not given"
     if isinstance(value, bool):

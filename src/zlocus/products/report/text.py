@@ -1,4 +1,4 @@
-"""What the report says in words: reasons, stages, numbers with units, and the summary."""
+"""Texts of the report: reasons, stages, numbers with units, and the summary."""
 
 from __future__ import annotations
 
@@ -36,49 +36,49 @@ MEANINGS = {
 }
 # Why a cell has no height although its own match curve may have a high peak: see `zlocus.matching.height_checks`.
 DESPITE_PEAK = {
-    Quality.NO_MATCH: "the surface lies where the heights around it allow, which need not be at this peak; there, in "
-    "windows that follow its slope, the mean correlation of all pairs of images that see it is below {min_ncc:g} "
-    "(checks.min_ncc)",
-    Quality.RANGE_END: "with the heights around it taken into account the best height is the lowest or the highest of "
-    "those searched ({low:.1f} to {high:.1f} m)",
-    Quality.OCCLUDED: "the curve does not know what stands in the way: at the height that the surface has here fewer "
-    "than two images see past what is around it",
-    Quality.INCONSISTENT: "the curve is of one reference: the height found from an image was not found again from any "
-    "other",
-    Quality.IMPRECISE: "a peak may be high and yet wide or in doubt: its standard deviation is larger than asked for",
+    Quality.NO_MATCH: "the semi-global constraint puts the surface at a height that agrees with its neighbours, which "
+    "need not be that of the peak. At that height, in windows that follow the slope, the mean correlation of all pairs "
+    "of images that see the cell is below {min_ncc:g} (checks.min_ncc)",
+    Quality.RANGE_END: "the height that agrees best with the neighbours is the lowest or the highest candidate height "
+    "({low:.1f} to {high:.1f} m)",
+    Quality.OCCLUDED: "match curves do not include occlusions. At the height of the surface fewer than two images see "
+    "the cell",
+    Quality.INCONSISTENT: "the curve belongs to one reference image, and no other image found the same height",
+    Quality.IMPRECISE: "the peak is high but wide or ambiguous: its standard deviation is larger than "
+    "checks.max_sigma_m",
 }
 HIGH_PEAK = 0.5
-# What helps, where something does.
+# What the user can do about a flag, where something helps.
 ADVICE = {
-    Quality.UNSEEN: "add images, or ask for a smaller area",
+    Quality.UNSEEN: "add images, or choose a smaller area",
     Quality.OCCLUDED: "add images from other directions",
     Quality.RANGE_END: "give a wider --heights",
-    Quality.NO_MATCH: "usual on water, snow and other plain ground; --fill interpolate closes small gaps",
+    Quality.NO_MATCH: "usual on water, snow and other ground without texture; --fill interpolate closes small gaps",
     Quality.IMPRECISE: "add images at wider angles, or allow more in checks.max_sigma_m",
     Quality.WEAK: "usual on vegetation, water and snow; check before use",
-    Quality.AMBIGUOUS: "usual on repeating patterns and plain ground; check before use",
-    Quality.DISPUTED: "holds most of the gross errors in towns; check before use",
+    Quality.AMBIGUOUS: "usual on repeating patterns and ground without texture; check before use",
+    Quality.DISPUTED: "most gross errors in towns carry this flag; check before use",
     Quality.IMAGE_EXCLUDED: "give --heights closer to those of the ground",
 }
 STAGES = {
     "open": "opening images and cameras",
     "orient": "finding tie points and correcting the cameras",
-    "setup": "height range, grid and plan of tiles",
-    "cross-check": "heights compared between images",
+    "setup": "choosing the height range, grid and tiles",
+    "cross-check": "comparing the heights of the images",
     "match": "matching and writing the rasters",
     "points": "writing tie points and ranking",
     "curves": "footprints and match curves for this page",
     "record": "checksums of the inputs",
-    "products": "hillshade and what else was made of the surface",
+    "products": "hillshade and other products of the surface",
 }
 SIDES = ("top", "upper right", "right", "lower right", "bottom", "lower left", "left", "upper left")
 NONE = "–"
-LEAST_SHARE = 0.0001
+MIN_SHOWN_SHARE = 0.0001
 
 
 @dataclass(frozen=True)
 class Reason:
-    """A row of the table of reasons. fate : whether a cell with it has its height; share : of the cells asked for."""
+    """A row of the table of reasons. fate : whether such cells have a height; share : of the requested cells."""
 
     name: str
     meaning: str
@@ -88,51 +88,51 @@ class Reason:
     share: str
 
 
-def reasons(found: Survey) -> list[Reason]:
-    """The reasons that occur, those without a height first, the most common first."""
+def reasons(survey: Survey) -> list[Reason]:
+    """Reasons that occur: first those without a height, and the most common ones first."""
     rows = []
     for flag in Quality:
-        n = found.count(flag)
+        n = survey.count(flag)
         if n:
-            base = math.prod(found.shape) if flag is Quality.OUTSIDE else found.n_asked
+            base = math.prod(survey.shape) if flag is Quality.OUTSIDE else survey.n_requested
             row = Reason(str(flag.name), MEANINGS[flag], fate(flag), ADVICE.get(flag, ""), n, percent(n, base))
             rows.append((flag not in EMPTY, -n, row))
     return [row for _, _, row in sorted(rows, key=lambda each: each[:2])]
 
 
 def fate(flag: Quality) -> str:
-    """Whether a cell with a reason has its height."""
+    """Whether cells with a flag have a height: `none`, `filled` or `kept`."""
     if flag in EMPTY:
         return "none"
     return "filled" if flag is Quality.FILLED else "kept"
 
 
 def percent(n: float, total: float) -> str:
-    """A share in percent: one that is not 0 never reads as 0, and one that is not all never as 100."""
+    """A share in percent. A share above 0 is never written as 0, and one below 1 never as 100."""
     if not total:
         return NONE
     share = n / total
-    if 0 < share < LEAST_SHARE:
+    if 0 < share < MIN_SHOWN_SHARE:
         return "< 0.01 %"
-    if 1 - LEAST_SHARE < share < 1:
+    if 1 - MIN_SHOWN_SHARE < share < 1:
         return "> 99.99 %"
     return f"{100 * share:.{2 if share < 0.1 or 0.999 <= share < 1 else 1}f} %"
 
 
 def whole_percent(n: int, total: int) -> str:
-    """A share in whole percent, without its sign; 0 and 100 only where it is none and all."""
+    """A share in whole percent, without the sign; 0 and 100 stand for none and all only."""
     if n in (0, total):
         return "100" if n else "0"
     return str(min(max(round(100 * n / total), 1), 99))
 
 
 def number(value: float | None, unit: str = "", digits: int = 2) -> str:
-    """A number with digits behind the point and its unit."""
+    """A number with a fixed number of decimals, and its unit."""
     return NONE if value is None or not math.isfinite(value) else f"{value:.{digits}f} {unit}".rstrip()
 
 
 def size(value: float | None, unit: str = "") -> str:
-    """A positive number to two digits that count, with its unit: 0.083 m, 0.31 m, 12 m."""
+    """A positive number with two significant digits and its unit: 0.083 m, 0.31 m, 12 m."""
     if value is None or not math.isfinite(value):
         return NONE
     decimals = 0 if value == 0 else max(1 - math.floor(math.log10(abs(value))), 0)
@@ -148,39 +148,39 @@ def seconds(value: float) -> str:
 
 
 def when(created: str | None) -> str:
-    """A time of run.json, to the minute; "" where it has none."""
+    """A time of run.json, to the minute; "" where there is none."""
     if not created:
         return ""
     return datetime.fromisoformat(created).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def sun(azimuth_deg: float, altitude_deg: float) -> str:
-    """Where the light of a map comes from, its first row being the north."""
+    """Direction of the light on a map whose top is north, in words."""
     side = SIDES[round(azimuth_deg / 45) % len(SIDES)]
     return f"lit from the {side} (azimuth {azimuth_deg:g} degrees), {altitude_deg:g} degrees above the horizon"
 
 
-def corners(found: Survey, is_local: bool) -> list[str]:
-    """Coordinates of the map's corners: upper left, upper right, lower left, lower right."""
-    (rows, cols), names = found.shape, ("x", "y") if is_local else ("E", "N")
+def corners(survey: Survey, is_local: bool) -> list[str]:
+    """Coordinates of a map's corners: upper left, upper right, lower left, lower right."""
+    (rows, cols), names = survey.shape, ("x", "y") if is_local else ("E", "N")
     return [
-        ", ".join(f"{name} {value:.1f}" for name, value in zip(names, found.transform * corner, strict=True))
+        ", ".join(f"{name} {value:.1f}" for name, value in zip(names, survey.transform * corner, strict=True))
         for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))
     ]
 
 
-def despite_peak(why: Quality, rho1: float | None, run: Mapping[str, Any]) -> str:
-    """Why a cell is empty although its mean curve reaches a correlation, as a sentence; "" where it does not."""
-    if rho1 is None or rho1 < HIGH_PEAK or why not in DESPITE_PEAK:
+def despite_peak(flag: Quality, rho1: float | None, run: Mapping[str, Any]) -> str:
+    """Why a cell is empty although its mean curve has a high peak, as a sentence; "" where the peak is not high."""
+    if rho1 is None or rho1 < HIGH_PEAK or flag not in DESPITE_PEAK:
         return ""
     low, high = run["heights"]["range_m"]
-    text = DESPITE_PEAK[why].format(min_ncc=run["config"]["options"]["checks"]["min_ncc"], low=low, high=high)
+    text = DESPITE_PEAK[flag].format(min_ncc=run["config"]["options"]["checks"]["min_ncc"], low=low, high=high)
     return f"No height in spite of the peak: {text}."
 
 
-def place(found: Survey, crs: CRS) -> tuple[str, str]:
-    """Where the middle of the surface lies, and its map, in words."""
-    x, y = found.transform * (found.shape[1] / 2, found.shape[0] / 2)
+def place(survey: Survey, crs: CRS) -> tuple[str, str]:
+    """Position of the surface's centre, and the name of its map, in words."""
+    x, y = survey.transform * (survey.shape[1] / 2, survey.shape[0] / 2)
     if is_local(crs):
         return f"around x {x:.1f} m, y {y:.1f} m of a local frame, which has no place on the Earth", "local frame"
     code = ":".join(authority) if (authority := crs.to_authority()) else "no code"
@@ -189,62 +189,63 @@ def place(found: Survey, crs: CRS) -> tuple[str, str]:
     return where, f"{crs.name}, {code}"
 
 
-def summary(found: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, float]) -> str:
-    """The whole run in one paragraph. quantiles : of the standard deviations, m, by percent."""
-    rows, cols = found.shape
-    where, frame = place(found, crs)
+def summary(survey: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, float]) -> str:
+    """Summary of the run in one paragraph. quantiles : of the standard deviations, m, by percent."""
+    rows, cols = survey.shape
+    where, frame = place(survey, crs)
     views = run["orientation"]["views"]
-    wide, high = cols * found.cell_m, rows * found.cell_m
-    what = "This is a digital surface model: the height of whatever is seen from above, roofs and treetops included."
+    wide, high = cols * survey.cell_m, rows * survey.cell_m
+    what = "This is a digital surface model: the height of the topmost surface, roofs and treetops included."
     if is_local(crs):
-        what = "This is a surface model: how far whatever the images show stands out along z."
+        what = "This is a surface model: the position of what the images show along z."
     said = [
         f"{what} It covers {wide:.0f} m by {high:.0f} m {where} (map: {frame}), with a cell every "
-        f"{found.cell_m:g} m, and was made from {len(views)} images.",
-        f"Of the cells that two images or more cover, {percent(found.n_matched, found.n_seen)} have a height.",
+        f"{survey.cell_m:g} m, and was made from {len(views)} images.",
+        f"Of the cells that two images or more cover, {percent(survey.n_matched, survey.n_covered)} have a height.",
     ]
-    if found.n_heights:
-        said.append(f"Heights run from {found.lowest_m:.1f} to {found.highest_m:.1f} m ({found.above}).")
+    if survey.n_heights:
+        said.append(f"Heights run from {survey.lowest_m:.1f} to {survey.highest_m:.1f} m ({survey.height_name}).")
     if 50 in quantiles:
         said.append(
-            f"By its own estimate, which knows nothing of errors that all images share, the standard deviation of a "
+            f"By the run's own estimate, which does not include errors that all images share, the standard deviation of a "
             f"height is {size(quantiles[50], 'm')} or better for half of the cells, and {size(quantiles[90], 'm')} or "
             "better for nine in ten."
         )
-    said += [what_is_missing(found), what_is_doubtful(found)]
+    said += [what_is_missing(survey), what_is_doubtful(survey)]
     return " ".join(sentence for sentence in said if sentence)
 
 
-def what_is_missing(found: Survey) -> str:
-    """How much has no height and why, in a sentence."""
-    n_missing = found.n_asked - found.n_heights
+def what_is_missing(survey: Survey) -> str:
+    """Share of cells without a height and the main reasons, in a sentence."""
+    n_missing = survey.n_requested - survey.n_heights
     if n_missing <= 0:
-        return "No cell of the area lacks a height."
-    why = [(found.count(flag), MEANINGS[flag]) for flag in EMPTY if flag is not Quality.OUTSIDE]
+        return "Every cell of the area has a height."
+    why = [(survey.count(flag), MEANINGS[flag]) for flag in EMPTY if flag is not Quality.OUTSIDE]
     common = sorted((each for each in why if each[0]), key=lambda each: -each[0])[:2]
-    reasons = "; ".join(f"{meaning} ({percent(n, found.n_asked)})" for n, meaning in common)
-    return f"{percent(n_missing, found.n_asked)} of the cells asked for have no height, mostly because: {reasons}."
+    reasons = "; ".join(f"{meaning} ({percent(n, survey.n_requested)})" for n, meaning in common)
+    return f"{percent(n_missing, survey.n_requested)} of the requested cells have no height, mostly because: {reasons}."
 
 
-def what_is_doubtful(found: Survey) -> str:
-    """How much carries which warning, in a sentence."""
+def what_is_doubtful(survey: Survey) -> str:
+    """Shares of cells with each warning, in a sentence."""
     warnings = Quality.WEAK | Quality.AMBIGUOUS | Quality.DISPUTED
-    counts = sorted(((found.count(flag), str(flag.name)) for flag in warnings), key=lambda each: -each[0])
-    told = [f"{name} ({percent(n, found.n_asked)} of the cells asked for)" for n, name in counts if n]
-    return f"Heights to check before use carry a warning, explained below: {listed(told)}." if told else ""
+    counts = sorted(((survey.count(flag), str(flag.name)) for flag in warnings), key=lambda each: -each[0])
+    warned = [f"{name} ({percent(n, survey.n_requested)} of the requested cells)" for n, name in counts if n]
+    return f"Heights to check before use carry a warning, explained below: {listed(warned)}." if warned else ""
 
 
 def against_reference(evaluation: Evaluation, reference: str) -> str:
-    """How the surface compares with a reference, in a sentence."""
-    figures = evaluation.statistics
-    moved = "" if evaluation.shift is None else ", once the shift between the two is removed"
+    """Result of the comparison with a reference, in a sentence."""
+    statistics = evaluation.statistics
+    moved = "" if evaluation.shift is None else ", after the shift between the two is removed"
     return (
-        f"Against the reference {reference}{moved}: {percent(figures.completeness, 1)} of its cells have a height, "
-        f"{percent(figures.within, 1)} one that is right to {evaluation.threshold_m:g} m; the errors' median is "
-        f"{number(figures.median, 'm', 3)}, their spread (NMAD) {number(figures.nmad, 'm', 3)}."
+        f"Comparison with the reference {reference}{moved}: {percent(statistics.completeness, 1)} of its cells have a "
+        f"height, and {percent(statistics.within, 1)} have one with an error below {evaluation.threshold_m:g} m. The "
+        f"median of the errors is {number(statistics.median, 'm', 3)}, their spread (NMAD) is "
+        f"{number(statistics.nmad, 'm', 3)}."
     )
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names with commas between, `none` without any."""
+    """Names separated by commas; `none` without any."""
     return ", ".join(names) or "none"
