@@ -225,7 +225,7 @@ def test_changed_files_are_listed_with_missing_ones_last(tmp_path):
     with pytest.raises(StoppedError, match=r"and so did 1 more input;"):
         inputs.check(may_miss=True)
     # What was known before counts.
-    assert InputFiles.of(paths, before=inputs).changed() == inputs.changed()
+    assert InputFiles.of(paths, earlier_inputs=inputs).changed() == inputs.changed()
 
 
 def test_files_that_a_virtual_raster_lists_are_inputs(copied, tmp_path):

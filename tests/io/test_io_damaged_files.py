@@ -32,7 +32,7 @@ from damage_outcomes import Good, check_sentence, outcome
 from zlocus.core.errors import ZlocusError
 
 EXAMPLES = int(os.environ.get("ZLOCUS_FUZZ_EXAMPLES", "30"))
-MOST_NUMBERS = 60
+MAX_NUMBERS = 60
 TEXT = [name for name, case in CASES.items() if case.text]
 BINARY = [name for name, case in CASES.items() if not case.text]
 SAME = 1e-9
@@ -214,7 +214,7 @@ def test_windows_line_ends_and_byte_order_marks_are_read(good, name, change):
 def test_every_number_that_is_not_one(good, name):
     """NaN in the place of each number in turn is found, or stands where no camera is."""
     whole = good(name).content
-    for match in list(re.finditer(rb"(?<![\w.])-?\d+\.\d+(?![\w.])", whole))[:MOST_NUMBERS]:
+    for match in list(re.finditer(rb"(?<![\w.])-?\d+\.\d+(?![\w.])", whole))[:MAX_NUMBERS]:
         found = outcome(good(name), whole[: match.start()] + b"nan" + whole[match.end() :])
         assert isinstance(found, str) or found == good(name).says, match
 

@@ -19,7 +19,7 @@ from zlocus.io.scene_file import open_scene, rotation_to_axes
 from zlocus.orientation.orientation import orient
 from zlocus.synthetic.terrain import analytic_height
 
-LEAST_COVERAGE, WITHIN_M, LEAST_WITHIN = 0.9, 0.25, 0.95
+MIN_COVERAGE, WITHIN_M, MIN_WITHIN = 0.9, 0.25, 0.95
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,8 @@ def test_the_surface_is_the_wall(surface):
     error, *_ = errors(surface)
     found = np.isfinite(error)
     record = json.loads((surface / "run.json").read_text())
-    assert record["coverage"] > LEAST_COVERAGE
-    assert (np.abs(error[found]) < WITHIN_M).mean() > LEAST_WITHIN
+    assert record["coverage"] > MIN_COVERAGE
+    assert (np.abs(error[found]) < WITHIN_M).mean() > MIN_WITHIN
     assert abs(np.median(error[found])) < 0.05
 
 

@@ -23,7 +23,7 @@ LO25 = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m 
 # Rounding of the table: 0.5 mm and 0.0005 degrees in each of three.
 TABLE_M, TABLE_DEG = 1e-3, 1e-3
 # A pixel on the ground.
-TERRAIN_M, LEAST_COVERAGE = 5.8, 0.7
+TERRAIN_M, MIN_COVERAGE = 5.8, 0.7
 
 
 def ortho(view, xyz, shape):
@@ -161,7 +161,7 @@ def test_a_surface_of_aerial_images_without_heights(shared_data, tmp_path):
     bounds = (x - 600, y - 900, x + 600, y + 900)
     request = DsmRequest(inputs=(out,), out=tmp_path / "dsm", bounds=bounds, resolution=12.0)
     result = run_dsm(request, RunConfig(), SilentProgress())
-    assert result.coverage > LEAST_COVERAGE
+    assert result.coverage > MIN_COVERAGE
     with rasterio.open(tmp_path / "dsm" / "dsm.tif") as source:
         found = source.read(1)
         col, row = np.meshgrid(np.arange(source.width), np.arange(source.height))

@@ -50,7 +50,7 @@ RPC = satellite_rpc()
 PIXELS = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
 GRID = GeoBox((20, 30), from_origin(700000, 4790400, 10.0, 10.0), "EPSG:32631")
 DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-MOST_LEAVES = 10_000
+MAX_LEAVES = 10_000
 Leaves = dict[tuple[Any, ...], Any]
 
 
@@ -93,7 +93,7 @@ def leaves(value: Any, at: tuple[Any, ...] = ()) -> Leaves:
     elif is_dataclass(value):
         value = {f.name: getattr(value, f.name) for f in fields(value) if not f.name.startswith("_")}
     elif isinstance(value, np.ndarray):
-        value = value.tolist() if value.size < MOST_LEAVES else value.tobytes()
+        value = value.tolist() if value.size < MAX_LEAVES else value.tobytes()
     if isinstance(value, Mapping):
         return {k: v for key, each in value.items() for k, v in leaves(each, (*at, key)).items()}
     if isinstance(value, list | tuple):

@@ -22,10 +22,10 @@ from pathlib import Path
 from places import TESTS
 
 SEEDS = TESTS / "fuzz_seeds"
-TIMEOUT_S, MOST_MB = 20, 3000
+TIMEOUT_S, MAX_MB = 20, 3000
 # Of a format, of a seed, and of all seeds of a format.
-MOST_SEEDS, LARGEST_SEED, MAX_SEED_TOTAL_BYTES = 40, 20_000, 24_000
-MOST_TOKENS = 200
+MAX_SEEDS, MAX_SEED_BYTES, MAX_SEED_TOTAL_BYTES = 40, 20_000, 24_000
+MAX_TOKENS = 200
 FAILED = "fail-"
 
 
@@ -55,11 +55,11 @@ def fuzz_one(name: str, corpus: Path, artifacts: Path, seconds: int) -> None:
 
     # What the file is made of, and what could stand in its place.
     tokens = {m.group() for m in TOKEN.finditer(path.read_bytes())} if case.text else set()
-    listed = sorted(tokens)[:MOST_TOKENS] + [word.encode() for word in WORDS if 0 < len(word) < 40]
+    listed = sorted(tokens)[:MAX_TOKENS] + [word.encode() for word in WORDS if 0 < len(word) < 40]
     dictionary = corpus.parent / "words.dict"
     dictionary.write_text("".join('"' + "".join(f"\\x{byte:02x}" for byte in word) + '"\n' for word in listed))
-    limits = {"max_total_time": seconds, "timeout": TIMEOUT_S, "rss_limit_mb": MOST_MB}
-    limits["max_len"] = max(LARGEST_SEED, 2 * path.stat().st_size)
+    limits = {"max_total_time": seconds, "timeout": TIMEOUT_S, "rss_limit_mb": MAX_MB}
+    limits["max_len"] = max(MAX_SEED_BYTES, 2 * path.stat().st_size)
     options = {"dict": dictionary, "artifact_prefix": f"{artifacts}/", **limits}
     words = [sys.argv[0], str(corpus), *(f"-{name}={value}" for name, value in options.items())]
     atheris.Setup(words, read)
@@ -89,9 +89,9 @@ def fuzz(name: str, seconds: float) -> int:
             print("\n".join(done.stderr.splitlines()[-40:]), flush=True)
             n_failed += 1
         chosen = sorted(
-            (p for p in corpus.iterdir() if p.stat().st_size <= LARGEST_SEED), key=lambda p: p.stat().st_size
+            (p for p in corpus.iterdir() if p.stat().st_size <= MAX_SEED_BYTES), key=lambda p: p.stat().st_size
         )
-        sizes = accumulate(seed.stat().st_size for seed in chosen[:MOST_SEEDS])
+        sizes = accumulate(seed.stat().st_size for seed in chosen[:MAX_SEEDS])
         for seed in (seed for seed, size in zip(chosen, sizes, strict=False) if size <= MAX_SEED_TOTAL_BYTES):
             (kept / seed.name).write_bytes(seed.read_bytes())
         for artifact in artifacts.iterdir():
