@@ -37,7 +37,7 @@ from zlocus.core.options import PyramidOptions, RunConfig
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.synthetic.files import render_scene
 from zlocus.synthetic.objects import Objects
-from zlocus.synthetic.render import seen_from
+from zlocus.synthetic.render import visible_ground_points
 from zlocus.synthetic.scenes import (
     SATELLITE_VIEWS,
     Exposure,
@@ -147,7 +147,7 @@ def feature_cells(name: str, ground: SyntheticGround, spec: SceneSpec, seen_by: 
     xyz = np.column_stack([east, north, ground.heights[cells].ravel()])
     hidden = np.zeros(len(xyz), bool)
     for exposure in seen_by:
-        seen = seen_from(ground, exposure.sensor, exposure.sensor.image_from_ground(xyz))
+        seen = visible_ground_points(ground, exposure.sensor, exposure.sensor.image_from_ground(xyz))
         hidden |= seen[:, 2] > xyz[:, 2] + HIDDEN_M
     return hidden.reshape(n, n)
 

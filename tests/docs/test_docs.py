@@ -18,7 +18,7 @@ from zlocus.cli.app import app
 from zlocus.core.requests import FINISHED
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
-from zlocus.io.vertical import KNOWN
+from zlocus.io.vertical import KNOWN_GEOIDS
 from zlocus.matching import quality as reasons
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.stac_item import PRODUCTS
@@ -68,7 +68,7 @@ def test_the_readme_is_short():
 
 def test_the_page_of_vertical_datums_names_what_there_is():
     page = (ROOT / "docs" / "how-to" / "vertical.md").read_text(encoding="utf-8")
-    for name, known in KNOWN.items():
+    for name, known in KNOWN_GEOIDS.items():
         assert f"| `{name}` | {', '.join(f'`{grid}`' for grid in known.grids)} |" in page
         assert f"| `{name}` | {known.title}, " in page
         assert f"horizontal + EPSG:{known.epsg} |" in page

@@ -20,7 +20,7 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.io import vertical
 from zlocus.io.grid_inputs import read_geobox
 from zlocus.io.rasters import write_cog
-from zlocus.io.vertical import ELLIPSOIDAL, KNOWN, check_heights, declared_vertical_datum, named_vertical_datum
+from zlocus.io.vertical import ELLIPSOIDAL, KNOWN_GEOIDS, check_heights, declared_vertical_datum, named_vertical_datum
 from zlocus.products.rasters import SurfaceRasters
 
 UTM = CRS.from_epsg(32631)
@@ -70,22 +70,22 @@ def test_the_ellipsoid_needs_no_file():
     datum.check_covers((0, 0, 1, 1), UTM)
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", KNOWN_GEOIDS)
 def test_a_missing_grid_is_an_error(no_grids, name):
     """Also where a file of that name would be found by PROJ over the network."""
     with pytest.raises(ConfigError) as error:
         named_vertical_datum(name)
     message = str(error.value)
-    grid = KNOWN[name].grids[0]
+    grid = KNOWN_GEOIDS[name].grids[0]
     assert f"--vertical {name} needs PROJ's grid {grid}, which is not in {no_grids}" in message
     assert f"pyproj sync --file {grid}" in message
     assert "--vertical FILE" in message
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", KNOWN_GEOIDS)
 def test_proj_names_the_same_grids(name):
     """And that without its grid, its best conversion leaves heights as they are, which is why it is not asked."""
-    known = KNOWN[name]
+    known = KNOWN_GEOIDS[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         group = TransformerGroup("EPSG:4979", f"EPSG:4326+{known.epsg}", always_xy=True)
@@ -185,7 +185,7 @@ def test_the_datum_of_a_file_is_in_its_crs(proj_grid, tmp_path):
 def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
     """The CRS comes back from the GeoTIFF alone, is a valid COG, and the grid is one for --like."""
     if name != "file":
-        write_proj_grid(no_grids / KNOWN[name].grids[0])
+        write_proj_grid(no_grids / KNOWN_GEOIDS[name].grids[0])
     datum = named_vertical_datum(str(geoid) if name == "file" else name)
     path = tmp_path / "out" / "dsm.tif"
     path.parent.mkdir()
@@ -202,7 +202,7 @@ def test_files_say_what_heights_are_above(tmp_path, no_grids, geoid, name):
         with pytest.raises(InputError, match="no geoid for"):
             declared_vertical_datum(crs, path, "--dem-vertical")
     else:
-        assert height.to_epsg() == KNOWN[name].epsg
+        assert height.to_epsg() == KNOWN_GEOIDS[name].epsg
         assert declared_vertical_datum(crs, path, "--dem-vertical").files == datum.files
     assert read_geobox(path) == GRID
     with rasterio.open(path) as file:

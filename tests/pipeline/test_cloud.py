@@ -27,7 +27,7 @@ from zlocus.matching.quality import Quality, is_empty
 from zlocus.pipeline import cloud
 from zlocus.pipeline import image_tiles as per_image
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
-from zlocus.synthetic.render import Sun, expose, render, seen_from
+from zlocus.synthetic.render import Sun, expose, render, visible_ground_points
 from zlocus.synthetic.terrain import analytic_ground
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -54,7 +54,7 @@ def true_height(kind: str, sensor, shape: tuple[int, int]) -> np.ndarray:
     """Height of what each pixel shows, (r, c) m."""
     ground = analytic_ground(kind, CENTRE, GSD_M / 2, FIELD, seed=5)
     col, row = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
-    return seen_from(ground, sensor, np.column_stack([col.ravel(), row.ravel()]))[:, 2].reshape(shape)
+    return visible_ground_points(ground, sensor, np.column_stack([col.ravel(), row.ravel()]))[:, 2].reshape(shape)
 
 
 def run(inputs, out, config=None, **asked):
@@ -214,7 +214,7 @@ def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypat
 
     def planted(space, scene, surface):
         matched = whole(space, scene, surface)
-        if space.reference.name == "nadir":
+        if space.reference_view.name == "nadir":
             matched.image.height[patch] += 20.0
         return matched
 

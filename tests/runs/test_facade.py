@@ -16,7 +16,7 @@ from zlocus.core.errors import ConfigError
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.requests import ImportRequest
 from zlocus.io.scene_file import open_scene, rotation_to_axes
-from zlocus.orientation.orientation import orient
+from zlocus.orientation.orientation import OrientationRequest, orient
 from zlocus.synthetic.terrain import analytic_height
 
 MIN_COVERAGE, WITHIN_M, MIN_WITHIN = 0.9, 0.25, 0.95
@@ -109,9 +109,9 @@ def test_a_local_frame_has_no_place_on_the_earth(facade, surface, tmp_path):
 
 def test_joint_corrections_are_made_where_they_are_asked_for(facade, tmp_path):
     scene = open_scene([imported(facade, tmp_path / "scene.yaml")])
-    assert orient(scene, OrientationOptions(), (40.0, 60.0)).model == "none"
+    assert orient(scene, OrientationOptions(), OrientationRequest((40.0, 60.0))).model == "none"
     asked = OrientationOptions(model="joint", bundle_adjustment=BundleAdjustmentOptions(sigma_position_m=0.01))
-    assert orient(scene, asked, (40.0, 60.0)).model == "joint"
+    assert orient(scene, asked, OrientationRequest((40.0, 60.0))).model == "joint"
 
 
 def test_north_turns_the_frame_about_its_up():

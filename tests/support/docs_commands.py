@@ -19,7 +19,7 @@ from geoids import write_geoid, write_proj_grid
 from places import ROOT
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
 from zlocus.io.scene_file import open_scene
-from zlocus.io.vertical import KNOWN
+from zlocus.io.vertical import KNOWN_GEOIDS
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.files import write_image
 from zlocus.synthetic.render import Sun, expose, render
@@ -177,7 +177,7 @@ def lay_out_datums(folder: Path) -> None:
     undulation_m, grid_m, half = 48.0, 2.0, 200.0
     write_geoid(folder / "geoid.tif", np.full((8, 8), undulation_m, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
     (folder / PROJ_GRIDS).mkdir()
-    for geoid in KNOWN.values():
+    for geoid in KNOWN_GEOIDS.values():
         write_proj_grid(folder / PROJ_GRIDS / geoid.grids[0], np.full((721, 1440), undulation_m, np.float32))
     n = round(2 * half / grid_m)
     along = (np.arange(n) + 0.5) * grid_m - half

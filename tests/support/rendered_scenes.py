@@ -19,7 +19,7 @@ from zlocus.sensors.linescan import FocalLine, LineScanModel, LineTimes
 from zlocus.sensors.rpc_fit import fit_rpc
 from zlocus.synthetic.cameras import SatelliteCamera
 from zlocus.synthetic.files import write_image
-from zlocus.synthetic.linescan import NADIR_COLUMN, SPEED_M_S, focal_line, sampled
+from zlocus.synthetic.linescan import NADIR_COLUMN, SPEED_M_S, focal_line, sampled_trajectory
 from zlocus.synthetic.render import Optics, Sun, expose, render
 from zlocus.synthetic.scenes import Exposure
 from zlocus.synthetic.terrain import analytic_ground, analytic_height
@@ -58,7 +58,7 @@ def line_scanner(exposure: Exposure) -> LineScanModel:
     line = focal_line(raw.sensor)
     line = FocalLine(line.xy_mm[first : first + raw.shape[1]], line.focal_mm)
     times = LineTimes.regular(0.0, -raw.sensor.advance_m / SPEED_M_S, raw.shape[0])
-    return LineScanModel(line, times, sampled(raw.sensor, raw.shape[0]), FRAME_SPACE)
+    return LineScanModel(line, times, sampled_trajectory(raw.sensor, raw.shape[0]), FRAME_SPACE)
 
 
 def camera(name: str, size: int = SIZE_PX) -> SatelliteCamera:

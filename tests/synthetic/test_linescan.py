@@ -21,7 +21,7 @@ from zlocus.pipeline.dsm import run_dsm
 from zlocus.sensors.linescan import LineScanModel, RectifiedModel
 from zlocus.synthetic.__main__ import main
 from zlocus.synthetic.files import RenderedScene, render_scene
-from zlocus.synthetic.linescan import TrajectoryNoise, noisy, sampled, write_linescan_views, write_scene
+from zlocus.synthetic.linescan import TrajectoryNoise, sampled_trajectory, with_noise, write_linescan_views, write_scene
 from zlocus.synthetic.rectify import rectified
 from zlocus.synthetic.scenes import SceneSpec, city_spec, demo_spec, exposures_of, with_ads40
 
@@ -137,16 +137,16 @@ def test_a_surface_from_line_scanners(rendered, spec, tmp_path):
 
 def test_noise_is_as_large_as_it_says(spec):
     camera = exposures_of(spec)[0].sensor
-    exact = sampled(camera, 300)
+    exact = sampled_trajectory(camera, 300)
     rng = np.random.default_rng(1)
-    np.testing.assert_array_equal(noisy(exact, TrajectoryNoise(), rng).rotations, exact.rotations)
-    found = noisy(exact, TrajectoryNoise(offset_m=0.1, turn_deg=0.002, every_s=1.0), rng)
+    np.testing.assert_array_equal(with_noise(exact, TrajectoryNoise(), rng).rotations, exact.rotations)
+    found = with_noise(exact, TrajectoryNoise(offset_m=0.1, turn_deg=0.002, every_s=1.0), rng)
     assert np.std(found.centres - exact.centres) == pytest.approx(0.1, rel=0.35)
     turns = found.rotations @ exact.rotations.mT
     assert np.rad2deg(np.std(turns[:, [0, 0, 1], [1, 2, 2]])) == pytest.approx(0.002, rel=0.35)
     # Slow: from sample to sample (5 ms) little changes; jitter does.
     assert np.abs(np.diff(found.centres - exact.centres, axis=0)).max() < 0.01
-    jitter = noisy(exact, TrajectoryNoise(jitter_m=0.1, jitter_deg=0.001), rng)
+    jitter = with_noise(exact, TrajectoryNoise(jitter_m=0.1, jitter_deg=0.001), rng)
     assert np.std(np.diff(jitter.centres - exact.centres, axis=0)) == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from zlocus.core.errors import GeometryError
 from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 from zlocus.synthetic.raycast import MISS, TOP, WALL_U, WALL_V, cast_rays
-from zlocus.synthetic.render import Optics, Sun, expose, field_of, render, seen_from, sunlit
+from zlocus.synthetic.render import Optics, Sun, expose, field_of, render, sunlit, visible_ground_points
 from zlocus.synthetic.terrain import (
     ANALYTIC_KINDS,
     GROUND,
@@ -52,7 +52,7 @@ def test_rays_meet_analytic_surfaces(kind: str, scanned: bool) -> None:
         position = (CENTRE[0] - 100.0, CENTRE[1] - 2000.0 * np.tan(np.deg2rad(26.0)), 2050.0)
         sensor = LineScanner(position, (-420.0, 60.0), 0.0, 26.0, 0.208, wobble_m=0.5, wobble_deg=0.03)
     xy = some_pixels()
-    seen = seen_from(ground, sensor, xy)
+    seen = visible_ground_points(ground, sensor, xy)
     east, north = seen[:, 0] - CENTRE[0], seen[:, 1] - CENTRE[1]
     assert np.isfinite(seen).all()
     np.testing.assert_allclose(sensor.image_from_ground(seen), xy, rtol=0, atol=RAY_PX)
@@ -78,7 +78,9 @@ def test_a_step_occludes_the_ground_behind_it() -> None:
     ground = analytic_ground("step", CENTRE, STEP, SHAPE)
     for across, hidden in ((15.0, 0.0), (-15.0, 15.0 * np.tan(np.deg2rad(15.0)))):
         sensor = camera(along=0.0, across=across, heading=0.0)
-        low = seen_from(ground, sensor, np.column_stack([np.linspace(20, 100, 20001), np.full(20001, 60.0)]))
+        low = visible_ground_points(
+            ground, sensor, np.column_stack([np.linspace(20, 100, 20001), np.full(20001, 60.0)])
+        )
         east = low[low[:, 2] < 50.001, 0] - CENTRE[0]
         assert east.max() == pytest.approx(-hidden, abs=0.01)
         on_wall = (low[:, 2] > 50.001) & (low[:, 2] < 64.999)

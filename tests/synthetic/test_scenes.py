@@ -18,7 +18,7 @@ from zlocus.synthetic.__main__ import main
 from zlocus.synthetic.files import render_scene
 from zlocus.synthetic.objects import BARE, PAINT, Objects
 from zlocus.synthetic.raycast import WEEDS, top_albedo
-from zlocus.synthetic.render import seen_from
+from zlocus.synthetic.render import visible_ground_points
 from zlocus.synthetic.scenes import (
     SceneSpec,
     ViewSpec,
@@ -79,7 +79,7 @@ def test_pixels_see_the_truth(folder: Path, spec: SceneSpec, ground: SyntheticGr
     truth = read(folder / "truth_dsm.tif")
     exposure = exposures_of(spec)[1]
     xy = np.random.default_rng(3).uniform(20, 90, (4000, 2))
-    seen = seen_from(ground, exposure.sensor, xy)
+    seen = visible_ground_points(ground, exposure.sensor, xy)
     within = exposure.sensor.ground_from_image(xy, seen[:, 2] - 0.001)
     row = np.floor((spec.north_m - within[:, 1]) / 0.25).astype(int)
     col = np.floor((within[:, 0] - spec.west_m) / 0.25).astype(int)

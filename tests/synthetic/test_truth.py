@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from zlocus.synthetic.scenes import ADS40_VIEWS, build_ground, demo_spec, exposures_of, steady
-from zlocus.synthetic.truth import image_positions, n_showing, write_truth
+from zlocus.synthetic.truth import image_positions, n_images_showing, write_truth
 
 # Positions are interpolated between the nodes of a grid.
 POSITION_PX = 0.1
@@ -56,7 +56,7 @@ def test_images_show_what_projects_inside_their_borders(ground, seen_by):
         expected += ((xy >= 0) & (xy <= last)).all(axis=1)
         near |= (np.minimum(np.abs(xy), np.abs(xy - last)) < POSITION_PX).any(axis=1)
     assert {0, 1, 2} == set(expected.tolist())
-    np.testing.assert_array_equal(n_showing(ground, seen_by)[cells][~near], expected[~near])
+    np.testing.assert_array_equal(n_images_showing(ground, seen_by)[cells][~near], expected[~near])
 
 
 def test_the_truth_has_a_height_where_two_images_see_and_nowhere_else(tmp_path, spec, ground, seen_by):
@@ -66,7 +66,7 @@ def test_the_truth_has_a_height_where_two_images_see_and_nowhere_else(tmp_path, 
     with rasterio.open(tmp_path / "truth_class.tif") as file:
         classes = file.read(1)
     rows, cols = ground.cells(transform.c, transform.f, truth.shape)
-    known = n_showing(ground, seen_by) >= 2
+    known = n_images_showing(ground, seen_by) >= 2
     np.testing.assert_array_equal(np.isfinite(truth), known[rows, cols])
     assert known.sum() == known[rows, cols].sum()
     # More than the area that all images were placed for.

@@ -45,7 +45,7 @@ class KnownGeoid:
     grids: tuple[str, ...]
 
 
-KNOWN = {
+KNOWN_GEOIDS = {
     "egm96": KnownGeoid("EGM96", 5773, "EGM96 geoid", ("us_nga_egm96_15.tif", "egm96_15.gtx")),
     "egm2008": KnownGeoid("EGM2008", 3855, "EGM2008 geoid", ("us_nga_egm08_25.tif", "egm08_25.gtx")),
 }
@@ -68,7 +68,11 @@ class VerticalDatum:
         """The surface in words, for descriptions: "the ellipsoid", "the EGM96 geoid"."""
         if self.geoid is None:
             return "the ellipsoid"
-        return f"the {KNOWN[self.name].title} geoid" if self.name in KNOWN else f"the geoid of {self.geoid.path.name}"
+        return (
+            f"the {KNOWN_GEOIDS[self.name].title} geoid"
+            if self.name in KNOWN_GEOIDS
+            else f"the geoid of {self.geoid.path.name}"
+        )
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -191,7 +195,7 @@ def named_vertical_datum(given: str, option: str = "--vertical") -> VerticalDatu
     name = given.lower()
     if name == ELLIPSOID:
         return ELLIPSOIDAL
-    if name in KNOWN:
+    if name in KNOWN_GEOIDS:
         return _installed(name, f"{option} {given}", f"{option} FILE")
     geoid = GeoidRaster.open(Path(given))
     return VerticalDatum(given, geoid, _named(geoid.path))
@@ -212,7 +216,7 @@ def declared_vertical_datum(crs: CRS, path: Path, option: str) -> VerticalDatum:
     vertical = vertical_part(crs)
     if vertical is None:
         return ELLIPSOIDAL
-    for name, known in KNOWN.items():
+    for name, known in KNOWN_GEOIDS.items():
         if vertical.datum is not None and vertical.datum.name == known.datum:
             return _installed(name, f"{path} has {known.title} heights by its CRS, which", f"{option} FILE")
     raise InputError(
@@ -260,7 +264,7 @@ def proj_folders() -> list[Path]:
 
 def _installed(name: str, who: str, instead: str) -> VerticalDatum:
     """The datum of a geoid whose grid PROJ has on this machine. Nothing is downloaded."""
-    known = KNOWN[name]
+    known = KNOWN_GEOIDS[name]
     folders = proj_folders()
     for grid in known.grids:
         for folder in folders:

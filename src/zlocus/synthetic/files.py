@@ -106,7 +106,7 @@ def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None],
     ground = build_ground(spec, exposures_of(steady(spec)))
     write_truth(spec, ground, exposures, folder)
     described = {}
-    for exposure, numbers in exposed(spec, ground, exposures, progress):
+    for exposure, numbers in render_exposures(spec, ground, exposures, progress):
         view = exposure.view
         fit = fit_exposure(spec, exposure) if noise is None else None
         write_image(folder / image_name(view), numbers, None if fit is None else fit.rpc)
@@ -121,7 +121,7 @@ def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None],
     (folder / "scene.json").write_text(json.dumps(text, indent=1) + "\n")
 
 
-def exposed(
+def render_exposures(
     spec: SceneSpec, ground: SyntheticGround, exposures: tuple[Exposure, ...], progress: Callable[[str], None]
 ) -> Iterator[tuple[Exposure, NDArray[np.integer]]]:
     """Yield each exposure and its rendered image (r, c); images of rectified scanners are resampled to level 1."""

@@ -72,7 +72,7 @@ def write_linescan_views(
         lines[name] = focal_line(camera)
         comment = f"{camera.focal_m * 1e3:g} mm, {camera.pixel_m * 1e6:g} um; x to the right, y forward"
         rng = np.random.default_rng([spec.seed, NOISE_STREAM, index])
-        trajectory = noisy(sampled(camera, exposure.taken.shape[0]), noise, rng)
+        trajectory = with_noise(sampled_trajectory(camera, exposure.taken.shape[0]), noise, rng)
         write_trajectory(folder / f"trajectory_{view.name}.csv", trajectory, "s; m in the scene's frame; degrees")
         entries.append(ViewEntry(name=view.name, image=image_name(view), camera=_entry(spec, exposure, camera, name)))
     write_calibration(folder / FOCAL_PLANE, lines, comment, COLUMNS_WRITTEN)
@@ -93,7 +93,7 @@ def focal_line(camera: LineScanner) -> FocalLine:
     return FocalLine(np.column_stack([x_mm, np.full(DETECTORS, y_mm)]), 1e3 * camera.focal_m)
 
 
-def sampled(camera: LineScanner, n_rows: int, samples_per_s: float = SAMPLES_PER_S) -> Trajectory:
+def sampled_trajectory(camera: LineScanner, n_rows: int, samples_per_s: float = SAMPLES_PER_S) -> Trajectory:
     """The trajectory of a camera around an image of `n_rows` rows. Row 0, which is exposed last, is at 0 s."""
     interval = -camera.advance_m / SPEED_M_S
     start, end = interval * (n_rows + MARGIN_PX), -interval * MARGIN_PX
@@ -102,7 +102,7 @@ def sampled(camera: LineScanner, n_rows: int, samples_per_s: float = SAMPLES_PER
     return Trajectory(times, centres, np.ascontiguousarray(frame_from_camera.mT))
 
 
-def noisy(trajectory: Trajectory, noise: TrajectoryNoise, rng: np.random.Generator) -> Trajectory:
+def with_noise(trajectory: Trajectory, noise: TrajectoryNoise, rng: np.random.Generator) -> Trajectory:
     """The trajectory with random errors added."""
     times = trajectory.times
     n_knots = max(int(np.ceil((times[-1] - times[0]) / noise.every_s)), 3) + 1

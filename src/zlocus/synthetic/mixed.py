@@ -12,7 +12,7 @@ from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.scene_file import ViewEntry
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
-from zlocus.synthetic.files import exposed, fit_exposure, new_folder, write_image
+from zlocus.synthetic.files import fit_exposure, new_folder, render_exposures, write_image
 from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
 from zlocus.synthetic.scenes import (
     ADS40_VIEWS,
@@ -24,7 +24,7 @@ from zlocus.synthetic.scenes import (
     area_corners,
     build_ground,
     exposures_of,
-    placed,
+    first_pixel_and_shape,
     steady,
 )
 from zlocus.synthetic.truth import write_truth
@@ -61,7 +61,7 @@ def _photograph(spec: SceneSpec, number: int) -> Exposure:
     centre = (east, north, (low + high) / 2 + ABOVE_GROUND_M)
     camera = FrameModel(centre, rotation_from_angles(*TILTS_DEG[number]), FOCAL_PX, (0.0, 0.0))
     view = ViewSpec(f"p{number + 1}", 0.0, 0.0, optics=FRAME_OPTICS)
-    first, shape = placed(camera.image_from_ground(area_corners(spec)))
+    first, shape = first_pixel_and_shape(camera.image_from_ground(area_corners(spec)))
     return Exposure(view, camera.moved(-first[0], -first[1]), shape)
 
 
@@ -88,7 +88,7 @@ def render_mixed_scene(
             "frame": tuple(_frame_entry(exposure) for exposure in exposures["frame"]),
             "rpc": tuple(_rpc_entry(exposure) for exposure in exposures["rpc"]),
         }
-        for exposure, numbers in exposed(spec, ground, sum(exposures.values(), ()), progress):
+        for exposure, numbers in render_exposures(spec, ground, sum(exposures.values(), ()), progress):
             fit = fit_exposure(spec, exposure) if exposure in exposures["rpc"] else None
             write_image(part / image_name(exposure.view), numbers, None if fit is None else fit.rpc)
         for kind, views in (*entries.items(), ("mixed", sum(entries.values(), ()))):

@@ -167,7 +167,7 @@ def _lattice(rows: FloatArray, cols: FloatArray) -> FloatArray:
     return np.column_stack([col.ravel(), row.ravel()])
 
 
-def seen_from(ground: SyntheticGround, sensor: SensorModel, xy: FloatArray) -> FloatArray:
+def visible_ground_points(ground: SyntheticGround, sensor: SensorModel, xy: FloatArray) -> FloatArray:
     """Ground points (n, 3) m seen at image positions (n, 2) px; NaN where a ray misses the ground."""
     lower, upper = _enclosing(ground)
     start, end = (_field_from_image(ground, sensor, xy, z) for z in (upper, lower))

@@ -207,7 +207,7 @@ def exposures_of(spec: SceneSpec) -> tuple[Exposure, ...]:
         if isinstance(camera, LineScanner) and spec.level == 1:
             result.append(_level_1(view, camera, middle, corners))
             continue
-        first, shape = placed(camera.image_from_ground(corners))
+        first, shape = first_pixel_and_shape(camera.image_from_ground(corners))
         result.append(Exposure(view, replace(camera, centre=(-first[0], -first[1])), shape))
     return tuple(result)
 
@@ -220,7 +220,7 @@ def area_corners(spec: SceneSpec) -> FloatArray:
     ])  # fmt: skip
 
 
-def placed(xy: FloatArray) -> tuple[tuple[float, float], tuple[int, int]]:
+def first_pixel_and_shape(xy: FloatArray) -> tuple[tuple[float, float], tuple[int, int]]:
     """First pixel (column, row) and shape (rows, columns) of an image that holds positions (n, 2) px with a border."""
     first = np.floor(xy.min(axis=0)) - BORDER_PX
     cols, rows = np.ceil(xy.max(axis=0)) + BORDER_PX + 1 - first
@@ -232,14 +232,14 @@ def _level_1(view: ViewSpec, camera: LineScanner, middle: tuple[float, float, fl
     forward, right = LEVEL_1_M * np.array(axes_of_heading(view.heading_deg))
     around_middle = Affine(right[0], -forward[0], middle[0], right[1], -forward[1], middle[1])
     rectified = RectifiedScanner(camera, (0, 0), middle[2], around_middle)
-    first, shape = placed(rectified.image_from_ground(corners))
+    first, shape = first_pixel_and_shape(rectified.image_from_ground(corners))
     rectified = replace(rectified, plane_from_image=around_middle * Affine.translation(*first))
     rows, cols = np.arange(shape[0]), np.arange(shape[1])
     outline = np.concatenate([
         *(np.column_stack([np.full(shape[0], col), rows]) for col in (0, shape[1] - 1)),
         *(np.column_stack([cols, np.full(shape[1], row)]) for row in (0, shape[0] - 1)),
     ])  # fmt: skip
-    first, raw_shape = placed(rectified.raw_from_image(outline))
+    first, raw_shape = first_pixel_and_shape(rectified.raw_from_image(outline))
     raw = replace(camera, centre=(-first[0], -first[1]))
     return Exposure(view, replace(rectified, raw_camera=raw, raw_shape=raw_shape), shape)
 

@@ -28,7 +28,7 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Ex
     """
     known: NDArray[np.bool_] | None = None
     if spec.whole_truth:
-        known = n_showing(ground, exposures) >= 2
+        known = n_images_showing(ground, exposures) >= 2
         rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         cells = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
     else:
@@ -52,7 +52,7 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Ex
             file.set_band_description(1, description)
 
 
-def n_showing(ground: SyntheticGround, exposures: Sequence[Exposure]) -> NDArray[np.uint8]:
+def n_images_showing(ground: SyntheticGround, exposures: Sequence[Exposure]) -> NDArray[np.uint8]:
     """Number of images inside whose borders each cell of the ground lies, (r, c) uint8, occluded or not."""
     count = np.zeros(ground.heights.shape, np.uint8)
     for exposure in exposures:
