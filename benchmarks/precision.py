@@ -149,8 +149,8 @@ def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
     kind = kinds(truth)
     parts = []
     for window, core, predictors, is_refined, scene in tiles:
-        col = np.floor((xy[:, 0] - scene.anchor[0]) / scene.cell_m).astype(int)
-        row = np.floor((scene.anchor[1] - xy[:, 1]) / scene.cell_m).astype(int)
+        col = np.floor((xy[:, 0] - scene.anchor[0]) / scene.cell_size).astype(int)
+        row = np.floor((scene.anchor[1] - xy[:, 1]) / scene.cell_size).astype(int)
         inside = np.isfinite(errors)
         for at, first, n in ((row, core.row, core.rows), (col, core.col, core.cols),
                              (row, window.row, window.rows), (col, window.col, window.cols)):  # fmt: skip

@@ -15,7 +15,7 @@ from zlocus.core.options import CostOptions, OrientationOptions, PyramidOptions,
 from zlocus.core.scene import ImageWindow, Scene, View
 from zlocus.matching.image_space import (
     BORDER_PX,
-    BY_DEPTH,
+    DEPTH_DEFAULTS,
     END_STEPS,
     BorderedImage,
     beyond_range,
@@ -74,8 +74,8 @@ def test_disparities_are_those_of_the_longest_base():
 def test_a_step_is_half_a_pixel_in_the_most_sensitive_image():
     space = image_space(row_of_frames(0.0, 1.0, 3.0), "v0", (0.0, 0.0))
     match_scene = build_image_match_scene(space, (4.0, 20.0), NO_TIES, PyramidOptions())
-    assert match_scene.step_m == pytest.approx(0.5)
-    assert match_scene.origin_m == pytest.approx(4.0 - END_STEPS * 0.5)
+    assert match_scene.height_step == pytest.approx(0.5)
+    assert match_scene.height_origin == pytest.approx(4.0 - END_STEPS * 0.5)
     assert match_scene.n_steps == 32 + 2 * END_STEPS
     assert (match_scene.overlap_window.row, match_scene.overlap_window.col) == (0, 0)
     assert match_scene.overlap_window.rows >= 60
@@ -91,7 +91,7 @@ def test_satellites_are_asked_for_heights_in_ground_pixels():
     match_scene = build_image_match_scene(space, (-20.0, 20.0), NO_TIES, PyramidOptions())
     # The aft image looks 18 degrees apart along the track and 7 across: a ground pixel of height shifts it so much.
     along, across = np.tan(np.deg2rad([1.0, -3.0])) - np.tan(np.deg2rad([-17.0, 4.0]))
-    assert match_scene.step_m == pytest.approx(0.5 / np.hypot(along, across), rel=0.05)
+    assert match_scene.height_step == pytest.approx(0.5 / np.hypot(along, across), rel=0.05)
 
 
 def test_the_first_pixel_is_the_first_cell():
@@ -146,7 +146,7 @@ def test_turned_images_are_tabulated_in_smaller_blocks():
     match_scene = build_image_match_scene(space, (10.0, 40.0), NO_TIES, PyramidOptions())
     assert fitting_block([match_scene], 32) in (8, 16)
     # Beyond what is in front of both cameras nothing helps.
-    assert fitting_block([replace(match_scene, origin_m=-2000.0, n_steps=8000)], 32) is None
+    assert fitting_block([replace(match_scene, height_origin=-2000.0, n_steps=8000)], 32) is None
 
 
 def test_the_widest_search_ends_where_no_other_view_sees():
@@ -158,11 +158,11 @@ def test_the_widest_search_ends_where_no_other_view_sees():
 
 def test_options_that_were_changed_stay():
     plain = depth_options(RunConfig())
-    for stage, values in BY_DEPTH.items():
+    for stage, values in DEPTH_DEFAULTS.items():
         assert {name: getattr(getattr(plain, stage), name) for name in values} == values
     mine = RunConfig(cost=CostOptions(occluded_pairs_excluded=0.25))
     assert depth_options(mine).cost.occluded_pairs_excluded == 0.25
-    assert depth_options(mine).cost.large_window == BY_DEPTH["cost"]["large_window"]
+    assert depth_options(mine).cost.large_window == DEPTH_DEFAULTS["cost"]["large_window"]
 
 
 @pytest.mark.parametrize("side", [3, 5, 7])

@@ -87,8 +87,8 @@ def test_the_match_scene_of_two_views():
     ties = np.random.default_rng(1).uniform(-20, 20, (60, 3)) + np.array([*CENTRE, 60.0])
     match_scene = build_match_scene(views, 0.5, (0.0, 0.0), (30.0, 90.0), ties, None, PyramidOptions())
     assert match_scene.views[0].name == "n"
-    assert match_scene.n_steps == np.ceil(60 / match_scene.step_m)
-    assert match_scene.origin_m == 30.0
+    assert match_scene.n_steps == np.ceil(60 / match_scene.height_step)
+    assert match_scene.height_origin == 30.0
     assert match_scene.grey_scales == grey_scales(match_scene.views, ties)
     assert match_scene.grey_scales != grey_scales(match_scene.views, ties[:0])
     transform = match_scene.transform(CellWindow(-4, 6, 3, 3), 2)

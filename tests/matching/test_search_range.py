@@ -35,9 +35,9 @@ def search_range(second_at, margin_at, ties=(), side=3, winner_at=20):
     some = np.s_[10 : 10 + side, 12 : 12 + side]
     second[some], margin[some], winner_takes_all[some] = second_at, margin_at, winner_at
     match_scene = SimpleNamespace(
-        ties=np.array(ties, float).reshape(-1, 3), cell_m=0.5, anchor=(1000.0, 2000.0), origin_m=10.0, step_m=0.25
+        ties=np.array(ties, float).reshape(-1, 3), cell_size=0.5, anchor=(1000.0, 2000.0), height_origin=10.0, height_step=0.25
     )
-    level = SimpleNamespace(window=CellWindow(0, 0, 40, 40), number=1, origin_m=10.0, step_m=0.5)
+    level = SimpleNamespace(window=CellWindow(0, 0, 40, 40), number=1, height_origin=10.0, height_step=0.5)
     return range_from_coarser(
         match_scene, coarse_result(best, second, margin, winner_takes_all, coarse), level, OPTIONS
     )

@@ -1,4 +1,4 @@
-"""One cell explained: what the rasters say of it, and its match, by the functions that the run is made of."""
+"""Explanation of one cell: its values in the rasters, and its match, computed by the functions of the run."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from zlocus.products.match_curve_figures import STRETCH_PERCENT
 from zlocus.products.point_report import Locus, PointReport, loci, point_record, what_order_rests_on, where_it_stops
 from zlocus.products.report.maps import data_uri
 
-# Cells a side that are shown around a window, most first: an image's end may cut the larger ones.
+# Sides of the patch shown around a correlation window, in cells. The smaller one is used near the edge of an image.
 SHOWN_SIDES = (25, 15)
-BLACK, BRIGHT = 1, 255  # 0: not shown by the image
+DARKEST_GREY, BRIGHTEST_GREY = 1, 255  # 0: not covered by the image
 
 
 @dataclass(frozen=True)
 class WhatIf:
-    """What is place_curves at otherwise than in the run. left_out : names of images; reference : name of the image to be it;
+    """What the match of a cell uses otherwise than the run. left_out : names of images; reference : name of the image to be it;
     window : side of the window, cells; selection : options of `SelectionOptions` by name."""
 
     left_out: frozenset[str] = frozenset()
@@ -42,12 +42,12 @@ class WhatIf:
     selection: Mapping[str, Any] = field(default_factory=dict)
 
     def config(self, config: RunConfig) -> RunConfig:
-        """The options of the run with those that are changed.
+        """The options of the run, with the changes.
 
         Raises
         ------
         ConfigError
-            One is out of range.
+            A changed option is out of range.
         """
         changed = replace(config, selection=replace(config.selection, **self.selection))
         if self.window is None:
@@ -55,27 +55,28 @@ class WhatIf:
         return replace(changed, cost=replace(changed.cost, large_window=self.window))
 
     def scene(self, match_scene: MatchScene) -> MatchScene:
-        """The scene without the images left out.
+        """The match scene without the images that are left out.
 
         Raises
         ------
         ConfigError
-            An image that is not in it.
+            An image is not in the scene, or the reference image is left out.
         """
         names = [view.name for view in match_scene.views]
         unknown = (self.left_out | ({self.reference} if self.reference else set())) - set(names)
         if unknown:
             raise ConfigError(f"This surface has no image {min(unknown)[:60]!r}.")
         if self.reference in self.left_out:
-            raise ConfigError(f"{self.reference} is the reference, and switched off. Choose another reference.")
+            raise ConfigError(f"{self.reference} is the reference image, and it is switched off. Choose another reference image.")
         kept = [i for i, name in enumerate(names) if name not in self.left_out]
-        return replace(match_scene, views=tuple(match_scene.views[i] for i in kept), grey_scales=tuple(match_scene.grey_scales[i] for i in kept))
+        views = tuple(match_scene.views[i] for i in kept)
+        return replace(match_scene, views=views, grey_scales=tuple(match_scene.grey_scales[i] for i in kept))
 
 
 def cell_record(folder: SurfaceFolder, reference: Reference | None, row: int, col: int) -> dict[str, Any]:
-    """What the rasters say of a cell; heights are NaN where there is none."""
+    """Values of a cell in the rasters; heights are NaN where there is none."""
     cell = folder.cell(row, col)
-    x, y = folder.middle_of(row, col)
+    x, y = folder.centre_of(row, col)
     record = {
         "row": row, "col": col, "x": float(x), "y": float(y), "height_m": cell["dsm"],
         "sigma_m": cell["sigma"], "n_images": cell["views"], "quality": cell["quality"],
@@ -87,32 +88,32 @@ def cell_record(folder: SurfaceFolder, reference: Reference | None, row: int, co
 
 
 def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: WhatIf) -> dict[str, Any]:
-    """How a cell is matched, with all that the page draws of it.
+    """Match of a cell with everything that the page draws.
 
-    xy : (2,) m, its middle; height_m : of the surface there, NaN without one. All heights are above what those of the
-    surface are.
+    xy : (2,) m, its centre; height_m : of the surface there, NaN without one. All heights of the record have the
+    vertical datum of the surface.
 
     Raises
     ------
     GeometryError
-        Fewer than two of the images show it.
+        Fewer than two of the images show the cell.
     ConfigError
         See `WhatIf`.
     """
-    matched, config = restored.run, what_if.config(restored.config)
-    place = place_of_cell(xy, height_m, matched)
-    match_scene = what_if.scene(matched.match_scene)
+    run, config = restored.run, what_if.config(restored.config)
+    place = place_of_cell(xy, height_m, run)
+    match_scene = what_if.scene(run.match_scene)
     if len(match_scene.views) < 2:
-        raise GeometryError("Two images are needed at least. Switch another one on.")
+        raise GeometryError("At least two images are needed. Switch on another one.")
     try:
         place_curves = curves_at("The cell", what_if.reference, match_scene, place, config, SHOWN_WITHIN_CELLS)
     except GeometryError as error:
         raise GeometryError(why_not_shown(what_if)) from error
-    report = PointReport.of("the cell", place_curves, match_scene, matched.scene.crs)
+    report = PointReport.of("the cell", place_curves, match_scene, run.scene.crs)
     images = image_records(place_curves, loci(place_curves.views, report))
-    below = float(matched.undulation(xy[None])[0])
+    undulation_m = float(run.undulation(xy[None])[0])
     report = replace(
-        report, heights_m=report.heights_m - below, peak_m=report.peak_m - below, xyz=report.xyz - (0.0, 0.0, below)
+        report, heights_m=report.heights_m - undulation_m, peak_m=report.peak_m - undulation_m, xyz=report.xyz - (0.0, 0.0, undulation_m)
     )
     curves, options = report.curves, config.selection
     return {
@@ -129,23 +130,23 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
 
 
 def why_not_shown(what_if: WhatIf) -> str:
-    """Why a cell has no curves, in a sentence."""
+    """Why a cell has no match curves, in a sentence."""
     if what_if.reference is not None:
-        return f"{what_if.reference} does not show this cell, or no other image does. Choose another reference."
+        return f"{what_if.reference} does not show this cell, or no other image does. Choose another reference image."
     return NOT_SHOWN + (" Some are switched off." if what_if.left_out else "")
 
 
-def image_records(place_curves: PlaceCurves, found: list[Locus]) -> list[dict[str, Any]]:
-    """What each image shows of a place, the reference first: a crop with the locus, and windows at every height."""
+def image_records(place_curves: PlaceCurves, loci_of_images: list[Locus]) -> list[dict[str, Any]]:
+    """What each image shows of a cell, the reference image first: a crop with the locus, and patches at every height."""
     names = [view.name for view in place_curves.views]
-    middle, large, less = len(place_curves.heights_m) // 2, place_curves.patches(SHOWN_SIDES[0]), None
+    middle, large, small = len(place_curves.heights_m) // 2, place_curves.patches(SHOWN_SIDES[0]), None
     records = []
-    for locus in found:
+    for locus in loci_of_images:
         i = names.index(locus.name)
         side, patches = SHOWN_SIDES[0], large[i]
         if not np.isfinite(patches[middle]).all():
-            less = place_curves.patches(SHOWN_SIDES[1]) if less is None else less
-            side, patches = SHOWN_SIDES[1], less[i]
+            small = place_curves.patches(SHOWN_SIDES[1]) if small is None else small
+            side, patches = SHOWN_SIDES[1], small[i]
         records.append(
             {
                 "image": locus.name, "crop": data_uri(encoded(stretched(locus.grey)), "image/png"),
@@ -158,7 +159,7 @@ def image_records(place_curves: PlaceCurves, found: list[Locus]) -> list[dict[st
 
 
 def neighbour_records(place_curves: PlaceCurves, match_scene: MatchScene, config: RunConfig) -> dict[str, Any]:
-    """The tie points that order the images, on the ground, with their labels."""
+    """The tie points on which the order of the images rests, with their positions and labels."""
     order, options = place_curves.curves.order, config.selection
     xy = match_scene.anchor + order.xy * match_scene.cell_size * (1.0, -1.0)
     return {
@@ -171,13 +172,13 @@ def neighbour_records(place_curves: PlaceCurves, match_scene: MatchScene, config
 
 
 def stretched(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Grey values of any shape as uint8 from `BLACK` to `BRIGHT`, 0 where not known."""
+    """Grey values of any shape as uint8 from `DARKEST_GREY` to `BRIGHTEST_GREY`, 0 where unknown."""
     known = np.isfinite(values)
     low, high = np.percentile(values[known], STRETCH_PERCENT) if known.any() else (0.0, 1.0)
     share = np.clip((np.nan_to_num(values) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
-    return np.where(known, np.rint(BLACK + (BRIGHT - BLACK) * share), 0).astype(np.uint8)
+    return np.where(known, np.rint(DARKEST_GREY + (BRIGHTEST_GREY - DARKEST_GREY) * share), 0).astype(np.uint8)
 
 
 def encoded(grey: NDArray[np.uint8]) -> bytes:
-    """A grey picture as PNG."""
+    """A grey picture (r, c) as PNG."""
     return bytes(cv2.imencode(".png", grey)[1].tobytes())

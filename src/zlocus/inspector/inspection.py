@@ -1,4 +1,4 @@
-"""A surface that is being looked at: what is known of it at once, and what is made ready meanwhile."""
+"""The surface that the page shows: what is known of it at once, and what is prepared in the background."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from zlocus.core.parallel import submitted
 from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
-from zlocus.inspector.queries import KINDS, MOST, WINDOWS
+from zlocus.inspector.queries import KINDS, MAX_VALUES, WINDOWS
 from zlocus.inspector.reference import Reference, check_comparison, reference_for
 from zlocus.inspector.restored_run import Restored, config_of, restored
 from zlocus.io.run_record import read_record
@@ -29,22 +29,22 @@ from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.report.page import KIND_WORDS
 
 T = TypeVar("T")
-FEWEST_LEVEL_CELLS = 128
-# Tie points at which a first match is tried.
-WARM_PLACES = 8
+MIN_LEVEL_CELLS = 128
+# A first match, which compiles the kernels, is tried at this many tie points.
+WARM_UP_PLACES = 8
 NOT_THE_SAME = (
-    "Cameras or grey values came out otherwise than in the run: an image has changed since, or this is another "
-    "machine. Curves may differ from those that the surface rests on."
+    "Cameras or grey values differ from those of the run: an image has changed since, or this is another machine. "
+    "Match curves may differ from those of the run."
 )
-NOT_KNOWN = "The run did not keep what tells whether cameras come out again as they were."
-MADE_AGAIN = "The surface was made again, or removed, since this page was opened. Start `zlocus inspect` anew."
-# Options that nothing of a single cell depends on.
-OF_RUNS = ("stopped_share", "min_images_for_choice")
+NOT_KNOWN = "The run did not record its fingerprint, so it is not known whether the cameras are the same as in the run."
+MADE_AGAIN = "The surface was made again, or removed, after this page was opened. Start `zlocus inspect` again."
+# Options that have no effect on a single cell.
+OPTIONS_OF_RUNS = ("stopped_share", "min_images_for_choice")
 
 
 @dataclass
-class Told:
-    """What the opening of a scene says last, as a `Progress`."""
+class OpeningProgress:
+    """Latest progress of the opening of a scene, as a text; a `Progress`."""
 
     text: str = ""
     _name: str = ""
@@ -52,7 +52,7 @@ class Told:
     _done: float = 0.0
 
     @contextmanager
-    def stage(self, name: str, total: float | None = None) -> Iterator[Told]:
+    def stage(self, name: str, total: float | None = None) -> Iterator[OpeningProgress]:
         """See `Progress`."""
         self.text, self._name, self._total, self._done = name, name, total, 0.0
         yield self
@@ -71,37 +71,37 @@ class Told:
 
 
 class Inspection:
-    """A surface and its scene, which is opened in the background, as is the comparison with a reference.
+    """A surface, its scene and its comparison with a reference; the latter two are prepared in the background.
 
-    As a context it opens the scene, and removes at the end what it keeps on disk.
+    The preparation starts when the context is entered. Temporary files are removed when it ends.
 
-    comparison : with a reference; may_ask : whether images on a server are asked for.
+    comparison : with a reference, or None; may_read_remote : whether images on a server may be read.
 
     Raises
     ------
     InputError
-        There is no complete surface in the folder, or no reference.
+        There is no complete surface in the folder, or the reference is missing.
     """
 
-    def __init__(self, out: Path, comparison: Comparison | None = None, may_ask: bool = False) -> None:
+    def __init__(self, out: Path, comparison: Comparison | None = None, may_read_remote: bool = False) -> None:
         self.folder: SurfaceFolder = surface_folder(out)
         self._state = self._now()
         if comparison is not None:
             check_comparison(comparison)
-        self._may_ask, self._told = may_ask, Told()
+        self._may_read_remote, self._opening_progress = may_read_remote, OpeningProgress()
         self.layers: dict[str, Layer] = layers_of(self.folder)
         self.comparison = comparison
         self._scene: Future[Restored] = Future()
         self._reference: Future[Reference] | None = None
         self._stack = ExitStack()
-        # One match at a time: each takes all that the machine has.
+        # One match at a time, because each uses the whole machine.
         self._matching = threading.Lock()
 
     def __enter__(self) -> Inspection:
         scratch = TemporaryDirectory(prefix="zlocus-inspect-", ignore_cleanup_errors=True)
         self._stack.enter_context(scratch)
         threads = ThreadPoolExecutor(2, "inspect")
-        # Who interrupts does not wait for a scene to open, see `zlocus.core.parallel.is_busy`.
+        # An interruption does not wait until the scene is open, see `zlocus.core.parallel.is_busy`.
         self._stack.callback(threads.shutdown, wait=False, cancel_futures=True)
         self._scene = submitted(threads, self._open)
         if self.comparison is not None:
@@ -114,14 +114,14 @@ class Inspection:
         self._stack.close()
 
     def _open(self) -> Restored:
-        found = restored(self.folder.out, self.folder.run, self._may_ask, self._told)
-        # Kernels are compiled, or loaded, before anyone waits for them.
-        for xy in found.run.ties[:: len(found.run.ties) // WARM_PLACES + 1, :2]:
+        found = restored(self.folder.out, self.folder.run, self._may_read_remote, self._opening_progress)
+        # Compile or load the kernels before a user waits for them.
+        for xy in found.run.ties[:: len(found.run.ties) // WARM_UP_PLACES + 1, :2]:
             try:
                 match_record(found, xy, math.nan, WhatIf())
                 break
             except Exception:
-                continue  # too few images there, or a place that is none: nothing depends on it
+                continue  # Too few images show this place; any other one will do.
         return found
 
     def _compare(self, comparison: Comparison, scratch: Path) -> Reference:
@@ -129,24 +129,23 @@ class Inspection:
 
     @property
     def reference(self) -> Reference | None:
-        """What the surface is compared with, once it is ready."""
+        """The reference, once it is ready; None before, and without one."""
         return _done(self._reference)
 
     def layer(self, name: str) -> Layer | None:
-        """A layer by its name, None of one that is not there, or not yet."""
+        """A layer by its name; None where it does not exist, or does not exist yet."""
         if name == "difference" and (reference := self.reference) is not None:
             return difference_layer(self.folder, reference)
         return self.layers.get(name)
 
     def state(self) -> dict[str, Any]:
-        """How far what is made in the background is: of scene and reference "opening", "ready" or "failed", with the
-        reason; notes : what is to be known of them."""
+        """State of scene and reference: "opening", "ready" or "failed" with the reason; and notes for the user."""
         state: dict[str, Any] = {"scene": _progress(self._scene), "notes": []}
         if self._reference is not None:
             state["reference"] = _progress(self._reference)
         scene, reference = _done(self._scene), self.reference
         if state["scene"]["is"] == "opening":
-            state["scene"]["what"] = self._told.text
+            state["scene"]["what"] = self._opening_progress.text
         if scene is not None and not scene.is_same:
             state["notes"].append(NOT_KNOWN if scene.is_same is None else NOT_THE_SAME)
         if self._now() != self._state:
@@ -158,7 +157,7 @@ class Inspection:
         return state
 
     def cell(self, x: float, y: float, what_if: WhatIf) -> dict[str, Any]:
-        """What is to be said of the cell at a ground point, m; of the match as soon as the scene is open.
+        """Record of the cell at a ground point, m; with its match as soon as the scene is open.
 
         Raises
         ------
@@ -177,49 +176,50 @@ class Inspection:
             return record | {"error": said(error)}
         try:
             with self._matching:
-                match = match_record(self._scene.result(), self.folder.middle_of(*at), record["height_m"], what_if)
+                match = match_record(self._scene.result(), self.folder.centre_of(*at), record["height_m"], what_if)
         except (GeometryError, InputError) as error:
             return record | {"error": str(error)}
         return record | {"match": match}
 
     def check_unchanged(self) -> None:
-        """Refuse to look at a surface that is no more the one that was opened.
+        """Refuse requests after the surface has changed.
 
         Raises
         ------
         InputError
-            It was made again, or removed.
+            The surface was made again, or removed.
         """
         if self._now() != self._state:
             raise InputError(MADE_AGAIN)
 
     def _now(self) -> tuple[int, int] | None:
-        """What tells whether the run is still the one that was opened."""
+        """Time and size of run.json, by which a change of the surface is noticed; None where it is missing."""
         try:
-            found = (self.folder.out / RECORD).stat()
+            status = (self.folder.out / RECORD).stat()
         except OSError:
             return None
-        return found.st_mtime_ns, found.st_size
+        return status.st_mtime_ns, status.st_size
 
     def summary(self) -> dict[str, Any]:
-        """What the page has to know before it shows anything."""
+        """What the page needs before it can show anything."""
         folder, run = self.folder, self.folder.run
         try:
             config = config_of(folder.out, run)
         except ConfigError:
-            config = RunConfig()  # the scene does not open then, and says why
+            config = RunConfig()  # The opening of the scene fails then, with the reason.
         rows, cols = folder.shape
         return {
             "title": folder.out.resolve().name, "shape": [rows, cols], "transform": list(folder.transform)[:6],
-            "crs": "a local frame" if folder.is_local else folder.crs.name, "above": folder.above,
+            "crs": "a local frame" if folder.is_local else folder.crs.name, "height_name": folder.height_name,
             "axes": ["x", "y"] if folder.is_local else ["E", "N"],
-            "levels": max(math.ceil(math.log2(max(rows, cols) / FEWEST_LEVEL_CELLS)), 0),
+            "levels": max(math.ceil(math.log2(max(rows, cols) / MIN_LEVEL_CELLS)), 0),
             "layers": [
                 {"name": layer.name, "title": layer.title, "legend": layer.legend} for layer in self.layers.values()
             ],
             "made": run.get("created", ""),
             "images": list(run["orientation"]["views"]), "method": run["config"]["request"]["method"],
-            "small_window": config.cost.small_window, "max_images_for_large_window": config.cost.max_images_for_large_window,
+            "small_window": config.cost.small_window,
+            "max_images_for_large_window": config.cost.max_images_for_large_window,
             "min_images_for_choice": config.selection.min_images_for_choice, "views": run["config"]["request"]["views"],
             "options": options_record(config.selection),
             "window": {"value": large_window_side(config.cost), "choices": list(WINDOWS)},
@@ -227,7 +227,7 @@ class Inspection:
         }  # fmt: skip
 
     def _cells(self) -> list[dict[str, Any]]:
-        """Cells that the report shows, to begin with."""
+        """The example cells of the report."""
         path = self.folder.out / CURVES
         if not path.exists():
             return []
@@ -239,15 +239,15 @@ class Inspection:
 
 
 def options_record(selection: SelectionOptions) -> list[dict[str, Any]]:
-    """Options of the selection as the page asks for them."""
+    """Options of the selection as the page offers them."""
     return [
         {
             "name": f.name, "doc": f.metadata["doc"], "value": getattr(selection, f.name), "low": f.metadata["low"],
-            "high": MOST.get(f.name, f.metadata["high"]), "choices": f.metadata["choices"], "unit": f.metadata["unit"],
+            "high": MAX_VALUES.get(f.name, f.metadata["high"]), "choices": f.metadata["choices"], "unit": f.metadata["unit"],
             "is_whole": KINDS[f.name] is int,
         }
         for f in fields(selection)
-        if f.name not in OF_RUNS
+        if f.name not in OPTIONS_OF_RUNS
     ]  # fmt: skip
 
 
@@ -259,13 +259,13 @@ def _progress(future: Future[Any]) -> dict[str, Any]:
 
 
 def _failure(future: Future[Any]) -> Exception | None:
-    """Why a future that is done failed, None where it did not."""
+    """Error of a future that is done; None where it succeeded."""
     error = future.exception()
     return error if isinstance(error, Exception) else None
 
 
 def _done(future: Future[T] | None) -> T | None:
-    """What a future gave, None before or where it failed."""
+    """Result of a future; None before it is done, and where it failed."""
     if future is None or not future.done() or future.exception() is not None:
         return None
     return future.result()

@@ -75,7 +75,7 @@ def refined_surface(tile: TileInputs, result: LevelResult, border: BorderGround)
     sigma = sigma_steps(predictors, refined)
     is_noise = border.is_near(result.level.window) & (spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps)
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)
-    sigma *= np.float32(match_scene.step_m)
+    sigma *= np.float32(match_scene.height_step)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
     n_images = np.where(np.isnan(height), 0, n_views).astype(np.uint8)
@@ -107,7 +107,7 @@ def ortho_of_surface(
     *coarser_results, finest = results
     lattice, config = finest.lattice, tile.config
     is_filled = (surface.quality & np.uint16(Quality.FILLED)) != 0
-    of_filled = (surface.height - np.float32(lattice.origin_m)) / np.float32(lattice.step_m)
+    of_filled = (surface.height - np.float32(lattice.height_origin)) / np.float32(lattice.height_step)
     lattice_index = np.where(is_filled, of_filled, lattice_index)
     coarser = [CoarserHeights(r.level.number, r.level.window, r.heights.vertex) for r in reversed(coarser_results)]
     around = what_stands_around(coarser, finest.tile_views, finest.level.window, lattice_index, config.pyramid.halo)

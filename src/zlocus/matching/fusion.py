@@ -10,7 +10,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from zlocus.matching.image_space import MatchedImage, difference
+from zlocus.matching.image_space import MatchedImage, hypothesis_differences
 from zlocus.matching.kernels.rasterise import agreed_heights, draw_image
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
@@ -24,7 +24,7 @@ MARGIN_PX = 3
 # Along a side of the cells, and of their heights, at which they are looked for in an image: outlines may be bent there.
 SAMPLES, HEIGHT_SAMPLES = 9, 3
 Numbers = NDArray[np.floating[Any]]
-WHY_PIXELS_ARE_EMPTY = Quality.HIDDEN | Quality.RANGE_END | Quality.NO_MATCH | Quality.UNCONFIRMED
+WHY_PIXELS_ARE_EMPTY = Quality.OCCLUDED | Quality.RANGE_END | Quality.NO_MATCH | Quality.INCONSISTENT
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def drawn(one: PixelHeights, pixels: Surface, cells: Cells) -> Surface:
     if not hypotheses.size:
         ortho = np.full(cells.shape + pixels.ortho.shape[2:], np.nan, np.float32)
         return Surface(height, height, np.zeros(cells.shape, np.uint16), np.zeros(cells.shape, np.uint8), ortho)
-    ground = one.image.space.ground(block[0].start, hypotheses, block[1].start)
+    ground = one.image.image_space.ground(block[0].start, hypotheses, block[1].start)
     sigma = pixels.sigma[block] * np.float32(one.step_m / one.step)
     ground[..., 0], ground[..., 1] = on_ground(~cells.transform, ground[..., 0], ground[..., 1])
     side = one.pixel_m / cells.transform.a
@@ -139,8 +139,8 @@ def why_empty(images: Sequence[PixelHeights], cells: Cells, height: NDArray[np.f
     """Reasons of the cells without a height, in their order, (n,) uint16, each at least one.
 
     A cell would have the height of the nearest cell that has one. It is UNSEEN where fewer than two images show that
-    place; else it has the reasons of the pixels there, and is HIDDEN where fewer than two are left that show nothing
-    nearer, or where all pixels there show another place. LEFT_OUT of any pixel there is kept beside them.
+    place; else it has the reasons of the pixels there, and is OCCLUDED where fewer than two are left that show nothing
+    nearer, or where all pixels there show another place. IMAGE_EXCLUDED of any pixel there is kept beside them.
     """
     empty = np.isnan(height)
     if empty.all():
@@ -157,12 +157,12 @@ def why_empty(images: Sequence[PixelHeights], cells: Cells, height: NDArray[np.f
         row, col, inside = _pixels_at(one.image, ground)
         found = np.where(inside, one.surface.quality[row, col], np.uint16(0))
         shows = inside & ((found & np.uint16(Quality.UNSEEN)) == 0)
-        nearer = np.nan_to_num(difference(one.image, ground)) > AGREE_STEPS * one.step
+        nearer = np.nan_to_num(hypothesis_differences(one.image, ground)) > AGREE_STEPS * one.step
         showing += shows
         open_ += shows & ~nearer
         reasons |= np.where(shows & ~nearer, found & np.uint16(WHY_PIXELS_ARE_EMPTY), np.uint16(0))
-        left_out |= found & np.uint16(Quality.LEFT_OUT)
-    reasons[(open_ < 2) | (reasons == 0)] |= np.uint16(Quality.HIDDEN)
+        left_out |= found & np.uint16(Quality.IMAGE_EXCLUDED)
+    reasons[(open_ < 2) | (reasons == 0)] |= np.uint16(Quality.OCCLUDED)
     return np.where(showing < 2, np.uint16(Quality.UNSEEN), reasons) | left_out
 
 
@@ -177,7 +177,7 @@ def _pixels_of(image: MatchedImage, cells: Cells) -> tuple[slice, slice]:
     rows, cols = cells.shape
     spans = ((0.0, cols, SAMPLES), (0.0, rows, SAMPLES), (*cells.z_range, HEIGHT_SAMPLES))
     across, down, z = (v.ravel() for v in np.meshgrid(*(np.linspace(*span) for span in spans)))
-    at = image.space.frame_from_ground(np.column_stack([*on_ground(cells.transform, across, down), z]))
+    at = image.image_space.frame_from_ground(np.column_stack([*on_ground(cells.transform, across, down), z]))
     if not np.isfinite(at).all():
         return slice(0, image.height.shape[0]), slice(0, image.height.shape[1])
     low, high = np.floor(at.min(axis=0)) - MARGIN_PX, np.ceil(at.max(axis=0)) + MARGIN_PX
@@ -190,7 +190,7 @@ def _pixels_at(
     image: MatchedImage, ground: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Row and column of the nearest pixels to ground points (n, 3) m, and whether they are inside; 0 elsewhere."""
-    at = image.space.frame_from_ground(ground)
+    at = image.image_space.frame_from_ground(ground)
     rows, cols = image.height.shape
     with np.errstate(invalid="ignore"):
         col, row = np.rint(at[:, 0]), np.rint(-at[:, 1])
@@ -199,7 +199,7 @@ def _pixels_at(
 
 
 def _warnings(qualities: Sequence[NDArray[np.uint16]], agrees: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Warnings of all images that agree; JUMP of any of them, and UNCONFIRMED never, for it empties a cell."""
+    """Warnings of all images that agree; JUMP of any of them, and INCONSISTENT never, for it empties a cell."""
     everything = np.uint16(0xFFFF)
     of_all, of_any = np.full(agrees.shape[1:], everything), np.zeros(agrees.shape[1:], np.uint16)
     for a, quality in zip(agrees, qualities, strict=True):

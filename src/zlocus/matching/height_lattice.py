@@ -7,8 +7,8 @@ A height is counted in five ways. Names of variables, fields and arguments, or e
 is.
 
 lattice index
-    Steps of the finest level above the origin of the scene: ``height = origin_m + lattice_index * step_m`` with the
-    step of the match scene. The index of tie points and of match curves at points. Fractions are allowed.
+    Steps of the finest level above the origin of the scene: ``height = height_origin + lattice_index * height_step``
+    with the step of the match scene. The index of tie points and of match curves at points. Fractions are allowed.
 level index
     The same with the step of a level, which is ``2**level`` times as high: ``lattice_index = level_index * 2**level``.
     One level finer it doubles. What levels hand to each other: search ranges of the prior, heights, visible height
@@ -48,13 +48,13 @@ NARROW_BASE_STEP_CELLS = 2.0
 class HeightLattice:
     """Heights of one level of a tile, and the search range of each block.
 
-    origin_m, step_m : height of level index 0, and height step of the level, the same in all tiles of a scene; shape :
-    (r, c) cells of the tile; block : cells along the side of a block; first, count : (b, d) int64, lowest slope index
+    height_origin, height_step : height of level index 0, and step of the level, the same in all tiles of a scene; shape
+    : (r, c) cells of the tile; block : cells along the side of a block; first, count : (b, d) int64, lowest slope index
     and number of heights that block row b, block column d searches.
     """
 
-    origin_m: float
-    step_m: float
+    height_origin: float
+    height_step: float
     shape: tuple[int, int]
     block: int
     first: IntArray
@@ -109,7 +109,7 @@ class HeightLattice:
 
     def metres(self, level_index: NDArray[np.float32]) -> NDArray[np.float32]:
         """Heights (m) of level indices, which may have fractions."""
-        return (self.origin_m + level_index.astype(np.float64) * self.step_m).astype(np.float32)
+        return (self.height_origin + level_index.astype(np.float64) * self.height_step).astype(np.float32)
 
 
 # The number of heights of a block is a multiple of this, so that loops over heights fill vector registers.
@@ -126,8 +126,8 @@ MAX_DIFFERENCE_OF_NEIGHBOURS_PX = 4.0
 def search_lattice(
     low: NDArray[np.float32],
     high: NDArray[np.float32],
-    origin_m: float,
-    step_m: float,
+    height_origin: float,
+    height_step: float,
     options: PyramidOptions,
     block: int | None = None,
 ) -> HeightLattice:
@@ -145,7 +145,7 @@ def search_lattice(
     first = np.where(known, np.floor(lowest) - options.margin_steps, 0)
     last = np.where(known, np.ceil(highest) + options.margin_steps, 0)
     count = -(-(last - first + 1).astype(np.int64) // LANES) * LANES
-    return HeightLattice(origin_m, step_m, shape, block, first.astype(np.int64), count)
+    return HeightLattice(height_origin, height_step, shape, block, first.astype(np.int64), count)
 
 
 def by_block(values: NDArray[Any], block: int, reduce: np.ufunc) -> NDArray[Any]:

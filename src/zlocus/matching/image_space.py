@@ -1,6 +1,8 @@
-"""Image space (GC3): the cells are the pixels of a reference image, and heights or depths are asked for along its rays.
+"""Image space (GC3): the cells are the pixels of a reference image, and heights or depths are searched along its rays.
 
-The matcher needs no change: each view is given a sensor model whose ground is the reference image (`sensors/rays.py`).
+The matcher is the same as on the ground: each view gets a sensor model whose ground is the reference image
+(`sensors/image_rays.py`). A position along a ray is a hypothesis: a height above a datum, or a disparity, in units of
+about a pixel.
 """
 
 from __future__ import annotations
@@ -26,18 +28,29 @@ from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.image_rays import DepthRays, HeightRays, PixelModel, Rays
 from zlocus.sensors.projection_table import TableRequest, projection_table
 
-SAMPLES = 7
+# Places along each side of the reference image at which its geometry is sampled.
+SAMPLES_PER_SIDE = 7
+# Outer corner of the first pixel: column, minus row.
 ANCHOR = (-0.5, 0.5)
-# Copies of the outermost pixels around every image, so that windows at its border can be compared: half a window, the
-# pixels that the interpolation needs beside it, and a pixel of slack.
+# Width of the copies of the outermost pixels around every image, which let windows at its edges be compared: half a
+# window, the pixels that the interpolation needs beside it, and one more.
 BORDER_PX = 6
-FEWEST_TIES = 20
-TIE_PERCENT = (0.5, 99.5)
+# Ties from which a range of disparities is found, the percentiles of it that are used, and what is added at both ends.
+MIN_TIES = 20
+TIE_PERCENTILES = (0.5, 99.5)
 DISPARITY_MARGIN_PX = 8.0
-# What is farther is as good as infinitely far.
-LEAST_DISPARITY_PX = 0.5
-BY_DEPTH: dict[str, dict[str, Any]] = {
-    "cost": {"large_window": 3, "occluded_pairs_excluded": 1.0, "occlusion_margin_steps": 24.0, "grey_weight_two_images": 1.0},
+# Smaller disparities count as infinitely far.
+MIN_DISPARITY_PX = 0.5
+# Views whose equivalent disparity grows more slowly than this, px per unit of the hypothesis, show no depths.
+MIN_DISPARITY_RATE_PX = 1e-4
+# Defaults of some options for depths, see `depth_options`.
+DEPTH_DEFAULTS: dict[str, dict[str, Any]] = {
+    "cost": {
+        "large_window": 3,
+        "occluded_pairs_excluded": 1.0,
+        "occlusion_margin_steps": 24.0,
+        "grey_weight_two_images": 1.0,
+    },
     "semiglobal": {
         "predecessors": 1,
         "p1": 20,
@@ -48,14 +61,16 @@ BY_DEPTH: dict[str, dict[str, Any]] = {
         "edge_contrast_two_images": 2.0,
     },
 }
-SMALLEST_BLOCK = 8
+MIN_BLOCK_CELLS = 8
+# Disparities at which the overlap with the other views is tested.
 DISPARITY_SAMPLES = 64
+# Steps that are added at both ends of the hypotheses, because a peak at an end needs its neighbours.
 END_STEPS = 6
 
 
 @dataclass(frozen=True)
 class BorderedImage:
-    """An image with copies of its outermost pixels around it, as an `ImageSource`."""
+    """An image with copies of its outermost pixels around it, as an `ImageSource`. border : px."""
 
     image: ImageSource
     border: int
@@ -85,15 +100,17 @@ class BorderedImage:
 
 @dataclass(frozen=True)
 class ImageSpace:
-    """A reference image, its rays, and the scene in its frame: a view each, the reference first."""
+    """A reference image, its rays, and all views with sensor models over its frame, the reference image first."""
 
-    reference: View
+    reference_view: View
     rays: Rays
     views: tuple[View, ...]
 
     def ground(self, row: int, z: NDArray[np.float32], col: int = 0) -> FloatArray:
-        """Ground points of a block of pixels, of which (row, col) is the first. z : (r, c) hypotheses -> (r, c, 3) m,
-        NaN where there is none."""
+        """Ground points (r, c, 3) m of a block of pixels whose first one is (row, col); NaN where z is NaN.
+
+        z : (r, c) hypotheses.
+        """
         known = np.isfinite(z)
         out = np.full((*z.shape, 3), np.nan)
         rows, cols = np.nonzero(known)
@@ -101,18 +118,19 @@ class ImageSpace:
         return out
 
     def frame_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """Ground points (n, 3) m -> column, minus row, hypothesis (n, 3)."""
-        xy = self.reference.sensor.image_from_ground(xyz)
+        """Column, minus row, and hypothesis (n, 3) of ground points (n, 3) m; NaN where they are not visible."""
+        xy = self.reference_view.sensor.image_from_ground(xyz)
         return np.column_stack([xy * [1.0, -1.0], self.rays.hypothesis(xyz)])
 
 
 def is_by_depth(scene: Scene) -> bool:
-    """Whether depths are asked for, not heights: where all views are frame cameras, which may look anywhere."""
+    """Whether depths are searched instead of heights: where all views are frame cameras, which may look anywhere."""
     return all(isinstance(view.sensor, FrameModel) for view in scene.views)
 
 
 def image_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> ImageSpace:
-    """The scene in the frame of one of its images. z_range : m, heights the ground lies between; unused by depth.
+    """The scene in the frame of one of its images. reference : name of its view; z_range : m, range of the heights of
+    the ground, not used for depths.
 
     Raises
     ------
@@ -125,14 +143,14 @@ def image_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> I
     if reference not in by_name:
         raise ConfigError(f"--reference {reference} is not a view of this scene. Choose one of {', '.join(by_name)}.")
     first = by_name[reference]
-    others = [view for view in scene.views if view.name != reference]
-    rays = depth_rays(first, others) if is_by_depth(scene) else height_rays(first, z_range)
-    moved = [replace(view, sensor=rays.to(view.sensor)) for view in others]
+    other_views = [view for view in scene.views if view.name != reference]
+    rays = depth_rays(first, other_views) if is_by_depth(scene) else height_rays(first, z_range)
+    moved = [replace(view, sensor=rays.to(view.sensor)) for view in other_views]
     return ImageSpace(first, rays, (replace(first, sensor=PixelModel()), *moved))
 
 
 def height_rays(view: View, z_range: tuple[float, float]) -> HeightRays:
-    """Rays of an image by height."""
+    """Rays of an image, with heights as hypotheses. z_range : m, range of the heights of the ground."""
     middle = (z_range[0] + z_range[1]) / 2
     unit = ground_sample_distance(view, middle)
     if not np.isfinite(unit):
@@ -142,11 +160,11 @@ def height_rays(view: View, z_range: tuple[float, float]) -> HeightRays:
     return HeightRays(view.sensor, middle, unit)
 
 
-def depth_rays(view: View, others: list[View]) -> DepthRays:
-    """Rays of a frame camera by disparity, in pixels of the longest base."""
+def depth_rays(view: View, other_views: list[View]) -> DepthRays:
+    """Rays of a frame camera, with disparities as hypotheses, in pixels of the longest base to another view."""
     sensor = view.sensor
     assert isinstance(sensor, FrameModel), "only frame cameras are matched by depth"
-    bases = [np.array(other.sensor.centre) - np.array(sensor.centre) for other in others]  # type: ignore[attr-defined]
+    bases = [np.array(other.sensor.centre) - np.array(sensor.centre) for other in other_views]  # type: ignore[attr-defined]
     longest = max(float(np.linalg.norm(base)) for base in bases)
     if not longest > 0:
         raise GeometryError(
@@ -156,29 +174,28 @@ def depth_rays(view: View, others: list[View]) -> DepthRays:
 
 
 def build_image_match_scene(
-    space: ImageSpace,
+    image_space: ImageSpace,
     z_range: tuple[float, float],
     ties: FloatArray,
     options: PyramidOptions,
     ground: FloatArray | None = None,
 ) -> MatchScene:
-    """Lattice of hypotheses, levels and extent of a reference image.
+    """Match scene whose cells are the pixels of a reference image and whose heights are hypotheses.
 
-    z_range : hypotheses, to which a few steps are added at both ends, for a peak there needs its neighbours; ties :
-    (n, 3), column, minus row, hypothesis; ground : (k, 3), those where grey values compare, None: all. See
-    `MatchScene`.
+    z_range : hypotheses to search, to which END_STEPS are added at both ends; ties : (n, 3), column, minus row,
+    hypothesis; ground : (k, 3), points at which the grey values of the images are compared, None: at all ties.
     """
-    rows, cols = space.reference.image.shape
-    views = tuple(bordered(view) for view in space.views)
-    step = hypothesis_step(space, (z_range[0] + z_range[1]) / 2, options.max_shift_px)
+    rows, cols = image_space.reference_view.image.shape
+    views = tuple(bordered(view) for view in image_space.views)
+    step = hypothesis_step(image_space, (z_range[0] + z_range[1]) / 2, options.max_shift_px)
     n_steps = int(np.ceil((z_range[1] - z_range[0]) / step)) + 2 * END_STEPS
     levels = levels_for(n_steps, options)
     return MatchScene(
         views=views,
         anchor=ANCHOR,
-        cell_m=1.0,
-        origin_m=z_range[0] - END_STEPS * step,
-        step_m=step,
+        cell_size=1.0,
+        height_origin=z_range[0] - END_STEPS * step,
+        height_step=step,
         n_steps=n_steps,
         levels=levels,
         overlap_window=cells_of_bounds((-0.5, 0.5 - rows, cols - 0.5, 0.5), ANCHOR, 1.0, levels),
@@ -188,9 +205,9 @@ def build_image_match_scene(
 
 
 def beyond_range(match_scene: MatchScene, height: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where hypotheses lie in the steps added by `build_image_match_scene`. height : (r, c)."""
-    low = match_scene.origin_m + (END_STEPS - 0.5) * match_scene.step_m
-    high = match_scene.origin_m + (match_scene.n_steps - END_STEPS + 0.5) * match_scene.step_m
+    """(r, c) bool: hypotheses that lie in the END_STEPS beyond the range that was asked for. height : (r, c)."""
+    low = match_scene.height_origin + (END_STEPS - 0.5) * match_scene.height_step
+    high = match_scene.height_origin + (match_scene.n_steps - END_STEPS + 0.5) * match_scene.height_step
     return np.asarray((height < low) | (height > high))
 
 
@@ -201,18 +218,19 @@ def bordered(view: View) -> View:
 
 
 def depth_options(config: RunConfig) -> RunConfig:
-    """The options with those for depths where they have their defaults, which are chosen for ground seen from above.
+    """The configuration with the defaults for depths, where an option has its usual default.
 
-    Close things have deep jumps and sharp texture: a narrow correlation window, for every jump is an outline of this
-    very image, and a higher least penalty of jumps. Pairs with a hidden view are left out whole, for the reference is
-    never hidden; and a view counts as hidden only far below what hides it, for the coarser surface blurs outlines by
-    some steps, and matching back finds what is hidden exactly.
+    The usual defaults are chosen for ground seen from above. Close objects have deep jumps and sharp texture. So the
+    correlation window is narrow, because every jump is an outline in the reference image, and the least penalty of jumps
+    is higher. Pairs with an occluded view are excluded whole, because the reference image is never occluded. A view
+    counts as occluded only far below the occluder, because the coarser surface blurs outlines by some steps, and the
+    cross-consistency check finds occlusions exactly.
     """
-    return _with_defaults(config, BY_DEPTH)
+    return _with_defaults(config, DEPTH_DEFAULTS)
 
 
 def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> RunConfig:
-    """The options with other values, by stage, where they have their defaults."""
+    """The configuration with other values where its options have their defaults. defaults : values by stage and name."""
     changed = {}
     for stage, values in defaults.items():
         mine, default = getattr(config, stage), getattr(RunConfig(), stage)
@@ -221,64 +239,67 @@ def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> Ru
     return replace(config, **changed)
 
 
-def hypotheses_of_heights(space: ImageSpace, z_range: tuple[float, float]) -> tuple[float, float] | None:
-    """Lowest and highest hypothesis of the rays between two heights (m); None where a ray does not meet one of them."""
-    rays, (rows, cols) = space.rays, space.reference.image.shape
+def hypotheses_of_heights(image_space: ImageSpace, z_range: tuple[float, float]) -> tuple[float, float] | None:
+    """Lowest and highest hypothesis between two heights (m); None where a ray does not reach one of them."""
+    rays, (rows, cols) = image_space.rays, image_space.reference_view.image.shape
     if isinstance(rays, HeightRays):
         return (z_range[0] - rays.datum) / rays.unit, (z_range[1] - rays.datum) / rays.unit
-    col, row = np.meshgrid(np.linspace(0, cols - 1, SAMPLES), np.linspace(0, rows - 1, SAMPLES))
+    col, row = np.meshgrid(np.linspace(0, cols - 1, SAMPLES_PER_SIDE), np.linspace(0, rows - 1, SAMPLES_PER_SIDE))
     xy = np.column_stack([col.ravel(), row.ravel()])
-    ground = [space.reference.sensor.ground_from_image(xy, np.full(len(xy), z)) for z in z_range]
+    ground = [image_space.reference_view.sensor.ground_from_image(xy, np.full(len(xy), z)) for z in z_range]
     found = rays.hypothesis(np.concatenate(ground))
     return (float(found.min()), float(found.max())) if np.isfinite(found).all() else None
 
 
-def widest_disparities(space: ImageSpace) -> tuple[float, float]:
-    """From infinitely far to the nearest that another view can see too, half the longest base away at most."""
-    rays = space.rays
+def widest_disparities(image_space: ImageSpace) -> tuple[float, float]:
+    """Disparities from infinitely far to the nearest point that another view can see too, at most half the longest base
+    away."""
+    rays = image_space.rays
     assert isinstance(rays, DepthRays), "heights have bounds of their own"
     nearest = 2.0 * rays.sensor.focal
     for z in np.linspace(nearest, nearest / DISPARITY_SAMPLES, DISPARITY_SAMPLES):
-        if any(np.isfinite(shift_rates(space, view, float(z))).any() for view in space.views[1:]):
+        if any(np.isfinite(shift_rates(image_space, view, float(z))).any() for view in image_space.views[1:]):
             return 0.0, float(z)
     return 0.0, nearest
 
 
-def hypotheses_of_ties(space: ImageSpace, ties: FloatArray, options: OrientationOptions) -> tuple[float, float]:
-    """Range to be searched, from ties (n, 3), column, minus row, disparity: their percentiles, widened on both sides by
-    `range_margin` times their span and by `DISPARITY_MARGIN_PX`, but not below `LEAST_DISPARITY_PX`.
+def hypotheses_of_ties(image_space: ImageSpace, ties: FloatArray, options: OrientationOptions) -> tuple[float, float]:
+    """Range of disparities to search, from ties (n, 3): column, minus row, disparity.
+
+    The percentiles of the ties are widened at both ends by `range_margin` times their span and by
+    `DISPARITY_MARGIN_PX`, but not below `MIN_DISPARITY_PX`.
 
     Raises
     ------
     GeometryError
-        Where there are too few.
+        There are fewer than MIN_TIES.
     """
-    if len(ties) < FEWEST_TIES:
+    if len(ties) < MIN_TIES:
         raise GeometryError(
-            f"Only {len(ties)} reliable tie points were found in {space.reference.name}, too few to tell its depths "
-            f"({FEWEST_TIES} are needed). Give --heights ZMIN ZMAX, or check the cameras."
+            f"Only {len(ties)} reliable tie points were found in {image_space.reference_view.name}, too few to tell its depths "
+            f"({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check the cameras."
         )
-    low, high = (float(v) for v in np.percentile(ties[:, 2], TIE_PERCENT))
+    low, high = (float(v) for v in np.percentile(ties[:, 2], TIE_PERCENTILES))
     margin = options.range_margin * (high - low) + DISPARITY_MARGIN_PX
-    return max(low - margin, LEAST_DISPARITY_PX), high + margin
+    return max(low - margin, MIN_DISPARITY_PX), high + margin
 
 
 def fitting_block(match_scenes: Sequence[MatchScene], block: int) -> int | None:
-    """The largest block, halved as often as needed, over which projections are straight enough for their tables; None
-    where even `SMALLEST_BLOCK` is too large.
+    """The largest block, from `block` cells halved as often as needed, whose projection tables hold; None where even
+    `MIN_BLOCK_CELLS` is too large.
 
-    Images that are turned against each other bend the loci more within a block of pixels than a map grid does.
+    Between images that are rotated against each other the loci bend more within a block of pixels than on a map grid.
     """
     while not all(_fits(match_scene, block) for match_scene in match_scenes):
         block //= 2
-        if block < SMALLEST_BLOCK:
+        if block < MIN_BLOCK_CELLS:
             return None
     return block
 
 
 def _fits(match_scene: MatchScene, block: int) -> bool:
-    step = match_scene.step_m * 2 ** (match_scene.levels - 1)
-    z_range = (match_scene.origin_m - 2 * step, match_scene.z_range[1] + 18 * step)
+    step = match_scene.height_step * 2 ** (match_scene.levels - 1)
+    z_range = (match_scene.height_origin - 2 * step, match_scene.z_range[1] + 18 * step)
     try:
         for level in range(match_scene.levels):
             window = match_scene.overlap_window.at_level(level, 0)
@@ -293,29 +314,35 @@ def _fits(match_scene: MatchScene, block: int) -> bool:
     return True
 
 
-def hypothesis_step(space: ImageSpace, z: float, max_shift_px: float) -> float:
-    """Step of the hypotheses that shifts the most sensitive image by `max_shift_px` at most, or by that share of the
-    reference's pixel where the image's own is finer (equivalent disparity, as in `height_step`).
+def hypothesis_step(image_space: ImageSpace, z: float, max_shift_px: float) -> float:
+    """Step of the hypotheses, in their unit, at which the most sensitive image moves by `max_shift_px`.
+
+    Movements are equivalent disparities, as in `height_step`: where a pixel of an image is smaller than one of the
+    reference image, they are counted in pixels of the reference image.
 
     Raises
     ------
     GeometryError
-        When no image is shifted, or none sees what the reference sees.
+        No image moves, or none overlaps the reference image.
     """
-    rates = [float(np.nanmedian(r)) for view in space.views[1:] if np.isfinite(r := shift_rates(space, view, z)).any()]
-    if not max(rates, default=0.0) > 1e-4:
+    rates = [
+        float(np.nanmedian(r))
+        for view in image_space.views[1:]
+        if np.isfinite(r := shift_rates(image_space, view, z)).any()
+    ]
+    if not max(rates, default=0.0) > MIN_DISPARITY_RATE_PX:
         raise GeometryError(
-            f"No other image shows the heights of what {space.reference.name} ({space.reference.path}) sees: they do "
+            f"No other image shows the heights of what {image_space.reference_view.name} ({image_space.reference_view.path}) sees: they do "
             "not overlap, or look along the same line. Check the cameras, or add an image from another direction."
         )
     return max_shift_px / max(rates)
 
 
-def shift_rates(space: ImageSpace, view: View, z: float) -> FloatArray:
-    """Equivalent disparity, px, of a view per unit of the hypothesis at pixels spread over the reference, (n,); NaN
-    where the view does not see them."""
-    rows, cols = space.reference.image.shape
-    col, row = np.meshgrid(np.linspace(0, cols - 1, SAMPLES), np.linspace(0, rows - 1, SAMPLES))
+def shift_rates(image_space: ImageSpace, view: View, z: float) -> FloatArray:
+    """Equivalent disparity (n,) of a view, px per unit of the hypothesis, at n pixels spread over the reference image;
+    NaN where the view does not see them. z : hypothesis."""
+    rows, cols = image_space.reference_view.image.shape
+    col, row = np.meshgrid(np.linspace(0, cols - 1, SAMPLES_PER_SIDE), np.linspace(0, rows - 1, SAMPLES_PER_SIDE))
     here = np.column_stack([col.ravel(), -row.ravel(), np.full(col.size, z)])
     at = [view.sensor.image_from_ground(here + 0.5 * step) for step in (np.zeros(3), *np.eye(3), *-np.eye(3))]
     by_col, by_row, by_z = (at[k] - at[k + 3] for k in (1, 2, 3))
@@ -326,75 +353,76 @@ def shift_rates(space: ImageSpace, view: View, z: float) -> FloatArray:
     return np.where(inside, rate, np.nan)
 
 
+# Rows of an image that are checked at a time.
 ROWS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class MatchedImage:
-    """What was found for the pixels of an image.
+    """Heights of the pixels of a reference image.
 
-    height : (r, c) float32 hypotheses, NaN where empty; middle : of the hypotheses that were searched.
+    height : (r, c) float32 hypotheses, NaN where there is none; middle : middle of the hypotheses that were searched.
     """
 
-    space: ImageSpace
+    image_space: ImageSpace
     height: NDArray[np.float32]
     middle: float
 
     def px_per_unit(self, other: str) -> float:
-        """Equivalent disparity against another view of a unit of the hypothesis; NaN where they share no ground."""
-        (view,) = (view for view in self.space.views if view.name == other)
-        rates = shift_rates(self.space, view, self.middle)
+        """Equivalent disparity against another view, px per unit of the hypothesis; NaN where they do not overlap."""
+        (view,) = (view for view in self.image_space.views if view.name == other)
+        rates = shift_rates(self.image_space, view, self.middle)
         return float(np.median(rates[np.isfinite(rates)])) if np.isfinite(rates).any() else float("nan")
 
 
 @dataclass(frozen=True)
-class Confirmation:
-    """How many other images agree with each height, see something farther (through it), or nearer (which hides it):
-    each (r, c) uint8."""
+class CrossConsistency:
+    """How many other images have the same height, a height farther away (they see through it), or a nearer one (it is
+    occluded there): each (r, c) uint8."""
 
     agreeing: NDArray[np.uint8]
     farther: NDArray[np.uint8]
     nearer: NDArray[np.uint8]
 
     @property
-    def is_confirmed(self) -> NDArray[np.bool_]:
-        """(r, c): where more images agree than look through it; so at least one does."""
+    def is_consistent(self) -> NDArray[np.bool_]:
+        """(r, c): where more images agree than see through the height; so at least one agrees."""
         return np.asarray(self.agreeing > self.farther)
 
 
-def confirm(
-    mine: MatchedImage, others: Sequence[MatchedImage], tolerance_px: float
-) -> Iterator[tuple[slice, Confirmation]]:
-    """Compare every height of an image with those of the others, where they show the same ground; some rows of the
-    image after others.
+def check_cross_consistency(
+    matched_image: MatchedImage, other_matched_images: Sequence[MatchedImage], tolerance_px: float
+) -> Iterator[tuple[slice, CrossConsistency]]:
+    """Compare every height of an image with those of the other images; yields some rows of the image after others.
 
-    A height becomes a ground point, which is at a pixel (the nearest) and at a hypothesis of each other image; that
-    image's own hypothesis there agrees when it differs by no more than `tolerance_px` of equivalent disparity of the
-    two. Pixels without a height have no say.
+    A height becomes a ground point. The ground point has a pixel (the nearest) and a hypothesis in each other image. It
+    agrees with the height of that pixel where the two hypotheses differ by no more than `tolerance_px` of equivalent
+    disparity between the two images. Pixels without a height do not count.
     """
-    sharing = [(other, rate) for other in others if np.isfinite(rate := other.px_per_unit(mine.space.reference.name))]
-    for row in range(0, len(mine.height), ROWS_AT_ONCE):
-        rows = slice(row, min(row + ROWS_AT_ONCE, len(mine.height)))
-        part = mine.height[rows]
+    name = matched_image.image_space.reference_view.name
+    overlapping = [(other, rate) for other in other_matched_images if np.isfinite(rate := other.px_per_unit(name))]
+    for row in range(0, len(matched_image.height), ROWS_AT_ONCE):
+        rows = slice(row, min(row + ROWS_AT_ONCE, len(matched_image.height)))
+        part = matched_image.height[rows]
         counts, known = np.zeros((3, *part.shape), np.uint8), np.isfinite(part)
-        ground = mine.space.ground(row, part)[known]
-        for other, px_per_unit in sharing:
-            differs = difference(other, ground) * px_per_unit
+        ground = matched_image.image_space.ground(row, part)[known]
+        for other, px_per_unit in overlapping:
+            differs = hypothesis_differences(other, ground) * px_per_unit
             for count, where in zip(
                 counts, (np.abs(differs) <= tolerance_px, differs < -tolerance_px, differs > tolerance_px), strict=True
             ):
                 count[known] += where
-        yield rows, Confirmation(counts[0], counts[1], counts[2])
+        yield rows, CrossConsistency(counts[0], counts[1], counts[2])
 
 
-def difference(image: MatchedImage, ground: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Hypotheses by which an image's heights are nearer to it than ground points (n, 3) m; NaN where it has none.
-    -> (n,)"""
-    at = image.space.frame_from_ground(ground)
-    rows, cols = image.height.shape
+def hypothesis_differences(matched_image: MatchedImage, ground: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Hypotheses (n,) by which the heights of an image are nearer to it than ground points (n, 3) m; NaN where it has
+    none."""
+    at = matched_image.image_space.frame_from_ground(ground)
+    rows, cols = matched_image.height.shape
     with np.errstate(invalid="ignore"):
         col, row = np.rint(at[:, 0]), np.rint(-at[:, 1])
         inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
     own = np.full(len(ground), np.nan)
-    own[inside] = image.height[row[inside].astype(int), col[inside].astype(int)]
+    own[inside] = matched_image.height[row[inside].astype(int), col[inside].astype(int)]
     return np.asarray(own - at[:, 2])

@@ -89,17 +89,17 @@ class PyramidLevel:
 
     number : 0 is the finest; window : its cells, halo included; core : rows and columns of the window that belong to
     the tile's core (decisions for the whole tile are computed from these cells only, so that they do not depend on the
-    halo); transform : from cell corners to the ground; cell_m : side of a cell; origin_m, step_m : height of level
-    index 0, and height step of the level; n_steps : steps of the scene's height range.
+    halo); transform : from cell corners to the ground; cell_size : side of a cell; height_origin, height_step : height
+    of level index 0, and height step of the level; n_steps : steps of the scene's height range.
     """
 
     number: int
     window: CellWindow
     core: tuple[slice, slice]
     transform: Affine
-    cell_m: float
-    origin_m: float
-    step_m: float
+    cell_size: float
+    height_origin: float
+    height_step: float
     n_steps: int
 
     @classmethod
@@ -110,9 +110,9 @@ class PyramidLevel:
             window=window,
             core=core_window.at_level(number, 0).within(window).slices_in(window),
             transform=match_scene.transform(window, number),
-            cell_m=match_scene.cell_m * 2**number,
-            origin_m=match_scene.origin_m,
-            step_m=match_scene.step_m * 2**number,
+            cell_size=match_scene.cell_size * 2**number,
+            height_origin=match_scene.height_origin,
+            height_step=match_scene.height_step * 2**number,
             n_steps=-(-match_scene.n_steps // 2**number),
         )
 

@@ -41,21 +41,23 @@ MIN_PARALLAX_RATE_PX = 1e-4
 class MatchScene:
     """What all tiles of a scene share.
 
-    views : oriented, the reference image (the requested or the most nadir one) first; anchor : easting and
-    northing of the north-west corner of cell (0, 0); cell_m : side of a finest cell; origin_m, step_m, n_steps :
+    views : oriented, the reference image (the requested or the most nadir one) first; anchor : easting and northing of
+    the north-west corner of cell (0, 0); cell_size : side of a finest cell; height_origin, height_step, n_steps :
     lattice of heights at the finest level; levels : of the pyramid; overlap_window : finest cells that two views may
     cover; grey_scales : grey scale of each image; ties : (n, 3) ground points, to which the search ranges of their
-    cells extend; dem_limits : (2, r, c) float32 m, lowest and highest height to search on the cells of `overlap_window`
+    cells extend; dem_limits : (2, r, c) float32, lowest and highest height to search on the cells of `overlap_window`
     at the coarsest level, NaN where the terrain model has no height; None without one.
 
-    Metres become pixels and disparities where the ground is a reference image (`zlocus.matching.image_space`).
+    Lengths and heights are metres on the ground. In image space (`zlocus.matching.image_space`) the ground is a
+    reference image: lengths are its pixels, and heights are hypotheses along its rays. That is why these names have no
+    unit.
     """
 
     views: tuple[View, ...]
     anchor: tuple[float, float]
-    cell_m: float
-    origin_m: float
-    step_m: float
+    cell_size: float
+    height_origin: float
+    height_step: float
     n_steps: int
     levels: int
     overlap_window: CellWindow
@@ -65,13 +67,13 @@ class MatchScene:
 
     @property
     def z_range(self) -> tuple[float, float]:
-        """Lowest and highest height of the search, m."""
-        return self.origin_m, self.origin_m + self.n_steps * self.step_m
+        """Lowest and highest height of the search."""
+        return self.height_origin, self.height_origin + self.n_steps * self.height_step
 
     @property
     def step_cells(self) -> float:
         """Height of a step over the side of a cell, the same at every level."""
-        return self.step_m / self.cell_m
+        return self.height_step / self.cell_size
 
     def views_near(self, xy: NDArray[np.float64]) -> list[int]:
         """Numbers of the views that may see ground in the box around points (n, 2) m."""
@@ -98,7 +100,7 @@ class MatchScene:
 
     def transform(self, window: CellWindow, level: int) -> Affine:
         """From cell corners (column, row) of a window of a level to the ground."""
-        return window_transform(window, self.anchor, self.cell_m * 2**level)
+        return window_transform(window, self.anchor, self.cell_size * 2**level)
 
     @property
     def overlap_bounds(self) -> tuple[float, float, float, float]:
@@ -273,9 +275,9 @@ def build_match_scene(
     return MatchScene(
         views=views,
         anchor=anchor,
-        cell_m=cell_m,
-        origin_m=z_range[0],
-        step_m=step,
+        cell_size=cell_m,
+        height_origin=z_range[0],
+        height_step=step,
         n_steps=n_steps,
         levels=levels,
         overlap_window=cells_of_bounds(shared_ground(scene, z_range), anchor, cell_m, levels),

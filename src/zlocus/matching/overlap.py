@@ -18,7 +18,7 @@ from zlocus.core.grid import CellWindow, on_cells
 from zlocus.matching.free_rays import agreement_on
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.occlusion import PAIR, coverage, covers, n_seeing
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews, ViewPixels
 
 AROUND = np.ones((3, 3), np.uint8)
@@ -87,7 +87,7 @@ def border_ground(
     level : of the cells; cell_m : side of a cell of that level.
     """
     shown = shown_heights(pixels, views, level, lattice, n_steps)
-    cell_steps = cell_m / lattice.step_m
+    cell_steps = cell_m / lattice.height_step
     covered = covered_ground(shown, matched, surface, searched, cell_steps)
     known = compared_at_all(matched, searched)
     if known.sum() < LEAST_COMPARED * covered.sum():
@@ -158,7 +158,7 @@ def shown_heights(
         views, blocked=np.concatenate(unusable), has_blocked=np.array([bool(mask.any()) for mask in unusable])
     )
     whole = replace(lattice, first=np.zeros_like(lattice.first), count=np.full_like(lattice.count, n_steps))
-    return coverage(bare, BaseSurface.level(lattice.shape, views.block), whole, 0.0)
+    return coverage(bare, SlopeSurface.flat(lattice.shape, views.block), whole, 0.0)
 
 
 def covered_ground(

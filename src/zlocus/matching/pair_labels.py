@@ -70,8 +70,8 @@ class GridTies(NamedTuple):
     def of(cls, match_scene: MatchScene, slope: FloatArray | None = None) -> GridTies:
         """All tie points of a scene, by default on level ground."""
         ties = match_scene.ties
-        xy = (ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
-        lattice_index = (ties[:, 2] - match_scene.origin_m) / match_scene.step_m
+        xy = (ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_size
+        lattice_index = (ties[:, 2] - match_scene.height_origin) / match_scene.height_step
         return cls(xy, lattice_index, np.zeros((len(xy), 2)) if slope is None else slope)
 
     def inside(self, window: CellWindow) -> NDArray[np.bool_]:
@@ -92,7 +92,7 @@ def label_pairs_at_ties(tile: TileInputs, coarsest_result: LevelResult | None) -
     if coarsest_result is not None:
         ties = ties._replace(slope=slope_at(coarsest_result, ties.xy, config))
     views = _views_around_ties(tile, window, ties)
-    steps_per_cell = match_scene.cell_m / match_scene.step_m
+    steps_per_cell = match_scene.cell_size / match_scene.height_step
     return label_pairs(views, window, ties, large_window_side(config.cost), steps_per_cell, config.selection)
 
 
@@ -111,14 +111,17 @@ def slope_at(result: LevelResult, xy: FloatArray, config: RunConfig) -> FloatArr
 def _views_around_ties(tile: TileInputs, window: CellWindow, ties: GridTies) -> TileViews:
     """A tile's views over a window of finest cells, at all heights of match curves at the tie points in it."""
     match_scene, config = tile.match_scene, tile.config
-    reach = config.selection.reach_steps * match_scene.step_m
-    z_range = (match_scene.origin_m - reach, match_scene.origin_m + match_scene.n_steps * match_scene.step_m + reach)
+    reach = config.selection.reach_steps * match_scene.height_step
+    z_range = (
+        match_scene.height_origin - reach,
+        match_scene.height_origin + match_scene.n_steps * match_scene.height_step + reach,
+    )
     z = match_scene.ties[ties.inside(window), 2]
     z = z[np.isfinite(z)]
     z_reachable = (float(z.min()) - reach, float(z.max()) + reach) if len(z) else None
     return tile_views(
         tile.view_pixels, 0, match_scene.transform(window, 0), (window.rows, window.cols), config.pyramid.block,
-        (match_scene.origin_m, match_scene.step_m), z_range, large_window_side(config.cost) // 2, z_reachable,
+        (match_scene.height_origin, match_scene.height_step), z_range, large_window_side(config.cost) // 2, z_reachable,
     )  # fmt: skip
 
 

@@ -280,7 +280,7 @@ class PlaceCurves:
 
 def cell_of(xy: FloatArray, match_scene: MatchScene) -> tuple[int, int]:
     """Row and column of the cell of the finest lattice that contains a ground point (2,) m."""
-    col, row = (xy - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_m
+    col, row = (xy - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_size
     return math.floor(row), math.floor(col)
 
 
@@ -347,7 +347,7 @@ def curves_at(
     names = [view.name for view in match_scene.views if shows(view, place.xyz)]
     check_shown(point_name, reference, place.xyz, names, match_scene)
     options = config.selection
-    lattice_index = (place.xyz[2] - match_scene.origin_m) / match_scene.step_m
+    lattice_index = (place.xyz[2] - match_scene.height_origin) / match_scene.height_step
     for distance_cells, sufficient_source in _tie_windows(options, max_distance_cells):
         halo = min(math.ceil(distance_cells), max_distance_cells)
         window = CellWindow(*place.cell, 1, 1).at_level(0, halo).within(match_scene.overlap_window)
@@ -368,7 +368,7 @@ def curves_at(
     step_px = steps_px(views, int(view_rows[order.reference]), view_rows[order.search])
     along = lattice_index + np.arange(-options.reach_steps, options.reach_steps + 1)
     curves = point_curves(windows[view_rows], order, step_px, along, options)
-    heights_m = match_scene.origin_m + along * match_scene.step_m
+    heights_m = match_scene.height_origin + along * match_scene.height_step
     return PlaceCurves(place, compared, curves, lattice_index, heights_m, views, window, view_rows)
 
 
@@ -404,7 +404,7 @@ def views_around(
         if view_window is not None:
             numbers.append(number)
             view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey_scales[number]))
-    shape, lattice = (window.rows, window.cols), (match_scene.origin_m, match_scene.step_m)
+    shape, lattice = (window.rows, window.cols), (match_scene.height_origin, match_scene.height_step)
     half = large_window_side(config.cost) // 2
     return numbers, tile_views(view_pixels, 0, transform, shape, config.pyramid.block, lattice, z_range, half)
 
@@ -419,11 +419,11 @@ def heights_around(
     """
     inside = GridTies.of(match_scene).inside(window) & np.isfinite(match_scene.ties[:, 2])
     heights = np.append(match_scene.ties[inside, 2], place.xyz[2])
-    reach = (options.reach_steps + 1) * match_scene.step_m
+    reach = (options.reach_steps + 1) * match_scene.height_step
     return float(heights.min()) - reach, float(heights.max()) + reach
 
 
 def labels_around(match_scene: MatchScene, tile_views: TileViews, window: CellWindow, config: RunConfig) -> PairLabels:
     """Labels of all pairs of views at the tie points of a window, as on level ground."""
-    ties, steps_per_cell = GridTies.of(match_scene), match_scene.cell_m / match_scene.step_m
+    ties, steps_per_cell = GridTies.of(match_scene), match_scene.cell_size / match_scene.height_step
     return label_pairs(tile_views, window, ties, large_window_side(config.cost), steps_per_cell, config.selection)

@@ -37,7 +37,7 @@ def coarsest_prior(match_scene: MatchScene, level: PyramidLevel, surface: FloatG
     if match_scene.dem_limits is not None:
         limits_window = match_scene.overlap_window.at_level(level.number, 0)
         limits = np.stack([on_cells(bound, limits_window, level.window, 0) for bound in match_scene.dem_limits])
-        from_dem = (limits - np.float32(level.origin_m)) / np.float32(level.step_m)
+        from_dem = (limits - np.float32(level.height_origin)) / np.float32(level.height_step)
         low, high = (
             np.where(np.isnan(from_dem[0]), low, from_dem[0]),
             np.where(np.isnan(from_dem[1]), high, from_dem[1]),
@@ -79,11 +79,11 @@ def _widen_to_ties(match_scene: MatchScene, level: PyramidLevel, low: FloatGrid,
     ties, window = match_scene.ties, level.window
     if not len(ties):
         return
-    side = match_scene.cell_m * 2**level.number
+    side = match_scene.cell_size * 2**level.number
     col = np.floor((ties[:, 0] - match_scene.anchor[0]) / side).astype(int) - window.col
     row = np.floor((match_scene.anchor[1] - ties[:, 1]) / side).astype(int) - window.row
     inside = (row >= 0) & (row < window.rows) & (col >= 0) & (col < window.cols)
-    level_index = ((ties[inside, 2] - level.origin_m) / level.step_m).astype(np.float32)
+    level_index = ((ties[inside, 2] - level.height_origin) / level.height_step).astype(np.float32)
     np.fmin.at(low, (row[inside], col[inside]), level_index)
     np.fmax.at(high, (row[inside], col[inside]), level_index)
 
@@ -91,8 +91,8 @@ def _widen_to_ties(match_scene: MatchScene, level: PyramidLevel, low: FloatGrid,
 def table_range(level: PyramidLevel) -> tuple[float, float]:
     """Lowest and highest height (m) of a level's projection tables: its height range, extended by a few steps."""
     return (
-        level.origin_m - TABLE_STEPS_BELOW * level.step_m,
-        level.origin_m + (level.n_steps + TABLE_STEPS_ABOVE) * level.step_m,
+        level.height_origin - TABLE_STEPS_BELOW * level.height_step,
+        level.height_origin + (level.n_steps + TABLE_STEPS_ABOVE) * level.height_step,
     )
 
 
@@ -104,4 +104,6 @@ def reachable_range(level: PyramidLevel, prior: SearchPrior, config: RunConfig) 
         return z_range
     margin = config.pyramid.margin_steps + LANES + curve_reach_steps(level.number, config.selection)
     low, high = float(prior.low[is_known].min()) - margin, float(prior.high[is_known].max()) + margin
-    return max(z_range[0], level.origin_m + low * level.step_m), min(z_range[1], level.origin_m + high * level.step_m)
+    return max(z_range[0], level.height_origin + low * level.height_step), min(
+        z_range[1], level.height_origin + high * level.height_step
+    )

@@ -230,7 +230,7 @@ def border_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> Border
     result, level, prior = coarsest_match.result, coarsest_match.result.level, coarsest_match.prior
     return border_ground(
         tile.view_pixels, result.tile_views, result.lattice, result.visible, result.heights.vertex,
-        (prior.low, prior.high), level.window, level.number, level.n_steps, level.cell_m,
+        (prior.low, prior.high), level.window, level.number, level.n_steps, level.cell_size,
     )  # fmt: skip
 
 
@@ -301,7 +301,7 @@ def search_along_slope(tile: TileInputs, level: PyramidLevel, prior: SearchPrior
     else:
         slope_surface = SlopeSurface.from_surface(smooth, views.block, prior.coarser_slope(level.window))
     low, high = slope_surface.slope_index(prior.low), slope_surface.slope_index(prior.high)
-    lattice = search_lattice(low, high, level.origin_m, level.step_m, config.pyramid, views.block)
+    lattice = search_lattice(low, high, level.height_origin, level.height_step, config.pyramid, views.block)
     return LevelSearch(views, smooth, slope_surface, slope_surface.along(views), lattice)
 
 
@@ -310,7 +310,7 @@ def _project(tile: TileInputs, level: PyramidLevel, prior: SearchPrior) -> TileV
     config = tile.config
     return tile_views(
         tile.view_pixels, level.number, level.transform, level.shape, config.pyramid.block,
-        (level.origin_m, level.step_m), table_range(level), large_window_side(config.cost) // 2,
+        (level.height_origin, level.height_step), table_range(level), large_window_side(config.cost) // 2,
         reachable_range(level, prior, config),
     )  # fmt: skip
 

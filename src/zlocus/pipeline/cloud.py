@@ -162,7 +162,7 @@ def check_geoid(vertical_datum: VerticalDatum, setup: ImageSetup) -> None:
 
 def image_record(matched_pixels: MatchedPixels) -> dict[str, Any]:
     """What run.json says of a reference image."""
-    match_scene, rays = matched_pixels.match_scene, matched_pixels.image.space.rays
+    match_scene, rays = matched_pixels.match_scene, matched_pixels.image.image_space.rays
     record: dict[str, Any] = {
         "points": int(np.isfinite(matched_pixels.image.height).sum()),
         "levels": match_scene.levels,

@@ -184,8 +184,8 @@ def _make_of_ties(
         )
     if TIES in names:
         write_ties(out / TIES, orientation, setup.scene, opened_inputs.vertical_datum)
-    if OBSERVATIONS in names and orientation.ties is not None:
-        write_observations(out, orientation.ties)
+    if OBSERVATIONS in names and orientation.refined_ties is not None:
+        write_observations(out, orientation.refined_ties)
     if shown := [name for name in names if name in (FOOTPRINTS, CURVES)]:
         run = ReportedRun.of(setup, opened_inputs.vertical_datum)
         with progress.stage("Match curves"):

@@ -68,7 +68,9 @@ def search_range(
 def range_from_ties(scene: Scene, orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
     """Height range (m) of the tie points with its margins, cut below the lowest camera."""
     station = lowest_station(view.sensor for view in scene.views)
-    return capped(height_range(orientation, options, station), station, CLEARANCE_FOUND)
+    names = [view.name for view in orientation.views]
+    found = height_range(orientation.xyz, orientation.sigma_z_m, names, options, station)
+    return capped(found, station, CLEARANCE_FOUND)
 
 
 def range_below_cameras(

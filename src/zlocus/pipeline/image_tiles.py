@@ -32,7 +32,7 @@ from zlocus.matching.image_space import (
     MatchedImage,
     beyond_range,
     build_image_match_scene,
-    confirm,
+    check_cross_consistency,
     depth_options,
     fitting_block,
     hypotheses_of_heights,
@@ -77,7 +77,7 @@ class GroundArea:
         col, row = (np.linspace(start - MARGIN_PX, start + n + MARGIN_PX, N_RAYS) for start, n in (
             (pixel_window.col, pixel_window.cols), (pixel_window.row, pixel_window.rows)))  # fmt: skip
         x, y, z = (v.ravel() for v in np.meshgrid(col, row, self.z_range))
-        ground = image_space.reference.sensor.ground_from_image(np.column_stack([x, y]), z)[:, :2]
+        ground = image_space.reference_view.sensor.ground_from_image(np.column_stack([x, y]), z)[:, :2]
         if not np.isfinite(ground).all():
             return True
         (west, south), (east, north) = ground.min(axis=0), ground.max(axis=0)
@@ -91,7 +91,7 @@ class ImageSetup:
     """What the matching of images in their own spaces starts from.
 
     scene : the views that take part, with corrected cameras; ties : (n, 3) m, ground points; is_supported : (n,)
-    whether the tie points around confirm them; z_range : heights searched, m, None where each image takes its range of
+    whether the tie points around check_cross_consistency them; z_range : heights searched, m, None where each image takes its range of
     depths from the tie points.
     """
 
@@ -264,7 +264,7 @@ def match_images(
     """
     checks = replace(matching.config.checks, max_sigma_m=None, max_overlap_edge_sigma_steps=NO_SPREAD_LIMIT_STEPS)
     config = replace(matching.config, checks=checks)
-    images = [CellWindow(0, 0, *one.image_space.reference.image.shape) for one in image_scenes]
+    images = [CellWindow(0, 0, *one.image_space.reference_view.image.shape) for one in image_scenes]
     surfaces = [Surface.nothing(window, full=matching.spill_arrays.full) for window in images]
     tasks = [
         (number, tile)
@@ -308,7 +308,7 @@ def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, choose_
     except ZlocusError:
         raise
     except Exception as error:
-        window, name = tile.core_window, image_scene.image_space.reference.name
+        window, name = tile.core_window, image_scene.image_space.reference_view.name
         where = f"The pixels from row {window.row}, column {window.col} on of {name}"
         what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
         raise TileError(f"{where} failed with {what}. This is a fault of zlocus, not of the input.") from error
@@ -355,15 +355,15 @@ def cross_checked_images(
     Where only one image was matched there is no other to check it: all its heights are kept, and a note says so.
     """
     if len(matched) < 2:
-        progress.note("Only one image was matched, so no other one could confirm its heights: all are kept.")
+        progress.note("Only one image was matched, so no other one could check_cross_consistency its heights: all are kept.")
         return list(matched)
     images, checked = [m.image for m in matched], []
     with progress.stage("Checking across images", len(images)) as stage:
         for k, one in enumerate(matched):
             kept = one.copied(spill_arrays)
-            for rows, result in confirm(one.image, images[:k] + images[k + 1 :], MAX_DISAGREEMENT_PX):
-                is_unconfirmed = np.isfinite(one.image.height[rows]) & ~result.is_confirmed
-                kept.remove_heights(rows, is_unconfirmed, Quality.INCONSISTENT)
+            for rows, result in check_cross_consistency(one.image, images[:k] + images[k + 1 :], MAX_DISAGREEMENT_PX):
+                is_inconsistent = np.isfinite(one.image.height[rows]) & ~result.is_consistent
+                kept.remove_heights(rows, is_inconsistent, Quality.INCONSISTENT)
                 spill_arrays.rest()
             checked.append(kept)
             stage.advance()
@@ -384,7 +384,7 @@ def heights_for_grid(
     checked = cross_checked_images(matched, progress, matching.spill_arrays)
     z = sum(matching.ground_area.z_range) / 2
     images = {
-        kept.image.space.reference.name: pixel_heights(kept, every, z)
+        kept.image.image_space.reference_view.name: pixel_heights(kept, every, z)
         for kept, every in zip(checked, matched, strict=True)
     }
     evaluations = sum(one.evaluations for one in matched), sum(one.all_images for one in matched)
@@ -393,11 +393,11 @@ def heights_for_grid(
 
 def pixel_heights(checked: MatchedPixels, unchecked: MatchedPixels, z: float) -> PixelHeights:
     """A matched image as the ground grid takes it. z : height (m) at which its ground pixel is measured."""
-    space, step, middle = checked.image.space, checked.match_scene.height_step, checked.image.middle
+    space, step, middle = checked.image.image_space, checked.match_scene.height_step, checked.image.middle
     rows, cols = checked.image.height.shape
     half_step = np.array([[middle - step / 2], [middle + step / 2]], np.float32)
     low, high = (space.ground(rows // 2, hypothesis[None], cols // 2)[0, 0, 2] for hypothesis in half_step)
-    pixel_m = ground_sample_distance(space.reference, z)
+    pixel_m = ground_sample_distance(space.reference_view, z)
     return PixelHeights(checked.image, checked.surface, unchecked.surface, step, abs(float(high - low)), pixel_m)
 
 

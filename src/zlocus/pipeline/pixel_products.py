@@ -35,12 +35,12 @@ def write_cloud(
     number = {view.name: k for k, view in enumerate(scene.views, 1)}
     with PointCloud(out, n_points, vertical_datum.compound_crs(scene.crs)) as cloud:
         for matched_pixels in matched:
-            view, height = matched_pixels.image.space.reference, matched_pixels.image.height
+            view, height = matched_pixels.image.image_space.reference_view, matched_pixels.image.height
             for row, rows in strips(len(height)):
                 known = np.isfinite(height[row : row + rows])
                 if known.any():
                     part = slice(row, row + rows)
-                    xyz = matched_pixels.image.space.ground(row, height[part])[known]
+                    xyz = matched_pixels.image.image_space.ground(row, height[part])[known]
                     xyz[:, 2] -= vertical_datum.undulation(xyz[:, :2], scene.crs)
                     share = np.clip(read_colours(view.path, row, rows)[known] / white, 0.0, 1.0)
                     rgb = np.rint(share * 65535.0).astype(np.uint16)
@@ -59,7 +59,7 @@ def precision_m(matched_pixels: MatchedPixels, row: int, known: NDArray[np.bool_
     part = slice(row, row + len(known))
     z, sigma = matched_pixels.image.height[part][known], matched_pixels.surface.sigma[part][known]
     xy = np.column_stack([cols, rows + row]).astype(float)
-    return np.asarray(sigma * matched_pixels.image.space.rays.metres_per_unit(xy, z.astype(float)))
+    return np.asarray(sigma * matched_pixels.image.image_space.rays.metres_per_unit(xy, z.astype(float)))
 
 
 def strips(n_rows: int) -> Iterator[tuple[int, int]]:
@@ -91,7 +91,7 @@ def write_maps(
     vertical_datum: VerticalDatum = ELLIPSOIDAL,
 ) -> None:
     """NAME_height.tif, NAME_quality.tif and, for frame cameras, NAME_depth.tif."""
-    space, height, quality = matched_pixels.image.space, matched_pixels.image.height, matched_pixels.quality
+    space, height, quality = matched_pixels.image.image_space, matched_pixels.image.height, matched_pixels.quality
     if fill == "interpolate":
         beyond = (quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
         whole = filled_from_behind(height, beyond)

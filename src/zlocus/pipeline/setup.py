@@ -40,7 +40,7 @@ from zlocus.io.vertical import VerticalDatum, named_vertical_datum
 from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
-from zlocus.orientation.orientation import Orientation, orient
+from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.plausibility import Doubt
@@ -146,7 +146,7 @@ def orient_views(
 ) -> Orientation:
     """Find tie points and correct the cameras of a scene.
 
-    control, terrain, known_ties : see `orient`; threads : None uses every core.
+    control, terrain, known_ties : see `OrientationRequest`; threads : None uses every core.
     """
     heights = scene.heights
     if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
@@ -161,7 +161,8 @@ def orient_views(
             done = start + length * share
 
         with opencv_in_one_thread():
-            return orient(scene, options, heights, report, control, terrain, threads or cores(), known_ties)
+            request = OrientationRequest(heights, control, terrain, known_ties)
+            return orient(scene, options, request, report, threads or cores())
 
 
 @contextmanager

@@ -48,8 +48,8 @@ def write_points(out: Path, setup: RunSetup, labelled_ties: list[LabelledTies], 
     """Write tie points (ties.gpkg), their image observations, and the ranking of images where there is one."""
     orientation, scene = setup.orientation, setup.scene
     write_ties(out / "ties.gpkg", orientation, scene, vertical_datum)
-    if orientation.ties is not None:
-        write_observations(out, orientation.ties)
+    if orientation.refined_ties is not None:
+        write_observations(out, orientation.refined_ties)
     if labelled_ties:
         names = [view.name for view in setup.match_scene.views]
         write_ranking(out / "ranking.gpkg", labelled_ties, names, scene.crs, vertical_datum)

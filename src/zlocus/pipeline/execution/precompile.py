@@ -100,7 +100,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     """Run the kernels of the orientation once."""
     from zlocus.orientation.epipolar import Sightlines, trace
     from zlocus.orientation.sift import DESCRIPTOR_LENGTH, Features
-    from zlocus.orientation.tie_refinement import refined_ties
+    from zlocus.orientation.tie_refinement import refine_ties
     from zlocus.orientation.ties import match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
 
@@ -112,7 +112,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
         match_along_curves(moved, features.only(point), features, options.inlier_px, options.match_ratio)
     seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
     ground = sensors[0].ground_from_image(xy, np.zeros(4))
-    refined_ties(match_scene.views, seen, ground_jacobian(sensors, seen, ground), options)
+    refine_ties(match_scene.views, seen, ground_jacobian(sensors, seen, ground), options)
 
 
 def warm(group: str) -> None:
