@@ -31,7 +31,7 @@ def test_a_level_without_prior_searches_the_whole_range():
     assert lattice.first.shape == (3, 5)
     assert (lattice.first == -6).all()
     assert (lattice.count == 64).all()
-    assert (lattice.origin_m, lattice.step_m) == (10.0, 0.5)
+    assert (lattice.height_origin, lattice.height_step) == (10.0, 0.5)
 
 
 def test_flat_ground_has_a_short_range_around_it():
