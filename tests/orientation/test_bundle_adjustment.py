@@ -32,9 +32,9 @@ from zlocus.orientation.parameter_groups import (
     FOCAL,
     POSE,
     SHIFT,
-    parameter_groups_of,
     kind_of,
     needs_bundle_adjustment,
+    parameter_groups_of,
 )
 from zlocus.orientation.shift_adjustment import adjust
 from zlocus.orientation.triangulate import project_points

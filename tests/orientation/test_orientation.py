@@ -15,7 +15,9 @@ from orientation_scenes import hill, hill_scene, image_of, observe, rendered, te
 from zlocus.core.errors import GeometryError
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.scene import Scene, View
-from zlocus.orientation.orientation import RefinedTies, Orientation, height_range, orient
+from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
+from zlocus.orientation.tie_heights import height_range as height_range_of_ties
+from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel
@@ -24,6 +26,11 @@ from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 OPTIONS = OrientationOptions(features_per_mpx=20000)
 PLANTED = np.array([(0.0, 0.0), (3.0, -8.0), (-5.0, 4.0)])
 SHIFT_TOLERANCE_PX = 0.1
+
+
+def height_range(orientation, options):
+    names = [view.name for view in orientation.views]
+    return height_range_of_ties(orientation.xyz, orientation.sigma_z_m, names, options)
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +59,10 @@ def test_ties_that_are_known_make_the_same_orientation(scene, oriented, monkeypa
     def looked_for(*_):
         raise AssertionError("ties are looked for again")
 
-    for name in ("find_ties", "refined_ties"):
+    for name in ("find_ties", "refine_ties"):
         monkeypatch.setattr(f"zlocus.orientation.orientation.{name}", looked_for)
-    known = RefinedTies.of(oriented.ties.arrays(), len(scene.views))
-    again = orient(scene, OPTIONS, known=known)
+    known = RefinedTies.of(oriented.refined_ties.arrays(), len(scene.views))
+    again = orient(scene, OPTIONS, OrientationRequest(refined_ties=known))
     assert again.as_dict() == oriented.as_dict()
     assert again.z_bounds == oriented.z_bounds
     np.testing.assert_array_equal(again.xyz, oriented.xyz)
@@ -76,7 +83,7 @@ def test_ties_that_are_known_make_the_same_orientation(scene, oriented, monkeypa
     ],
 )
 def test_arrays_that_are_no_ties_of_the_scene_are_none(scene, oriented, change):
-    kept = oriented.ties.arrays()
+    kept = oriented.refined_ties.arrays()
     assert RefinedTies.of(kept, len(scene.views)) is not None
     change(kept)
     assert RefinedTies.of(kept, len(scene.views)) is None

@@ -22,7 +22,8 @@ from zlocus.matching.radiometry import FEWEST_POINTS, MOST_POINTS, grey_scales, 
 from zlocus.orientation import sift as features
 from zlocus.orientation import ties as ties_module
 from zlocus.orientation.epipolar import Sightlines, trace
-from zlocus.orientation.orientation import linked_pairs, orient
+from zlocus.orientation.orientation import orient
+from zlocus.orientation.tie_residuals import linked_pairs
 from zlocus.orientation.ties import find_ties, neighbours
 from zlocus.orientation.triangulate import Observations
 from zlocus.pipeline.messages import MAX_NAMED, what_was_applied
@@ -132,7 +133,7 @@ def test_pairs_are_those_that_see_a_point_together(n_views, n_points, seed, at_o
     seen = Observations(view[shuffled], point[shuffled], np.zeros((len(view), 2)))
     expected = [[a, b] for a, b in combinations(range(n_views), 2) if (sees[a] & sees[b]).any()]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("zlocus.orientation.orientation.POINTS_AT_ONCE", at_once)
+        patch.setattr("zlocus.orientation.tie_residuals.POINTS_AT_ONCE", at_once)
         assert linked_pairs(seen, n_views, n_points).tolist() == expected
 
 

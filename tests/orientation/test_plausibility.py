@@ -15,10 +15,10 @@ from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import progress_for
 from zlocus.core.requests import DsmRequest
 from zlocus.io.scene_file import open_scene
-from zlocus.orientation.orientation import first_ground, orient
+from zlocus.orientation.orientation import orient
 from zlocus.orientation.plausibility import (
-    MAX_USUAL_SHIFT_PX,
     MAX_USUAL_RESIDUAL_PX,
+    MAX_USUAL_SHIFT_PX,
     agreeing_shares,
     contradicting_views,
     doubts_about,
@@ -26,6 +26,7 @@ from zlocus.orientation.plausibility import (
     untied_images,
 )
 from zlocus.orientation.shift_adjustment import shifts_with_most_images_in_place
+from zlocus.orientation.tie_points import first_ground_points
 from zlocus.orientation.triangulate import Observations
 from zlocus.pipeline.dsm import run_dsm
 
@@ -203,7 +204,7 @@ def test_one_image_far_off_does_not_move_the_others():
 def test_cameras_of_their_own_are_not_called_exchanged(images):
     scene = open_scene(list(images("sine").inputs))
     found = orient(scene, OrientationOptions())
-    xyz = first_ground(scene, found.ties.rough)
+    xyz = first_ground_points(scene, found.refined_ties.ties)
     sensors = [view.sensor for view in scene.views]
     assert exchanged_views(sensors, found.ties.precise, xyz, range(3), OrientationOptions()) is None
     wrong = [sensors[1], sensors[0], sensors[2]]

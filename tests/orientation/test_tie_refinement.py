@@ -10,9 +10,9 @@ import pytest
 from orientation_scenes import BASE_HEIGHT_M, GSD_M, hill, hill_scene, image_of
 from zlocus.core.options import OrientationOptions
 from zlocus.orientation import sift as features
-from zlocus.orientation.orientation import with_rough_ties
 from zlocus.orientation.shift_adjustment import adjust
-from zlocus.orientation.tie_refinement import MIN_REFINED_OF_VIEW, reference_rows, refined_ties, squares_around, warps
+from zlocus.orientation.tie_points import with_rough_ties
+from zlocus.orientation.tie_refinement import MIN_REFINED_OF_VIEW, reference_rows, refine_ties, squares_around, warps
 from zlocus.orientation.triangulate import Observations, ground_jacobian, project_points
 
 OPTIONS = OrientationOptions()
@@ -49,7 +49,7 @@ def test_errors_of_features_are_taken_off():
     brighter = image_of(scene.views[1].image.pixels * 3.0 + 900.0)
     scene = replace(scene, views=(scene.views[0], replace(scene.views[1], image=brighter), scene.views[2]))
     seen, true, _, by_ground = planted(scene)
-    found = refined_ties(scene.views, seen, by_ground, OPTIONS)
+    found = refine_ties(scene.views, seen, by_ground, OPTIONS)
     assert len(found) > 0.9 * len(seen)
     moved = found.view > 0
     assert np.median(errors(seen, true)[seen.view > 0]) > 0.8 * PLANTED_PX
@@ -60,9 +60,9 @@ def test_errors_of_features_are_taken_off():
 def test_reading_part_by_part_changes_nothing(monkeypatch):
     scene = hill_scene([(0.0, 0.0)] * 3)
     seen, _, _, by_ground = planted(scene)
-    whole = refined_ties(scene.views, seen, by_ground, OPTIONS)
+    whole = refine_ties(scene.views, seen, by_ground, OPTIONS)
     monkeypatch.setattr(features, "PART_PX", 70)
-    parts = refined_ties(scene.views, seen, by_ground, OPTIONS)
+    parts = refine_ties(scene.views, seen, by_ground, OPTIONS)
     np.testing.assert_array_equal(whole.point, parts.point)
     np.testing.assert_array_equal(whole.xy, parts.xy)
 
@@ -74,7 +74,7 @@ def test_what_looks_different_or_is_not_valid_is_left_out():
     valid[:140] = False
     scene = replace(scene, views=(*scene.views[:2], replace(scene.views[2], image=image_of(pixels, valid))))
     seen, true, _, by_ground = planted(scene)
-    found = refined_ties(scene.views, seen, by_ground, OPTIONS)
+    found = refine_ties(scene.views, seen, by_ground, OPTIONS)
     kept = true[found.view * 400 + found.point][found.view == 2]
     assert (kept > 135.0).all()
     assert len(kept) >= MIN_REFINED_OF_VIEW
@@ -88,7 +88,7 @@ def test_invalid_pixels_count_even_where_their_value_is_an_ordinary_one():
     col, row = np.rint(true[seen.view == 2][:5]).astype(int).T
     valid[row, col] = False
     scene = replace(scene, views=(*scene.views[:2], replace(scene.views[2], image=image_of(pixels, valid))))
-    found = refined_ties(scene.views, seen, by_ground, OPTIONS)
+    found = refine_ties(scene.views, seen, by_ground, OPTIONS)
     kept = found.point[found.view == 2]
     assert len(kept) > MIN_REFINED_OF_VIEW
     assert (kept >= 5).all()
@@ -99,7 +99,7 @@ def test_a_view_of_another_season_keeps_what_sift_found():
     noise = image_of(np.random.default_rng(3).normal(size=(280, 280)))
     scene = replace(scene, views=(*scene.views[:2], replace(scene.views[2], image=noise)))
     seen, _, _, by_ground = planted(scene)
-    found = refined_ties(scene.views, seen, by_ground, OPTIONS)
+    found = refine_ties(scene.views, seen, by_ground, OPTIONS)
     last = found.view == 2
     assert last.sum() == 400
     assert (found.xy[last] == seen.xy[seen.view == 2]).all()
@@ -108,7 +108,7 @@ def test_a_view_of_another_season_keeps_what_sift_found():
 def test_nothing_seen_is_nothing_found():
     scene = hill_scene([(0.0, 0.0)] * 2)
     nothing = Observations(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
-    assert len(refined_ties(scene.views, nothing, np.empty((0, 2, 3)), OPTIONS)) == 0
+    assert len(refine_ties(scene.views, nothing, np.empty((0, 2, 3)), OPTIONS)) == 0
 
 
 def test_the_reference_is_the_least_slanted_view_of_each_tie():

@@ -283,7 +283,7 @@ def test_a_resumed_run_does_not_search_tie_points_again(images, straight, tmp_pa
     def looked_for(*_):
         raise AssertionError("ties are looked for again")
 
-    for name in ("find_ties", "refined_ties"):
+    for name in ("find_ties", "refine_ties"):
         monkeypatch.setattr(f"zlocus.orientation.orientation.{name}", looked_for)
     run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     assert same(out, straight)

@@ -12,8 +12,8 @@ from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.normal_equations import Problem, Solution, solve
-from zlocus.orientation.parameter_groups import ParameterGroup, parameter_groups_of, corrected_sensors
-from zlocus.orientation.shift_adjustment import Adjustment, without_outliers, renumbered
+from zlocus.orientation.parameter_groups import ParameterGroup, corrected_sensors, parameter_groups_of
+from zlocus.orientation.shift_adjustment import Adjustment, renumbered, without_outliers
 from zlocus.orientation.triangulate import Observations, project_points, triangulate
 
 ROUNDS = 3
@@ -25,8 +25,8 @@ class BundleAdjustment:
 
     sensors : corrected; adjustment : the ties kept, see `Adjustment`, with shifts of 0; control : the points given;
     control_points : (k, 3) m where their image points put them, check points by them alone, NaN where one image sees a
-    check point; control_residual : (j, 2) px of `control.observations`; terrain_m : (n,) m, heights of the ties less those of
-    the terrain.
+    check point; control_residual : (j, 2) px of `control.observations`; terrain_m : (n,) m, heights of the ties less
+    those of the terrain.
     """
 
     sensors: tuple[SensorModel, ...]

@@ -16,7 +16,8 @@ class GroundControl:
     """Points known on the ground and seen in images.
 
     names : (n,); xyz : (n, 3) m in the scene's frame; sigma_m : (n, 3), standard deviations, NaN where they are not
-    given; is_check : (n,) bool, points that only judge the result; observations : their image points, by the scene's views.
+    given; is_check : (n,) bool, points that only judge the result; observations : their image points, by the scene's
+    views.
     """
 
     names: tuple[str, ...]

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CorrectedCameras:
-    """adjustment : the ties; sensors : corrected, but for the shifts of `adjustment`; joint : where all were jointly."""
+    """adjustment : the ties; sensors : corrected, but for the shifts of `adjustment`; joint : where all were
+    jointly."""
 
     adjustment: Adjustment
     sensors: list[SensorModel]
@@ -39,8 +40,8 @@ class CorrectedCameras:
 
 @dataclass(frozen=True)
 class CameraSolver:
-    """Corrects the cameras of a scene by ties. uses_bundle_adjustment : all jointly, else one shift each; control, terrain : see
-    `orient`."""
+    """Corrects the cameras of a scene by ties. uses_bundle_adjustment : all jointly, else one shift each; control,
+    terrain : see `orient`."""
 
     scene: Scene
     options: OrientationOptions

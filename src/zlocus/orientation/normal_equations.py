@@ -43,8 +43,8 @@ COMMON_PX = 0.03
 class Problem:
     """What is adjusted.
 
-    sensors : as delivered; blocks : of their parameters; observations : image points of ties, then of control points; n_ties :
-    the first so many ground points are ties; control_xyz, control_precision : (k, 3) m and 1/m2 of the others;
+    sensors : as delivered; blocks : of their parameters; observations : image points of ties, then of control points;
+    n_ties : the first so many ground points are ties; control_xyz, control_precision : (k, 3) m and 1/m2 of the others;
     control_px : sigma of their image points; terrain : heights that ties should have, with their sigma in m.
     """
 
@@ -344,7 +344,8 @@ def spread(by_ground: FloatArray, point: NDArray[np.int64], n_points: int) -> An
 
 
 def weak_directions(problem: Problem, linear: Linearised, weight: FloatArray, normal: FloatArray) -> WeakDirections:
-    """Directions whose information from ties, per image point, is next to nothing (see `groups.MIN_INFORMATION_IN_IMAGE`).
+    """Directions whose information from ties, per image point, is next to nothing (see
+    `groups.MIN_INFORMATION_IN_IMAGE`).
 
     normal : (p, p) of the ties alone.
     """

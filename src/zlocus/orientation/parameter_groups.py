@@ -19,8 +19,8 @@ Correct = Callable[[SensorModel, FloatArray], SensorModel]
 Scanner = LineScanModel | RectifiedModel
 
 # A direction of the parameters counts as seen when its information, per observation and in px2, exceeds this over the
-# number of images squared. Shifts: see `adjust.MIN_SHIFT_INFORMATION`. Physical cameras have honest priors, which need no
-# help but where there is no information at all.
+# number of images squared. Shifts: see `adjust.MIN_SHIFT_INFORMATION`. Physical cameras have honest priors, which need
+# no help but where there is no information at all.
 MIN_INFORMATION_IN_IMAGE = 0.01
 MIN_INFORMATION_IN_SPACE = 1e-6
 SHIFT, AFFINE, POSE, FOCAL, DRIFT = "shift", "affine", "pose", "focal length", "drift"
@@ -36,8 +36,8 @@ class ParameterGroup:
     """Parameters that correct some images together.
 
     kind : see above; views : numbers of the images; names : (k,) of the parameters, which end in their unit; sigma :
-    (k,) standard deviations beforehand, about zero, in m, rad and px; observations : see `MIN_INFORMATION_IN_IMAGE`; correct : a sensor
-    model of one of the images and values (k,) in the units of `sigma`, to the corrected model.
+    (k,) standard deviations beforehand, about zero, in m, rad and px; observations : see `MIN_INFORMATION_IN_IMAGE`;
+    correct : a sensor model of one of the images and values (k,) in the units of `sigma`, to the corrected model.
     """
 
     kind: str

@@ -32,9 +32,10 @@ NO_SHIFT_PX, MAJORITY_ROUNDS, MAX_SUSPECTS = 1.0, 30, 12
 class Adjustment:
     """Shifts and the ties they were found from.
 
-    shift_px : (i, 2) column and row to add to what each model projects; n_determined: how many of the 2 i components the ties
-    show, the rest stay at zero; observations, ground_points: the ties kept and their ground points with the shifts; before_px : (m, 2)
-    residuals of those ties with the models as delivered; numbers : (n,) which of the ties given are kept.
+    shift_px : (i, 2) column and row to add to what each model projects; n_determined: how many of the 2 i components
+    the ties show, the rest stay at zero; observations, ground_points: the ties kept and their ground points with the
+    shifts; before_px : (m, 2) residuals of those ties with the models as delivered; numbers : (n,) which of the ties
+    given are kept.
     """
 
     shift_px: FloatArray
@@ -63,11 +64,11 @@ def adjust(
     for _ in range(2):
         if options.model != "none":
             shift, n_determined = solve_shifts(sensors, observations, xyz, options.sigma_shift_px, shift)
-        ground_points = triangulate(sensors, moved(observations, shift), xyz)
+        ground_points = triangulate(sensors, without_shifts(observations, shift), xyz)
         observations, xyz = without_outliers(observations, ground_points, options.inlier_px), ground_points.xyz
     numbers = np.unique(observations.point)
     observations, xyz = renumbered(observations, xyz)
-    ground_points = triangulate(sensors, moved(observations, shift), xyz)
+    ground_points = triangulate(sensors, without_shifts(observations, shift), xyz)
     before = triangulate(sensors, observations, ground_points.xyz, by_ground=ground_points.by_ground)
     return Adjustment(shift, n_determined, observations, ground_points, before.residual, numbers)
 
@@ -90,10 +91,10 @@ def with_most_images_in_place(
         for suspect in _farthest(found.shift_px, tied)
     ]
     shift_px = min(begun, key=lambda shift: _sum_of_logarithms(shift[tied]))
-    ground_points = triangulate(sensors, moved(found.observations, shift_px), found.ground_points.xyz)
+    ground_points = triangulate(sensors, without_shifts(found.observations, shift_px), found.ground_points.xyz)
     # A translation is not quite a shift of every image: the rest is solved for.
     shift_px, _ = solve_shifts(sensors, found.observations, ground_points.xyz, options.sigma_shift_px, shift_px)
-    ground_points = triangulate(sensors, moved(found.observations, shift_px), ground_points.xyz)
+    ground_points = triangulate(sensors, without_shifts(found.observations, shift_px), ground_points.xyz)
     before = triangulate(sensors, found.observations, ground_points.xyz, by_ground=ground_points.by_ground)
     return Adjustment(shift_px, found.n_determined, found.observations, ground_points, before.residual, found.numbers)
 
@@ -140,7 +141,7 @@ def solve_shifts(
     """
     weight, by_ground, n_determined = np.ones(len(observations)), None, 0
     for _ in range(MAX_ITERATIONS):
-        ground_points = triangulate(sensors, moved(observations, shift), xyz, weight, by_ground)
+        ground_points = triangulate(sensors, without_shifts(observations, shift), xyz, weight, by_ground)
         sigma = robust_sigma(ground_points.residual)
         weight = huber_weight(ground_points.residual, sigma)
         normal, pull = reduced_normal_equations(observations, ground_points, weight, len(sensors))
@@ -217,11 +218,11 @@ def translations(
 def determined_directions(normal: FloatArray, weight_of_view: FloatArray, translated: FloatArray) -> FloatArray:
     """Orthonormal basis (2 i, k) of the shifts that ties can tell from a change of the ground.
 
-    Information is judged per observation, so that an image with few ties counts like one with many; what is not observations
-    (a translation of the ground; for two images the shift along their loci; images without ties) stays exactly zero.
-    translated : see `translations`. Where sensors of several kinds are mixed, a translation changes the scales of their
-    images by different amounts, from which a height can be had to a decimetre or so; the cameras say it better, so it
-    stays zero all the same.
+    Information is judged per observation, so that an image with few ties counts like one with many; what is not
+    observations (a translation of the ground; for two images the shift along their loci; images without ties) stays
+    exactly zero. translated : see `translations`. Where sensors of several kinds are mixed, a translation changes the
+    scales of their images by different amounts, from which a height can be had to a decimetre or so; the cameras say it
+    better, so it stays zero all the same.
     """
     scale = np.repeat(np.sqrt(weight_of_view), 2)
     linked = scale > 0.0
@@ -242,7 +243,7 @@ def determined_directions(normal: FloatArray, weight_of_view: FloatArray, transl
     return np.where(linked[:, None], left[:, hidden.shape[1] :], 0.0)
 
 
-def moved(observations: Observations, shift: FloatArray) -> Observations:
+def without_shifts(observations: Observations, shift: FloatArray) -> Observations:
     """The observations as the uncorrected models would have projected them."""
     return Observations(observations.view, observations.point, observations.xy - shift[observations.view])
 

@@ -1,11 +1,12 @@
-"""Ties measured again in the images as they are, by correlation of patches, to a fraction of a pixel."""
+"""Least-squares refinement of ties: each tie is measured in the full-resolution images to a fraction of a pixel."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +17,21 @@ from zlocus.core.scene import View, held_window
 from zlocus.core.sensor_model import FloatArray
 from zlocus.orientation.kernels.patches import patch_shifts
 from zlocus.orientation.sift import parts, reduction
+from zlocus.orientation.ties import Ties
 from zlocus.orientation.triangulate import Observations
 
-# A view with fewer observations that could be measured keeps them all as SIFT found them: another season, haze.
+# A view with fewer observations that could be refined (another season, haze) keeps them all as SIFT found them.
 MIN_REFINED_OF_VIEW = 50
-BORDER_PX = 4  # that cubic interpolation and the last steps need around what is searched
+# Pixels around the searched positions that cubic interpolation and the last steps need.
+BORDER_PX = 4
 
 
 @dataclass(frozen=True)
 class PixelSquares:
-    """Pixels around whole pixels of one part of an image.
+    """Squares of pixels around some observations, from one part of an image.
 
-    rows : (k,) which points; pixels : (k, s, s) float32; valid : (k,) bool, whether all of them are valid.
+    rows : (k,) numbers of the observations; pixels : (k, s, s) float32; valid : (k,) bool, squares without an invalid
+    pixel.
     """
 
     rows: NDArray[np.int64]
@@ -35,18 +39,19 @@ class PixelSquares:
     valid: NDArray[np.bool_]
 
 
-def refined_ties(
+def refine_ties(
     views: Sequence[View],
     observations: Observations,
     by_ground: FloatArray,
     options: OrientationOptions,
     threads: int = 1,
 ) -> Observations:
-    """The observations, each put where its image correlates best with that of the tie's reference.
+    """Observations moved to where their image correlates best with the reference image of their tie.
 
-    by_ground : (m, 2, 3) px per m of each observation, from which follows how level ground looks in one image against
-    another. The reference of a tie is the image that sees it the least slanted; what SIFT found there stays. What
-    correlates less than `min_ncc` is dropped, and ties that keep no two images with it.
+    by_ground : (m, 2, 3) px per m of each observation, from which follows how a patch of level ground is distorted from
+    one image to another. The reference image of a tie is the one that looks at it most steeply; its observation keeps
+    the position of SIFT. Observations that correlate less than `min_ncc` are dropped, and with them ties that keep
+    fewer than two images.
     """
     if not len(observations):
         return observations
@@ -56,14 +61,14 @@ def refined_ties(
     patches, usable = reference_patches(views, observations.view, whole, np.unique(reference), options, threads)
     warp = np.zeros((len(observations), 2, 2))
     warp[other] = warps(by_ground[reference[other]], by_ground[other])
-    # Where the whole pixel of the reference is expected.
+    # Positions at which the whole pixel of the reference is expected.
     expected = observations.xy + np.einsum("mij,mj->mi", warp, (whole - observations.xy)[reference])
     found = np.zeros((len(observations), 3))
     reach = math.ceil(max(reduction(held_window(view.image)[2:], options) for view in views) / 2.0)
     half = 2 * (options.patch_px // 2) + reach + BORDER_PX
 
-    def measure(i: int) -> None:
-        """Observations of one view."""
+    def refine_view(i: int) -> None:
+        """Refine the observations of one view."""
         for squares in squares_around(views[i], whole, other[observations.view[other] == i], half):
             rows, of = squares.rows, reference[squares.rows]
             out = np.empty((len(rows), 3))
@@ -72,7 +77,7 @@ def refined_ties(
             out[:, 2] *= squares.valid & usable[of]
             found[rows] = out
 
-    deque(run_all(measure, range(len(views)), threads), maxlen=0)
+    deque(run_all(refine_view, range(len(views)), threads), maxlen=0)
     is_good = found[:, 2] >= options.min_ncc
     n_good = np.bincount(observations.view[is_good], minlength=len(views))
     as_found = (n_good < MIN_REFINED_OF_VIEW)[observations.view]
@@ -84,11 +89,17 @@ def refined_ties(
 
 
 def reference_rows(observations: Observations, by_ground: FloatArray, n_views: int) -> NDArray[np.int64]:
-    """For each observation (m,) that of the same tie in the view that looks the least slanted at the ground."""
+    """For each observation (m,) the observation of the same tie in the view that looks at the ground most steeply.
+
+    by_ground : (m, 2, 3) px per m. Views are compared by their median parallax rate, in the ground plane.
+    """
     along = np.einsum("mij,mj->mi", inverses(by_ground[:, :, :2]), by_ground[:, :, 2])
-    slant = np.nan_to_num(np.hypot(*along.T), nan=np.inf)
+    parallax_rate = np.nan_to_num(np.hypot(*along.T), nan=np.inf)
     of_view = np.array(
-        [np.median(slant[observations.view == i]) if (observations.view == i).any() else np.inf for i in range(n_views)]
+        [
+            np.median(parallax_rate[observations.view == i]) if (observations.view == i).any() else np.inf
+            for i in range(n_views)
+        ]
     )
     order = np.lexsort((observations.view, of_view[observations.view], observations.point))
     _, first = np.unique(observations.point[order], return_index=True)
@@ -98,16 +109,17 @@ def reference_rows(observations: Observations, by_ground: FloatArray, n_views: i
 
 
 def inverses(matrix: FloatArray) -> FloatArray:
-    """Inverses (n, 2, 2); not finite where there is none."""
+    """Inverses (n, 2, 2) of matrices; not finite where there is none."""
     (a, b), (c, d) = np.moveaxis(matrix, 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), -1, 0))
 
 
 def warps(reference: FloatArray, other: FloatArray) -> FloatArray:
-    """Pixels of the others per pixel of the references (n, 2, 2) on level ground; 0 where unknown.
+    """Derivatives (n, 2, 2) of positions in one image by those in the reference image, on level ground; 0 where
+    unknown.
 
-    reference, other : (n, 2, 3) px per m.
+    reference, other : (n, 2, 3) px per m, derivatives of the image positions by the ground point.
     """
     with np.errstate(invalid="ignore"):
         warp = other[:, :, :2] @ inverses(reference[:, :, :2])
@@ -122,7 +134,11 @@ def reference_patches(
     options: OrientationOptions,
     threads: int = 1,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Patches around some of the observations, (m, p, p) float32 with a border for slopes, and which are valid (m,)."""
+    """Patches (m, p, p) float32 around some of the observations, and which of them are valid (m,).
+
+    view : (m,) of all observations; whole : (m, 2) column and row of their whole pixels; rows : (k,) which are read,
+    the other patches are zero. Patches have a border of one pixel for slopes.
+    """
     half = options.patch_px // 2 + 1
     patches, usable = np.zeros((len(view), 2 * half + 1, 2 * half + 1), np.float32), np.zeros(len(view), bool)
 
@@ -153,3 +169,45 @@ def squares_around(view: View, whole: NDArray[np.int64], rows: NDArray[np.int64]
         at = (row[here] - row0)[:, None, None] + offset[:, None], (col[here] - col0)[:, None, None] + offset
         valid = np.ones(len(here), bool) if window.valid.all() else window.valid[at].all(axis=(1, 2))
         yield PixelSquares(rows[here], window.pixels[at], valid)
+
+
+# Names of the arrays in which refined ties are kept: of the ties as SIFT found them and of the refined observations.
+KEPT_TIES, KEPT_COLUMNS = ("rough", "precise"), ("view", "point", "xy")
+
+
+@dataclass(frozen=True)
+class RefinedTies:
+    """The measurements in the images, which take most of the time of an orientation.
+
+    ties : as SIFT found them; observations : the same ties, refined by least squares, without those that could not be.
+    """
+
+    ties: Ties
+    observations: Observations
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The measurements as named arrays, to be kept in a file, without the matches of the pairs."""
+        both = zip(KEPT_TIES, (self.ties.observations, self.observations), strict=True)
+        columns = {f"{kept}_{column}": getattr(each, column) for kept, each in both for column in KEPT_COLUMNS}
+        return {**columns, "z": self.ties.z, "z_range": np.array(self.ties.z_range)}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]], n_views: int) -> RefinedTies | None:
+        """The measurements that `arrays` gave; None where the arrays do not belong to ties of `n_views` views."""
+        try:
+            rough, refined = (Observations(*(arrays[f"{kept}_{name}"] for name in KEPT_COLUMNS)) for kept in KEPT_TIES)
+            z, (low, high) = arrays["z"], arrays["z_range"]
+        except (KeyError, ValueError):
+            return None
+        if not all(_are_valid(observations, n_views, len(z)) for observations in (rough, refined)):
+            return None
+        return cls(Ties(rough, z, (), (float(low), float(high))), refined)
+
+
+def _are_valid(observations: Observations, n_views: int, n_points: int) -> bool:
+    """Whether observations have the shapes and numbers of so many views and points."""
+    view, point, xy = observations.view, observations.point, observations.xy
+    if view.ndim != 1 or point.shape != view.shape or xy.shape != (len(observations), 2):
+        return False
+    numbers = ((view, n_views), (point, n_points))
+    return all(v.dtype == np.int64 and v.min(initial=0) >= 0 and v.max(initial=-1) < n for v, n in numbers)

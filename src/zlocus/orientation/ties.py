@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError
+from zlocus.core.footprints import ground_box
 from zlocus.core.options import OrientationOptions
 from zlocus.core.parallel import run_all
 from zlocus.core.scene import Scene, View, held_window
-from zlocus.core.footprints import ground_box
 from zlocus.core.sensor_model import FloatArray, lowest_station
 from zlocus.orientation.epipolar import EpipolarCurves, Sightlines, epipolar_offsets, trace
 from zlocus.orientation.kernels.descriptors import CurveSegments, SecondFeatures, nearest_descriptors

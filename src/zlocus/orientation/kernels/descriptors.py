@@ -56,8 +56,8 @@ def dot(a, b):
 def sort_into_cells(xy, corner, rows, cols, start, order):
     """Sort points (k, 2) into the cells of a grid with its first cell at `corner`, px.
 
-    order : (k,) receives the numbers of the points, cell after cell, row by row; start : (rows * cols + 1,) receives the
-    place in `order` at which each cell begins.
+    order : (k,) receives the numbers of the points, cell after cell, row by row; start : (rows * cols + 1,) receives
+    the place in `order` at which each cell begins.
     """
     cell = np.empty(len(xy), np.int64)
     start[:] = 0
@@ -124,9 +124,9 @@ def is_clear(xy, near, distance, n_near, ratio):
 def nearest_descriptors(segments, features, max_px, ratio, best_a, best_b):
     """Find for each segment the feature near it with the nearest descriptor, and for each feature the segment.
 
-    max_px : largest distance of a feature from its segment; ratio : see `is_clear`. best_a : (n,) receives the number of
-    a feature, -1 where none is near or the best match is not clear; best_b : (k,) receives the number of a segment, -1
-    where none is near.
+    max_px : largest distance of a feature from its segment; ratio : see `is_clear`. best_a : (n,) receives the number
+    of a feature, -1 where none is near or the best match is not clear; best_b : (k,) receives the number of a segment,
+    -1 where none is near.
     """
     low, high, in_a, xy, in_b = segments.low, segments.high, segments.descriptors, features.xy, features.descriptors
     best_a[:] = -1

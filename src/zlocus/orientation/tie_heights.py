@@ -1,0 +1,93 @@
+"""Heights of tie points: which of them can be trusted, and the range of heights that they suggest for the search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.core.errors import GeometryError
+from zlocus.core.options import OrientationOptions
+from zlocus.core.sensor_model import FloatArray
+
+# Trusted ties that a range of heights needs, and the percentiles of their heights that it is taken from.
+MIN_TIES_FOR_RANGE = 20
+RANGE_PERCENT = (0.5, 99.5)
+# Largest margin above and below the ties, as a share of the depth below the lowest camera: a drone flies higher than
+# what it sees is tall.
+MAX_MARGIN_SHARE_OF_DEPTH = 0.15
+# A tie is trusted where so many of its nearest neighbours have a height that agrees with its own: up to this slope
+# between the two, and this many standard deviations of both.
+NEIGHBOURS = 8
+MIN_AGREEING_NEIGHBOURS = 3
+MAX_SLOPE = 1.5
+MAX_HEIGHT_SIGMAS = 4.0
+KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex); its other trees are random
+
+
+def height_range(
+    xyz: FloatArray,
+    sigma_z_m: FloatArray,
+    names: Sequence[str],
+    options: OrientationOptions,
+    station: float | None = None,
+) -> tuple[float, float]:
+    """Lowest and highest height (m) to search, from the heights of the ties.
+
+    xyz : (n, 3) m, ground points of the ties; sigma_z_m : (n,) precision of their heights; names : of the views, for
+    the message; station : height of the lowest camera (m), where it is known.
+
+    The range is that of the 0.5 to 99.5 percentiles of the trusted ties. It is widened at both ends by `range_margin`
+    times itself (peaks and valleys between ties), then by `range_up_m` above (towers and trees carry few ties) and
+    `range_down_m` below, but by no more than `MAX_MARGIN_SHARE_OF_DEPTH` of the depth below the station. A range that
+    is too wide costs time at the coarsest level only (and, for a drone, accuracy of the projection tables); one that is
+    too narrow loses the tower.
+
+    Raises
+    ------
+    GeometryError
+        Fewer than `MIN_TIES_FOR_RANGE` ties can be trusted.
+    """
+    trusted = supported(xyz, sigma_z_m)
+    if trusted.sum() < MIN_TIES_FOR_RANGE:
+        raise GeometryError(
+            f"Only {int(trusted.sum())} reliable tie points were found between {', '.join(names)}, too few to tell the "
+            f"height range of the ground ({MIN_TIES_FOR_RANGE} are needed). Give --heights ZMIN ZMAX or --dem, or check "
+            "that the images overlap."
+        )
+    low, high = np.percentile(xyz[trusted, 2], RANGE_PERCENT)
+    margin = options.range_margin * (high - low)
+    low, high = float(low - margin), float(high + margin)
+    down, up = (
+        more if station is None else min(more, MAX_MARGIN_SHARE_OF_DEPTH * max(station - z, 0.0))
+        for more, z in ((options.range_down_m, low), (options.range_up_m, high))
+    )
+    return low - down, high + up
+
+
+def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> NDArray[np.bool_]:
+    """Ties (n,) whose height agrees with that of three or more of their eight nearest neighbours.
+
+    xyz : (n, 3) m, NaN for ties without a ground point; sigma_z_m : (n,). Two heights agree where a slope of 1.5
+    between the ties, together with four standard deviations of both heights, explains their difference.
+    """
+    good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    trusted = np.zeros(len(xyz), bool)
+    if len(good) <= MIN_AGREEING_NEIGHBOURS:
+        return trusted
+    distance, near = nearest_points(xyz[good, :2], min(NEIGHBOURS + 1, len(good)))
+    sigma = np.hypot(sigma_z_m[good][:, None], sigma_z_m[good][near[:, 1:]])
+    difference = np.abs(xyz[good, 2][:, None] - xyz[good, 2][near[:, 1:]])
+    agrees = difference <= MAX_SLOPE * distance[:, 1:] + MAX_HEIGHT_SIGMAS * sigma
+    trusted[good] = agrees.sum(axis=1) >= MIN_AGREEING_NEIGHBOURS
+    return trusted
+
+
+def nearest_points(xy: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int32]]:
+    """Distances and numbers, (n, count) each, of the points nearest to each of xy (n, 2), itself among them."""
+    points = (xy - xy.mean(axis=0)).astype(np.float32)
+    index = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})
+    near, squared = index.knnSearch(points, count, params={"checks": -1, "eps": 0.0, "sorted": True})
+    return np.sqrt(squared.astype(float)), near

@@ -1,0 +1,125 @@
+"""Residuals of ties, for each image and each pair, before and after the cameras were corrected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.core.scene import Scene, View
+from zlocus.core.sensor_model import FloatArray, SensorModel
+from zlocus.orientation.epipolar import Sightlines, epipolar_offsets
+from zlocus.orientation.parameter_groups import kind_of
+from zlocus.orientation.shift_adjustment import Adjustment
+from zlocus.orientation.triangulate import Observations, rows_of_views
+
+# Points of which it is computed at once which images see them, so that the memory for it stays small.
+POINTS_AT_ONCE = 4096
+# About so many ties of a pair (up to twice as many) are enough for the median distance that is reported.
+TIES_FOR_MEDIAN = 200
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Statistics of the lengths of tie residuals, px; NaN without ties."""
+
+    median: float
+    rms: float
+    percent90: float
+
+    @classmethod
+    def of(cls, residual: FloatArray) -> Residuals:
+        """Statistics of residuals (m, 2) px."""
+        length = np.hypot(*residual.T)
+        if not len(length):
+            return cls(np.nan, np.nan, np.nan)
+        return cls(float(np.median(length)), float(np.sqrt(np.mean(length**2))), float(np.percentile(length, 90)))
+
+    def as_dict(self) -> dict[str, float | None]:
+        """The statistics for run.json, rounded; None for NaN."""
+        values = {"median": self.median, "rms": self.rms, "percent90": self.percent90}
+        return {name: round(value, 4) if np.isfinite(value) else None for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class ViewOrientation:
+    """Correction and residuals of one image.
+
+    shift_px : (column, row) added to what its sensor model projects; where more than a shift was corrected, the median
+    of the correction at its ties; before, after : residuals of its ties; sensor : see `parameter_groups.kind_of`.
+    """
+
+    name: str
+    shift_px: tuple[float, float]
+    n_ties: int
+    before: Residuals
+    after: Residuals
+    sensor: str = "rpc"
+
+
+@dataclass(frozen=True)
+class PairOrientation:
+    """Number of ties of two images, and the median distance of their points from the epipolar curves, px, before and
+    after the correction; NaN where there are no curves."""
+
+    views: tuple[str, str]
+    n_ties: int
+    epipolar_distance_before_px: float
+    epipolar_distance_after_px: float
+
+
+def view_orientation(view: View, number: int, adjustment: Adjustment, corrected_sensor: SensorModel) -> ViewOrientation:
+    """Correction and residuals of the view of that number. corrected_sensor : its sensor, but for its shift."""
+    mine = adjustment.observations.view == number
+    column, row = adjustment.shift_px[number]
+    if corrected_sensor is not view.sensor and mine.any():
+        xyz = adjustment.ground_points.xyz[adjustment.observations.point[mine]]
+        moved = corrected_sensor.image_from_ground(xyz) - view.sensor.image_from_ground(xyz)
+        column, row = np.nanmedian(moved, axis=0)
+    before, after = Residuals.of(adjustment.before_px[mine]), Residuals.of(adjustment.after_px[mine])
+    shift = (float(column), float(row))
+    return ViewOrientation(view.name, shift, int(mine.sum()), before, after, kind_of(view.sensor))
+
+
+def pair_orientations(
+    scene: Scene, corrected_sensors: Sequence[SensorModel], adjustment: Adjustment, z_range: tuple[float, float]
+) -> tuple[PairOrientation, ...]:
+    """Distances of each pair's points from the epipolar curves, over the ties that both its images see.
+
+    corrected_sensors : of all views, but for their shifts; z_range : lowest and highest height of the curves, m.
+    """
+    observations, found = adjustment.observations, []
+    of_view = rows_of_views(observations, len(scene.views))
+    for a, b in linked_pairs(observations, len(scene.views), len(adjustment.ground_points.xyz)):
+        _, in_a, in_b = np.intersect1d(
+            observations.point[of_view[a]], observations.point[of_view[b]], assume_unique=True, return_indices=True
+        )
+        few = slice(None, None, max(len(in_a) // TIES_FOR_MEDIAN, 1))
+        xy_a, xy_b = observations.xy[of_view[a][in_a[few]]], observations.xy[of_view[b][in_b[few]]]
+        sightlines = Sightlines.of(scene.views[a].sensor, xy_a, z_range)
+        before = epipolar_offsets(sightlines, scene.views[b].sensor, xy_b, z_range).distance_px
+        sightlines = Sightlines.of(corrected_sensors[a], xy_a - adjustment.shift_px[a], z_range)
+        shifted_b = xy_b - adjustment.shift_px[b]
+        after = epipolar_offsets(sightlines, corrected_sensors[b], shifted_b, z_range).distance_px
+        names = (scene.views[a].name, scene.views[b].name)
+        found.append(PairOrientation(names, len(in_a), median_distance(before), median_distance(after)))
+    return tuple(found)
+
+
+def linked_pairs(observations: Observations, n_views: int, n_points: int) -> NDArray[np.int64]:
+    """Numbers (k, 2) of the views, the smaller first, that see some point together."""
+    together = np.zeros((n_views, n_views), np.float32)
+    for first in range(0, n_points, POINTS_AT_ONCE):
+        here = (observations.point >= first) & (observations.point < first + POINTS_AT_ONCE)
+        sees = np.zeros((n_views, POINTS_AT_ONCE), np.float32)
+        sees[observations.view[here], observations.point[here] - first] = 1.0
+        together += sees @ sees.T
+    return np.argwhere(np.triu(together > 0, 1))
+
+
+def median_distance(distance_px: FloatArray) -> float:
+    """Median length of the signed distances (n,) px that are finite; NaN where none is."""
+    known = distance_px[np.isfinite(distance_px)]
+    return float(np.median(np.abs(known))) if len(known) else np.nan
