@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import get_type_hints
 
@@ -15,6 +15,7 @@ import zlocus
 from docs_commands import PAGES
 from places import ROOT
 from zlocus.cli.app import app
+from zlocus.core.options import RunConfig
 from zlocus.core.requests import FINISHED
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.scene_file import read_scene_file
@@ -94,6 +95,8 @@ STAGES = re.findall(
 )
 # Folders in pages that are not those of the repository.
 NOT_OURS = {"cameras/", "point/", "scene/", "surface/", "sparse/"}
+# Keys of run.json that begin like an option.
+IN_RUN_JSON = {"orientation.excluded_images", "orientation.doubts"}
 # Files that a reader of the page makes, or that stand for any.
 MADE_BY_READER = re.compile(r"src/zlocus/a/b\.py|tests/a/test_b\.py|New file `([\w/.]+)`")
 # One or more sizes: (n,), (r, c), (4, r, c).
@@ -151,3 +154,34 @@ def test_files_named_in_pages_exist(page):
 def test_the_method_names_the_files_of_its_steps():
     text = (ROOT / "docs" / "explanation" / "method.md").read_text(encoding="utf-8")
     assert len(re.findall(r"`(?:matching|orientation|sensors)/", text)) > 15
+
+
+def option_names(options=None, prefix="") -> set[str]:
+    """Names of all options of a run, with those of their groups, and of the groups themselves."""
+    options = RunConfig() if options is None else options
+    names = set()
+    for field in fields(options):
+        value = getattr(options, field.name)
+        names.add(f"{prefix}{field.name}")
+        if is_dataclass(value):
+            names |= option_names(value, f"{prefix}{field.name}.")
+    return names
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_options_named_in_pages_exist(page):
+    """As `[group]`, or as `group.option`."""
+    known, text = option_names(), page.read_text(encoding="utf-8")
+    groups = {name.partition(".")[0] for name in known}
+    named = re.findall(r"`([a-z]+(?:\.[a-z0-9_]+)+)(?: = [^`]*)?`", text)
+    named = [name for name in named if name.partition(".")[0] in groups and not name.endswith((".tif", ".json", ".py"))]
+    named += re.findall(r"`\[([a-z_.]+)\]`", text)
+    assert set(named) <= known | IN_RUN_JSON, set(named) - known
+
+
+def test_options_of_the_choice_of_images_exist():
+    text = (ROOT / "docs" / "explanation" / "selection.md").read_text(encoding="utf-8")
+    known = {name.rpartition(".")[2] for name in option_names()}
+    named = set(re.findall(r"`([a-z]+(?:_[a-z]+)+)`", text))
+    assert len(named) > 8
+    assert named <= known | {"all_images"}
