@@ -29,6 +29,7 @@ from rendered_scenes import SMALL_TILES, UTM, run
 from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError, InputError, OutputError
 from zlocus.core.options import RunConfig
+from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.inspector.cell import WhatIf, match_record
 from zlocus.inspector.folder import Patch, read_patch, surface_folder
@@ -41,7 +42,6 @@ from zlocus.inspector.serving import checked_address, fragment_of, listening
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.point_report import PointReport, point_record
-from zlocus.evaluation.comparison import Comparison
 from zlocus.products.report.maps import FLAG_GROUPS, groups_of
 from zlocus.products.tie_observations import OBSERVATIONS
 
@@ -93,7 +93,7 @@ def scene(out):
 
 def report_of(scene, folder, row, col, config: RunConfig, reference=None, views=None) -> PointReport:
     """What the library says of a cell, without the inspector."""
-    xy = folder.middle_of(row, col)
+    xy = folder.centre_of(row, col)
     settled = scene.matched.settled
     place = place_of_cell(xy, folder.cell(row, col)["dsm"], scene.matched)
     if views is not None:
@@ -121,7 +121,7 @@ def test_the_scene_comes_out_as_it_was_in_the_run(out, scene):
 def test_a_cell_is_told_as_the_library_tells_it(page, out, scene):
     inspection, client = page
     row, col = a_cell(out)
-    x, y = inspection.folder.middle_of(row, col)
+    x, y = inspection.folder.centre_of(row, col)
     found = client.get("api/cell", params={"x": x + 0.1, "y": y - 0.1}).json()
     for name, raster in (("height_m", "dsm"), ("sigma_m", "sigma"), ("n_images", "views"), ("quality", "quality")):
         with rasterio.open(out / f"{raster}.tif") as file:
@@ -144,7 +144,7 @@ def test_a_cell_is_told_as_the_library_tells_it(page, out, scene):
 def test_what_if_is_computed_by_the_same_functions(page, out, scene, asked, window, selection, reference, views):
     inspection, client = page
     row, col = a_cell(out)
-    x, y = inspection.folder.middle_of(row, col)
+    x, y = inspection.folder.centre_of(row, col)
     config = replace(scene.config, selection=replace(scene.config.selection, **selection))
     if window is not None:
         config = replace(config, cost=replace(config.cost, large_window=window))
@@ -159,7 +159,7 @@ def test_windows_and_lines_are_those_of_the_images(page, out, scene):
     """The middle of the patch is the window whose correlation is shown, and the line goes where the camera says."""
     inspection, client = page
     row, col = a_cell(out)
-    xy = inspection.folder.middle_of(row, col)
+    xy = inspection.folder.centre_of(row, col)
     found = client.get("api/cell", params={"x": xy[0], "y": xy[1]}).json()["match"]
     report = report_of(scene, inspection.folder, row, col, scene.config)
     views = {view.name: view for view in scene.matched.settled.views}
@@ -177,14 +177,14 @@ def test_windows_and_lines_are_those_of_the_images(page, out, scene):
 def test_a_cell_without_a_height_has_curves_all_the_same(out, scene):
     folder = surface_folder(out)
     row, col = a_cell(out)
-    found = match_record(scene, folder.middle_of(row, col), np.nan, WhatIf())
+    found = match_record(scene, folder.centre_of(row, col), np.nan, WhatIf())
     assert "tie points" in found["height_from"]
     assert len(found["heights_m"]) == 2 * scene.config.selection.reach_steps + 1
 
 
 def test_two_images_are_needed(page, out):
     inspection, client = page
-    x, y = inspection.folder.middle_of(*a_cell(out))
+    x, y = inspection.folder.centre_of(*a_cell(out))
     found = client.get("api/cell", params={"x": x, "y": y, "without": ["nadir", "fore"]}).json()
     assert found["error"] == "Two images are needed at least. Switch another one on."
     assert "match" not in found
@@ -257,14 +257,14 @@ def test_patches_come_from_overviews_and_keep_their_place(tmp_path, out):
 def test_profiles_are_the_cells_along_the_line(page, out):
     inspection, client = page
     folder, heights = inspection.folder, heights_of(out)
-    (x0, y0), (x1, y1) = folder.middle_of(50, 20), folder.middle_of(50, 120)
+    (x0, y0), (x1, y1) = folder.centre_of(50, 20), folder.centre_of(50, 120)
     found = client.get("api/profile", params={"x0": x0, "y0": y0, "x1": x1, "y1": y1}).json()
     assert found["spacing_m"] == pytest.approx(folder.cell_m)
     assert found["distance_m"][-1] == pytest.approx(100 * folder.cell_m)
     np.testing.assert_allclose(np.array(found["height_m"], float), heights[50, 20:121], atol=ROUNDED_M)
     with rasterio.open(out / "sigma.tif") as file:
         np.testing.assert_allclose(np.array(found["sigma_m"], float), file.read(1)[50, 20:121], atol=ROUNDED_M)
-    (x0, y0), (x1, y1) = folder.middle_of(64, 40), folder.middle_of(64, 90)
+    (x0, y0), (x1, y1) = folder.centre_of(64, 40), folder.centre_of(64, 90)
     found = client.get("api/profile", params={"x0": x0, "y0": y0, "x1": x1, "y1": y1}).json()
     expected = heights[64, 40:91] + 0.25
     expected[20:30] = np.nan
@@ -309,7 +309,7 @@ def test_the_reference_is_moved_as_the_surface_is(out, tmp_path):
     with Inspection(out, comparison) as inspection:
         opened(inspection)
         row, col = a_cell(out)
-        x, y = inspection.folder.middle_of(row, col)
+        x, y = inspection.folder.centre_of(row, col)
         assert abs(inspection.cell(x, y, WhatIf())["difference_m"]) < 0.1
 
 
@@ -324,7 +324,7 @@ def test_a_reference_above_a_geoid_is_raised(out, tmp_path):
     reference = written(out, tmp_path / "above.tif", lambda z: z - UNDULATION_M + 0.25, crs="EPSG:32632")
     with Inspection(out, Comparison(reference, geoid=geoid, margin_m=0.0)) as inspection:
         opened(inspection)
-        x, y = inspection.folder.middle_of(*a_cell(out))
+        x, y = inspection.folder.centre_of(*a_cell(out))
         assert inspection.cell(x, y, WhatIf())["difference_m"] == pytest.approx(-0.25, abs=1e-3)
 
 
@@ -350,7 +350,7 @@ def test_a_surface_above_a_geoid_is_looked_at_above_it(images, tmp_path):
     with Inspection(out, Comparison(ellipsoidal, geoid=geoid, margin_m=0.0)) as inspection:
         opened(inspection)
         row, col = a_cell(out)
-        found = inspection.cell(*inspection.folder.middle_of(row, col), WhatIf())
+        found = inspection.cell(*inspection.folder.centre_of(row, col), WhatIf())
     assert found["difference_m"] == pytest.approx(0.0, abs=1e-3)
     heights = found["match"]["heights_m"]
     assert heights[len(heights) // 2] == pytest.approx(z[row, col], abs=1e-3)
@@ -382,7 +382,7 @@ def test_without_its_images_a_surface_is_still_shown(images, tmp_path):
     inputs[0].unlink()
     with Inspection(out) as inspection:
         opened(inspection)
-        x, y = inspection.folder.middle_of(*a_cell(out))
+        x, y = inspection.folder.centre_of(*a_cell(out))
         found = inspection.cell(x, y, WhatIf())
         assert found["height_m"] is not None
         assert found["error"].startswith(f"There is no image {inputs[0]}")
@@ -448,7 +448,7 @@ def test_what_is_no_surface_is_refused_with_a_sentence(out, tmp_path):
 def test_nothing_but_what_the_page_asks_is_answered(page, out, path, status):
     """The address goes to the server just as it stands here: no client tidies it first."""
     inspection, client = page
-    x, y = inspection.folder.middle_of(*a_cell(out))
+    x, y = inspection.folder.centre_of(*a_cell(out))
     answer, content = raw(client, "GET", path.replace("{x}", str(x)).replace("{y}", str(y)))
     assert answer.status == status
     assert len(content) < 300
@@ -582,15 +582,15 @@ def test_the_crs_is_that_of_the_run(out):
     folder = surface_folder(out)
     assert folder.crs == UTM
     assert not folder.is_local
-    assert folder.cell_of(*folder.middle_of(3, 4)) == (3, 4)
-    assert folder.cell_of(*folder.middle_of(-1, 4)) is None
+    assert folder.cell_of(*folder.centre_of(3, 4)) == (3, 4)
+    assert folder.cell_of(*folder.centre_of(-1, 4)) is None
     assert folder.cell_of(np.inf, 0) is None
 
 
 def test_clicks_that_nobody_waits_for_keep_nobody_waiting(page, out):
     """Those that were given up are not computed, and what else is asked is answered meanwhile."""
     inspection, client = page
-    x, y = inspection.folder.middle_of(*a_cell(out))
+    x, y = inspection.folder.centre_of(*a_cell(out))
     base = urlsplit(str(client.base_url))
     gone = [HTTPConnection(base.hostname, base.port) for _ in range(60)]
     for connection in gone:
@@ -607,7 +607,7 @@ def test_a_surface_that_is_made_again_is_not_mixed_with_the_old(out, tmp_path):
     copy = Path(shutil.copytree(out, tmp_path / "out"))
     with Inspection(copy) as inspection:
         opened(inspection)
-        x, y = inspection.folder.middle_of(*a_cell(out))
+        x, y = inspection.folder.centre_of(*a_cell(out))
         assert "match" in inspection.cell(x, y, WhatIf())
         record = (copy / "run.json").read_text()
         (copy / "run.json").write_text(record + " ")
@@ -619,7 +619,7 @@ def test_a_surface_that_is_made_again_is_not_mixed_with_the_old(out, tmp_path):
 def test_files_that_are_gone_are_an_answer(out, tmp_path):
     copy = Path(shutil.copytree(out, tmp_path / "out"))
     with served(copy) as (inspection, address), httpx.Client(base_url=address) as client:
-        x, y = inspection.folder.middle_of(*a_cell(out))
+        x, y = inspection.folder.centre_of(*a_cell(out))
         (copy / "sigma.tif").unlink()
         for path in (f"api/cell?x={x}&y={y}", "tiles/sigma/0/0/0.png", f"api/profile?x0={x}&y0={y}&x1={x}&y1={y}"):
             answer = client.get(path)

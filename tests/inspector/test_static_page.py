@@ -15,11 +15,11 @@ import rasterio
 from browser import found_browser
 from inspected import a_cell, served
 from rendered_scenes import SMALL_TILES, run
+from zlocus.evaluation.comparison import Comparison
 from zlocus.inspector.restored_run import restored
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.point_report import PointReport
-from zlocus.evaluation.comparison import Comparison
 
 LAYERS = ["hillshade", "ortho", "height", "sigma", "views", "quality", "difference"]
 DESK, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
@@ -112,7 +112,7 @@ def open_address(page, part) -> None:
 
 def click_cell(page, folder, row, col) -> None:
     """Click the middle of a cell where the map shows it."""
-    x, y = folder.middle_of(row, col)
+    x, y = folder.centre_of(row, col)
     # One pixel of the map is a cell then, and the cell's middle the map's.
     open_address(page, f"#at={x},{y},2")
     box = page.locator("#map").bounding_box()
@@ -130,7 +130,7 @@ def report_of(out, folder, row, col, without=(), window=None) -> PointReport:
     kept = [i for i, view in enumerate(matching.views) if view.name not in without]
     views, grey = (tuple(each[i] for i in kept) for each in (matching.views, matching.grey))
     matching = replace(matching, views=views, grey=grey)
-    place = place_of_cell(folder.middle_of(row, col), folder.cell(row, col)["dsm"], scene.matched)
+    place = place_of_cell(folder.centre_of(row, col), folder.cell(row, col)["dsm"], scene.matched)
     looked = curves_at("the cell", None, matching, place, config, SHOWN_WITHIN_CELLS)
     return PointReport.of("the cell", looked, matching, scene.matched.scene.crs)
 
@@ -207,10 +207,10 @@ def test_the_slider_moves_all_that_shows_a_height(page, inspected, out):
     pictures = "nodes => nodes.map((node) => node.getAttribute('href'))"
     before = page.eval_on_selector_all(fixed, pictures)
     assert page.eval_on_selector_all(moving, pictures) == before
-    line = "#ncc-figure line.looked-at"
+    line = "#ncc-figure line.selected-height"
     at = float(page.locator(line).get_attribute("x1"))
     circles = "nodes => nodes.map((node) => node.getAttribute('transform'))"
-    places = page.eval_on_selector_all("#loci-figure circle.looked-at", circles)
+    places = page.eval_on_selector_all("#loci-figure circle.selected-height", circles)
     page.locator("#height").fill(str(middle + 9))
     height = report.heights_m[middle + 9]
     assert number(page.locator("#height-value").inner_text()) == pytest.approx(height, abs=SHOWN_M)
@@ -218,7 +218,7 @@ def test_the_slider_moves_all_that_shows_a_height(page, inspected, out):
     moved = page.eval_on_selector_all(moving, pictures)
     assert all(one != other for one, other in zip(moved, before, strict=True))
     assert float(page.locator(line).get_attribute("x1")) > at
-    assert page.eval_on_selector_all("#loci-figure circle.looked-at", circles) != places
+    assert page.eval_on_selector_all("#loci-figure circle.selected-height", circles) != places
     said = page.locator("#windows-figure text.moving-value").nth(1).text_content()
     assert said == f"{height:.2f} m: ρ {report.curves.single_curves.values[0, middle + 9]:.2f}"
 
@@ -288,7 +288,7 @@ def test_a_link_reopens_the_view(page, browser, inspected, out):
 
 def test_an_address_that_is_opened_is_not_overwritten_by_the_one_before(page, inspected):
     # What the map wrote late could otherwise come between the new address and the event that reads it.
-    x, y = inspected[0].folder.middle_of(40, 40)
+    x, y = inspected[0].folder.centre_of(40, 40)
     address = f"#at={x},{y},2"
     page.wait_for_timeout(400)
     page.evaluate(
@@ -373,7 +373,7 @@ def test_the_surface_is_shown_in_three_dimensions(page, inspected, tmp_path):
 
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (DESK, "dark"), (PHONE, "light"), (PHONE, "dark")])
 def test_it_fits_laptops_and_telephones_by_day_and_night(browser, inspected, out, size, scheme):
-    x, y = inspected[0].folder.middle_of(*a_cell(out))
+    x, y = inspected[0].folder.centre_of(*a_cell(out))
     page, faults = page_at(browser, f"{inspected[1]}#cell={x},{y}", size, color_scheme=scheme)
     settled(page)
     assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
@@ -407,7 +407,7 @@ def test_the_page_is_used_while_the_scene_opens(browser, out, monkeypatch):
 
     monkeypatch.setattr("zlocus.inspector.inspection.restored", slowly)
     with served(out, wait=False) as (inspection, address):
-        x, y = inspection.folder.middle_of(*a_cell(out))
+        x, y = inspection.folder.centre_of(*a_cell(out))
         context = browser.new_context(viewport=DESK)
         page = context.new_page()
         page.goto(f"{address}#cell={x},{y}&tab=profile&line={x - 9},{y},{x + 9},{y}")
@@ -455,7 +455,7 @@ def test_names_that_are_code_do_not_run(images, browser, tmp_path):
     curves["cells"][0]["why"] = bad
     (out / "curves.json").write_text(json.dumps(curves))
     with served(out) as (inspection, address):
-        x, y = inspection.folder.middle_of(*a_cell(out))
+        x, y = inspection.folder.centre_of(*a_cell(out))
         context = browser.new_context(viewport=DESK)
         page, asked = context.new_page(), []
         page.on("dialog", lambda dialog: asked.append(dialog.message))

@@ -1,1 +1,1 @@
-"""The page that explains a surface, cell by cell: map, match curves, profile and relief."""
+"""A web page that explains a surface cell by cell: map, match curves, profile and 3-D view."""

@@ -33,8 +33,11 @@ DARKEST_GREY, BRIGHTEST_GREY = 1, 255  # 0: not covered by the image
 
 @dataclass(frozen=True)
 class WhatIf:
-    """What the match of a cell uses otherwise than the run. left_out : names of images; reference : name of the image to be it;
-    window : side of the window, cells; selection : options of `SelectionOptions` by name."""
+    """Settings with which a cell is matched, where they differ from the run.
+
+    left_out : names of images that are not used; reference : name of the reference image; window : side of the
+    correlation window, cells; selection : changed options of `SelectionOptions` by name.
+    """
 
     left_out: frozenset[str] = frozenset()
     reference: str | None = None
@@ -67,7 +70,9 @@ class WhatIf:
         if unknown:
             raise ConfigError(f"This surface has no image {min(unknown)[:60]!r}.")
         if self.reference in self.left_out:
-            raise ConfigError(f"{self.reference} is the reference image, and it is switched off. Choose another reference image.")
+            raise ConfigError(
+                f"{self.reference} is the reference image, and it is switched off. Choose another reference image."
+            )
         kept = [i for i, name in enumerate(names) if name not in self.left_out]
         views = tuple(match_scene.views[i] for i in kept)
         return replace(match_scene, views=views, grey_scales=tuple(match_scene.grey_scales[i] for i in kept))
@@ -113,7 +118,10 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
     images = image_records(place_curves, loci(place_curves.views, report))
     undulation_m = float(run.undulation(xy[None])[0])
     report = replace(
-        report, heights_m=report.heights_m - undulation_m, peak_m=report.peak_m - undulation_m, xyz=report.xyz - (0.0, 0.0, undulation_m)
+        report,
+        heights_m=report.heights_m - undulation_m,
+        peak_m=report.peak_m - undulation_m,
+        xyz=report.xyz - (0.0, 0.0, undulation_m),
     )
     curves, options = report.curves, config.selection
     return {

@@ -1,4 +1,4 @@
-"""What lies in the folder of a surface: its grid, and patches of its rasters, read from their overviews."""
+"""The folder of a surface: its grid, and patches of its rasters, which are read from overviews."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ NEEDED = {"dsm": "float32", "sigma": "float32", "quality": "uint16", "views": "u
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of the grid as a picture.
+    """A part of the grid, resampled to a picture.
 
-    row, col, rows, cols : first cell and number of cells, which may lie outside the grid; height, width : px.
+    row, col, rows, cols : first cell and number of cells, which may lie outside the grid; height, width : px, of the
+    picture.
     """
 
     row: float
@@ -43,14 +44,14 @@ class Patch:
     width: int
 
     def strips(self, px: int) -> Iterator[Patch]:
-        """The patch from top to bottom, so many rows of pixels at a time."""
+        """Strips of the patch from top to bottom, `px` rows of pixels each."""
         down = self.rows / self.height
         for top in range(0, self.height, px):
             height = min(px, self.height - top)
             yield Patch(self.row + top * down, self.col, height * down, self.cols, height, self.width)
 
     def widened(self, px: int) -> Patch:
-        """With so many more pixels on all sides."""
+        """The patch with `px` more pixels on all sides."""
         down, across = self.rows / self.height, self.cols / self.width
         return Patch(
             self.row - px * down, self.col - px * across, self.rows + 2 * px * down, self.cols + 2 * px * across,
@@ -60,14 +61,17 @@ class Patch:
 
 @dataclass(frozen=True)
 class SurfaceFolder:
-    """A surface that is there. run : its run.json; shape : rows and columns; above : what its heights are above."""
+    """A finished surface.
+
+    run : content of run.json; shape : rows and columns; height_name : description of the heights with their datum.
+    """
 
     out: Path
     run: Mapping[str, Any]
     shape: tuple[int, int]
     transform: Affine
     crs: CRS
-    above: str
+    height_name: str
 
     @property
     def cell_m(self) -> float:
@@ -80,11 +84,11 @@ class SurfaceFolder:
         return is_local(self.crs)
 
     def path(self, name: str) -> Path:
-        """Of one of its rasters."""
+        """Path of a raster."""
         return self.out / f"{name}.tif"
 
     def has(self, name: str) -> bool:
-        """Whether it has a raster."""
+        """Whether the folder has a raster."""
         return self.path(name).is_file()
 
     def cell_of(self, x: float, y: float) -> tuple[int, int] | None:
@@ -93,17 +97,17 @@ class SurfaceFolder:
         inside = 0 <= row < self.shape[0] and 0 <= col < self.shape[1]
         return (int(row), int(col)) if inside else None
 
-    def middle_of(self, row: float, col: float) -> FloatArray:
-        """The middle of a cell, (2,) m."""
+    def centre_of(self, row: float, col: float) -> FloatArray:
+        """Centre of a cell, (2,) m."""
         return np.array(self.transform * (col + 0.5, row + 0.5))
 
     def cell(self, row: int, col: int) -> dict[str, Any]:
-        """What the rasters say of one cell, by their names."""
-        found = {}
+        """Values of one cell by name of the raster."""
+        values = {}
         for name in NEEDED:
             with cached_raster(self.path(name)) as file:
-                found[name] = file.read(1, window=Window(col, row, 1, 1))[0, 0].item()
-        return found
+                values[name] = file.read(1, window=Window(col, row, 1, 1))[0, 0].item()
+        return values
 
 
 class _Request(BaseModel):
@@ -113,13 +117,13 @@ class _Request(BaseModel):
     views: str
 
 
-class _Sun(BaseModel):
+class _ProductsOfRun(BaseModel):
     sun_azimuth_deg: float
     sun_altitude_deg: float
 
 
 class _Options(BaseModel):
-    products: _Sun
+    products: _ProductsOfRun
 
 
 class _Config(BaseModel):
@@ -141,7 +145,7 @@ class _Input(BaseModel):
 
 
 class _Run(BaseModel):
-    """What is taken from run.json without another look."""
+    """The part of run.json that the page uses without further checks."""
 
     config: _Config
     grid: _Grid
@@ -150,17 +154,17 @@ class _Run(BaseModel):
 
 
 def checked_run(out: Path) -> dict[str, Any]:
-    """run.json of a surface, with all that the page takes for granted.
+    """Content of run.json of a surface, checked for everything that the page uses.
 
     Raises
     ------
     InputError
-        It is missing, damaged, or of something else.
+        The file is missing, damaged, or not of a surface.
     """
     run = run_record(out)
     try:
-        found = _Run.model_validate(run)
-        CRS.from_user_input(found.grid.crs)
+        checked = _Run.model_validate(run)
+        CRS.from_user_input(checked.grid.crs)
     except (ValidationError, CRSError) as error:
         where = ""
         if isinstance(error, ValidationError):
@@ -181,51 +185,51 @@ def surface_folder(out: Path) -> SurfaceFolder:
     for name, kind in NEEDED.items():
         with cached_raster(out / f"{name}.tif") as file:
             if file.shape != tuple(run["grid"]["shape"]) or file.dtypes != (kind,):
-                raise InputError(f"{out / name}.tif is not the one that run.json tells of. Make the surface again.")
+                raise InputError(f"{out / name}.tif is not the one that run.json describes. Make the surface again.")
     with cached_raster(out / "dsm.tif") as file:
-        above = file.descriptions[0] or "height"
+        height_name = file.descriptions[0] or "height"
         crs = CRS.from_user_input(run["grid"]["crs"])
-        above = "z of the local frame" if is_local(crs) else above
-        return SurfaceFolder(out, run, file.shape, file.transform, crs, above)
+        height_name = "z of the local frame" if is_local(crs) else height_name
+        return SurfaceFolder(out, run, file.shape, file.transform, crs, height_name)
 
 
 @dataclass(frozen=True)
-class Cells:
-    """A patch that was read. values : (b, r, c), NaN or 0 where nothing is known; known : (r, c) bool."""
+class PatchValues:
+    """Values of a patch. values : (b, r, c), NaN or 0 where unknown; known : (r, c) bool."""
 
     values: NDArray[Any]
     known: NDArray[np.bool_]
 
 
-def read_patch(path: Path, patch: Patch, average: bool, like: SurfaceFolder | None = None) -> Cells:
-    """A patch of a raster, from its overviews.
+def read_patch(path: Path, patch: Patch, average: bool, folder: SurfaceFolder | None = None) -> PatchValues:
+    """Read a patch of a raster from its overviews.
 
-    average : the mean of the cells of a pixel, else one of them; like : surface on whose grid it is looked up, its own
-    being another.
+    average : take the mean of the cells of a pixel, else one of them; folder : of the surface on whose grid the patch
+    lies, where that is not the raster's own grid.
     """
     with cached_raster(path) as file:
-        if like is None:
+        if folder is None:
             return _patch_of(file, patch, average)
-        with on_grid(file, like) as view:
+        with on_grid(file, folder) as view:
             return _patch_of(view, patch, average)
 
 
-def on_grid(file: DatasetReader, like: SurfaceFolder) -> WarpedVRT:
-    """A raster of heights as it lies on the grid of a surface, cell by cell."""
+def on_grid(file: DatasetReader, folder: SurfaceFolder) -> WarpedVRT:
+    """A raster of heights, resampled to the grid of a surface (nearest cell)."""
     return WarpedVRT(
-        file, src_crs=file.crs or like.crs.to_wkt(), crs=like.crs.to_wkt(), transform=like.transform,
-        height=like.shape[0], width=like.shape[1], resampling=Resampling.nearest, nodata=float("nan"),
+        file, src_crs=file.crs or folder.crs.to_wkt(), crs=folder.crs.to_wkt(), transform=folder.transform,
+        height=folder.shape[0], width=folder.shape[1], resampling=Resampling.nearest, nodata=float("nan"),
     )  # fmt: skip
 
 
-def _patch_of(file: DatasetReader, patch: Patch, average: bool) -> Cells:
+def _patch_of(file: DatasetReader, patch: Patch, average: bool) -> PatchValues:
     kind = np.dtype(file.dtypes[0])
     values = np.full((file.count, patch.height, patch.width), np.nan if kind.kind == "f" else 0, kind)
     known = np.zeros((patch.height, patch.width), bool)
     top, height = _inside(patch.row, patch.rows, patch.height, file.height)
     left, width = _inside(patch.col, patch.cols, patch.width, file.width)
     if not (height and width):
-        return Cells(values, known)
+        return PatchValues(values, known)
     down, across = patch.rows / patch.height, patch.cols / patch.width
     row, col = max(patch.row + top * down, 0.0), max(patch.col + left * across, 0.0)
     window = Window(col, row, min(width * across, file.width - col), min(height * down, file.height - row))
@@ -238,11 +242,11 @@ def _patch_of(file: DatasetReader, patch: Patch, average: bool) -> Cells:
         known[part] = np.isfinite(values[0][part])
     else:
         known[part] = True if file.nodata is None else values[0][part] != file.nodata
-    return Cells(values, known)
+    return PatchValues(values, known)
 
 
 def _inside(start: float, size: float, pixels: int, end: int) -> tuple[int, int]:
-    """First pixel and number of pixels whose middles lie on the grid, along one side of it with `end` cells."""
-    middles = start + (np.arange(pixels) + 0.5) * size / pixels
-    inside = np.flatnonzero((middles >= 0) & (middles < end))
+    """First pixel and number of pixels whose centres lie on the grid, along a side of `end` cells."""
+    centres = start + (np.arange(pixels) + 0.5) * size / pixels
+    inside = np.flatnonzero((centres >= 0) & (centres < end))
     return (int(inside[0]), len(inside)) if len(inside) else (0, 0)

@@ -1,4 +1,4 @@
-"""Who is let through to the page of a surface: who knows its token, at its own address, to read."""
+"""Access control of the page: requests need the token, the page's own address, and a method that only reads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 TOKEN_BYTES = 24
-# Scripts are the page's own files, and the one line in it that says where modules are.
+# Allowed scripts are the page's own files and the import map inside the page.
 POLICY = (
     "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -30,12 +30,12 @@ WORDS = {
 
 
 def new_token() -> str:
-    """A token that nobody guesses."""
+    """A token that cannot be guessed."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 class Guard:
-    """Lets through what comes from this page: the right token, host and origin, and only what reads.
+    """Application that lets through requests of this page: with its token, host and origin, and only to read.
 
     hosts : "host:port" as the browser may write them.
     """
@@ -50,7 +50,7 @@ class Guard:
             await self.app(scope, receive, send)
             return
         if scope["type"] != "http":
-            return  # no other kind of connection is ever accepted
+            return  # Other kinds of connection are never accepted.
         refusal = self._refusal(Request(scope))
         if refusal is not None:
             await refusal(scope, receive, send)
@@ -62,11 +62,11 @@ class Guard:
                 message = {**message, "headers": [*message["headers"], *extra]}
             await send(message)
 
-        # What is behind the token is all that the routes see.
+        # The routes see only the part of the path after the token.
         await self.app({**scope, "path": scope["path"][len(self.token) + 1 :]}, receive, send_guarded)
 
     def _refusal(self, request: Request) -> Response | None:
-        """The answer to what is not let through."""
+        """The answer to a request that is refused; None for one that is let through."""
         origin, path = request.headers.get("origin"), request.scope["path"]
         is_own = request.headers.get("host", "") in self.hosts
         is_own &= origin is None or origin in {f"http://{host}" for host in self.hosts}
@@ -82,7 +82,7 @@ class Guard:
 
 
 def inline_hashes(page: str) -> str:
-    """What the policy has to know of the scripts that stand in the page itself."""
+    """Hashes of the scripts inside the page, as the security policy needs them."""
     found = re.findall(r"<script(?![^>]*\bsrc=)[^>]*>(.*?)</script>", page, re.DOTALL)
     digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in found)
     return " ".join(f"'sha256-{digest}'" for digest in digests)

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from zlocus.core.errors import ConfigError, GeometryError, InputError, ZlocusError
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.parallel import submitted
+from zlocus.evaluation.comparison import Comparison
 from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
@@ -24,7 +25,6 @@ from zlocus.inspector.reference import Reference, check_comparison, reference_fo
 from zlocus.inspector.restored_run import Restored, config_of, restored
 from zlocus.io.run_record import read_record
 from zlocus.pipeline.report_inputs import said
-from zlocus.evaluation.comparison import Comparison
 from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.report.page import KIND_WORDS
 

@@ -1,4 +1,4 @@
-"""Layers of the map: what each shows, its colours and legend, and a patch of it as a picture."""
+"""Layers of the map: title, legend, and the drawing of a patch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.inspector.folder import Cells, Patch, SurfaceFolder, read_patch
+from zlocus.inspector.folder import Patch, PatchValues, SurfaceFolder, read_patch
 from zlocus.inspector.reference import Reference
 from zlocus.io.open_raster import cached_raster
 from zlocus.products.demo_figure import error_map
@@ -19,20 +19,23 @@ from zlocus.products.report import maps
 from zlocus.products.report import text as words
 
 Rgba = NDArray[np.uint8]
-# Cells a side that tell the range of colours.
-SAMPLED = 800
-MOST_CLASSES = 12
+# The range of colours is computed from a sample of this many cells a side.
+SAMPLED_SIDE = 800
+MAX_CLASSES = 12
 OPAQUE = 255
-# Rows of a picture that are worked on at a time.
+# Rows of a picture that are composed at a time.
 STRIP_PX = 256
-# Of what was not asked for, and its opacity as a part of the others'.
-GREY, SHADE = 128, 3
+# Cells outside the area have this grey, and their opacity is divided by this.
+OUTSIDE_GREY, OUTSIDE_OPACITY_DIVISOR = 128, 3
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer. legend : as the page draws it, None where there is nothing to say; draw : a patch of the grid as
-    (r, c, 4) uint8: red, green, blue and opacity."""
+    """A layer of the map.
+
+    legend : as the page draws it, None without one; draw : draws a patch of the grid as (r, c, 4) uint8: red, green,
+    blue and opacity.
+    """
 
     name: str
     title: str
@@ -41,21 +44,21 @@ class Layer:
 
 
 def layers_of(folder: SurfaceFolder) -> dict[str, Layer]:
-    """The layers that a surface has, by name, from the lowest to the highest."""
-    found = [_hillshade(folder)]
-    found += [_ortho(folder)] if folder.has("ortho") else []
-    found += [_height(folder), _sigma(folder), _views(folder), _quality(folder)]
-    return {layer.name: layer for layer in found}
+    """The layers of a surface by name, from the lowest to the highest."""
+    layers = [_hillshade(folder)]
+    layers += [_ortho(folder)] if folder.has("ortho") else []
+    layers += [_height(folder), _sigma(folder), _views(folder), _quality(folder)]
+    return {layer.name: layer for layer in layers}
 
 
 def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
-    """Surface less reference."""
+    """Layer of the surface less the reference."""
     saturated_m = reference.saturated_m
 
     def draw(patch: Patch) -> Rgba:
-        # A single cell of each where the map is near: means would differ at every edge.
-        found, true = read_patch(folder.path("dsm"), patch, False), read_patch(reference.path, patch, False, folder)
-        return with_opacity(error_map(found.values[0] - true.values[0], saturated_m), found.known & true.known)
+        # One cell per pixel of both: means would differ at every edge.
+        height, true = read_patch(folder.path("dsm"), patch, False), read_patch(reference.path, patch, False, folder)
+        return with_opacity(error_map(height.values[0] - true.values[0], saturated_m), height.known & true.known)
 
     line = error_map(np.linspace(-saturated_m, saturated_m, maps.STOPS, dtype=np.float32)[None], saturated_m)[0]
     ticks = [f"{value:+g}" if value else "0" for value in np.linspace(-saturated_m, saturated_m, maps.TICKS)]
@@ -64,7 +67,7 @@ def difference_layer(folder: SurfaceFolder, reference: Reference) -> Layer:
 
 
 def composed(layers: Sequence[tuple[Layer, float]], patch: Patch) -> Rgba:
-    """Layers over each other, the first below, each with an opacity of 0 to 1, as the map shows them."""
+    """Layers composed as the map shows them: the first is the lowest, and each has an opacity of 0 to 1."""
     strips = [_composed(layers, strip) for strip in patch.strips(STRIP_PX)]
     return np.concatenate(strips)
 
@@ -82,30 +85,30 @@ def _composed(layers: Sequence[tuple[Layer, float]], patch: Patch) -> Rgba:
 
 
 def png_of(picture: Rgba) -> bytes:
-    """A picture as PNG, written fast."""
+    """A picture as PNG, with fast compression."""
     swapped = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
     return bytes(cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 
 def with_opacity(colours: NDArray[Any], known: NDArray[np.bool_]) -> Rgba:
-    """Colours (r, c, 3) in OpenCV's order as a picture that is clear where nothing is known."""
+    """Colours (r, c, 3) in OpenCV's order as a picture that is transparent where values are unknown."""
     return np.dstack([colours[..., ::-1], np.where(known, OPAQUE, 0)]).astype(np.uint8)
 
 
 def scale(title: str, gradient: str, ticks: Sequence[str]) -> dict[str, Any]:
-    """The legend of colours that run."""
+    """Legend of a continuous quantity."""
     return {"kind": "scale", "title": title, "gradient": gradient, "ticks": list(ticks)}
 
 
 def classes(title: str, items: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    """The legend of colours (CSS) that each mean something."""
+    """Legend of classes, each with a colour (CSS) and a meaning."""
     return {"kind": "classes", "title": title, "items": [{"colour": c, "meaning": m} for c, m in items]}
 
 
-def sampled(folder: SurfaceFolder, name: str, average: bool = True) -> Cells:
-    """All of a raster, made small."""
+def sampled(folder: SurfaceFolder, name: str, average: bool = True) -> PatchValues:
+    """A whole raster, reduced to at most `SAMPLED_SIDE` cells a side."""
     rows, cols = folder.shape
-    share = min(SAMPLED / max(rows, cols), 1.0)
+    share = min(SAMPLED_SIDE / max(rows, cols), 1.0)
     size = (max(round(rows * share), 1), max(round(cols * share), 1))
     return read_patch(folder.path(name), Patch(0, 0, rows, cols, *size), average)
 
@@ -147,7 +150,7 @@ def _height(folder: SurfaceFolder) -> Layer:
         share = np.clip((np.nan_to_num(cells.values[0]) - low) / max(high - low, 1e-6), 0.0, 1.0)
         return with_opacity(cv2.applyColorMap((OPAQUE * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS), cells.known)
 
-    legend = scale(f"{folder.above}, m", maps.gradient(cv2.COLORMAP_VIRIDIS), maps.even_ticks(low, high))
+    legend = scale(f"{folder.height_name}, m", maps.gradient(cv2.COLORMAP_VIRIDIS), maps.even_ticks(low, high))
     return Layer("height", "Height", legend, draw)
 
 
@@ -164,7 +167,7 @@ def _sigma(folder: SurfaceFolder) -> Layer:
 
 
 def _views(folder: SurfaceFolder) -> Layer:
-    # A count that is rare is not missed: the raster knows its largest.
+    # The sample may miss a rare number of images; the statistics of the raster hold the largest one.
     with cached_raster(folder.path("views")) as file:
         top = max(int(float(file.tags(1).get("STATISTICS_MAXIMUM", 0))), 1)
     used = np.unique([*sampled(folder, "views", average=False).values[0].ravel(), top])
@@ -176,8 +179,8 @@ def _views(folder: SurfaceFolder) -> Layer:
         cells = read_patch(folder.path("views"), patch, False)
         return with_opacity(colours[np.minimum(cells.values[0], top)], cells.known)
 
-    title = "images a height rests on"
-    if used.size > MOST_CLASSES:
+    title = "number of images used"
+    if used.size > MAX_CLASSES:
         ticks = [f"{n:.0f}" for n in np.linspace(1, top, maps.TICKS)]
         return Layer("views", "Number of images", scale(title, maps.gradient(cv2.COLORMAP_VIRIDIS), ticks), draw)
     items = [(maps.css(table[n - 1]), str(n)) for n in used.tolist()]
@@ -185,25 +188,25 @@ def _views(folder: SurfaceFolder) -> Layer:
 
 
 def _quality(folder: SurfaceFolder) -> Layer:
-    """Reasons; clear where nothing is to be said, so that what lies below is seen."""
+    """Layer of the reasons; transparent where there is none, so that the layers below are visible."""
     colours = np.array([*(colour for *_, colour in maps.FLAG_GROUPS), maps.NO_FLAG[1]], np.uint8)[:, ::-1]
-    colours[0] = GREY
+    colours[0] = OUTSIDE_GREY
     groups = maps.groups_of(np.arange(1 << 16))
 
     def draw(patch: Patch) -> Rgba:
         cells = read_patch(folder.path("quality"), patch, False)
         group = groups[cells.values[0]]
         drawn = with_opacity(colours[group], cells.known & (group < len(maps.FLAG_GROUPS)))
-        # What was not asked for, or cannot be seen, is no more than a shade.
-        drawn[..., 3][group == 0] //= SHADE
+        # Cells outside the area, or without coverage, are only shaded.
+        drawn[..., 3][group == 0] //= OUTSIDE_OPACITY_DIVISOR
         return drawn
 
     items = [(maps.css(colours[k]), meaning) for k, (meaning, *_) in enumerate(maps.FLAG_GROUPS)]
-    return Layer("quality", "Reasons", classes("why there is no height, or one to be checked", items), draw)
+    return Layer("quality", "Reasons", classes("reason for no height, or for a height to be checked", items), draw)
 
 
 def reasons_of(code: int) -> list[Mapping[str, str]]:
-    """What a value of quality.tif says, as the report has it."""
+    """Reasons in a value of quality.tif, in the words of the report."""
     return [
         {"name": str(flag.name), "meaning": words.MEANINGS[flag], "fate": words.fate(flag),
          "advice": words.ADVICE.get(flag, "")}

@@ -1,4 +1,4 @@
-"""Heights along a line, cell by cell."""
+"""Profile: heights along a line."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from zlocus.inspector.folder import SurfaceFolder, on_grid
 from zlocus.inspector.reference import Reference
 from zlocus.io.open_raster import cached_raster
 
-MOST_PLACES = 2000
-# Cells a side that are read at a time.
-PIECE = 512
+MAX_PLACES = 2000
+# Rasters are read in pieces of this many cells a side.
+PIECE_CELLS = 512
 
 
 def profile(
     folder: SurfaceFolder, reference: Reference | None, start: tuple[float, float], end: tuple[float, float]
 ) -> dict[str, Any]:
-    """Heights and what is known of them at cells along a line, a cell or more apart, `MOST_PLACES` at most.
+    """Heights of the cells along a line, at least a cell apart and at `MAX_PLACES` places at most.
 
-    start, end : m. Keys: distance_m (n,), height_m, sigma_m, reference_m (None without a reference), each None where
-    nothing is known; spacing_m; length_m.
+    start, end : m. Keys of the record: distance_m (n,), height_m, sigma_m, reference_m (None without a reference), each
+    None where unknown; spacing_m; length_m.
     """
     length = math.dist(start, end)
-    n = int(np.clip(math.ceil(length / folder.cell_m) + 1, 2, MOST_PLACES))
+    n = int(np.clip(math.ceil(length / folder.cell_m) + 1, 2, MAX_PLACES))
     share = np.linspace(0.0, 1.0, n)[:, None]
     xy = (1 - share) * start + share * end
     cells = cells_of(folder, xy)
@@ -43,7 +43,7 @@ def profile(
 
 
 def cells_of(folder: SurfaceFolder, xy: FloatArray) -> NDArray[np.int64]:
-    """Row and column (n, 2) of the cells that hold ground points (n, 2) m; some may lie outside the grid."""
+    """Row and column (n, 2) of the cells that contain ground points (n, 2) m; they may lie outside the grid."""
     a, b, c, d, e, f = (~folder.transform)[:6]
     col, row = a * xy[:, 0] + b * xy[:, 1] + c, d * xy[:, 0] + e * xy[:, 1] + f
     cells: NDArray[np.int64] = np.floor(np.column_stack([row, col])).astype(np.int64)
@@ -51,7 +51,7 @@ def cells_of(folder: SurfaceFolder, xy: FloatArray) -> NDArray[np.int64]:
 
 
 def values_at(folder: SurfaceFolder, name: str, cells: NDArray[np.int64]) -> FloatArray:
-    """A raster's values at cells (n, 2), NaN outside the grid."""
+    """Values of a raster at cells (n, 2), NaN outside the grid."""
     with cached_raster(folder.path(name)) as file:
         return picked(file, cells)
 
@@ -63,19 +63,19 @@ def reference_at(folder: SurfaceFolder, reference: Reference, cells: NDArray[np.
 
 
 def picked(file: DatasetReader, cells: NDArray[np.int64]) -> FloatArray:
-    """Values at cells (n, 2) of a raster, read piece by piece where the cells are."""
-    found = np.full(len(cells), np.nan)
+    """Values of an open raster at cells (n, 2), read piece by piece; NaN outside the grid."""
+    result = np.full(len(cells), np.nan)
     inside = ((cells >= 0) & (cells < (file.height, file.width))).all(axis=1)
-    pieces, which = np.unique(cells[inside] // PIECE, axis=0, return_inverse=True)
+    pieces, which = np.unique(cells[inside] // PIECE_CELLS, axis=0, return_inverse=True)
     members = np.flatnonzero(inside)
     for k in range(len(pieces)):
         chosen = members[which.ravel() == k]
         (row, col), (last_row, last_col) = cells[chosen].min(axis=0), cells[chosen].max(axis=0)
         values = file.read(1, window=Window(col, row, last_col - col + 1, last_row - row + 1))
-        found[chosen] = values[cells[chosen, 0] - row, cells[chosen, 1] - col]
-    return found
+        result[chosen] = values[cells[chosen, 0] - row, cells[chosen, 1] - col]
+    return result
 
 
 def listed(values: FloatArray) -> list[float | None]:
-    """Numbers for JSON."""
+    """Rounded numbers for JSON, None in place of NaN."""
     return [round(float(value), 4) if math.isfinite(value) else None for value in values]

@@ -1,4 +1,4 @@
-"""What the page may ask, checked: numbers in range, names that are known, nothing else."""
+"""Checks of the parameters of requests: numbers in range, known names, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from zlocus.inspector.cell import WhatIf
 from zlocus.inspector.folder import Patch
 
 Pairs = Iterable[tuple[str, str]]
-# Pixels of a picture, and along one side of it; layers over each other; levels of a map.
-MOST_PX, MOST_SIDE_PX, MOST_LAYERS, MOST_LEVELS = 10_000_000, 4096, 8, 24
-# Options that make an answer large are held below what a run may take.
-MOST = {"reach_steps": 200, "max_candidates": 48, "nearest": 500, "max_images": 48, "min_images": 48}
+# Limits on the pixels of a picture and along its side, on the layers of a picture, and on the levels of the map.
+MAX_PIXELS, MAX_SIDE_PX, MAX_LAYERS, MAX_LEVELS = 10_000_000, 4096, 8, 24
+# Options that make an answer large have lower limits than in a run.
+MAX_VALUES = {"reach_steps": 200, "max_candidates": 48, "nearest": 500, "max_images": 48, "min_images": 48}
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-# Cells from the grid at which something may still be asked for.
-FARTHEST_CELLS = 1e7
-# No coordinate is larger, in any frame.
-FARTHEST_M = 1e9
+# Patches may lie at most this far from the grid.
+MAX_DISTANCE_CELLS = 1e7
+# Coordinates are smaller than this in every frame.
+MAX_COORDINATE_M = 1e9
 PATCH = ("row", "col", "rows", "cols", "height", "width")
-LONGEST_NUMBER = 40
+MAX_NUMBER_LENGTH = 40
 SELECTION = {f.name: f for f in fields(SelectionOptions)}
 KINDS = get_type_hints(SelectionOptions)
 WINDOWS: tuple[int, ...] = next(f for f in fields(CostOptions) if f.name == "large_window").metadata["choices"]
 
 
 class BadQuery(ConfigError):
-    """Something was asked that cannot be answered."""
+    """A request with parameters that cannot be used."""
 
 
 def once(pairs: Pairs, allowed: Iterable[str], repeated: str = "") -> tuple[dict[str, str], list[str]]:
-    """Values by name, each at most once, and those of the one name that may be repeated.
+    """Values by name, each given at most once, and the values of the one name that may be repeated.
 
     Raises
     ------
     BadQuery
-        A name that is not allowed, or that is given twice.
+        A name is not allowed, or is given twice.
     """
     values: dict[str, str] = {}
     many: list[str] = []
@@ -49,7 +49,7 @@ def once(pairs: Pairs, allowed: Iterable[str], repeated: str = "") -> tuple[dict
         if name == repeated:
             many.append(value)
         elif name not in known:
-            raise BadQuery(f"{name[:40]!r} is nothing that can be asked here.")
+            raise BadQuery(f"{name[:40]!r} is not a parameter of this request.")
         elif name in values:
             raise BadQuery(f"{name} is given twice.")
         else:
@@ -63,10 +63,10 @@ def number(values: Mapping[str, str], name: str, low: float = -math.inf, high: f
     Raises
     ------
     BadQuery
-        It is missing, no number, not finite, or out of range.
+        It is missing, not a finite number, or out of range.
     """
     text = values.get(name, "")
-    value = float(text) if len(text) <= LONGEST_NUMBER and NUMBER.fullmatch(text) else math.nan
+    value = float(text) if len(text) <= MAX_NUMBER_LENGTH and NUMBER.fullmatch(text) else math.nan
     if not (math.isfinite(value) and low <= value <= high):
         raise BadQuery(f"{name} must be a number{_between(low, high)}.")
     return value
@@ -87,29 +87,29 @@ def whole(values: Mapping[str, str], name: str, low: int, high: int) -> int:
 
 
 def patch(values: Mapping[str, str]) -> Patch:
-    """A part of the grid and the size of its picture: row, col, rows, cols, height, width."""
-    far = FARTHEST_CELLS
+    """The patch of a request: its part of the grid and the size of its picture."""
+    far = MAX_DISTANCE_CELLS
     row, col = (number(values, name, -far, far) for name in PATCH[:2])
     rows, cols = (number(values, name, 1e-3, far) for name in PATCH[2:4])
-    height, width = (whole(values, name, 1, MOST_SIDE_PX) for name in PATCH[4:])
-    if height * width > MOST_PX:
-        raise BadQuery(f"A picture has {MOST_PX} pixels at most.")
+    height, width = (whole(values, name, 1, MAX_SIDE_PX) for name in PATCH[4:])
+    if height * width > MAX_PIXELS:
+        raise BadQuery(f"A picture has at most {MAX_PIXELS} pixels.")
     return Patch(row, col, rows, cols, height, width)
 
 
 def layer_and_opacity(text: str) -> tuple[str, float]:
-    """A layer's name and its opacity, of NAME or NAME:OPACITY."""
+    """Name and opacity of a layer, from NAME or NAME:OPACITY."""
     name, _, opacity = text.partition(":")
     return name, number({"opacity": opacity or "1"}, "opacity", 0.0, 1.0)
 
 
 def what_if(values: Mapping[str, str], left_out: Iterable[str]) -> WhatIf:
-    """What is to be changed: `reference`, `window`, and options of the selection by their names.
+    """Changed settings of a request: `reference`, `window`, and options of the selection by their names.
 
     Raises
     ------
     BadQuery
-        A value that is not of the option's kind, or out of its range.
+        A value has the wrong type, or is out of range.
     """
     window = whole(values, "window", min(WINDOWS), max(WINDOWS)) if "window" in values else None
     if window is not None and window not in WINDOWS:
@@ -119,7 +119,7 @@ def what_if(values: Mapping[str, str], left_out: Iterable[str]) -> WhatIf:
 
 
 def _option(values: Mapping[str, str], option: Field[Any]) -> Any:
-    low, high = option.metadata["low"], MOST.get(option.name, option.metadata["high"])
+    low, high = option.metadata["low"], MAX_VALUES.get(option.name, option.metadata["high"])
     if KINDS[option.name] is str:
         return values[option.name]
     if KINDS[option.name] is int:

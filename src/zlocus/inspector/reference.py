@@ -1,4 +1,4 @@
-"""A reference beside the surface: judged as `zlocus evaluate` does, and made comparable cell by cell."""
+"""The reference of the page: compared as by `zlocus evaluate`, and made comparable cell by cell."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from zlocus.products.report.text import against_reference
 
 @dataclass(frozen=True)
 class Reference:
-    """Heights that those of the surface can be compared with.
+    """Heights with which the surface can be compared cell by cell.
 
-    path : raster of them, on their own grid, above what those of the surface are, any shift between the two removed;
-    name : of the file given; saturated_m : size of a difference from which colours are full; sentence : how the two compare.
+    path : raster on the reference's grid, with the surface's vertical datum and without a shift between the two; name :
+    of the reference's file; saturated_m : size of a difference from which colours are saturated; sentence : the result
+    of the comparison.
     """
 
     path: Path
@@ -34,12 +35,12 @@ class Reference:
 
 
 def check_comparison(comparison: Comparison) -> None:
-    """Refuse at once what `reference_for` would refuse later.
+    """Refuse a comparison at once that would fail later in the background.
 
     Raises
     ------
     InputError, ConfigError
-        There is no such file, or an option is out of range.
+        The reference does not exist, or the geoid is not known.
     """
     existing_file(comparison.reference, "reference")
     if comparison.geoid is not None:
@@ -47,7 +48,7 @@ def check_comparison(comparison: Comparison) -> None:
 
 
 def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference:
-    """Compare a surface with a reference. scratch : folder that the comparable heights are written to.
+    """Compare a surface with a reference. scratch : folder to which the comparable heights are written.
 
     Raises
     ------
@@ -64,11 +65,11 @@ def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference
 
 
 def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> HeightRaster:
-    """The reference's heights above what those of the surface are, moved as the surface is."""
+    """The reference's heights with the surface's vertical datum, shifted as the surface is."""
     compared = same_heights(described(dsm), read_heights(comparison.reference), comparison.geoid)
     heights = compared.reference
     if compared.converted == dsm and heights.horizontal is not None:
-        # The surface's heights were raised to the ellipsoid: the reference's are lowered instead.
+        # The comparison converted the surface to the ellipsoid; here the reference is converted to the geoid instead.
         geobox = GeoBox(heights.z.shape, heights.transform, heights.horizontal.to_wkt())
         datum = named_vertical_datum(str(comparison.geoid), "--geoid")
         z = datum.heights_from_ellipsoidal(heights.z.astype(np.float32), geobox).astype(np.float64)
@@ -80,6 +81,6 @@ def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> Height
 
 
 def described(dsm: Path) -> HeightRaster:
-    """What a surface says of its heights, without them."""
+    """A surface without its heights: only its CRS and the description of the heights."""
     with open_raster(dsm, "raster of heights") as file:
         return HeightRaster(dsm, np.full((2, 2), np.nan), file.transform, file.crs, file.descriptions[0] or "")

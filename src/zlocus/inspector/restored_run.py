@@ -1,4 +1,4 @@
-"""The scene of a run that is over, as it was before its first tile: from run.json and the ties that the run kept."""
+"""Restore the match scene of a finished run from run.json and the observations that the run wrote."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from zlocus.pipeline.setup import open_inputs, orient_views, set_up_run
 from zlocus.products.report.file_names import RECORD
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations
 
-# Of a request, what names files; beside these --vertical and --dem-vertical may.
+# Fields of a request that name files. --vertical and --dem-vertical may name files, too.
 FILES = ("like", "area", "mask", "dem")
 DATUMS = ("vertical", "dem_vertical")
 
 
 @dataclass(frozen=True)
 class Restored:
-    """A scene that was matched.
+    """The scene of a finished run.
 
-    is_same : whether cameras, heights and grey values came out as in the run, None where it did not say.
+    is_same : whether cameras, heights and grey values are the same as in the run; None where the run recorded no
+    fingerprint.
     """
 
     run: ReportedRun
@@ -38,30 +39,33 @@ class Restored:
     is_same: bool | None
 
 
-def restored(out: Path, run: Mapping[str, Any], may_ask: bool = False, progress: Progress | None = None) -> Restored:
-    """The scene of the run in a folder.
+def restored(
+    out: Path, run: Mapping[str, Any], may_read_remote: bool = False, progress: Progress | None = None
+) -> Restored:
+    """Restore the scene of the run in a folder.
 
-    run : its run.json; may_ask : whether images that it names on a server are asked for.
+    run : content of run.json; may_read_remote : whether images that it names on a server may be read.
 
     Raises
     ------
     InputError
-        An image or another file of the run is not where it was, or the run kept no observations of its ties.
+        An image or another file of the run was moved, or the observations of the ties are missing.
     ConfigError, GeometryError
         run.json is not what a run writes.
     """
     request, config, progress = request_of(out, run), config_of(out, run), progress or SilentProgress()
-    elsewhere = [each["path"] for each in run["inputs"] if is_remote(Path(each["path"]))]
-    elsewhere += [str(path) for path in request.inputs if is_remote(path)]
-    if elsewhere and not may_ask:
+    remote = [each["path"] for each in run["inputs"] if is_remote(Path(each["path"]))]
+    remote += [str(path) for path in request.inputs if is_remote(path)]
+    if remote and not may_read_remote:
         raise InputError(
-            f"The run read {elsewhere[0]} from a server, which is not asked again unbidden. Add --remote for curves."
+            f"The run read {remote[0]} from a server, which is not read again without permission. Add --remote to see match "
+            "curves."
         )
     opened = open_inputs(SetupRequest.of(request), progress)
     ties = read_observations(out, len(opened.scene.views))
     if ties is None and run["orientation"].get("n_ties"):
         raise InputError(
-            f"{out / OBSERVATIONS} is missing or damaged, without which the cameras of the run do not come out again. "
+            f"{out / OBSERVATIONS} is missing or damaged. The cameras of the run cannot be restored without it. "
             "Make the surface again."
         )
     orientation = orient_views(opened.scene, config.orientation, progress, known_ties=ties)
@@ -72,12 +76,12 @@ def restored(out: Path, run: Mapping[str, Any], may_ask: bool = False, progress:
 
 
 def config_of(out: Path, run: Mapping[str, Any]) -> RunConfig:
-    """The options of a run."""
+    """Options of a run."""
     return config_from_dict(run["config"]["options"], str(out / RECORD))
 
 
 def request_of(out: Path, run: Mapping[str, Any]) -> DsmRequest:
-    """What a run was asked for, its files where they are now.
+    """Request of a run, with the present paths of its files.
 
     Raises
     ------
@@ -101,13 +105,13 @@ def request_of(out: Path, run: Mapping[str, Any]) -> DsmRequest:
         values = {name: value for name, value in values.items() if name in known} | {"out": out, "overwrite": False}
         return TypeAdapter(DsmRequest).validate_python(values)
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
-        raise InputError(f"{out / RECORD} does not say what was asked for. Make the surface again.") from error
+        raise InputError(f"{out / RECORD} does not hold the request of the run. Make the surface again.") from error
 
 
 def folder_of(out: Path, run: Mapping[str, Any]) -> Path:
-    """Where relative paths of a run begin: the folder it was started in, or the one that holds them now.
+    """Folder where relative paths of a run start: the one in which the run was started, or the one that holds them now.
 
-    Where the run's folder was moved together with its images, the same steps lead up from it.
+    Where the output folder was moved together with the images, the latter is found by the same relative path.
     """
     started, asked = run.get("started_in"), Path(str(run["config"]["request"]["out"]))
     candidates = [Path(started)] if isinstance(started, str) else []
@@ -123,7 +127,7 @@ def folder_of(out: Path, run: Mapping[str, Any]) -> Path:
 
 
 def _is_file(path: Path) -> bool:
-    """Whether a file is there; a name that none can have is not."""
+    """Whether a file exists; False for names that no file can have."""
     try:
         return path.is_file()
     except (OSError, ValueError):

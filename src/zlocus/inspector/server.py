@@ -1,7 +1,7 @@
-"""What the page of a surface asks, answered.
+"""Routes of the page: answers to its requests.
 
-No part of an address is ever taken for a path: it names a layer, or one of the page's own files, which are read once
-when the server starts.
+No part of an address is used as a path. It names a layer, or one of the page's own files, which are read once when the
+server starts.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Reply = Callable[[Inspection, Request], Response]
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """The page's own files, content and type, by the only names that they are served by."""
+    """The page's own files: content and type by the only names under which they are served."""
     root = files("zlocus.inspector") / "static"
 
     def listed(folder: Traversable, prefix: str) -> Iterator[tuple[str, Traversable]]:
@@ -55,9 +55,9 @@ def page_files() -> dict[str, tuple[bytes, str]]:
 
 
 def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> ASGIApp:
-    """The page of an inspection. hosts : "host:port" under which it is asked for."""
+    """The web application of an inspection. hosts : "host:port" at which browsers open it."""
     static = page_files()
-    # A click that nobody waits for any more does not keep the others waiting.
+    # Clicks and pictures each have one slot, so that an abandoned one does not delay the other requests.
     clicks, pictures, others = CapacityLimiter(1), CapacityLimiter(1), CapacityLimiter(THREADS)
 
     async def of_page(request: Request) -> Response:
@@ -82,7 +82,7 @@ def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> AS
 
 
 async def nothing_here(request: Request, error: Exception) -> Response:
-    """For what is not known."""
+    """Answer for unknown addresses."""
     return PlainTextResponse(WORDS[404], 404)
 
 
@@ -95,7 +95,7 @@ def file_of(static: Mapping[str, tuple[bytes, str]], name: str) -> Response:
 
 
 def answered(inspection: Inspection, answer: Reply, slots: CapacityLimiter) -> Answer:
-    """An answer in which what is wrong with the question is a sentence. slots : how many are worked on at a time."""
+    """Wrap a reply so that errors become sentences. slots : limit on the number of requests at one time."""
 
     def said(request: Request) -> Response:
         try:
@@ -115,8 +115,7 @@ def answered(inspection: Inspection, answer: Reply, slots: CapacityLimiter) -> A
 
 
 def status_of(error: ZlocusError) -> int:
-    """The status of an answer that is an error: a wrong question, nothing there, or files that are no more what they
-    were."""
+    """HTTP status of an error: bad request, not found, or conflict where files have changed."""
     return 400 if isinstance(error, ConfigError) else 404 if isinstance(error, GeometryError) else 409
 
 
@@ -132,16 +131,18 @@ def cell(inspection: Inspection, request: Request) -> Response:
     values, left_out = queries.once(request.query_params.multi_items(), allowed, "without")
     x, y = (queries.number(values, name) for name in ("x", "y"))
     found = inspection.cell(x, y, queries.what_if(values, left_out))
-    return Response(json_of(found), media_type="application/json")
+    return Response(json_of(record), media_type="application/json")
 
 
 def line(inspection: Inspection, request: Request) -> Response:
     """A profile from x0, y0 to x1, y1, m."""
     names = ("x0", "y0", "x1", "y1")
     values, _ = queries.once(request.query_params.multi_items(), names)
-    x0, y0, x1, y1 = (queries.number(values, name, -queries.FARTHEST_M, queries.FARTHEST_M) for name in names)
-    found = profile(inspection.folder, inspection.reference, (x0, y0), (x1, y1))
-    return Response(json_of(found), media_type="application/json")
+    x0, y0, x1, y1 = (
+        queries.number(values, name, -queries.MAX_COORDINATE_M, queries.MAX_COORDINATE_M) for name in names
+    )
+    record = profile(inspection.folder, inspection.reference, (x0, y0), (x1, y1))
+    return Response(json_of(record), media_type="application/json")
 
 
 def heights(inspection: Inspection, request: Request) -> Response:
@@ -152,10 +153,10 @@ def heights(inspection: Inspection, request: Request) -> Response:
 
 
 def picture(inspection: Inspection, request: Request) -> Response:
-    """Layers of a patch over each other: `layer` once for each, NAME or NAME:OPACITY, the lowest first."""
+    """Layers of a patch, composed: one parameter `layer` for each, NAME or NAME:OPACITY, the lowest first."""
     values, names = queries.once(request.query_params.multi_items(), queries.PATCH, "layer")
-    if len(names) > queries.MOST_LAYERS:
-        raise queries.BadQuery(f"A picture has {queries.MOST_LAYERS} layers at most.")
+    if len(names) > queries.MAX_LAYERS:
+        raise queries.BadQuery(f"A picture has {queries.MAX_LAYERS} layers at most.")
     layers = [(layer_of(inspection, name), opacity) for name, opacity in map(queries.layer_and_opacity, names)]
     return Response(png_of(composed(layers, queries.patch(values))), media_type="image/png")
 
@@ -164,7 +165,7 @@ def tile(inspection: Inspection, request: Request) -> Response:
     """A square of `TILE_PX` pixels of a layer; at level n a pixel is 2 ** n cells a side."""
     queries.once(request.query_params.multi_items(), ("of",))
     values = {name: str(request.path_params[name]) for name in ("level", "col", "row")}
-    level = queries.whole(values, "level", 0, queries.MOST_LEVELS)
+    level = queries.whole(values, "level", 0, queries.MAX_LEVELS)
     side = TILE_PX << level
     last_row, last_col = ((n - 1) // side for n in inspection.folder.shape)
     row, col = queries.whole(values, "row", 0, last_row), queries.whole(values, "col", 0, last_col)
@@ -179,14 +180,14 @@ def layer_of(inspection: Inspection, name: str) -> Layer:
     Raises
     ------
     GeometryError
-        It is not there.
+        There is no such layer.
     """
-    found = inspection.layer(name)
-    if found is None:
+    layer = inspection.layer(name)
+    if layer is None:
         raise GeometryError(f"There is no layer {name[:40]!r}.")
-    return found
+    return layer
 
 
 def json_of(record: Any) -> bytes:
-    """JSON, with null for every number that is not finite."""
+    """JSON with null for every number that is not finite."""
     return json.dumps(finite_only(record), allow_nan=False).encode()

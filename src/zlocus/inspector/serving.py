@@ -1,4 +1,4 @@
-"""`zlocus inspect`, from the folder to a page that answers until it is interrupted."""
+"""The server of `zlocus inspect`, which runs until it is interrupted."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from pathlib import Path
 import uvicorn
 
 from zlocus.core.errors import ConfigError, OutputError
+from zlocus.evaluation.comparison import Comparison
 from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.server import application
-from zlocus.evaluation.comparison import Comparison
 
-# Answers under way are waited for so long.
+# Time that requests in progress get to finish.
 GRACE_S = 2
-USUAL_PORT = 80
+HTTP_PORT = 80
 Announce = Callable[[str, bool], None]
 
 
 def inspect_surface(
-    out: Path, comparison: Comparison | None, may_ask: bool, host: str, port: int, view: str, announce: Announce
+    out: Path, comparison: Comparison | None, may_read_remote: bool, host: str, port: int, view: str, announce: Announce
 ) -> None:
     """Serve the page of a surface until interrupted.
 
-    may_ask : whether images that run.json names on a server are asked for; host, port : where; port 0 is any that is
-    free; view : link of a view, or what stands behind its #, to begin with; announce : is given the address, and
-    whether others than this machine can reach it.
+    may_read_remote : whether images that run.json names on a server may be read; host, port : address; port 0: any free
+    port; view : link of the view to start with, or its part after the #; announce : called with the address, and with
+    whether other machines can reach it.
 
     Raises
     ------
@@ -42,12 +42,12 @@ def inspect_surface(
     """
     address = checked_address(host)
     fragment = fragment_of(view)
-    with listening(address, port) as listener, Inspection(out, comparison, may_ask) as inspection:
+    with listening(address, port) as listener, Inspection(out, comparison, may_read_remote) as inspection:
         port, token = listener.getsockname()[1], new_token()
         names = [f"[{address}]" if address.version == 6 else str(address)]
         hosts = names + (["localhost"] if address.is_loopback else [])
-        # A browser leaves out the port that is usual.
-        known = {f"{host}:{port}" for host in hosts} | (set(hosts) if port == USUAL_PORT else set())
+        # Browsers leave out the default port.
+        known = {f"{host}:{port}" for host in hosts} | (set(hosts) if port == HTTP_PORT else set())
         app = application(inspection, token, frozenset(known))
         config = uvicorn.Config(
             app, log_level="error", access_log=False, server_header=False, ws="none",
@@ -58,24 +58,24 @@ def inspect_surface(
 
 
 class _Server(uvicorn.Server):
-    """A server that says when it answers, and that SIGHUP ends as SIGTERM does: after the answers under way."""
+    """A server that announces when it is ready, and that SIGHUP ends like SIGTERM: after the requests in progress."""
 
     def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
         super().__init__(config)
         self._announce = announce
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to answer, and say so."""
+        """Start, and announce it."""
         await super().startup(sockets)
         self._announce()
 
     @contextmanager
     def capture_signals(self) -> Generator[None, None, None]:
-        """Note the signals that come in the block, which ends the server; at its end they do what they did before."""
+        """Handle signals inside the block by ending the server; restore the handlers afterwards."""
         with super().capture_signals():
             hang_up = getattr(signal, "SIGHUP", None)
             before = None if hang_up is None else signal.getsignal(hang_up)
-            if hang_up is None or before in (None, signal.SIG_IGN):  # as below nohup
+            if hang_up is None or before in (None, signal.SIG_IGN):  # as under nohup
                 yield
                 return
             signal.signal(hang_up, self.handle_exit)
@@ -86,32 +86,34 @@ class _Server(uvicorn.Server):
 
 
 def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    """An address of this machine that a browser can be given.
+    """Address of this machine that a browser can open.
 
     Raises
     ------
     ConfigError
-        It is a name, or stands for all addresses.
+        It is a name, or stands for several addresses.
     """
     try:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError as error:
-        raise ConfigError(f"--host {host} is no address. Give one of this machine, such as 127.0.0.1.") from error
+        raise ConfigError(f"--host {host} is not an address. Give one of this machine, such as 127.0.0.1.") from error
     if address.is_unspecified or address.is_multicast:
-        raise ConfigError(f"--host {host} stands for no single address. Give that under which the page is asked for.")
+        raise ConfigError(
+            f"--host {host} does not stand for a single address. Give the one at which the page is opened."
+        )
     return address
 
 
 def fragment_of(view: str) -> str:
-    """What stands behind the # of a link, with it; "" of nothing."""
+    """The # of a link and the part after it; "" where there is none."""
     text = view.partition("#")[2] if "#" in view else view
-    # What no address holds, as a terminal would otherwise take it for its own.
+    # Characters that addresses do not allow are escaped, since a terminal might interpret them.
     text = "".join(c if "!" <= c <= "~" else "".join(f"%{byte:02X}" for byte in c.encode()) for c in text)
     return f"#{text}" if text else ""
 
 
 def listening(address: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int) -> socket.socket:
-    """A socket that listens.
+    """A listening socket.
 
     Raises
     ------
@@ -119,10 +121,10 @@ def listening(address: ipaddress.IPv4Address | ipaddress.IPv6Address, port: int)
         The address is not this machine's, or the port is taken.
     """
     family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
-    # Named as TCP, for only then does asyncio send answers without waiting (TCP_NODELAY): else each takes 40 ms more.
+    # The protocol is named, because only then does asyncio set TCP_NODELAY; without it each answer takes 40 ms more.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        if os.name != "nt":  # where it would let two processes share a port
+        if os.name != "nt":  # There it would let two processes share a port.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((str(address), port))
         listener.listen()

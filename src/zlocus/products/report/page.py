@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -173,8 +173,8 @@ def footprints_part(path: Path, survey: Survey, crs: CRS, names: Sequence[str]) 
 def number_places(rings: Sequence[FloatArray]) -> list[tuple[float, float] | None]:
     """Place of each outline's number, on the outline and clear of other numbers; None where there is no room.
 
-    rings : outlines (n, 2) in units of the drawing. Each number takes the place on its outline that is farthest from the
-    numbers before it.
+    rings : outlines (n, 2) in units of the drawing. Each number takes the place on its outline that is farthest from
+    the numbers before it.
     """
     placed: list[FloatArray] = []
     places: list[tuple[float, float] | None] = []
@@ -218,25 +218,38 @@ def pairs_part(out: Path, run: Mapping[str, Any]) -> dict[str, Any]:
     if len(names) > tables.MAX_MATRIX_IMAGES:
         why = f"There are {len(names)} images, too many for a matrix."
         return {"labels": None, "n_sampled": 0, "no_labels": f"{why} See {RANKING}.", "pairs": None, "no_pairs": why}
-    labels, n_sampled, why = label_part(out, names)
+    labels = label_part(out, names)
     overlaps = [each["properties"] for each in features(out / FOOTPRINTS, "overlap")]
     known = [each for each in overlaps if set(each["views"]) <= set(names)]
     return {
-        "labels": labels, "n_sampled": n_sampled, "no_labels": why,
+        "labels": labels.matrix, "n_sampled": labels.n_sampled, "no_labels": labels.why_none,
         "pairs": tables.pair_matrix(names, run["orientation"]["pairs"], known), "no_pairs": "",
     }  # fmt: skip
 
 
-def label_part(out: Path, names: Sequence[str]) -> tuple[tables.Matrix | None, int, str]:
-    """Matrix of labels, number of sampled points (0 where images were ranked everywhere), and why there is no matrix."""
+class LabelPart(NamedTuple):
+    """Matrix of labels.
+
+    matrix : None where there is none; n_sampled : number of points in a sample, 0 where images were ranked everywhere;
+    why_none : reason why there is no matrix.
+    """
+
+    matrix: tables.Matrix | None
+    n_sampled: int
+    why_none: str
+
+
+def label_part(out: Path, names: Sequence[str]) -> LabelPart:
+    """Matrix of labels from the ranking of the run, or else from the sample that was made for the report."""
     labels = tables.label_matrix(out / RANKING, names)
     sample = read_record(out / CURVES).get("labels", {}) if (out / CURVES).exists() else {}
     if labels is not None or not sample:
-        return labels, 0, f"The run left no ranking of these images ({RANKING}), and no sample of one ({CURVES})."
+        why_none = f"The run wrote no ranking of these images ({RANKING}), and no sample of one ({CURVES})."
+        return LabelPart(labels, 0, why_none)
     if "error" in sample:
-        return None, 0, f"None could be made: {sample['error']}"
+        return LabelPart(None, 0, f"The sample could not be made: {sample['error']}")
     matrix = tables.sampled_matrix(sample["pairs"], names) if sample["pairs"] else None
-    return matrix, sample["points"], "No tie point lies where two images were compared."
+    return LabelPart(matrix, sample["points"], "No tie point lies where two images were compared.")
 
 
 def curves_part(path: Path, run: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-// What the server answers. Addresses are relative to the page's own, which holds the token.
+// Requests to the server. Addresses are relative to that of the page, which holds the token.
 
 export class Refused extends Error {}
 

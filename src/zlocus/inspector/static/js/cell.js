@@ -1,4 +1,4 @@
-// The panel of one cell: what the surface says of it, how it was matched, and what would be otherwise.
+// The panel of one cell: its values in the surface, its match, and its match with other settings.
 
 import { asked, Refused } from "./api.js";
 import * as curves from "./curves.js";
@@ -8,12 +8,12 @@ import * as map from "./map.js";
 import * as state from "./state.js";
 import * as windows from "./windows.js";
 
-const MOST_LISTED = 100;
+const MAX_LISTED = 100;
 const LABELS = { 1: "good", 0: "fair", "-1": "poor" };
 const WAIT_MS = 700;
-// Keys and spinners that are held ask for the last of many cells only.
+// While a key or a spinner is held, only the last of many cells is requested.
 const REST_MS = 60;
-// Options that a cell's curves depend on most; the others are behind them.
+// Options that influence the curves of a cell most; the others follow under "More".
 const FIRST = [
   "rho1_high", "ratio_high", "rho1_middle", "ratio_middle", "rho1_low", "ratio_low", "rho1_fair", "ratio_fair", "max_sigma_steps",
   "neighbours", "radius_px", "order", "min_label_share", "max_images",
@@ -25,7 +25,7 @@ export function make(about, theMap) {
   [surface, leaflet] = [about, theMap];
   drawn = L.layerGroup().addTo(leaflet);
   $("height").addEventListener("input", () => {
-    // Once per frame, however fast it is dragged.
+    // At most once per frame.
     framed ??= requestAnimationFrame(() => {
       framed = null;
       moved(true);
@@ -44,12 +44,12 @@ export function make(about, theMap) {
   $("find").addEventListener("input", () => otherImages());
 }
 
-// What stands beside a figure that is saved alone.
+// Title and legend of a figure that is saved without the page.
 function words(id) {
   const lines = id === "ncc" ? shown.match.curves.map(({ image }, j) => ({ text: `${j + 1}. ${image}`, colour: curves.lineColour(j) })) : [];
   const below = $(`${id}-figure`).querySelector(":scope > p.aside")?.textContent.replace(/\s+/g, " ").trim();
   if (below) lines.push({ text: below });
-  if (["windows", "ncc", "sncc"].includes(id)) lines.push({ text: `height looked at: ${$("height-value").textContent}` });
+  if (["windows", "ncc", "sncc"].includes(id)) lines.push({ text: `selected height: ${$("height-value").textContent}` });
   const title = `${$(`${id}-figure`).querySelector("figcaption span").textContent}, reference ${shown.match.reference}`;
   return { title, subtitle: `${surface.title}, row ${shown.row}, column ${shown.col} (${map.words(shown.x, shown.y)})`, lines };
 }
@@ -59,13 +59,13 @@ function explain(event) {
   if (text) $("option-doc").textContent = text;
 }
 
-// Look at the cell at a ground point.
+// Open the cell at a ground point.
 export function look(x, y) {
   state.set({ cell: `${map.place(x)},${map.place(y)}`, height: null });
   return open();
 }
 
-// Look at the neighbour of the cell, as far as there is one.
+// Open the neighbour of the cell, where there is one.
 export function step(down, across) {
   const at = state.numbers("cell", 2);
   if (!at) return;
@@ -89,7 +89,7 @@ export async function open() {
   drawn.clearLayers();
   if (!at) {
     shown = null;
-    if (state.get("cell")) notice(`The link names no place: cell=${state.get("cell")}.`);
+    if (state.get("cell")) notice(`The link does not name a place: cell=${state.get("cell")}.`);
     return;
   }
   $("changed").hidden = !Object.keys(whatIf()).length;
@@ -116,7 +116,7 @@ async function load([x, y], signal) {
   facts(record);
   while (record.is_pending) {
     $("cell-error").hidden = false;
-    $("cell-error").textContent = "The images are being opened; curves follow.";
+    $("cell-error").textContent = "The images are being opened. The match curves will follow.";
     await new Promise((done) => setTimeout(done, WAIT_MS));
     if (signal.aborted) return;
     record = await asked("cell", { ...changes, x, y }, signal);
@@ -138,7 +138,7 @@ async function load([x, y], signal) {
   document.dispatchEvent(new CustomEvent("looked", { detail: record }));
 }
 
-// Nothing of the cell before stays beside what went wrong.
+// Nothing of the previous cell stays beside an error message.
 function fail(text) {
   shown = null;
   for (const id of ["cell-facts", "cell-reasons"]) $(id).replaceChildren();
@@ -156,11 +156,11 @@ function noMatch(text) {
 function facts(record) {
   $("cell-title").textContent = `Cell at row ${record.row}, column ${record.col}`;
   for (const each of document.querySelectorAll(".begun")) {
-    each.textContent = record.height_m === null ? "height that the search began with" : "height of the surface";
+    each.textContent = record.height_m === null ? "height at the start" : "height of the surface";
   }
   const rows = [
     ["Place", map.words(record.x, record.y, digitsFor(surface.transform[0]))],
-    ["Height", record.height_m === null ? "none" : `${metres(record.height_m, digits())} (${surface.above})`],
+    ["Height", record.height_m === null ? "none" : `${metres(record.height_m, digits())} (${surface.height_name})`],
     ["Standard deviation", metres(record.sigma_m, digits() + 1)],
     ["Images used", record.height_m === null ? "–" : String(record.n_images)],
   ];
@@ -169,12 +169,12 @@ function facts(record) {
   $("cell-facts").replaceChildren(
     ...rows.flatMap(([name, text]) => [element("dt", {}, name), element("dd", { id: ids[name] ?? null }, text)]),
   );
-  // Of a cell without a height: why it has none.
+  // A cell without a height shows only the reasons for that.
   const said = record.height_m === null ? record.reasons.filter(({ fate }) => fate === "none") : record.reasons;
   $("cell-reasons").replaceChildren(...said.map(reason));
 }
 
-// Of heights: they are no better than a tenth of a cell.
+// Decimals of heights, which are at best precise to a tenth of a cell.
 function digits() {
   return digitsFor(surface.transform[0]);
 }
@@ -211,9 +211,9 @@ function match(found, before) {
   const reference = shown.difference_m === null ? null : shown.height_m - shown.difference_m;
   $("match-stop").textContent = `${found.says.stop} ${peak(found)} One step of height is ${metres(found.step_m, digitsFor(found.step_m) + 1)}.`;
   $("match-run").textContent = `${apart(found)}${ofRun(found)}`;
-  $("match-order").textContent = `Labels are of ${found.says.order}; ${howOrdered()} A line is drawn below the last image that is used.`;
+  $("match-order").textContent = `The labels come from ${found.says.order}. ${howOrdered()} A line is drawn below the last image that is used.`;
   draw("ncc", curves.single(found, reference), key(found, reference));
-  draw("sncc", curves.means(found, before, reference), before ? element("p", { class: "aside" }, "dashed in colour: the mean that the run's options end with") : null);
+  draw("sncc", curves.means(found, before, reference), before ? element("p", { class: "aside" }, "dashed in colour: the mean with which the match ends with the options of the run") : null);
   const columns = Math.max(2, Math.floor(($("windows-figure").clientWidth || 500) / 118));
   draw("windows", windows.windows(found, unpacked, columns));
   draw("loci", windows.loci(found, Math.max(2, Math.floor(($("loci-figure").clientWidth || 500) / 200))));
@@ -233,40 +233,40 @@ function peak(found) {
   return `The peak lies at ${metres(found.peak_m, precisely)}, predicted to ${sigma === null ? "no precision" : metres(sigma, precisely)}.`;
 }
 
-// How far the surface is from the peak, and why.
+// Distance of the surface from the peak, and the reason for it.
 function apart(found) {
   if (shown.height_m === null || found.peak_m === null) return "";
   const away = shown.height_m - found.peak_m, reasons = shown.reasons.map(({ name }) => name);
   if (Math.abs(away) < 1.5 * found.step_m) return "";
   const [low, high] = [found.heights_m[0], found.heights_m.at(-1)];
-  const atEnd = Math.min(found.peak_m - low, high - found.peak_m) < 1.5 * found.step_m ? " (which is at an end of the heights looked at, so it is none to be trusted)" : "";
-  const why = reasons.includes("PLANE") ? "it is that of the plane fitted to the plain segment around" :
-    reasons.includes("FILLED") ? "it was filled from its neighbours" : "neighbours, other windows or other images decided otherwise than this cell alone";
+  const atEnd = Math.min(found.peak_m - low, high - found.peak_m) < 1.5 * found.step_m ? " (which lies at an end of the candidate heights and is therefore not reliable)" : "";
+  const why = reasons.includes("PLANE") ? "its height is that of the plane fitted to the whole segment" :
+    reasons.includes("FILLED") ? "its height was interpolated from the neighbours" : "the semi-global constraint, other correlation windows or other images led to another height than this cell without its neighbours";
   return `The surface lies ${metres(Math.abs(away))} ${away > 0 ? "above" : "below"} this peak${atEnd}: ${why}. `;
 }
 
 function howOrdered() {
   const chosen = (name) => state.get(`if.${name}`) ?? surface.options.find((each) => each.name === name)?.value;
   return chosen("order") === "angle" ?
-    `images that help come in the order of their angle to the reference, nearest to ${chosen("best_angle_deg")} degrees first, the others behind them.` :
-    "images of the highest sum come first.";
+    `Images that help come in the order of their angle to the reference, nearest to ${chosen("best_angle_deg")} degrees first; the others follow.` :
+    "Images with the highest sum of labels come first.";
 }
 
-// What the run did otherwise than a cell alone would.
+// Differences between the run and the match of a single cell.
 function ofRun(found) {
   if (surface.method === "gc3-sgm") {
-    return "The run matched the pixels of the images (gc3-sgm); these are the curves of the vertical line through the cell, where the heights found lie.";
+    return "The run matched the pixels of the images (gc3-sgm); The curves are those of the vertical line through the cell.";
   }
   const window = `${found.window} x ${found.window}`;
-  const used = shown.height_m === null ? "" : `In the run ${shown.n_images} of ${surface.images.length} images, the reference among them, took part in the last fit of this height; what hides one there leaves it out. `;
-  const settles = ` Curves compare windows of ${window} cells; the run also compares smaller ones and grey values` +
-    (surface.method === "mvll" ? "." : ", and settles the height together with those of the neighbours: it need not lie at this peak.");
-  if (surface.views === "all") return `${used}The run was told to use every image in every cell (--views all).${settles}`;
+  const used = shown.height_m === null ? "" : `In the run ${shown.n_images} of ${surface.images.length} images, including the reference image, were used for the final height. Images in which the cell is occluded were not used. `;
+  const curves_text = ` These curves use correlation windows of ${window} cells. The run also uses smaller windows and grey values` +
+    (surface.method === "mvll" ? "." : ", and the semi-global constraint, so that its height need not lie at this peak.");
+  if (surface.views === "all") return `${used}The run used every image in every cell (--views all).${curves_text}`;
   if (surface.images.length < surface.min_images_for_choice) {
-    return `${used}With fewer than ${surface.min_images_for_choice} images it leaves out no other: order and stop ` +
-      `are what the rule says of this cell alone.${settles}`;
+    return `${used}With fewer than ${surface.min_images_for_choice} images the run uses all of them: order and stop ` +
+      `are those that the rule gives for this single cell.${curves_text}`;
   }
-  return `${used}It decides by the same rule, for blocks of cells and one level up.${settles}`;
+  return `${used}It applies the same rule to matching blocks, on the next coarser pyramid level.${curves_text}`;
 }
 
 function nearest(found, height) {
@@ -285,7 +285,7 @@ function key(found, reference) {
   ));
 }
 
-// The height under the slider, wherever it is shown.
+// Show the height of the slider in all figures.
 function moved(isAsked) {
   const found = shown?.match;
   if (!found) return;
@@ -294,7 +294,7 @@ function moved(isAsked) {
   $("height-value").textContent = text;
   $("height").setAttribute("aria-valuetext", text);
   const each = found.curves.map(({ image }, j) => `${image} ${correlation(found.ncc[j][k])}`);
-  $("height-text").textContent = `There: mean of ${found.stop.images} ${correlation(found.sncc[found.stop.images - 1][k])}; ${each.join(", ")}`;
+  $("height-text").textContent = `At this height: mean of ${found.stop.images} ${correlation(found.sncc[found.stop.images - 1][k])}; ${each.join(", ")}`;
   curves.mark(charts.ncc, found, k);
   curves.mark(charts.sncc, found, k);
   windows.show(charts.windows, found, unpacked, "moving", k);
@@ -303,7 +303,7 @@ function moved(isAsked) {
 }
 
 function correlation(value) {
-  return value === null ? "not seen" : value.toFixed(2);
+  return value === null ? "not visible" : value.toFixed(2);
 }
 
 export function slide(by) {
@@ -315,7 +315,7 @@ function imageTable(found) {
   const heads = ["use, image", "label", "ρ1", "ratio", "peak m", "around", "mean", "σ m"];
   const rows = [element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))];
   const order = found?.curves.map((curve) => curve.image) ?? [];
-  if (found) rows.push(imageRow(found.reference, ["reference", "", "", "", "", "", ""]));
+  if (found) rows.push(imageRow(found.reference, ["reference image", "", "", "", "", "", ""]));
   order.forEach((name, j) => {
     const [one, mean] = [found.curves[j], found.means[j]];
     const cells = [
@@ -336,17 +336,17 @@ function imageTable(found) {
   otherImages();
 }
 
-// Images that do not show the cell, or promise less than those that are compared.
+// Images that do not show the cell, or are ranked lower than those that are compared.
 function others() {
   const found = shown?.match, known = new Set([found?.reference, ...(found?.curves ?? []).map((curve) => curve.image), ...state.all("without")]);
   return surface.images.filter((name) => !known.has(name));
 }
 
-// Those that are looked for, when somebody looks.
+// Those that match the search text, while the list is open.
 function otherImages() {
   const names = $("others").open ? others().filter((name) => name.toLowerCase().includes($("find").value.toLowerCase())) : [];
-  const rows = names.slice(0, MOST_LISTED).map((name) => imageRow(name, ["not compared"], name, "off"));
-  if (names.length > MOST_LISTED) rows.push(element("tr", {}, element("td", {}, `and ${names.length - MOST_LISTED} more`)));
+  const rows = names.slice(0, MAX_LISTED).map((name) => imageRow(name, ["not compared"], name, "off"));
+  if (names.length > MAX_LISTED) rows.push(element("tr", {}, element("td", {}, `and ${names.length - MAX_LISTED} more`)));
   $("other-images").replaceChildren(...rows);
 }
 
@@ -373,7 +373,7 @@ function tieTable(found) {
   const rows = points.slice(0, 12).map((point) => element("tr", {}, element("th", { scope: "row" }, `${point.distance_m.toFixed(digitsFor(surface.transform[0]) - 1)} m`),
     ...point.labels.map((value) => element("td", { class: `label-${value}` }, signed(value)))));
   if (points.length > rows.length) rows.push(element("tr", {}, element("td", {}, `and ${points.length - rows.length} more`)));
-  if (!points.length) rows.push(element("tr", {}, element("td", {}, "none near enough")));
+  if (!points.length) rows.push(element("tr", {}, element("td", {}, "none is near enough")));
   $("ties").replaceChildren(caption, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);
 }
 
@@ -383,7 +383,7 @@ function switchImage(name, isOn) {
   open();
 }
 
-// What is looked at otherwise than in the run, as the server takes it.
+// Settings that differ from the run, as parameters of a request.
 function whatIf() {
   const found = Object.fromEntries(state.entries("if."));
   const without = state.all("without");
@@ -398,8 +398,8 @@ function asInRun() {
 function makeOptions() {
   const known = Object.fromEntries(surface.options.map((each) => [each.name, each]));
   const others = surface.options.map(({ name }) => name).filter((name) => !FIRST.includes(name));
-  const window = { name: "window", value: surface.window.value, choices: surface.window.choices, doc: "Side of the window that is compared.", unit: "cells" };
-  const reference = { name: "reference", value: "", choices: [""], doc: "Image that the others are compared with.", unit: "" };
+  const window = { name: "window", value: surface.window.value, choices: surface.window.choices, doc: "Side of the correlation window.", unit: "cells" };
+  const reference = { name: "reference", value: "", choices: [""], doc: "Reference image.", unit: "" };
   $("options").append(...[window, reference, ...FIRST.map((name) => known[name])].map(optionRow));
   $("options").append(element("details", { style: "grid-column: 1 / -1" }, element("summary", {}, "More"), ...others.map((name) => optionRow(known[name]))));
 }
@@ -414,7 +414,7 @@ function optionRow({ name, value, choices, low, high, is_whole, doc, unit }) {
   return element("label", { title: `${name}: ${doc}${range}` }, element("span", {}, name), input);
 }
 
-// References to choose from: images that are compared here.
+// Reference images to choose from: those that are compared here.
 function fillReferences(found) {
   const select = $("options").querySelector("select[name=reference]"), value = state.get("if.reference") ?? "";
   const names = new Set(["", found.reference, ...found.curves.map(({ image }) => image), value]);
@@ -444,7 +444,7 @@ function changed() {
   soon();
 }
 
-// After colours changed.
+// Draw the figures again after the colours have changed.
 export function redraw() {
   if (shown?.match) match(shown.match, $("changed").hidden ? null : asRun?.match);
 }

@@ -1,8 +1,8 @@
-// Match curves: correlation against height, with the heights that matter marked.
+// Match curves: correlation against height, with the important heights marked.
 
 import { colour } from "./dom.js";
 
-// Okabe and Ito's colours, as in the figures of `zlocus curves`, the dark ones lighter on dark paper.
+// The colours of Okabe and Ito, as in the figures of `zlocus curves`; lighter on a dark page.
 const LIGHT = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195"];
 const DARK = ["#4aa8e0", "#ff8a4a", "#33cfa3", "#e39ac6", "#f0b73a", "#8fd0f5", "#c08a58", "#ad85c9"];
 const DASHES = ["", "7 4", "2 3"];
@@ -55,7 +55,7 @@ export function single(match, reference) {
   ], "Correlation with each search image against height", reference);
 }
 
-// The mean of the first 1, 2, ... images, from pale to dark, that at which the match ends thick.
+// The means of the first 1, 2, ... images from pale to dark; the one with which the match ends is thick.
 export function means(match, before, reference) {
   const used = match.stop.images;
   const steps = match.sncc.map((values, m) => ({ m: m + 1, points: points(match.heights_m, values, `mean of ${m + 1}`) }));
@@ -81,12 +81,12 @@ function tips(all) {
   }));
 }
 
-// The height that is looked at, as a line on a chart that is there.
+// Mark the selected height as a line on an existing chart.
 export function mark(svg, match, k) {
   const scale = svg.scale("x");
   const [low, high] = scale.domain, [left, right] = scale.range;
   const x = left + ((match.heights_m[k] - low) / (high - low)) * (right - left);
-  const line = d3.select(svg).selectAll("line.looked-at").data([x]).join("line");
-  line.attr("class", "looked-at").attr("x1", x).attr("x2", x).attr("y1", SIZE.marginTop).attr("y2", SIZE.height - SIZE.marginBottom)
+  const line = d3.select(svg).selectAll("line.selected-height").data([x]).join("line");
+  line.attr("class", "selected-height").attr("x1", x).attr("x2", x).attr("y1", SIZE.marginTop).attr("y2", SIZE.height - SIZE.marginBottom)
     .attr("stroke", colour("accent")).attr("stroke-width", 2).attr("pointer-events", "none");
 }

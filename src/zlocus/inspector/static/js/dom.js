@@ -13,7 +13,7 @@ export function element(name, attributes = {}, ...children) {
   return made;
 }
 
-// Why something is not there, or "" to say nothing.
+// Show a message above the page; "" hides it.
 export function notice(text) {
   $("notice").textContent = text;
   $("notice").hidden = !text;
@@ -31,7 +31,7 @@ export function metres(value, digits = 2) {
   return value === null || value === undefined ? "none" : `${value.toFixed(digits)} m`;
 }
 
-// Digits behind the point that show a tenth of a size, in m; two at least.
+// Decimals that show a tenth of a size in m; at least two.
 export function digitsFor(size) {
   return Math.max(2, Math.ceil(1 - Math.log10(size) - 1e-9));
 }

@@ -1,11 +1,11 @@
-// Figures as files: an SVG as it is, or drawn into a PNG of twice its size.
+// Figures as files: SVG, or PNG of twice the size.
 
 import { colour, element } from "./dom.js";
 
 const SCALE = 2;
 
-// Give a figure its buttons. svg, name, words : give the drawing as it is now, if there is one, the name of its file, and
-// what the page says beside it.
+// Add buttons that save a figure. svg, name, words : functions that return the current drawing, if there is one, the name
+// of its file, and its title and legend.
 export function exportable(figure, name, svg, words) {
   const buttons = element("span", {}), title = figure.querySelector("figcaption span").textContent;
   for (const kind of ["SVG", "PNG"]) {
@@ -68,7 +68,7 @@ export function saveCanvas(canvas, name) {
   canvas.toBlob((blob) => save(blob, `${name}.png`), "image/png");
 }
 
-// An SVG that needs no style sheet: colours of the page are written into it.
+// An SVG without a style sheet: the colours of the page are written into it.
 export function textOf(svg) {
   const copy = svg.cloneNode(true);
   copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");

@@ -1,4 +1,4 @@
-// The page: what was asked for by its address, and what keys and buttons do.
+// The page: opens the view that the address names, and handles keys and buttons.
 
 import { asked } from "./api.js";
 import * as cell from "./cell.js";
@@ -11,18 +11,18 @@ import * as state from "./state.js";
 const LETTERS = "zlocus.letters";
 const TABS = ["cell", "profile", "relief"];
 const KEYS = [
-  ["1 to 7", "layers, on and off, by the number before their name"],
+  ["1 to 7", "switch the layer with this number on or off"],
   ["Arrows, + and −", "move the map and zoom, while it has the focus; the same for the view in three dimensions, which Shift and arrows turn"],
-  ["Enter", "look at the cell in the middle of the map"],
-  ["Shift and arrows", "the neighbouring cell"],
-  ["[ and ]", "the height looked at, down and up"],
-  ["P", "one end of a profile, then the other, in the middle of the map"],
-  ["Esc", "end drawing"],
-  ["H", "all of the surface"],
-  ["C, F, V", "cell, profile, 3-D"],
+  ["Enter", "open the cell in the middle of the map"],
+  ["Shift and arrows", "open the neighbouring cell"],
+  ["[ and ]", "move the selected height down and up"],
+  ["P", "set one end of a profile, then the other, in the middle of the map"],
+  ["Esc", "stop drawing"],
+  ["H", "show the whole surface"],
+  ["C, F, V", "open cell, profile or 3-D view"],
   ["L", "copy the link of this view"],
-  ["D", "light or dark"],
-  ["?", "these keys"],
+  ["D", "switch between light and dark"],
+  ["?", "show this list"],
 ];
 const WAIT_MS = 1000, PATIENCE_MS = 5000;
 let leaflet, surface, relief = null;
@@ -49,9 +49,9 @@ async function start() {
     const canvas = await map.exportMap();
     if (canvas) saveCanvas(canvas, `${surface.title}_map`);
   });
-  // Before the map, which would move for shift and arrows.
+  // Captured before the map, which would move on Shift and arrows.
   addEventListener("keydown", key, true);
-  // Where the keyboard is used, the map's middle is marked.
+  // The middle of the map is marked while the keyboard is used.
   addEventListener("keydown", () => (document.body.dataset.keys = "true"), true);
   $("letters").checked = localStorage.getItem(LETTERS) !== "off";
   $("letters").addEventListener("change", () => localStorage.setItem(LETTERS, $("letters").checked ? "on" : "off"));
@@ -72,7 +72,7 @@ function reopen() {
   open(TABS.includes(tab) ? tab : "cell", false);
 }
 
-// Until everything that is made in the background is there.
+// Poll the server until everything that is prepared in the background is ready.
 async function watch() {
   for (;;) {
     let found;
@@ -120,7 +120,7 @@ async function open(name, isAsked = true) {
   if (name !== "profile") profile.cancel();
   if (name === "profile" && !state.get("line")) profile.begin();
   if (name === "relief") {
-    // Three dimensions are loaded when somebody wants them.
+    // The 3-D view is loaded on first use.
     relief ??= import("./relief.js").then((found) => {
       found.make(surface);
       return found;
@@ -129,7 +129,7 @@ async function open(name, isAsked = true) {
       await (await relief).show();
     } catch {
       relief = null;
-      $("relief-text").textContent = "The view in three dimensions could not be loaded. Open it again.";
+      $("relief-text").textContent = "The 3-D view could not be loaded. Open it again.";
     }
   }
 }
@@ -164,7 +164,7 @@ function key(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
   const isTyping = event.target.matches("input:not([type=checkbox], [type=range]), select, textarea");
   const arrows = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
-  // There arrows turn the view.
+  // In the 3-D view arrows turn it.
   if (event.target.closest("#relief-view") && arrows[event.key]) return;
   if (event.key.length === 1 && !$("letters").checked) return;
   if (event.shiftKey && arrows[event.key] && !isTyping) cell.step(...arrows[event.key]);

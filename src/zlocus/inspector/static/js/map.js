@@ -12,7 +12,7 @@ const layers = new Map();
 
 const Tiles = L.TileLayer.extend({
   getTileUrl({ x, y }) {
-    // Of a surface that is made again nothing is kept.
+    // The time of the run is in the address, so that the browser keeps no tile of an older surface.
     return `tiles/${this.options.name}/${-this._clampZoom(this._tileZoom)}/${x}/${y}.png?of=${encodeURIComponent(surface.made)}`;
   },
 });
@@ -27,7 +27,7 @@ export function make(about) {
   });
   L.control.scale({ imperial: false, maxWidth: 160 }).addTo(map);
   about.layers.forEach(addLayer);
-  // Not so far away that nothing is seen of it.
+  // Limit the zoom so that the surface stays visible.
   map.setMinZoom(Math.min(map.getBoundsZoom(bounds()) - 1, 0));
   map.setMaxBounds(bounds().pad(1));
   if (matchMedia("(max-width: 860px)").matches) $("layers").open = false;
@@ -43,7 +43,7 @@ export function make(about) {
   return map;
 }
 
-// A coordinate as links have it, to a tenth of a cell.
+// A coordinate as links contain it, to a tenth of a cell.
 export function place(value) {
   return value.toFixed(digitsFor(surface.transform[0]));
 }
@@ -53,7 +53,7 @@ export function words(x, y, digits = digitsFor(surface.transform[0]) - 1) {
   return `${first} ${x.toFixed(digits)}, ${second} ${y.toFixed(digits)} m`;
 }
 
-// The place and the layers that the address asks for.
+// Show the place and the layers that the address names.
 export function openView() {
   const at = state.numbers("at", 3);
   if (at && bounds().pad(1).contains([at[1], at[0]])) map.setView([at[1], at[0]], at[2], { animate: false });
@@ -73,7 +73,7 @@ function clamp(share) {
   return Number.isFinite(share) ? Math.min(Math.max(share, 0), 1) : 1;
 }
 
-// A little less than all of the surface: no tile is asked for that only touches it.
+// Slightly smaller than the surface, so that no tile is requested that only touches it.
 function inner() {
   const box = bounds(), aside = surface.transform[0] * 1e-3;
   return L.latLngBounds([box.getSouth() + aside, box.getWest() + aside], [box.getNorth() - aside, box.getEast() - aside]);
@@ -85,9 +85,9 @@ export function holds(x, y) {
   return x >= box.getWest() && x < box.getEast() && y > box.getSouth() && y <= box.getNorth();
 }
 
-// All of the surface.
+// Show the whole surface.
 export function home() {
-  // Beside the list of layers, where there is room.
+  // Leave room for the list of layers, where the map is wide enough.
   const list = $("layers"), aside = list.open && list.offsetWidth < $("map").clientWidth / 2 ? list.offsetWidth : 0;
   map.fitBounds(bounds(), { animate: false, paddingBottomRight: [aside, 0] });
 }
@@ -111,7 +111,7 @@ export function addLayer(about) {
   const legend = legendOf(about);
   const layer = { ...about, drawnLegend: about.legend, tiles, box, share, legend, number };
   layers.set(about.name, layer);
-  // The highest stands at the top.
+  // The highest layer is at the top of the list.
   $("layer-rows").prepend(
     element("div", { class: "layer" }, element("label", { title: `Key ${number}` }, box, element("span", { class: "number" }, number), about.title), share),
   );
@@ -123,7 +123,7 @@ export function has(name) {
   return layers.has(name);
 }
 
-// A layer that came later, as the address asks for it.
+// Add a layer that became ready later, as the address names it.
 export function addLate(about) {
   addLayer(about);
   const share = parsed(state.get("layers") ?? "")[about.name];

@@ -1,4 +1,4 @@
-// Heights along a line drawn on the map, with their standard deviation, and the reference where there is one.
+// Profile: heights along a line on the map, with their standard deviation and the reference, where there is one.
 
 import { asked } from "./api.js";
 import { colour, $ } from "./dom.js";
@@ -33,7 +33,7 @@ export function cancel() {
   first = null;
   $("map").classList.remove("drawing");
   $("draw").setAttribute("aria-pressed", "false");
-  if (isBegun) open(); // the line that was there before
+  if (isBegun) open(); // the previous line
 }
 
 // One end of the line, then the other.
@@ -53,7 +53,7 @@ export function point({ lat, lng }) {
 
 // The line that the address names, or none.
 export async function open() {
-  if (first) return; // somebody draws
+  if (first) return; // a line is being drawn
   const ends = state.numbers("line", 4);
   busy?.abort();
   line.clearLayers();
@@ -92,7 +92,7 @@ function draw([x0, y0, x1, y1]) {
     x: { label: "distance, m", labelAnchor: "center", labelArrow: "none" },
     y: { label: "height, m", labelArrow: "none", nice: true, zero: false },
     marks: [
-      // Where a height is missing there is a gap.
+      // Missing heights leave a gap.
       Plot.areaY(points, { x: "distance", y1: (d) => low(d), y2: (d) => high(d), fill: colour("accent"), fillOpacity: 0.3 }),
       ...(hasReference ? [Plot.line(points, { x: "distance", y: (d) => d.reference ?? NaN, stroke: colour("warn"), strokeWidth: 1.4, strokeDasharray: "5 3" })] : []),
       Plot.line(points, { x: "distance", y: (d) => d.height ?? NaN, stroke: colour("accent"), strokeWidth: 1.6 }),
@@ -120,7 +120,7 @@ function mark(distance) {
   dot.setLatLng([y0 + share * (y1 - y0), x0 + share * (x1 - x0)]).addTo(line);
 }
 
-// One place of the line in words, for who does not point at the chart.
+// One place of the line in words, for users without a pointer.
 function along(i) {
   const [height, sigma, reference] = [last.height_m[i], last.sigma_m[i], last.reference_m?.[i] ?? null];
   mark(last.distance_m[i]);

@@ -1,4 +1,4 @@
-// The surface in three dimensions with a layer on it.
+// The 3-D view: the surface with a layer as its texture.
 
 import * as THREE from "three";
 import { ask } from "./api.js";
@@ -8,8 +8,8 @@ import * as map from "./map.js";
 import * as state from "./state.js";
 import { OrbitControls } from "../vendor/three/OrbitControls.js";
 
-const MOST_SIDE = 512, PICTURE_SIDE = 2048;
-// Of the distance, with each key.
+const MAX_SIDE = 512, PICTURE_SIDE = 2048;
+// Factor of the distance for each key press.
 const CLOSER = 0.85;
 let surface, renderer, scene, camera, controls, mesh = null, span = 0, shows = 0, isPlaced = false;
 
@@ -30,9 +30,9 @@ export function make(about) {
   });
 }
 
-// Layers may come later.
+// Called whenever the list of layers may have changed.
 function fillDrapes() {
-  const choices = [["map", "what the map shows"], ...map.titles().map(({ name, title }) => [name, title])];
+  const choices = [["map", "layers of the map"], ...map.titles().map(({ name, title }) => [name, title])];
   const usual = map.has("ortho") ? "ortho" : "map", asked = state.get("drape") ?? usual;
   $("drape").replaceChildren(...choices.map(([value, text]) => element("option", { value }, text)));
   $("drape").value = choices.some(([value]) => value === asked) ? asked : usual;
@@ -43,7 +43,7 @@ function begin() {
   try {
     renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
   } catch {
-    $("relief-text").textContent = "This browser shows nothing in three dimensions: it has no WebGL.";
+    $("relief-text").textContent = "This browser cannot show the 3-D view, because it has no WebGL.";
     return false;
   }
   renderer.setPixelRatio(devicePixelRatio);
@@ -72,12 +72,12 @@ export async function show() {
   const number = ++shows;
   fillDrapes();
   $("exaggeration").value = state.get("exaggeration") ?? $("exaggeration").value;
-  const part = map.patch(MOST_SIDE, true);
+  const part = map.patch(MAX_SIDE, true);
   if (!part) {
-    $("relief-text").textContent = "The map shows nothing of the surface. Move it there.";
+    $("relief-text").textContent = "The map does not show the surface. Move the map to it.";
     return;
   }
-  // Below what is clear the surface is seen all the same.
+  // The hillshade below shows the surface where the texture is transparent.
   const on = $("drape").value === "map" ? map.shown().map(([name, share]) => `${name}:${share}`) : [$("drape").value];
   const names = ["hillshade", ...on];
   const scale = PICTURE_SIDE / Math.max(part.rows, part.cols);
@@ -99,12 +99,12 @@ function load(address) {
   });
 }
 
-// Longer side of the part: 1; heights to the same scale.
+// The longer side of the part has length 1, and heights have the same scale.
 function build(part, heights, texture) {
   const { height: rows, width: cols } = part;
   const known = heights.filter(Number.isFinite);
   if (!known.length) {
-    $("relief-text").textContent = "No cell of what the map shows has a height.";
+    $("relief-text").textContent = "No cell in the part that the map shows has a height.";
     return;
   }
   const sorted = known.slice().sort();
@@ -135,11 +135,11 @@ function build(part, heights, texture) {
   place();
   exaggerate();
   const shape = `${rows} x ${cols} places, ${step.toFixed(2)} m apart`;
-  $("relief-text").textContent = `${shape}, ${sorted[0].toFixed(1)} to ${sorted.at(-1).toFixed(1)} m. Drag to turn, wheel or pinch to come closer; holes are holes.`;
+  $("relief-text").textContent = `${shape}, ${sorted[0].toFixed(1)} to ${sorted.at(-1).toFixed(1)} m. Drag to turn, use the wheel or pinch to zoom. Cells without a height are holes.`;
   $("relief-view").dataset.places = String(known.length);
 }
 
-// Two per square of places that all have a height.
+// Two triangles for each square of places that all have a height.
 function triangles(heights, rows, cols) {
   const found = [];
   for (let row = 0; row + 1 < rows; row++) {
@@ -152,7 +152,7 @@ function triangles(heights, rows, cols) {
 }
 
 function place() {
-  // All of it, in a window that may be narrow.
+  // The whole part, also in a narrow window.
   const away = Math.max(1, 1.1 / camera.aspect);
   const kept = state.numbers("eye", 6) ?? [0, 0.85 * away, 1.05 * away, 0, 0, 0];
   camera.position.set(...kept.slice(0, 3));

@@ -1,10 +1,10 @@
-// The view, kept behind the # of the address: whoever opens the link sees the same.
+// The state of the page, kept in the address after the #, so that a link shows the same view.
 
-// Some browsers refuse to write the address more often than this.
+// Some browsers refuse to change the address more often than this.
 const WRITE_MS = 250;
 const listeners = [];
 let writing = null;
-let known; // the part of the address behind # when it was last read or written here
+let known; // the part of the address after # when it was last read or written here
 let values = read();
 
 export function get(name) {
@@ -29,7 +29,7 @@ export function set(changes) {
   writing ??= setTimeout(write, WRITE_MS);
 }
 
-// The link of the view as it is.
+// The link of the current view.
 export function link() {
   write();
   return location.href;

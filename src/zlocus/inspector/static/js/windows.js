@@ -1,4 +1,4 @@
-// What the images show: the ground around the cell at two heights, and the vertical line with the match on it.
+// What the images show: the ground around the cell at two heights, and the vertical line with its match.
 
 import { colour, digitsFor, element } from "./dom.js";
 import { lineColour } from "./curves.js";
@@ -23,13 +23,13 @@ function address({ side, at }, k) {
   return canvas.toDataURL();
 }
 
-// Two rows of windows: at the height of the surface, and at that of the slider; the window that is compared is outlined.
+// Two rows of patches: at the height of the surface, and at the selected height. The correlation window is outlined.
 export function windows(match, unpacked, columns) {
   const size = 25 * CELL_PX;
   const n = match.images.length, across = Math.min(n, columns), blocks = Math.ceil(n / across);
   const width = across * (size + GAP), block = 2 * (size + 18) + HEAD + GAP, height = blocks * block;
   const svg = d3.create("svg").attr("viewBox", [0, 0, width, height]).attr("width", width).attr("height", height)
-    .attr("role", "img").attr("aria-label", "The ground in each image at the height in the middle and at the height looked at")
+    .attr("role", "img").attr("aria-label", "The ground in each image at the height of the surface and at the selected height")
     .attr("font-size", 11).attr("fill", "currentColor");
   match.images.forEach((image, i) => {
     const x = (i % across) * (size + GAP), y = Math.floor(i / across) * block;
@@ -64,7 +64,7 @@ export function show(svg, match, unpacked, which, k) {
 }
 
 function value(ncc) {
-  return ncc === null ? "not seen" : `ρ ${ncc.toFixed(2)}`;
+  return ncc === null ? "not visible" : `ρ ${ncc.toFixed(2)}`;
 }
 
 function outline(svg, x, y, size, side, window) {
@@ -73,7 +73,7 @@ function outline(svg, x, y, size, side, window) {
     .attr("fill", "none").attr("stroke", "#ffd400").attr("stroke-width", 1.5);
 }
 
-// The vertical line over a crop of every image: + where the surface is, x the peak, o the height looked at.
+// The vertical line over a crop of every image: + the surface, x the peak, o the selected height.
 export function loci(match, columns) {
   const n = match.images.length, across = Math.min(n, columns), size = CROP_PX;
   const width = across * (size + GAP), block = size + 24 + GAP, height = Math.ceil(n / across) * block;
@@ -88,7 +88,7 @@ export function loci(match, columns) {
       .attr("preserveAspectRatio", "none").style("image-rendering", "pixelated");
     const line = image.line.map((xy) => drawn(xy, image, scale));
     if (i) {
-      // Dark below light, so that it is seen on any ground.
+      // A light line on a dark one is visible on any ground.
       for (const [stroke, width] of [["#000000", 3.6], ["#ffd400", 1.8]]) {
         place.append("path").attr("d", d3.line().defined((d) => d !== null)(line)).attr("fill", "none")
           .attr("stroke", stroke).attr("stroke-width", width);
@@ -97,7 +97,7 @@ export function loci(match, columns) {
     cross(place, line[middle(match)], "M-7 0H7M0 -7V7", "#00d0ff");
     cross(place, along(line, match), "M-5 -5L5 5M-5 5L5 -5", "#ff3030");
     for (const [stroke, width] of [["#000000", 4], ["#ffffff", 2]]) {
-      place.append("circle").attr("class", "looked-at").attr("r", 5).attr("fill", "none").attr("stroke", stroke)
+      place.append("circle").attr("class", "selected-height").attr("r", 5).attr("fill", "none").attr("stroke", stroke)
         .attr("stroke-width", width).datum(line);
     }
   });
@@ -121,7 +121,7 @@ function heading(svg, x, y, name, i) {
   if (i) svg.append("rect").attr("x", x).attr("y", y + 2).attr("width", 24).attr("height", 3).attr("fill", lineColour(i - 1));
 }
 
-// The peak lies between two of the heights.
+// The image point of the peak, which lies between two of the heights.
 function along(line, match) {
   if (match.peak_m === null) return null;
   const [low, high] = [match.heights_m[0], match.heights_m.at(-1)];
@@ -131,7 +131,7 @@ function along(line, match) {
 }
 
 export function moveLoci(svg, k) {
-  d3.select(svg).selectAll("circle.looked-at").each(function (line) {
+  d3.select(svg).selectAll("circle.selected-height").each(function (line) {
     const at = line[k];
     d3.select(this).attr("visibility", at ? null : "hidden").attr("transform", at ? `translate(${at})` : null);
   });
