@@ -21,7 +21,7 @@ from zlocus.core.scene import View
 from zlocus.matching.radiometry import FEWEST_POINTS, MOST_POINTS, grey_scales, greys_of
 from zlocus.orientation import sift as features
 from zlocus.orientation import ties as ties_module
-from zlocus.orientation.epipolar import Sightlines, trace
+from zlocus.orientation.epipolar import Sightlines, epipolar_curves
 from zlocus.orientation.orientation import orient
 from zlocus.orientation.tie_residuals import linked_pairs
 from zlocus.orientation.ties import find_ties, neighbours
@@ -61,7 +61,7 @@ def test_images_of_common_ground_are_neighbours(places):
     corner = np.linspace(0.0, 39.0, 6)
     xy = np.stack(np.meshgrid(corner, corner), axis=-1).reshape(-1, 2)
     for a, b in combinations(range(len(views)), 2):
-        loci = trace(Sightlines.of(views[a].sensor, xy, Z_RANGE), views[b].sensor, Z_RANGE)
+        loci = epipolar_curves(Sightlines.of(views[a].sensor, xy, Z_RANGE), views[b].sensor, Z_RANGE)
         ends = np.stack([loci.low, loci.high])
         inside = ((ends > -MARGIN_PX) & (ends < 40 + MARGIN_PX)).all(axis=2)
         assert near[a, b] or not inside.any()

@@ -153,7 +153,7 @@ def test_views_with_few_ties_are_untied():
 
 def test_views_that_keep_few_of_their_ties_contradict():
     class Kept:
-        seen = observations([90, 40, 0, 20])
+        observations = observations([90, 40, 0, 20])
 
     shares = agreeing_shares(observations([100, 100, 0, 100]), Kept, 4)
     np.testing.assert_allclose(shares, [0.9, 0.4, 1.0, 0.2])
@@ -206,9 +206,9 @@ def test_cameras_of_their_own_are_not_called_exchanged(images):
     found = orient(scene, OrientationOptions())
     xyz = first_ground_points(scene, found.refined_ties.ties)
     sensors = [view.sensor for view in scene.views]
-    assert exchanged_views(sensors, found.ties.precise, xyz, range(3), OrientationOptions()) is None
+    assert exchanged_views(sensors, found.refined_ties.observations, xyz, range(3), OrientationOptions()) is None
     wrong = [sensors[1], sensors[0], sensors[2]]
-    assert exchanged_views(wrong, found.ties.precise, xyz, range(3), OrientationOptions()) == (0, 1)
+    assert exchanged_views(wrong, found.refined_ties.observations, xyz, range(3), OrientationOptions()) == (0, 1)
 
 
 def test_good_images_raise_no_doubt(images, tmp_path):

@@ -1,1 +1,1 @@
-"""Tie points, pointing corrections and the height range of the ground (method section 7)."""
+"""Tie points, pointing corrections and the height range of the ground (method section 1)."""

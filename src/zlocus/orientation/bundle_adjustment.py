@@ -1,4 +1,5 @@
-"""Joint orientation: the cameras of all images and the ground points of all ties at once (method section 7)."""
+"""Bundle adjustment: the cameras of all images and the ground points of all ties in one adjustment (method, section
+1)."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class BundleAdjustment:
-    """The corrected cameras and what they rest on.
+    """Result of a bundle adjustment.
 
     sensors : corrected; adjustment : the ties kept, see `Adjustment`, with shifts of 0; control : the points given;
     control_points : (k, 3) m where their image points put them, check points by them alone, NaN where one image sees a
@@ -47,7 +48,7 @@ def adjust_bundle(
     control: GroundControl | None = None,
     terrain: TerrainHeights | None = None,
 ) -> BundleAdjustment:
-    """Cameras that make the rays of all ties meet, where their priors and the control leave them.
+    """Correct all cameras so that the rays of all ties meet, within their priors and the control.
 
     xyz : (n, 3) m, first ground points of the ties. Observations further than 4 sigma (and at least `inlier_px`) from
     where the rest of their tie puts them are dropped, then everything is solved again, twice. Check points take no
@@ -96,7 +97,7 @@ def problem_of(
     control: GroundControl,
     terrain: TerrainHeights | None,
 ) -> Problem:
-    """Ties and control points in one list."""
+    """The adjustment problem, with the ties followed by the control points."""
     known = control.only(~control.is_check)
     observations = Observations(
         np.concatenate([ties.view, known.observations.view]),

@@ -1,4 +1,4 @@
-"""What is known of the ground beforehand: control points, check points, and the heights of a terrain model."""
+"""Known ground: control points, check points, and the heights of a terrain model."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class GroundControl:
     """Points known on the ground and seen in images.
 
     names : (n,); xyz : (n, 3) m in the scene's frame; sigma_m : (n, 3), standard deviations, NaN where they are not
-    given; is_check : (n,) bool, points that only judge the result; observations : their image points, by the scene's
-    views.
+    given; is_check : (n,) bool, points that take no part in the adjustment and only show its errors; observations :
+    their image points, in the scene's views.
     """
 
     names: tuple[str, ...]
@@ -36,7 +36,7 @@ class GroundControl:
         return len(self.names)
 
     def only(self, wanted: NDArray[np.bool_]) -> GroundControl:
-        """Some of the points, wanted : (n,) bool, with numbers of their own."""
+        """The points where wanted (n,) bool is set, numbered anew."""
         number = np.cumsum(wanted) - 1
         observations = self.observations.kept(wanted[self.observations.point])
         names = tuple(name for name, is_wanted in zip(self.names, wanted, strict=True) if is_wanted)
@@ -48,7 +48,8 @@ class GroundControl:
 class TerrainHeights:
     """Heights on a north-up grid in the scene's frame.
 
-    z : (r, c) m, NaN where there is none; west, north : m, of the first cell's centre; cell_m : from cell to cell.
+    z : (r, c) m, NaN where there is none; west, north : coordinates of the first cell's centre, m; cell_m : distance
+    from cell to cell.
     """
 
     z: FloatArray
@@ -57,7 +58,8 @@ class TerrainHeights:
     cell_m: float
 
     def at(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Heights (n,) m at points (n, 2), bilinear, and slopes (n, 2) to the east and north; NaN beyond."""
+        """Heights (n,) m at points (n, 2), bilinear, and slopes (n, 2) to the east and north; NaN outside of the
+        grid."""
         col, row = (xy[:, 0] - self.west) / self.cell_m, (self.north - xy[:, 1]) / self.cell_m
         with np.errstate(invalid="ignore"):
             inside = (col >= 0) & (row >= 0) & (col < self.z.shape[1] - 1) & (row < self.z.shape[0] - 1)

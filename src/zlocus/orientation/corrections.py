@@ -1,4 +1,4 @@
-"""The cameras of a scene corrected by its ties, without the images that contradict the others."""
+"""Correction of the cameras of a scene by its ties, without the images that contradict the others."""
 
 from __future__ import annotations
 
@@ -30,8 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CorrectedCameras:
-    """adjustment : the ties; sensors : corrected, but for the shifts of `adjustment`; joint : where all were
-    jointly."""
+    """Corrected cameras of a scene.
+
+    adjustment : of the ties; sensors : corrected, but for the shifts of `adjustment`; bundle_adjustment : None where
+    each image was only shifted.
+    """
 
     adjustment: Adjustment
     sensors: list[SensorModel]
@@ -40,8 +43,10 @@ class CorrectedCameras:
 
 @dataclass(frozen=True)
 class CameraSolver:
-    """Corrects the cameras of a scene by ties. uses_bundle_adjustment : all jointly, else one shift each; control,
-    terrain : see `orient`."""
+    """Correction of the cameras of a scene by ties.
+
+    uses_bundle_adjustment : False gives one shift per image; control, terrain : for the bundle adjustment.
+    """
 
     scene: Scene
     options: OrientationOptions
@@ -50,7 +55,7 @@ class CameraSolver:
     terrain: TerrainHeights | None
 
     def __call__(self, observations: Observations, xyz: FloatArray) -> CorrectedCameras:
-        """observations, xyz : observations and first ground points (n, 3) m of the ties."""
+        """Correct the cameras. observations, xyz : of the ties, with first ground points (n, 3) m."""
         views, options = self.scene.views, self.options
         sensors = [view.sensor for view in views]
         if self.uses_bundle_adjustment:
@@ -66,25 +71,28 @@ class CameraSolver:
 
 
 def without_contradicting_images(
-    solve: CameraSolver, observations: Observations, xyz: FloatArray
+    solver: CameraSolver, observations: Observations, xyz: FloatArray
 ) -> tuple[CorrectedCameras, NDArray[np.int64], list[Doubt]]:
-    """The cameras corrected without images that contradict the others, the numbers of these, and what is to be doubted.
+    """Corrected cameras without the images that contradict the others, the numbers of these images, and doubts.
 
-    Where too few images agree with each other all are kept, and doubted. observations, xyz : see `CameraSolver`.
+    Where too few images agree with each other, all are kept, and a doubt says so. observations, xyz : see
+    `CameraSolver`.
     """
-    solved, nobody = solve(observations, xyz), np.empty(0, np.int64)
-    names = [view.name for view in solve.scene.views]
-    shares = agreeing_shares(observations, solved.adjustment, len(names))
+    cameras, nobody = solver(observations, xyz), np.empty(0, np.int64)
+    names = [view.name for view in solver.scene.views]
+    shares = agreeing_shares(observations, cameras.adjustment, len(names))
     wrong = contradicting_views(shares)
     n_tied = len(np.unique(observations.view))
-    if solve.options.model == "none" or not n_tied:
-        return solved, nobody, []
+    if solver.options.model == "none" or not n_tied:
+        return cameras, nobody, []
     doubts = []
-    sensors = [view.sensor for view in solve.scene.views]
-    # Of more images those that are exchanged contradict the others.
+    sensors = [view.sensor for view in solver.scene.views]
+    # Among more images, those whose cameras are exchanged contradict the others.
     candidates = np.unique(observations.view) if n_tied <= MIN_AGREEING_IMAGES else wrong
     pair = (
-        exchanged_views(sensors, observations, xyz, candidates.tolist(), solve.options) if len(candidates) > 1 else None
+        exchanged_views(sensors, observations, xyz, candidates.tolist(), solver.options)
+        if len(candidates) > 1
+        else None
     )
     if pair is not None:
         one, other = (names[number] for number in pair)
@@ -96,30 +104,33 @@ def without_contradicting_images(
             )
         )
     if not len(wrong):
-        return solved, nobody, doubts
+        return cameras, nobody, doubts
     rest = ~np.isin(observations.view, wrong)
     rest &= np.bincount(observations.point[rest], minlength=len(xyz))[observations.point] >= 2
     if len(np.unique(observations.view[rest])) >= MIN_AGREEING_IMAGES:
         others = observations.kept(rest)
-        again = solve(others, xyz)
+        again = solver(others, xyz)
         if not len(contradicting_views(agreeing_shares(others, again.adjustment, len(names)))):
             return again, wrong, [replace(doubt, is_grave=False) for doubt in doubts]
-    told = ", ".join(f"{names[number]} ({100 * shares[number]:.0f} %)" for number in wrong)
+    shares_by_name = ", ".join(f"{names[number]} ({100 * shares[number]:.0f} %)" for number in wrong)
     doubts.append(
         Doubt(
-            f"Only a part of the tie points of {told} agrees with the other images, and too few images agree for it to "
-            "be known which cameras are wrong. Check that each camera belongs to its image.",
+            f"Only a part of the tie points of {shares_by_name} agrees with the other images, and too few images agree "
+            "for it to be known which cameras are wrong. Check that each camera belongs to its image.",
             is_grave=True,
         )
     )
-    return solved, nobody, doubts
+    return cameras, nobody, doubts
 
 
 def excluded_images_of(
-    scene: Scene, found: Observations, wrong: NDArray[np.int64], options: OrientationOptions
+    scene: Scene, observations: Observations, wrong: NDArray[np.int64], options: OrientationOptions
 ) -> tuple[ExcludedImage, ...]:
-    """Images that take no part. found : observations of all ties; wrong : numbers of those that contradict others."""
-    untied = untied_images(found, len(scene.views))
+    """Images that take no part in the matching, with the reasons.
+
+    observations : of all ties; wrong : numbers of the images that contradict the others.
+    """
+    untied = untied_images(observations, len(scene.views))
     excluded = []
     for number, view in enumerate(scene.views):
         if number in wrong:

@@ -162,7 +162,7 @@ def orient(
     """Correct the cameras of a scene by tie points: one shift per image, or a bundle adjustment of all cameras.
 
     Ties are found by SIFT, refined by least squares in the full-resolution images, and adjusted together with their
-    ground points (method section 7). The result does not depend on the number of threads.
+    ground points (method section 1). The result does not depend on the number of threads.
     """
     request = OrientationRequest() if request is None else request
     options = _with_model(options, scene)

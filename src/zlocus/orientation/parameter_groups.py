@@ -1,4 +1,5 @@
-"""What can be wrong with the cameras, as blocks of parameters by the kind of sensor, with what is known beforehand."""
+"""Parameter groups of the bundle adjustment: what is corrected of each kind of sensor, with prior standard
+deviations."""
 
 from __future__ import annotations
 
@@ -18,22 +19,22 @@ from zlocus.sensors.trajectory import Drift
 Correct = Callable[[SensorModel, FloatArray], SensorModel]
 Scanner = LineScanModel | RectifiedModel
 
-# A direction of the parameters counts as seen when its information, per observation and in px2, exceeds this over the
-# number of images squared. Shifts: see `adjust.MIN_SHIFT_INFORMATION`. Physical cameras have honest priors, which need
-# no help but where there is no information at all.
+# Ties determine a direction of the parameters if its information, per observation and in px2, exceeds this value over
+# the number of images squared. Corrections in the image: see `shift_adjustment.MIN_SHIFT_INFORMATION`. Physical cameras
+# have realistic priors, which need help only where there is no information at all.
 MIN_INFORMATION_IN_IMAGE = 0.01
 MIN_INFORMATION_IN_SPACE = 1e-6
 SHIFT, AFFINE, POSE, FOCAL, DRIFT = "shift", "affine", "pose", "focal length", "drift"
 SHIFT_NAMES = ("column_px", "row_px")
 AFFINE_NAMES = ("column_by_column_px", "column_by_row_px", "row_by_column_px", "row_by_row_px")
 POSE_NAMES = ("x_m", "y_m", "z_m", "turn_x_deg", "turn_y_deg", "turn_z_deg")
-# By how many units an angle in radians is larger in what is reported.
+# Factors from the units of the parameters to those of the report, by the last word of the parameter's name.
 UNITS = {"deg": 180.0 / np.pi}
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterGroup:
-    """Parameters that correct some images together.
+    """Parameters that correct one image, or several images together.
 
     kind : see above; views : numbers of the images; names : (k,) of the parameters, which end in their unit; sigma :
     (k,) standard deviations beforehand, about zero, in m, rad and px; observations : see `MIN_INFORMATION_IN_IMAGE`;
@@ -44,14 +45,14 @@ class ParameterGroup:
     views: tuple[int, ...]
     names: tuple[str, ...]
     sigma: FloatArray
-    observations: float
+    min_information: float
     correct: Correct
 
     def __len__(self) -> int:
         return len(self.sigma)
 
     def described(self, values: FloatArray) -> dict[str, float]:
-        """Values (k,) by name, in the units of the names."""
+        """Values (k,) by the names of the parameters, in the units that the names end in."""
         return {
             name: float(value) * UNITS.get(name.rsplit("_", 1)[-1], 1.0)
             for name, value in zip(self.names, values, strict=True)
@@ -59,27 +60,32 @@ class ParameterGroup:
 
 
 def kind_of(sensor: SensorModel) -> str:
-    """rpc, frame or linescan: the groups of the report. What is neither a frame camera nor a line scanner is corrected
-    in its image, as an RPC is."""
+    """Kind of a sensor in reports: rpc, frame or linescan.
+
+    A sensor that is neither a frame camera nor a line scanner is corrected in its image, as an RPC is.
+    """
     bare = uncorrected(sensor)
     return "frame" if isinstance(bare, FrameModel) else "linescan" if isinstance(bare, Scanner) else "rpc"
 
 
 def uncorrected(sensor: SensorModel) -> SensorModel:
-    """The model under corrections of its image."""
+    """The sensor model without corrections in its image."""
     while isinstance(sensor, ShiftedModel | AffineModel):
         sensor = sensor.base
     return sensor
 
 
 def needs_bundle_adjustment(views: Sequence[View]) -> bool:
-    """Whether a shift of each image is too little: some sensor knows its pose."""
+    """Whether a shift of each image is not enough, because some sensor has a pose."""
     return any(isinstance(view.sensor, FrameModel | Scanner) for view in views)
 
 
 def parameter_groups_of(views: Sequence[View], options: OrientationOptions) -> tuple[ParameterGroup, ...]:
-    """The blocks of a scene: for each image a shift (or affine map), or a pose; one drift for all images of a
-    trajectory; on request one focal length for all images of a camera."""
+    """The parameter groups of a scene.
+
+    Each image gets a shift (or an affine map) or a pose. All images of a trajectory share a drift. On request, all
+    images of a camera share a focal length.
+    """
     frames = [i for i, view in enumerate(views) if isinstance(view.sensor, FrameModel)]
     scanners = [i for i, view in enumerate(views) if isinstance(view.sensor, Scanner)]
     in_image = sorted(set(range(len(views))) - set(frames) - set(scanners))
@@ -96,7 +102,7 @@ def parameter_groups_of(views: Sequence[View], options: OrientationOptions) -> t
 
 
 def shift_group(number: int, view: View, options: OrientationOptions) -> ParameterGroup:
-    """A shift of the image."""
+    """The parameters of a shift of the image."""
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
         return ShiftedModel(sensor, float(values[0]), float(values[1]))
@@ -107,7 +113,7 @@ def shift_group(number: int, view: View, options: OrientationOptions) -> Paramet
 
 
 def affine_group(number: int, view: View, options: OrientationOptions) -> ParameterGroup:
-    """A shift of the image's centre, and what it grows by towards the borders."""
+    """The parameters of a shift that changes linearly over the image."""
     rows, cols = view.image.shape
     middle, half = np.array([(cols - 1) / 2, (rows - 1) / 2]), np.array([cols / 2, rows / 2])
 
@@ -122,34 +128,34 @@ def affine_group(number: int, view: View, options: OrientationOptions) -> Parame
 
 
 def pose_group(number: int, options: OrientationOptions) -> ParameterGroup:
-    """Position and attitude of a frame camera, along and about its axes."""
+    """The parameters of the position and attitude of a frame camera, along and about its axes."""
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
-        assert isinstance(sensor, FrameModel), "blocks fit their sensors"
+        assert isinstance(sensor, FrameModel), "groups fit their sensors"
         return sensor.corrected(values[:3], values[3:])
 
     return ParameterGroup(POSE, (number,), POSE_NAMES, pose_sigma(options), MIN_INFORMATION_IN_SPACE, correct)
 
 
 def focal_group(numbers: Sequence[int], views: Sequence[View], sigma_px: float) -> ParameterGroup:
-    """The focal length of some frame cameras."""
+    """The parameter of the focal length that some frame cameras share."""
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
-        assert isinstance(sensor, FrameModel), "blocks fit their sensors"
+        assert isinstance(sensor, FrameModel), "groups fit their sensors"
         return replace(sensor, focal=sensor.focal + float(values[0]))
 
     return ParameterGroup(FOCAL, tuple(numbers), ("focal_px",), np.array([sigma_px]), MIN_INFORMATION_IN_SPACE, correct)
 
 
 def drift_group(numbers: Sequence[int], views: Sequence[View], options: OrientationOptions) -> ParameterGroup:
-    """A slow error of a trajectory while its images were exposed: even for short ones, a spline for long ones."""
+    """The parameters of a slow error of a trajectory: constant over a short exposure, a spline over a long one."""
     ends = [raw(views[i].sensor).lines.times[[0, -1]] for i in numbers]
     start, end = float(np.min(ends)), float(np.max(ends))
     n_knots = 1 + int(np.ceil((end - start) / options.bundle_adjustment.drift_knot_interval_s))
     drift = Drift.zero(start, end, n_knots)
 
     def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
-        assert isinstance(sensor, Scanner), "blocks fit their sensors"
+        assert isinstance(sensor, Scanner), "groups fit their sensors"
         return sensor.corrected(drift.with_parameters(values))
 
     names = tuple(f"knot{k}_{name}" for k in range(n_knots) for name in POSE_NAMES)
@@ -159,7 +165,7 @@ def drift_group(numbers: Sequence[int], views: Sequence[View], options: Orientat
 
 
 def pose_sigma(options: OrientationOptions) -> FloatArray:
-    """(6,) m and rad."""
+    """Prior standard deviations (6,) of a pose, m and rad."""
     bundle_options = options.bundle_adjustment
     return np.array([bundle_options.sigma_position_m] * 3 + [np.deg2rad(bundle_options.sigma_attitude_deg)] * 3)
 
@@ -167,7 +173,7 @@ def pose_sigma(options: OrientationOptions) -> FloatArray:
 def same(
     numbers: Sequence[int], views: Sequence[View], are_same: Callable[[SensorModel, SensorModel], bool]
 ) -> list[list[int]]:
-    """Images in groups that share something."""
+    """Numbers of the images in groups whose sensors `are_same`."""
     groups: list[list[int]] = []
     for i in numbers:
         for group in groups:
@@ -179,22 +185,22 @@ def same(
     return groups
 
 
-def same_trajectory(one: SensorModel, other: SensorModel) -> bool:
-    """Whether two line scanners flew together: the three lines of a camera."""
-    assert isinstance(one, Scanner), "callers make sure"
-    assert isinstance(other, Scanner), "callers make sure"
-    first, second = raw(one).trajectory, raw(other).trajectory
+def same_trajectory(sensor: SensorModel, other_sensor: SensorModel) -> bool:
+    """Whether two line scanners have the same trajectory, as the three lines of one camera do."""
+    assert isinstance(sensor, Scanner), "callers make sure"
+    assert isinstance(other_sensor, Scanner), "callers make sure"
+    first, second = raw(sensor).trajectory, raw(other_sensor).trajectory
     return all(
         np.array_equal(getattr(first, name), getattr(second, name)) for name in ("times", "centres", "rotations")
     )
 
 
-def same_lens(one: SensorModel, other: SensorModel) -> bool:
+def same_lens(sensor: SensorModel, other_sensor: SensorModel) -> bool:
     """Whether two frame cameras have the same interior orientation."""
-    assert isinstance(one, FrameModel), "callers make sure"
-    assert isinstance(other, FrameModel), "callers make sure"
+    assert isinstance(sensor, FrameModel), "callers make sure"
+    assert isinstance(other_sensor, FrameModel), "callers make sure"
     names = ("focal", "principal_point", "aspect", "skew", "distortion")
-    return all(getattr(one, name) == getattr(other, name) for name in names)
+    return all(getattr(sensor, name) == getattr(other_sensor, name) for name in names)
 
 
 def raw(sensor: SensorModel) -> LineScanModel:
@@ -206,8 +212,10 @@ def raw(sensor: SensorModel) -> LineScanModel:
 def corrected_sensors(
     groups: Sequence[ParameterGroup], sensors: Sequence[SensorModel], parameters: FloatArray
 ) -> tuple[SensorModel, ...]:
-    """The sensors with parameters (p,) of all groups, one after the other, in units of their sigma; where they are
-    all zero, the sensor itself."""
+    """The sensors corrected by parameters (p,) of all groups, one after the other, in units of their sigma.
+
+    A sensor whose parameters are all zero stays the same object.
+    """
     corrected, first = list(sensors), 0
     for group in groups:
         values = parameters[first : first + len(group)] * group.sigma

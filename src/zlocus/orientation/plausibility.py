@@ -1,4 +1,4 @@
-"""What tie points say of the cameras as delivered: which images nothing supports, and which cameras are doubtful."""
+"""Plausibility of the delivered cameras: images that no tie supports, cameras that contradict others or look wrong."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.shift_adjustment import Adjustment, adjust, renumbered, robust_sigma
 from zlocus.orientation.triangulate import Observations
 
-# An image takes part in the matching where so many tie points were found in it.
+# An image takes part in the matching if it has at least so many tie points.
 MIN_TIES_OF_IMAGE = 4
-# An image contradicts the others where they leave less than this share of its tie points. Of images whose cameras are
-# their own at least 0.74 were left (nineteen satellite images of ten months); of exchanged ones at most 0.35.
+# An image contradicts the others if less than this share of its tie points agrees with them. With correct cameras at
+# least 0.74 agreed (nineteen satellite images of ten months); with exchanged cameras at most 0.35.
 MIN_AGREEING_SHARE = 0.5
-# So many others must remain that agree with each other, or nobody can tell which images are wrong.
+# So many other images must agree with each other, or it cannot be known which images are wrong.
 MIN_AGREEING_IMAGES = 3
-# Cameras are doubted where the median residual of their ties is larger, or where their images had to be moved farther,
-# than those of any satellite, aircraft or drone that are in order.
+# Cameras are doubted if the median residual of their ties, or the shift of their image, is larger than correct cameras
+# of satellites, aircraft and drones show.
 MAX_USUAL_RESIDUAL_PX = 0.3
 MAX_USUAL_SHIFT_PX = 60.0
 # Share of the trusted tie points that may lie outside the heights for which the sensor models were made.
 MAX_SHARE_OUTSIDE_RANGE = 0.01
-# Two sensor models are said to be exchanged where the ties fit this much better with them exchanged: by their noise, or
-# by the share that agrees. Looked for among so many images, with so many tie points.
+# Two sensor models count as exchanged if exchanging them reduces the noise of the ties to this share, or raises the
+# share of ties that agree by this much. So many images are tried, with so many tie points.
 MAX_NOISE_RATIO, MIN_GAIN_OF_SHARE = 0.5, 0.1
 MAX_IMAGES_TO_EXCHANGE, TIES_TO_COMPARE = 6, 400
 MEANINGFUL_NOISE_PX = 0.1
@@ -49,7 +49,7 @@ class ExcludedImage:
 
 @dataclass(frozen=True)
 class Doubt:
-    """What makes a camera, or all of them, doubtful. is_grave : heights are likely to be wrong."""
+    """A reason to doubt one camera, or all. is_grave : heights are likely to be wrong."""
 
     sentence: str
     is_grave: bool = False
@@ -59,17 +59,17 @@ class Doubt:
         return {"sentence": self.sentence, "is_grave": self.is_grave}
 
 
-def untied_images(found: Observations, n_views: int) -> NDArray[np.bool_]:
-    """(i,) images in which too few tie points were found for them to take part. found : observations of all ties."""
-    return np.asarray(np.bincount(found.view, minlength=n_views) < MIN_TIES_OF_IMAGE)
+def untied_images(observations: Observations, n_views: int) -> NDArray[np.bool_]:
+    """Images (i,) with too few tie points to take part. observations : of all ties."""
+    return np.asarray(np.bincount(observations.view, minlength=n_views) < MIN_TIES_OF_IMAGE)
 
 
-def agreeing_shares(found: Observations, adjustment: Adjustment, n_views: int) -> FloatArray:
-    """(i,) share of the observations of each image that agree with those of the other images; 1 for those without any.
+def agreeing_shares(observations: Observations, adjustment: Adjustment, n_views: int) -> FloatArray:
+    """Share (i,) of each image's observations that agree with those of the other images; 1 for images without any.
 
-    found : all observations that were adjusted.
+    observations : all that were adjusted; adjustment : which of them it kept.
     """
-    of_view = np.bincount(found.view, minlength=n_views)
+    of_view = np.bincount(observations.view, minlength=n_views)
     kept = np.bincount(adjustment.observations.view, minlength=n_views)
     return np.where(of_view > 0, kept / np.maximum(of_view, 1), 1.0)
 
@@ -86,10 +86,10 @@ def doubts_about(
     shift_px: Sequence[tuple[float, float]],
     heights: FloatArray,
 ) -> list[Doubt]:
-    """Doubts about cameras after their correction.
+    """Doubts about the corrected cameras.
 
-    residual_px : (i,) median length of the ties' residuals of each image; shift_px : (i, 2) by which they were moved;
-    heights : (n,) m, ellipsoidal, of the tie points that their neighbours confirm.
+    residual_px : (i,) median length of the residuals of each image's ties; shift_px : (i, 2), by which the images were
+    moved; heights : (n,) m, ellipsoidal, of the trusted tie points.
     """
     doubts = []
     for view, residual, shift in zip(views, residual_px, shift_px, strict=True):
@@ -112,7 +112,7 @@ def doubts_about(
 
 
 def _outside_range(views: Sequence[View], heights: FloatArray) -> list[Doubt]:
-    """A doubt where tie points lie at heights for which the sensor models were not made."""
+    """A doubt if tie points lie at heights for which the sensor models were not made."""
     bounds = [bound for view in views if (bound := view.sensor.height_bounds()) is not None]
     if not bounds or not len(heights):
         return []
@@ -132,18 +132,18 @@ def _outside_range(views: Sequence[View], heights: FloatArray) -> list[Doubt]:
 
 def exchanged_views(
     sensors: Sequence[SensorModel],
-    found: Observations,
+    observations: Observations,
     xyz: FloatArray,
     candidates: Sequence[int],
     options: OrientationOptions,
 ) -> tuple[int, int] | None:
-    """Two images whose sensor models seem to be exchanged: with each other's the ties fit clearly better.
+    """Numbers of two images whose sensor models seem to be exchanged: with each other's, the ties fit clearly better.
 
-    found, xyz : observations and first ground points (n, 3) m of the ties; candidates : numbers of the images to look
-    at. Two images from one pass, whose rays lie in parallel planes, fit as well either way.
+    observations, xyz : of the ties, with first ground points (n, 3) m; candidates : numbers of the images to try. Two
+    images from one pass, whose rays lie in parallel planes, fit equally well either way.
     """
-    points = np.unique(found.point)
-    few = found.kept(np.isin(found.point, points[:: max(len(points) // TIES_TO_COMPARE, 1)]))
+    points = np.unique(observations.point)
+    few = observations.kept(np.isin(observations.point, points[:: max(len(points) // TIES_TO_COMPARE, 1)]))
     noise, share = _fit(sensors, few, xyz, options)
     if noise <= MEANINGFUL_NOISE_PX and share >= 1.0 - MIN_GAIN_OF_SHARE:
         return None
@@ -159,9 +159,9 @@ def exchanged_views(
 
 
 def _fit(
-    sensors: Sequence[SensorModel], found: Observations, xyz: FloatArray, options: OrientationOptions
+    sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray, options: OrientationOptions
 ) -> tuple[float, float]:
     """Noise of the ties (px) after shifts of all images, and the share of the observations that agree with them."""
-    observations, start = renumbered(found, xyz)
+    observations, start = renumbered(observations, xyz)
     shifted = adjust(sensors, observations, start, replace(options, model="shift"))
     return robust_sigma(shifted.ground_points.residual), len(shifted.observations) / max(len(observations), 1)

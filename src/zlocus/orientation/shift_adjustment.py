@@ -1,4 +1,4 @@
-"""One shift per image, solved jointly and robustly with the ground points of the ties."""
+"""Shift adjustment: one shift per image, solved robustly together with the ground points of the ties."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ TOLERANCE_PX = 1e-3
 HUBER_SIGMAS = 1.5
 OUTLIER_SIGMAS = 4.0
 MIN_SIGMA_PX = 0.02
-# A direction of the shifts counts as seen when its normalised information exceeds this / n_views**2: two images whose
-# loci differ by less than 3 degrees do not fix the shift along them, while the slow bends of a long chain of n images,
-# whose information falls as 5 / n**2, are kept.
+# Ties determine a direction of the shifts if its normalised information exceeds this value over the number of images
+# squared. Two images whose epipolar curves differ by less than 3 degrees then do not determine the shift along them,
+# while the slow bends of a long chain of n images, whose information falls as 5 / n**2, are kept.
 MIN_SHIFT_INFORMATION = 0.01
-# Shifts like a translation of the ground that are not unseen, by more than this sine, need the information that counts
-# for two images, however many there are: no chain of images adds any to them.
+# Shifts that look like a translation of the ground, and differ from the undetermined directions by more than this sine,
+# need the information that is required of two images, however many there are: no chain of images adds any to them.
 APART_SINE = 0.5
-# Below this size, px, a shift is as good as none where it is decided which images keep their place.
+# Where it is decided which images keep their place: shifts below this size count as none, the number of rounds of the
+# reweighted least squares, and the number of images that are left out in turn.
 NO_SHIFT_PX, MAJORITY_ROUNDS, MAX_SUSPECTS = 1.0, 30, 12
 
 
 @dataclass(frozen=True)
 class Adjustment:
-    """Shifts and the ties they were found from.
+    """Result of an adjustment: the shifts of the images, and the ties that were kept.
 
     shift_px : (i, 2) column and row to add to what each model projects; n_determined: how many of the 2 i components
     the ties show, the rest stay at zero; observations, ground_points: the ties kept and their ground points with the
@@ -47,18 +48,17 @@ class Adjustment:
 
     @property
     def after_px(self) -> FloatArray:
-        """Residuals (m, 2) px with the shifts."""
+        """Residuals (m, 2) px of the kept ties, with the shifts applied."""
         return self.ground_points.residual
 
 
 def adjust(
     sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray, options: OrientationOptions
 ) -> Adjustment:
-    """Shifts that make the rays of all ties meet, with Huber's loss, and the ties that remain.
+    """Shifts of all images that make the rays of the ties meet, by least squares with Huber's loss.
 
-    xyz : (n, 3) m, first ground points. Observations further than 4 sigma (and at least `inlier_px`) from where the
-    rest of their tie puts them are dropped, then everything is solved again. With `model` "none" shifts stay
-    zero.
+    xyz : (n, 3) m, first ground points. Observations whose residual exceeds 4 sigma (and `inlier_px`) are dropped, then
+    everything is solved again. With `model` "none" the shifts stay zero.
     """
     shift, n_determined = np.zeros((len(sensors), 2)), 0
     for _ in range(2):
@@ -74,38 +74,45 @@ def adjust(
 
 
 def with_most_images_in_place(
-    sensors: Sequence[SensorModel], found: Adjustment, options: OrientationOptions
+    sensors: Sequence[SensorModel], adjustment: Adjustment, options: OrientationOptions
 ) -> Adjustment:
-    """The same adjustment with the common translation of ground and images that leaves most images where they were.
+    """The adjustment after a common translation of the ground that leaves most images where they were.
 
-    Ties do not see that translation. Among errors of a few pixels the least squares of all shifts are a good choice.
-    One image that is far off would draw the ground, and with it all other images, a part of the way along. So the sum
-    of the logarithms of the shifts' lengths is minimised instead, which few large shifts please more than many small
-    ones (iteratively reweighted least squares, begun without each of the images that moved most in turn).
+    Ties do not determine that translation. While all errors are a few pixels, the smallest sum of squared shifts is a
+    good choice. But one image that is far off would pull the ground, and with it all other images, a part of the way.
+    So the sum of the logarithms of the shifts' lengths is minimised instead, which prefers few large shifts to many
+    small ones. It is minimised by iteratively reweighted least squares, started without each of the images that moved
+    most in turn.
     """
-    n_views = len(found.shift_px)
-    tied = np.bincount(found.observations.view, minlength=n_views) > 0
-    basis = translations(found.observations, found.ground_points, np.ones(len(found.observations)), n_views)
-    begun = [
-        shifts_with_most_images_in_place(found.shift_px, basis, tied, suspect)
-        for suspect in _farthest(found.shift_px, tied)
+    n_views = len(adjustment.shift_px)
+    tied = np.bincount(adjustment.observations.view, minlength=n_views) > 0
+    basis = translations(
+        adjustment.observations, adjustment.ground_points, np.ones(len(adjustment.observations)), n_views
+    )
+    candidates = [
+        shifts_with_most_images_in_place(adjustment.shift_px, basis, tied, suspect)
+        for suspect in _farthest_moved(adjustment.shift_px, tied)
     ]
-    shift_px = min(begun, key=lambda shift: _sum_of_logarithms(shift[tied]))
-    ground_points = triangulate(sensors, without_shifts(found.observations, shift_px), found.ground_points.xyz)
-    # A translation is not quite a shift of every image: the rest is solved for.
-    shift_px, _ = solve_shifts(sensors, found.observations, ground_points.xyz, options.sigma_shift_px, shift_px)
-    ground_points = triangulate(sensors, without_shifts(found.observations, shift_px), ground_points.xyz)
-    before = triangulate(sensors, found.observations, ground_points.xyz, by_ground=ground_points.by_ground)
-    return Adjustment(shift_px, found.n_determined, found.observations, ground_points, before.residual, found.numbers)
+    shift_px = min(candidates, key=lambda shift: _sum_of_logarithms(shift[tied]))
+    ground_points = triangulate(
+        sensors, without_shifts(adjustment.observations, shift_px), adjustment.ground_points.xyz
+    )
+    # A translation is not exactly a shift of every image, so the rest is solved for.
+    shift_px, _ = solve_shifts(sensors, adjustment.observations, ground_points.xyz, options.sigma_shift_px, shift_px)
+    ground_points = triangulate(sensors, without_shifts(adjustment.observations, shift_px), ground_points.xyz)
+    before = triangulate(sensors, adjustment.observations, ground_points.xyz, by_ground=ground_points.by_ground)
+    return Adjustment(
+        shift_px, adjustment.n_determined, adjustment.observations, ground_points, before.residual, adjustment.numbers
+    )
 
 
 def shifts_with_most_images_in_place(
     shift_px: FloatArray, basis: FloatArray, tied: NDArray[np.bool_], suspect: int
 ) -> FloatArray:
-    """Shifts (i, 2) px plus the translation that leaves most images where they were, looked for from a first guess in
-    which one image, `suspect`, has no say.
+    """Shifts (i, 2) px plus the translation that leaves most images where they were.
 
-    basis : (2 i, k), see `translations`; tied : (i,) images that have a say.
+    shift_px : (i, 2), the shifts before; basis : (2 i, k), see `translations`; tied : (i,) bool, images that count;
+    suspect : number of an image that does not count in the first round.
     """
     start, weight = shift_px.ravel(), np.where(np.arange(len(tied)) == suspect, 0.0, tied.astype(float))
     moved_shift = shift_px
@@ -117,7 +124,7 @@ def shifts_with_most_images_in_place(
     return np.where(tied[:, None], moved_shift, 0.0)
 
 
-def _farthest(shift_px: FloatArray, tied: NDArray[np.bool_]) -> list[int]:
+def _farthest_moved(shift_px: FloatArray, tied: NDArray[np.bool_]) -> list[int]:
     """Numbers of the tied images that were moved farthest, at most `MAX_SUSPECTS`."""
     order = np.argsort(-np.hypot(*shift_px.T), kind="stable")
     return [int(number) for number in order if tied[number]][:MAX_SUSPECTS]
@@ -134,7 +141,9 @@ def solve_shifts(
     sigma_shift_px: float,
     shift: FloatArray,
 ) -> tuple[FloatArray, int]:
-    """Robust shifts (i, 2) px, from those to start with, and the number of their directions that the ties show.
+    """Robust shifts (i, 2) px, and the number of their directions that the ties determine.
+
+    xyz : (n, 3) m, first ground points; shift : (i, 2) px, first shifts.
 
     Iteratively reweighted least squares: every round triangulates with the present shifts and weights, then eliminates
     the ground points from the normal equations (Schur complement) and solves for the shifts alone.
@@ -180,7 +189,7 @@ def reduced_normal_equations(
 
 
 def between_views(observations: Observations, mixed: FloatArray, covariance: FloatArray, n_views: int) -> FloatArray:
-    """E C^-1 E^T (2 i, 2 i): what views have to do with each other through the points that they share.
+    """The product E C^-1 E^T (2 i, 2 i), which links views through the points that they share.
 
     mixed : (m, 2, 3), the blocks of E; covariance : (n, 3, 3), the blocks of C^-1. Every observation of a point meets
     every other, so the work grows with the number of points.
@@ -205,7 +214,7 @@ def between_views(observations: Observations, mixed: FloatArray, covariance: Flo
 def translations(
     observations: Observations, ground_points: GroundPoints, weight: FloatArray, n_views: int
 ) -> FloatArray:
-    """The shifts (2 i, k) that a common translation of the ground looks like, k at most 3, orthonormal."""
+    """Orthonormal basis (2 i, k) of the shifts that a common translation of the ground looks like, k at most 3."""
     usable = np.asarray(np.isfinite(ground_points.by_ground).all(axis=(1, 2)))
     by_ground = np.where(usable[:, None, None], ground_points.by_ground * weight[:, None, None], 0.0)
     total = summed(by_ground.reshape(-1, 6), observations.view, n_views)
@@ -216,35 +225,35 @@ def translations(
 
 
 def determined_directions(normal: FloatArray, weight_of_view: FloatArray, translated: FloatArray) -> FloatArray:
-    """Orthonormal basis (2 i, k) of the shifts that ties can tell from a change of the ground.
+    """Orthonormal basis (2 i, k) of the shifts that ties can distinguish from a change of the ground.
 
-    Information is judged per observation, so that an image with few ties counts like one with many; what is not
-    observations (a translation of the ground; for two images the shift along their loci; images without ties) stays
-    exactly zero. translated : see `translations`. Where sensors of several kinds are mixed, a translation changes the
-    scales of their images by different amounts, from which a height can be had to a decimetre or so; the cameras say it
-    better, so it stays zero all the same.
+    normal : (2 i, 2 i); weight_of_view : (i,); translated : see `translations`. Information is judged per observation,
+    so that an image with few ties counts like one with many. Undetermined shifts stay exactly zero: those of a
+    translation of the ground, for two images the shift along their epipolar curves, and those of images without ties.
+    Where sensors of several kinds are mixed, a translation changes the scales of their images by different amounts,
+    which determines a height to a decimetre or so. The cameras determine it better, so the translation stays zero.
     """
     scale = np.repeat(np.sqrt(weight_of_view), 2)
     linked = scale > 0.0
     inverse = np.where(linked, 1.0 / np.where(linked, scale, 1.0), 0.0)
     values, vectors = np.linalg.eigh(normal * inverse[:, None] * inverse)
     n_views = max(int((weight_of_view > 0.0).sum()), 1)
-    unseen = vectors[:, values < MIN_SHIFT_INFORMATION / n_views**2]
-    hidden = np.where(linked[:, None], unseen * inverse[:, None], unseen)
-    left, _, _ = np.linalg.svd(hidden, full_matrices=True)
-    known = left[:, : hidden.shape[1]]
+    undetermined = vectors[:, values < MIN_SHIFT_INFORMATION / n_views**2]
+    excluded = np.where(linked[:, None], undetermined * inverse[:, None], undetermined)
+    left, _, _ = np.linalg.svd(excluded, full_matrices=True)
+    known = left[:, : excluded.shape[1]]
     apart, sine, _ = np.linalg.svd(translated - known @ (known.T @ translated), full_matrices=False)
     scaled = apart * scale[:, None]
     information = np.einsum("ik,ij,jk->k", apart, normal, apart) / np.maximum((scaled**2).sum(axis=0), 1e-12)
     is_doubtful = (np.asarray(sine) > APART_SINE) & (information < MIN_SHIFT_INFORMATION / 2**2)
     if is_doubtful.any():
-        hidden = np.column_stack([known, apart[:, is_doubtful]])
-        left, _, _ = np.linalg.svd(hidden, full_matrices=True)
-    return np.where(linked[:, None], left[:, hidden.shape[1] :], 0.0)
+        excluded = np.column_stack([known, apart[:, is_doubtful]])
+        left, _, _ = np.linalg.svd(excluded, full_matrices=True)
+    return np.where(linked[:, None], left[:, excluded.shape[1] :], 0.0)
 
 
 def without_shifts(observations: Observations, shift: FloatArray) -> Observations:
-    """The observations as the uncorrected models would have projected them."""
+    """Observations with the shifts (i, 2) px of their images subtracted, as the uncorrected models project them."""
     return Observations(observations.view, observations.point, observations.xy - shift[observations.view])
 
 
@@ -263,7 +272,10 @@ def huber_weight(residual: FloatArray, sigma: float) -> FloatArray:
 
 
 def without_outliers(observations: Observations, ground_points: GroundPoints, inlier_px: float) -> Observations:
-    """Observations near where their tie puts them, of ties that keep two images or more."""
+    """Observations with small residuals, of ties that keep two images or more.
+
+    The limit is 4 sigma, or `inlier_px` where that is larger.
+    """
     length = np.hypot(*ground_points.residual.T)
     limit = max(OUTLIER_SIGMAS * robust_sigma(ground_points.residual), inlier_px)
     keep = length <= limit
@@ -272,6 +284,6 @@ def without_outliers(observations: Observations, ground_points: GroundPoints, in
 
 
 def renumbered(observations: Observations, xyz: FloatArray) -> tuple[Observations, FloatArray]:
-    """The same with points numbered without gaps."""
+    """Observations and ground points (n, 3) of the points that are observed, numbered without gaps."""
     used, point = np.unique(observations.point, return_inverse=True)
     return Observations(observations.view, point, observations.xy), xyz[used]

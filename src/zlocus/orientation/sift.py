@@ -1,4 +1,4 @@
-"""SIFT features of an image, found part by part so that any image size fits in memory."""
+"""SIFT features of images, detected part by part so that an image of any size fits in memory."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.core.unnamed_files import on_disk
 
 PART_PX = 1024
-HALO_PX = 16  # of the reduced image
+# Pixels of the reduced image that are read around each part.
+HALO_PX = 16
 STRETCH_PERCENT = (0.5, 99.5)
 CONTRAST_THRESHOLD = 0.02
 DESCRIPTOR_LENGTH = 128
-# Descriptors held in memory, all images together.
+# Descriptors of all images together that are kept in memory; further ones are written to files.
 HELD_BYTES = 500e6
-MIN_VALID_SHARE = 0.999  # valid share of what a reduced pixel covers
+MIN_VALID_SHARE = 0.999  # of the area of a reduced pixel
 
 
 @dataclass(frozen=True)
 class Features:
-    """Distinctive points of one image. xy : (n, 2) px; descriptors : (n, 128) float32 of unit length."""
+    """SIFT features of one image. xy : (n, 2) px; descriptors : (n, 128) float32 of unit length."""
 
     xy: FloatArray
     descriptors: NDArray[np.float32]
@@ -37,7 +38,7 @@ class Features:
         return len(self.xy)
 
     def only(self, rows: NDArray[np.int64]) -> Features:
-        """Some of the features."""
+        """Some of the features, rows (k,)."""
         return Features(self.xy[rows], self.descriptors[rows])
 
 
@@ -45,10 +46,9 @@ NOTHING = Features(np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), np.float32
 
 
 def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOptions) -> Features:
-    """SIFT features of the wanted parts of an image, the strongest of each part.
+    """SIFT features of some parts of an image, the strongest of each part.
 
-    wanted : (r, c) bool, one entry per part, as `part_grid` numbers them. Large images are reduced first, see
-    `reduction`.
+    wanted : (r, c) bool, the parts, as `part_grid` numbers them. Large images are reduced first, see `reduction`.
     """
     return detect_all([image], [wanted], options)[0]
 
@@ -60,7 +60,10 @@ def detect_all(
     threads: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> list[Features]:
-    """Features of several images, see `detect`, parts of all of them in threads. progress : is told the share done."""
+    """Features of several images, see `detect`. Threads share the parts of all images.
+
+    progress : is called with the share that is done.
+    """
     work = [(i, core) for i, image in enumerate(images) for part, core in parts(image) if wanted[i][part]]
     left = np.bincount([i for i, _ in work], minlength=len(images))
     waiting: list[dict[int, Features]] = [{} for _ in images]
@@ -84,8 +87,11 @@ def detect_all(
 
 
 def joined(several: Sequence[Features], held_bytes: int) -> Features:
-    """Features as one. held_bytes : of descriptors that are in memory already; beyond `HELD_BYTES` those of thousands
-    of images lie in unnamed files, from which the system takes them into memory as they are needed."""
+    """The features of several parts as those of one image.
+
+    held_bytes : size of the descriptors that are in memory already. Beyond `HELD_BYTES` descriptors are written to
+    unnamed files, from which the system reads them as they are needed.
+    """
     xy = np.concatenate([part.xy for part in several])
     descriptors = np.concatenate([part.descriptors for part in several])
     if held_bytes + descriptors.nbytes > HELD_BYTES and descriptors.size:
@@ -94,7 +100,7 @@ def joined(several: Sequence[Features], held_bytes: int) -> Features:
 
 
 def detect_part(image: ImageSource, core: tuple[int, int, int, int], options: OrientationOptions) -> Features:
-    """Features of a part of an image: of rows and columns from the first two to before the last two of `core`."""
+    """Features of a part of an image. core : first row, first column, end row and end column of the part."""
     (rows, cols), held_shape = image.shape, held_window(image)[2:]
     area_mpx = math.prod(held_shape) / 1e6
     factor = reduction(held_shape, options)
@@ -112,25 +118,25 @@ def detect_part(image: ImageSource, core: tuple[int, int, int, int], options: Or
 
 
 def reduction(shape: tuple[int, int], options: OrientationOptions) -> float:
-    """How many pixels along an image become one for SIFT.
+    """Number of pixels along each axis that become one pixel for SIFT.
 
-    1 up to `full_detail_mpx`, 2 just above it, 3.3 at 4.4 Mpx, 10 at 400: work grows with the square root of the image.
-    What the reduced image cannot tell comes back when ties are measured again, see `sharpen`.
+    It is 1 up to `full_detail_mpx`, 2 just above it, 3.3 at 4.4 Mpx and 10 at 400 Mpx, so that the work grows with the
+    square root of the image. The precision lost by the reduction comes back in `tie_refinement`.
     """
     ratio = shape[0] * shape[1] / 1e6 / options.full_detail_mpx
     return 1.0 if ratio <= 1.0 else 2.0 * ratio**0.25
 
 
 def part_grid(shape: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns of parts of an image."""
+    """Numbers of rows and columns of parts into which an image of that shape is divided."""
     return max(round(shape[0] / PART_PX), 1), max(round(shape[1] / PART_PX), 1)
 
 
 def parts(image: ImageSource) -> Iterator[tuple[tuple[int, int], tuple[int, int, int, int]]]:
     """Each part's (row, column) in the grid of parts and its (first row, first column, end row, end column) in px.
 
-    The grid lies on the window of the image that its file holds (`held_window`); of a sparse file, only the parts of
-    which it holds pixels are given.
+    The grid covers the window of the image that its file holds (`held_window`). Of a sparse file, only the parts with
+    pixels are given.
     """
     top, left, rows, cols = held_window(image)
     grid = part_grid((rows, cols))
@@ -148,12 +154,13 @@ def parts(image: ImageSource) -> Iterator[tuple[tuple[int, int], tuple[int, int,
 
 
 def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
-    """SIFT positions (n, 2) px in the window and RootSIFT descriptors (n, 128), the strongest first, at most `limit`.
+    """SIFT positions (n, 2) px in a window and RootSIFT descriptors (n, 128), at most `limit`, the strongest first.
 
     factor : by which the window is reduced first, see `reduction`.
 
-    `enable_precise_upscale` matters: without it OpenCV's positions are 0.25 px too large in both axes, because of how
-    it doubles the image. Descriptors are compared as square roots (Arandjelovic and Zisserman 2012, section 2).
+    `enable_precise_upscale` is needed: without it OpenCV's positions are 0.25 px too large in both axes, because of the
+    way in which it doubles the image. Descriptors are compared as square roots (Arandjelovic and Zisserman 2012,
+    section 2).
     """
     full = np.array(window.pixels.shape[::-1])
     size = np.maximum(np.round(full / factor).astype(int), 1)
@@ -173,7 +180,8 @@ def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[Float
 
 
 def reduced(window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
-    """The window with fewer pixels, (columns, rows), each the mean over its area, valid where all of that is."""
+    """The window reduced to a size (columns, rows), each pixel the mean over its area, valid where all of the area
+    is."""
     pixels = np.asarray(cv2.resize(window.pixels, size.tolist(), interpolation=cv2.INTER_AREA))
     if window.valid.all():
         return ImageWindow(pixels, np.ones(pixels.shape, bool))
@@ -182,7 +190,7 @@ def reduced(window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
 
 
 def stretched(window: ImageWindow) -> NDArray[np.uint8]:
-    """The window as 8 bit, stretched between percentiles of its valid pixels; invalid pixels take their median."""
+    """The window in 8 bit, stretched between percentiles of its valid pixels; invalid pixels get their median."""
     sample = window.pixels[::3, ::3][window.valid[::3, ::3]]
     if not len(sample):
         return np.zeros(window.pixels.shape, np.uint8)
@@ -192,7 +200,7 @@ def stretched(window: ImageWindow) -> NDArray[np.uint8]:
 
 
 def far_from_nodata(xy: FloatArray, size_px: FloatArray, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Features whose surroundings, three times their size, hold no invalid pixel."""
+    """Features (n,) without an invalid pixel within three times their size."""
     if valid.all():
         return np.ones(len(xy), bool)
     distance = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, 3)

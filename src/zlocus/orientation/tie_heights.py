@@ -54,8 +54,8 @@ def height_range(
     if trusted.sum() < MIN_TIES_FOR_RANGE:
         raise GeometryError(
             f"Only {int(trusted.sum())} reliable tie points were found between {', '.join(names)}, too few to tell the "
-            f"height range of the ground ({MIN_TIES_FOR_RANGE} are needed). Give --heights ZMIN ZMAX or --dem, or check "
-            "that the images overlap."
+            f"height range of the ground ({MIN_TIES_FOR_RANGE} are needed). Give --heights ZMIN ZMAX or --dem, or "
+            "check that the images overlap."
         )
     low, high = np.percentile(xyz[trusted, 2], RANGE_PERCENT)
     margin = options.range_margin * (high - low)

@@ -1,4 +1,4 @@
-"""Tie points: ground points seen in two images or more, found by SIFT and judged by the sensor models."""
+"""Tie points: ground points seen in two or more images, found by SIFT and checked by the sensor models."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from zlocus.core.options import OrientationOptions
 from zlocus.core.parallel import run_all
 from zlocus.core.scene import Scene, View, held_window
 from zlocus.core.sensor_model import FloatArray, lowest_station
-from zlocus.orientation.epipolar import EpipolarCurves, Sightlines, epipolar_offsets, trace
+from zlocus.orientation.epipolar import EpipolarCurves, Sightlines, epipolar_curves, epipolar_offsets
 from zlocus.orientation.kernels.descriptors import CurveSegments, SecondFeatures, nearest_descriptors
 from zlocus.orientation.ransac import find_shift
 from zlocus.orientation.sift import Features, detect_all, part_grid, parts, reduction
@@ -23,13 +23,17 @@ from zlocus.orientation.triangulate import Observations
 
 Progress = Callable[[str, float], None]
 
-PART_POINTS = 5  # along each side of a part, whose loci are looked at
-PARTS_AT_ONCE = 4096  # whose loci are in memory: those of an image of 64 000 px a side
-FIRST_SEARCH_FEATURES = 1000  # features of a pair's first search
-# EpipolarCurves of cameras close by run on unevenly: they are looked at over depths that differ by this ratio squared.
+# Points along each side of a part of an image of which epipolar curves are computed, to see which images may show it.
+PART_POINTS = 5
+# Parts whose curves are in memory at once: those of an image of 64 000 px a side.
+PARTS_AT_ONCE = 4096
+# Features of the first search of a pair, which finds its shift.
+FIRST_SEARCH_FEATURES = 1000
+# Epipolar curves of cameras close to the ground are far from straight. Each is searched over ranges of heights whose
+# depths differ by this ratio squared.
 DEPTH_RATIO = 1.5
-# Images that tie to none are looked for this many times farther away from where their cameras point, beside so many of
-# the others; and are believed where they tie to so many that tie to each other.
+# Images without ties are searched again with a pointing error that is this many times larger, together with so many of
+# the other images. Their ties count if they lead to at least so many images that are tied to each other.
 WIDER_POINTING_FACTOR, MAX_PARTNERS, MIN_PARTNERS = 10.0, 6, 2
 
 
@@ -37,8 +41,9 @@ WIDER_POINTING_FACTOR, MAX_PARTNERS, MIN_PARTNERS = 10.0, 6, 2
 class PairMatches:
     """Matches of two images that agree with the sensor models up to one shift.
 
-    first, second : (k,) feature numbers; z : (k,) m, height of each; n_candidates: matches before RANSAC;
-    shift_px : (2,) by which the second image's points lie off their loci.
+    views : numbers of the two views; first, second : (k,) numbers of their features; z : (k,) height of each match, m;
+    n_candidates : number of matches before RANSAC; shift_px : (2,) by which the second image's points lie off their
+    epipolar curves.
     """
 
     views: tuple[int, int]
@@ -56,8 +61,8 @@ class PairMatches:
 class Ties:
     """Tie points of a scene.
 
-    observations: their observations; z : (n,) m, first height of each point; pairs: the matches they were built from;
-    z_range: the heights that were looked at, m.
+    observations : their image points; z : (n,) m, first height of each tie; pairs : the matches from which they were
+    built; z_range : lowest and highest height that were searched, m.
     """
 
     observations: Observations
@@ -73,10 +78,10 @@ def find_ties(
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Ties:
-    """Tie points between all images that overlap, the same whatever the number of threads.
+    """Tie points between all images that overlap. They do not depend on the number of threads.
 
-    Heights are looked for within `z_range_hint` (m) where given, else within the scene's heights, else wherever the
-    sensor models are made for. A pair with fewer than `min_ties` agreeing matches is dropped.
+    Ties are searched at heights within `z_range_hint` (m) where it is given, else within the scene's heights, else at
+    all heights for which the sensor models were made. A pair with fewer than `min_ties` agreeing matches is dropped.
     """
     z_range = z_range_hint or scene.heights or widest_range(scene.views)
     report = progress or (lambda _stage, _share: None)
@@ -88,7 +93,7 @@ def find_ties(
     pairs: dict[int, list[PairMatches]] = {}
 
     def match_all(a: int) -> list[PairMatches]:
-        """With all images after it: its sightlines are needed for these only."""
+        """Match an image with all images after it, for which alone its sightlines are needed."""
         others = np.flatnonzero(near[a, a + 1 :]) + a + 1
         if not len(others):
             return []
@@ -115,10 +120,10 @@ def match_untied_images(
     z_ranges: Sequence[tuple[float, float]],
     options: OrientationOptions,
 ) -> tuple[PairMatches, ...]:
-    """Matches of images that tie to no other within the pointing error that is looked for, found farther away.
+    """Matches of images that have no ties within the expected pointing error, from a search with a larger one.
 
-    pairs : the matches so far. Along its locus a shift cannot be told from a height, so an image that is far off counts
-    where it ties to several others that already tie to each other.
+    pairs : the matches so far. Along an epipolar curve a shift cannot be told from a height. So an image that is far
+    off counts only where it ties to several others that are already tied to each other.
     """
     n_ties = np.zeros(len(views), np.int64)
     for pair in pairs:
@@ -136,8 +141,10 @@ def match_untied_images(
 
 
 def height_slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tuple[float, float]]:
-    """Ranges (m) that cover the heights, overlapping, in each of which loci run on evenly: all of it but for cameras
-    that stood close by."""
+    """Overlapping ranges of heights (m) that cover `z_range`, in each of which epipolar curves are nearly straight.
+
+    It is one range, except for cameras close to the ground.
+    """
     station = lowest_station(view.sensor for view in views)
     if station is None:
         return [z_range]
@@ -150,7 +157,7 @@ def height_slabs(views: Sequence[View], z_range: tuple[float, float]) -> list[tu
 
 
 def widest_range(views: Sequence[View]) -> tuple[float, float]:
-    """The heights (m) for which all the views' sensor models together were made."""
+    """Lowest and highest height (m) for which any of the views' sensor models was made."""
     bounds = [bound for view in views if (bound := view.sensor.height_bounds()) is not None]
     if not bounds:
         raise GeometryError(
@@ -160,10 +167,10 @@ def widest_range(views: Sequence[View]) -> tuple[float, float]:
 
 
 def neighbours(views: Sequence[View], z_range: tuple[float, float], margin_px: float) -> NDArray[np.bool_]:
-    """(i, i) whether two images may see the same ground between two heights (m), if each may lie `margin_px` away from
-    where its sensor model puts it; never an image itself.
+    """Whether two images may show the same ground, (i, i) bool; False for an image and itself.
 
-    Told by the boxes around footprints, so some that see no common ground are among them.
+    z_range : heights of the ground, m; margin_px : largest pointing error of each image. Boxes around the footprints
+    are compared, so that some of the pairs show no common ground.
     """
     low, high = np.moveaxis(np.array([ground_box(view, z_range, margin_px) for view in views]), 1, 0)
     may = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
@@ -177,8 +184,10 @@ def shared_parts(
     margin_px: float,
     near: NDArray[np.bool_],
 ) -> list[NDArray[np.bool_]]:
-    """For each view the grid of its parts (see `features.parts`) that some other view may see too. near : see
-    `neighbours`."""
+    """For each view the grid of its parts (see `sift.parts`), with those set that another view may show too.
+
+    near : (i, i) bool, see `neighbours`.
+    """
     wanted = [np.zeros(part_grid(held_window(view.image)[2:]), bool) for view in views]
     for i, view in enumerate(views):
         others, every = [views[j] for j in np.flatnonzero(near[i]).tolist()], parts(view.image)
@@ -195,25 +204,25 @@ def _seen_by(
     z_ranges: Sequence[tuple[float, float]],
     margin_px: float,
 ) -> set[tuple[int, int]]:
-    """Those parts of a view that another view may see. places : px of each part, see `parts`."""
+    """Parts of a view that another view may show. places : pixels of each part, see `sift.parts`."""
     edge = np.linspace(0.0, 1.0, PART_POINTS)
     row, col, row_end, col_end = np.array(list(places.values())).T[:, :, None]
     y, x = np.broadcast_arrays((row + edge * (row_end - row))[:, :, None], (col + edge * (col_end - col))[:, None])
     xy = np.stack([x, y], axis=-1).reshape(-1, 2)
     lines, seen = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges], set()
     for other, line in product(others, lines):
-        loci = trace(line, other.sensor, line.z_range)
+        curves = epipolar_curves(line, other.sensor, line.z_range)
         for number, part in enumerate(places):
             if part not in seen:
                 at = slice(number * PART_POINTS**2, (number + 1) * PART_POINTS**2)
-                if may_fall_inside(loci.part(at), other.image.shape, margin_px):
+                if may_fall_inside(curves.part(at), other.image.shape, margin_px):
                     seen.add(part)
     return seen
 
 
-def may_fall_inside(loci: EpipolarCurves, shape: tuple[int, int], margin_px: float) -> bool:
-    """Whether the box around some loci, widened by a margin, touches an image of that shape."""
-    ends = np.concatenate([loci.low, loci.high])
+def may_fall_inside(curves: EpipolarCurves, shape: tuple[int, int], margin_px: float) -> bool:
+    """Whether the box around epipolar curves, widened by a margin, touches an image of that shape."""
+    ends = np.concatenate([curves.low, curves.high])
     ends = ends[np.isfinite(ends).all(axis=1)]
     if not len(ends):
         return False
@@ -225,17 +234,18 @@ def match_pair(
     views: Sequence[View],
     features: Sequence[Features],
     pair: tuple[int, int],
-    lines: Sequence[Sightlines],
+    sightlines: Sequence[Sightlines],
     options: OrientationOptions,
 ) -> PairMatches:
-    """Matches of two images, guided by the loci, that agree with one pointing shift.
+    """Matches of two images along epipolar curves that agree with one pointing shift.
 
-    lines : of the first image's features, for ranges of heights that are looked at one after the other; that with the
-    most matches counts.
+    sightlines : of the first image's features, one entry for each range of heights. The range with the most matches
+    counts.
 
-    Twice: first a sample of the features within `max_pointing_px` of the loci; then, with the shift and the heights
-    found, all features within twice `inlier_px`, where fewer rivals let more matches through. In reduced images the
-    distance counts by `sift_tolerance_factor`.
+    Features are matched twice. The first search takes a sample of the features, within `max_pointing_px` of the curves.
+    The second search takes all features, within twice `inlier_px` of the curves at the shift and heights found; there
+    are fewer second-best matches, so that more matches are accepted. In reduced images `inlier_px` is multiplied by
+    `sift_tolerance_factor`.
     """
     a, b = pair
     inlier_px = options.inlier_px * sift_tolerance_factor([views[a], views[b]], options)
@@ -243,12 +253,12 @@ def match_pair(
     sample = np.arange(0, n_a, max(n_a // FIRST_SEARCH_FEATURES, 1))
     nothing = np.empty(0, np.int64)
     empty = PairMatches(pair, nothing, nothing, np.empty(0), 0, np.zeros(2))
-    max_px, pointing, found, likely_lines = options.max_pointing_px, None, None, lines[0]
-    for line in lines:
-        loci = trace(line.only(sample), sensor, line.z_range)
-        if not len(xy_b) or not may_fall_inside(loci, views[b].image.shape, max_px):
+    max_px, pointing, found, likely_lines = options.max_pointing_px, None, None, sightlines[0]
+    for line in sightlines:
+        curves = epipolar_curves(line.only(sample), sensor, line.z_range)
+        if not len(xy_b) or not may_fall_inside(curves, views[b].image.shape, max_px):
             continue
-        first, second = match_along_curves(loci, features[a].only(sample), features[b], max_px, options.match_ratio)
+        first, second = match_along_curves(curves, features[a].only(sample), features[b], max_px, options.match_ratio)
         here = epipolar_offsets(line.only(sample[first]), sensor, xy_b[second], line.z_range)
         shift = find_shift(here, max_px, inlier_px)
         if pointing is None or shift.inliers.sum() > pointing.inliers.sum():
@@ -256,8 +266,8 @@ def match_pair(
     if pointing is None or found is None or not pointing.is_certain(options.min_ties):
         return empty
     likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * inlier_px
-    loci = trace(likely_lines, sensor, likely).moved(pointing.shift_px)
-    first, second = match_along_curves(loci, features[a], features[b], near_px, options.match_ratio)
+    curves = epipolar_curves(likely_lines, sensor, likely).moved(pointing.shift_px)
+    first, second = match_along_curves(curves, features[a], features[b], near_px, options.match_ratio)
     moved_b = xy_b[second] - pointing.shift_px
     rest = find_shift(epipolar_offsets(likely_lines.only(first), sensor, moved_b, likely), near_px, inlier_px)
     if not rest.is_certain(options.min_ties):
@@ -268,14 +278,15 @@ def match_pair(
 
 
 def sift_tolerance_factor(views: Sequence[View], options: OrientationOptions) -> float:
-    """How much farther than in halved images features may lie from their loci: with the reduction they blur."""
+    """Factor by which features of reduced images may lie farther from their epipolar curves than those of halved
+    ones."""
     return max(1.0, *(reduction(held_window(view.image)[2:], options) / 2.0 for view in views))
 
 
 def likely_range(z: FloatArray) -> tuple[float, float]:
-    """Heights (m) worth a second look: those of nearly all matches z (n,), widened by their span.
+    """Range of heights (m) for the second search: that of nearly all matches z (n,), widened by itself at both ends.
 
-    Not cut to the heights asked for: a pointing error along the loci raises or lowers all of them.
+    It is not limited to the requested heights, because a pointing error along the curves raises or lowers all matches.
     """
     low, high = np.percentile(z, (5.0, 95.0))
     return low - (high - low) - 1.0, high + (high - low) + 1.0
@@ -299,10 +310,10 @@ def match_along_curves(
 
 
 def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_range: tuple[float, float]) -> Ties:
-    """Tie points from the matches of all pairs: matches that share a feature belong to the same ground point.
+    """Tie points from the matches of all pairs. Matches that share a feature belong to the same ground point.
 
-    A point that would be seen twice by one image is a contradiction and is dropped. Features at one place with several
-    orientations count as one.
+    A point that one image would show twice is a contradiction and is dropped. Several features at one place, which
+    differ in their direction only, count as one.
     """
     start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
     place = np.concatenate([same_place_numbers(f.xy) + start[i] for i, f in enumerate(features)])
@@ -328,10 +339,10 @@ def join_tracks(features: Sequence[Features], pairs: tuple[PairMatches, ...], z_
 
 
 def linked(one: NDArray[np.int64], two: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """For each of `count` things the number of the first one it is linked to, directly or through others.
+    """Number (count,) of the first feature that each feature is linked to, directly or through others.
 
-    one, two : (k,) the ends of the links. Every round gives both ends the smaller number and follows numbers to their
-    end, so that a chain of n links takes about log n rounds.
+    one, two : (k,) numbers of the features at the ends of the links. Every round gives both ends the smaller number and
+    then follows numbers to the first feature, so that a chain of n links takes about log n rounds.
     """
     number = np.arange(count)
     while True:
@@ -345,6 +356,6 @@ def linked(one: NDArray[np.int64], two: NDArray[np.int64], count: int) -> NDArra
 
 
 def same_place_numbers(xy: FloatArray) -> NDArray[np.int64]:
-    """For each feature (n, 2) px the number of the first feature at the same place."""
+    """Number (n,) of the first feature at the same place as each feature; xy : (n, 2) px."""
     _, first, inverse = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[inverse.ravel()])

@@ -1,4 +1,4 @@
-"""Ground points from the image points that see them."""
+"""Triangulation: ground points from the image points that see them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 
 MAX_ITERATIONS = 10
 TOLERANCE_PX = 1e-3
-RELINEARISE_PX = 5.0  # below such a step the old derivatives serve: sensors are nearly linear
+# After larger steps the derivatives are computed again. Sensors are nearly linear over smaller ones.
+RELINEARISE_PX = 5.0
 DIFFERENCE_M = 1.0
 
 
@@ -20,7 +21,7 @@ DIFFERENCE_M = 1.0
 class Observations:
     """Image points of ground points, one row per observation.
 
-    view, point : (m,) int, which image and which ground point; xy : (m, 2) px.
+    view, point : (m,) int, numbers of the image and of the ground point; xy : (m, 2) px.
     """
 
     view: NDArray[np.int64]
@@ -39,8 +40,9 @@ class Observations:
 class GroundPoints:
     """Triangulated ground points and how well they explain their observations.
 
-    xyz : (n, 3) m, NaN where the rays do not meet; sigma_z : (n,) m of height per pixel of noise in each coordinate;
-    residual : (m, 2) px, observed minus projected; by_ground : (m, 2, 3) px per m.
+    xyz : (n, 3) m, NaN where the rays do not meet; sigma_z : (n,) standard deviation of the height, in m per px of
+    noise; residual : (m, 2) px, observed minus projected; by_ground : (m, 2, 3) px per m, derivatives of the image
+    points.
     """
 
     xyz: FloatArray
@@ -56,11 +58,11 @@ def triangulate(
     weight: FloatArray | None = None,
     by_ground: FloatArray | None = None,
 ) -> GroundPoints:
-    """Least-squares ground points by Gauss-Newton, all points at once.
+    """Ground points by least squares (Gauss-Newton, all points at once).
 
     xyz : (n, 3) m to start from; weight : (m,) of each observation (1 where not given); by_ground : (m, 2, 3) px per m,
-    derivatives from an earlier round near these points. Every point needs two observations with distinct rays; others
-    come out NaN.
+    derivatives from an earlier round near these points. A point with fewer than two observations on distinct rays is
+    NaN.
     """
     weight = np.ones(len(observations)) if weight is None else weight
     by_ground = ground_jacobian(sensors, observations, xyz) if by_ground is None else by_ground
@@ -82,7 +84,7 @@ def triangulate(
 
 
 def project_points(sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray) -> FloatArray:
-    """Image positions (m, 2) px at which each observation's ground point is expected."""
+    """Projections (m, 2) px of each observation's ground point into its image; xyz : (n, 3) m."""
     xy = np.full((len(observations), 2), np.nan)
     for i, rows in enumerate(rows_of_views(observations, len(sensors))):
         if len(rows):
@@ -91,13 +93,13 @@ def project_points(sensors: Sequence[SensorModel], observations: Observations, x
 
 
 def rows_of_views(observations: Observations, n_views: int) -> list[NDArray[np.intp]]:
-    """The observations of each view, in their order."""
+    """Row numbers of the observations of each view, in their order."""
     order = np.argsort(observations.view, kind="stable")
     return np.split(order, np.searchsorted(observations.view, np.arange(1, n_views), sorter=order))
 
 
 def ground_jacobian(sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray) -> FloatArray:
-    """Derivatives (m, 2, 3) of image position by ground position, px per m, as differences over a metre."""
+    """Derivatives (m, 2, 3) of image positions by ground positions, px per m, by differences over a metre."""
     here = project_points(sensors, observations, xyz)
     columns = [
         (project_points(sensors, observations, xyz + step) - here) / DIFFERENCE_M for step in np.eye(3) * DIFFERENCE_M
@@ -118,5 +120,5 @@ def point_covariance(by_ground: FloatArray, weight: FloatArray, point: NDArray[n
 
 
 def summed(values: FloatArray, point: NDArray[np.int64], n_points: int) -> FloatArray:
-    """Sums (n, k) over the observations of each point; values : (m, k)."""
+    """Sums (n, k) of values (m, k) over the observations of each point."""
     return np.stack([np.bincount(point, column, n_points) for column in values.T], axis=1)

@@ -98,7 +98,7 @@ def tiny_scene() -> MatchScene:
 
 def warm_orientation(match_scene: MatchScene) -> None:
     """Run the kernels of the orientation once."""
-    from zlocus.orientation.epipolar import Sightlines, trace
+    from zlocus.orientation.epipolar import Sightlines, epipolar_curves
     from zlocus.orientation.sift import DESCRIPTOR_LENGTH, Features
     from zlocus.orientation.tie_refinement import refine_ties
     from zlocus.orientation.ties import match_along_curves
@@ -107,8 +107,8 @@ def warm_orientation(match_scene: MatchScene) -> None:
     sensors, options = [view.sensor for view in match_scene.views], RunConfig().orientation
     xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
     features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
-    loci = trace(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
-    for moved in (loci, loci.moved(np.zeros(2))):
+    curves = epipolar_curves(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
+    for moved in (curves, curves.moved(np.zeros(2))):
         match_along_curves(moved, features.only(point), features, options.inlier_px, options.match_ratio)
     seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
     ground = sensors[0].ground_from_image(xy, np.zeros(4))
