@@ -15,9 +15,9 @@ from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError
 from zlocus.core.requests import DsmRequest
 from zlocus.core.scene import View
-from zlocus.matching.fusion import Cells, PixelHeights, _pixels_of, agreed, gridded
+from zlocus.matching.fusion import GridCells, PixelHeights, _pixels_of, agreed, gridded
 from zlocus.matching.image_space import ImageSpace, MatchedImage
-from zlocus.matching.kernels.rasterise import agreed_heights, draw_image
+from zlocus.matching.kernels.rasterise import SurfaceLimits, agreed_heights, draw_image
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.surface import Surface
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
@@ -26,7 +26,7 @@ from zlocus.sensors.distortion import FisheyeDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.image_rays import HeightRays
 
-LIMITS = np.array([3.0, 1.0, 3.0])
+LIMITS = SurfaceLimits(3.0, 1.0, 3.0)
 WITHIN_M, MEDIAN_M, BIAS_M = 1.0, 0.1, 0.05
 LEAST_WITHIN = {"plane": 0.995, "step": 0.97, "sine": 0.995}
 LEAST_KEPT = {"plane": 0.98, "step": 0.93, "sine": 0.98}
@@ -119,7 +119,7 @@ def test_every_empty_cell_says_why():
     low = height.copy()
     low[60:70, 60:70], quality[60:70, 60:70] = np.nan, Quality.NO_MATCH
     west, north = camera("nadir").ground_from_image(np.zeros((1, 2)), np.array([50.0]))[0, :2]
-    cells = Cells((170, 150), Affine(0.5, 0, west, 0, -0.5, north), (40.0, 80.0))
+    cells = GridCells((170, 150), Affine(0.5, 0, west, 0, -0.5, north), (40.0, 80.0))
     image = flat_image(low, quality)
     found = gridded([image] * 2, cells, [image] * 2)
     empty = np.isnan(found.height)
@@ -133,16 +133,17 @@ def test_every_empty_cell_says_why():
     assert (alone.quality[hole] == Quality.UNSEEN).all()
 
 
-def test_what_took_no_part_is_said_of_empty_cells_too():
-    """LEFT_OUT empties no cell: another reason stands beside it."""
+def test_an_excluded_image_is_marked_in_empty_cells_too():
+    """IMAGE_EXCLUDED does not explain an empty cell: another flag stands beside it."""
     height, quality = np.zeros((150, 150), np.float32), np.zeros((150, 150), np.uint16)
     height[60:70, 60:70] = np.nan
-    quality[60:66, 60:70], quality[66:70, 60:70] = Quality.NO_MATCH | Quality.LEFT_OUT, Quality.LEFT_OUT
+    quality[60:66, 60:70], quality[66:70, 60:70] = Quality.NO_MATCH | Quality.IMAGE_EXCLUDED, Quality.IMAGE_EXCLUDED
     west, north = camera("nadir").ground_from_image(np.zeros((1, 2)), np.array([50.0]))[0, :2]
     image = flat_image(height, quality)
-    found = gridded([image] * 2, Cells((150, 150), Affine(0.5, 0, west, 0, -0.5, north), (40.0, 80.0)), [image] * 2)
+    found = gridded([image] * 2, GridCells((150, 150), Affine(0.5, 0, west, 0, -0.5, north), (40.0, 80.0)), [image] * 2)
     hole = found.quality[55:75, 55:75][np.isnan(found.height[55:75, 55:75])]
-    assert set(np.unique(hole)) == {Quality.NO_MATCH | Quality.LEFT_OUT, Quality.HIDDEN | Quality.LEFT_OUT}
+    excluded = Quality.IMAGE_EXCLUDED
+    assert set(np.unique(hole)) == {Quality.NO_MATCH | excluded, Quality.OCCLUDED | excluded}
     np.testing.assert_array_equal(np.isnan(found.height), is_empty(found.quality))
 
 
@@ -166,7 +167,7 @@ def test_a_lens_sees_the_area_beyond_the_corners_of_a_window(row):
 
 
 def test_a_lens_sees_cells_beyond_those_at_the_corners():
-    cells = Cells((160, 60), Affine(1.0, 0, 20.0, 0, -1.0, 80.0), (0.0, 10.0))
+    cells = GridCells((160, 60), Affine(1.0, 0, 20.0, 0, -1.0, 80.0), (0.0, 10.0))
     image = MatchedImage(fisheye_space(), np.zeros((1000, 1000), np.float32), 0.0)
     rows, cols = _pixels_of(image, cells)
     for z in cells.z_range:
@@ -183,7 +184,7 @@ def test_a_lens_sees_cells_beyond_those_at_the_corners():
 def test_only_pixels_that_may_show_the_area_are_matched():
     from zlocus.core.grid import CellWindow
 
-    space = flat_image(np.zeros((150, 150), np.float32), np.zeros((150, 150), np.uint16)).image.space
+    space = flat_image(np.zeros((150, 150), np.float32), np.zeros((150, 150), np.uint16)).matched_image.image_space
     area = GroundArea(PART, (45.0, 55.0))
     assert area.may_show(space, CellWindow(60, 60, 30, 30))
     assert not area.may_show(space, CellWindow(0, 0, 20, 150))
@@ -240,7 +241,7 @@ def test_area_and_workers_change_nothing(images, tmp_path):
 def test_one_reference_gives_heights_the_others_confirm(images, tmp_path):
     result = run(images("step"), tmp_path / "out", method="gc3-sgm", reference="nadir")
     quality, _ = read(result.out / "quality.tif")
-    assert (quality & Quality.UNCONFIRMED).any()
+    assert (quality & Quality.INCONSISTENT).any()
     error, seen = errors_of(result.out, "step")
     assert (np.abs(error[seen & np.isfinite(error)]) < WITHIN_M).mean() > LEAST_WITHIN["step"]
 

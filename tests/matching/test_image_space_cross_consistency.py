@@ -10,7 +10,7 @@ import pytest
 from pyproj import CRS
 
 from zlocus.core.scene import ImageWindow, Scene, View
-from zlocus.matching.image_space import Confirmation, MatchedImage, confirm, image_space
+from zlocus.matching.image_space import CrossConsistency, MatchedImage, check_cross_consistency, image_space
 from zlocus.sensors.frame import FrameModel
 
 LEVEL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -44,9 +44,9 @@ def images(*places: float) -> list[MatchedImage]:
 
 def whole(mine, others):
     """Counts of all rows, which come some after others."""
-    rows, parts = zip(*confirm(mine, others, 1.0), strict=True)
+    rows, parts = zip(*check_cross_consistency(mine, others, 1.0), strict=True)
     assert np.concatenate([np.arange(len(mine.height))[r] for r in rows]).tolist() == list(range(len(mine.height)))
-    return Confirmation(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Confirmation)))
+    return CrossConsistency(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(CrossConsistency)))
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +59,7 @@ def test_equal_heights_agree_where_both_see():
     result = whole(left, [right])
     np.testing.assert_array_equal(result.agreeing[:, 6:], 1)
     np.testing.assert_array_equal(result.agreeing[:, :6], 0)  # left of the right image
-    np.testing.assert_array_equal(result.is_confirmed, result.agreeing == 1)
+    np.testing.assert_array_equal(result.is_consistent, result.agreeing == 1)
     assert not result.nearer.any()
     assert not result.farther.any()
 
@@ -77,7 +77,7 @@ def test_the_tolerance_is_in_pixels(by_px, agrees):
 def test_a_wrong_patch_is_not_confirmed():
     left, right = images(0.0, 1.0)
     left.height[PATCH] += 8.0
-    confirmed = whole(left, [right]).is_confirmed
+    confirmed = whole(left, [right]).is_consistent
     assert not confirmed[PATCH].any()
     confirmed[PATCH] = True
     assert confirmed[:, 6:].all()
@@ -86,13 +86,13 @@ def test_a_wrong_patch_is_not_confirmed():
 def test_more_must_agree_than_look_through():
     first, *others = images(0.0, 1.0, 2.0, -1.0)
     for other in others[:1]:
-        other.height[:] -= 2.0 * other.px_per_unit(first.space.reference.name) ** -1
+        other.height[:] -= 2.0 * other.px_per_unit(first.image_space.reference_view.name) ** -1
     inside = (slice(None), slice(14, 50))
     result = whole(first, others)
     assert (result.farther[inside] == 1).all()
     assert (result.agreeing[inside] == 2).all()
-    assert result.is_confirmed[inside].all()
-    assert not whole(first, others[:2]).is_confirmed[inside].any()
+    assert result.is_consistent[inside].all()
+    assert not whole(first, others[:2]).is_consistent[inside].any()
 
 
 def test_empty_pixels_have_no_say():
@@ -105,5 +105,5 @@ def test_empty_pixels_have_no_say():
 
 def test_disparity_of_a_pair_is_that_of_its_own_base():
     first, near, far = images(0.0, 1.0, 4.0)
-    assert first.px_per_unit(far.space.reference.name) == pytest.approx(1.0)
-    assert first.px_per_unit(near.space.reference.name) == pytest.approx(0.25)
+    assert first.px_per_unit(far.image_space.reference_view.name) == pytest.approx(1.0)
+    assert first.px_per_unit(near.image_space.reference_view.name) == pytest.approx(0.25)

@@ -221,16 +221,16 @@ def depth_options(config: RunConfig) -> RunConfig:
     """The configuration with the defaults for depths, where an option has its usual default.
 
     The usual defaults are chosen for ground seen from above. Close objects have deep jumps and sharp texture. So the
-    correlation window is narrow, because every jump is an outline in the reference image, and the least penalty of jumps
-    is higher. Pairs with an occluded view are excluded whole, because the reference image is never occluded. A view
-    counts as occluded only far below the occluder, because the coarser surface blurs outlines by some steps, and the
-    cross-consistency check finds occlusions exactly.
+    correlation window is narrow, because every jump is an outline in the reference image, and the least penalty of
+    jumps is higher. Pairs with an occluded view are excluded whole, because the reference image is never occluded. A
+    view counts as occluded only far below the occluder, because the coarser surface blurs outlines by some steps, and
+    the cross-consistency check finds occlusions exactly.
     """
     return _with_defaults(config, DEPTH_DEFAULTS)
 
 
 def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> RunConfig:
-    """The configuration with other values where its options have their defaults. defaults : values by stage and name."""
+    """The configuration with other values where its options have their defaults. defaults : by stage and option."""
     changed = {}
     for stage, values in defaults.items():
         mine, default = getattr(config, stage), getattr(RunConfig(), stage)
@@ -276,8 +276,8 @@ def hypotheses_of_ties(image_space: ImageSpace, ties: FloatArray, options: Orien
     """
     if len(ties) < MIN_TIES:
         raise GeometryError(
-            f"Only {len(ties)} reliable tie points were found in {image_space.reference_view.name}, too few to tell its depths "
-            f"({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check the cameras."
+            f"Only {len(ties)} reliable tie points were found in {image_space.reference_view.name}, too few to tell "
+            f"its depths ({MIN_TIES} are needed). Give --heights ZMIN ZMAX, or check the cameras."
         )
     low, high = (float(v) for v in np.percentile(ties[:, 2], TIE_PERCENTILES))
     margin = options.range_margin * (high - low) + DISPARITY_MARGIN_PX
@@ -331,9 +331,10 @@ def hypothesis_step(image_space: ImageSpace, z: float, max_shift_px: float) -> f
         if np.isfinite(r := shift_rates(image_space, view, z)).any()
     ]
     if not max(rates, default=0.0) > MIN_DISPARITY_RATE_PX:
+        name, path = image_space.reference_view.name, image_space.reference_view.path
         raise GeometryError(
-            f"No other image shows the heights of what {image_space.reference_view.name} ({image_space.reference_view.path}) sees: they do "
-            "not overlap, or look along the same line. Check the cameras, or add an image from another direction."
+            f"No other image shows the heights of what {name} ({path}) sees: they do not overlap, or look along the "
+            "same line. Check the cameras, or add an image from another direction."
         )
     return max_shift_px / max(rates)
 

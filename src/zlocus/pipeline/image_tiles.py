@@ -25,7 +25,7 @@ from zlocus.core.requests import DsmRequest
 from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.fill import filled
-from zlocus.matching.fusion import Cells, PixelHeights, gridded
+from zlocus.matching.fusion import GridCells, PixelHeights, gridded
 from zlocus.matching.image_space import (
     ROWS_AT_ONCE,
     ImageSpace,
@@ -91,7 +91,7 @@ class ImageSetup:
     """What the matching of images in their own spaces starts from.
 
     scene : the views that take part, with corrected cameras; ties : (n, 3) m, ground points; is_supported : (n,)
-    whether the tie points around check_cross_consistency them; z_range : heights searched, m, None where each image takes its range of
+    whether the tie points around confirm them; z_range : heights searched, m, None where each image takes its range of
     depths from the tie points.
     """
 
@@ -355,7 +355,7 @@ def cross_checked_images(
     Where only one image was matched there is no other to check it: all its heights are kept, and a note says so.
     """
     if len(matched) < 2:
-        progress.note("Only one image was matched, so no other one could check_cross_consistency its heights: all are kept.")
+        progress.note("Only one image was matched, so no other one could confirm its heights: all are kept.")
         return list(matched)
     images, checked = [m.image for m in matched], []
     with progress.stage("Checking across images", len(images)) as stage:
@@ -410,8 +410,8 @@ def grid_tile(
     halo = config.pyramid.halo
     window = core_window.at_level(0, halo)
     z_range = (match_scene.height_origin, match_scene.height_origin + match_scene.n_steps * match_scene.height_step)
-    cells = Cells((window.rows, window.cols), match_scene.transform(window, 0), z_range)
-    surface = gridded(grid_images.images, cells, grid_images.all_matched).precise(config.checks.max_sigma_m)
+    grid_cells = GridCells((window.rows, window.cols), match_scene.transform(window, 0), z_range)
+    surface = gridded(grid_images.images, grid_cells, grid_images.all_matched).precise(config.checks.max_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, halo // 2)
     return TileResult(surface.part(core_window, window))

@@ -1,23 +1,35 @@
-"""The heights of an image's pixels drawn on a ground grid."""
+"""Drawing the heights of the pixels of images on a ground grid."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from zlocus.core.jit import kernel
 
+# Rounding by which a point may lie outside a triangle, as a share of the triangle.
 ON_EDGE = 1e-9
 
 
-# (r,c,3) f8, i8, i8, i8, (3,) f8 -> b1
+class SurfaceLimits(NamedTuple):
+    """When neighbouring pixels show one surface."""
+
+    max_distance_cells: float  # f8: largest distance on the ground
+    max_height_difference_m: float  # f8: largest difference in height of pixels that are close together
+    max_slope_m: float  # f8: largest difference in height per cell of distance
+
+
+# (r,c,3) f8, i8, i8, i8, SurfaceLimits -> b1
 @kernel
 def is_connected(ground, a, b, c, limits):
-    """Whether three pixels (flat indices) show one surface: no two are far apart in place, or in height and steeply."""
+    """Whether three pixels (flat indices) show one surface: each two are close enough in place and in height."""
     n_cols = ground.shape[1]
     for i, j in ((a, b), (b, c), (c, a)):
         p, q = ground[i // n_cols, i % n_cols], ground[j // n_cols, j % n_cols]
         away = np.hypot(p[0] - q[0], p[1] - q[1])
-        if not away <= limits[0] or abs(p[2] - q[2]) > max(limits[1], limits[2] * away):
+        max_difference = max(limits.max_height_difference_m, limits.max_slope_m * away)
+        if not away <= limits.max_distance_cells or abs(p[2] - q[2]) > max_difference:
             return False
     return True
 
@@ -25,7 +37,7 @@ def is_connected(ground, a, b, c, limits):
 # (r,c,3) f8, i8, i8, i8, (r,c) f4, (r,c) i4 -> None
 @kernel
 def draw_triangle(ground, a, b, c, height, pixel):
-    """Draw the plane through three pixels on the cells whose centres it covers, over what lies lower there."""
+    """Draw the plane through three pixels on the cells whose centres it covers, where nothing higher was drawn."""
     n_cols = ground.shape[1]
     p, q, s = ground[a // n_cols, a % n_cols], ground[b // n_cols, b % n_cols], ground[c // n_cols, c % n_cols]
     area = (q[0] - p[0]) * (s[1] - p[1]) - (q[1] - p[1]) * (s[0] - p[0])
@@ -47,27 +59,26 @@ def draw_triangle(ground, a, b, c, height, pixel):
                 pixel[row, col] = a if u >= max(v, w) else (b if v >= w else c)
 
 
-# (r,c,3) f8, (3,) f8, (r,c) f4, (r,c) i4 -> None
+# (r,c,3) f8, SurfaceLimits, (r,c) f4, (r,c) i4 -> None
 @kernel
 def draw_image(ground, limits, height, pixel):
-    """Draw an image's pixels on a grid; where they overlap, the highest wins, so that roofs hide the walls below them.
+    """Draw the pixels of an image on a grid. Where they overlap the highest is kept, so roofs cover the walls below.
 
-    ground : (r, c, 3) float64, column and row in cells (a cell's corner is whole) and height of what each pixel shows,
-    NaN where not known; limits : (3,), cells that neighbouring pixels of one surface are apart at most, m that they may
-    differ in height, and m per cell that they may differ beyond that; height : (r, c) float32, NaN, and pixel : (r, c)
-    int32, -1, both written: highest height at the cell's centre, and flat index of the pixel that is nearest to it.
+    ground : (r, c, 3) float64, column and row in cells (corners of cells are whole numbers) and height of the ground
+    point of each pixel, NaN where not known; height : (r, c) float32, NaN, and pixel : (r, c) int32, -1, both written:
+    the highest height at the centre of each cell, and the flat index of the pixel that is nearest to it.
 
-    Triangles of neighbouring pixels are drawn where they show one surface: so no cell between two pixels stays empty,
-    and a height is that at the cell's centre, not that at the place where a point fell. A pixel counts for
-    the cell it falls into where no triangle covers that, or only one that lies more than the limit lower.
+    Triangles of neighbouring pixels are drawn where they show one surface. So no cell between two pixels stays empty,
+    and a height is that at the centre of the cell, not at the place of a pixel. A pixel is also drawn on the cell that
+    it falls into where no triangle covers that cell, or only one that is lower by more than the limit.
     """
     n_rows, n_cols = ground.shape[0], ground.shape[1]
-    jump = np.float32(limits[1])
+    jump = np.float32(limits.max_height_difference_m)
     for r in range(n_rows - 1):
         for c in range(n_cols - 1):
             a = r * n_cols + c
             b, d, e = a + 1, a + n_cols, a + n_cols + 1
-            # Along the diagonal whose ends differ less, or that has both of its ends.
+            # The square is divided along the diagonal whose ends differ less in height, or whose ends are both known.
             falling = abs(ground[r, c, 2] - ground[r + 1, c + 1, 2])
             rising = abs(ground[r, c + 1, 2] - ground[r + 1, c, 2])
             if np.isnan(rising) or falling <= rising:
@@ -91,11 +102,11 @@ def draw_image(ground, limits, height, pixel):
 # (i,r,c) f4, f4, (r,c) f4, (i,r,c) b1 -> None
 @kernel
 def agreed_heights(heights, tolerance, height, agrees):
-    """The height on which most images agree in each cell, of equal numbers the higher: the median of theirs.
+    """Write the height on which most images agree in each cell (of equal numbers the higher): the median of theirs.
 
-    heights : (i, r, c) float32 m, one surface an image, NaN where it shows none; tolerance : m from the highest to the
-    lowest of those that agree; height : (r, c) float32, written, NaN where no image shows the cell; agrees : (i, r, c)
-    bool, written, the images that do.
+    heights : (i, r, c) float32 m, one surface for each image, NaN where it has no height; tolerance : m, largest
+    difference between the highest and the lowest height that agree; height : (r, c) float32, written, NaN where no
+    image has one; agrees : (i, r, c) bool, written, images that agree.
     """
     n_images, n_rows, n_cols = heights.shape
     agrees[:] = False
