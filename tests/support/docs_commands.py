@@ -27,6 +27,8 @@ from zlocus.synthetic.terrain import analytic_ground, analytic_height
 
 # Every page that a reader may be sent to, the notebooks aside.
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks" / "README.md"])
+# Those whose commands are run; the examples of the other have a test of their own.
+PAGES_WITH_COMMANDS = [page for page in PAGES if page.name != "contributing.md"]
 PROGRAMS = ("zlocus", "python", "make", "printf")
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```|((?:^ {4}[^\n]*\n)+)", re.DOTALL | re.MULTILINE)
 # Where a user's own grids of PROJ lie, below a page's folder.
@@ -210,7 +212,6 @@ def lay_out_surface(folder: Path) -> None:
 # What a page's commands find in the folder in which they are run.
 LAID_OUT = {
     "README.md": lay_out_readme,
-    "docs/explanation/orientation.md": lay_out_images,
     "docs/how-to/cloud.md": lay_out_images,
     "docs/how-to/curves.md": lay_out_images,
     "docs/how-to/doctor.md": lay_out_images,
