@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zlocus.sensors.distortion import WIDEST_DEG, BrownDistortion, FisheyeDistortion
+from zlocus.sensors.distortion import MAX_ANGLE_FROM_AXIS_DEG, BrownDistortion, FisheyeDistortion
 
 FOCAL_PX = 3000.0
 SAME_PX = 1e-6
@@ -125,9 +125,9 @@ def test_poles_end_the_disc():
 
 def test_a_fisheye_sees_nearly_to_its_side():
     model = FisheyeDistortion()
-    at = np.tan(np.deg2rad([[80.0, 0.0], [WIDEST_DEG - 0.1, 0.0], [WIDEST_DEG + 0.1, 0.0]]))
+    at = np.tan(np.deg2rad([[80.0, 0.0], [MAX_ANGLE_FROM_AXIS_DEG - 0.1, 0.0], [MAX_ANGLE_FROM_AXIS_DEG + 0.1, 0.0]]))
     there = model.distorted(at)
-    np.testing.assert_allclose(there[:2, 0], np.deg2rad([80.0, WIDEST_DEG - 0.1]), atol=1e-12)
+    np.testing.assert_allclose(there[:2, 0], np.deg2rad([80.0, MAX_ANGLE_FROM_AXIS_DEG - 0.1]), atol=1e-12)
     assert np.isnan(there[2]).all()
 
 

@@ -1,4 +1,4 @@
-"""What is laid over a sensor model: a shift in the image, an affine map of it, or larger pixels."""
+"""Corrections of a sensor model in its image: a shift, an affine map, or larger pixels."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 
 @dataclass(frozen=True)
 class ShiftedModel:
-    """A sensor model whose image positions are moved by a constant.
+    """A sensor model with a constant shift in the image.
 
-    column, row : pixels added to what `base` projects (so a base that projects 2 px too far left is mended by
-    column = +2).
+    column, row : pixels added to the positions that `base` projects. A base that projects 2 px too far left is
+    corrected by column = +2.
     """
 
     base: SensorModel
@@ -36,9 +36,9 @@ class ShiftedModel:
 
 @dataclass(frozen=True)
 class AffineModel:
-    """A sensor model whose image positions are moved by amounts that grow evenly over the image.
+    """A sensor model with a shift in the image that changes linearly over the image.
 
-    column, row : (constant px, per column, per row), what is added to the column and to the row that `base` projects.
+    column, row : (constant px, per column, per row), added to the column and to the row that `base` projects.
     Source: Grodecki and Dial 2003, Photogrammetric Engineering & Remote Sensing 69 (1), 59-68, equations 3 and 4, whose
     line and sample are `row` and `column`.
     """
@@ -63,18 +63,18 @@ class AffineModel:
 
     @property
     def _constant(self) -> FloatArray:
-        """(2,) px."""
+        """Constant part of the correction, (2,) px."""
         return np.array([self.column[0], self.row[0]])
 
     @property
     def _growth(self) -> FloatArray:
-        """(2, 2) corrected image positions per px of those that `base` projects."""
+        """Derivatives (2, 2) of the corrected image positions by those that `base` projects."""
         return np.asarray(np.eye(2) + np.array([self.column[1:], self.row[1:]]), float)
 
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """A sensor model of an image whose pixels are `factor` x `factor` pixels of the one that `base` is of."""
+    """The sensor model of a reduced image: each pixel is `factor` x `factor` pixels of the image of `base`."""
 
     base: SensorModel
     factor: int

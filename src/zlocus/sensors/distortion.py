@@ -1,7 +1,7 @@
-"""Lens distortion: from where an ideal camera sees a direction to where the real one does, and back.
+"""Lens distortion: image positions of an ideal camera to those of the real camera, and back.
 
-Both sides lie in the plane at depth 1: x to the right and y down, over the depth, without unit. Each kind maps a disc
-about the axis, in which nothing is seen twice; what lies outside is NaN.
+Positions lie in the plane at depth 1, without unit: x to the right and y down, divided by the depth. Each distortion
+maps a disc about the optical axis one to one; positions outside of the disc are NaN.
 """
 
 from __future__ import annotations
@@ -14,45 +14,53 @@ import numpy as np
 
 from zlocus.core.sensor_model import FloatArray
 
-WIDEST_DEG = 89.5
+# Largest angle from the optical axis.
+MAX_ANGLE_FROM_AXIS_DEG = 89.5
+# Smallest derivative of the distorted by the ideal position, in any direction, at which the map counts as one to one.
 MIN_SLOPE = 0.01
+# Radii or angles at which the disc is tabulated.
 N_NODES = 4096
 MAX_ITERATIONS = 50
-CONVERGED = 1e-14
-REACHED = 1e-11
+# Relative size of the last Newton step, and largest remaining error of a position that counts as found.
+CONVERGED_STEP = 1e-14
+MAX_ERROR = 1e-11
 
 
 class Distortion(Protocol):
-    """A kind of lens distortion. NaN in is NaN out."""
+    """A model of lens distortion. NaN positions stay NaN."""
 
     def distorted(self, at: FloatArray) -> FloatArray:
-        """From ideal to real positions, (n, 2); NaN beyond the disc."""
+        """Real positions of ideal ones, (n, 2); NaN outside of the disc."""
         ...
 
     def undistorted(self, at: FloatArray) -> FloatArray:
-        """From real to ideal positions, (n, 2); NaN where the disc is not seen."""
+        """Ideal positions of real ones, (n, 2); NaN where no position of the disc is mapped."""
         ...
 
 
 @dataclass(frozen=True)
 class _Disc:
-    """A disc that is mapped without folds. inside : (n,) radii or angles; outside : (n,) where they go, increasing."""
+    """A disc that is mapped one to one.
+
+    inside : (n,) radii or angles of ideal positions; outside : (n,) those of the real positions, increasing.
+    """
 
     inside: FloatArray
     outside: FloatArray
 
     @property
-    def reach(self) -> float:
+    def radius(self) -> float:
+        """Radius or angle of the rim, on the ideal side."""
         return float(self.inside[-1])
 
     def inverse(self, outside: FloatArray) -> FloatArray:
-        """A first guess of what goes to `outside`; the rim for what is farther."""
+        """First guess of the ideal radii or angles of real ones; those beyond the rim get the rim."""
         return np.asarray(np.interp(outside, self.outside, self.inside))
 
 
-def _disc(inside: FloatArray, outside: FloatArray, least_slope: FloatArray) -> _Disc:
-    """The part from the axis on in which the least slope in any direction stays above `MIN_SLOPE`."""
-    usable = (least_slope > MIN_SLOPE) & (np.diff(outside, prepend=-1.0) > 0)
+def _one_to_one_disc(inside: FloatArray, outside: FloatArray, min_slope: FloatArray) -> _Disc:
+    """The disc about the axis in which the smallest slope in any direction stays above `MIN_SLOPE`."""
+    usable = (min_slope > MIN_SLOPE) & (np.diff(outside, prepend=-1.0) > 0)
     n = len(usable) if usable.all() else int(np.argmin(usable))
     return _Disc(inside[: max(n, 1)], outside[: max(n, 1)])
 
@@ -81,38 +89,38 @@ class BrownDistortion:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             r2 = (at**2).sum(axis=1)
             out = self._mapped(at, r2, self._radial(r2)[0])
-        out[~(r2 <= self._range.reach**2)] = np.nan
+        out[~(r2 <= self._disc.radius**2)] = np.nan
         return out
 
     def undistorted(self, at: FloatArray) -> FloatArray:
         """See `Distortion`: Newton from the inverse of the radial part, kept in the disc."""
         at = np.asarray(at, float)
-        reach = self._range.reach
+        rim = self._disc.radius
         far = np.hypot(at[:, 0], at[:, 1])
-        # Sizes that no camera has would overflow; they are out of reach in any case.
+        # Positions that no camera has would overflow; they are beyond the disc in any case.
         at = np.where((far < 1e9)[:, None], at, np.nan)
-        guess = self._range.inverse(far)
+        guess = self._disc.inverse(far)
         ideal = at * np.divide(guess, far, out=np.ones_like(far), where=far > 0)[:, None]
         for _ in range(MAX_ITERATIONS):
             step = self._newton_step(ideal, at)
             ideal = ideal + step
             radius = np.hypot(ideal[:, 0], ideal[:, 1])
-            ideal *= np.minimum(1.0, reach / np.maximum(radius, 1e-300))[:, None]
-            if not (np.abs(step) > CONVERGED * (1.0 + radius[:, None])).any():
+            ideal *= np.minimum(1.0, rim / np.maximum(radius, 1e-300))[:, None]
+            if not (np.abs(step) > CONVERGED_STEP * (1.0 + radius[:, None])).any():
                 break
         r2 = (ideal**2).sum(axis=1)
         gap = np.abs(self._mapped(ideal, r2, self._radial(r2)[0]) - at)
-        ideal[~(gap <= REACHED * (1.0 + far[:, None])).all(axis=1)] = np.nan
+        ideal[~(gap <= MAX_ERROR * (1.0 + far[:, None])).all(axis=1)] = np.nan
         return ideal
 
     @cached_property
-    def _range(self) -> _Disc:
-        radius = np.tan(np.deg2rad(np.linspace(0.0, WIDEST_DEG, N_NODES)))
+    def _disc(self) -> _Disc:
+        radius = np.tan(np.deg2rad(np.linspace(0.0, MAX_ANGLE_FROM_AXIS_DEG, N_NODES)))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             factor, slope = self._radial(radius**2)
             tangential = 6.0 * radius * np.hypot(self.p1, self.p2)
-            least = np.minimum(factor, factor + 2.0 * radius**2 * slope) - tangential
-        return _disc(radius, radius * factor, least)
+            smallest = np.minimum(factor, factor + 2.0 * radius**2 * slope) - tangential
+        return _one_to_one_disc(radius, radius * factor, smallest)
 
     def _radial(self, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The radial factor and its derivative by r2, (n,) each."""
@@ -133,7 +141,7 @@ class BrownDistortion:
         return out
 
     def _newton_step(self, ideal: FloatArray, target: FloatArray) -> FloatArray:
-        """(n, 2) towards the ideal positions that are mapped to `target`."""
+        """Newton step (n, 2) towards the ideal positions that are mapped to `target`."""
         (x, y), r2 = ideal.T, (ideal**2).sum(axis=1)
         factor, slope = self._radial(r2)
         dx, dy = (target - self._mapped(ideal, r2, factor)).T
@@ -160,29 +168,29 @@ class FisheyeDistortion:
         radius = np.hypot(at[:, 0], at[:, 1])
         angle = np.arctan(radius)
         out = at * np.divide(self._radius(angle)[0], radius, out=np.ones_like(radius), where=radius > 0)[:, None]
-        out[~(angle <= self._range.reach)] = np.nan
+        out[~(angle <= self._disc.radius)] = np.nan
         return out
 
     def undistorted(self, at: FloatArray) -> FloatArray:
         """See `Distortion`: Newton along the radius, kept in the disc."""
         at = np.asarray(at, float)
         far = np.hypot(at[:, 0], at[:, 1])
-        angle = self._range.inverse(far)
+        angle = self._disc.inverse(far)
         for _ in range(MAX_ITERATIONS):
             radius, slope = self._radius(angle)
             step = (far - radius) / slope
-            angle = np.clip(angle + step, 0.0, self._range.reach)
-            if not (np.abs(step) > CONVERGED).any():
+            angle = np.clip(angle + step, 0.0, self._disc.radius)
+            if not (np.abs(step) > CONVERGED_STEP).any():
                 break
         ideal = at * np.divide(np.tan(angle), far, out=np.ones_like(far), where=far > 0)[:, None]
-        ideal[~(np.abs(self._radius(angle)[0] - far) <= REACHED)] = np.nan
+        ideal[~(np.abs(self._radius(angle)[0] - far) <= MAX_ERROR)] = np.nan
         return ideal
 
     @cached_property
-    def _range(self) -> _Disc:
-        angle = np.deg2rad(np.linspace(0.0, WIDEST_DEG, N_NODES))
+    def _disc(self) -> _Disc:
+        angle = np.deg2rad(np.linspace(0.0, MAX_ANGLE_FROM_AXIS_DEG, N_NODES))
         radius, slope = self._radius(angle)
-        return _disc(angle, radius, slope)
+        return _one_to_one_disc(angle, radius, slope)
 
     def _radius(self, angle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Radius in the image and its derivative by the angle, (n,) each."""

@@ -1,4 +1,5 @@
-"""Spaces in which rays are straight: the scene's frame itself, or geocentric axes under a map of the curved Earth."""
+"""Spaces in which rays are straight: the scene's own frame, or geocentric axes where the scene is a map of the
+Earth."""
 
 from __future__ import annotations
 
@@ -15,32 +16,32 @@ WGS84 = CRS.from_epsg(4326)
 NORTH_STEP_M = 10.0
 LATITUDE_ITERATIONS = 3
 MAX_ITERATIONS = 20
-# Before the last step, which squares what is missing.
+# Error before the last step; Newton's method squares it.
 HEIGHT_TOLERANCE_M = 1e-6
 
 
 class Space(Protocol):
-    """Cartesian axes in which rays are straight, and the scene's frame seen from there."""
+    """Cartesian axes in which rays are straight, and the conversion to and from the scene's frame."""
 
     def cartesian_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """Points of the scene's frame (n, 3) -> (n, 3) m; NaN outside of what the frame can express."""
+        """Points of the scene's frame (n, 3) -> (n, 3) m; NaN where the frame has no coordinates."""
         ...
 
     def ground_from_cartesian(self, xyz: FloatArray) -> FloatArray:
-        """Points (n, 3) m -> (n, 3) in the scene's frame; NaN outside of what the frame can express."""
+        """Points (n, 3) m -> (n, 3) in the scene's frame; NaN where the frame has no coordinates."""
         ...
 
     def meet(self, centre: FloatArray, ray: FloatArray, z: FloatArray) -> FloatArray:
-        """Where rays (n, 3), of any length, from a centre (3,) or centres (n, 3) m, first meet heights (n,) m.
+        """Points (n, 3) of the scene's frame where rays first meet heights; NaN where they do not.
 
-        (n, 3) in the scene's frame, NaN where they do not.
+        centre : (3,) or (n, 3) m, projection centres; ray : (n, 3), directions of any length; z : (n,) m.
         """
         ...
 
 
 @dataclass(frozen=True)
 class FrameSpace:
-    """The scene's own coordinates, taken as Cartesian: local frames, flat maps and rendered scenes."""
+    """The scene's own coordinates as Cartesian axes: for local frames, flat maps and rendered scenes."""
 
     def cartesian_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `Space`."""
@@ -53,10 +54,10 @@ class FrameSpace:
     def meet(self, centre: FloatArray, ray: FloatArray, z: FloatArray) -> FloatArray:
         """See `Space`."""
         with np.errstate(all="ignore"):
-            reach = (z - centre[..., 2]) / ray[:, 2]
-            xyz = centre + reach[:, None] * ray
+            depth = (z - centre[..., 2]) / ray[:, 2]
+            xyz = centre + depth[:, None] * ray
         xyz[:, 2] = z
-        xyz[~((reach > 0) & np.isfinite(xyz).all(axis=1))] = np.nan
+        xyz[~((depth > 0) & np.isfinite(xyz).all(axis=1))] = np.nan
         return np.asarray(xyz)
 
 
@@ -65,7 +66,7 @@ FRAME_SPACE = FrameSpace()
 
 @lru_cache(maxsize=32)
 def between(given: CRS, wanted: CRS) -> Transformer:
-    """Coordinates of one CRS as those of another, x or longitude first. Made once: it takes longer than many points."""
+    """Transformer from one CRS to another, x or longitude first. It is kept, because building it takes long."""
     return Transformer.from_crs(given, wanted, always_xy=True)
 
 
@@ -117,10 +118,10 @@ class EarthSpace:
         return xyz
 
     def depth_at_height(self, centre: FloatArray, ray: FloatArray, z: FloatArray) -> FloatArray:
-        """How many times `ray` it is from `centre` to the first point at ellipsoidal height z, (n,).
+        """Distance from `centre` to the first point of a ray at ellipsoidal height z, in lengths of the ray, (n,).
 
-        centre : (3,) or (n, 3) m, ray : (n, 3), geocentric; z : (n,) m. NaN where a ray does not come to that height
-        before the horizon. From where it meets the ellipsoid that is larger by z all around, by Newton.
+        centre : (3,) or (n, 3) m, ray : (n, 3), geocentric; z : (n,) m. NaN where a ray does not reach that height
+        before the horizon. Newton's method starts where the ray meets an ellipsoid whose axes are longer by z.
         """
         a, b = self.axes_m
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -146,18 +147,18 @@ class EarthSpace:
         return np.column_stack([np.rad2deg(lon), np.rad2deg(lat), height])
 
     def pose(self, given: CRS, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A point of a map as a geocentric one, (3,) m, and the map's axes there, rows (3, 3); see `poses`."""
+        """Geocentric coordinates (3,) m of a point of a map, and the map's axes there, rows (3, 3); see `poses`."""
         centre, axes = self.poses(given, xyz[None])
         return centre[0], axes[0]
 
     def poses(self, given: CRS, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points of a map as geocentric ones, (n, 3) m, and the map's axes there, rows (n, 3, 3).
+        """Geocentric coordinates (n, 3) m of points of a map, and the map's axes there, rows (n, 3, 3).
 
         given : the map's CRS, projected, of which xyz (n, 3) are coordinates; the axes point to grid east, to grid
         north and up along the normal of the ellipsoid, so that they turn with the meridian convergence.
         """
         to_own = between(given.to_2d(), self.crs.to_2d())
-        # North is that of the map, which lies on the ellipsoid.
+        # Grid north is a direction on the ellipsoid, so it is computed at height 0.
         centre, north, south = (
             self.cartesian_from_ground(np.column_stack([*to_own.transform(xyz[:, 0], xyz[:, 1] + step), height]))
             for step, height in ((0.0, xyz[:, 2]), (NORTH_STEP_M, 0.0 * xyz[:, 2]), (-NORTH_STEP_M, 0.0 * xyz[:, 2]))
@@ -170,7 +171,7 @@ class EarthSpace:
         return centre, np.stack([np.cross(towards, up), towards, up], axis=1)
 
     def _geocentric(self, lon: FloatArray, lat: FloatArray, height: FloatArray) -> FloatArray:
-        """(n, 3) m of longitude and latitude (radians) and height, (n,) each."""
+        """Geocentric coordinates (n, 3) m of longitudes and latitudes (radians) and heights (m), (n,) each."""
         a, b = self.axes_m
         normal = a / np.sqrt(1.0 - (1.0 - (b / a) ** 2) * np.sin(lat) ** 2)
         across = (normal + height) * np.cos(lat)
@@ -193,7 +194,7 @@ class EarthSpace:
         return np.arctan2(xyz[:, 1], xyz[:, 0]), lat, height
 
 
-# Longitudes, latitudes and heights of WGS84 as the scene's frame: what has no map yet is converted by it.
+# The space of longitudes, latitudes and heights of WGS84: it converts cameras before the scene has a map.
 WGS84_EARTH = EarthSpace(WGS84)
 MAJOR_M, MINOR_M = WGS84_EARTH.axes_m
 

@@ -1,4 +1,4 @@
-"""Frame camera: one centre of projection, a flat image, an ideal lens or a real one, a Cartesian frame or the Earth."""
+"""Frame camera: one projection centre and a flat image, with or without lens distortion."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FrameModel:
     space: Space = FRAME_SPACE
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """See `SensorModel`; NaN behind the camera, and where its distortion folds."""
+        """See `SensorModel`; NaN behind the camera, and where its distortion is not one to one."""
         return self.image_from_ray(self._from_centre(xyz))
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
@@ -58,8 +58,7 @@ class FrameModel:
         return self._along(self.ray_from_image(xy), depth)
 
     def ray_from_image(self, xy: FloatArray) -> FloatArray:
-        """From the centre of projection to what pixels (n, 2) see at a depth of 1. -> (n, 3) m; NaN where they see
-        nothing."""
+        """Rays (n, 3) m from the projection centre to a depth of 1, of pixels (n, 2); NaN where a pixel has no ray."""
         at = (np.asarray(xy, float) - np.array(self.principal_point)) / [self.focal, self.focal * self.aspect]
         if self.skew:
             at[:, 0] -= self.skew / self.focal * at[:, 1]
@@ -68,7 +67,7 @@ class FrameModel:
         return np.column_stack([at, np.ones(len(at))]) @ self.rotation
 
     def image_from_ray(self, ray: FloatArray) -> FloatArray:
-        """Pixels that see directions from the centre of projection. ray : (n, 3), any length -> (n, 2) px."""
+        """Image positions (n, 2) px of rays (n, 3) from the projection centre, of any length; NaN behind the camera."""
         in_camera = np.asarray(ray, float) @ self.rotation.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = in_camera[:, :2] / in_camera[:, 2:]
@@ -85,7 +84,7 @@ class FrameModel:
         return np.asarray(self._from_centre(xyz) @ self.rotation[2])
 
     def moved(self, column: float, row: float) -> FrameModel:
-        """The camera whose image positions are `column` and `row` pixels larger."""
+        """The camera with its image positions increased by `column` and `row` pixels."""
         return replace(self, principal_point=(self.principal_point[0] + column, self.principal_point[1] + row))
 
     def corrected(self, offset: FloatArray, turn: FloatArray) -> FrameModel:
@@ -101,7 +100,7 @@ class FrameModel:
         return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
 
     def turned(self, rotation: FloatArray) -> FrameModel:
-        """The camera in a Cartesian frame that is turned. rotation : (3, 3), new frame from old."""
+        """The camera in a rotated Cartesian frame. rotation : (3, 3), new frame from old frame."""
         assert self.space == FRAME_SPACE, "the Earth is not turned"
         centre, rows = rotation @ np.array(self.centre), self.rotation @ rotation.T
         return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
@@ -117,7 +116,7 @@ class FrameModel:
         return replace(self, centre=as_row(centre), camera_from_ground=as_rows(self.rotation @ axes), space=earth)
 
     def _from_centre(self, xyz: FloatArray) -> FloatArray:
-        """Rays (n, 3) m to ground points (n, 3)."""
+        """Rays (n, 3) m from the projection centre to ground points (n, 3)."""
         return np.asarray(self.space.cartesian_from_ground(xyz) - np.array(self.centre))
 
     def _along(self, ray: FloatArray, depth: FloatArray) -> FloatArray:

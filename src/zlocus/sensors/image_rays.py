@@ -1,6 +1,7 @@
-"""Image space: the pixels of a reference image as the ground of sensor models, heights or depths along its rays.
+"""Image space: sensor models whose ground is the pixels of a reference image, with heights or depths along its rays.
 
-There x is the column, y minus the row, and z the hypothesis, in units that are about a pixel; higher hides lower.
+In image space x is the column, y is minus the row, and z is the hypothesis (a height or a disparity, in units of about
+a pixel). A larger hypothesis occludes a smaller one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from zlocus.sensors.frame import FrameModel
 
 
 class Rays(Protocol):
-    """The rays of a reference image, and what counts along them."""
+    """The rays of a reference image, and the hypotheses along them."""
 
     def ground(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """Ground points (n, 3) m that pixels (n, 2) see at hypotheses (n,)."""
@@ -26,18 +27,18 @@ class Rays(Protocol):
         ...
 
     def metres_per_unit(self, xy: FloatArray, z: FloatArray) -> FloatArray:
-        """What a unit of the hypothesis is worth at pixels (n, 2) and hypotheses (n,), (n,) m: of height, or of the way
-        along the ray."""
+        """Metres per unit of the hypothesis, (n,), at pixels (n, 2) and hypotheses (n,): of height, or along the
+        ray."""
         ...
 
     def to(self, sensor: SensorModel) -> SensorModel:
-        """Another view's sensor model over the reference image's pixels and hypotheses."""
+        """The sensor model of another view in image space."""
         ...
 
 
 @dataclass(frozen=True)
 class HeightRays:
-    """Heights above `datum` m in units of `unit` m, the reference image's ground pixel."""
+    """Hypotheses that are heights above `datum` (m) in units of `unit` (m), the ground pixel of the reference image."""
 
     sensor: SensorModel
     datum: float
@@ -62,7 +63,7 @@ class HeightRays:
 
 @dataclass(frozen=True)
 class HeightModel:
-    """A view over the pixels of a reference image and heights along its rays, as a `SensorModel`."""
+    """A view in the image space of heights, as a `SensorModel`."""
 
     rays: HeightRays
     sensor: SensorModel
@@ -84,16 +85,16 @@ class HeightModel:
 
 @dataclass(frozen=True)
 class DepthRays:
-    """Inverse depth along the optical axis of a frame camera, as disparity: `scale` (px m) over the depth (m).
+    """Hypotheses that are disparities: `scale` (px m) over the depth (m) along the optical axis of a frame camera.
 
-    Disparities are linear in it, and what is nearer is higher.
+    Image positions are linear in the disparity, and nearer points have a larger one.
     """
 
     sensor: FrameModel
     scale: float
 
     def ground(self, xy: FloatArray, z: FloatArray) -> FloatArray:
-        """See `Rays`; NaN at no disparity, which is infinitely far, and below."""
+        """See `Rays`; NaN at disparities of 0, which are infinitely far, and below."""
         z = np.broadcast_to(np.asarray(z, float), (len(xy),))
         depth = np.divide(self.scale, z, out=np.full(len(z), np.nan), where=z > 0)
         return self.sensor.ground_at_depth(xy, depth)
@@ -118,9 +119,9 @@ class DepthRays:
 
 @dataclass(frozen=True)
 class DepthModel:
-    """A frame camera over the pixels and disparities of a reference one, as a `SensorModel`.
+    """A frame camera in the image space of disparities, as a `SensorModel`.
 
-    At one disparity the two images, freed of distortion, are related by a homography, which holds beyond infinity too.
+    At one disparity the two images, without distortion, are related by a homography, also beyond infinity.
     """
 
     rays: DepthRays
@@ -149,13 +150,13 @@ class DepthModel:
 
     @property
     def _base(self) -> FloatArray:
-        """(3,) m, from the other camera's centre to the reference's."""
+        """Vector (3,) m from this camera's centre to that of the reference image."""
         return np.asarray(np.array(self.rays.sensor.centre) - np.array(self.sensor.centre))
 
 
 @dataclass(frozen=True)
 class PixelModel:
-    """The reference image over its own pixels, as a `SensorModel`."""
+    """The reference image itself in image space, as a `SensorModel`."""
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`."""

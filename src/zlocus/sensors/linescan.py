@@ -1,4 +1,4 @@
-"""Line scanner: one line of a focal plane, exposed again and again along a trajectory. Rows are exposures."""
+"""Line scanner: one line of a focal plane, exposed repeatedly along a trajectory. Each row is an exposure."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.earth_frame import Space
 from zlocus.sensors.trajectory import Drift, Trajectory
 
-# Pixels around the image where the model still holds: tiles and blocks reach that far beyond it.
+# Width of the frame around the image in which points are still mapped, because tiles and blocks extend beyond it.
 MARGIN_PX = 4096.0
-# Points handled at once, so that what is computed of them stays in the processor's cache.
+# Points that are projected at once, so that their arrays stay in the processor's cache.
 CHUNK = 8192
 MAX_STEPS = 8
-# Newton steps are quadratic, so the one after a step of this size is below 1e-9 rows.
+# Newton steps converge quadratically: the step after one of this size is below 1e-9 rows.
 TOLERANCE_ROWS = 1e-7
 SCAN_KNOTS = 129
-# Exposures that are asked how high they were.
+# Exposures whose heights are compared for the lowest projection centre.
 STATIONS = 65
 SCAN_STEPS = 60
 # Heights at which the first guess is fitted, as parts of the depth at which pixels are square.
 GUESS_DEPTHS = (0.8, 1.0)
 GUESS_COLUMNS = 5
-# A flight that turns by more than this (cosine of 20 degrees) can see a place with its line's two sides.
+# A flight that turns by more than this (cosine of 20 degrees) can see one place in two exposures.
 TURNS_COS = 0.94
 
 
@@ -42,19 +42,19 @@ class FocalLine:
     focal_mm: float
 
     def along(self) -> FloatArray:
-        """(2, 2) that turns image coordinates so that the line runs along the first axis."""
+        """Rotation (2, 2) of image coordinates after which the line runs along the first axis."""
         x, y = self.xy_mm[-1] - self.xy_mm[0]
         return np.asarray(np.array([[x, y], [-y, x]]) / np.hypot(x, y))
 
     def goes_on(self) -> bool:
-        """Whether each column lies further along the line than the one before: two columns do not see the same."""
+        """Whether each column lies further along the line than the one before, so that no two columns see the same."""
         is_open = bool((self.xy_mm[0] != self.xy_mm[-1]).any())
         return is_open and bool((np.diff(self.xy_mm @ self.along()[0]) > 0).all())
 
 
 @dataclass(frozen=True, eq=False)
 class LineTimes:
-    """When the middle of each row was exposed: straight between known rows, and beyond them.
+    """Exposure times of the rows: linear between known rows, and beyond them.
 
     rows : (k,) increasing, the first and the last row of the image among them; times : (k,) s, all increasing or all
     decreasing (where row 0 is the last one flown).
@@ -75,11 +75,11 @@ class LineTimes:
         return float((self.times[-1] - self.times[0]) / (self.rows[-1] - self.rows[0]))
 
     def time(self, row: FloatArray) -> FloatArray:
-        """Instants (n,) s of rows (n,)."""
+        """Exposure times (n,) s of rows (n,)."""
         return _straight(row, self.rows, self.times)
 
     def row(self, time: FloatArray) -> FloatArray:
-        """Rows (n,) of instants (n,) s."""
+        """Rows (n,) exposed at times (n,) s."""
         if self.times[-1] > self.times[0]:
             return _straight(time, self.times, self.rows)
         return _straight(time, self.times[::-1], self.rows[::-1])
@@ -105,7 +105,7 @@ class LineScanModel:
         object.__setattr__(self, "_track", _Track.of(self))
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
-        """See `SensorModel`. The instant is searched at which the point crosses the line."""
+        """See `SensorModel`. The time at which the point crosses the line is searched by Newton's method."""
         ground = self.space.cartesian_from_ground(xyz)
         xy = np.empty((len(ground), 2))
         for first in range(0, len(ground), CHUNK):
@@ -145,9 +145,9 @@ class LineScanModel:
 class RectifiedModel:
     """A line scanner's image resampled to a plane (ADS40 level 1), as a `SensorModel`.
 
-    A pixel stands for a point of the plane, that for a place in the raw image, and that for a ray. raw : the raw image
-    in the scene's frame; over_plane : the same in the plane's; height : of the plane, m; plane_from_image : from pixels
-    (column, row), (0, 0) the centre of the first one, to x and y of the plane.
+    A pixel belongs to a point of the plane, that to a position in the raw image, and that to a ray. raw : the raw image
+    in the scene's frame; over_plane : the raw image in the frame of the plane; height : of the plane, m;
+    plane_from_image : from pixels (column, row), with (0, 0) the centre of the first one, to x and y of the plane.
     """
 
     raw: LineScanModel
@@ -179,12 +179,13 @@ class RectifiedModel:
         return self.raw.flight_time()
 
     def corrected(self, drift: Drift) -> RectifiedModel:
-        """The model with a drift of its trajectory added: the pixels stay where the flawed one put them."""
+        """The model with a drift of its trajectory added. The pixels were resampled with the old trajectory, which
+        stays."""
         return replace(self, raw=self.raw.corrected(drift))
 
 
 def _mapped(transform: Affine, xy: FloatArray) -> FloatArray:
-    """Points (n, 2 or more) through an affine map: (n, 2)."""
+    """Points (n, 2) that an affine map makes of points (n, 2 or more)."""
     x, y = xy[:, 0], xy[:, 1]
     return np.column_stack(
         [transform.a * x + transform.b * y + transform.c, transform.d * x + transform.e * y + transform.f]
@@ -192,7 +193,7 @@ def _mapped(transform: Affine, xy: FloatArray) -> FloatArray:
 
 
 def _straight(at: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
-    """Linear interpolation of values at increasing knots, and extrapolation by the end pieces: (n,)."""
+    """Values (n,) interpolated linearly between increasing knots, and extrapolated by the first and last piece."""
     inside = np.interp(at, knots, values)
     below, above = np.minimum(at - knots[0], 0.0), np.maximum(at - knots[-1], 0.0)
     first = (values[1] - values[0]) / (knots[1] - knots[0])
@@ -202,9 +203,10 @@ def _straight(at: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArr
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """What a model computes once: its line turned along the first axis, and where along the flight a point is seen.
+    """Quantities that a model computes once: its line rotated to the first axis, and a first guess of exposure times.
 
-    In the line's axes a point lies at u along the line and v across it (mm in the focal plane), at a depth in front.
+    In the axes of the line a point lies at u along the line and v across it (mm in the focal plane), at a depth in
+    front of the camera.
     """
 
     lines: LineTimes
@@ -220,7 +222,7 @@ class _Track:
 
     @classmethod
     def of(cls, model: LineScanModel) -> _Track:
-        """The track of a model."""
+        """The quantities of a model."""
         turn = np.zeros((3, 3))
         turn[:2, :2], turn[2, 2] = model.line.along(), -1.0
         path = model.trajectory
@@ -238,7 +240,7 @@ class _Track:
         return track._with_guess()
 
     def _with_guess(self) -> _Track:
-        """The linear map from points to instants that fits those seen from margin to margin, and what it leaves."""
+        """With the linear map from points to exposure times that fits the points seen by the image and its margin."""
         pose, rate = self.trajectory.moving(self.instants)
         pitch = np.hypot(*((self.u[-1] - self.u[0], self.v[-1] - self.v[0]))) / (self.columns[-1] - self.columns[0])
         speed = np.median(np.linalg.norm(rate[9:], axis=0)) * abs(self.lines.interval)
@@ -261,7 +263,7 @@ class _Track:
         inside = (xy[:, 0] >= self.columns[0]) & (xy[:, 0] <= self.columns[-1]) & self._in_time(xy[:, 1])
         u, v = np.interp(xy[:, 0], self.columns, self.u), np.interp(xy[:, 0], self.columns, self.v)
         a, b, c = pose[:9].reshape(3, 3, -1)
-        # The inverse of a matrix by its rows' products: interpolated, it is not quite a rotation.
+        # The inverse of the matrix, by cross products of its rows: an interpolated matrix is not exactly a rotation.
         ray = u * np.cross(b, c, axis=0) + v * np.cross(c, a, axis=0) + self.focal * np.cross(a, b, axis=0)
         # The line's axes are left-handed, so the products point backwards.
         ray = np.sign((a * np.cross(b, c, axis=0)).sum(axis=0)) * ray
@@ -293,11 +295,13 @@ class _Track:
         return self._pixels(time, u)
 
     def _crossing(self, ground: FloatArray, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Where points (3, n) lie along the line and how far ahead of it (mm) at instants (n,), and how fast both
-        change (mm/s); NaN where a point is not in front of the camera."""
+        """Positions of points (3, n) along the line and ahead of it (mm) at times (n,), and their rates (mm/s).
+
+        NaN where a point is not in front of the camera.
+        """
         pose, rate = self.trajectory.moving(time)
         x, y, z = ground - pose[9:]
-        # Rotated first: the turn of the camera and its motion add up in its own axes.
+        # Points are rotated first, because the rotation and the motion of the camera add up in its own axes.
         right, ahead, depth = (pose[i] * x + pose[i + 1] * y + pose[i + 2] * z for i in (0, 3, 6))
         dx, dy, dz = rate[9:]
         right_rate, ahead_rate, depth_rate = (
@@ -312,15 +316,17 @@ class _Track:
             return u, off, right_rate * scale - u * shrink, ahead_rate * scale - v * shrink
 
     def _bounded(self, step: FloatArray, time: FloatArray) -> FloatArray:
-        """Steps (n,) s of at most a quarter of the flight, that do not leave it by more than its length."""
+        """Steps (n,) s limited to a quarter of the flight, and to times at most its length before or after it."""
         span = self.instants[-1] - self.instants[0]
         step = np.clip(step, -span / 4, span / 4)
         return np.asarray(np.clip(time + step, self.instants[0] - span, self.instants[-1] + span) - time)
 
     def _recover(self, ground: FloatArray, time: FloatArray, u: FloatArray, lost: NDArray[np.intp]) -> None:
-        """Search the whole flight for points (indices) whose steps did not arrive; fills in time and u, NaN for none.
+        """Search the whole flight for points whose steps did not converge; fills in time and u, NaN where none is
+        found.
 
-        Where the flight turns, points found outside the image too: another exposure may see them inside.
+        lost : indices of the points. Where the flight turns, points found outside of the image are searched too,
+        because another exposure may see them inside.
         """
         u[lost] = np.nan
         if self.turns:
@@ -345,8 +351,10 @@ class _Track:
         u[lost[~found]] = np.nan
 
     def _between(self, points: FloatArray, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The instants (n,) between two at which points (3, n) cross the line, and where (n,) mm: Newton steps inside
-        the bracket, halves of it outside."""
+        """Times (n,) between low and high at which points (3, n) cross the line, and the positions (n,) mm along it.
+
+        Newton steps that leave the bracket are replaced by its middle.
+        """
         rising = self._crossing(points, high)[1] > 0
         time = (low + high) / 2
         for _ in range(SCAN_STEPS):
@@ -359,14 +367,14 @@ class _Track:
         return time, self._crossing(points, time)[0]
 
     def _pixels(self, time: FloatArray, u: FloatArray) -> FloatArray:
-        """Columns and rows (n, 2) of instants and places along the line, (n,) each; NaN beyond the margin."""
+        """Image positions (n, 2) of times and positions along the line, (n,) each; NaN beyond the margin."""
         row = self.lines.row(time)
         xy = np.column_stack([np.interp(u, self.u, self.columns), row])
         xy[~((u >= self.u[0]) & (u <= self.u[-1]) & self._in_time(row))] = np.nan
         return xy
 
     def _outside(self, column: FloatArray, row: FloatArray) -> FloatArray:
-        """How far (n,) px image positions lie outside the image's pixels; 0 inside."""
+        """Distances (n,) px of image positions from the image's pixels; 0 inside."""
         over = [
             self.columns[1] - column,
             column - self.columns[-2],

@@ -1,4 +1,4 @@
-"""Rational polynomial camera (RPC00B): ratios of cubics from longitude, latitude, height to image row, column."""
+"""Rational polynomial camera (RPC00B): ratios of cubic polynomials from longitude, latitude and height to the image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from zlocus.core.sensor_model import FloatArray
 GEOGRAPHIC = CRS.from_epsg(4979)
 MAX_ITERATIONS = 30
 TOLERANCE_PX = 1e-7
-MAX_STEP = 0.5  # of the RPC's box, per Newton iteration
+# Largest Newton step, in half sizes of the RPC's box.
+MAX_STEP = 0.5
 # The cubic terms (see `rpc_terms`) as products of a quadratic and a linear one.
 CUBICS = (
     (10, 6, 1), (11, 7, 1), (12, 8, 1), (13, 9, 1), (14, 7, 2), (15, 8, 2), (16, 9, 2), (17, 7, 3), (18, 8, 3),
@@ -52,12 +53,14 @@ class RpcCoefficients:
 
     @cached_property
     def matrix(self) -> FloatArray:
-        """(4, 20) float64: line numerator and denominator, sample numerator and denominator, by the terms."""
+        """Coefficients (4, 20) float64 of the terms: line numerator, line denominator, sample numerator and
+        denominator."""
         return np.array([self.line_num, self.line_den, self.samp_num, self.samp_den])
 
     @cached_property
     def slopes(self) -> FloatArray:
-        """(8, 10) float64: derivatives of the same four by longitude, then by latitude, by the quadratic terms."""
+        """Coefficients (8, 10) float64 of the quadratic terms in the derivatives of the four polynomials, by longitude,
+        then by latitude."""
         slopes = np.zeros((2, 4, 10))
         for axis, rules in enumerate((BY_LON, BY_LAT)):
             for term, factor, quadratic in rules:
@@ -65,7 +68,7 @@ class RpcCoefficients:
         return slopes.reshape(8, 10)
 
     def moved(self, column: float, row: float) -> RpcCoefficients:
-        """The RPC whose image positions are `column` and `row` pixels larger."""
+        """The RPC with its image positions increased by `column` and `row` pixels."""
         return replace(self, samp_off=self.samp_off + column, line_off=self.line_off + row)
 
 
@@ -116,7 +119,7 @@ class RpcModel:
         return self.rpc.height_off - self.rpc.height_scale, self.rpc.height_off + self.rpc.height_scale
 
     def image_from_geographic(self, lon: FloatArray, lat: FloatArray, height: FloatArray) -> FloatArray:
-        """Longitude, latitude (degrees, WGS84) and ellipsoidal height (m), each (n,) -> xy (n, 2) px.
+        """Image positions (n, 2) px of longitudes, latitudes (degrees, WGS84) and ellipsoidal heights (m), (n,) each.
 
         NaN beyond a pole of the rational function (far outside the RPC's box), where its value means nothing.
         """
@@ -129,10 +132,10 @@ class RpcModel:
         return xy
 
     def geographic_from_image(self, xy: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Longitude and latitude (degrees) where the rays of xy (n, 2) px meet height z (n,) m.
+        """Longitudes and latitudes (degrees) where the rays of xy (n, 2) px meet heights z (n,) m.
 
-        Newton with the exact derivative from the centre of the RPC's box, damped by at most half the box a step so that
-        crops far from the centre of a large box converge too. NaN where it does not reach `TOLERANCE_PX`.
+        Newton's method with exact derivatives starts at the centre of the RPC's box. A step is limited to half the box,
+        so that crops far from the centre of a large box converge too. NaN where it does not reach `TOLERANCE_PX`.
         """
         rpc = self.rpc
         scale = np.array([[rpc.samp_scale], [rpc.line_scale]])
@@ -162,7 +165,7 @@ class RpcModel:
     def _normalised(
         self, lon: FloatArray, lat: FloatArray, height: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Degrees and metres -> the RPC's normalised coordinates; longitudes across the date line are neighbours."""
+        """Normalised coordinates of the RPC of degrees and metres; longitudes across the date line are neighbours."""
         rpc = self.rpc
         # Points pyproj could not project are infinite; they become NaN.
         with np.errstate(invalid="ignore", over="ignore"):
@@ -174,7 +177,7 @@ class RpcModel:
             )
 
     def _ratios(self, values: FloatArray) -> FloatArray:
-        """The four polynomials (4, n), as `RpcCoefficients.matrix` has them -> normalised (sample, line) (2, n)."""
+        """Normalised (sample, line) (2, n) of the four polynomials (4, n), in the order of `RpcCoefficients.matrix`."""
         line_num, line_den, samp_num, samp_den = values
         with np.errstate(all="ignore"):
             ratios = np.stack([samp_num / samp_den, line_num / line_den])
@@ -184,7 +187,7 @@ class RpcModel:
         return ratios
 
     def _newton_step(self, terms: FloatArray, values: FloatArray, residual: FloatArray) -> FloatArray:
-        """Normalised (longitude, latitude) step (2, n) that removes residual (2, n), each at most `MAX_STEP`.
+        """Normalised step (longitude, latitude) (2, n) that removes a residual (2, n), limited to `MAX_STEP`.
 
         terms : (10, n), the quadratic ones; values : (4, n), the polynomials there.
         """

@@ -1,4 +1,4 @@
-"""Rational polynomial coefficients fitted to any sensor model: least squares on a grid of ground points."""
+"""Rational polynomial coefficients fitted to any sensor model by least squares on a grid of ground points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class RpcFit:
-    """Coefficients and how well they stand for the camera.
+    """Coefficients and their largest difference from the camera.
 
     max_error_px : largest distance from the exact camera, over points between those of the fit; infinite where the RPC
     fails.
@@ -30,12 +30,12 @@ class RpcFit:
 
 
 def fit_rpc(sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tuple[float, float]) -> RpcFit:
-    """The RPC that stands for `sensor` over an image of `shape` (rows, columns) and a range of heights in m.
+    """Fit an RPC to `sensor` over an image of `shape` (rows, columns) and a range of heights (m).
 
-    Each axis is solved alone, linear in its 39 coefficients. The denominators of near-parallel and airborne rays stay
-    near 1, so weighting by them changes nothing and is left out. The ridge keeps the terms that the points cannot tell
-    apart near zero. Source: Tao & Hu (2001), "A comprehensive study of the rational function model for photogrammetric
-    processing", the direct least-squares solution.
+    Each axis is solved separately, linear in its 39 coefficients. The denominators of near-parallel and airborne rays
+    stay near 1, so weighting by them changes nothing and is left out. The ridge keeps terms that the points cannot
+    distinguish near zero. Source: Tao & Hu (2001), "A comprehensive study of the rational function model for
+    photogrammetric processing", the direct least-squares solution.
 
     Raises
     ------
@@ -70,7 +70,8 @@ def fit_rpc(sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tupl
 def _correspondences(
     sensor: SensorModel, shape: tuple[int, int], crs: CRS, z_range: tuple[float, float], n_points: int, n_heights: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Image positions (n, 2) px over the whole image, and longitude, latitude, height (n, 3) that they see."""
+    """Image positions (n, 2) px over the whole image, and the longitudes, latitudes and heights (n, 3) that they
+    see."""
     cols = np.linspace(-0.5, shape[1] - 0.5, n_points)
     rows = np.linspace(-0.5, shape[0] - 0.5, n_points)
     z, row, col = (a.ravel() for a in np.meshgrid(np.linspace(*z_range, n_heights), rows, cols, indexing="ij"))

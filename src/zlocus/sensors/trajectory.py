@@ -1,4 +1,4 @@
-"""Where a line scanner was and how it was turned at any instant, and slow errors of that."""
+"""Trajectory of a line scanner: its position and rotation at any time, and slow errors (drift) of these."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from zlocus.core.sensor_model import FloatArray
 
+# Samples that a cubic spline needs.
 MIN_SAMPLES = 4
-# Beyond an end, the mean motion of its last `MEAN_SECONDS` goes on; the turning eases off within `EASE_SECONDS`.
+# Beyond an end, the mean motion of its last `MEAN_SECONDS` continues, and the rotation slows down within
+# `EASE_SECONDS`.
 MEAN_SECONDS = 0.25
 EASE_SECONDS = 6.0
 EASE_SAMPLES = 60
@@ -18,12 +20,12 @@ EASE_SAMPLES = 60
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Projection centres and rotations at instants, cubic splines between them.
+    """Projection centres and rotations at given times, with cubic splines between them.
 
     times : (n,) s, increasing, four or more; centres : (n, 3) m in Cartesian axes; rotations : (n, 3, 3), from those
     axes to the camera's (x, y in its image plane, z backwards). The elements of the matrices are interpolated; they
-    leave the rotations by the fourth power of the turn between two samples, over 400. Beyond the ends the flight goes
-    on as it was, with turns that die down smoothly: a sudden end would bend the rays from one row to the next.
+    differ from rotations by the fourth power of the rotation between two samples, over 400. Beyond the ends the flight
+    continues, and its rotation slows down smoothly: a sudden stop would bend the rays from one row to the next.
     """
 
     times: FloatArray
@@ -38,8 +40,8 @@ class Trajectory:
         from scipy.interpolate import CubicSpline
 
         assert len(self.times) >= MIN_SAMPLES, "a cubic spline needs four samples"
-        before, first_velocity = self._run_on(0, -1)
-        after, last_velocity = self._run_on(-1, 1)
+        before, first_velocity = self._continued(0, -1)
+        after, last_velocity = self._continued(-1, 1)
         own = np.column_stack([self.times, self.rotations.reshape(-1, 9), self.centres])
         samples = np.concatenate([before[::-1], own, after])
         times, values = samples[:, 0], samples[:, 1:]
@@ -52,18 +54,21 @@ class Trajectory:
         object.__setattr__(self, "_pieces", np.ascontiguousarray(pieces.reshape(48, -1)))
 
     def pose(self, time: FloatArray) -> FloatArray:
-        """Rotations, row by row, then centres at instants (n,) s: (12, n)."""
+        """Rotations (row by row) and centres at times (n,) s: (12, n)."""
         (a, b, c, d), since = self._piece(time)
         return np.asarray(((d * since + c) * since + b) * since + a)
 
     def moving(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `pose`, and its derivative by time: (12, n) each."""
+        """The same as `pose`, and its derivative by time: (12, n) each."""
         (a, b, c, d), since = self._piece(time)
         return ((d * since + c) * since + b) * since + a, (3.0 * d * since + 2.0 * c) * since + b
 
-    def _run_on(self, end: int, way: int) -> tuple[FloatArray, FloatArray]:
-        """Samples (k, 13), time, rotation and centre, beyond the first (0, -1) or last (-1, 1) of the trajectory,
-        outwards, and the velocity (3,) there."""
+    def _continued(self, end: int, way: int) -> tuple[FloatArray, FloatArray]:
+        """Samples (k, 13) of time, rotation and centre beyond an end of the trajectory, outwards, and the velocity
+        (3,).
+
+        end, way : (0, -1) for the first end, (-1, 1) for the last.
+        """
         from scipy.spatial.transform import Rotation
 
         away = np.abs(self.times - self.times[end])
@@ -80,18 +85,18 @@ class Trajectory:
         return np.column_stack([self.times[end] + since, rotations.reshape(-1, 9), centres]), velocity
 
     def _piece(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients (4, 12, n) of the pieces that hold instants (n,), and the time (n,) since their starts."""
+        """Coefficients (4, 12, n) of the spline pieces at times (n,), and the time (n,) since the pieces start."""
         piece: NDArray[np.intp] = np.searchsorted(self._knots, time, side="right")
         return np.take(self._pieces, piece, axis=1).reshape(4, 12, -1), time - self._starts[piece]
 
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """A slow error of a trajectory, to be estimated: the correction is added.
+    """A slow error of a trajectory, to be estimated; it is added to the trajectory.
 
     knots : (k,) s, increasing; values : (k, 6), what to add there: offsets along the camera's x, y, z axes (m) and
-    turns about them (rad). Between the knots it is the polynomial of least degree for up to three knots, a cubic spline
-    from four on; beyond them it stays.
+    turns about them (rad). Between the knots it is the polynomial of lowest degree for up to three knots, a cubic
+    spline from four on; beyond them it stays.
     """
 
     knots: FloatArray
@@ -99,12 +104,12 @@ class Drift:
 
     @classmethod
     def zero(cls, start: float, end: float, n_knots: int) -> Drift:
-        """Nothing to correct, with evenly spaced knots between two instants (s)."""
+        """A drift of zero, with evenly spaced knots between two times (s)."""
         return cls(np.linspace(start, end, n_knots), np.zeros((n_knots, 6)))
 
     @property
     def parameters(self) -> FloatArray:
-        """(6 k,) the values, knot by knot."""
+        """The values (6 k,), knot by knot."""
         return self.values.ravel()
 
     def with_parameters(self, parameters: FloatArray) -> Drift:
@@ -112,7 +117,7 @@ class Drift:
         return replace(self, values=np.asarray(parameters, float).reshape(-1, 6))
 
     def at(self, time: FloatArray) -> FloatArray:
-        """Offsets (m) and turns (rad) at instants (n,) s: (n, 6)."""
+        """Offsets (m) and turns (rad) at times (n,) s: (n, 6)."""
         if len(self.knots) == 1:
             return np.repeat(self.values, len(time), axis=0)
         from scipy.interpolate import make_interp_spline
