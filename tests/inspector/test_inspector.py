@@ -94,22 +94,24 @@ def scene(out):
 def report_of(scene, folder, row, col, config: RunConfig, reference=None, views=None) -> PointReport:
     """What the library says of a cell, without the inspector."""
     xy = folder.centre_of(row, col)
-    settled = scene.matched.settled
-    place = place_of_cell(xy, folder.cell(row, col)["dsm"], scene.matched)
+    match_scene = scene.run.match_scene
+    place = place_of_cell(xy, folder.cell(row, col)["dsm"], scene.run)
     if views is not None:
-        kept = [i for i, view in enumerate(settled.views) if view.name in views]
-        settled = replace(
-            settled, views=tuple(settled.views[i] for i in kept), grey_scales=tuple(settled.grey_scales[i] for i in kept)
+        kept = [i for i, view in enumerate(match_scene.views) if view.name in views]
+        match_scene = replace(
+            match_scene,
+            views=tuple(match_scene.views[i] for i in kept),
+            grey_scales=tuple(match_scene.grey_scales[i] for i in kept),
         )
-    looked = curves_at("the cell", reference, settled, place, config, SHOWN_WITHIN_CELLS)
-    return PointReport.of("the cell", looked, settled, scene.matched.scene.crs)
+    looked = curves_at("the cell", reference, match_scene, place, config, SHOWN_WITHIN_CELLS)
+    return PointReport.of("the cell", looked, match_scene, scene.run.scene.crs)
 
 
 def same_record(found: dict, report: PointReport, config: RunConfig) -> None:
     expected = json.loads(json.dumps(point_record(report, config.selection)))
     assert {name: found[name] for name in expected} == expected
-    np.testing.assert_allclose(np.array(found["ncc"], float), report.curves.single.values, atol=ROUNDED_NCC)
-    np.testing.assert_allclose(np.array(found["sncc"], float), report.curves.mean.values, atol=ROUNDED_NCC)
+    np.testing.assert_allclose(np.array(found["ncc"], float), report.curves.single_curves.values, atol=ROUNDED_NCC)
+    np.testing.assert_allclose(np.array(found["sncc"], float), report.curves.mean_curves.values, atol=ROUNDED_NCC)
     np.testing.assert_allclose(found["heights_m"], report.heights_m, atol=ROUNDED_M)
 
 
@@ -162,7 +164,7 @@ def test_windows_and_lines_are_those_of_the_images(page, out, scene):
     xy = inspection.folder.centre_of(row, col)
     found = client.get("api/cell", params={"x": xy[0], "y": xy[1]}).json()["match"]
     report = report_of(scene, inspection.folder, row, col, scene.config)
-    views = {view.name: view for view in scene.matched.settled.views}
+    views = {view.name: view for view in scene.run.match_scene.views}
     for image in found["images"]:
         xyz = np.column_stack([np.broadcast_to(report.middle, (len(report.heights_m), 2)), report.heights_m])
         exact = views[image["image"]].sensor.image_from_ground(xyz)
@@ -409,7 +411,7 @@ def test_what_is_no_surface_is_refused_with_a_sentence(out, tmp_path):
         restored(copy, surface_folder(copy).run)
     record = json.loads((copy / "run.json").read_text())
     record["config"]["request"]["inputs"] = 7
-    with pytest.raises(InputError, match="does not say what was asked for"):
+    with pytest.raises(InputError, match="does not hold the request of the run"):
         request_of(copy, record)
     (copy / "views.tif").unlink()
     with pytest.raises(InputError, match=r"views\.tif"):

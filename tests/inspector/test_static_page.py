@@ -93,7 +93,7 @@ def link_of(page) -> str:
     return page.evaluate('async () => (await import(new URL("static/js/state.js", document.baseURI))).link()')
 
 
-def settled(page) -> None:
+def match_scene(page) -> None:
     """Wait for the curves of the cell that was asked for."""
     page.wait_for_selector('#match:not([hidden])[aria-busy="false"]')
 
@@ -118,21 +118,21 @@ def click_cell(page, folder, row, col) -> None:
     box = page.locator("#map").bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.wait_for_selector(f"text=Cell at row {row}, column {col}")
-    settled(page)
+    match_scene(page)
 
 
 def report_of(out, folder, row, col, without=(), window=None) -> PointReport:
     """What the library says of the cell."""
     scene = restored(out, folder.run)
-    config, matching = scene.config, scene.matched.settled
+    config, matching = scene.config, scene.run.match_scene
     if window is not None:
         config = replace(config, cost=replace(config.cost, large_window=window))
     kept = [i for i, view in enumerate(matching.views) if view.name not in without]
     views, grey = (tuple(each[i] for i in kept) for each in (matching.views, matching.grey))
     matching = replace(matching, views=views, grey=grey)
-    place = place_of_cell(folder.centre_of(row, col), folder.cell(row, col)["dsm"], scene.matched)
+    place = place_of_cell(folder.centre_of(row, col), folder.cell(row, col)["dsm"], scene.run)
     looked = curves_at("the cell", None, matching, place, config, SHOWN_WITHIN_CELLS)
-    return PointReport.of("the cell", looked, matching, scene.matched.scene.crs)
+    return PointReport.of("the cell", looked, matching, scene.run.scene.crs)
 
 
 def number(text: str) -> float:
@@ -230,12 +230,12 @@ def test_an_image_can_be_switched_off_and_on(page, inspected, out):
     off = report_of(out, folder, row, col).search[0]
     page.get_by_label(f"Use {off}").uncheck()
     page.wait_for_selector(f"#images tr[data-image={off}] >> text=switched off")
-    settled(page)
+    match_scene(page)
     assert page.locator("#changed").is_visible()
     agrees(shown_table(page), report_of(out, folder, row, col, without=(off,)))
     page.locator("#reset").click()
     page.wait_for_selector("#changed", state="hidden")
-    settled(page)
+    match_scene(page)
     assert shown_table(page) == as_run
 
 
@@ -245,7 +245,7 @@ def test_window_and_thresholds_change_the_curves(page, inspected, out):
     page.locator("#what-if summary").first.click()
     page.locator("#options select[name=window]").select_option("9")
     page.wait_for_selector("#changed", state="visible")
-    settled(page)
+    match_scene(page)
     agrees(shown_table(page), report_of(out, folder, row, col, window=9))
     page.locator("#options input[name=rho1_high]").fill("7")
     page.locator("#options input[name=rho1_high]").dispatch_event("change")
@@ -273,10 +273,10 @@ def test_a_link_reopens_the_view(page, browser, inspected, out):
     page.locator("#height").fill("55")
     page.get_by_label("Use aft").uncheck()
     page.wait_for_selector("#changed", state="visible")
-    settled(page)
+    match_scene(page)
     link = link_of(page)
     other, faults = page_at(browser, link, DESK)
-    settled(other)
+    match_scene(other)
     for what in ("#cell-title", "#height-value", "#match-stop"):
         assert other.locator(what).inner_text() == page.locator(what).inner_text()
     assert other.locator("#layer-sigma").is_checked()
@@ -312,12 +312,12 @@ def test_it_is_used_from_the_keyboard(page, inspected):
     assert page.locator("#crosshair").is_visible()
     page.keyboard.press("Enter")
     page.wait_for_selector("#cell-content:not([hidden])")
-    settled(page)
+    match_scene(page)
     before = page.locator("#cell-title").inner_text()
     page.keyboard.press("Shift+ArrowDown")
     row, col = (int(n) for n in re.findall(r"\d+", before))
     page.wait_for_selector(f"text=Cell at row {row + 1}, column {col}")
-    settled(page)
+    match_scene(page)
     height = page.locator("#height-value").inner_text()
     page.keyboard.press("]")
     assert page.locator("#height-value").inner_text() != height
@@ -375,7 +375,7 @@ def test_the_surface_is_shown_in_three_dimensions(page, inspected, tmp_path):
 def test_it_fits_laptops_and_telephones_by_day_and_night(browser, inspected, out, size, scheme):
     x, y = inspected[0].folder.centre_of(*a_cell(out))
     page, faults = page_at(browser, f"{inspected[1]}#cell={x},{y}", size, color_scheme=scheme)
-    settled(page)
+    match_scene(page)
     assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (int(re.findall(r"\d+", paper)[0]) < 60) == (scheme == "dark")
@@ -418,7 +418,7 @@ def test_the_page_is_used_while_the_scene_opens(browser, out, monkeypatch):
         assert page.locator("#cell-height").inner_text() != "none"
         assert "The images are being opened" in page.locator("#notice").inner_text()
         may_open.set()
-        settled(page)
+        match_scene(page)
         assert page.locator("#cell-error").is_hidden()
         assert page.locator("#tab-cell").get_attribute("aria-selected") == "true"
         context.close()
@@ -433,7 +433,7 @@ def test_nothing_old_stays_beside_an_error(page, inspected, out):
     page.wait_for_selector("text=Two images are needed at least")
     assert page.locator("#match").is_hidden()
     page.locator("#reset").click()
-    settled(page)
+    match_scene(page)
     assert page.locator("#cell-error").is_hidden()
 
 
@@ -461,7 +461,7 @@ def test_names_that_are_code_do_not_run(images, browser, tmp_path):
         page.on("dialog", lambda dialog: asked.append(dialog.message))
         page.on("console", lambda message: asked.append(message.text))
         page.goto(f"{address}#cell={x},{y}")
-        settled(page)
+        match_scene(page)
         page.locator("#others summary").click()
         page.wait_for_selector("#other-images tr")
         assert bad in page.locator("#other-images").inner_text()

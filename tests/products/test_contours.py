@@ -106,7 +106,7 @@ def test_short_rings_are_left_out(tmp_path):
     # Perimeters at 1 m of 4 * 2 ** 0.5 * (1 - 1 / top) cells: 2.83, 4.24, 5.09 and 5.60.
     z = pyramids([2.0, 4.0, 10.0, 100.0])
     for least, n in ((0, 4), (2.8, 4), (2.9, 3), (4.3, 2), (5.05, 2), (5.1, 1), (5.7, 0)):
-        _, _, elevation = drawn(tmp_path, z, 1.0, contour_least_cells=least)
+        _, _, elevation = drawn(tmp_path, z, 1.0, min_contour_cells=least)
         assert np.sum(np.isclose(elevation, 1.0)) == n, least
     # By default none of these is drawn, nor a ring about five cells in a row, but one about six.
     for end, lengths in ((7, []), (8, [2 * 5 + 2 * 2**0.5])):

@@ -145,7 +145,7 @@ def why_not_shown(what_if: WhatIf) -> str:
 
 
 def image_records(place_curves: PlaceCurves, loci_of_images: list[Locus]) -> list[dict[str, Any]]:
-    """What each image shows of a cell, the reference image first: a crop with the locus, and patches at every height."""
+    """Crop with the locus, and patches at every height, of each image; the reference image first."""
     names = [view.name for view in place_curves.views]
     middle, large, small = len(place_curves.heights_m) // 2, place_curves.patches(SHOWN_SIDES[0]), None
     records = []

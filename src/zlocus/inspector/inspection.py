@@ -243,7 +243,8 @@ def options_record(selection: SelectionOptions) -> list[dict[str, Any]]:
     return [
         {
             "name": f.name, "doc": f.metadata["doc"], "value": getattr(selection, f.name), "low": f.metadata["low"],
-            "high": MAX_VALUES.get(f.name, f.metadata["high"]), "choices": f.metadata["choices"], "unit": f.metadata["unit"],
+            "high": MAX_VALUES.get(f.name, f.metadata["high"]), "choices": f.metadata["choices"],
+            "unit": f.metadata["unit"],
             "is_whole": KINDS[f.name] is int,
         }
         for f in fields(selection)

@@ -58,8 +58,8 @@ def restored(
     remote += [str(path) for path in request.inputs if is_remote(path)]
     if remote and not may_read_remote:
         raise InputError(
-            f"The run read {remote[0]} from a server, which is not read again without permission. Add --remote to see match "
-            "curves."
+            f"The run read {remote[0]} from a server, which is not read again without permission. Add --remote to see "
+            "match curves."
         )
     opened = open_inputs(SetupRequest.of(request), progress)
     ties = read_observations(out, len(opened.scene.views))

@@ -130,7 +130,7 @@ def cell(inspection: Inspection, request: Request) -> Response:
     allowed = {"x", "y", "reference", "window", *queries.SELECTION}
     values, left_out = queries.once(request.query_params.multi_items(), allowed, "without")
     x, y = (queries.number(values, name) for name in ("x", "y"))
-    found = inspection.cell(x, y, queries.what_if(values, left_out))
+    record = inspection.cell(x, y, queries.what_if(values, left_out))
     return Response(json_of(record), media_type="application/json")
 
 

@@ -96,11 +96,9 @@ def checked_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     try:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError as error:
-        raise ConfigError(f"--host {host} is not an address. Give one of this machine, such as 127.0.0.1.") from error
+        raise ConfigError(f"--host {host} is no address. Give one of this machine, such as 127.0.0.1.") from error
     if address.is_unspecified or address.is_multicast:
-        raise ConfigError(
-            f"--host {host} does not stand for a single address. Give the one at which the page is opened."
-        )
+        raise ConfigError(f"--host {host} is no single address. Give the one at which the page is opened.")
     return address
 
 

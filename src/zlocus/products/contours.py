@@ -40,7 +40,7 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
     Its layer `contours` holds 2-D lines with their `elevation_m`, from low to high, with the higher ground on their
     right. The CRS names the vertical datum where the raster's CRS does. Between the centres of cells heights are
     linear. Lines end at cells without a height and at the edge of the raster. Closed lines shorter than
-    `contour_least_cells` are left out, because noise and trees make thousands of them. strip_rows : rows that are
+    `min_contour_cells` are left out, because noise and trees make thousands of them. strip_rows : rows that are
     traced at a time; they change no line.
 
     Raises
@@ -60,7 +60,7 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
         transform, crs = reader.geobox.transform, reader.crs or local_frame()
 
         def batches() -> Iterator[Batch]:
-            for levels, lines in batched(contours(reader, interval, strip_rows, options.contour_least_cells)):
+            for levels, lines in batched(contours(reader, interval, strip_rows, options.min_contour_cells)):
                 geometries = np.array([linestrings(_map_coordinates(line, transform)) for line in lines], dtype=object)
                 # A product of number and interval, since a sum of intervals would drift.
                 yield geometries, {"elevation_m": _rounded(np.array(levels, np.float64) * interval)}

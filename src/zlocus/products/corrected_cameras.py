@@ -101,7 +101,7 @@ def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
     sensor, shift = view.sensor, np.zeros(2)
     while isinstance(sensor, ShiftedModel):
         shift += [sensor.column, sensor.row]
-        sensor = sensor.base
+        sensor = sensor.base_sensor
     if isinstance(sensor, RpcModel):
         return sensor.rpc.moved(column=float(shift[0]), row=float(shift[1])), None
     heights = view.sensor.height_bounds()
@@ -113,8 +113,8 @@ def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
 def frame_entry(camera: FrameCamera, sensor: SensorModel, scene: Scene) -> FrameCamera:
     """Entry of a frame camera in the scene's frame, with its pose relative to the map's axes at its centre."""
     while isinstance(sensor, ShiftedModel):
-        assert isinstance(sensor.base, FrameModel), "one shift is laid over a camera"
-        sensor = sensor.base.moved(sensor.column, sensor.row)
+        assert isinstance(sensor.base_sensor, FrameModel), "one shift is laid over a camera"
+        sensor = sensor.base_sensor.moved(sensor.column, sensor.row)
     assert isinstance(sensor, FrameModel), "frame cameras stay frame cameras"
     centre, rows = sensor.centre, sensor.camera_from_ground
     if isinstance(sensor.space, EarthSpace):
@@ -141,14 +141,14 @@ def write_scanner(
             f"The image of the line scanner {view.name} was shifted, which a trajectory cannot express. Set "
             "orientation.model = joint in --config."
         )
-    raw = sensor.raw if isinstance(sensor, RectifiedModel) else sensor
+    raw = sensor.raw_sensor if isinstance(sensor, RectifiedModel) else sensor
     on_earth = camera.rays == "earth"
     file = f"{FOLDER}/{name}_trajectory.csv"
     write_trajectory(out / file, raw.trajectory, "s; m; corrected", quaternions=on_earth)
     rectification = camera.rectification
     if isinstance(sensor, RectifiedModel):
         flawed = f"{FOLDER}/{name}_resampled.csv"
-        write_trajectory(out / flawed, sensor.over_plane.trajectory, "s; m; as resampled", quaternions=on_earth)
+        write_trajectory(out / flawed, sensor.plane_sensor.trajectory, "s; m; as resampled", quaternions=on_earth)
         assert rectification is not None, "level 1 images say how they were resampled"
         rectification = rectification.model_copy(update={"trajectory": flawed})
     times = camera.times if not isinstance(camera.times, str) else relative(folder / camera.times, out)

@@ -5,6 +5,7 @@ A configuration file with an old key is refused with a message that names the ne
 
 # Old key, with the names of its groups, and the new key.
 RENAMED_KEYS: dict[str, str] = {
+    "products.contour_least_cells": "products.min_contour_cells",
     "measure": "cost",
     "measure.small_window": "cost.small_window",
     "measure.large_window": "cost.large_window",

@@ -71,7 +71,7 @@ class ScaleBar:
 class Scale:
     """Legend of a continuous quantity.
 
-    title : quantity and unit; gradient : CSS colours from the lowest to the highest value; ticks : evenly spaced values.
+    title : quantity and unit; gradient : CSS colours from lowest to highest; ticks : evenly spaced values.
     """
 
     title: str

@@ -27,7 +27,7 @@ class Survey:
     """Counts over all cells, and every `stride`-th row and column of the rasters.
 
     shape : rows and columns of the grid; transform : cell corners to ground; height_name : description of the heights
-    in dsm.tif; codes : (65536,) int64, number of cells with each value of quality.tif; n_heights : number of cells with a
+    in dsm.tif; codes : (65536,) int64, number of cells per value of quality.tif; n_heights : number of cells with a
     height; n_used : (256,) int64, number of cells that were matched with each number of images; lowest_m, highest_m :
     of all heights, NaN without any. height, sigma : (r, c) float32 m, NaN where there is none; quality : (r, c) uint16;
     views : (r, c) uint8, number of images. Cell [i, j] of these is cell [first + i * stride, first + j * stride] of the

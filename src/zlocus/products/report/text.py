@@ -207,9 +207,9 @@ def summary(survey: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, 
         said.append(f"Heights run from {survey.lowest_m:.1f} to {survey.highest_m:.1f} m ({survey.height_name}).")
     if 50 in quantiles:
         said.append(
-            f"By the run's own estimate, which does not include errors that all images share, the standard deviation of "
-            f"a height is {size(quantiles[50], 'm')} or better for half of the cells, and {size(quantiles[90], 'm')} or "
-            "better for nine in ten."
+            f"By the run's own estimate, which does not include errors that all images share, the standard deviation "
+            f"of a height is {size(quantiles[50], 'm')} or better for half of the cells, and "
+            f"{size(quantiles[90], 'm')} or better for nine in ten."
         )
     said += [what_is_missing(survey), what_is_doubtful(survey)]
     return " ".join(sentence for sentence in said if sentence)
