@@ -12,8 +12,8 @@ from reference import free_rays as twin
 from zlocus.matching import free_rays as stage
 from zlocus.matching.free_rays import add_costs_of_rays, agreement_on, free_rays, pair_agreement
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
-from zlocus.matching.occlusion import coverage
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.occlusion import covered_heights
+from zlocus.matching.slope_surface import SlopeSurface
 
 HEIGHT_TOLERANCE_STEPS = 1e-3
 
@@ -56,22 +56,23 @@ def test_costs_of_rays_against_their_slow_twin(lattice):
     rays[rng.random(rays.shape) < 0.6] = np.inf
     cost = rng.integers(0, 256, lattice.size).astype(np.uint8)
     expected = twin.with_ray_costs(rays, base, lattice, 12, 30, cost)
-    add_ray_costs(rays, base, lattice.ranges, lattice.address, lattice.block, 12, 30, cost)
+    add_ray_costs(rays, base, lattice.layout, 12, 30, cost)
     np.testing.assert_array_equal(cost, expected)
 
 
 def test_agreement_of_pairs_against_its_slow_twin():
     rng = np.random.default_rng(7)
     truth = gaussian_filter(rng.normal(size=(19, 22)), 1.0) * 3
-    truth[:8, :9] *= 0.02  # even ground
+    truth[:8, :9] *= 0.02  # ground without texture
     grey = np.stack([truth + rng.normal(scale=scale, size=truth.shape) for scale in (0.02, 0.05, 0.1, 1.0)])
     grey, covers = grey.astype(np.float32), rng.random(grey.shape) < 0.9
     found = pair_agreement(grey, covers)
-    textured, even = twin.agreeing_images(grey, covers, stage.WINDOW_CELLS, stage.LEAST_NCC, stage.ALIKE, stage.EVEN)
+    limits = stage.MIN_NCC, stage.MAX_GREY_DIFFERENCE, stage.MAX_DEVIATION_WITHOUT_TEXTURE
+    textured, untextured = twin.agreeing_images(grey, covers, stage.WINDOW_CELLS, *limits)
     np.testing.assert_array_equal(found.textured, textured)
-    np.testing.assert_array_equal(found.even, even)
+    np.testing.assert_array_equal(found.untextured, untextured)
     assert (textured >= 2).any()
-    assert (even >= 1).any()
+    assert (untextured >= 1).any()
 
 
 def test_images_agree_on_the_ground_and_not_in_free_air():
@@ -79,8 +80,8 @@ def test_images_agree_on_the_ground_and_not_in_free_air():
     agreement = agreement_on(views, with_patch(), np.ones((len(ANGLES_DEG), *SHAPE), bool))
     inside = np.zeros(SHAPE, bool)
     inside[PATCH] = True
-    assert agreement.supported[:, ~inside].mean() > 0.9
-    assert agreement.defended[:, inside].mean() < 0.05
+    assert agreement.clearly_seen[:, ~inside].mean() > 0.9
+    assert agreement.height_is_seen[:, inside].mean() < 0.05
 
 
 def test_rays_to_the_ground_pass_below_a_patch_in_free_air():
@@ -98,9 +99,9 @@ def test_rays_to_the_ground_pass_below_a_patch_in_free_air():
 
 def test_a_height_in_free_air_becomes_more_expensive_than_the_ground():
     views, lattice = level_ground()
-    base, cost = BaseSurface.level(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
-    seen = coverage(views, base, lattice)
-    assert add_costs_of_rays(cost, views, base, lattice, seen, with_patch(), level=0)
+    base, cost = SlopeSurface.flat(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
+    visible = covered_heights(views, base, lattice)
+    assert add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0)
     by_cell = cost.reshape(lattice.shape[0], -1)
     for row, col in ((28, 38), (30, 40), (31, 41)):
         b, d = row // BLOCK, col // BLOCK
@@ -113,7 +114,7 @@ def test_a_height_in_free_air_becomes_more_expensive_than_the_ground():
 
 def test_two_images_have_no_free_rays():
     views, lattice = level_ground(ANGLES_DEG[:2])
-    base, cost = BaseSurface.level(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
-    seen = coverage(views, base, lattice)
-    assert not add_costs_of_rays(cost, views, base, lattice, seen, with_patch(), level=0)
+    base, cost = SlopeSurface.flat(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
+    visible = covered_heights(views, base, lattice)
+    assert not add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0)
     assert (cost == 50).all()

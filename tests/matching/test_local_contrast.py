@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zlocus.matching.local_contrast import TO_A_DOUBLING, edge_unit, rounded, texture_unit
+from zlocus.matching.local_contrast import STEPS_PER_DOUBLING, edge_unit, rounded, texture_unit
 
 # Share by which a unit may miss what it stands for: half of a step of powers.
-HALF_A_STEP = 2 ** (0.5 / TO_A_DOUBLING) * (1 + 1e-9)
+HALF_A_STEP = 2 ** (0.5 / STEPS_PER_DOUBLING) * (1 + 1e-9)
 
 
 def image(shape=(40, 50), seed=0):
@@ -21,7 +21,7 @@ def image(shape=(40, 50), seed=0):
 def test_a_unit_is_a_power_of_two_nearby(value):
     found = rounded(value)
     assert 1 / HALF_A_STEP <= found / value <= HALF_A_STEP
-    assert TO_A_DOUBLING * np.log2(found) == pytest.approx(round(TO_A_DOUBLING * np.log2(found)), abs=1e-9)
+    assert STEPS_PER_DOUBLING * np.log2(found) == pytest.approx(round(STEPS_PER_DOUBLING * np.log2(found)), abs=1e-9)
     assert rounded(found) == pytest.approx(found, rel=1e-12)
 
 

@@ -7,8 +7,8 @@ import pytest
 from affine import Affine
 
 from rendered_scenes import CENTRE
-from zlocus.matching.local_contrast import AGREES, FEWEST_SHARED, agreement, edge_image
-from zlocus.matching.tile_views import ViewPixels, tile_views
+from zlocus.matching.local_contrast import MIN_AGREEMENT_SHARE, MIN_SHARED_CELLS, agreement, edge_image
+from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
 from zlocus.matching.true_ortho import ortho_image
 from zlocus.synthetic.cameras import SatelliteCamera
 
@@ -27,7 +27,7 @@ def views_of(*greys):
     mask = (np.ones((SIDE_PX, SIDE_PX), bool),)
     pixels = [ViewPixels(sensor, (0, 0), 0.0, 1.0, (np.asarray(grey, np.float32),), mask) for grey in greys]
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
-    return tile_views(pixels, 0, transform, SHAPE, BLOCK, (ORIGIN_M, STEP_M), z, 2)
+    return tile_views(pixels, TileGrid(0, transform, SHAPE, BLOCK, ORIGIN_M, STEP_M), z, 2)
 
 
 def textures(count, seed=0):
@@ -66,13 +66,13 @@ def test_agreement_is_the_correlation_of_the_cells_that_both_views_show(covering
 def test_views_that_share_too_few_cells_say_nothing_of_each_other(covering):
     same = textures(1)[0]
     covering[0] = False
-    covering[0, 10, : 10 + FEWEST_SHARED - 1] = True
+    covering[0, 10, : 10 + MIN_SHARED_CELLS - 1] = True
     found = agreement(views_of(same, same, same), SURFACE, covering, CORE)
     assert np.isnan(found[0])
     assert (found[1:] > ALIKE).all()
 
 
-def test_the_leading_view_is_the_first_that_shows_half_of_what_another_shows(covering):
+def test_edges_are_those_of_the_first_view_that_shows_half_as_much_as_another(covering):
     views, alike = views_of(*plain(3)), np.ones(3)
     covering[0, :, 35:] = False
     leading = edge_image(views, SURFACE, covering, CORE, alike)
@@ -84,9 +84,14 @@ def test_the_leading_view_is_the_first_that_shows_half_of_what_another_shows(cov
     np.testing.assert_array_equal(leading, ortho_image(views, SURFACE, 2))
 
 
-def test_a_view_that_does_not_agree_with_the_others_does_not_lead(covering):
-    views, barely = views_of(*plain(3)), 0.99 * AGREES
-    cases = [([barely, 1.0, 1.0], 1), ([AGREES, 1.0, 0.9], 0), ([np.nan] * 3, 0), ([-0.2, -0.1, np.nan], 0)]
+def test_a_view_that_does_not_agree_with_the_others_gives_no_edges(covering):
+    views, barely = views_of(*plain(3)), 0.99 * MIN_AGREEMENT_SHARE
+    cases = [
+        ([barely, 1.0, 1.0], 1),
+        ([MIN_AGREEMENT_SHARE, 1.0, 0.9], 0),
+        ([np.nan] * 3, 0),
+        ([-0.2, -0.1, np.nan], 0),
+    ]
     for agrees, leads in cases:
         image = edge_image(views, SURFACE, covering, CORE, np.array(agrees))
         np.testing.assert_array_equal(image, ortho_image(views, SURFACE, leads))

@@ -1,4 +1,4 @@
-"""Ground beside what two views share: shown at wrong heights only, and so not looked for."""
+"""Ground outside the overlap of two views: covered at wrong heights only, and therefore not matched."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ import pytest
 
 import free_ray_scene as free
 from zlocus.core.grid import CellWindow
-from zlocus.matching import overlap as border
+from zlocus.matching import overlap as stage
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.kernels.cost_volume import HIDDEN
-from zlocus.matching.occlusion import coverage
+from zlocus.matching.kernels.shared_records import NEVER_COVERED, VisibleHeights
+from zlocus.matching.occlusion import covered_heights
 from zlocus.matching.overlap import (
-    OFF_GROUND_STEPS,
-    RISE_BY_DISTANCE,
-    BorderGround,
-    border_ground,
+    MAX_GROUND_STEPS,
+    MAX_RISE_BY_DISTANCE,
+    CoarsestHeights,
+    OverlapGround,
+    SearchBounds,
     covered_ground,
     ground_nearby,
+    overlap_ground,
     unsupported,
 )
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.slope_surface import SlopeSurface
 
 ROWS, COLS, LAST = 12, 60, 40
 # Two views whose images end at a column that moves by a cell per two steps of height: further out, only higher ground
@@ -33,18 +35,18 @@ WINDOW = 4
 
 
 def views(edge=EDGE, n=2):
-    """(3, n, r, c): a cell at column c is shown from 2 (c - edge) on."""
+    """Visible heights of n views: a cell at column c is shown from 2 (c - edge) on."""
     col = np.arange(COLS)
     low = np.maximum(np.ceil((col - edge) / SLANT), 0).astype(np.int32)
-    seen = np.empty((3, n, ROWS, COLS), np.int32)
-    seen[0], seen[1], seen[2] = low, LAST, HIDDEN
+    full = (np.broadcast_to(bound, (n, ROWS, COLS)).astype(np.int32) for bound in (low, LAST, NEVER_COVERED))
+    visible = VisibleHeights(*full)
     never = np.broadcast_to(low > LAST, (n, ROWS, COLS))
-    seen[0][never], seen[1][never] = HIDDEN, -1
-    return seen
+    visible.lowest_covered[never], visible.highest_covered[never] = NEVER_COVERED, -1
+    return visible
 
 
 def found(surface=None, shown=None, matched=None):
-    searched = np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32)
+    searched = SearchBounds(np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32))
     shown = views() if shown is None else shown
     matched = views(EDGE - WINDOW) if matched is None else matched
     return covered_ground(shown, matched, ground() if surface is None else surface, searched, CELL_STEPS)
@@ -81,7 +83,7 @@ def test_ground_that_rises_is_followed():
     assert not covered[:, 43:].any()
 
 
-def test_a_tower_in_the_rim_is_kept_with_the_ground_around_it():
+def test_a_tower_at_the_edge_is_kept_with_the_ground_around_it():
     surface = ground()
     surface[3:7, 28:32] = 20.0
     assert found(surface)[:, :33].all()
@@ -89,20 +91,21 @@ def test_a_tower_in_the_rim_is_kept_with_the_ground_around_it():
 
 def test_where_nothing_is_shown_at_all_heights_nothing_is_cut_off():
     shown = views(-2)
-    np.testing.assert_array_equal(found(shown=shown, matched=shown), shown[1][0] >= shown[0][0])
+    np.testing.assert_array_equal(
+        found(shown=shown, matched=shown), shown.highest_covered[0] >= shown.lowest_covered[0]
+    )
 
 
 def test_ground_apart_from_all_other_is_kept():
     """Beyond a gap that no two views cover; what is cut off by ground that is shown at wrong heights is not."""
     shown = views()
-    shown[1][:, :, 36:] = -1
-    shown[0][:, :, 36:] = HIDDEN
-    shown[:2, :, :, 50:] = np.array([10, LAST], np.int32)[:, None, None, None]
+    shown.lowest_covered[:, :, 36:], shown.highest_covered[:, :, 36:] = NEVER_COVERED, -1
+    shown.lowest_covered[:, :, 50:], shown.highest_covered[:, :, 50:] = 10, LAST
     covered = found(shown=shown, matched=views(EDGE - WINDOW))
     assert covered[:, 50:].all()
     assert not covered[:, 36:50].any()
     shown = views()
-    shown[:2, :, :, 40:] = np.array([10, LAST], np.int32)[:, None, None, None]
+    shown.lowest_covered[:, :, 40:], shown.highest_covered[:, :, 40:] = 10, LAST
     assert not found(shown=shown)[:, 36:].any()
 
 
@@ -128,30 +131,30 @@ def compared(cols=COMPARED):
 
 def test_the_ground_nearby_has_no_buildings_and_may_rise_with_the_distance():
     surface = np.full((WIDE_ROWS, WIDE_COLS), GROUND, np.float32)
-    surface[10:22, 48:60] = 30.0  # a building at the border of what views compare
+    surface[10:22, 48:60] = 30.0  # a building at the edge of the cells that views compare
     surface[:, COMPARED:] = GHOST
-    found, rise = ground_nearby(surface, compared(), OBJECT, CELL_STEPS)
-    np.testing.assert_array_equal(found, GROUND)
+    height, rise = ground_nearby(surface, compared(), OBJECT, CELL_STEPS)
+    np.testing.assert_array_equal(height, GROUND)
     distance = np.arange(WIDE_COLS) - (COMPARED - 1)
-    expected = RISE_BY_DISTANCE * CELL_STEPS * np.maximum(distance, 0)
+    expected = MAX_RISE_BY_DISTANCE * CELL_STEPS * np.maximum(distance, 0)
     np.testing.assert_allclose(rise, np.tile(expected, (WIDE_ROWS, 1)), rtol=0, atol=1e-3)
 
 
 def test_a_slope_is_ground():
     slope = np.tile(0.4 * np.arange(WIDE_COLS, dtype=np.float32), (WIDE_ROWS, 1))
-    found, rise = ground_nearby(slope, compared(), OBJECT, CELL_STEPS)
-    assert (found + rise + OFF_GROUND_STEPS >= slope).all()
-    np.testing.assert_allclose(found[5:-5, 10:50], slope[5:-5, 10:50], rtol=0, atol=0.5)
+    height, rise = ground_nearby(slope, compared(), OBJECT, CELL_STEPS)
+    assert (height + rise + MAX_GROUND_STEPS >= slope).all()
+    np.testing.assert_allclose(height[5:-5, 10:50], slope[5:-5, 10:50], rtol=0, atol=0.5)
 
 
-def border_of_wide(level=1, beside=COMPARED):
-    highest = np.full((WIDE_ROWS, WIDE_COLS), GROUND + OFF_GROUND_STEPS, np.float32)
+def ground_of_wide(level=1, beside=COMPARED):
+    highest = np.full((WIDE_ROWS, WIDE_COLS), GROUND + MAX_GROUND_STEPS, np.float32)
     window = CellWindow(5, 3, WIDE_ROWS, WIDE_COLS)
-    return BorderGround(window, level, ~compared(0), ~compared(), ~compared(beside), highest)
+    return OverlapGround(window, level, ~compared(0), ~compared(), ~compared(beside), highest)
 
 
 def test_heights_off_the_ground_need_support_beside_it():
-    beside = border_of_wide(beside=COMPARED + 5)
+    beside = ground_of_wide(beside=COMPARED + 5)
     window = beside.window.finer(beside.level)
     height = np.full((window.rows, window.cols), 2 * GROUND, np.float32)
     assert not beside.needs_support(window, height).any()
@@ -159,34 +162,35 @@ def test_heights_off_the_ground_need_support_beside_it():
     needs = beside.needs_support(window, height)
     assert needs[20:30, 2 * (COMPARED + 5) : 150].all()
     assert needs.sum() == 10 * (150 - 2 * (COMPARED + 5))
-    assert beside.is_near(window)[:, 2 * COMPARED :].all()
-    assert not beside.is_near(window)[:, : 2 * COMPARED].any()
+    assert beside.is_at_edge_in(window)[:, 2 * COMPARED :].all()
+    assert not beside.is_at_edge_in(window)[:, : 2 * COMPARED].any()
 
 
 @pytest.mark.parametrize("edge", [EDGE + 20, EDGE - 24])
-def test_where_most_cells_are_border_none_is(edge, monkeypatch):
+def test_where_most_cells_are_at_the_edge_none_is(edge, monkeypatch):
     """Of oblique views hardly a cell is compared at all heights, and the ground beside would be guessed far away."""
     matched = views(edge)
-    searched = np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32)
-    monkeypatch.setattr(border, "shown_heights", lambda *_: views(EDGE + 24))
+    searched = SearchBounds(np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32))
+    monkeypatch.setattr(stage, "heights_shown", lambda *_: views(EDGE + 24))
     lattice = HeightLattice(0.0, 1.0, (ROWS, COLS), 4, np.zeros((3, 15), np.int64), np.full((3, 15), LAST, np.int64))
     window = CellWindow(0, 0, ROWS, COLS)
-    found = border_ground([], None, lattice, matched, ground(), searched, window, 0, LAST, CELL_STEPS)
-    assert found.is_border.any() == (edge > EDGE)
-    assert found.is_beside.any() == (edge > EDGE)
-    assert np.isinf(found.highest).all() == (edge < EDGE)
+    coarsest = CoarsestHeights(None, lattice, matched, window, 0, ground(), searched)
+    found = overlap_ground([], coarsest, LAST, CELL_STEPS)
+    assert found.is_at_edge.any() == (edge > EDGE)
+    assert found.is_outside.any() == (edge > EDGE)
+    assert np.isinf(found.max_ground).all() == (edge < EDGE)
 
 
 @pytest.mark.parametrize("n_views", [2, 3])
-def test_a_height_in_free_air_at_the_border_has_no_support(n_views):
+def test_a_height_in_free_air_at_the_edge_has_no_support(n_views):
     """All cells stand off the ground that is known; in the patch alone images do not agree."""
     views, lattice = free.level_ground(free.ANGLES_DEG[:n_views])
     window = CellWindow(0, 0, *free.SHAPE)
     nowhere = np.zeros(free.SHAPE, bool)
     low = np.full(free.SHAPE, free.GROUND - 5, np.float32)
-    around = BorderGround(window, 0, ~nowhere, ~nowhere, ~nowhere, low)
-    seen = coverage(views, BaseSurface.level(free.SHAPE, free.BLOCK), lattice)
-    found = unsupported(around, window, views, seen, free.with_patch())
+    around = OverlapGround(window, 0, ~nowhere, ~nowhere, ~nowhere, low)
+    visible = covered_heights(views, SlopeSurface.flat(free.SHAPE, free.BLOCK), lattice)
+    found = unsupported(around, window, views, visible, free.with_patch())
     in_patch = np.zeros(free.SHAPE, bool)
     in_patch[free.PATCH] = True
     assert found[in_patch].mean() > 0.8

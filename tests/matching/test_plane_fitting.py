@@ -23,6 +23,7 @@ from zlocus.matching.kernels.plane_fitting import (
     segment_loci,
     solve_damped,
 )
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.local_contrast import deviation
 from zlocus.matching.plane_fitting import PlanarHeights, plain_segments, with_planes
 from zlocus.matching.tile_views import TileViews
@@ -94,10 +95,9 @@ def leading(seen_by: TileViews) -> np.ndarray:
 
 def fitted(seen_by: TileViews, height: np.ndarray, options: PlaneOptions = OPTIONS) -> PlanarHeights:
     n = len(seen_by.layout)
-    seen = np.zeros((3, n, SIDE, SIDE), np.int32)
-    seen[1], seen[2] = 100, -100
+    visible = VisibleHeights(*(np.full((n, SIDE, SIDE), index, np.int32) for index in (0, 100, -100)))
     known = PlanarHeights(height, np.zeros(height.shape, bool))
-    return with_planes(seen_by, leading(seen_by), known, seen, options)
+    return with_planes(seen_by, leading(seen_by), known, visible, options)
 
 
 def level_roof() -> np.ndarray:
@@ -160,11 +160,11 @@ def test_greys_are_levelled_over_the_core():
 
 def test_no_plane_where_fewer_than_two_views_see():
     seen_by = views()
-    seen = np.full((3, len(PARALLAX), SIDE, SIDE), -100, np.int32)
-    seen[1] = 100
-    seen[1, 1:, :, 48:] = -200
+    shape = (len(PARALLAX), SIDE, SIDE)
+    visible = VisibleHeights(*(np.full(shape, index, np.int32) for index in (-100, 100, -100)))
+    visible.highest_covered[1:, :, 48:] = -200
     known = PlanarHeights(level_roof(), np.zeros((SIDE, SIDE), bool))
-    found = with_planes(seen_by, leading(seen_by), known, seen, OPTIONS)
+    found = with_planes(seen_by, leading(seen_by), known, visible, OPTIONS)
     assert found.is_planar[35:60, 35:45].all()
     assert not found.is_planar[:, 48:].any()
 
@@ -173,12 +173,12 @@ def test_a_view_whose_table_does_not_hold_everywhere():
     """Neither its missing grey values nor its missing positions spoil what the others show."""
     seen_by = views()
     seen_by.nodes[0, :2, :2] = np.nan
-    seen = np.full((3, len(PARALLAX), SIDE, SIDE), -100, np.int32)
-    seen[1] = 100
-    seen[1, 0, : 2 * BLOCK, : 2 * BLOCK] = -200
+    shape = (len(PARALLAX), SIDE, SIDE)
+    visible = VisibleHeights(*(np.full(shape, index, np.int32) for index in (-100, 100, -100)))
+    visible.highest_covered[0, : 2 * BLOCK, : 2 * BLOCK] = -200
     ortho = leading(seen_by)
     ortho[: BLOCK - 8, : BLOCK - 8] = np.nan
-    found = with_planes(seen_by, ortho, PlanarHeights(level_roof(), np.zeros((SIDE, SIDE), bool)), seen, OPTIONS)
+    found = with_planes(seen_by, ortho, PlanarHeights(level_roof(), np.zeros((SIDE, SIDE), bool)), visible, OPTIONS)
     middle = np.s_[ROOF.start + 3 : ROOF.stop - 3, ROOF.start + 3 : ROOF.stop - 3]
     assert found.is_planar[middle].all()
     assert np.abs(found.height - true_heights())[middle].max() < STEPS
@@ -273,7 +273,7 @@ def test_greys_and_their_slopes():
     row, col = rng.integers(0, SIDE, (2, n))
     start, asked = rng.uniform(0, 20, (2, n))
     locus = np.empty((len(PARALLAX), n, 4))
-    segment_loci(seen_by.nodes, seen_by.heights, BLOCK, row, col, start, locus)
+    segment_loci(seen_by.nodes, seen_by.t_of_index, BLOCK, row, col, start, locus)
     np.testing.assert_allclose(locus[1, :, 0], col + MARGIN_PX + 0.5 * start)
     np.testing.assert_allclose(locus[2, :, 1:], np.column_stack([row + MARGIN_PX, np.full(n, -0.5), np.zeros(n)]))
     grey, slope, near, _ = np.empty((4, len(PARALLAX), n))

@@ -12,11 +12,11 @@ from scipy.ndimage import gaussian_filter
 from orientation_scenes import BASE_HEIGHT_M, GSD_M, AffineSensor, ArrayImage, image_of
 from zlocus.core.scene import View
 from zlocus.matching.radiometry import (
-    FEWEST_POINTS,
-    MOST_POINTS,
+    MAX_POINTS,
+    MIN_POINTS,
     PART_PX,
     SAMPLE_ROWS,
-    SIDE_PX,
+    SQUARE_PX,
     grey_at,
     grey_scales,
     image_grey,
@@ -57,7 +57,7 @@ def view_of(ground, index, noise=0.0, valid=None):
 def points(n, east_px=(-80.0, 80.0), seed=2):
     """Ground points whose squares lie inside the images that see them."""
     rng = np.random.default_rng(seed)
-    east = rng.uniform(east_px[0] + SIDE_PX, east_px[1] - SIDE_PX, n)
+    east = rng.uniform(east_px[0] + SQUARE_PX, east_px[1] - SQUARE_PX, n)
     north = rng.uniform(-70, 70, n)
     return np.column_stack([east * GSD_M, north * GSD_M, np.full(n, BASE_HEIGHT_M)])
 
@@ -100,7 +100,7 @@ def test_a_shadow_that_moved_does_not_matter():
     assert unit.max() < (1 + GAIN) * unit.min()
 
 
-@pytest.mark.parametrize(("n_seen", "keeps"), [(FEWEST_POINTS - 1, True), (FEWEST_POINTS, False)])
+@pytest.mark.parametrize(("n_seen", "keeps"), [(MIN_POINTS - 1, True), (MIN_POINTS, False)])
 def test_a_view_that_shares_too_few_points_keeps_its_own_moments(n_seen, keeps):
     """However far the others, which differ by noise, are moved together."""
     views = tuple(view_of(albedo(), i, noise=3.0) for i in range(3))
@@ -188,14 +188,14 @@ def test_a_scene_of_many_points_reads_few_and_from_all_of_it():
     windows: list[tuple[int, ...]] = []
     plain = view_of(albedo(), 0)
     counted = replace(plain, image=CountedImage(plain.image.pixels, plain.image.valid, windows))
-    at = points(20 * MOST_POINTS)
+    at = points(20 * MAX_POINTS)
     at = at[np.argsort(at[:, 0])]
     grey_scales((counted, view_of(albedo(), 1)), at)
     reads = [window for window in windows if window[2] > 1]
     assert len(reads) <= np.prod([-(-n // PART_PX) for n in counted.image.shape])
     assert len(windows) == len(reads) + SAMPLE_ROWS
     assert max(col + cols for _, col, _, cols in reads) - min(col for _, col, _, _ in reads) > 0.8 * SIZE_PX
-    assert max(window[k] for window in reads for k in (2, 3)) <= PART_PX + SIDE_PX
+    assert max(window[k] for window in reads for k in (2, 3)) <= PART_PX + SQUARE_PX
 
 
 def test_grey_around_a_point():
@@ -204,7 +204,7 @@ def test_grey_around_a_point():
     valid = np.ones((40, 50), bool)
     valid[10, 10] = False
     view = View("v", Path("v.tif"), image_of(col + 100.0 * row, valid), AffineSensor(0.0, 0.0))
-    half = SIDE_PX // 2
+    half = SQUARE_PX // 2
     at_px = [(20.3, 30.4), (half, half), (half - 0.6, 20), (20, 39.6 - half), (49 - half, 39 - half),
              (10 + half, 10 + half), (10 + half + 1, 10), (np.nan, 3)]  # fmt: skip
     expected = [20 + 3000, half * 101, np.nan, np.nan, 49 - half + 100 * (39 - half), np.nan, 11 + half + 1000, np.nan]

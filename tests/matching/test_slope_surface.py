@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kernel_scene import at_all_heights, kernel_scene
-from zlocus.matching.kernels.cost_volume import plane_grid
+from zlocus.matching.kernels.resample import block_grid, coordinate
 from zlocus.matching.slope_surface import DAMPING, PATCH, ROUNDS, CoarserSlope, SlopeSurface, patch_medians, relaxed
 from zlocus.matching.tile_views import TileViews
 
@@ -43,19 +43,19 @@ def test_views_along_the_slope_take_slope_indices():
     slope_views = slope_surface.along(views_of(scene))
     assert slope_views.nodes.shape == scene.nodes.shape
     start, step = scene.heights
-    grid, plain = np.empty(8), np.empty(8)
     for view in range(scene.n_views):
         for b, d in np.ndindex(scene.nodes.shape[1] - 1, scene.nodes.shape[2] - 1):
             for k in (-7, 0, 19.25):
                 corner = slope_views.nodes[:, b : b + 2, d : d + 2]
-                plane_grid(corner, view, start + k * step, scene.block, 0, grid)
+                grid = block_grid(corner, view, start + k * step, scene.block, 0)
                 for i, j in np.ndindex(2, 2):
                     t = start + (k + up[b + i, d + j]) * step
                     alone = np.broadcast_to(scene.nodes[view, b + i, d + j], (1, 2, 2, 2, 4))
-                    plane_grid(np.ascontiguousarray(alone), 0, t, scene.block, 0, plain)
+                    plain = block_grid(np.ascontiguousarray(alone), 0, t, scene.block, 0)
                     r, c = i * scene.block, j * scene.block
-                    found = grid[:2] + c * grid[2:4] + r * grid[4:6] + r * c * grid[6:8]
-                    np.testing.assert_allclose(found, plain[:2], rtol=0, atol=POSITION_PX)
+                    found = coordinate(grid.x, r, c), coordinate(grid.y, r, c)
+                    expected = plain.x.origin, plain.y.origin
+                    np.testing.assert_allclose(found, expected, rtol=0, atol=POSITION_PX)
 
 
 @pytest.mark.parametrize("shape", [SHAPE, (64, 72), (5, 9)])

@@ -9,6 +9,7 @@ from scipy.ndimage import spline_filter
 
 from rendered_scenes import CENTRE, FIELD, GSD_M, LOOKS, SIZE_PX, camera
 from zlocus.core.options import RefineOptions
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.subpixel import (
     MAX_GROUP_DISTANCE_STEPS,
     MeasuredDistances,
@@ -21,7 +22,7 @@ from zlocus.matching.subpixel import (
     refine,
     smoothed,
 )
-from zlocus.matching.tile_views import ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
 from zlocus.synthetic.render import Sun, render
 from zlocus.synthetic.terrain import analytic_ground
 
@@ -198,11 +199,10 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
         ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane
     ]
     z = (origin, origin + 50 * STEP_M)
-    views = tile_views(windows, 0, transform, shape, block, (origin, STEP_M), z, 2)
-    seen = np.zeros((3, len(LOOKS), *shape), np.int32)
-    seen[1] = 50
+    views = tile_views(windows, TileGrid(0, transform, shape, block, origin, STEP_M), z, 2)
+    visible = VisibleHeights(*(np.full((len(LOOKS), *shape), index, np.int32) for index in (0, 50, 0)))
     coarse = np.full(shape, 20.5, np.float32)
-    found = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=3))
+    found = refine(views, splines(plane), coarse, visible, STEP_M / GSD_M, RefineOptions(rounds=3))
     inner = (slice(4, -4), slice(4, -4))
     assert found.is_refined[inner].mean() > 0.99
     assert abs(np.median(found.height[inner]) - 20 - fraction) < STEPS
@@ -218,16 +218,15 @@ def test_what_is_too_far_keeps_the_coarse_height(plane):
     windows = [
         ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane
     ]
-    views = tile_views(windows, 0, transform, shape, 16, (origin, STEP_M), (40.0, 70.0), 2)
-    seen = np.zeros((3, len(LOOKS), *shape), np.int32)
-    seen[1] = 50
+    views = tile_views(windows, TileGrid(0, transform, shape, 16, origin, STEP_M), (40.0, 70.0), 2)
+    visible = VisibleHeights(*(np.full((len(LOOKS), *shape), index, np.int32) for index in (0, 50, 0)))
     coarse = np.full(shape, 32.0, np.float32)
     options = RefineOptions(rounds=1, max_correction_steps=0.1)
-    found = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, options)
+    found = refine(views, splines(plane), coarse, visible, STEP_M / GSD_M, options)
     kept = found.height[~found.is_refined]
     assert kept.size > 100
     assert (kept == 32.0).all()
-    none = refine(views, splines(plane), coarse, seen, STEP_M / GSD_M, RefineOptions(rounds=0))
+    none = refine(views, splines(plane), coarse, visible, STEP_M / GSD_M, RefineOptions(rounds=0))
     assert (none.height == 32.0).all()
     assert not none.is_refined.any()
     assert np.isnan(none.group_distance).all()

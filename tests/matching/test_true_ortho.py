@@ -19,18 +19,18 @@ from zlocus.core.requests import DsmRequest
 from zlocus.io.images import open_image
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.occlusion import coverage, hide
+from zlocus.matching.occlusion import covered_heights, mark_occlusions
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.slope_surface import BaseSurface
-from zlocus.matching.tile_views import ViewPixels, tile_views
+from zlocus.matching.slope_surface import SlopeSurface
+from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
 from zlocus.matching.true_ortho import (
-    Around,
     CoarserHeights,
+    Surroundings,
     best_view,
     ortho_image,
     pixels_per_cell,
+    surroundings_of_tile,
     true_ortho,
-    what_stands_around,
 )
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.sensors.frame import FrameModel
@@ -68,8 +68,8 @@ def tile(sensors, greys=None, contrast=1.0, mean=0.0, shape=SHAPE, col=0):
         ORIGIN_M, STEP_M, shape, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
     )
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
-    views = tile_views(pixels, 0, transform, shape, BLOCK, (ORIGIN_M, STEP_M), z, 2)
-    return pixels, views, coverage(views, BaseSurface.level(shape, BLOCK), lattice)
+    views = tile_views(pixels, TileGrid(0, transform, shape, BLOCK, ORIGIN_M, STEP_M), z, 2)
+    return pixels, views, covered_heights(views, SlopeSurface.flat(shape, BLOCK), lattice)
 
 
 def tower() -> np.ndarray:
@@ -95,11 +95,11 @@ def test_pixels_of_a_cell():
 
 
 @pytest.mark.parametrize(("across", "behind"), [(30.0, np.s_[16:24, 37:48]), (-30.0, np.s_[16:24, 12:23])])
-def test_what_a_tower_hides_is_shown_by_another_view(across, behind):
+def test_cells_that_a_tower_occludes_are_shown_by_another_view(across, behind):
     """12 m high, seen 30 degrees from one side: 7 m, or 13 cells, of the ground behind it."""
     slanted, opposite = sensor(across=across), sensor(across=-across)
-    _, views, seen = tile([slanted, opposite])
-    best = best_view(views, seen, tower())
+    _, views, visible = tile([slanted, opposite])
+    best = best_view(views, visible, tower())
     hidden = best == 1
     assert hidden[behind].all()
     assert not hidden[16:24, 60 - behind[1].stop : 60 - behind[1].start].any()
@@ -120,23 +120,23 @@ def beside_the_tile(across):
     sensors = [sensor(across=across), sensor(across=-across)]
     surface = np.full(WIDE, LOW, np.float32)
     surface[BESIDE] = HIGH
-    _, views, seen = tile(sensors, shape=WIDE, col=-40)
+    _, views, visible = tile(sensors, shape=WIDE, col=-40)
     _, part, of_part = tile(sensors, col=FIRST - 40)
-    return surface, best_view(views, seen, surface), part, of_part
+    return surface, best_view(views, visible, surface), part, of_part
 
 
 @pytest.mark.parametrize("across", [30.0, -30.0])
-def test_what_stands_beside_a_tile_hides_its_cells(across):
-    surface, whole, views, seen = beside_the_tile(across)
+def test_a_tower_beside_a_tile_occludes_its_cells(across):
+    surface, whole, views, visible = beside_the_tile(across)
     mine = surface[:, FIRST : FIRST + SHAPE[1]]
     shows_its_shadow = (whole[:, FIRST : FIRST + SHAPE[1]] == 1).any()
     assert shows_its_shadow == (across > 0)
-    found = best_view(views, seen, mine, Around(surface, 0, FIRST))
+    found = best_view(views, visible, mine, Surroundings(surface, 0, FIRST))
     np.testing.assert_array_equal(found, whole[:, FIRST : FIRST + SHAPE[1]])
-    assert (best_view(views, seen, mine) == 0).all()
+    assert (best_view(views, visible, mine) == 0).all()
 
 
-def test_coarser_levels_are_asked_as_far_as_they_matter():
+def test_coarser_levels_are_used_as_far_as_they_can_occlude():
     """The tower as levels of half and of a quarter of the cells have it, whose halos reach twice and four times as
     far."""
     surface, _, views, _ = beside_the_tile(30.0)
@@ -145,28 +145,28 @@ def test_coarser_levels_are_asked_as_far_as_they_matter():
         CoarserHeights(level, CellWindow(0, 0, WIDE[0] // size, WIDE[1] // size), surface[::size, ::size] / size)
         for level, size in ((1, 2), (2, 4))
     ]
-    around = what_stands_around(coarser, views, window, mine, HALO)
+    around = surroundings_of_tile(coarser, views, window, mine, HALO)
     # 13.9 cells from the core's edge, 4 of which are the halo: the first level knows 4 of the others, the second 12.
     assert (around.row, around.col) == (0, 10)
     np.testing.assert_array_equal(around.surface, coarser[1].surface.repeat(4, 0).repeat(4, 1)[:, 50:] * 4)
     # Nothing near is that tall, and a false height of a cell is no tower.
     level = [CoarserHeights(1, coarser[0].window, np.full_like(coarser[0].surface, LOW / 2))]
     level[0].surface[8, 20] = HIGH / 2
-    assert what_stands_around(level, views, window, mine, HALO) is None
-    assert what_stands_around([], views, window, mine, HALO) is None
+    assert surroundings_of_tile(level, views, window, mine, HALO) is None
+    assert surroundings_of_tile([], views, window, mine, HALO) is None
     # So tall that the coarsest level must do.
     taller = [
         CoarserHeights(c.level, c.window, np.where(c.surface > LOW / 2**c.level, 3 * c.surface, c.surface))
         for c in coarser
     ]
-    assert what_stands_around(taller, views, window, mine, HALO).col > 12
+    assert surroundings_of_tile(taller, views, window, mine, HALO).col > 12
 
 
 def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
-    _, views, seen = tile([sensor(across=30.0), sensor(across=-30.0)])
-    best = best_view(views, seen, tower())
-    _, views, seen = tile([sensor(across=-30.0), sensor(across=30.0)])
-    other = best_view(views, seen, tower())
+    _, views, visible = tile([sensor(across=30.0), sensor(across=-30.0)])
+    best = best_view(views, visible, tower())
+    _, views, visible = tile([sensor(across=-30.0), sensor(across=30.0)])
+    other = best_view(views, visible, tower())
     # Where the first of the two is hidden, the second is shown, and it is the first elsewhere.
     assert not ((best == 1) & (other == 1)).any()
     assert (best >= 0).all()
@@ -174,12 +174,12 @@ def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
 
 
 def test_cells_that_no_view_sees():
-    pixels, views, seen = tile([sensor(across=30.0), sensor(across=31.0)])
+    pixels, views, visible = tile([sensor(across=30.0), sensor(across=31.0)])
     # Where a view that was matched counts as seeing it, that is shown all the same.
-    assert (best_view(views, seen, tower()) >= 0).all()
-    hide(seen, views, tower(), np.zeros(SHAPE, np.float32), 1.0)
-    best = best_view(views, seen, tower())
-    ortho = true_ortho(pixels, views, seen, tower())
+    assert (best_view(views, visible, tower()) >= 0).all()
+    mark_occlusions(visible, views, tower(), np.zeros(SHAPE, np.float32), 1.0)
+    best = best_view(views, visible, tower())
+    ortho = true_ortho(pixels, views, visible, tower())
     assert (best < 0).sum() > 80
     np.testing.assert_array_equal(np.isnan(ortho), best < 0)
 
@@ -187,37 +187,37 @@ def test_cells_that_no_view_sees():
 def test_the_finer_view_is_shown_where_it_is_clearly_finer():
     flat = np.full(SHAPE, LOW, np.float32)
     for gsds, expected in (((0.5, 0.48), 0), ((0.5, 0.25), 1), ((0.25, 0.5), 0)):
-        _, views, seen = tile([sensor(gsd=gsd) for gsd in gsds])
-        assert (best_view(views, seen, flat) == expected).all()
+        _, views, visible = tile([sensor(gsd=gsd) for gsd in gsds])
+        assert (best_view(views, visible, flat) == expected).all()
 
 
 def test_grey_values_are_those_of_the_image():
     """Scaled back from what is matched."""
-    pixels, views, seen = tile([sensor(), sensor(along=20.0)], greys=(0.25, -3.0), contrast=40.0, mean=500.0)
+    pixels, views, visible = tile([sensor(), sensor(along=20.0)], greys=(0.25, -3.0), contrast=40.0, mean=500.0)
     flat = np.full(SHAPE, LOW, np.float32)
-    np.testing.assert_allclose(true_ortho(pixels, views, seen, flat), 510.0, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(true_ortho(pixels, views, visible, flat), 510.0, rtol=0, atol=1e-3)
     np.testing.assert_allclose(ortho_image(views, flat, 1), -3.0, rtol=0, atol=1e-6)
 
 
 def test_grey_values_are_levelled_to_those_of_one_image():
     """0.25 of 40 above 500 is 0.25 of 8 above 100; a trend is taken off."""
     flat = np.full(SHAPE, LOW, np.float32)
-    pixels, views, seen = tile([sensor()], greys=(0.25,), contrast=40.0, mean=500.0)
+    pixels, views, visible = tile([sensor()], greys=(0.25,), contrast=40.0, mean=500.0)
     fallen = [replace(view, trend=np.full((201, 201), 7.0, np.float32)) for view in pixels]
     for held, scale, expected in (
         (pixels, None, 510.0), (fallen, None, 517.0),
         (pixels, GreyScale(100.0, 8.0), 102.0), (fallen, GreyScale(100.0, 8.0), 102.0),
     ):  # fmt: skip
-        np.testing.assert_allclose(true_ortho(held, views, seen, flat, scale=scale), expected, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(true_ortho(held, views, visible, flat, scale=scale), expected, rtol=0, atol=1e-3)
     red, green, blue = (np.full((201, 201), v, np.float32) for v in (517.0, 497.0, 547.0))
 
     class Coloured:
         def colours(self, row, col, rows, cols):
             return np.stack([red, green, blue])[:, row : row + rows, col : col + cols]
 
-    found = true_ortho(fallen, views, seen, flat, [Coloured()], scale=GreyScale(100.0, 8.0))
+    found = true_ortho(fallen, views, visible, flat, [Coloured()], scale=GreyScale(100.0, 8.0))
     np.testing.assert_allclose(found[5, 5], [102.0, 98.0, 108.0], rtol=0, atol=1e-3)
-    np.testing.assert_allclose(true_ortho(fallen, views, seen, flat, [Coloured()])[5, 5], [517, 497, 547], atol=1e-3)
+    np.testing.assert_allclose(true_ortho(fallen, views, visible, flat, [Coloured()])[5, 5], [517, 497, 547], atol=1e-3)
 
 
 @pytest.fixture(scope="module", params=["uint8", "uint16"])
@@ -259,7 +259,7 @@ def test_grey_where_not_all_images_have_colours(coloured, images, tmp_path):
         assert source.count == 1
 
 
-def test_few_cells_of_a_town_show_what_hides_them(shared_data, tmp_path):
+def test_few_cells_of_a_town_show_the_roof_that_occludes_them(shared_data, tmp_path):
     scene = shared_data / "rendered-city"
     # All four look aside: from the side of a house the street behind it is hidden.
     images = tuple(scene / f"img_{view}.tif" for view in ("f1", "b1", "f2", "b2"))

@@ -10,12 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from kernel_scene import HIDDEN
 from textured_views import LEVEL_STEPS, SHAPE, SHORT, SIDE, textured
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.match_curve import FAIR, GOOD, POOR, predicted_sigma
+from zlocus.matching.occlusion import exclude
 from zlocus.matching.pair_labels import PairLabels
 from zlocus.matching.view_selection import (
     CoarserCurves,
@@ -263,9 +264,9 @@ def test_middles_of_blocks(shape, block):
 @SHAPES
 def test_shares_of_blocks(shape, block):
     lattice = lattice_of(shape, block)
-    visible = np.zeros((3, 3, *shape), np.int32)
+    visible = VisibleHeights(*np.zeros((3, 3, *shape), np.int32))
     nothing = np.random.default_rng(4).random((3, *shape)) < 0.3
-    visible[0][nothing], visible[1][nothing] = HIDDEN, -1
+    exclude(visible, nothing)
     found = block_shares(visible, lattice)
     for i in range(3):
         plain = []
@@ -287,10 +288,9 @@ def needed(views, options, *, worth=(True, True, True), covering=None, occluded_
     n_views = len(views.layout)
     cells = np.array([(r, c) for c in (10, 14, 30, 34) for r in (10, 20, 28)], np.int64)
     of_block = (cells[:, 1] > 24).astype(np.int64)
-    visible = np.zeros((3, n_views, *SHAPE), np.int32)
-    visible[1], visible[2] = 1000, -1000
+    visible = VisibleHeights(*(np.full((n_views, *SHAPE), index, np.int32) for index in (0, 1000, -1000)))
     if occluded_below is not None:
-        visible[2] = np.array(occluded_below)[:, None, None]
+        visible.lowest_unoccluded[:] = np.array(occluded_below)[:, None, None]
     order = ViewOrder(np.zeros(2, np.int64), np.tile(search, (2, 1)), np.tile(worth, (2, 1)))
     covering = np.ones((len(cells), n_views), bool) if covering is None else covering(cells)
     surface = np.full(SHAPE, LEVEL_STEPS, np.float32)

@@ -18,7 +18,7 @@ from orientation_scenes import BASE_HEIGHT_M, GSD_M, AffineSensor, hill_scene, i
 from zlocus.core.options import OrientationOptions
 from zlocus.core.progress import SilentProgress
 from zlocus.core.scene import View
-from zlocus.matching.radiometry import FEWEST_POINTS, MOST_POINTS, grey_scales, greys_of
+from zlocus.matching.radiometry import MAX_POINTS, MIN_POINTS, grey_scales, greys_of
 from zlocus.orientation import sift as features
 from zlocus.orientation import ties as ties_module
 from zlocus.orientation.epipolar import Sightlines, epipolar_curves
@@ -196,8 +196,8 @@ def strip():
 def test_every_image_of_a_long_strip_gets_enough_points():
     views, _, at = strip()
     n_seen = np.bincount(greys_of(views, at).view, minlength=N_VIEWS)
-    assert n_seen.min() > 3 * FEWEST_POINTS
-    assert n_seen.max() < 3 * MOST_POINTS
+    assert n_seen.min() > 3 * MIN_POINTS
+    assert n_seen.max() < 3 * MAX_POINTS
 
 
 def test_neighbours_of_a_long_strip_agree():

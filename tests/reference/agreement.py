@@ -1,4 +1,4 @@
-"""Twins of the measure: windows cut out of planes, their plain correlation, grey differences, means over all pairs."""
+"""Twins of the matching cost: windows cut out of planes, their correlation, grey differences, means over all pairs."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from reference.projection import along_base, bilinear, cubic, positions
+from reference.projection import along_slope, bilinear, cubic, positions
 
-UNSEEN_COST = 40.0
+UNCOVERED_COST = 40.0
 
 
 def windows(plane, half):
@@ -19,29 +19,29 @@ def windows(plane, half):
     return cut.reshape(*cut.shape[:2], side * side)
 
 
-def ncc(a, b, floor=0.0):
-    """Correlation of windows (..., m), with `floor` added to both variances; 0 where a window is constant."""
+def ncc(a, b, variance=0.0):
+    """Correlation of windows (..., m), with `variance` added to both variances; 0 where a window is constant."""
     a, b = a - a.mean(axis=-1, keepdims=True), b - b.mean(axis=-1, keepdims=True)
     va, vb = (a * a).sum(axis=-1), (b * b).sum(axis=-1)
     m = a.shape[-1]
-    norm = np.sqrt((va + m * floor) * (vb + m * floor))
+    norm = np.sqrt((va + m * variance) * (vb + m * variance))
     constant = (va < 1e-9) | (vb < 1e-9)
     return np.where(constant, 0.0, (a * b).sum(axis=-1) / np.where(constant, 1.0, norm))
 
 
-def over_pairs(total, visible, excused):
+def over_pairs(total, visible, excluded):
     """Mean over all pairs of usable views of a sum over the visible pairs, (r, c).
 
-    visible : (2, i, r, c) whether a view sees the cell at this height, and whether it does at any height (then its
-    pairs count); excused : share of the hidden pairs that is as good as the visible ones, the others are 0.
+    visible : (2, i, r, c) whether a view sees the cell at this height, and whether it covers it at any height (then its
+    pairs count); excluded : share of the pairs with an occluded view that is excluded from the mean; the others are 0.
     """
     here, anywhere = (v.sum(axis=0) for v in visible)
     every = np.where(anywhere > 1, total / np.maximum(anywhere * (anywhere - 1) / 2, 1), 0.0)
     shown = np.where(here > 1, total / np.maximum(here * (here - 1) / 2, 1), 0.0)
-    return (1 - excused) * every + excused * shown
+    return (1 - excluded) * every + excluded * shown
 
 
-def mean_ncc(planes, visible, half, floor=0.0, excused=0.0, group=(0, 1)):
+def mean_ncc(planes, visible, half, variance=0.0, excluded=0.0, group=(0, 1)):
     """Mean over all pairs of the views that are usable, (r, c), see `over_pairs`.
 
     planes : one (r + 2 half, c + 2 half) each; group : number, and how many: the part of the pairs a + b of which is
@@ -52,59 +52,63 @@ def mean_ncc(planes, visible, half, floor=0.0, excused=0.0, group=(0, 1)):
     for a, b in combinations(range(len(planes)), 2):
         if (a + b) % group[1] != group[0]:
             continue
-        agreement = ncc(windows(planes[a], half), windows(planes[b], half), floor)
+        agreement = ncc(windows(planes[a], half), windows(planes[b], half), variance)
         total += np.where(here[a] & here[b], agreement, 0.0)
-    return over_pairs(total, visible, excused)
+    return over_pairs(total, visible, excluded)
 
 
-def mean_closeness(greys, visible, reach, excused=0.0):
-    """Mean over all pairs of usable views of max(0, 1 - grey difference / reach), (r, c), see `over_pairs`.
+def mean_closeness(greys, visible, max_difference, excluded=0.0):
+    """Mean over all pairs of usable views of max(0, 1 - grey difference / max_difference), (r, c), see `over_pairs`.
 
     greys : one (r, c) each.
     """
     here = visible[0]
     total = np.zeros(here.shape[1:])
     for a, b in combinations(range(len(greys)), 2):
-        close = np.maximum(0.0, 1.0 - np.abs(np.subtract(greys[a], greys[b], dtype=float)) / reach)
+        close = np.maximum(0.0, 1.0 - np.abs(np.subtract(greys[a], greys[b], dtype=float)) / max_difference)
         total += np.where(here[a] & here[b], close, 0.0)
-    return over_pairs(total, visible, excused)
+    return over_pairs(total, visible, excluded)
 
 
-def cell_costs(images, nodes, heights, index, block, halves, seen, measure, relief):
+def cell_costs(images, nodes, heights, index, block, halves, visible, parameters, relief):
     """64 (1 - mean NCC + weight (1 - mean closeness)) of a block's cells at one height, (r, c), before rounding.
 
-    Where fewer than two images cover that height, a fixed cost: see `block_costs`. measure : floor, weight, reach,
-    excused, the weight where only two views cover the block; relief : (r + 2 half, c + 2 half) steps.
+    Where fewer than two images cover that height, a fixed cost: see `block_costs`. parameters : `CostParameters`; relief :
+    (r + 2 half, c + 2 half) steps.
     """
-    half = max(halves)
-    floor, weight, reach, excused, weight_two = measure
-    weight = weight_two if (seen[0] <= seen[1]).any(axis=(1, 2)).sum() == 2 else weight
-    shape = seen.shape[2:]
+    half, p = max(halves), parameters
+    low, high, free_from = visible
+    weight = float(p.grey_weight_two_images if (low <= high).any(axis=(1, 2)).sum() == 2 else p.grey_weight)
+    variance, max_difference, excluded = (
+        float(v) for v in (p.window_variance, p.max_grey_difference, p.occluded_pairs_excluded)
+    )
+    shape = low.shape[1:]
     t = heights[0] + index * heights[1]
     planes = [
-        bilinear(image, along_base(node, t, relief, heights[1], shape, block, half))
+        bilinear(image, along_slope(node, t, relief, heights[1], shape, block, half))
         for image, node in zip(images, nodes, strict=True)
     ]
-    covered = (seen[0] <= index) & (index <= seen[1])
-    visible = np.stack([covered & (seen[2] <= index), seen[0] <= seen[1]])
+    covered = (low <= index) & (index <= high)
+    usable = np.stack([covered & (free_from <= index), low <= high])
     by_window = []
     for small in halves:
         trim = half - small
         inner = [plane[trim : plane.shape[0] - trim, trim : plane.shape[1] - trim] for plane in planes]
-        by_window.append(mean_ncc(inner, visible, small, floor, excused))
+        by_window.append(mean_ncc(inner, usable, small, variance, excluded))
     greys = [plane[half:-half, half:-half] for plane in planes]
-    apart = 1.0 - np.mean(by_window, axis=0) + weight * (1.0 - mean_closeness(greys, visible, reach, excused))
-    return np.where(covered.sum(axis=0) > 1, 64.0 * apart, UNSEEN_COST * (1.0 + weight))
+    apart = 1.0 - np.mean(by_window, axis=0) + weight * (1.0 - mean_closeness(greys, usable, max_difference, excluded))
+    return np.where(covered.sum(axis=0) > 1, 64.0 * apart, UNCOVERED_COST * (1.0 + weight))
 
 
-def profile(images, nodes, heights, surface, offset, block, half, seen, floor=0.0, group=(0, 1)):
+def profile(images, nodes, heights, surface, offset, block, half, visible, variance=0.0, group=(0, 1)):
     """Mean NCC, (r, c), in windows of a block that follow a surface (r + 2 half, c + 2 half), plus `offset`.
 
-    Or the part of it that a group of pairs has, see `mean_ncc`.
+    Or the part of it that comes from a group of pairs, see `mean_ncc`.
     """
-    shape = seen.shape[2:]
+    low, high, free_from = visible
+    shape = low.shape[1:]
     t = heights[0] + (surface + offset) * heights[1]
     planes = [cubic(image, positions(node, t, shape, block, half)) for image, node in zip(images, nodes, strict=True)]
     centre = surface[half : half + shape[0], half : half + shape[1]]
-    visible = (seen[0] <= centre) & (centre <= seen[1]) & (seen[2] <= centre)
-    return mean_ncc(planes, np.stack([visible, visible]), half, floor, group=group)
+    is_seen = (low <= centre) & (centre <= high) & (free_from <= centre)
+    return mean_ncc(planes, np.stack([is_seen, is_seen]), half, variance, group=group)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-NEAR = 0.25
+MIN_SHARE_OF_RAY = 0.25
 
 
 def lowest_free_ray(surface, supported, by_col, by_row):
     """Rays marched from every supported cell, a cell at a time along the longer component of the direction.
 
     A ray that passes between two cells counts for each that it is at least a quarter of a cell near to; from there it
-    goes on in the same direction, as the kernel's sweep does.
+    continues in the same direction, as the kernel's sweep does.
     """
     rows, cols = surface.shape
     longest = max(abs(by_col), abs(by_row))
@@ -20,7 +20,7 @@ def lowest_free_ray(surface, supported, by_col, by_row):
         return out
     along_cols = abs(by_col) >= abs(by_row)
     sign = 1 if (by_col if along_cols else by_row) > 0 else -1
-    slant = (by_row if along_cols else by_col) / longest
+    drift = (by_row if along_cols else by_col) / longest
     best = {}
     stack = [(r, c, float(surface[r, c])) for r, c in np.ndindex(surface.shape) if supported[r, c]]
     while stack:
@@ -31,9 +31,9 @@ def lowest_free_ray(surface, supported, by_col, by_row):
             continue
         height += 1 / longest
         for target in range(rows if along_cols else cols):
-            # The cell looks back to `target - slant`, between two cells, of which this may be one.
-            share = 1 - abs(target - slant - minor)
-            if share < NEAR:
+            # The cell looks back to `target - drift`, between two cells, of which this may be one.
+            share = 1 - abs(target - drift - minor)
+            if share < MIN_SHARE_OF_RAY:
                 continue
             cell = (target, major) if along_cols else (major, target)
             if height < best.get(cell, np.inf) - 1e-9:
@@ -44,23 +44,23 @@ def lowest_free_ray(surface, supported, by_col, by_row):
     return out
 
 
-def with_ray_costs(rays, base, lattice, per_ray, most, cost):
+def with_ray_costs(rays, slope_cells, lattice, ray_cost, max_cost, cost):
     """The volume with the costs of all rays below each height, cell by cell and height by height."""
     cost = cost.astype(int).copy()
     address = lattice.address
-    for r, c in np.ndindex(base.shape):
+    for r, c in np.ndindex(slope_cells.shape):
         b, d = r // lattice.block, c // lattice.block
         first, count = int(lattice.first[b, d]), int(lattice.count[b, d])
         start = address[0, b, 0] + (r - b * lattice.block) * address[1, b, 0]
         start += address[2, b, d] + (c - d * lattice.block) * count
         for k in range(count):
-            n_rays = sum(first + k + base[r, c] > ray for ray in rays[:, r, c])
-            cost[start + k] = min(cost[start + k] + min(n_rays * per_ray, most), 255)
+            n_rays = sum(first + k + slope_cells[r, c] > ray for ray in rays[:, r, c])
+            cost[start + k] = min(cost[start + k] + min(n_rays * ray_cost, max_cost), 255)
     return cost
 
 
-def agreeing_images(grey, covers, window, least_ncc, alike, even):
-    """With how many others each image agrees on each cell, textured and even, from windows cut out one by one."""
+def agreeing_images(grey, covers, window, min_ncc, max_difference, max_plain):
+    """Number of others with which each image agrees on each cell, textured and not, from windows cut out one by one."""
     n, rows, cols = grey.shape
     half = window // 2
     padded = np.pad(grey.astype(float), ((0, 0), (half, half), (half, half)), mode="symmetric")
@@ -76,6 +76,6 @@ def agreeing_images(grey, covers, window, least_ncc, alike, even):
                 apart = abs(float(grey[i, r, c]) - float(grey[j, r, c]))
                 deviations = np.std(a) * np.std(b)
                 ncc = np.mean((a - a.mean()) * (b - b.mean())) / deviations if deviations > 1e-9 else 0.0
-                textured[i, r, c] += ncc > least_ncc and apart < alike
-                plain[i, r, c] += max(np.std(a), np.std(b), apart) < even
+                textured[i, r, c] += ncc > min_ncc and apart < max_difference
+                plain[i, r, c] += max(np.std(a), np.std(b), apart) < max_plain
     return textured, plain

@@ -1,4 +1,4 @@
-"""Twins of `plane_grid`, `resample_plane`, `resample_surface` and `tile_ortho`: where cells fall, and what is there."""
+"""Twins of `block_grid`, `resample_plane`, `resample_surface` and `tile_ortho`: where cells project to, and the values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ def position(node, t, row, col, block):
 
 
 def positions(node, t, shape, block, border=0):
-    """(r, c, 2) px of the first `shape` cells of a block and a border around them. t : height, a number or (r, c)."""
+    """(r, c, 2) px of the first `shape` cells of a block and of `border` cells around them.
+
+    t : height, a number or (r, c).
+    """
     row, col = np.indices((shape[0] + 2 * border, shape[1] + 2 * border)) - float(border)
     return position(node, np.broadcast_to(np.asarray(t, float), row.shape), row, col, block)
 
@@ -30,7 +33,7 @@ def derivative(node):
     return np.concatenate([node[..., 1:] * [1.0, 2.0, 3.0], np.zeros_like(node[..., :1])], axis=-1)
 
 
-def along_base(node, t, relief, per_index, shape, block, border=0):
+def along_slope(node, t, relief, per_index, shape, block, border=0):
     """(r, c, 2) px of the cells of a block, `relief` steps above t, moving as fast as the block's middle does at t.
 
     relief : (r + 2 border, c + 2 border) steps; per_index : t per step. `positions` of the cells' own heights, but for
@@ -40,9 +43,12 @@ def along_base(node, t, relief, per_index, shape, block, border=0):
     return positions(node, t, shape, block, border) + relief[..., None] * speed
 
 
-def base_relief(base, corners, rows, cols, block, border):
-    """Base surface less the bilinear surface through a block's four corners. base : of a tile and its border."""
-    part = base[rows.start : rows.stop + 2 * border, cols.start : cols.stop + 2 * border]
+def slope_relief(surface, corners, rows, cols, block, border):
+    """Support surface less the bilinear surface through a block's four corners.
+
+    surface : of a tile and of `border` cells around it.
+    """
+    part = surface[rows.start : rows.stop + 2 * border, cols.start : cols.stop + 2 * border]
     a, b = (np.indices(part.shape) - border) / block
     top = (1 - b) * corners[0, 0] + b * corners[0, 1]
     low = (1 - b) * corners[1, 0] + b * corners[1, 1]

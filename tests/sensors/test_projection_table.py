@@ -15,10 +15,19 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.scene import View
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.occlusion import coverage, covers, hide, left_out
+from zlocus.matching.kernels.shared_records import VisibleHeights
+from zlocus.matching.occlusion import covered_heights, covers, excluded_view_mask, mark_occlusions
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.slope_surface import SlopeSurface
-from zlocus.matching.tile_views import FINEST_BENT_PX, MOST_LOST, ViewPixels, halved, read_pixels, tile_views
+from zlocus.matching.tile_views import (
+    FINEST_BENT_PX,
+    MAX_EXCLUDED_SHARE_AT_LAST,
+    TileGrid,
+    ViewPixels,
+    halved,
+    read_pixels,
+    tile_views,
+)
 from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.linescan import RectifiedModel
@@ -146,31 +155,39 @@ def test_coverage_leaves_out_what_does_not_hold():
     shape, sensor = (600, 600), drone()
     pixels = np.zeros((912, 1368), np.float32)
     window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
-    views = tile_views([window, window], 0, grid(0.15, shape), shape, 32, (45.0, 0.5), (40.0, 60.0), 4, (45.0, 55.0))
+    views = tile_views(
+        [window, window], TileGrid(0, grid(0.15, shape), shape, 32, 45.0, 0.5), (40.0, 60.0), 4, (45.0, 55.0)
+    )
     assert views.block < 32
-    assert not views.holds.all()
+    assert not views.is_projected.all()
     base = SlopeSurface.flat(shape, views.block)
     n = (-(-600 // views.block),) * 2
     lattice = HeightLattice(45.0, 0.5, shape, views.block, np.zeros(n, np.int64), np.full(n, 20))
-    seen = covers(coverage(views, base, lattice))
+    seen = covers(covered_heights(views, base, lattice))
     row, col = np.mgrid[0:600, 0:600]
     x, y = grid(0.15, shape) * (col + 0.5, row + 0.5)
     xy = sensor.image_from_ground(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 50.0)]))
     inside = ((xy > 4) & (xy < (1363, 907))).all(axis=1).reshape(shape)
     assert not (seen[0] & ~((xy > 0) & (xy < (1367, 911))).all(axis=1).reshape(shape)).mean() > 0.02
     assert (seen[0] & inside).sum() > 0.97 * inside.sum()
-    unmapped = ~views.holds[0].repeat(views.block, 0).repeat(views.block, 1)[:600, :600]
+    unmapped = ~views.is_projected[0].repeat(views.block, 0).repeat(views.block, 1)[:600, :600]
     assert not seen[0][unmapped].any()
-    hide(np.zeros((3, 2, *shape), np.int32), views, np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0)
+    mark_occlusions(
+        VisibleHeights(*np.zeros((3, 2, *shape), np.int32)),
+        views,
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        0.0,
+    )
 
 
 def test_tables_hold_over_heights_that_reach_close_to_the_camera():
     """From 170 to 55 m below a tilted wide lens, no block that shows the ground is left out."""
     shape, pixels = (400, 400), np.zeros((912, 1368), np.float32)
     window = ViewPixels(drone(), (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
-    views = tile_views([window], 0, grid(0.15, shape), shape, 32, (-15.0, 0.5), (-15.0, 100.0), 4)
-    assert not views.lost.any()
-    assert views.holds.mean() > 0.3
+    views = tile_views([window], TileGrid(0, grid(0.15, shape), shape, 32, -15.0, 0.5), (-15.0, 100.0), 4)
+    assert not views.is_excluded.any()
+    assert views.is_projected.mean() > 0.3
 
 
 def shown_errors(table, sensor, transform, shape, block, window):
@@ -204,13 +221,13 @@ def test_each_block_is_tabulated_over_the_heights_at_which_it_is_shown(omega):
     request = TableRequest(transform, shape, block, heights, FINEST_BENT_PX, HIGHEST_DEGREE)
     with pytest.raises(GeometryError):
         projection_table(sensor, request, IMAGE)
-    table = projection_table_where_shown(sensor, request, IMAGE, MOST_LOST, may_drop_heights=True)
+    table = projection_table_where_shown(sensor, request, IMAGE, MAX_EXCLUDED_SHARE_AT_LAST, may_drop_heights=True)
     errors, left_out = shown_errors(table, sensor, transform, shape, block, IMAGE)
     assert len(errors) > 300
     assert errors.max() < 1.5 * FINEST_BENT_PX
     assert left_out < 0.25
     low = projection_table_where_shown(
-        sensor, replace(request, z_range=(25.0, 90.0)), IMAGE, MOST_LOST, may_drop_heights=True
+        sensor, replace(request, z_range=(25.0, 90.0)), IMAGE, MAX_EXCLUDED_SHARE_AT_LAST, may_drop_heights=True
     )
     assert shown_errors(low, sensor, transform, shape, block, IMAGE)[1] < 0.02
 
@@ -219,7 +236,7 @@ def test_what_is_too_bent_is_refused_unless_it_may_be_left_out():
     shape, sensor = (200, 200), drone()
     request = TableRequest(grid(1.0, shape), shape, 4, (25.0, 140.0), FINEST_BENT_PX, HIGHEST_DEGREE)
     with pytest.raises(GeometryError, match=r"of 4 cells is .* Use a smaller block or fewer heights"):
-        projection_table_where_shown(sensor, request, IMAGE, MOST_LOST, may_drop_heights=False)
+        projection_table_where_shown(sensor, request, IMAGE, MAX_EXCLUDED_SHARE_AT_LAST, may_drop_heights=False)
     table = projection_table_where_shown(sensor, request, IMAGE, 1.0, may_drop_heights=True)
     assert table.lost.any()
     assert table.holds.any()
@@ -261,10 +278,10 @@ def test_raw_lines_of_an_unsteady_flight_need_a_high_degree(unsteady):
         projection_table(raw, TableRequest(around, shape, 4, z, FINEST_BENT_PX, HIGHEST_DEGREE))
     pixels = np.zeros((300, 300), np.float32)
     window = ViewPixels(raw, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
-    views = tile_views([window], 0, around, shape, 32, (430.0, 0.5), z, 4)
+    views = tile_views([window], TileGrid(0, around, shape, 32, 430.0, 0.5), z, 4)
     assert views.nodes.shape[-1] == UNSTEADY_DEGREE + 1
-    assert views.holds.any()
-    assert not views.lost.any()
+    assert views.is_projected.any()
+    assert not views.is_excluded.any()
 
 
 def test_flights_too_unsteady_for_raw_images_are_told_so(unsteady):
@@ -276,7 +293,7 @@ def test_flights_too_unsteady_for_raw_images_are_told_so(unsteady):
     shaken = replace(raw.trajectory, centres=raw.trajectory.centres + jitter)
     window = ViewPixels(replace(raw, trajectory=shaken), (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
     with pytest.raises(GeometryError, match=r"too unsteady for its raw images.*level 1"):
-        tile_views([window], 0, around, shape, 32, (430.0, 0.5), (430.0, 500.0), 4)
+        tile_views([window], TileGrid(0, around, shape, 32, 430.0, 0.5), (430.0, 500.0), 4)
 
 
 def test_blocks_from_which_a_view_is_left_out_are_named():
@@ -293,12 +310,12 @@ def test_blocks_from_which_a_view_is_left_out_are_named():
     both = projection_table(drone(), TableRequest(ahead, shape, 8, (30.0, 153.0), 2.0, 7), IMAGE, 1.0)
     assert (both.lost & ~both.holds).mean() > 0.8
     assert not (table.lost & table.holds).any()
-    views = tile_views([window], 0, grid(0.5, shape), shape, 32, (15.0, 0.5), (15.0, 60.0), 4)
-    named = replace(views, lost=np.zeros_like(views.lost))
-    assert not left_out(named, shape).any()
-    named.lost[0, 1, 2] = True
+    views = tile_views([window], TileGrid(0, grid(0.5, shape), shape, 32, 15.0, 0.5), (15.0, 60.0), 4)
+    named = replace(views, is_excluded=np.zeros_like(views.is_excluded))
+    assert not excluded_view_mask(named, shape).any()
+    named.is_excluded[0, 1, 2] = True
     side = views.block
-    marked = left_out(named, shape)
+    marked = excluded_view_mask(named, shape)
     assert marked[side : 2 * side, 2 * side : 3 * side].all()
     assert marked.sum() == side**2
 
@@ -309,7 +326,7 @@ def test_perspective_shrinks_blocks_and_raises_the_degree_only_where_needed():
 
     def fitted(sensor):
         window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
-        return tile_views([window], 0, grid(0.15, (256, 256)), (256, 256), 32, (45.0, 0.5), (40.0, 60.0), 4)
+        return tile_views([window], TileGrid(0, grid(0.15, (256, 256)), (256, 256), 32, 45.0, 0.5), (40.0, 60.0), 4)
 
     far = FrameModel((*CENTRE, 2050.0), rotation_from_angles(0.0, 0.0, 10.0), 13_000.0, (683.5, 455.5))
     assert (fitted(far).block, fitted(far).nodes.shape[-1]) == (32, 4)
@@ -327,9 +344,9 @@ def test_pixels_of_a_level(level):
     pixels = tuple(np.zeros((96 // 2**k, 112 // 2**k), np.float32) for k in range(3))
     window = ViewPixels(sensor, origin, 0.0, 1.0, pixels, tuple(np.ones(p.shape, bool) for p in pixels))
     lattice = (30.0, 1.5)
-    views = tile_views([window], level, transform, shape, block, lattice, HEIGHTS, 2)
+    views = tile_views([window], TileGrid(level, transform, shape, block, *lattice), HEIGHTS, 2)
     for row, col, k in ((0, 0, 0), (16, 32, 7), (32, 48, 30)):
-        t = views.heights[0] + k * views.heights[1]
+        t = views.t_of_index[0] + k * views.t_of_index[1]
         x, y = views.nodes[0, row // block, col // block] @ t ** np.arange(4)
         ground = np.array([[*(transform * (col + 0.5, row + 0.5)), lattice[0] + k * lattice[1]]])
         exact = (sensor.image_from_ground(ground)[0] + 0.5) / 2**level - 0.5 - np.array(origin[::-1]) / 2**level

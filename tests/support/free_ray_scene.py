@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from rendered_scenes import CENTRE
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.tile_views import ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
 from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (60, 80)
@@ -39,7 +39,7 @@ def level_ground(angles=ANGLES_DEG):
         ORIGIN_M, STEP_M, SHAPE, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
     )
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
-    return tile_views(pixels, 0, transform, SHAPE, BLOCK, (ORIGIN_M, STEP_M), z, 2), lattice
+    return tile_views(pixels, TileGrid(0, transform, SHAPE, BLOCK, ORIGIN_M, STEP_M), z, 2), lattice
 
 
 def with_patch():

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.kernels.shared_records import ViewArrays
+from zlocus.matching.kernels.shared_records import ViewArrays, VisibleHeights
 
-HIDDEN = 2**30
 IMAGE_SHAPE = (61, 97)
 
 
@@ -43,11 +42,15 @@ class KernelScene:
                 rows = slice(r0, min(r0 + self.block, self.shape[0]))
                 yield b, d, rows, slice(c0, min(c0 + self.block, self.shape[1]))
 
-    def all_seen(self):
-        """(3, i, r, c) int32: every view covers and sees every height."""
-        seen = np.zeros((3, self.n_views, *self.shape), np.int32)
-        seen[1] = 1000
-        return seen
+    @property
+    def arrays(self):
+        """The views as the kernels take them."""
+        return ViewArrays(self.pixels, self.layout, self.nodes, self.heights, self.block)
+
+    def all_visible(self):
+        """Every view covers and sees every height."""
+        shape = (self.n_views, *self.shape)
+        return VisibleHeights(np.zeros(shape, np.int32), np.full(shape, 1000, np.int32), np.zeros(shape, np.int32))
 
 
 def kernel_scene(n_views=3, shape=(37, 70), block=16, seed=0):
@@ -88,7 +91,7 @@ def even_lattice(count=16, shape=(37, 70), block=16, first=0):
 
 
 def at_all_heights(holds):
-    """`TileViews.ends` of blocks (i, b, d) that hold at every height."""
+    """`TileViews.index_range` of blocks (i, b, d) that hold at every height."""
     return np.broadcast_to((-np.inf, np.inf), (*holds.shape, 2))
 
 

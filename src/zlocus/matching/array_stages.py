@@ -20,11 +20,11 @@ from zlocus.core.scene import ImageSource, Scene
 from zlocus.matching import true_ortho as ortho
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.match_scene import height_step, reference_first
-from zlocus.matching.occlusion import coverage
+from zlocus.matching.occlusion import covered_heights
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties
 from zlocus.matching.slope_surface import SlopeSurface
-from zlocus.matching.tile_views import pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, pixel_window, read_pixels, tile_views
 
 # Cost of 1 - NCC = 1 in the integer units of the kernels, and the largest cost that these hold.
 COST_UNIT, MAX_COST = 64.0, 255.0
@@ -197,14 +197,14 @@ def true_ortho(
     pixels = [read_pixels(view, part, 1, GreyScale(0.0, 1.0)) for view, part in parts if part is not None]
     if not pixels:
         return np.full(shape, np.nan, np.float32)
-    projected = tile_views(pixels, 0, transform, shape, options.block, (origin_m, step_m), z_range, 0)
+    projected = tile_views(pixels, TileGrid(0, transform, shape, options.block, origin_m, step_m), z_range, 0)
     blocks = (-(-shape[0] // projected.block), -(-shape[1] // projected.block))
     lattice = HeightLattice(
         origin_m, step_m, shape, projected.block, np.zeros(blocks, np.int64), np.full(blocks, n_steps, np.int64)
     )
     index = ((np.where(np.isfinite(height), height, lowest) - origin_m) / step_m).astype(np.float32)
-    seen = coverage(projected, SlopeSurface.flat(shape, projected.block), lattice)
-    shown = ortho.true_ortho(pixels, projected, seen, index)
+    visible = covered_heights(projected, SlopeSurface.flat(shape, projected.block), lattice)
+    shown = ortho.true_ortho(pixels, projected, visible, index)
     shown[~np.isfinite(height)] = np.nan
     return shown
 

@@ -13,14 +13,14 @@ from zlocus.matching.height_checks import judge
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.level_records import LevelResult, TileInputs
 from zlocus.matching.local_contrast import texture_unit
-from zlocus.matching.occlusion import covers, left_out, n_seeing
-from zlocus.matching.overlap import BorderGround, unsupported
+from zlocus.matching.occlusion import covers, excluded_view_mask, n_seeing
+from zlocus.matching.overlap import OverlapGround, unsupported
 from zlocus.matching.plane_fitting import PlanarHeights, with_planes
 from zlocus.matching.precision import sigma_steps, spread_around, uncertainty_predictors
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.subpixel import refine
 from zlocus.matching.surface import Surface
-from zlocus.matching.true_ortho import CoarserHeights, ortho_image, true_ortho, what_stands_around
+from zlocus.matching.true_ortho import CoarserHeights, ortho_image, surroundings_of_tile, true_ortho
 
 # Number of views in which segments without texture are looked for, one after the other.
 MAX_VIEWS_FOR_PLANES = 2
@@ -56,7 +56,7 @@ def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResu
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
 
 
-def refined_surface(tile: TileInputs, result: LevelResult, border: BorderGround) -> RefinedSurface:
+def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> RefinedSurface:
     """Refine the heights of the finest level, halo included, check them, and estimate their precision."""
     match_scene, config = tile.match_scene, tile.config
     splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in tile.view_pixels])
@@ -70,10 +70,10 @@ def refined_surface(tile: TileInputs, result: LevelResult, border: BorderGround)
     last_index = match_scene.n_steps - 1
     group_distance = np.exp(predictors["group_distance"])
     quality = judge(result.heights, refined, n_covering, n_views, group_distance, last_index, config.checks)
-    _mark_overlap(quality, result, border, refined.height)
+    _mark_overlap(quality, result, ground, refined.height)
     height = result.lattice.metres(refined.height)
     sigma = sigma_steps(predictors, refined)
-    is_noise = border.is_near(result.level.window) & (spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps)
+    is_noise = ground.is_at_edge_in(result.level.window) & (spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps)
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)
     sigma *= np.float32(match_scene.height_step)
     height[is_empty(quality)] = np.nan
@@ -84,13 +84,13 @@ def refined_surface(tile: TileInputs, result: LevelResult, border: BorderGround)
 
 
 def _mark_overlap(
-    quality: NDArray[np.uint16], result: LevelResult, border: BorderGround, lattice_index: NDArray[np.float32]
+    quality: NDArray[np.uint16], result: LevelResult, ground: OverlapGround, lattice_index: NDArray[np.float32]
 ) -> None:
     """Mark excluded views, cells outside the overlap of the images, and planes; changes `quality` (r, c)."""
     window = result.level.window
-    quality[left_out(result.tile_views, quality.shape)] |= np.uint16(Quality.IMAGE_EXCLUDED)
-    quality[border.is_beyond(window)] |= np.uint16(Quality.UNSEEN)
-    is_unsupported = unsupported(border, window, result.tile_views, result.visible, lattice_index)
+    quality[excluded_view_mask(result.tile_views, quality.shape)] |= np.uint16(Quality.IMAGE_EXCLUDED)
+    quality[ground.is_uncovered_in(window)] |= np.uint16(Quality.UNSEEN)
+    is_unsupported = unsupported(ground, window, result.tile_views, result.visible, lattice_index)
     quality[is_unsupported] |= np.uint16(Quality.UNSEEN)
     if result.is_planar is not None:
         quality[result.is_planar] |= np.uint16(Quality.PLANE)
@@ -110,9 +110,9 @@ def ortho_of_surface(
     of_filled = (surface.height - np.float32(lattice.height_origin)) / np.float32(lattice.height_step)
     lattice_index = np.where(is_filled, of_filled, lattice_index)
     coarser = [CoarserHeights(r.level.number, r.level.window, r.heights.vertex) for r in reversed(coarser_results)]
-    around = what_stands_around(coarser, finest.tile_views, finest.level.window, lattice_index, config.pyramid.halo)
+    surroundings = surroundings_of_tile(coarser, finest.tile_views, finest.level.window, lattice_index, config.pyramid.halo)
     scale = tile.match_scene.grey_scales[0] if config.products.ortho_levels == "common" else None
     coloured = tile.match_scene.coloured(tile.view_numbers)
-    ortho = true_ortho(tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, around, scale)
+    ortho = true_ortho(tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, surroundings, scale)
     ortho[np.isnan(surface.height)] = np.nan
     return ortho

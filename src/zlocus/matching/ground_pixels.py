@@ -1,7 +1,7 @@
-"""Images of one ground pixel: which cells a set of images supports, and the finest image reduced to the others.
+"""Ground pixels of the images: how small cells may be, and the finest image reduced to the pixels of the others.
 
-A correlation compares what both images resolve. Beside an image of coarser pixels a finer one shows details that the
-other does not have, and in cells much finer than the coarser pixels windows hold less than one of them.
+A correlation compares only details that both images resolve. A much finer image shows details that a coarser one does
+not have; and in cells much finer than the coarser pixels, a window holds less than one of them.
 """
 
 from __future__ import annotations
@@ -14,43 +14,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError
-from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View
 from zlocus.core.footprints import ground_sample_distance
+from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View
 from zlocus.sensors.correction import ReducedModel
 
-# Cells are not finer than this share of the finest image's ground pixel.
-FINEST_CELL = 0.1
-# The finest image is reduced, and bounds what cells may be asked for, where the second finest has ground pixels more
-# than this many times as large. At twice the size all is well without.
-MIXED_RATIO = 2.2
-# Cells are not finer than this share of the second finest image's ground pixel in such a scene: two images are needed.
-FINEST_MIXED_CELL = 0.5
+# The side of a cell is at least this share of the finest image's ground pixel.
+MIN_CELL_SHARE = 0.1
+# A scene has mixed ground pixels where those of the second finest image are more than so many times as large as those
+# of the finest. Its finest image is reduced. At twice the size results are as good without.
+MIN_MIXED_RATIO = 2.2
+# In such a scene the side of a cell is at least this share of the second finest image's ground pixel: two images are
+# needed.
+MIN_MIXED_CELL_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class ReducedImage:
-    """An image whose pixels are the means of `factor` x `factor` pixels of another, valid where most of them are.
+    """An image whose pixels are the means of `factor` x `factor` pixels of another, valid where most of these are.
 
-    Rows and columns at the end that fill no whole pixel are dropped.
+    The last rows and columns are dropped where they fill no whole pixel.
     """
 
-    base: ImageSource
+    full_image: ImageSource
     factor: int
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        rows, cols = self.base.shape
+        rows, cols = self.full_image.shape
         return rows // self.factor, cols // self.factor
 
     @property
     def dtype(self) -> str:
         """See `ImageSource`."""
-        return self.base.dtype
+        return self.full_image.dtype
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """See `ImageSource`."""
-        window = self.base.read(*(number * self.factor for number in (row, col, rows, cols)))
+        window = self.full_image.read(*(number * self.factor for number in (row, col, rows, cols)))
         share = self._means(window.valid.astype(np.float32))
         total = self._means(np.where(window.valid, window.pixels, np.float32(0.0)))
         valid = share > 0.5
@@ -59,12 +60,12 @@ class ReducedImage:
     @property
     def has_colours(self) -> bool:
         """See `ColourSource`."""
-        return isinstance(self.base, ColourSource) and self.base.has_colours
+        return isinstance(self.full_image, ColourSource) and self.full_image.has_colours
 
     def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
         """See `ColourSource`."""
-        assert isinstance(self.base, ColourSource), "callers ask whether it has colours"
-        full = self.base.colours(*(number * self.factor for number in (row, col, rows, cols)))
+        assert isinstance(self.full_image, ColourSource), "callers ask whether it has colours"
+        full = self.full_image.colours(*(number * self.factor for number in (row, col, rows, cols)))
         return np.stack([self._means(band) for band in full])
 
     def _means(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -73,7 +74,7 @@ class ReducedImage:
 
 
 def median_ground_pixel(scene: Scene, z: float) -> float:
-    """Median over the views of the ground pixel, m."""
+    """Median ground pixel of the views at height z (m), m."""
     return float(np.median(ground_pixels(scene.views, z)))
 
 
@@ -83,9 +84,9 @@ def ground_pixels(views: Sequence[View], z: float) -> list[float]:
 
 
 def default_cell(scene: Scene, z: float) -> float:
-    """Side of the cells where none is asked for, m, to two digits: the median ground pixel.
+    """Default side of the cells, m, rounded to two digits: the median ground pixel at height z (m).
 
-    Where all images but one are much coarser, it is that of the second finest image.
+    Where all images but one are much coarser, it is the ground pixel of the second finest image.
     """
     common = common_pixel(ground_pixels(scene.views, z))
     pixel = median_ground_pixel(scene, z)
@@ -95,11 +96,14 @@ def default_cell(scene: Scene, z: float) -> float:
 def common_pixel(pixels: Sequence[float]) -> float | None:
     """Ground pixel (m) of the second finest image where it is much coarser than the finest; else None."""
     finest = sorted(pixel for pixel in pixels if np.isfinite(pixel))[:2]
-    return finest[1] if len(finest) == 2 and finest[1] > MIXED_RATIO * finest[0] else None
+    return finest[1] if len(finest) == 2 and finest[1] > MIN_MIXED_RATIO * finest[0] else None
 
 
 def check_resolution(resolution: float, scene: Scene, z: float, given: str) -> None:
-    """Refuse cells much finer than the images. given : what asked for the resolution, for the message.
+    """Refuse cells that are much finer than the images.
+
+    resolution : side of the cells, m; z : m, a height of the ground; given : where the resolution was set, for the
+    message.
 
     Raises
     ------
@@ -109,17 +113,17 @@ def check_resolution(resolution: float, scene: Scene, z: float, given: str) -> N
     """
     pixels = ground_pixels(scene.views, z)
     finest, common = min(pixels), common_pixel(pixels)
-    if resolution < FINEST_CELL * finest:
+    if resolution < MIN_CELL_SHARE * finest:
         raise ConfigError(
             f"{given} {resolution:g} m is finer than a tenth of the finest image's pixel ({finest:.3g} m on the "
             f"ground). Ask for {finest:.2g} m or a few times that."
         )
-    if common is not None and resolution < FINEST_MIXED_CELL * common:
+    if common is not None and resolution < MIN_MIXED_CELL_SHARE * common:
         name = scene.views[int(np.argmin(pixels))].name
         raise ConfigError(
             f"{given} {resolution:g} m is too fine: two images are compared in every cell, and only {name} has pixels "
             f"of {finest:.2g} m on the ground, the next has {common:.2g} m. Ask for "
-            f"{rounded_up(FINEST_MIXED_CELL * common):g} m or more, or add another fine image."
+            f"{rounded_up(MIN_MIXED_CELL_SHARE * common):g} m or more, or add another fine image."
         )
 
 
@@ -130,7 +134,7 @@ def rounded_up(size: float) -> float:
 
 
 def with_common_pixel(views: Sequence[View], z: float) -> tuple[View, ...]:
-    """The views, of which the finest is reduced to about the ground pixel of the second finest, if that is much larger.
+    """The views; where the second finest image has much larger ground pixels, the finest is reduced to about these.
 
     z : m, a height of the ground.
     """

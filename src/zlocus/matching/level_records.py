@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig
 from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.occlusion import PAIR
 from zlocus.matching.semiglobal import SemiGlobalHeights
@@ -151,8 +152,8 @@ class LevelResult:
     """What one pyramid level hands to the next.
 
     slope_surface : the slanted support surface along which the level was searched; of the coarsest level, the one that
-    follows from its heights. lattice : the search range of each block, in slope indices. visible : (3, i, r, c) int32
-    level indices, the visible height ranges of all views that help, see `coverage`. heights : level indices.
+    follows from its heights. lattice : the search range of each block, in slope indices. visible : level
+    indices, the visible height ranges of all views that help, see `occlusion`. heights : level indices.
     winner_takes_all : (r, c) int32 level indices of the least cost of each cell without the semi-global constraint;
     None at the finest level. evaluations : cells x heights x images that were compared, with those that the choice of
     images took; all_images : the same if every image that covers a cell had been used. agreement : (i,) see
@@ -164,7 +165,7 @@ class LevelResult:
     tile_views: TileViews
     slope_surface: SlopeSurface
     lattice: HeightLattice
-    visible: NDArray[np.int32]
+    visible: VisibleHeights
     heights: SemiGlobalHeights
     winner_takes_all: NDArray[np.int32] | None
     evaluations: int

@@ -42,8 +42,5 @@ class CurveSamples:
         cells, first, relief = self.cells[rows], self.first[rows], self.relief[rows]
         out = np.empty((len(cells), self.n_heights, self.relief.shape[1]), np.float32)
         half = (round(self.relief.shape[1] ** 0.5) - 1) // 2
-        line_windows(
-            tile_views.pixels, tile_views.blocked, tile_views.layout, tile_views.nodes, tile_views.heights,
-            tile_views.block, view, cells, first, half, relief, out,
-        )  # fmt: skip
+        line_windows(tile_views.arrays, tile_views.blocked, view, cells, first, half, relief, out)
         return out

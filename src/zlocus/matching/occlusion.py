@@ -1,110 +1,125 @@
-"""Between which heights each view sees each cell: inside the image, on valid pixels, not hidden by the surface."""
+"""The visible height range of every view in every cell: inside the image, on valid pixels, not occluded by a surface.
+
+Height indices are slope indices while a level is matched, and level indices in its result: see `height_lattice`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from affine import Affine
 from numpy.typing import NDArray
 
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.kernels.cost_volume import HIDDEN
-from zlocus.matching.kernels.coverage import tile_reach
-from zlocus.matching.kernels.occlusion import count_seeing, hide_below, lowest_visible
-from zlocus.matching.slope_surface import BaseSurface
+from zlocus.matching.kernels.coverage import BlockLimits, ViewMasks, tile_coverage
+from zlocus.matching.kernels.occlusion import count_seeing, lowest_visible, write_lowest_unoccluded
+from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, CellBox, VisibleHeights
+from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.view_directions import cells_per_step, parts_of_one_direction
 
-IntVolume = NDArray[np.int32]
-BORDER_PX = 3.0
-NOTHING_HIDDEN = -(2**29)
-# Views that a height takes.
+# Pixels along the edge of every image that are not used.
+EDGE_PX = 3.0
+# A height takes two views.
 PAIR = 2
 
 
-def coverage(views: TileViews, base: BaseSurface, lattice: HeightLattice, border_px: float = BORDER_PX) -> IntVolume:
-    """(3, i, r, c) int32: lowest and highest height index at which each image covers each cell, and from where on
-    nothing hides it (everywhere, for now).
+def covered_heights(
+    slope_views: TileViews, slope_surface: SlopeSurface, lattice: HeightLattice, edge_px: float = EDGE_PX
+) -> VisibleHeights:
+    """Height range over which each view covers each cell, in slope indices; nothing is occluded yet.
 
     A view takes part over the longest run of heights whose windows lie inside the image and on valid pixels; at other
-    heights it counts like a hidden one. (Asking for the whole range would empty the borders of every image by the
-    parallax of the range.) views : whose nodes follow `base`, from which heights are counted; border_px : of the images
-    that is not looked at.
+    heights it counts like an occluded one. (If the whole search range had to be covered, every image would lose its
+    edges by as much as the range is wide in parallax.) slope_views : projections of slope indices; edge_px : pixels
+    along the edge of the image that are not used.
     """
-    seen = np.empty((3, len(views.layout), *lattice.shape), np.int32)
-    seen[2] = NOTHING_HIDDEN
-    tile_reach(
-        views.blocked, views.has_blocked, views.layout, views.nodes, views.heights, lattice.ranges, views.limits,
-        lattice.block, border_px, base.relief, seen[0], seen[1],
+    shape = (len(slope_views.layout), *lattice.shape)
+    visible = VisibleHeights(np.empty(shape, np.int32), np.empty(shape, np.int32), np.full(shape, NEVER_OCCLUDED))
+    tile_coverage(
+        slope_views.arrays, ViewMasks(slope_views.blocked, slope_views.has_blocked), lattice.layout,
+        BlockLimits(*slope_views.index_limits), edge_px, slope_surface.relief, visible.lowest_covered,
+        visible.highest_covered,
     )  # fmt: skip
-    return seen
+    return visible
 
 
-def left_out(views: TileViews, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Cells (r, c) of which a view that may show them was left out: see `TileViews.lost`."""
-    return _cells_of(np.asarray(views.lost.any(axis=0)), views.block, shape)
+def excluded_view_mask(tile_views: TileViews, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Mark the cells (r, c) for which a view that may show them was excluded: see `TileViews.is_excluded`."""
+    return _cells_of(np.asarray(tile_views.is_excluded.any(axis=0)), tile_views.block, shape)
 
 
 def _cells_of(blocks: NDArray[np.bool_], block: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """What holds for blocks (..., b, d), for cells (..., r, c)."""
+    """Values of the cells (..., r, c) from those of their blocks (..., b, d)."""
     rows, cols = shape
     return blocks.repeat(block, axis=-2).repeat(block, axis=-1)[..., :rows, :cols]
 
 
-def hide(
-    seen: IntVolume,
-    views: TileViews,
-    surface: NDArray[np.float32],
-    base: NDArray[np.float32],
+def mark_occlusions(
+    visible: VisibleHeights,
+    tile_views: TileViews,
+    occluder: NDArray[np.float32],
+    slope_cells: NDArray[np.float32],
     margin_steps: float,
     first: tuple[int, int] = (0, 0),
 ) -> None:
-    """Set the lowest visible height of every view to what `surface` lets it see; changes `seen`.
+    """Set the lowest height index at which each view is not occluded by a surface; changes `visible`.
 
-    surface : float32 height indices of what may stand in the way, a lower bound of it, on the cells of the tile and,
-    where some are known, of those around it; base : (r, c) float32, the base surface that the indices of `seen` are
-    counted from; first : row and column of the tile's first cell in `surface`.
+    tile_views : projections of level indices; occluder : float32 level indices of the surface, a lower bound of it, on
+    the cells of the tile and, where some are known, of those around it; slope_cells : (r, c) float32, the surface that
+    the indices of `visible` are counted from; margin_steps : a view counts as occluded this far below the lowest
+    visible height; first : row and column of the tile's first cell in `occluder`.
     """
-    lowest, begin = np.empty(surface.shape, np.float32), np.array(first)
-    for i in range(len(views.layout)):
-        for part in parts_of_one_direction(views, i):
-            lowest_visible(surface, *cells_per_step(views, i, part), lowest)
-            ends = np.array([span.indices(n)[:2] for span, n in zip(part, base.shape, strict=True)])
-            hide_below(lowest, begin, base, np.float32(margin_steps), np.float32(NOTHING_HIDDEN), ends, seen[2, i])
+    lowest, begin = np.empty(occluder.shape, np.float32), np.array(first)
+    for i in range(len(tile_views.layout)):
+        for part in parts_of_one_direction(tile_views, i):
+            lowest_visible(occluder, *cells_per_step(tile_views, i, part), lowest)
+            (r0, r1), (c0, c1) = (span.indices(n)[:2] for span, n in zip(part, slope_cells.shape, strict=True))
+            write_lowest_unoccluded(
+                lowest, begin, slope_cells, np.float32(margin_steps), np.float32(NEVER_OCCLUDED),
+                CellBox(r0, r1, c0, c1), visible.lowest_unoccluded[i],
+            )  # fmt: skip
 
 
-def spare_pairs(seen: IntVolume) -> None:
-    """Take back what hides a view from cells that two views cover; changes `seen`.
+def keep_both_views_of_pairs(visible: VisibleHeights) -> None:
+    """Remove the occlusions from cells that only two views cover; changes `visible`.
 
-    There neither can be spared: hidden by a false height as likely as by a true one, nothing is left that could tell.
+    A height that is wrong occludes as much as one that is right. Without the second view no comparison would be left to
+    correct the error.
     """
-    seen[2][:, covers(seen).sum(axis=0) <= PAIR] = NOTHING_HIDDEN
+    visible.lowest_unoccluded[:, covers(visible).sum(axis=0) <= PAIR] = NEVER_OCCLUDED
 
 
-def sees(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which views see the cells at the given height indices. seen : (3, ..., r, c); height : (..., r, c)."""
-    return np.asarray((seen[0] <= height) & (height <= seen[1]) & (seen[2] <= height))
+def sees(visible: VisibleHeights, height: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which views see the cells at the given height indices. visible : (..., r, c); height : (..., r, c)."""
+    return np.asarray(covers_at(visible, height) & (visible.lowest_unoccluded <= height))
 
 
-def n_seeing(seen: IntVolume, height: NDArray[np.float32]) -> NDArray[np.int32]:
-    """How many views see each cell at its height index, (r, c). seen : (3, i, r, c); height : (r, c)."""
+def covers_at(visible: VisibleHeights, height: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which views cover the cells at the given height indices, occluded or not. Shapes: see `sees`."""
+    return np.asarray((visible.lowest_covered <= height) & (height <= visible.highest_covered))
+
+
+def n_seeing(visible: VisibleHeights, height: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Number of views that see each cell at its height index, (r, c). height : (r, c)."""
     count = np.empty(height.shape, np.int32)
-    count_seeing(seen, height, count)
+    count_seeing(visible, height, count)
     return count
 
 
-def covers(seen: IntVolume) -> NDArray[np.bool_]:
-    """Which views cover the cells at any height. seen : (3, ..., r, c)."""
-    return np.asarray(seen[0] <= seen[1])
+def covers(visible: VisibleHeights) -> NDArray[np.bool_]:
+    """Which views cover the cells at any height, (..., r, c)."""
+    return np.asarray(visible.lowest_covered <= visible.highest_covered)
 
 
-def above_base(seen: IntVolume, base: NDArray[np.float32]) -> IntVolume:
-    """`seen`, counted from a base surface (r, c), counted from the lattice's origin, to half a step; changes `seen`."""
-    never = ~covers(seen)
-    seen += np.rint(base).astype(np.int32)
-    seen[0][never], seen[1][never] = HIDDEN, NOTHING_HIDDEN
-    return seen
+def in_level_indices(visible: VisibleHeights, slope_cells: NDArray[np.float32]) -> VisibleHeights:
+    """Convert slope indices to level indices, to half a step; changes `visible`. slope_cells : (r, c) float32."""
+    never = ~covers(visible)
+    offset = np.rint(slope_cells).astype(np.int32)
+    for bound in visible:
+        bound += offset
+    exclude(visible, never)
+    return visible
 
 
-def metres_per_cell(transform: Affine) -> float:
-    """Side of a cell."""
-    return float(np.hypot(transform.a, transform.d))
+def exclude(visible: VisibleHeights, excluded: NDArray[np.bool_]) -> None:
+    """Let views cover some cells at no height; changes `visible`. excluded : (i, r, c) bool."""
+    visible.lowest_covered[excluded], visible.highest_covered[excluded] = NEVER_COVERED, NEVER_OCCLUDED

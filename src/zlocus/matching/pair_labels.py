@@ -22,7 +22,7 @@ from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import GOOD, POOR, curve_labels
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.subpixel import smoothed
-from zlocus.matching.tile_views import TileViews, tile_views
+from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
 from zlocus.matching.view_directions import cells_per_step
 
 IntArray = NDArray[np.int64]
@@ -119,10 +119,7 @@ def _views_around_ties(tile: TileInputs, window: CellWindow, ties: GridTies) -> 
     z = match_scene.ties[ties.inside(window), 2]
     z = z[np.isfinite(z)]
     z_reachable = (float(z.min()) - reach, float(z.max()) + reach) if len(z) else None
-    return tile_views(
-        tile.view_pixels, 0, match_scene.transform(window, 0), (window.rows, window.cols), config.pyramid.block,
-        (match_scene.height_origin, match_scene.height_step), z_range, large_window_side(config.cost) // 2, z_reachable,
-    )  # fmt: skip
+    return tile_views(tile.view_pixels, TileGrid(0, match_scene.transform(window, 0), (window.rows, window.cols), config.pyramid.block, match_scene.height_origin, match_scene.height_step), z_range, large_window_side(config.cost) // 2, z_reachable)  # fmt: skip
 
 
 def label_pairs(

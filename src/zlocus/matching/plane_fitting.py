@@ -2,7 +2,7 @@
 
 The semi-global constraint gives such cells the height of the least cost, which is level instead of sloped, and wrong by
 a metre or two. The outline of a segment and what little texture it has, taken together over the whole segment, give a
-better height (method section 6).
+better height (method section 8).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from zlocus.matching.kernels.plane_fitting import (
     PlaneLimits,
     fit_segments,
 )
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.local_contrast import ALL, Part, deviation, texture_unit
 from zlocus.matching.occlusion import sees
 from zlocus.matching.tile_views import TileViews
@@ -64,10 +65,10 @@ class PlainSegments:
 
 
 class LabelledSegments(NamedTuple):
-    """labels : (r, c) int32, 1 to `count`, 0 where a cell belongs to no segment."""
+    """labels : (r, c) int32, 1 to `n_segments`, 0 where a cell belongs to no segment."""
 
     labels: NDArray[np.int32]
-    count: int
+    n_segments: int
 
 
 class RectangleSides(NamedTuple):
@@ -81,14 +82,14 @@ def with_planes(
     views: TileViews,
     ortho: NDArray[np.float32],
     known: PlanarHeights,
-    visible: NDArray[np.int32],
+    visible: VisibleHeights,
     options: PlaneOptions,
     core: Part = ALL,
 ) -> PlanarHeights:
     """Heights with planes in place of the heights of plain segments, where the views agree on a plane.
 
     ortho : (r, c) grey values on the known heights, NaN where not known; known : heights so far, as lattice indices;
-    cells that are planar already keep theirs; visible : (3, i, r, c), see `coverage`; core : the cells whose texture is
+    cells that are planar already keep theirs; visible : see `occlusion`; core : the cells whose texture is
     the unit.
 
     A plane is accepted where most matched heights are near it, or the views agree better on it. In both cases the views
@@ -104,7 +105,7 @@ def with_planes(
         return known
     row, col = segments.row, segments.col
     before = height[row, col].astype(np.float64)
-    is_visible = sees(visible[:, :, row, col], height[row, col])
+    is_visible = sees(visible.at(np.s_[:, row, col]), height[row, col])
     fitted = _fitted_planes(views, segments, before, is_visible, PlaneLimits(float(noise), options.max_cost))
     is_near = np.abs(fitted.heights - before) < options.near_steps
     is_accepted = accepted_planes(segments, fitted, is_near, options)

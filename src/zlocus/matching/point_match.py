@@ -30,7 +30,7 @@ from zlocus.matching.match_curve import (
 )
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import GridTies, PairLabels, label_pairs
-from zlocus.matching.tile_views import TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, TileViews, pixel_window, read_pixels, tile_views
 from zlocus.matching.view_directions import cells_per_step
 from zlocus.matching.view_ranking import FeaturePoints, NeighbourSearch, OrderSource, order_images
 from zlocus.matching.view_selection import order_views, preselected
@@ -406,7 +406,7 @@ def views_around(
             view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey_scales[number]))
     shape, lattice = (window.rows, window.cols), (match_scene.height_origin, match_scene.height_step)
     half = large_window_side(config.cost) // 2
-    return numbers, tile_views(view_pixels, 0, transform, shape, config.pyramid.block, lattice, z_range, half)
+    return numbers, tile_views(view_pixels, TileGrid(0, transform, shape, config.pyramid.block, *lattice), z_range, half)
 
 
 def heights_around(

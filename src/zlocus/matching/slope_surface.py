@@ -165,15 +165,15 @@ class SlopeSurface:
         A polynomial in t at a node, evaluated at t + delta, is another polynomial in t:
         c'_j = sum_i C(i, j) c_i delta^(i - j).
         """
-        delta = self.nodes * tile_views.heights[1]
+        delta = self.nodes * tile_views.t_of_index[1]
         moved = np.zeros_like(tile_views.nodes)
         n = moved.shape[-1]
         for j in range(n):
             for i in range(j, n):
                 moved[..., j] += comb(i, j) * tile_views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
         corners = np.stack([self.nodes[i:n, j:m] for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None))])
-        ends = tile_views.ends - np.stack([corners.min(axis=0), corners.max(axis=0)], axis=-1)
-        return replace(tile_views, nodes=moved, ends=ends)
+        index_range = tile_views.index_range - np.stack([corners.min(axis=0), corners.max(axis=0)], axis=-1)
+        return replace(tile_views, nodes=moved, index_range=index_range)
 
 
 def divided(corners: NDArray[np.float64], times: int) -> NDArray[np.float64]:

@@ -100,7 +100,7 @@ def refine(
     views: TileViews,
     coefficients: NDArray[np.float32],
     coarse: FloatGrid,
-    visible: NDArray[np.int32],
+    visible: VisibleHeights,
     step_cells: float,
     options: RefineOptions,
     is_fixed: NDArray[np.bool_] | None = None,
@@ -156,7 +156,7 @@ def _sampling(half: int, is_first: bool, is_last: bool) -> ProfileSampling:
 
 
 def profiles_around(
-    views: ViewArrays, surface: FloatGrid, sampling: ProfileSampling, n_groups: int, visible: NDArray[np.int32]
+    views: ViewArrays, surface: FloatGrid, sampling: ProfileSampling, n_groups: int, visible: VisibleHeights
 ) -> NDArray[np.float32]:
     """Correlation around a surface (r, c): (w, g, j, r, c) by window, group of image pairs and offset.
 

@@ -20,6 +20,7 @@ from zlocus.matching.fill import filled
 from zlocus.matching.finest_level import ortho_of_surface, refined_surface, with_planes_of_segments
 from zlocus.matching.free_rays import add_costs_of_rays
 from zlocus.matching.height_lattice import HeightLattice, by_block, search_lattice
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import (
     ERODE_OWN_SURFACE,
     LevelResult,
@@ -30,8 +31,15 @@ from zlocus.matching.level_records import (
 )
 from zlocus.matching.local_contrast import agreement, edge_image
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.occlusion import PAIR, above_base, coverage, covers, hide, spare_pairs
-from zlocus.matching.overlap import BorderGround, border_ground, worth_matching
+from zlocus.matching.occlusion import (
+    PAIR,
+    covered_heights,
+    covers,
+    in_level_indices,
+    keep_both_views_of_pairs,
+    mark_occlusions,
+)
+from zlocus.matching.overlap import CoarsestHeights, OverlapGround, SearchBounds, find_overlap_window, overlap_ground
 from zlocus.matching.pair_labels import PairLabels, TileLabels, label_pairs_at_ties
 from zlocus.matching.search_range import coarsest_prior, prior_from_coarser, reachable_range, table_range
 from zlocus.matching.semiglobal import (
@@ -45,7 +53,7 @@ from zlocus.matching.semiglobal import (
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.surface import Surface
-from zlocus.matching.tile_views import TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, TileViews, pixel_window, read_pixels, tile_views
 from zlocus.matching.view_selection import ChosenViews, choose_views, preselected
 
 # Points along each side of a tile whose projections say which images may see it.
@@ -98,10 +106,10 @@ def match_tile(
     if len(tile.view_pixels) < PAIR:
         return TileResult(Surface.nothing(core_window))
     coarsest_match = match_coarsest_level(tile)
-    border = border_of_overlap(tile, coarsest_match)
+    ground = ground_of_overlap(tile, coarsest_match)
     coarsest_level = coarsest_match.result.level
-    overlap_window = worth_matching(
-        coarsest_match.result.visible, coarsest_match.result.heights.vertex, border.covered, coarsest_level.window
+    overlap_window = find_overlap_window(
+        coarsest_match.result.visible, coarsest_match.result.heights.vertex, ground.covered, coarsest_level.window
     )
     if not core_window.at_level(coarsest_level.number, 0).meets(overlap_window):
         return TileResult(
@@ -110,7 +118,7 @@ def match_tile(
     results = match_finer_levels(tile, coarsest_match, overlap_window)
     if method != "mvll":
         results[-1] = with_planes_of_segments(results[-1], config)
-    refined = refined_surface(tile, results[-1], border)
+    refined = refined_surface(tile, results[-1], ground)
     surface = refined.surface.precise(config.checks.max_sigma_m)
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
@@ -225,13 +233,14 @@ def pair_labels_for_choice(tile: TileInputs, coarsest_result: LevelResult | None
     return label_pairs_at_ties(tile, coarsest_result)
 
 
-def border_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> BorderGround:
+def ground_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> OverlapGround:
     """What the coarsest level says about the ground at the borders of the images' overlap."""
     result, level, prior = coarsest_match.result, coarsest_match.result.level, coarsest_match.prior
-    return border_ground(
-        tile.view_pixels, result.tile_views, result.lattice, result.visible, result.heights.vertex,
-        (prior.low, prior.high), level.window, level.number, level.n_steps, level.cell_size,
+    heights = CoarsestHeights(
+        result.tile_views, result.lattice, result.visible, level.window, level.number, result.heights.vertex,
+        SearchBounds(prior.low, prior.high),
     )  # fmt: skip
+    return overlap_ground(tile.view_pixels, heights, level.n_steps, level.cell_size)
 
 
 def match_finer_levels(
@@ -308,24 +317,26 @@ def search_along_slope(tile: TileInputs, level: PyramidLevel, prior: SearchPrior
 def _project(tile: TileInputs, level: PyramidLevel, prior: SearchPrior) -> TileViews:
     """The views of a level, with their projections over the heights that the prior can reach."""
     config = tile.config
+    cells = TileGrid(
+        level.number, level.transform, level.shape, config.pyramid.block, level.height_origin, level.height_step
+    )
     return tile_views(
-        tile.view_pixels, level.number, level.transform, level.shape, config.pyramid.block,
-        (level.height_origin, level.height_step), table_range(level), large_window_side(config.cost) // 2,
+        tile.view_pixels, cells, table_range(level), large_window_side(config.cost) // 2,
         reachable_range(level, prior, config),
     )  # fmt: skip
 
 
-def visible_heights(tile: TileInputs, search: LevelSearch, prior: SearchPrior) -> NDArray[np.int32]:
-    """Visible height ranges of all views, (3, i, r, c) int32 slope indices, see `coverage`.
+def visible_heights(tile: TileInputs, search: LevelSearch, prior: SearchPrior) -> VisibleHeights:
+    """Visible height ranges of all views, slope indices.
 
     Where a surface is known and there are three views or more, heights at which it occludes a view are excluded.
     """
-    visible = coverage(search.slope_views, search.slope_surface, search.lattice)
+    visible = covered_heights(search.slope_views, search.slope_surface, search.lattice)
     if prior.surface is not None and tile.handles_occlusion:
         occluder = cv2.erode(prior.surface, prior.erosion)
         margin_steps = tile.config.cost.occlusion_margin_steps
-        hide(visible, search.tile_views, occluder, search.slope_surface.cells, margin_steps)
-        spare_pairs(visible)
+        mark_occlusions(visible, search.tile_views, occluder, search.slope_surface.cells, margin_steps)
+        keep_both_views_of_pairs(visible)
     return visible
 
 
@@ -333,7 +344,7 @@ def _chosen_views(
     tile: TileInputs,
     level: PyramidLevel,
     search: LevelSearch,
-    visible: NDArray[np.int32],
+    visible: VisibleHeights,
     prior: SearchPrior,
     pair_labels: PairLabels | None,
 ) -> ChosenViews:
@@ -380,7 +391,7 @@ def semiglobal_heights(
     search: LevelSearch,
     cost: NDArray[np.uint8],
     penalties: NDArray[np.uint16],
-    visible: NDArray[np.int32],
+    visible: VisibleHeights,
 ) -> SemiGlobalHeights:
     """Heights of a level under the semi-global constraint, slope indices.
 
@@ -399,7 +410,7 @@ def semiglobal_heights(
 def _level_result(
     level: PyramidLevel,
     search: LevelSearch,
-    visible: NDArray[np.int32],
+    visible: VisibleHeights,
     chosen_views: ChosenViews,
     cost: NDArray[np.uint8],
     heights: SemiGlobalHeights,
@@ -417,7 +428,7 @@ def _level_result(
         tile_views=search.tile_views,
         slope_surface=search.slope_surface,
         lattice=search.lattice,
-        visible=above_base(chosen_views.helpful, slope_cells),
+        visible=in_level_indices(chosen_views.helpful, slope_cells),
         heights=heights.on_lattice(slope_cells),
         winner_takes_all=winner_takes_all,
         evaluations=evaluations,
@@ -426,7 +437,7 @@ def _level_result(
     )
 
 
-def count_evaluations(visible: NDArray[np.int32], lattice: HeightLattice) -> int:
-    """Cells x heights x views that are compared. visible : (3, i, r, c), see `coverage`."""
+def count_evaluations(visible: VisibleHeights, lattice: HeightLattice) -> int:
+    """Cells x heights x views that are compared."""
     n_covering = covers(visible).sum(axis=0, dtype=np.int32)
     return int((by_block(n_covering, lattice.block, np.add) * lattice.count).sum())

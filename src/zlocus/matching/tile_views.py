@@ -1,9 +1,10 @@
-"""What a tile sees of every view: pixels of one level, where they are valid, and how its cells project into them."""
+"""The views of a tile at one level: their pixels, where these are valid, and how the cells project into them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,16 +28,19 @@ from zlocus.sensors.projection_table import (
 )
 
 FloatImage = NDArray[np.float32]
-FAR = 2**29  # no height index is as large
-MARGIN_PX = 4
-# Table against exact model, in pixels of the level. Coarser levels only guide, and a block of theirs spans so much
-# ground that an aircraft's unsteady flight bends it (0.011 px over the 102 m of the demo's).
+NO_INDEX = 2**29  # every height index is smaller
+MARGIN_PX = 4  # pixels of a level around the part of an image that shows the tile
+# Largest error of the projection table, in pixels of the level. It may be larger at coarser levels, which only give the
+# search range of the next, and whose blocks span so much ground that the unsteady flight of an aircraft bends them
+# (0.011 px over the 102 m of the demo).
 FINEST_TABLE_PX, COARSER_TABLE_PX = 0.01, 0.05
-# Where even the smallest blocks are too bent for that: a wide lens close to high things.
+# The same where even the smallest blocks do not allow it: a wide lens close to tall objects.
 FINEST_BENT_PX, COARSER_BENT_PX = 0.05, 0.25
-# A view may be left out of this share of what it shows (blocks by heights); and at last of this.
-LITTLE_LOST, MOST_LOST = 0.01, 0.5
-# The windows' borders make small blocks slow: these are twice as slow per cell as those of eight cells.
+# Largest share of what a view shows (blocks by heights) from which it may be excluded; and the share in the last
+# attempt.
+MAX_EXCLUDED_SHARE, MAX_EXCLUDED_SHARE_AT_LAST = 0.01, 0.5
+# Cells along the side of the smallest blocks. The cells around a block make small ones slow: those of four cells are
+# twice as slow per cell as those of eight.
 SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
@@ -47,10 +51,10 @@ class ViewPixels:
     """A window of one view at every level.
 
     origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
-    does not depend on the window. mean, contrast : grey value of the image that is 0, and that are 1 here, so that
-    views taken with other exposures compare. pixels, valid : per level,
-    (r, c) float32 and bool; level l has half the pixels of level l - 1 each way. trend : (r, c) float32 grey values
-    taken off at the finest level, None is nothing (see `GreyTrend`).
+    does not depend on the window. mean, contrast : grey value of the image that becomes 0, and number of grey values
+    that become 1, so that views taken with different exposures can be compared. pixels, valid : per level, (r, c)
+    float32 and bool; level l has half as many rows and columns as level l - 1. trend : (r, c) float32 grey values that
+    were subtracted at the finest level, None if nothing was (see `GreyTrend`).
     """
 
     sensor: SensorModel
@@ -72,12 +76,15 @@ class ViewPixels:
 class TileViews:
     """All views of a tile at one level, as the kernels take them.
 
-    pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels no window may touch; layout : (i, 3)
-    int64, offset, rows, columns; nodes : (i, b + 1, d + 1, 2, n) float64, see `ProjectionTable`, in pixels of the
-    window; holds : (i, b, d) bool, blocks that a view can show; lost : (i, b, d) bool, others that it may show, where
-    it takes no part all the same because its table does not hold; heights : (2,) float64, t of the tables at height
-    index 0 and per index; ends : (i, b, d, 2) float64, lowest and highest height index, counted from what the nodes
-    follow, over which a block's polynomials hold; block : cells between the nodes.
+    pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels that no window may touch; has_blocked :
+    (i,) bool, whether a view has any; layout : (i, 3) int64, offset, rows and columns of each view in `pixels`; nodes :
+    (i, b + 1, d + 1, 2, n) float64, polynomials at the corners of the blocks, see `ProjectionTable`, in pixels of the
+    window; is_projected : (i, b, d) bool, blocks that a view can show; is_excluded : (i, b, d) bool, other blocks that
+    it may show, from which it is excluded because its projection table is not accurate there; t_of_index : (2,)
+    float64, parameter t of the polynomials at height index 0, and its change per index; index_range : (i, b, d, 2)
+    float64, lowest and highest height index over which the polynomials of a block hold; block : cells along the side of
+    a block. Height indices are level indices, or slope indices where the nodes follow a slanted support surface (see
+    `height_lattice`).
     """
 
     pixels: FloatImage
@@ -85,32 +92,60 @@ class TileViews:
     has_blocked: NDArray[np.bool_]
     layout: NDArray[np.int64]
     nodes: NDArray[np.float64]
-    holds: NDArray[np.bool_]
-    lost: NDArray[np.bool_]
-    heights: NDArray[np.float64]
-    ends: NDArray[np.float64]
+    is_projected: NDArray[np.bool_]
+    is_excluded: NDArray[np.bool_]
+    t_of_index: NDArray[np.float64]
+    index_range: NDArray[np.float64]
     block: int
 
     @property
     def arrays(self) -> ViewArrays:
-        """What the kernels read of them."""
-        return ViewArrays(self.pixels, self.layout, self.nodes, self.heights, self.block)
+        """The arrays that the kernels read."""
+        return ViewArrays(self.pixels, self.layout, self.nodes, self.t_of_index, self.block)
 
     @property
-    def limits(self) -> NDArray[np.int64]:
-        """(2, i, b, d), lowest and highest height index at which a block may be seen; the first is the higher one where
-        there is none."""
-        low = np.where(self.holds, np.ceil(self.ends[..., 0]), FAR)
-        high = np.where(self.holds, np.floor(self.ends[..., 1]), -FAR)
-        return np.stack([low, high]).clip(-FAR, FAR).astype(np.int64)
+    def index_limits(self) -> NDArray[np.int64]:
+        """Lowest and highest whole height index at which a view may show a block, (2, i, b, d).
+
+        The lowest is larger than the highest where the view may not show it.
+        """
+        low = np.where(self.is_projected, np.ceil(self.index_range[..., 0]), NO_INDEX)
+        high = np.where(self.is_projected, np.floor(self.index_range[..., 1]), -NO_INDEX)
+        return np.stack([low, high]).clip(-NO_INDEX, NO_INDEX).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """The cells of a tile at one level, and what their height indices mean.
+
+    transform : from cell corners to the ground; shape : rows and columns; block : cells along the side of a block,
+    fewer where projections are too curved for that; height_origin, height_step : height of index 0, and of a step.
+    """
+
+    level: int
+    transform: Affine
+    shape: tuple[int, int]
+    block: int
+    height_origin: float
+    height_step: float
+
+
+class PixelWindow(NamedTuple):
+    """A window of an image: its first row and column, and its size in pixels."""
+
+    row: int
+    col: int
+    rows: int
+    cols: int
 
 
 def pixel_window(
     view: View, corners: NDArray[np.float64], z_range: tuple[float, float], step: int
-) -> tuple[int, int, int, int] | None:
-    """Window (row, col, rows, cols) of an image that sees a patch of ground; None where it sees none of it.
+) -> PixelWindow | None:
+    """The window of an image that shows a patch of ground; None where the image does not show it.
 
-    corners : (n, 2) m, outline of the patch; z_range : m; step : the origin is a multiple of it.
+    corners : (n, 2) m, outline of the patch; z_range : m, heights of the ground; step : row and column of the window
+    are multiples of it, px.
     """
     xyz = np.concatenate([np.column_stack([corners, np.full(len(corners), z)]) for z in z_range])
     xy = view.sensor.image_from_ground(xyz)
@@ -119,7 +154,7 @@ def pixel_window(
     if not known.any():
         return None
     if not known.all():
-        # What lies between a point that is seen and one that is not may be anywhere in the image.
+        # The ground between a point that the image shows and one that it does not may be anywhere in the image.
         xy = np.concatenate([xy[known], [(0.0, 0.0), (cols - 1.0, rows - 1.0)]])
     margin = MARGIN_PX * step
     col0, row0 = np.floor(xy.min(axis=0)).astype(int) - margin
@@ -128,13 +163,13 @@ def pixel_window(
     row1, col1 = min(row1, rows), min(col1, cols)
     if row1 - row0 < 2 * step or col1 - col0 < 2 * step:
         return None
-    return row0, col0, row1 - row0, col1 - col0
+    return PixelWindow(row0, col0, row1 - row0, col1 - col0)
 
 
 def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, scale: GreyScale) -> ViewPixels:
-    """Read a window and build its pyramid by means of 2 x 2 valid pixels.
+    """Read a window of an image, and build its pyramid from means of 2 x 2 valid pixels.
 
-    scale : of the whole image, the same for every window of it.
+    window : row, col, rows, cols; scale : grey scale of the whole image, the same for every window of it.
     """
     row, col, rows, cols = window
     read = view.image.read(row, col, rows, cols)
@@ -149,7 +184,10 @@ def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, scal
 
 
 def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, NDArray[np.bool_]]:
-    """Means over 2 x 2 valid pixels; valid where three of the four are. A last odd row or column is dropped."""
+    """Pixels and validity at half the size: means over 2 x 2 valid pixels, valid where at least three of the four are.
+
+    An odd last row or column is dropped.
+    """
     rows, cols = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
     blocks = pixels[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
     if valid.all():
@@ -162,33 +200,28 @@ def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, ND
 
 
 def tile_views(
-    views: Sequence[ViewPixels],
-    level: int,
-    transform: Affine,
-    shape: tuple[int, int],
-    block: int,
-    lattice: tuple[float, float],
+    view_pixels: Sequence[ViewPixels],
+    tile_grid: TileGrid,
     z_range: tuple[float, float],
     half: int,
     z_needed: tuple[float, float] | None = None,
 ) -> TileViews:
-    """Gather one level of all views for a grid of cells.
+    """Pixels and projections of all views for the cells of a tile at one level.
 
-    transform, shape : of the grid at this level; block : cells between nodes, fewer where projections are too bent for
-    that; lattice : height of index 0 and step (m); z_range : m, heights that may be asked for; half : half width of the
-    largest window, by which blocked pixels grow; z_needed : m, the part of them that will be, where that is known.
+    z_range : m, heights that may be projected; half : half width of the largest window, by which the unusable pixels
+    grow; z_needed : m, the part of these heights that will be projected, None where it is not known.
 
     Raises
     ------
     GeometryError
-        Where projections are too bent even for the smallest block.
+        Projections are too curved even for the smallest block.
     """
-    layout, nodes, blocked, offset = [], [], [], 0
+    layout, nodes, blocked, offset, level = [], [], [], 0, tile_grid.level
     scale = 2.0**level
-    station = lowest_station(view.sensor for view in views)
+    station = lowest_station(view.sensor for view in view_pixels)
     z_ranges = capped(z_range, station, CLEARANCE), capped(z_needed or z_range, station, CLEARANCE)
-    tables, block = _fitting_tables(views, level, transform, shape, block, z_ranges)
-    for view, table in zip(views, tables, strict=True):
+    tables, block = _fitting_tables(view_pixels, tile_grid, z_ranges)
+    for view, table in zip(view_pixels, tables, strict=True):
         shape_px = view.pixels[level].shape
         layout.append((offset, *shape_px))
         offset += view.pixels[level].size
@@ -196,69 +229,102 @@ def tile_views(
         scaled[..., 0, 0] += 0.5 / scale - 0.5 - view.origin[1] / scale
         scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0] / scale
         nodes.append(scaled)
-        unusable = ~view.valid[level]
-        if unusable.any():
-            side = 2 * (half + 2) + 1
-            unusable = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
-        blocked.append(unusable)
-    heights = np.array([(lattice[0] - tables[0].z_mid) / tables[0].z_half, lattice[1] / tables[0].z_half])
+        blocked.append(_grown(~view.valid[level], half))
+    t_of_index = np.array(
+        [(tile_grid.height_origin - tables[0].z_mid) / tables[0].z_half, tile_grid.height_step / tables[0].z_half]
+    )
     return TileViews(
-        pixels=np.concatenate([view.pixels[level].ravel() for view in views]),
+        pixels=np.concatenate([view.pixels[level].ravel() for view in view_pixels]),
         blocked=np.concatenate([mask.ravel() for mask in blocked]),
         has_blocked=np.array([bool(mask.any()) for mask in blocked]),
         layout=np.array(layout, np.int64),
         nodes=np.ascontiguousarray(np.stack(nodes)),
-        holds=np.stack([table.holds for table in tables]),
-        lost=np.stack([table.lost for table in tables]),
-        heights=heights,
-        ends=(np.stack([table.ends for table in tables]) - heights[0]) / heights[1],
+        is_projected=np.stack([table.holds for table in tables]),
+        is_excluded=np.stack([table.lost for table in tables]),
+        t_of_index=t_of_index,
+        index_range=(np.stack([table.ends for table in tables]) - t_of_index[0]) / t_of_index[1],
         block=block,
     )
 
 
-def _fitting_tables(
-    views: Sequence[ViewPixels],
-    level: int,
-    transform: Affine,
-    shape: tuple[int, int],
-    block: int,
-    z_ranges: tuple[tuple[float, float], tuple[float, float]],
-) -> tuple[list[ProjectionTable], int]:
-    """A table per view that holds to a tolerance, and its block: as asked for, where need be over the second, shorter
-    range of heights only and of a higher degree, where need be halved; where that is not enough, of the highest degree,
-    each block over the heights at which it is shown; and then to the wider tolerance. A view is left out of more than a
-    few blocks (see `TileViews.lost`) only after all that.
+def _grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
+    """Pixels (r, c) that no middle of a window of half width `half` may be on."""
+    if not unusable.any():
+        return unusable
+    side = 2 * (half + 2) + 1
+    return cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
 
-    Perspective bends projections along heights and across blocks: images taken from close by, and tilted ones. So does
-    an unsteady flight in raw images of line scanners, far more than any perspective, which get a still higher degree.
+
+@dataclass(frozen=True)
+class TableAttempt:
+    """How projection tables are made.
+
+    block : cells along the side of a block; tolerance_px : largest error, pixels of the level; degree : of the
+    polynomials in height; max_excluded : share of what a view shows from which it may be excluded.
     """
+
+    block: int
+    tolerance_px: float
+    degree: int
+    max_excluded: float = 0.0
+
+    def request(self, tile_grid: TileGrid, z_range: tuple[float, float]) -> TableRequest:
+        """The table of a view over some heights (m)."""
+        tolerance_px = self.tolerance_px * 2.0**tile_grid.level
+        return TableRequest(tile_grid.transform, tile_grid.shape, self.block, z_range, tolerance_px, self.degree)
+
+
+def _attempts(block: int, level: int, is_scanning: bool) -> tuple[list[TableAttempt], list[TableAttempt]]:
+    """Attempts to make projection tables that hold at all heights that are needed, and, after these, attempts in which
+    each block holds at the heights at which a view shows it."""
     near, far = (COARSER_TABLE_PX, COARSER_BENT_PX) if level else (FINEST_TABLE_PX, FINEST_BENT_PX)
     blocks = [block]
     while blocks[-1] >= 2 * SMALL_BLOCK:
         blocks.append(blocks[-1] // 2)
     large = [b for b in blocks if b > SMALL_BLOCK]
-    for cells, z_range, degree in ((block, z_ranges[0], DEGREE), *((b, z_ranges[1], HIGHER_DEGREE) for b in large)):
-        tables = _tables_over_all_heights(
-            views, TableRequest(transform, shape, cells, z_range, near * 2.0**level, degree)
-        )
+    everywhere = [TableAttempt(b, near, HIGHER_DEGREE) for b in large]
+    shown = [TableAttempt(b, near, HIGHEST_DEGREE) for b in large]
+    shown += [TableAttempt(b, far, HIGHEST_DEGREE) for b in large[-1:]]
+    shown += [TableAttempt(SMALL_BLOCK, px, HIGHEST_DEGREE) for px in (near, far)]
+    shown += [TableAttempt(SMALL_BLOCK, far, UNSTEADY_DEGREE)] * is_scanning
+    shown += [
+        TableAttempt(SMALL_BLOCK, far, HIGHEST_DEGREE, MAX_EXCLUDED_SHARE),
+        TableAttempt(SMALLEST_BLOCK, far, HIGHEST_DEGREE),
+        TableAttempt(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MAX_EXCLUDED_SHARE_AT_LAST),
+    ]
+    return everywhere, shown
+
+
+def _fitting_tables(
+    view_pixels: Sequence[ViewPixels], tile_grid: TileGrid, z_ranges: tuple[tuple[float, float], tuple[float, float]]
+) -> tuple[list[ProjectionTable], int]:
+    """Projection tables of all views that are accurate enough, and the cells along the side of their blocks.
+
+    The first attempt takes the blocks of the grid over the first, wider range of heights. The next ones take the
+    second, shorter range and polynomials of a higher degree, then smaller blocks; then each block over the heights at
+    which it is shown, with the highest degree; then a larger tolerance. Only after all these is a view excluded from
+    more than a few blocks (see `TileViews.is_excluded`).
+
+    Perspective bends projections along heights and across blocks: images taken from close by, and oblique ones. So does
+    an unsteady flight in raw images of line scanners, far more than any perspective; they get a still higher degree.
+    """
+    level = tile_grid.level
+    is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in view_pixels)
+    everywhere, shown = _attempts(tile_grid.block, level, is_scanning)
+    first = TableAttempt(tile_grid.block, COARSER_TABLE_PX if level else FINEST_TABLE_PX, DEGREE)
+    for attempt, z_range in ((first, z_ranges[0]), *((attempt, z_ranges[1]) for attempt in everywhere)):
+        tables = _tables_over_all_heights(view_pixels, attempt.request(tile_grid, z_range))
         if tables is not None:
-            return tables, cells
-    is_scanning = any(isinstance(bare(view.sensor), Scanning) for view in views)
-    attempts = [(b, near, HIGHEST_DEGREE, 0.0) for b in large]
-    attempts += [(b, far, HIGHEST_DEGREE, 0.0) for b in large[-1:]]
-    attempts += [(SMALL_BLOCK, px, HIGHEST_DEGREE, 0.0) for px in (near, far)]
-    attempts += [(SMALL_BLOCK, far, UNSTEADY_DEGREE, 0.0)] * is_scanning
-    attempts += [(SMALL_BLOCK, far, HIGHEST_DEGREE, LITTLE_LOST), (SMALLEST_BLOCK, far, HIGHEST_DEGREE, 0.0)]
-    attempts += [(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MOST_LOST)]
-    for cells, px, degree, lost in attempts:
-        request = TableRequest(transform, shape, cells, z_ranges[1], px * 2.0**level, degree)
+            return tables, attempt.block
+    for attempt in shown:
+        request, share = attempt.request(tile_grid, z_ranges[1]), max(attempt.max_excluded, MAX_EXCLUDED_SHARE)
         try:
             return [
                 projection_table_where_shown(
-                    view.sensor, request, (*view.origin, *view.shape), max(lost, LITTLE_LOST), lost > 0.0
+                    view.sensor, request, (*view.origin, *view.shape), share, attempt.max_excluded > 0.0
                 )
-                for view in views
-            ], cells
+                for view in view_pixels
+            ], attempt.block
         except GeometryError as error:
             bent = error
     if not is_scanning:
@@ -268,10 +334,10 @@ def _fitting_tables(
     )
 
 
-def _tables_over_all_heights(views: Sequence[ViewPixels], request: TableRequest) -> list[ProjectionTable] | None:
-    """A table per view; None where one of them does not hold, or not wherever its window shows something."""
+def _tables_over_all_heights(view_pixels: Sequence[ViewPixels], request: TableRequest) -> list[ProjectionTable] | None:
+    """A projection table per view; None where one is not accurate enough, or not wherever its window shows the tile."""
     tables = []
-    for view in views:
+    for view in view_pixels:
         window = (*view.origin, *view.shape)
         try:
             table = projection_table(view.sensor, request, window)

@@ -1,4 +1,4 @@
-"""Directions of views over a tile: how many cells an image point moves for a step of height."""
+"""Directions of views over a tile: how many cells the point seen by a fixed pixel moves per height step."""
 
 from __future__ import annotations
 
@@ -9,50 +9,55 @@ import numpy as np
 
 from zlocus.matching.tile_views import TileViews
 
-# Cells per height step by which directions differ within a part of a tile, and parts along a side at most.
-TURN, MOST_PARTS = 0.2, 8
+# Directions may differ by so many cells per height step within a part of a tile.
+MAX_TURN_CELLS_PER_STEP = 0.2
+MAX_PARTS_PER_SIDE = 8
 
 
-def parts_of_one_direction(views: TileViews, i: int) -> list[tuple[slice, slice]]:
-    """Parts of a tile, whole blocks each, over which a view looks about the same way: the tile itself from afar."""
-    n = views.holds.shape[1:]
-    by_step = np.array([cells_per_step(views, i, _block_cells(views, b, d)) for b in _ends(n[0]) for d in _ends(n[1])])
-    apart = float(np.abs(np.diff(by_step, axis=0)).max())
-    n_parts = min(max(math.ceil(apart / TURN), 1), MOST_PARTS)
-    edges = [np.unique(np.linspace(0, count, n_parts + 1).astype(int)) * views.block for count in n]
+def parts_of_one_direction(tile_views: TileViews, view: int) -> list[tuple[slice, slice]]:
+    """Parts of a tile, whole blocks each, over which a view looks in nearly the same direction.
+
+    For a view from far away that is the tile itself.
+    """
+    n, ends = tile_views.is_projected.shape[1:], []
+    for b in (0, n[0] - 1):
+        ends += [cells_per_step(tile_views, view, _block_cells(tile_views, b, d)) for d in (0, n[1] - 1)]
+    apart = float(np.abs(np.diff(np.array(ends), axis=0)).max())
+    n_parts = min(max(math.ceil(apart / MAX_TURN_CELLS_PER_STEP), 1), MAX_PARTS_PER_SIDE)
+    edges = [np.unique(np.linspace(0, count, n_parts + 1).astype(int)) * tile_views.block for count in n]
     rows, cols = ([slice(int(a), int(b)) for a, b in pairwise(edge)] for edge in edges)
     return [(row, col) for row in rows for col in cols]
 
 
-def _ends(count: int) -> tuple[int, int]:
-    return 0, count - 1
+def _block_cells(tile_views: TileViews, b: int, d: int) -> tuple[slice, slice]:
+    """Rows and columns of the cells of a block."""
+    block = tile_views.block
+    return slice(b * block, (b + 1) * block), slice(d * block, (d + 1) * block)
 
 
-def _block_cells(views: TileViews, b: int, d: int) -> tuple[slice, slice]:
-    """Cells of a block."""
-    return slice(b * views.block, (b + 1) * views.block), slice(d * views.block, (d + 1) * views.block)
+def cells_per_step(tile_views: TileViews, view: int, part: tuple[slice, slice] | None = None) -> tuple[float, float]:
+    """Cells (columns, rows) that the ground point seen by a fixed pixel of a view moves per height step.
 
-
-def cells_per_step(views: TileViews, i: int, part: tuple[slice, slice] | None = None) -> tuple[float, float]:
-    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, at the centre of a part
-    of the tile, by default of all, or as near to it as the view can show; 0 where it shows none of the tile."""
-    nodes = views.nodes[i]
+    Taken at the centre of a part of the tile (None: of the whole tile), or at the block nearest to it that the view can
+    show; 0 where it shows no block of the tile.
+    """
+    nodes = tile_views.nodes[view]
     b, d = (nodes.shape[0] - 1) // 2, (nodes.shape[1] - 1) // 2
     if part is not None:
-        b, d = ((span.start + span.stop) // 2 // views.block for span in part)
+        b, d = ((span.start + span.stop) // 2 // tile_views.block for span in part)
         b, d = min(b, nodes.shape[0] - 2), min(d, nodes.shape[1] - 2)
-    if not views.holds[i, b, d]:
-        shown = np.argwhere(views.holds[i])
+    if not tile_views.is_projected[view, b, d]:
+        shown = np.argwhere(tile_views.is_projected[view])
         if not len(shown):
             return 0.0, 0.0
         b, d = shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()]
-    # At a height where the block is seen: 0, or as near to it as may be.
-    low, high = views.heights[0] + views.ends[i, b, d] * views.heights[1]
+    # At height index 0, or as near to it as the polynomials of the block hold.
+    low, high = tile_views.t_of_index[0] + tile_views.index_range[view, b, d] * tile_views.t_of_index[1]
     t = float(min(max(0.0, low), high))
     powers = t ** np.arange(nodes.shape[-1])
     slopes = np.arange(1, nodes.shape[-1]) * powers[:-1]
     here, right, below = (nodes[at] @ powers for at in ((b, d), (b, d + 1), (b + 1, d)))
-    by_cell = np.column_stack([right - here, below - here]) / views.block
-    by_step = nodes[b, d][:, 1:] @ slopes * views.heights[1]
+    by_cell = np.column_stack([right - here, below - here]) / tile_views.block
+    by_step = nodes[b, d][:, 1:] @ slopes * tile_views.t_of_index[1]
     col, row = -np.linalg.solve(by_cell, by_step)
     return float(col), float(row)

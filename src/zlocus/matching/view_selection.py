@@ -21,12 +21,12 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.scene import View
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.kernels.cost_volume import HIDDEN
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.match_scene import parallax_rate
-from zlocus.matching.occlusion import NOTHING_HIDDEN, covers, sees
+from zlocus.matching.occlusion import covers, exclude, sees
 from zlocus.matching.pair_labels import PairLabels
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.tile_views import TileViews
@@ -62,19 +62,19 @@ class ViewOrder:
 class ChosenViews:
     """Visible height ranges of the views that the blocks of a level use.
 
-    matched : (3, i, r, c) int32, of the views that a block is matched with; helpful : the same of all views that
+    matched : of the views that a block is matched with; helpful : the same of all views that
     improve its match, for what follows; evaluations : cells x heights x images that the choice compared.
     """
 
-    matched: NDArray[np.int32]
-    helpful: NDArray[np.int32]
+    matched: VisibleHeights
+    helpful: VisibleHeights
     evaluations: int = 0
 
 
 def choose_views(
     level: PyramidLevel,
     lattice: HeightLattice,
-    visible: NDArray[np.int32],
+    visible: VisibleHeights,
     surface: NDArray[np.float32] | None,
     coarser_result: LevelResult | None,
     pair_labels: PairLabels,
@@ -82,7 +82,7 @@ def choose_views(
 ) -> ChosenViews:
     """Choose the views of every block.
 
-    visible : (3, i, r, c) int32 slope indices, see `coverage`; surface : (r, c) slope indices known before, None where
+    visible : slope indices; surface : (r, c) slope indices known before, None where
     nothing is known; coarser_result : the level on which match curves decide how many views a block needs, None at the
     coarsest level, which takes `max_images` everywhere.
     """
@@ -93,15 +93,16 @@ def choose_views(
     n_needed, evaluations = np.minimum(n_all, options.max_images), 0
     if coarser_result is not None:
         cells, block_of_cell = sampled_cells(lattice)
-        covering = covers(visible[:, :, cells[:, 0], cells[:, 1]]).T
+        covering = covers(visible.at(np.s_[:, cells[:, 0], cells[:, 1]])).T
         curves = CoarserCurves.of(coarser_result, config)
         coarser_cells = cells_one_level_up(cells, level.window, coarser_result.level.window)
         match = images_needed(curves, coarser_cells, block_of_cell, covering, view_order, options)
         n_needed = np.where(match.n_added > 0, np.minimum(match.n_added, options.max_images), n_all)
         evaluations = match.evaluations + len(cells) * curves.n_heights
     every = slice(None, None, COVERAGE_STRIDE_CELLS)
-    some = visible[:, :, every, every]
-    covered = (covers(some) if surface is None else sees(some, surface[every, every])).reshape(visible.shape[1], -1)
+    some = visible.at(np.s_[:, every, every])
+    covered = covers(some) if surface is None else sees(some, surface[every, every])
+    covered = covered.reshape(len(covered), -1)
     block_of_cell = block_of_cells(lattice, COVERAGE_STRIDE_CELLS).ravel()
     matched, helpful = (
         only_chosen(visible, chosen_views(view_order, n_search, covered, block_of_cell, options), lattice)
@@ -239,13 +240,13 @@ def chosen_views(
     return chosen
 
 
-def only_chosen(visible: NDArray[np.int32], chosen: NDArray[np.bool_], lattice: HeightLattice) -> NDArray[np.int32]:
+def only_chosen(visible: VisibleHeights, chosen: NDArray[np.bool_], lattice: HeightLattice) -> VisibleHeights:
     """Visible height ranges without those of the views that a block does not use. chosen : (i, b) bool."""
     by_block = chosen.reshape(len(chosen), *lattice.count.shape)
     rows, cols = lattice.shape
     excluded = ~by_block.repeat(lattice.block, axis=1).repeat(lattice.block, axis=2)[:, :rows, :cols]
     of_chosen = visible.copy()
-    of_chosen[0][excluded], of_chosen[1][excluded] = HIDDEN, NOTHING_HIDDEN
+    exclude(of_chosen, excluded)
     return of_chosen
 
 
@@ -265,13 +266,13 @@ def sampled_cells(lattice: HeightLattice) -> tuple[IntArray, IntArray]:
 class CoarserCurves:
     """A coarser level, from which match curves are sampled along its surface.
 
-    tile_views : of that level; visible : (3, i, r, c) level indices, see `LevelResult`; surface : (r, c) float32,
+    tile_views : of that level; visible : level indices, see `LevelResult`; surface : (r, c) float32,
     smooth level indices, which the windows follow; side : cells along the side of a window; reach : steps to both sides
     of the surface.
     """
 
     tile_views: TileViews
-    visible: NDArray[np.int32]
+    visible: VisibleHeights
     surface: NDArray[np.float32]
     side: int
     reach: int
@@ -308,7 +309,7 @@ class CoarserCurves:
         windows = samples.windows(self.tile_views, view, rows)
         row, col = samples.cells[rows].T
         level_index = samples.first[rows, None] + np.arange(samples.n_heights)
-        windows[level_index < self.visible[2, view, row, col][:, None]] = np.nan
+        windows[level_index < self.visible.lowest_unoccluded[view, row, col][:, None]] = np.nan
         return windows
 
 
@@ -355,8 +356,8 @@ def images_needed(
     return match_progressively(correlate, samples.n_heights, search_plan, options)
 
 
-def block_shares(visible: NDArray[np.int32], lattice: HeightLattice) -> FloatArray:
-    """Share of each block that each view covers, (i, b) float64. visible : (3, i, r, c), see `coverage`."""
+def block_shares(visible: VisibleHeights, lattice: HeightLattice) -> FloatArray:
+    """Share of each block that each view covers, (i, b) float64."""
     block, covered = lattice.block, covers(visible)
     rows, cols = np.arange(0, lattice.shape[0], block), np.arange(0, lattice.shape[1], block)
     count = np.add.reduceat(np.add.reduceat(covered, rows, axis=1, dtype=np.int32), cols, axis=2)

@@ -9,6 +9,7 @@ from kernel_scene import kernel_scene
 from reference import windows as twin
 from reference.agreement import ncc
 from zlocus.matching.kernels.locus_windows import line_windows, normalise, sample_window
+from zlocus.matching.kernels.shared_records import AxisGrid, BlockGrid, PixelVelocity, ViewImage
 
 # Values of windows of norm 1: bilinear weights are float32, relief moves by a float32 speed.
 VALUE = 2e-5
@@ -31,10 +32,7 @@ def windows_of(scene, view, cells, first=FIRST, relief=None, blocked=None):
     relief = np.zeros((len(cells), K), np.float32) if relief is None else relief
     blocked = np.zeros(len(scene.pixels), bool) if blocked is None else blocked
     out = np.full((len(cells), N_HEIGHTS, K), 7.0, np.float32)
-    line_windows(
-        scene.pixels, blocked, scene.layout, scene.nodes, scene.heights, scene.block, view, cells, first, HALF, relief,
-        out,
-    )  # fmt: skip
+    line_windows(scene.arrays, blocked, view, cells, first, HALF, relief, out)
     return out
 
 
@@ -155,7 +153,7 @@ def test_windows_whose_middle_is_blocked_are_nan(scene, cells):
 
 
 @pytest.mark.parametrize("grey", [0.0, 1e-3, 1000.0, 1234.567, -30000.7])
-def test_even_windows_agree_with_none(grey):
+def test_windows_without_texture_agree_with_none(grey):
     """All zero: their correlation with any window is 0, not NaN."""
     window = np.full(K, grey, np.float32)
     normalise(window)
@@ -177,16 +175,20 @@ def test_a_window_is_normalised_whatever_its_gain_and_offset():
 
 
 def test_a_sample_outside_ends_the_window():
-    image = np.arange(12 * 9, dtype=np.float32)
-    layout, velocity = np.array([0, 9, 12], np.int64), np.array([0.5, 0.0], np.float32)
-    grid = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    pixels = np.arange(12 * 9, dtype=np.float32)
+    image, velocity = ViewImage(pixels, 9, 12), PixelVelocity(np.float32(0.5), np.float32(0.0))
+    grid = BlockGrid(AxisGrid(0.0, 1.0, 0.0, 0.0), AxisGrid(0.0, 0.0, 1.0, 0.0))
     relief, out = np.zeros(9, np.float32), np.empty(9, np.float32)
-    assert sample_window(image, layout, grid, 4.0, 5.0, 1, relief, velocity, out)
-    np.testing.assert_array_equal(out, image.reshape(9, 12)[3:6, 4:7].ravel())
-    assert sample_window(image, layout, grid, 1.0, 1.0, 1, relief, velocity, out)
-    assert not sample_window(image, layout, grid, 0.99, 1.0, 1, relief, velocity, out)
-    assert sample_window(image, layout, grid, 6.99, 9.99, 1, relief, velocity, out)
-    assert not sample_window(image, layout, grid, 7.0, 9.0, 1, relief, velocity, out), "no pixel below"
-    assert not sample_window(image, layout, grid, 4.0, 10.0, 1, relief, velocity, out)
+
+    def is_sampled(row, col):
+        return sample_window(image, grid, velocity, row, col, 1, relief, out)
+
+    assert is_sampled(4.0, 5.0)
+    np.testing.assert_array_equal(out, pixels.reshape(9, 12)[3:6, 4:7].ravel())
+    assert is_sampled(1.0, 1.0)
+    assert not is_sampled(0.99, 1.0)
+    assert is_sampled(6.99, 9.99)
+    assert not is_sampled(7.0, 9.0), "no pixel below"
+    assert not is_sampled(4.0, 10.0)
     relief[3] = -8.0
-    assert not sample_window(image, layout, grid, 4.0, 4.0, 1, relief, velocity, out)
+    assert not is_sampled(4.0, 4.0)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kernel_scene import HIDDEN, rough_surface
+from kernel_scene import rough_surface
 from reference import surfaces
-from zlocus.matching.kernels.occlusion import count_seeing, finest_view, hide_below, lowest_visible
+from zlocus.matching.kernels.occlusion import count_seeing, finest_view, lowest_visible, write_lowest_unoccluded
+from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, CellBox, VisibleHeights
 
 
 def visible_from(surface, by_col, by_row):
@@ -39,7 +40,7 @@ def test_a_nadir_view_sees_everything():
     assert (visible_from(rough_surface((9, 12)), 0.0, 0.0) == np.float32(-1e30)).all()
 
 
-def test_a_tower_hides_what_its_shadow_covers():
+def test_a_tower_occludes_the_cells_behind_it():
     """20 high, view gains 2 per cell: hidden behind it 18, 16, ... down to 0 after ten cells."""
     surface = np.zeros((5, 30), np.float32)
     surface[:, 20] = 20.0
@@ -48,49 +49,49 @@ def test_a_tower_hides_what_its_shadow_covers():
     assert (found[:9] < 0).all()
 
 
-def any_seen(n_views, shape, seed=0):
-    """(3, i, r, c), ranges of height indices that meet, touch or miss a surface of heights 0 to 9; some cover none."""
+def any_visible(n_views, shape, seed=0):
+    """Ranges of height indices that contain, touch or miss a surface of heights 0 to 9; some contain none."""
     rng = np.random.default_rng(seed)
-    seen = rng.integers(0, 10, (3, n_views, *shape)).astype(np.int32)
-    seen[1] += seen[0] - 2
-    seen[0][seen[1] < seen[0]] = HIDDEN
-    return seen, np.round(rng.uniform(0, 9, shape) * 2).astype(np.float32) / 2
+    visible = VisibleHeights(*rng.integers(0, 10, (3, n_views, *shape)).astype(np.int32))
+    visible.highest_covered[:] += visible.lowest_covered - 2
+    visible.lowest_covered[visible.highest_covered < visible.lowest_covered] = NEVER_COVERED
+    return visible, np.round(rng.uniform(0, 9, shape) * 2).astype(np.float32) / 2
 
 
 def test_views_that_see_a_surface():
-    seen, surface = any_seen(3, (11, 14))
+    visible, surface = any_visible(3, (11, 14))
     found = np.full(surface.shape, -7, np.int32)
-    count_seeing(seen, surface, found)
+    count_seeing(visible, surface, found)
     for at in np.ndindex(surface.shape):
-        low, high, visible = seen[:, :, *at]
-        assert found[at] == sum(max(a, v) <= surface[at] <= b for a, b, v in zip(low, high, visible, strict=True))
+        ranges = zip(*visible.at(np.s_[:, *at]), strict=True)
+        assert found[at] == sum(max(low, free_from) <= surface[at] <= high for low, high, free_from in ranges)
     assert set(found.ravel().tolist()) == {0, 1, 2, 3}
 
 
 def test_the_finest_view_of_those_that_see_a_cell():
     """Blocks of 4 cells; of equal sizes the first; a cell that has a view already keeps it."""
-    (seen, surface), block = any_seen(4, (11, 14)), 4
+    (visible, surface), block = any_visible(4, (11, 14)), 4
     size = np.random.default_rng(1).integers(0, 4, (4, 3, 4)).astype(float)
     size[0, 0, 0] = np.nan
     found = np.full(surface.shape, -1, np.int32)
     found[5, :] = 9
-    finest_view(size, seen, surface, block, found)
+    finest_view(size, visible, surface, block, found)
     for r, c in np.ndindex(surface.shape):
-        low, high, visible = seen[:, :, r, c]
-        sees = (np.maximum(low, visible) <= surface[r, c]) & (surface[r, c] <= high)
+        low, high, free_from = visible.at(np.s_[:, r, c])
+        sees = (np.maximum(low, free_from) <= surface[r, c]) & (surface[r, c] <= high)
         of_view = np.where(sees, np.nan_to_num(size[:, r // block, c // block]), 0)
         assert found[r, c] == (9 if r == 5 else of_view.argmax() if of_view.max() > 0 else -1)
     assert {-1, 0, 1, 2, 3} <= set(found.ravel().tolist())
 
 
-def test_height_indices_from_which_nothing_hides_a_cell():
+def test_lowest_height_indices_at_which_nothing_occludes_a_cell():
     """Of a part of the tile, which begins at row 2 and column 3 of a wider surface; other cells stay."""
-    rng, least = np.random.default_rng(0), np.float32(-(2**29))
+    rng, least = np.random.default_rng(0), np.float32(NEVER_OCCLUDED)
     lowest, base = rng.uniform(-9, 9, (12, 15)).astype(np.float32), rng.uniform(-3, 3, (8, 10)).astype(np.float32)
     lowest[4, 5] = -1e30
     out = np.full(base.shape, 77, np.int32)
-    hide_below(lowest, np.array([2, 3]), base, np.float32(1.5), least, np.array([[1, 6], [2, 10]]), out)
+    write_lowest_unoccluded(lowest, np.array([2, 3]), base, np.float32(1.5), least, CellBox(1, 6, 2, 10), out)
     expected = np.full(base.shape, 77)
     expected[1:6, 2:10] = np.floor(np.maximum(lowest[3:8, 5:13] - base[1:6, 2:10] - 1.5, least))
     np.testing.assert_array_equal(out, expected)
-    assert out[2, 2] == -(2**29)
+    assert out[2, 2] == NEVER_OCCLUDED

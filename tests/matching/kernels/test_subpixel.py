@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from kernel_scene import HIDDEN, kernel_scene
+from kernel_scene import kernel_scene
 from reference import agreement
 from reference.projection import bilinear, cubic, positions
-from zlocus.matching.kernels.cost_volume import flat_cells, plane_grid
-from zlocus.matching.kernels.resample import RUN
+from zlocus.matching.kernels.resample import RUN, flat_cells, image_of
+from zlocus.matching.kernels.shared_records import NEVER_COVERED
 from zlocus.matching.kernels.subpixel import (
     CUBIC,
     LINEAR,
     ProfileSampling,
     block_profile,
+    level_grids,
     resample_surface,
     tile_ortho,
     tile_profile,
@@ -40,14 +41,13 @@ def test_values_on_a_surface(degree):
     """Positions quadratic in the level are given by three grids; values are those of the interpolating B-spline, or
     bilinear. More cells than are taken at a time."""
     scene, shape = kernel_scene(2, (30, 31), 32), (30, 31)
-    grids, level = np.empty((3, 8)), np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
-    node = scene.nodes[1].copy()
+    level, node = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32), scene.nodes[1].copy()
     node[..., 3] = 0.0
-    for m in range(3):
-        plane_grid(node[None], 0, 0.3 * (m - 1), 32, 0, grids[m])
+    grids = level_grids(scene.arrays._replace(nodes=node[None]), 0, 0.0, 0.3, 0)
     out, pixels = np.empty(level.size, np.float32), scene.pixels if degree == LINEAR else coefficients(scene)
     assert level.size > RUN
-    resample_surface(pixels, scene.layout[1], grids, flat_cells(shape), level.ravel(), degree, out)
+    image = image_of(scene.arrays._replace(pixels=pixels), 1)
+    resample_surface(image, grids, flat_cells(*shape), level.ravel(), degree, out)
     value = bilinear if degree == LINEAR else cubic
     expected = value(scene.images[1], positions(node, 0.3 * level.astype(float), shape, 32))
     np.testing.assert_allclose(out.reshape(shape), expected, rtol=0, atol=GREY)
@@ -59,12 +59,12 @@ def test_profiles(n_views, half):
     shape = (20 + 2 * half, 26 + 2 * half)
     surface = (15 + 4 * gaussian_filter(np.random.default_rng(1).normal(size=shape), 3)).astype(np.float32)
     offsets = np.array([-1.5, 0.0, 0.7], np.float32)
-    seen = scene.all_seen()
-    seen[0, 1, 3:9], seen[1, 0, :, :5] = HIDDEN, 3
+    visible = scene.all_visible()
+    visible.lowest_covered[1, 3:9], visible.highest_covered[0, :, :5] = NEVER_COVERED, 3
     windows = np.array([1, half])
     groups = np.empty((2, 2, 3, *scene.shape), np.float32)
     sampling = ProfileSampling(CUBIC, offsets, windows, np.float32(0.0))
-    tile_profile(scene.arrays._replace(pixels=coefficients(scene)), surface, sampling, seen, groups)
+    tile_profile(scene.arrays._replace(pixels=coefficients(scene)), surface, sampling, visible, groups)
     out = groups.sum(axis=1)
     for (b, d, rows, cols), (w, window) in product(scene.blocks(), enumerate(windows)):
         trim = half - window
@@ -74,13 +74,20 @@ def test_profiles(n_views, half):
         nodes = scene.nodes[:, b : b + 2, d : d + 2]
         for j, offset in enumerate(offsets):
             expected = agreement.profile(
-                scene.images, nodes, scene.heights, around, offset, scene.block, window, seen[:, :, rows, cols]
+                scene.images,
+                nodes,
+                scene.heights,
+                around,
+                offset,
+                scene.block,
+                window,
+                visible.at(np.s_[:, rows, cols]),
             )
             np.testing.assert_allclose(out[w, j, rows, cols], expected, rtol=0, atol=NCC)
             for group in range(2):
                 expected = agreement.profile(
-                    scene.images, nodes, scene.heights, around, offset, scene.block, window, seen[:, :, rows, cols],
-                    group=(group, 2),
+                    scene.images, nodes, scene.heights, around, offset, scene.block, window,
+                    visible.at(np.s_[:, rows, cols]), group=(group, 2),
                 )  # fmt: skip
                 np.testing.assert_allclose(groups[w, group, j, rows, cols], expected, rtol=0, atol=NCC)
     if n_views == 2:
@@ -91,9 +98,9 @@ def test_profile_of_one_block():
     scene = kernel_scene(3, (9, 11), 16)
     surface, out = np.full((13, 15), 12, np.float32), np.empty((1, 1, 1, 9, 11), np.float32)
     sampling = ProfileSampling(CUBIC, np.zeros(1, np.float32), np.array([2]), np.float32(0.0))
-    block_profile(scene.arrays._replace(pixels=coefficients(scene)), surface, sampling, scene.all_seen(), out)
+    block_profile(scene.arrays._replace(pixels=coefficients(scene)), surface, sampling, scene.all_visible(), out)
     expected = agreement.profile(
-        scene.images, scene.nodes, scene.heights, surface.astype(float), 0.0, 16, 2, scene.all_seen()
+        scene.images, scene.nodes, scene.heights, surface.astype(float), 0.0, 16, 2, scene.all_visible()
     )
     np.testing.assert_allclose(out[0, 0, 0], expected, rtol=0, atol=1e-3)
 

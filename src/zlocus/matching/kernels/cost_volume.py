@@ -1,154 +1,167 @@
-"""The cost volume: every view resampled at every height of a block of cells, and how well they agree there."""
+"""The cost volume: every view resampled at every height of a block of cells, and how well the views agree there."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from zlocus.core.jit import kernel
-from zlocus.matching.kernels.ncc import SLACK, add_closeness, add_pairs, window_moments
-from zlocus.matching.kernels.resample import resample_plane
+from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
+from zlocus.matching.kernels.resample import (
+    block_grid,
+    block_velocity,
+    flat_cells,
+    image_of,
+    resample_plane,
+    resample_scratch,
+)
+from zlocus.matching.kernels.shared_records import (
+    NEVER_COVERED,
+    CellBox,
+    HeightSpan,
+    ViewArrays,
+    VisibleHeights,
+)
 
 COST_SCALE = np.float32(64.0)
-UNSEEN_COST = np.float32(40.0)
-HIDDEN = np.int32(2**30)
-# Grey value of a view where it shows nothing, times its number: as far from any grey as from another view's.
-NOWHERE = np.float32(1e6)
+# Cost of a height that fewer than two images cover: less than chance agreement costs, and more than a match.
+UNCOVERED_COST = np.float32(40.0)
+# Grey value of a view where it does not see the cell, times its number: far from every grey value, and from that of
+# another view.
+GREY_OF_UNSEEING_VIEW = np.float32(1e6)
+# How much of a block a view sees at a height.
 NOTHING, PART, WHOLE = 0, 1, 2
 
 
-# (n,) f8, f8 -> f8
+class CostParameters(NamedTuple):
+    """Constants of the matching cost; see `zlocus.core.options.CostOptions`."""
+
+    window_variance: float  # f4: added to the variance of every window, grey values squared
+    grey_weight: float  # f4: weight of grey differences beside the correlation
+    grey_weight_two_images: float  # f4: the same in blocks that two of three or more views cover
+    max_grey_difference: float  # f4: grey difference at which two views do not agree at all
+    occluded_pairs_excluded: float  # f4: share of the pairs with an occluded view that is excluded from the mean
+    max_images_for_large_window: int  # i8: blocks that more views cover take the smallest window only
+
+
+class SlopeArrays(NamedTuple):
+    """The slanted support surface of a tile; see `zlocus.matching.slope_surface`."""
+
+    cells: np.ndarray  # (r,c) f4: height index of the surface in the cells and in the cells around the tile
+    corners: np.ndarray  # (b,d) f8: height index at the corners of the blocks, which the nodes of the views follow
+
+
+class FlatVisibility(NamedTuple):
+    """`VisibleHeights` of a block on flat planes. Beyond the block a view never covers."""
+
+    lowest_covered: np.ndarray  # (i,p) i4: see `VisibleHeights`
+    highest_covered: np.ndarray  # (i,p) i4: see `VisibleHeights`
+    lowest_unoccluded: np.ndarray  # (i,p) i4: see `VisibleHeights`
+
+
+class BlockVisibility(NamedTuple):
+    """Height indices at which each view covers or sees any cell, or every cell, of a block."""
+
+    lowest_covering_any: np.ndarray  # (i,) i4: lowest index at which the view covers any cell
+    highest_covering_any: np.ndarray  # (i,) i4: highest index at which it covers any cell
+    lowest_seeing_all: np.ndarray  # (i,) i4: lowest index at which it sees every cell
+    highest_covering_all: np.ndarray  # (i,) i4: highest index at which it covers every cell
+    lowest_seeing_any: np.ndarray  # (i,) i4: lowest index at which it sees any cell
+
+
+# VisibleHeights, i8, FlatVisibility, (p,) f4 -> None
 @kernel
-def polynomial(coefficients, t):
-    """Value of a polynomial at t; coefficients of 1, t, t^2, ..."""
-    value = 0.0
-    for power in range(coefficients.shape[0] - 1, -1, -1):
-        value = value * t + coefficients[power]
-    return value
+def flat_visibility(visible, half, flat, pair_weight):
+    """Write the visible heights of a block in the flat layout, and the weight 2 / (n (n - 1)) of a pair of views.
 
-
-# (i,2,2,2,4) f8, i8, f8, i8, i8, (8,) f8 -> None
-@kernel
-def plane_grid(nodes, view, t, block, half, grid):
-    """Positions of one view over a block at one height, border included.
-
-    nodes : (i, 2, 2, 2, n) float64: view, corner row, corner column, (x, y), polynomial in t; t : height in the table's
-    normalised unit; block : cells between the corners; grid : (8,), see `resample_plane`.
+    n is the number of views that cover the cell at any height; the weight is 0 where it is less than two.
     """
-    for axis in range(2):
-        origin, right = polynomial(nodes[view, 0, 0, axis], t), polynomial(nodes[view, 0, 1, axis], t)
-        below, diagonal = polynomial(nodes[view, 1, 0, axis], t), polynomial(nodes[view, 1, 1, axis], t)
-        by_col = (right - origin) / block
-        by_row = (below - origin) / block
-        mixed = (diagonal - below - right + origin) / (block * block)
-        grid[axis] = origin - half * by_col - half * by_row + half * half * mixed
-        grid[2 + axis] = by_col - half * mixed
-        grid[4 + axis] = by_row - half * mixed
-        grid[6 + axis] = mixed
-
-
-# (3,i,r,c) i4, i8, (i,3,p) i4, (p,) f4 -> None
-@kernel
-def flat_visibility(seen, half, flat, pairs):
-    """`seen` of a block on the flat layout (never beyond it); 2 / (n (n - 1)), n the views that see the cell."""
-    n_views, rows, cols = seen.shape[1], seen.shape[2], seen.shape[3]
+    n_views, rows, cols = visible.lowest_covered.shape
     width = cols + 2 * half
-    flat[:, 0] = HIDDEN
-    flat[:, 1] = -1
-    flat[:, 2] = HIDDEN
-    pairs[:] = 0.0
+    flat.lowest_covered[:] = NEVER_COVERED
+    flat.highest_covered[:] = -1
+    flat.lowest_unoccluded[:] = NEVER_COVERED
+    pair_weight[:] = 0.0
     for i in range(n_views):
-        for bound in range(3):
-            for r in range(rows):
-                for c in range(cols):
-                    flat[i, bound, r * width + c] = seen[bound, i, r, c]
-        for j in range(pairs.shape[0]):
-            pairs[j] += np.float32(flat[i, 0, j] <= flat[i, 1, j])
-    for j in range(pairs.shape[0]):
-        usable = pairs[j]
+        for r in range(rows):
+            for c in range(cols):
+                flat.lowest_covered[i, r * width + c] = visible.lowest_covered[i, r, c]
+                flat.highest_covered[i, r * width + c] = visible.highest_covered[i, r, c]
+                flat.lowest_unoccluded[i, r * width + c] = visible.lowest_unoccluded[i, r, c]
+        for j in range(pair_weight.shape[0]):
+            pair_weight[j] += np.float32(flat.lowest_covered[i, j] <= flat.highest_covered[i, j])
+    for j in range(pair_weight.shape[0]):
+        usable = pair_weight[j]
         ordered = usable * (usable - np.float32(1.0))
-        pairs[j] = np.float32(2.0) / ordered if usable > np.float32(1.5) else np.float32(0.0)
+        pair_weight[j] = np.float32(2.0) / ordered if usable > np.float32(1.5) else np.float32(0.0)
 
 
-# (3,i,r,c) i4 -> (i,5) i4
+# VisibleHeights -> BlockVisibility
 @kernel
-def height_ranges(seen):
-    """Of every view, lowest and highest height index at which it covers any cell of a block, and at which it covers and
-    sees every cell, and the lowest at which it sees any. seen : see `block_costs`."""
-    ranges = np.empty((seen.shape[1], 5), np.int32)
-    for i in range(seen.shape[1]):
-        low, high, from_, to, any_from = HIDDEN, np.int32(-HIDDEN), np.int32(-HIDDEN), HIDDEN, HIDDEN
-        for r in range(seen.shape[2]):
-            for c in range(seen.shape[3]):
-                visible = max(seen[0, i, r, c], seen[2, i, r, c])
-                low, high = min(low, seen[0, i, r, c]), max(high, seen[1, i, r, c])
-                from_, any_from = max(from_, visible), min(any_from, visible)
-                to = min(to, seen[1, i, r, c])
-        ranges[i, 0], ranges[i, 1], ranges[i, 2], ranges[i, 3], ranges[i, 4] = low, high, from_, to, any_from
-    return ranges
+def block_visibility(visible):
+    """Height indices at which each view covers or sees any cell, or every cell, of a block."""
+    n_views, n_rows, n_cols = visible.lowest_covered.shape
+    block = BlockVisibility(
+        np.empty(n_views, np.int32), np.empty(n_views, np.int32), np.empty(n_views, np.int32),
+        np.empty(n_views, np.int32), np.empty(n_views, np.int32),
+    )  # fmt: skip
+    never, always = NEVER_COVERED, np.int32(-NEVER_COVERED)
+    for i in range(n_views):
+        low, high, all_from, all_to, any_from = never, always, always, never, never
+        for r in range(n_rows):
+            for c in range(n_cols):
+                lowest, highest = visible.lowest_covered[i, r, c], visible.highest_covered[i, r, c]
+                seen_from = max(lowest, visible.lowest_unoccluded[i, r, c])
+                low, high = min(low, lowest), max(high, highest)
+                all_from, any_from = max(all_from, seen_from), min(any_from, seen_from)
+                all_to = min(all_to, highest)
+        block.lowest_covering_any[i], block.highest_covering_any[i] = low, high
+        block.lowest_seeing_all[i], block.highest_covering_all[i] = all_from, all_to
+        block.lowest_seeing_any[i] = any_from
+    return block
 
 
-# (i,5) i4, i8, i4 -> i8
+# BlockVisibility, i8, i4 -> i8
 @kernel
-def extent_at(ranges, view, height):
-    """What a view shows of a block at a height: NOTHING, PART or WHOLE. ranges : see `height_ranges`."""
-    if ranges[view, 2] <= height <= ranges[view, 3]:
+def extent_at(block, view, height):
+    """How much of a block a view sees at a height index: NOTHING, PART or WHOLE."""
+    if block.lowest_seeing_all[view] <= height <= block.highest_covering_all[view]:
         return WHOLE
-    return PART if ranges[view, 4] <= height <= ranges[view, 1] else NOTHING
+    return PART if block.lowest_seeing_any[view] <= height <= block.highest_covering_any[view] else NOTHING
 
 
-# (i,5) i4, (i,) i8, i4 -> i8
+# BlockVisibility, (i,) i8, i4 -> i8
 @kernel
-def whole_views(ranges, takes, height):
-    """How many views show the whole block at a height."""
+def count_whole_views(block, views, height):
+    """How many of the views see the whole block at a height index."""
     n = 0
-    for view in takes:
-        n += 1 if extent_at(ranges, view, height) == WHOLE else 0
+    for view in views:
+        n += 1 if extent_at(block, view, height) == WHOLE else 0
     return n
 
 
-# (i,5) i4, (2,) i8 -> (i,) i8
+# BlockVisibility, HeightSpan -> (i,) i8
 @kernel
-def taking_part(ranges, span):
-    """The views that cover any cell of a block at any height of its range. ranges : see `height_ranges`."""
-    takes = np.empty(ranges.shape[0], np.int64)
+def covering_views(block, span):
+    """The views that cover any cell of a block at any height that it searches."""
+    views = np.empty(block.lowest_covering_any.shape[0], np.int64)
     n = 0
-    for i in range(ranges.shape[0]):
-        if ranges[i, 1] >= span[0] and ranges[i, 0] < span[0] + span[1]:
-            takes[n] = i
+    for i in range(views.shape[0]):
+        if block.highest_covering_any[i] >= span.first and block.lowest_covering_any[i] < span.first + span.count:
+            views[n] = i
             n += 1
-    return takes[:n]
-
-
-# (2,) i8 -> (2,p) f4
-@kernel
-def flat_cells(shape):
-    """Rows and columns of cells on the flat layout."""
-    cells = np.empty((2, shape[0] * shape[1]), np.float32)
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            cells[0, r * shape[1] + c], cells[1, r * shape[1] + c] = r, c
-    return cells
-
-
-# (i,2,2,2,4) f8, i8, f8, f8, (2,) f4 -> None
-@kernel
-def plane_velocity(nodes, view, t, per_index, velocity):
-    """Pixels (x, y) that a cell at the middle of a block moves per height index. per_index : t per index."""
-    for axis in range(2):
-        total = 0.0
-        for corner in range(4):
-            k = nodes[view, corner // 2, corner % 2, axis]
-            slope = 0.0
-            for power in range(k.shape[0] - 1, 0, -1):
-                slope = slope * t + power * k[power]
-            total += slope
-        velocity[axis] = np.float32(0.25 * total * per_index)
+    return views[:n]
 
 
 # (r,c) f4, (2,2) f8, i8, i8, (r,c) f4 -> None
 @kernel
 def block_relief(surface, corners, block, half, relief):
-    """Base surface of a block and its border, less the bilinear surface through its corners, which its nodes follow."""
+    """Write the slanted support surface of a block, less the bilinear surface through the corners of the block.
+
+    surface : height indices of the block's cells and of `half` cells around them. The nodes of the views follow the
+    bilinear surface.
+    """
     for r in range(surface.shape[0]):
         u = (r - half) / block
         left = corners[0, 0] + u * (corners[1, 0] - corners[0, 0])
@@ -157,64 +170,64 @@ def block_relief(surface, corners, block, half, relief):
             relief[r, c] = np.float32(surface[r, c] - left - (c - half) / block * rise)
 
 
-# (i,3,p) i4, i8, i4, i8, (p,) f4, (2,p) f4 -> None
+# FlatVisibility, i8, i4, i8, (p,) f4, (2,p) f4 -> None
 @kernel
-def shown_at(bounds, view, height, n, shown, counts):
-    """Where a view covers and sees the cells at a height (1 or 0); counts the views that cover, and that see, a cell.
+def mark_seen_cells(flat, view, height, n, is_seen, counts):
+    """Write where a view sees the cells at a height index (1 or 0), and count it.
 
-    bounds : see `flat_visibility`.
+    counts : (2, p), how many views cover, and how many see, each cell.
     """
-    low, high, visible = bounds[view, 0], bounds[view, 1], bounds[view, 2]
+    low, high, visible = flat.lowest_covered[view], flat.highest_covered[view], flat.lowest_unoccluded[view]
     for j in range(n):
         covered = np.float32(low[j] <= height and height <= high[j])
-        shown[j] = covered * np.float32(visible[j] <= height)
+        is_seen[j] = covered * np.float32(visible[j] <= height)
         counts[0, j] += covered
-        counts[1, j] += shown[j]
+        counts[1, j] += is_seen[j]
 
 
 # (p,) f4, i8, (w,p) f4, (p,) f4, f4 -> None
 @kernel
-def hide(shown, n, scale, grey, nowhere):
-    """Take a view out of all pairs where it is not shown."""
+def exclude_unseen(is_seen, n, scale, grey, grey_of_unseen):
+    """Exclude a view from all pairs of the cells that it does not see."""
     for w in range(scale.shape[0]):
         unit = scale[w]
         for j in range(n):
-            unit[j] *= shown[j]
+            unit[j] *= is_seen[j]
     for j in range(n):
-        grey[j] = grey[j] if shown[j] > np.float32(0.0) else nowhere
+        grey[j] = grey[j] if is_seen[j] > np.float32(0.0) else grey_of_unseen
 
 
 # (p,) f4, (2,p) f4, f4, i8, (p,) f4 -> None
 @kernel
-def excuse(pairs, counts, excused, n, out):
-    """Weights of pairs, part of that of those with a hidden view passed on to the visible ones. counts : (2, p), views
-    that cover and that see each cell.
+def weights_with_occlusion(pair_weight, counts, excluded, n, out):
+    """Write the weight of a pair of views that see the cell, where some pairs contain an occluded view.
 
-    A pair with a hidden view counts as uncorrelated (NCC 0), but for the excused share, which agrees as the visible
-    pairs do: without it the ground beside a wall would rather be roof, which all views see; excusing all would favour
-    heights that few views see, where chance agreement is larger.
+    counts : (2, p), views that cover and that see each cell; excluded : share of the pairs with an occluded view that
+    is left out of the mean. The other such pairs count as uncorrelated (NCC 0). If none was left out, the ground beside
+    a wall would rather be roof, which all views see; if all were, heights that few views see would be favoured, where
+    chance agreement is larger.
     """
     n_seeing, one = counts[1], np.float32(1.0)
     for j in range(n):
         m = n_seeing[j]
         visible = np.float32(2.0) / max(m * (m - one), one)
-        out[j] = pairs[j] + excused * (visible - pairs[j])
+        out[j] = pair_weight[j] + excluded * (visible - pair_weight[j])
 
 
 # (p,) f4, (p,) f4, (p,) f4, f4, i8, i8, (p,) u1 -> None
 @kernel
-def whole_costs(total, pairs, n_covering, weight, n_sizes, n, out):
-    """Costs of a block at one height, rounded, from the sums over pairs of views; see `block_costs`.
+def rounded_costs(total, pair_weight, n_covering, grey_weight, n_sizes, n, out):
+    """Write the costs of a block at one height, rounded, from the sums over the pairs of views; see `block_costs`.
 
-    pairs : (p,), weight of a visible pair. Heights that fewer than two images cover cost UNSEEN_COST, less than chance
-    agreement and more than a match: so a cell whose true height is outside the images is not matched elsewhere.
+    pair_weight : (p,), weight of a pair of views that see the cell. Heights that fewer than two images cover cost
+    UNCOVERED_COST, so that a cell whose true height lies outside the images is not matched elsewhere.
     """
-    highest = COST_SCALE * (np.float32(1.0) + weight)
-    unseen = UNSEEN_COST * (np.float32(1.0) + weight)
+    highest = COST_SCALE * (np.float32(1.0) + grey_weight)
+    uncovered = UNCOVERED_COST * (np.float32(1.0) + grey_weight)
     factor = COST_SCALE / np.float32(n_sizes)
     for j in range(n):
-        cost = highest - factor * total[j] * pairs[j]
-        total[j] = (cost if n_covering[j] > np.float32(1.5) else unseen) + np.float32(0.5)
+        cost = highest - factor * total[j] * pair_weight[j]
+        total[j] = (cost if n_covering[j] > np.float32(1.5) else uncovered) + np.float32(0.5)
     for j in range(n):
         out[j] = np.uint8(np.int32(min(max(total[j], np.float32(0.0)), np.float32(255.0))))
 
@@ -222,7 +235,7 @@ def whole_costs(total, pairs, n_covering, weight, n_sizes, n, out):
 # (h,p) u1, i8, (r,d) u1 -> None
 @kernel
 def heights_last(codes, width, out):
-    """Costs, one flat plane a height, as rows of cells with all their heights."""
+    """Write costs that are one flat plane per height as rows of cells, each cell with all its heights."""
     count = codes.shape[0]
     for r in range(out.shape[0]):
         for c in range(out.shape[1] // count):
@@ -232,118 +245,151 @@ def heights_last(codes, width, out):
 
 # (p,) f4, i8, f4, i8, f4, i8, (p,) f4 -> None
 @kernel
-def centred(plane, size, centre, start, by_reach, n, grey):
-    """Take `centre` from a plane's `size` values; grey : those of the cells themselves, from `start` on, times
-    `by_reach`, unless that is 0."""
+def subtract_centre(plane, size, centre, start, grey_factor, n, grey):
+    """Subtract `centre` from the first `size` values of a plane, and write the grey values of the cells.
+
+    grey : values of the cells themselves, which begin at `start` in the plane, times `grey_factor`; not written where
+    that is 0.
+    """
     for j in range(size):
         plane[j] -= centre
-    if by_reach > np.float32(0.0):
+    if grey_factor > np.float32(0.0):
         inner = plane[start:]
         for j in range(n):
-            grey[j] = inner[j] * by_reach
+            grey[j] = inner[j] * grey_factor
 
 
-# (p,) f4, (i,3) i8, (i,2,2,2,4) f8, (2,) f8, (r,c) f4, (2,) i8, (w,) i8, (3,i,r,c) i4, i8, (6,) f4, (r,d) u1 -> None
+# ViewArrays, (r,c) f4, HeightSpan, (w,) i8, VisibleHeights, CostParameters, (r,d) u1 -> None
 @kernel
-def block_costs(pixels, layout, nodes, heights, relief, span, windows, seen, block, measure, out):
-    """Costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and as much,
-    weighted, for their grey differences.
+def block_costs(views, relief, span, windows, visible, parameters, out):
+    """Write the costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and
+    as much, weighted, for the grey differences of the same pairs.
 
-    pixels, layout : see `resample_plane`; nodes : see `plane_grid`; heights : t of height index 0, t per index;
-    relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; span : first height index and count; windows :
-    half widths of the windows, ascending; seen : (3, i, r, c) int32, lowest and highest height index at which an image
-    covers a cell (HIDDEN, -1 where it never does), and the lowest at which nothing hides it; measure : (6,) float32,
-    variance added to every window, weight and reach of grey differences, share of hidden pairs that is excused, what
-    `tile_costs` takes, the weight where two views take part; out : (r, c * count) uint8.
-    Views that show nothing of the block at a height are left out there.
+    views : with the nodes of this block; relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; windows
+    : half widths, ascending, the last is `half`; visible : of this block; out : (r, c * count) uint8. Views that see
+    nothing of the block at a height are left out there.
     """
-    ranges = height_ranges(seen)
-    takes = taking_part(ranges, span)
-    floor, weight = measure[0], measure[5] if takes.shape[0] == 2 else measure[1]
+    of_block = block_visibility(visible)
+    takes = covering_views(of_block, span)
+    weight = parameters.grey_weight_two_images if takes.shape[0] == 2 else parameters.grey_weight
     if takes.shape[0] < 2:
-        out[:] = np.uint8(UNSEEN_COST * (np.float32(1.0) + weight))
+        out[:] = np.uint8(UNCOVERED_COST * (np.float32(1.0) + weight))
         return
+    nodes, heights, block, variance = views.nodes, views.heights, views.block, parameters.window_variance
     n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
-    n, start, steps, cells = seen.shape[2] * width, half * (width + 1), relief.ravel(), flat_cells(relief.shape)
-    size = steps.shape[0] + SLACK
+    n, start, steps = visible.lowest_covered.shape[1] * width, half * (width + 1), relief.ravel()
+    size, cells = steps.shape[0] + SLACK, flat_cells(relief.shape[0], width)
     planes, greys = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
     mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
-    flat, codes = np.empty((seen.shape[1], 3, size), np.int32), np.empty((span[1], n), np.uint8)
+    flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.empty((span.count, n), np.uint8)
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    counts, sides = np.empty((2, size), np.float32), np.empty((2, size), np.complex64)
-    work, grid, velocity = np.empty((4, size), np.float32), np.empty(8), np.empty(2, np.float32)
-    index, fraction, totals = np.empty(size, np.uint32), np.empty((2, size), np.float32), total.reshape((1, 1, size))
-    flat_visibility(seen, half, flat, pairs)
+    counts, scratch = np.empty((2, size), np.float32), resample_scratch(size)
+    work, totals = np.empty((4, size), np.float32), total.reshape((1, 1, size))
+    flat_visibility(visible, half, flat, pairs)
     top, centre = weight * np.float32(n_sizes), np.float32(0.0)
-    by_reach = top / measure[2]
-    for k in range(span[1]):
-        height, m = np.int32(span[0] + k), 0
-        t, n_whole = heights[0] + height * heights[1], whole_views(ranges, takes, height)
+    grey_factor = top / parameters.max_grey_difference
+    for k in range(span.count):
+        height, m = np.int32(span.first + k), 0
+        t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole
         for i in range(n_views):
             view, plane, grey = takes[i], planes[m], greys[m]
-            extent = extent_at(ranges, view, height)
+            extent = extent_at(of_block, view, height)
             if extent < WHOLE:
-                shown_at(flat, view, height, n, shown, counts)
+                mark_seen_cells(flat, view, height, n, shown, counts)
             if extent == NOTHING and i > 0:
                 continue
-            plane_grid(nodes, view, t, block, half, grid)
-            plane_velocity(nodes, view, t, heights[1], velocity)
-            resample_plane(pixels, layout[view], grid, cells, steps, velocity, index, fraction, sides, plane)
+            grid, velocity = block_grid(nodes, view, t, block, half), block_velocity(nodes, view, t, heights[1])
+            resample_plane(image_of(views, view), grid, velocity, cells, steps, scratch, plane)
             centre = plane[start] if i == 0 else centre
             if extent == NOTHING:
                 continue
-            centred(plane, steps.shape[0], centre, start, by_reach, n, grey)
-            window_moments(plane, windows, width, n, floor, work, mean[m], scale[m])
+            subtract_centre(plane, steps.shape[0], centre, start, grey_factor, n, grey)
+            window_moments(plane, windows, width, n, variance, work, mean[m], scale[m])
             if extent < WHOLE:
-                hide(shown, n, scale[m], grey, NOWHERE * np.float32(m + 1))
+                exclude_unseen(shown, n, scale[m], grey, GREY_OF_UNSEEING_VIEW * np.float32(m + 1))
             m += 1
         if weight > 0.0:
             add_closeness(greys[:m], top, n, total)
-        add_pairs(planes[:m], windows, mean[:m], scale[:m], width, n, work, totals)
+        add_pairs(planes[:m], windows, WindowMoments(mean[:m], scale[:m]), width, n, work, totals)
         if n_whole < n_views:
-            excuse(pairs, counts, measure[3], n, shown)
-        whole_costs(total, shown if n_whole < n_views else pairs, counts[0], weight, n_sizes, n, codes[k])
+            weights_with_occlusion(pairs, counts, parameters.occluded_pairs_excluded, n, shown)
+        rounded_costs(total, shown if n_whole < n_views else pairs, counts[0], weight, n_sizes, n, codes[k])
     heights_last(codes, width, out)
 
 
-# (3,i,r,c) i4, (2,) i8, (w,) i8, i8 -> (w,) i8
+# i8, i8 -> FlatVisibility
 @kernel
-def windows_for(seen, span, windows, few):
-    """The windows of a block: all where at most `few` views take part, else the smallest, for many pairs of views
-    average noise as well, and their windows do not reach beyond a small crown."""
-    return windows if taking_part(height_ranges(seen), span).shape[0] <= few else windows[:1]
+def empty_visibility(n_views, size):
+    """Arrays for the visibility of a block on flat planes of a size, not filled."""
+    shape = (n_views, size)
+    return FlatVisibility(np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, np.int32))
 
 
-# as block_costs, with (r,c) f4, (b,d) f8 for its relief, (2,b,d) i8, (3,b,d) i8 for its span and (v,) u1 -> None
+# VisibleHeights, HeightSpan, (w,) i8, i8 -> (w,) i8
 @kernel
-def tile_costs(
-    pixels, layout, nodes, heights, base, base_nodes, ranges, address, windows, seen, block, measure, volume
-):  # fmt: skip
-    """`block_costs` of every block of a tile.
+def windows_of_block(visible, span, windows, max_views):
+    """The windows of a block: all where at most `max_views` views cover it, else the smallest only.
 
-    base : (r + 2 half, c + 2 half) float32 base surface, border included, in height indices; base_nodes : (b + 1,
-    d + 1) float64, the base surface at the corners of blocks, which `nodes` follow; ranges : (2, b, d) int64, first
-    index and count of each block; address : (3, b, d) int64, see `HeightLattice.address`; measure : (6,) float32, the
-    fifth is the most views of a block that takes all windows, see `windows_for`; volume : (v,) uint8, written.
+    Many pairs of views average noise as large windows do, and small windows do not reach beyond a small crown.
     """
-    n_rows, n_cols = seen.shape[2], seen.shape[3]
-    span, few = np.empty(2, np.int64), np.int64(measure[4])
-    for br in range(ranges.shape[1]):
-        r0, r1 = br * block, min((br + 1) * block, n_rows)
-        first, length = address[0, br, 0], address[1, br, 0]
-        rows = volume[first : first + (r1 - r0) * length].reshape((r1 - r0, length))
-        for bc in range(ranges.shape[2]):
-            c0, c1 = bc * block, min((bc + 1) * block, n_cols)
-            span[0], span[1] = ranges[0, br, bc], ranges[1, br, bc]
-            start = address[2, br, bc]
-            sizes = windows_for(seen[:, :, r0:r1, c0:c1], span, windows, few)
+    return windows if covering_views(block_visibility(visible), span).shape[0] <= max_views else windows[:1]
+
+
+# as VisibleHeights, sliced: VisibleHeights, CellBox -> VisibleHeights
+@kernel
+def visible_in(visible, box):
+    """The visible heights of the cells of a rectangle."""
+    r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
+    return VisibleHeights(
+        visible.lowest_covered[:, r0:r1, c0:c1], visible.highest_covered[:, r0:r1, c0:c1],
+        visible.lowest_unoccluded[:, r0:r1, c0:c1],
+    )  # fmt: skip
+
+
+# as ViewArrays with sliced nodes: ViewArrays, i8, i8 -> ViewArrays
+@kernel
+def views_of_block(views, block_row, block_col):
+    """The arrays of the views with the nodes at the corners of one block."""
+    nodes = views.nodes[:, block_row : block_row + 2, block_col : block_col + 2]
+    return ViewArrays(views.pixels, views.layout, nodes, views.heights, views.block)
+
+
+# i8, i8, i8, i8, i8 -> CellBox
+@kernel
+def cells_of_block(block_row, block_col, block, n_rows, n_cols):
+    """The cells of a block; blocks at the end of the tile may be smaller."""
+    return CellBox(
+        block_row * block, min((block_row + 1) * block, n_rows),
+        block_col * block, min((block_col + 1) * block, n_cols),
+    )  # fmt: skip
+
+
+# ViewArrays, SlopeArrays, VolumeLayout, (w,) i8, VisibleHeights, CostParameters, (v,) u1 -> None
+@kernel
+def tile_costs(views, slope, layout, windows, visible, parameters, volume):
+    """Write `block_costs` of every block of a tile.
+
+    views : whose nodes follow the slanted support surface; slope : with as many cells around the tile as the half width
+    of the largest window; windows : half widths, ascending; volume : (v,) uint8, laid out as `layout` says.
+    """
+    n_rows, n_cols = visible.lowest_covered.shape[1], visible.lowest_covered.shape[2]
+    block = views.block
+    for br in range(layout.count.shape[0]):
+        for bc in range(layout.count.shape[1]):
+            box = cells_of_block(br, bc, block, n_rows, n_cols)
+            span = HeightSpan(layout.first[br, bc], layout.count[br, bc])
+            r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
+            first, length = layout.block_row_start[br, 0], layout.row_length[br, 0]
+            rows = volume[first : first + (r1 - r0) * length].reshape((r1 - r0, length))
+            start, of_block = layout.block_start[br, bc], visible_in(visible, box)
+            sizes = windows_of_block(of_block, span, windows, parameters.max_images_for_large_window)
             half, beside = sizes[-1], windows[-1] - sizes[-1]
             relief = np.empty((r1 - r0 + 2 * half, c1 - c0 + 2 * half), np.float32)
-            corners, r, c = base_nodes[br : br + 2, bc : bc + 2], r0 + beside, c0 + beside
-            around = base[r : r + relief.shape[0], c : c + relief.shape[1]]
+            corners, r, c = slope.corners[br : br + 2, bc : bc + 2], r0 + beside, c0 + beside
+            around = slope.cells[r : r + relief.shape[0], c : c + relief.shape[1]]
             block_relief(around, corners, block, half, relief)
             block_costs(
-                pixels, layout, nodes[:, br : br + 2, bc : bc + 2], heights, relief, span, sizes,
-                seen[:, :, r0:r1, c0:c1], block, measure, rows[:, start : start + (c1 - c0) * span[1]],
+                views_of_block(views, br, bc), relief, span, sizes, of_block, parameters,
+                rows[:, start : start + (c1 - c0) * span.count],
             )  # fmt: skip

@@ -1,43 +1,66 @@
-"""Which heights a view can see in each cell, given a surface that may hide them; how many views see it, which best."""
+"""Which heights a view sees in each cell below a surface that may occlude it, how many views see it, and which best."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from zlocus.core.jit import kernel
 
+# A view that moves by fewer cells than this per unit of height looks straight down.
+MIN_SPEED = 1e-6
+
+
+class RaySweep(NamedTuple):
+    """How a tile is swept along the rays of one view: cell by cell along the longer component of their direction."""
+
+    along_cols: bool  # b1: whether the sweep goes from column to column (else from row to row)
+    sign: int  # i8: 1 where rays rise towards larger columns (rows), else -1
+    gain: float  # f4: height that a ray gains from one cell to the next
+    drift: float  # f8: cells that a ray moves across the sweep from one cell to the next
+    n_along: int  # i8: cells along the sweep
+    n_across: int  # i8: cells across it
+    is_vertical: bool  # b1: whether the view looks straight down, so that there is nothing to sweep
+
+
+# i8, i8, f8, f8 -> RaySweep
+@kernel
+def ray_sweep(n_rows, n_cols, by_col, by_row):
+    """The sweep of a tile along v = (by_col, by_row): cells that the point seen by a fixed pixel moves per height."""
+    along_cols = abs(by_col) >= abs(by_row)
+    major, minor = (by_col, by_row) if along_cols else (by_row, by_col)
+    speed = max(abs(major), MIN_SPEED)
+    n_along, n_across = (n_cols, n_rows) if along_cols else (n_rows, n_cols)
+    sign = 1 if major > 0 else -1
+    return RaySweep(along_cols, sign, np.float32(1.0 / speed), minor / speed, n_along, n_across, abs(major) < MIN_SPEED)
+
 
 # (r,c) f4, f8, f8, (r,c) f4 -> None
 @kernel
 def lowest_visible(surface, by_col, by_row, out):
-    """Lowest height that a view sees in each cell: max over h > 0 of surface(cell + h v) - h.
+    """Write the lowest height that a view sees in each cell: max over h > 0 of surface(cell + h v) - h.
 
-    surface : (r, c) float32, in any unit of height (NaN nowhere); by_col, by_row : v, cells the point seen by a fixed
-    pixel moves per unit of height; out : (r, c) float32, -1e30 where nothing stands in the way.
+    surface : (r, c) float32, in any unit of height, without NaN; by_col, by_row : v, cells that the point seen by a
+    fixed pixel moves per unit of height; out : (r, c) float32, -1e30 where nothing occludes the cell.
 
-    One sweep against the direction of v, a cell at a time along its longer component: what hides a cell is what hides
-    the next one on the ray, or that next cell itself, less the height the ray gains on the way. The value between two
-    cells is interpolated.
+    One sweep against the direction of v: what occludes a cell also occludes the next cell on the ray, or that next cell
+    itself does, less the height that the ray gains on the way. The value between two cells is interpolated.
     """
-    n_rows, n_cols = surface.shape
+    sweep = ray_sweep(surface.shape[0], surface.shape[1], by_col, by_row)
+    along_cols, sign, gain, n_across = sweep.along_cols, sweep.sign, sweep.gain, sweep.n_across
     out[:] = np.float32(-1e30)
-    along_cols = abs(by_col) >= abs(by_row)
-    major = by_col if along_cols else by_row
-    if abs(major) < 1e-6:
+    if sweep.is_vertical:
         return
-    gain = np.float32(1.0 / abs(major))
-    slant = (by_row if along_cols else by_col) / abs(major)
-    sign = 1 if major > 0 else -1
-    n_major, n_minor = (n_cols, n_rows) if along_cols else (n_rows, n_cols)
-    for step in range(1, n_major):
-        m = n_major - 1 - step if sign > 0 else step
-        for j in range(n_minor):
-            place = j + slant
+    for step in range(1, sweep.n_along):
+        m = sweep.n_along - 1 - step if sign > 0 else step
+        for j in range(n_across):
+            place = j + sweep.drift
             first = int(np.floor(place))
             fraction = np.float32(place - first)
-            if first < 0 or first > n_minor - 1 or (first + 1 > n_minor - 1 and fraction > 0.0):
+            if first < 0 or first > n_across - 1 or (first + 1 > n_across - 1 and fraction > 0.0):
                 continue
-            second = min(first + 1, n_minor - 1)
+            second = min(first + 1, n_across - 1)
             if along_cols:
                 a = max(out[first, m + sign], surface[first, m + sign])
                 b = max(out[second, m + sign], surface[second, m + sign])
@@ -48,45 +71,43 @@ def lowest_visible(surface, by_col, by_row, out):
                 out[m, j] = a + fraction * (b - a) - gain
 
 
-# (s,t) f4, (2,) i8, (r,c) f4, f4, f4, (2,2) i8, (r,c) i4 -> None
+# (s,t) f4, (2,) i8, (r,c) f4, f4, f4, CellBox, (r,c) i4 -> None
 @kernel
-def hide_below(lowest, first, base, margin, least, ends, out):
-    """Height index from which on nothing hides each cell: what lies at most `margin` below the lowest visible height is
-    seen, and no height index is below `least`.
+def write_lowest_unoccluded(lowest, first, slope_cells, margin, least, box, out):
+    """Write the lowest height index at which nothing occludes each cell of a rectangle.
 
-    lowest : (s, t) float32, see `lowest_visible`; first : row and column in it of the first cell; base : (r, c)
-    float32, that height indices are counted from; ends : first row and the one after the last, and so for columns, of
-    the cells that are written; out : (r, c) int32.
+    A height counts as seen that lies at most `margin` below the lowest visible height. lowest : (s, t) float32, see
+    `lowest_visible`; first : row and column, in `lowest`, of the first cell of the tile; slope_cells : (r, c) float32,
+    the surface that height indices are counted from; least : no index is below it; out : (r, c) int32.
     """
-    c0, c1 = ends[1, 0], ends[1, 1]
-    for r in range(ends[0, 0], ends[0, 1]):
-        found, ground, to = lowest[first[0] + r, first[1] + c0 : first[1] + c1], base[r, c0:c1], out[r, c0:c1]
+    c0, c1 = box.first_col, box.end_col
+    for r in range(box.first_row, box.end_row):
+        found, ground, to = lowest[first[0] + r, first[1] + c0 : first[1] + c1], slope_cells[r, c0:c1], out[r, c0:c1]
         for c in range(c1 - c0):
             to[c] = np.int32(np.floor(max(found[c] - (ground[c] + margin), least)))
 
 
-# (3,i,r,c) i4, (r,c) f4, (r,c) i4 -> None
+# VisibleHeights, (r,c) f4, (r,c) i4 -> None
 @kernel
-def count_seeing(seen, surface, out):
-    """How many views see each cell at its height. seen : (3, i, r, c) int32, lowest and highest height index at which a
-    view covers a cell, and the lowest at which nothing hides it; surface : (r, c) float32, height indices; out : (r, c)
-    int32, written."""
+def count_seeing(visible, surface, out):
+    """Write how many views see each cell at its height. surface : (r, c) float32 height indices; out : (r, c) int32."""
     out[:] = 0
     for r in range(out.shape[0]):
         at, n = surface[r], out[r]
-        for i in range(seen.shape[1]):
-            low, high, visible = seen[0, i, r], seen[1, i, r], seen[2, i, r]
+        for i in range(visible.lowest_covered.shape[0]):
+            low, high = visible.lowest_covered[i, r], visible.highest_covered[i, r]
+            free_from = visible.lowest_unoccluded[i, r]
             for c in range(n.shape[0]):
-                n[c] += np.int32((low[c] <= at[c]) & (at[c] <= high[c]) & (visible[c] <= at[c]))
+                n[c] += np.int32((low[c] <= at[c]) & (at[c] <= high[c]) & (free_from[c] <= at[c]))
 
 
-# (i,b,d) f8, (3,i,r,c) i4, (r,c) f4, i8, (r,c) i4 -> None
+# (i,b,d) f8, VisibleHeights, (r,c) f4, i8, (r,c) i4 -> None
 @kernel
-def finest_view(size, seen, surface, block, best):
-    """Of the views that see each cell that with the largest size, the first of equals; cells that have one keep it.
+def finest_view(size, visible, surface, block, best):
+    """Write, for each cell without a view, the view of the largest size that sees it, the first of equals.
 
-    size : (i, b, d) float64, by blocks of so many cells, positive where a view counts; seen, surface : see
-    `count_seeing`; best : (r, c) int32, written where it is below 0.
+    size : (i, b, d) float64, by blocks of `block` cells, positive where a view counts; surface : (r, c) float32, height
+    indices; best : (r, c) int32, number of a view, below 0 where the cell has none yet.
     """
     n_cols = best.shape[1]
     most = np.empty(n_cols)
@@ -95,11 +116,12 @@ def finest_view(size, seen, surface, block, best):
         for c in range(n_cols):
             most[c] = np.inf if found[c] >= 0 else 0.0
         for i in range(size.shape[0]):
-            low, high, visible = seen[0, i, r], seen[1, i, r], seen[2, i, r]
+            low, high = visible.lowest_covered[i, r], visible.highest_covered[i, r]
+            free_from = visible.lowest_unoccluded[i, r]
             for d in range(size.shape[2]):
                 of_view = size[i, r // block, d]
                 for c in range(d * block, min((d + 1) * block, n_cols)):
-                    is_seen = (low[c] <= z[c]) & (z[c] <= high[c]) & (visible[c] <= z[c])
+                    is_seen = (low[c] <= z[c]) & (z[c] <= high[c]) & (free_from[c] <= z[c])
                     is_better = is_seen & (of_view > most[c])
                     found[c] = np.int32(i) if is_better else found[c]
                     most[c] = of_view if is_better else most[c]

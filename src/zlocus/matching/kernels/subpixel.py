@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from zlocus.core.jit import kernel
-from zlocus.matching.kernels.cost_volume import HIDDEN, flat_cells, flat_visibility, plane_grid
-from zlocus.matching.kernels.ncc import SLACK, add_pairs, window_moments
-from zlocus.matching.kernels.resample import RUN, gather
-from zlocus.matching.kernels.shared_records import ViewArrays
+from zlocus.matching.kernels.cost_volume import empty_visibility, flat_visibility, views_of_block, visible_in
+from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_pairs, window_moments
+from zlocus.matching.kernels.resample import RUN, block_grid, flat_cells, gather, image_of, resample_scratch
+from zlocus.matching.kernels.shared_records import NEVER_COVERED, BlockGrid, CellBox, VisibleHeights
 
 LINEAR, CUBIC = 1, 3
 
@@ -27,41 +27,67 @@ class ProfileSampling(NamedTuple):
     noise_variance: np.float32  # f4: grey values squared, added to the variance of every window
 
 
-# (3,8) f8, (3,) i8, i8, (2,14) f4 -> (2,) i8
-@kernel
-def surface_path(grids, layout, degree, path):
-    """Write where one view shows a block of cells, as polynomials in the height u.
+class LevelGrids(NamedTuple):
+    """Image positions of the cells of a block in one view at three heights: u = -1, 0 and 1."""
 
-    path : (2, 14), written, for x and y: the bilinear coefficients (1, column, row, both) of 1, u and u^2, then the
-    lowest and the highest position. Positions are px from a whole pixel (column, row), which is returned. grids :
-    (3, 8), positions at u = -1, 0 and 1, see `plane_grid`; degree : of the interpolation, whose pixels have to lie
-    inside the image.
-    """
+    low: BlockGrid  # BlockGrid: at u = -1
+    middle: BlockGrid  # BlockGrid: at u = 0
+    high: BlockGrid  # BlockGrid: at u = 1
+
+
+# ViewArrays, i8, f8, f8, i8 -> LevelGrids
+@kernel
+def level_grids(views, view, middle, span, half):
+    """Image positions of the cells of a block, and of `half` cells around it, at t = middle - span, middle and middle +
+    span."""
+    nodes, block = views.nodes, views.block
+    return LevelGrids(
+        block_grid(nodes, view, middle - span, block, half), block_grid(nodes, view, middle, block, half),
+        block_grid(nodes, view, middle + span, block, half),
+    )  # fmt: skip
+
+
+# AxisGrid, AxisGrid, AxisGrid, i8, i8, (14,) f4 -> i8
+@kernel
+def axis_path(low, middle, high, n, degree, path):
+    """Write the path of one axis, see `surface_path`; returns the whole pixel. n : size of the image along the axis."""
     before, after = (1, 3.01) if degree == CUBIC else (0, 1.01)
-    origin = np.empty(2, np.int64)
-    for axis in range(2):
-        n = layout[2 - axis]
-        origin[axis] = min(max(int(grids[1, axis]), before), n - int(after) - 1)
-        for part in range(4):
-            k = axis + 2 * part
-            low, middle, high = grids[0, k], grids[1, k], grids[2, k]
-            path[axis, part] = middle - (origin[axis] if part == 0 else 0.0)
-            path[axis, 4 + part] = 0.5 * (high - low)
-            path[axis, 8 + part] = 0.5 * (high + low) - middle
-        path[axis, 12], path[axis, 13] = before - origin[axis], n - after - origin[axis]
+    origin = min(max(int(middle.origin), before), n - int(after) - 1)
+    path[0], path[1], path[2], path[3] = middle.origin - origin, middle.by_col, middle.by_row, middle.mixed
+    path[4], path[5] = 0.5 * (high.origin - low.origin), 0.5 * (high.by_col - low.by_col)
+    path[6], path[7] = 0.5 * (high.by_row - low.by_row), 0.5 * (high.mixed - low.mixed)
+    path[8] = 0.5 * (high.origin + low.origin) - middle.origin
+    path[9] = 0.5 * (high.by_col + low.by_col) - middle.by_col
+    path[10] = 0.5 * (high.by_row + low.by_row) - middle.by_row
+    path[11] = 0.5 * (high.mixed + low.mixed) - middle.mixed
+    path[12], path[13] = before - origin, n - after - origin
     return origin
 
 
-# (14,) f4, (2,p) f4, (p,) f4, i8, i8, (n,) f4 -> None
+# LevelGrids, ViewImage, i8, (2,14) f4 -> (2,) i8
+@kernel
+def surface_path(grids, image, degree, path):
+    """Write where one view shows a block of cells, as polynomials in the height u.
+
+    path : (2, 14), written, for x and y: the bilinear coefficients (1, column, row, both) of 1, u and u^2, then the
+    lowest and the highest position. Positions are px from a whole pixel (column, row), which is returned. degree : of
+    the interpolation, whose pixels have to lie inside the image.
+    """
+    low, middle, high, origin = grids.low, grids.middle, grids.high, np.empty(2, np.int64)
+    origin[0] = axis_path(low.x, middle.x, high.x, image.n_cols, degree, path[0])
+    origin[1] = axis_path(low.y, middle.y, high.y, image.n_rows, degree, path[1])
+    return origin
+
+
+# (14,) f4, FlatCells, (p,) f4, i8, i8, (n,) f4 -> None
 @kernel
 def positions_along(path, cells, level, first, end, out):
-    """Write the positions of a run of cells on one axis. path : see `surface_path`; cells : (2, p), rows and columns;
-    level : heights u."""
+    """Write the positions of a run of cells on one axis. path : see `surface_path`; level : heights u."""
     a, b, c, d = path[0], path[1], path[2], path[3]
     by_a, by_b, by_c, by_d = path[4], path[5], path[6], path[7]
     bend_a, bend_b, bend_c, bend_d = path[8], path[9], path[10], path[11]
     low, high = path[12], path[13]
-    rows, cols, levels = cells[0][first:end], cells[1][first:end], level[first:end]
+    rows, cols, levels = cells.rows[first:end], cells.cols[first:end], level[first:end]
     for j in range(end - first):
         row, col, u = rows[j], cols[j], levels[j]
         at = (a + row * c) + col * (b + row * d)
@@ -126,24 +152,22 @@ def fractions(position, n, whole, fraction):
             beyond[j] = at[j] - pixel[j]
 
 
-# (p,) f4, (3,) i8, (3,8) f8, (2,p) f4, (p,) f4, i8, (p,) f4 -> None
+# ViewImage, LevelGrids, FlatCells, (p,) f4, i8, (p,) f4 -> None
 @kernel
-def resample_surface(pixels, layout, grids, cells, level, degree, out):
+def resample_surface(image, grids, cells, level, degree, out):
     """Write the image values on cells at individual heights: bilinear, or cubic B-spline from coefficients.
 
-    pixels : (p,) float32, pixels or B-spline coefficients of all images; layout : see `resample_plane`; grids : (3, 8)
-    positions at levels -1, 0 and 1 (see `plane_grid`); cells : (2, p) float32, rows and columns; level : (p,) float32
-    in [-1, 1], heights, in which positions are quadratic; degree : LINEAR or CUBIC; out : (p,) or longer. Positions are
-    float32, counted from a whole pixel near the grid; those outside the image are moved to its edge.
+    image : pixels or B-spline coefficients; level : (p,) float32 in [-1, 1], heights, in which positions are quadratic;
+    degree : LINEAR or CUBIC; out : (p,) or longer. Positions are float32, counted from a whole pixel near the grid; those
+    outside the image are moved to its edge.
     """
-    path, n_cols = np.empty((2, 14), np.float32), layout[2]
-    origin = surface_path(grids, layout, degree, path)
+    path, n_cols, pixels = np.empty((2, 14), np.float32), image.n_cols, image.pixels
+    origin = surface_path(grids, image, degree, path)
     before = 1 if degree == CUBIC else 0
     start = np.int32((origin[1] - before) * n_cols + origin[0] - before)
-    image = pixels[layout[0] : layout[0] + layout[1] * n_cols]
-    position, whole, index = np.empty((2, RUN), np.float32), np.empty((2, RUN), np.float32), np.empty(RUN, np.uint32)
+    position, whole, scratch = np.empty((2, RUN), np.float32), np.empty((2, RUN), np.float32), resample_scratch(RUN)
     across, down = np.empty((4, RUN), np.float32), np.empty((4, RUN), np.float32)
-    pairs = np.empty((2, RUN), np.complex64)
+    index = scratch.index
     for first in range(0, level.shape[0], RUN):
         end = min(first + RUN, level.shape[0])
         n = end - first
@@ -153,42 +177,41 @@ def resample_surface(pixels, layout, grids, cells, level, degree, out):
             spline_weights(position[0], n, whole[0], across)
             spline_weights(position[1], n, whole[1], down)
             pixel_indices(whole, n, start, np.int32(n_cols), index)
-            spline_gather(image, n_cols, index, across, down, n, out[first:end])
+            spline_gather(pixels, n_cols, index, across, down, n, out[first:end])
         else:
-            fractions(position, n, whole, across)
+            fractions(position, n, whole, scratch.fraction)
             pixel_indices(whole, n, start, np.int32(n_cols), index)
-            gather(pixels, layout, index, across, pairs, out[first:end])
+            gather(image, scratch, out[first:end])
 
 
-# ViewArrays, (r,c) f4, ProfileSampling, (3,i,r,c) i4, (w,g,j,r,c) f4 -> None
+# ViewArrays, (r,c) f4, ProfileSampling, VisibleHeights, (w,g,j,r,c) f4 -> None
 @kernel
 def block_profile(views, surface, sampling, visible, out):
     """Write the mean NCC over all pairs of the views that see the surface, at the offsets of the sampling from it.
 
     The windows follow the surface. surface : (r + 2 half, c + 2 half) float32 height indices, with the cells around the
-    block that its windows need (half is the last half width); visible : (3, i, r, c) int32, see `block_costs`; out :
-    (w, g, j, r, c) float32, 0 where fewer than two views see the cell. The pairs are divided into g groups (see
+    block that its windows need (half is the last half width); out : (w, g, j, r, c) float32, 0 where fewer than two views see the cell. The pairs are divided into g groups (see
     `add_pairs`); the sum over the groups is the mean over all pairs.
     """
-    pixels, layout, nodes, heights, block = views.pixels, views.layout, views.nodes, views.heights, views.block
-    offsets, windows, degree, floor = sampling.offsets, sampling.windows, sampling.degree, sampling.noise_variance
+    offsets, windows, degree, variance = sampling.offsets, sampling.windows, sampling.degree, sampling.noise_variance
     n_windows, n_groups, rows, cols = out.shape[0], out.shape[1], out.shape[3], out.shape[4]
-    n_views, half = layout.shape[0], windows[-1]
+    n_views, half, heights = views.layout.shape[0], windows[-1], views.heights
     width = cols + 2 * half
     n, size = rows * width, surface.size + SLACK
     planes = np.zeros((n_views, size), np.float32)
     mean, scale = np.zeros((n_views, n_windows, size), np.float32), np.zeros((n_views, n_windows, size), np.float32)
-    flat = np.empty((n_views, 3, size), np.int32)
+    flat, shape = empty_visibility(n_views, size), (n_views, rows, cols)
     pairs, agreed = np.empty(size, np.float32), np.empty((n_windows, n_groups, size), np.float32)
     work = np.empty((4, size), np.float32)
-    grids, level, cells = np.empty((3, 8)), np.empty(surface.size, np.float32), flat_cells(surface.shape)
-    at_surface = np.zeros((3, n_views, rows, cols), np.int32)
+    level, cells = np.empty(surface.size, np.float32), flat_cells(surface.shape[0], width)
+    at_surface = VisibleHeights(np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, np.int32))
     for i in range(n_views):
         for r in range(rows):
             for c in range(cols):
                 z = surface[r + half, c + half]
-                if not (max(visible[0, i, r, c], visible[2, i, r, c]) <= z <= visible[1, i, r, c]):
-                    at_surface[0, i, r, c] = HIDDEN
+                lowest = max(visible.lowest_covered[i, r, c], visible.lowest_unoccluded[i, r, c])
+                if not (lowest <= z <= visible.highest_covered[i, r, c]):
+                    at_surface.lowest_covered[i, r, c] = NEVER_COVERED
     flat_visibility(at_surface, half, flat, pairs)
     if pairs.max() == 0.0:
         out[:] = 0.0
@@ -200,19 +223,21 @@ def block_profile(views, surface, sampling, visible, out):
             for c in range(width):
                 level[r * width + c] = (surface[r, c] + offsets[j] - np.float32(centre)) / np.float32(span)
         for i in range(n_views):
-            if flat[i, 0].min() == HIDDEN:
+            if flat.lowest_covered[i].min() == NEVER_COVERED:
                 continue
-            for m in range(3):
-                t = heights[0] + (centre + (m - 1) * span) * heights[1]
-                plane_grid(nodes, i, t, block, half, grids[m])
-            resample_surface(pixels, layout[i], grids, cells, level, degree, planes[i])
+            grids = LevelGrids(
+                block_grid(views.nodes, i, heights[0] + (centre - span) * heights[1], views.block, half),
+                block_grid(views.nodes, i, heights[0] + centre * heights[1], views.block, half),
+                block_grid(views.nodes, i, heights[0] + (centre + span) * heights[1], views.block, half),
+            )
+            resample_surface(image_of(views, i), grids, cells, level, degree, planes[i])
             planes[i] -= planes[i, half * width + half]
-            window_moments(planes[i], windows, width, n, floor, work, mean[i], scale[i])
+            window_moments(planes[i], windows, width, n, variance, work, mean[i], scale[i])
             for w in range(n_windows):
                 for p in range(n):
-                    scale[i, w, p] *= np.float32(flat[i, 0, p] < HIDDEN)
+                    scale[i, w, p] *= np.float32(flat.lowest_covered[i, p] < NEVER_COVERED)
         agreed[:] = 0.0
-        add_pairs(planes, windows, mean, scale, width, n, work, agreed)
+        add_pairs(planes, windows, WindowMoments(mean, scale), width, n, work, agreed)
         for w in range(n_windows):
             for g in range(n_groups):
                 for r in range(rows):
@@ -221,21 +246,18 @@ def block_profile(views, surface, sampling, visible, out):
                         out[w, g, j, r, c] = agreed[w, g, p] * pairs[p]
 
 
-# as block_profile, over every block of a tile
+# ViewArrays, (r,c) f4, ProfileSampling, VisibleHeights, (w,g,j,r,c) f4 -> None
 @kernel
 def tile_profile(views, surface, sampling, visible, out):
     """`block_profile` of every block of a tile; out : (w, g, j, r, c)."""
-    n_rows, n_cols, half, block, nodes = out.shape[3], out.shape[4], sampling.windows[-1], views.block, views.nodes
+    n_rows, n_cols, half, block = out.shape[3], out.shape[4], sampling.windows[-1], views.block
     for br in range((n_rows + block - 1) // block):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
-            of_block = ViewArrays(
-                views.pixels, views.layout, nodes[:, br : br + 2, bc : bc + 2], views.heights, block
-            )  # fmt: skip
             block_profile(
-                of_block, surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], sampling, visible[:, :, r0:r1, c0:c1],
-                out[:, :, :, r0:r1, c0:c1],
+                views_of_block(views, br, bc), surface[r0 : r1 + 2 * half, c0 : c1 + 2 * half], sampling,
+                visible_in(visible, CellBox(r0, r1, c0, c1)), out[:, :, :, r0:r1, c0:c1],
             )  # fmt: skip
 
 
@@ -243,26 +265,24 @@ def tile_profile(views, surface, sampling, visible, out):
 @kernel
 def tile_ortho(views, surface, view, out):
     """Write the image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c)."""
-    pixels, layout, nodes, heights, block = views.pixels, views.layout, views.nodes, views.heights, views.block
-    n_rows, n_cols = surface.shape
+    (n_rows, n_cols), heights, block, image = surface.shape, views.heights, views.block, image_of(views, view)
     low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
     middle, span = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
-    grids, level, grey = np.empty((3, 8)), np.empty(block * block, np.float32), np.empty(block * block, np.float32)
-    cells, last_width = flat_cells((block, block)), block
+    level, grey = np.empty(block * block, np.float32), np.empty(block * block, np.float32)
+    cells, last_width = flat_cells(block, block), block
     for br in range((n_rows + block - 1) // block):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
-            for m in range(3):
-                plane_grid(nodes[:, br : br + 2, bc : bc + 2], view, middle + (m - 1) * span, block, 0, grids[m])
+            grids = level_grids(views_of_block(views, br, bc), view, middle, span, 0)
             width, n = c1 - c0, (r1 - r0) * (c1 - c0)
-            if cells.shape[1] != n or last_width != width:
-                cells, last_width = flat_cells((r1 - r0, width)), width
+            if cells.rows.shape[0] != n or last_width != width:
+                cells, last_width = flat_cells(r1 - r0, width), width
             for r in range(r0, r1):
                 for c in range(width):
                     index = heights[0] + surface[r, c0 + c] * heights[1]
                     level[(r - r0) * width + c] = (index - middle) / span
-            resample_surface(pixels, layout[view], grids, cells, level[:n], LINEAR, grey[:n])
+            resample_surface(image, grids, cells, level[:n], LINEAR, grey[:n])
             out[r0:r1, c0:c1] = grey[:n].reshape((r1 - r0, width))
 
 

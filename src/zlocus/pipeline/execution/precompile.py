@@ -119,10 +119,11 @@ def warm(group: str) -> None:
     """Run a group of kernels once: `orient` for the orientation, `match` for matching up to the heights of the finest
     level, `refine` for the stages after it."""
     from zlocus.matching import tile
+    from zlocus.matching.kernels.shared_records import VisibleHeights
     from zlocus.matching.kernels.spline import spline_coefficients
     from zlocus.matching.locus_windows import CurveSamples
     from zlocus.matching.subpixel import refine
-    from zlocus.matching.tile_views import read_pixels, tile_views
+    from zlocus.matching.tile_views import TileGrid, read_pixels, tile_views
 
     scene, config = tiny_scene(), RunConfig()
     if group == "orient":
@@ -134,15 +135,15 @@ def warm(group: str) -> None:
         return
     pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey_scales[0]) for view in scene.views]
     shape, block = (SIDE, SIDE), config.pyramid.block
-    views = tile_views(pixels, 0, scene.transform(scene.overlap_window, 0), shape, block, (0.0, 1.0), (0.0, 16.0), 2)
+    views = tile_views(pixels, TileGrid(0, scene.transform(scene.overlap_window, 0), shape, block, 0.0, 1.0), (0.0, 16.0), 2)
     for view in pixels:
         spline_coefficients(view.pixels[0])
     CurveSamples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(
         views, 0, slice(None)
     )
-    seen = np.zeros((3, 2, *shape), np.int32)
-    seen[1] = 16
-    refine(views, views.pixels, np.full(shape, 8.0, np.float32), seen, 1.0, config.refine)
+    low = np.zeros((2, *shape), np.int32)
+    visible = VisibleHeights(low, low + np.int32(16), low)
+    refine(views, views.pixels, np.full(shape, 8.0, np.float32), visible, 1.0, config.refine)
 
 
 def _leave_after_input() -> None:
