@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from joint_scenes import views_of
+from bundle_scenes import views_of
 from zlocus.core.errors import InputError
 from zlocus.io.control_points import read_control
 from zlocus.orientation.control import GroundControl, TerrainHeights

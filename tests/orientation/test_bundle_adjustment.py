@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from joint_scenes import (
+from bundle_scenes import (
     AFFINE_SIZE,
     FRAME_SIZE,
     SCAN_COLUMNS,
@@ -260,7 +260,7 @@ def test_an_affine_correction_there_and_back():
     xy = np.random.default_rng(1).uniform(0, 800, (50, 2))
     xyz = model.ground_from_image(xy, np.linspace(100.0, 160.0, 50))
     np.testing.assert_allclose(model.image_from_ground(xyz), xy, rtol=0, atol=1e-9)
-    base = model.base.image_from_ground(xyz)
+    base = model.base_sensor.image_from_ground(xyz)
     np.testing.assert_allclose(xy - base, [[3.0, -5.0]] + base @ np.array([[0.1, 0.05], [-0.2, 0.15]]), atol=1e-9)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from joint_scenes import (
+from bundle_scenes import (
     AFFINE_SIZE,
     FRAME_SIZE,
     SCAN_COLUMNS,
@@ -23,7 +23,7 @@ from joint_scenes import (
     views_of,
 )
 from orientation_scenes import random_ground
-from reference.joint import dense_jacobians, dense_reduced
+from reference.bundle_adjustment import dense_jacobians, dense_reduced
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.orientation.bundle_adjustment import problem_of
 from zlocus.orientation.control import GroundControl, TerrainHeights

@@ -48,9 +48,9 @@ def test_planted_pointing_errors_are_taken_back(scene, oriented):
     assert np.abs(without_translation(shift + PLANTED, [v.sensor for v in scene.views])).max() < SHIFT_TOLERANCE_PX
     for view in oriented.views:
         assert view.n_ties > 100
-        assert view.before.rms > 1.0
-        assert view.after.median <= view.after.rms < 0.3
-        assert view.after.median < view.before.median
+        assert view.residuals_before.rms > 1.0
+        assert view.residuals_after.median <= view.residuals_after.rms < 0.3
+        assert view.residuals_after.median < view.residuals_before.median
     for pair in oriented.pairs:
         assert pair.epipolar_distance_after_px < 0.3 < pair.epipolar_distance_before_px
 
@@ -143,8 +143,8 @@ def test_frame_cameras_are_corrected_jointly():
     assert all(isinstance(view.sensor, FrameModel) for view in corrected.views)
     for view in found.views:
         assert view.n_ties > 100
-        assert view.before.rms > 0.5
-        assert view.after.rms < 0.3
+        assert view.residuals_before.rms > 0.5
+        assert view.residuals_after.rms < 0.3
     for pair in found.pairs:
         assert pair.epipolar_distance_after_px < 0.3 < pair.epipolar_distance_before_px
     xyz, sensors = found.refined_xyz, [view.sensor for view in corrected.views]
@@ -251,7 +251,7 @@ def test_heights_of_a_pair_do_not_move():
     found = orient(scene, OPTIONS)
     assert "1 of the 4" in found.unobservable
     assert np.abs([v.shift_px for v in found.views]).max() < SHIFT_TOLERANCE_PX
-    exact = [view.sensor.base for view in scene.views]
+    exact = [view.sensor.base_sensor for view in scene.views]
     seen = observe(exact, found.xyz[:1])
     assert len(seen) == 2
     assert isinstance(scene.views[1].sensor, ShiftedModel)

@@ -136,7 +136,7 @@ def test_ties_lie_on_the_ground_despite_wrong_pointing():
     ties = find_ties(scene, OPTIONS)
     assert [p.views for p in ties.pairs] == [(0, 1), (0, 2), (1, 2)]
     assert all(len(p) > 100 for p in ties.pairs)
-    exact = [view.sensor.base for view in scene.views]
+    exact = [view.sensor.base_sensor for view in scene.views]
     error = np.full(len(ties.observations), np.nan)
     for i, sensor in enumerate(exact):
         rows = np.flatnonzero(ties.observations.view == i)

@@ -61,7 +61,7 @@ def colmap_cameras():
 @pytest.mark.parametrize(("name", "numbers", "model"), colmap_cameras(), ids=[c[0] for c in colmap_cameras()])
 def test_agrees_with_colmap(name, numbers, model):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed: no second opinion on COLMAP's models")
-    camera = pycolmap.CameraEntry(model=name, width=3000, height=2000, params=numbers)
+    camera = pycolmap.Camera(model=name, width=3000, height=2000, params=numbers)
     theirs = camera.img_from_cam(np.column_stack([GRID, np.ones(len(GRID))]))
     fy = numbers[1] if len(numbers) > 6 else numbers[0]
     here = model.distorted(GRID) * [numbers[0], fy] + [1500.0, 1000.0]

@@ -24,11 +24,11 @@ from pyproj import CRS
 from rasterio.transform import from_origin
 
 import camera_files as files
+from bundle_scenes import views_of
 from csm_states import state
 from flights import FOCAL_MM, INTERVAL_S
 from geoids import write_geoid
 from grid_input_files import write_polygons, write_raster
-from joint_scenes import views_of
 from rpc_fixtures import dimap_dim, dimap_rpc, rpb, rpc_txt, satellite_rpc, write_image
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import ImportRequest

@@ -53,8 +53,8 @@ class Scanning(Protocol):
 
 def bare(sensor: SensorModel) -> SensorModel:
     """The sensor model without its corrections."""
-    while hasattr(sensor, "base"):
-        sensor = sensor.base
+    while hasattr(sensor, "base_sensor"):
+        sensor = sensor.base_sensor
     return sensor
 
 

@@ -24,10 +24,10 @@ ROUNDS = 3
 class BundleAdjustment:
     """Result of a bundle adjustment.
 
-    sensors : corrected; adjustment : the ties kept, see `Adjustment`, with shifts of 0; control : the points given;
-    control_points : (k, 3) m where their image points put them, check points by them alone, NaN where one image sees a
-    check point; control_residual : (j, 2) px of `control.observations`; terrain_m : (n,) m, heights of the ties less
-    those of the terrain.
+    sensors : corrected; adjustment : of the ties that were kept, with shifts of 0; control : the given points;
+    control_points : (k, 3) m, their positions after the adjustment, NaN for check points that fewer than two images
+    show; control_residual : (j, 2) px, of `control.observations`; terrain_m : (n,) m, heights of the ties minus those of
+    the terrain.
     """
 
     sensors: tuple[SensorModel, ...]
@@ -50,9 +50,8 @@ def adjust_bundle(
 ) -> BundleAdjustment:
     """Correct all cameras so that the rays of all ties meet, within their priors and the control.
 
-    xyz : (n, 3) m, first ground points of the ties. Observations further than 4 sigma (and at least `inlier_px`) from
-    where the rest of their tie puts them are dropped, then everything is solved again, twice. Check points take no
-    part.
+    xyz : (n, 3) m, first ground points of the ties. Observations whose residual exceeds 4 sigma (and `inlier_px`) are
+    dropped, then everything is solved again; this is done twice. Check points take no part.
     """
     sensors, groups = tuple(view.sensor for view in views), parameter_groups_of(views, options)
     control = GroundControl.none() if control is None else control
@@ -81,8 +80,11 @@ def adjust_bundle(
 
 
 def control_points(sensors: Sequence[SensorModel], control: GroundControl, solution: Solution) -> FloatArray:
-    """Where control and check points lie, (k, 3) m: a control point where the adjustment put it, which its coordinates
-    had a say in; a check point where the rays of the corrected cameras meet."""
+    """Positions (k, 3) m of control and check points after the adjustment.
+
+    A control point has the position that the adjustment gave it, to which its coordinates contributed. A check point
+    lies where the rays of the corrected cameras meet.
+    """
     xyz = triangulate(sensors, control.observations, control.xyz).xyz
     xyz[~control.is_check] = solution.xyz[len(solution.xyz) - int((~control.is_check).sum()) :]
     return xyz
@@ -91,7 +93,7 @@ def control_points(sensors: Sequence[SensorModel], control: GroundControl, solut
 def problem_of(
     sensors: tuple[SensorModel, ...],
     groups: tuple[ParameterGroup, ...],
-    ties: Observations,
+    tie_observations: Observations,
     xyz: FloatArray,
     options: OrientationOptions,
     control: GroundControl,
@@ -100,9 +102,9 @@ def problem_of(
     """The adjustment problem, with the ties followed by the control points."""
     known = control.only(~control.is_check)
     observations = Observations(
-        np.concatenate([ties.view, known.observations.view]),
-        np.concatenate([ties.point, known.observations.point + len(xyz)]),
-        np.concatenate([ties.xy, known.observations.xy]),
+        np.concatenate([tie_observations.view, known.observations.view]),
+        np.concatenate([tie_observations.point, known.observations.point + len(xyz)]),
+        np.concatenate([tie_observations.xy, known.observations.xy]),
     )
     sigma = np.where(np.isfinite(known.sigma_m), known.sigma_m, options.bundle_adjustment.sigma_control_m)
     bundle_options = options.bundle_adjustment

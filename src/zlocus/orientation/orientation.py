@@ -77,7 +77,10 @@ class Orientation:
     def __repr__(self) -> str:
         """The orientation in one line, because ties are thousands."""
         before, after = (
-            max((m for view in self.views if np.isfinite(m := getattr(view, when).median)), default=np.nan)
+            max(
+                (m for view in self.views if np.isfinite(m := getattr(view, f"residuals_{when}").median)),
+                default=np.nan,
+            )
             for when in ("before", "after")
         )
         return (
@@ -130,8 +133,8 @@ class Orientation:
                     "sensor": v.sensor,
                     "shift_px": [round(v.shift_px[0], 4), round(v.shift_px[1], 4)],
                     "n_ties": v.n_ties,
-                    "residual_before_px": v.before.as_dict(),
-                    "residual_after_px": v.after.as_dict(),
+                    "residual_before_px": v.residuals_before.as_dict(),
+                    "residual_after_px": v.residuals_after.as_dict(),
                 }
                 for v in self.views
             },
@@ -179,7 +182,7 @@ def orient(
     tie_points = with_rough_ties(adjustment, sensors, rough, xyz, rough_inlier_px)
     views = tuple(view_orientation(view, i, adjustment, sensors[i]) for i, view in enumerate(scene.views))
     heights = tie_points.xyz[supported(tie_points.xyz, tie_points.sigma_z_m), 2]
-    doubts = doubts_about(scene.views, [v.after.median for v in views], [v.shift_px for v in views], heights)
+    doubts = doubts_about(scene.views, [v.residuals_after.median for v in views], [v.shift_px for v in views], heights)
     return Orientation(
         views=views,
         pairs=pair_orientations(scene, sensors, adjustment, ties.z_range),

@@ -71,7 +71,7 @@ def kind_of(sensor: SensorModel) -> str:
 def uncorrected(sensor: SensorModel) -> SensorModel:
     """The sensor model without corrections in its image."""
     while isinstance(sensor, ShiftedModel | AffineModel):
-        sensor = sensor.base
+        sensor = sensor.base_sensor
     return sensor
 
 
@@ -206,7 +206,7 @@ def same_lens(sensor: SensorModel, other_sensor: SensorModel) -> bool:
 def raw(sensor: SensorModel) -> LineScanModel:
     """The line scanner of a raw or rectified image."""
     assert isinstance(sensor, Scanner), "callers make sure"
-    return sensor.raw if isinstance(sensor, RectifiedModel) else sensor
+    return sensor.raw_sensor if isinstance(sensor, RectifiedModel) else sensor
 
 
 def corrected_sensors(

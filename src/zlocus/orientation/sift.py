@@ -66,7 +66,7 @@ def detect_all(
     """
     work = [(i, core) for i, image in enumerate(images) for part, core in parts(image) if wanted[i][part]]
     left = np.bincount([i for i, _ in work], minlength=len(images))
-    waiting: list[dict[int, Features]] = [{} for _ in images]
+    part_features: list[dict[int, Features]] = [{} for _ in images]
     found, held_bytes = [NOTHING for _ in images], 0
 
     def detect_one(number: int) -> Features:
@@ -75,25 +75,25 @@ def detect_all(
 
     for done, (number, part) in enumerate(run_all(detect_one, range(len(work)), threads)):
         i = work[number][0]
-        waiting[i][number] = part
+        part_features[i][number] = part
         left[i] -= 1
         if not left[i]:
-            found[i] = joined([waiting[i][number] for number in sorted(waiting[i])], held_bytes)
+            found[i] = joined([part_features[i][number] for number in sorted(part_features[i])], held_bytes)
             held_bytes += found[i].descriptors.nbytes
-            waiting[i] = {}
+            part_features[i] = {}
         if progress is not None:
             progress((done + 1) / len(work))
     return found
 
 
-def joined(several: Sequence[Features], held_bytes: int) -> Features:
+def joined(features_of_parts: Sequence[Features], held_bytes: int) -> Features:
     """The features of several parts as those of one image.
 
     held_bytes : size of the descriptors that are in memory already. Beyond `HELD_BYTES` descriptors are written to
     unnamed files, from which the system reads them as they are needed.
     """
-    xy = np.concatenate([part.xy for part in several])
-    descriptors = np.concatenate([part.descriptors for part in several])
+    xy = np.concatenate([features.xy for features in features_of_parts])
+    descriptors = np.concatenate([features.descriptors for features in features_of_parts])
     if held_bytes + descriptors.nbytes > HELD_BYTES and descriptors.size:
         descriptors = on_disk(descriptors, "Features of the images")
     return Features(xy, descriptors)
@@ -107,9 +107,9 @@ def detect_part(image: ImageSource, core: tuple[int, int, int, int], options: Or
     halo = math.ceil(HALO_PX * factor)
     per_mpx = min(options.features_per_mpx * math.sqrt(area_mpx), options.features_per_image) / area_mpx
     row, col = max(core[0] - halo, 0), max(core[1] - halo, 0)
-    window = image.read(row, col, min(core[2] + halo, rows) - row, min(core[3] + halo, cols) - col)
-    limit = int(np.ceil(per_mpx * window.valid.size / 1e6))
-    xy, descriptors = detect_window(window, limit, factor)
+    image_window = image.read(row, col, min(core[2] + halo, rows) - row, min(core[3] + halo, cols) - col)
+    limit = int(np.ceil(per_mpx * image_window.valid.size / 1e6))
+    xy, descriptors = detect_window(image_window, limit, factor)
     xy = xy + np.array([col, row])
     inside = (xy >= np.array([core[1], core[0]]) - 0.5) & (xy < np.array([core[3], core[2]]) - 0.5)
     kept = np.flatnonzero(inside.all(axis=1))
@@ -153,7 +153,7 @@ def parts(image: ImageSource) -> Iterator[tuple[tuple[int, int], tuple[int, int,
         yield (part[0], part[1]), (core[0], core[1], core[2], core[3])
 
 
-def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
+def detect_window(image_window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
     """SIFT positions (n, 2) px in a window and RootSIFT descriptors (n, 128), at most `limit`, the strongest first.
 
     factor : by which the window is reduced first, see `reduction`.
@@ -162,10 +162,10 @@ def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[Float
     way in which it doubles the image. Descriptors are compared as square roots (Arandjelovic and Zisserman 2012,
     section 2).
     """
-    full = np.array(window.pixels.shape[::-1])
+    full = np.array(image_window.pixels.shape[::-1])
     size = np.maximum(np.round(full / factor).astype(int), 1)
-    window = window if factor == 1.0 else reduced(window, size)
-    pixels, valid = stretched(window), window.valid
+    image_window = image_window if factor == 1.0 else reduced(image_window, size)
+    pixels, valid = stretched(image_window), image_window.valid
     sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True)
     keypoints, found = sift.detectAndCompute(pixels, None)
     if not keypoints:
@@ -179,23 +179,27 @@ def detect_window(window: ImageWindow, limit: int, factor: float) -> tuple[Float
     return (xy[keep] + 0.5) * (full / size) - 0.5, descriptors.astype(np.float32)
 
 
-def reduced(window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
+def reduced(image_window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:
     """The window reduced to a size (columns, rows), each pixel the mean over its area, valid where all of the area
     is."""
-    pixels = np.asarray(cv2.resize(window.pixels, size.tolist(), interpolation=cv2.INTER_AREA))
-    if window.valid.all():
+    pixels = np.asarray(cv2.resize(image_window.pixels, size.tolist(), interpolation=cv2.INTER_AREA))
+    if image_window.valid.all():
         return ImageWindow(pixels, np.ones(pixels.shape, bool))
-    valid = cv2.resize(window.valid.astype(np.float32), size.tolist(), interpolation=cv2.INTER_AREA)
+    valid = cv2.resize(image_window.valid.astype(np.float32), size.tolist(), interpolation=cv2.INTER_AREA)
     return ImageWindow(pixels, valid > MIN_VALID_SHARE)
 
 
-def stretched(window: ImageWindow) -> NDArray[np.uint8]:
+def stretched(image_window: ImageWindow) -> NDArray[np.uint8]:
     """The window in 8 bit, stretched between percentiles of its valid pixels; invalid pixels get their median."""
-    sample = window.pixels[::3, ::3][window.valid[::3, ::3]]
+    sample = image_window.pixels[::3, ::3][image_window.valid[::3, ::3]]
     if not len(sample):
-        return np.zeros(window.pixels.shape, np.uint8)
+        return np.zeros(image_window.pixels.shape, np.uint8)
     low, middle, high = np.percentile(sample, (STRETCH_PERCENT[0], 50.0, STRETCH_PERCENT[1]))
-    pixels = window.pixels if window.valid.all() else np.where(window.valid, window.pixels, np.float32(middle))
+    pixels = (
+        image_window.pixels
+        if image_window.valid.all()
+        else np.where(image_window.valid, image_window.pixels, np.float32(middle))
+    )
     return np.asarray(cv2.convertScaleAbs(np.maximum(pixels - low, 0.0), alpha=255.0 / max(high - low, 1e-12)))
 
 

@@ -48,14 +48,15 @@ class ViewOrientation:
     """Correction and residuals of one image.
 
     shift_px : (column, row) added to what its sensor model projects; where more than a shift was corrected, the median
-    of the correction at its ties; before, after : residuals of its ties; sensor : see `parameter_groups.kind_of`.
+    of the correction at its ties; residuals_before, residuals_after : of its ties; sensor : see
+    `parameter_groups.kind_of`.
     """
 
     name: str
     shift_px: tuple[float, float]
     n_ties: int
-    before: Residuals
-    after: Residuals
+    residuals_before: Residuals
+    residuals_after: Residuals
     sensor: str = "rpc"
 
 

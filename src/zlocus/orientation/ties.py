@@ -198,7 +198,7 @@ def shared_parts(
 
 
 def _seen_by(
-    others: Sequence[View],
+    other_views: Sequence[View],
     view: View,
     places: Mapping[tuple[int, int], tuple[int, int, int, int]],
     z_ranges: Sequence[tuple[float, float]],
@@ -210,7 +210,7 @@ def _seen_by(
     y, x = np.broadcast_arrays((row + edge * (row_end - row))[:, :, None], (col + edge * (col_end - col))[:, None])
     xy = np.stack([x, y], axis=-1).reshape(-1, 2)
     lines, seen = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges], set()
-    for other, line in product(others, lines):
+    for other, line in product(other_views, lines):
         curves = epipolar_curves(line, other.sensor, line.z_range)
         for number, part in enumerate(places):
             if part not in seen:

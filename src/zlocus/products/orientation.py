@@ -55,7 +55,7 @@ def sensors_record(orientation: Orientation, bundle_adjustment: BundleAdjustment
 
 
 def corrections_record(bundle_adjustment: BundleAdjustment, names: list[str]) -> list[dict[str, Any]]:
-    """What was added to the parameters of each block, with standard deviations after and before."""
+    """Correction of each parameter group, with its standard deviations after and before the adjustment."""
     record, first = [], 0
     for group in bundle_adjustment.groups:
         part = slice(first, first + len(group))
@@ -80,7 +80,7 @@ def corrections_record(bundle_adjustment: BundleAdjustment, names: list[str]) ->
 
 
 def described(group: ParameterGroup, values: FloatArray) -> dict[str, float | None]:
-    """Values (k,) of a block by name, rounded."""
+    """Values (k,) of a parameter group by name, rounded."""
     return {name: rounded(value) for name, value in group.described(values).items()}
 
 

@@ -13,53 +13,53 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 class ShiftedModel:
     """A sensor model with a constant shift in the image.
 
-    column, row : pixels added to the positions that `base` projects. A base that projects 2 px too far left is
+    column, row : pixels added to the positions that `base_sensor` projects. A sensor that projects 2 px too far left is
     corrected by column = +2.
     """
 
-    base: SensorModel
+    base_sensor: SensorModel
     column: float
     row: float
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        return np.asarray(self.base.image_from_ground(xyz) + np.array([self.column, self.row]), float)
+        return np.asarray(self.base_sensor.image_from_ground(xyz) + np.array([self.column, self.row]), float)
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        return self.base.ground_from_image(np.asarray(xy, float) - np.array([self.column, self.row]), z)
+        return self.base_sensor.ground_from_image(np.asarray(xy, float) - np.array([self.column, self.row]), z)
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
-        return self.base.height_bounds()
+        return self.base_sensor.height_bounds()
 
 
 @dataclass(frozen=True)
 class AffineModel:
     """A sensor model with a shift in the image that changes linearly over the image.
 
-    column, row : (constant px, per column, per row), added to the column and to the row that `base` projects.
+    column, row : (constant px, per column, per row), added to the column and to the row that `base_sensor` projects.
     Source: Grodecki and Dial 2003, Photogrammetric Engineering & Remote Sensing 69 (1), 59-68, equations 3 and 4, whose
     line and sample are `row` and `column`.
     """
 
-    base: SensorModel
+    base_sensor: SensorModel
     column: tuple[float, float, float]
     row: tuple[float, float, float]
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        xy = self.base.image_from_ground(xyz)
+        xy = self.base_sensor.image_from_ground(xyz)
         return np.asarray(self._constant + xy @ self._growth.T, float)
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`."""
         before = (np.asarray(xy, float) - self._constant) @ np.linalg.inv(self._growth).T
-        return self.base.ground_from_image(before, z)
+        return self.base_sensor.ground_from_image(before, z)
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
-        return self.base.height_bounds()
+        return self.base_sensor.height_bounds()
 
     @property
     def _constant(self) -> FloatArray:
@@ -68,25 +68,25 @@ class AffineModel:
 
     @property
     def _growth(self) -> FloatArray:
-        """Derivatives (2, 2) of the corrected image positions by those that `base` projects."""
+        """Derivatives (2, 2) of the corrected image positions by those that `base_sensor` projects."""
         return np.asarray(np.eye(2) + np.array([self.column[1:], self.row[1:]]), float)
 
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """The sensor model of a reduced image: each pixel is `factor` x `factor` pixels of the image of `base`."""
+    """The sensor model of a reduced image: each pixel is `factor` x `factor` pixels of the image of `base_sensor`."""
 
-    base: SensorModel
+    base_sensor: SensorModel
     factor: int
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        return np.asarray((self.base.image_from_ground(xyz) + 0.5) / self.factor - 0.5, float)
+        return np.asarray((self.base_sensor.image_from_ground(xyz) + 0.5) / self.factor - 0.5, float)
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        return self.base.ground_from_image((np.asarray(xy, float) + 0.5) * self.factor - 0.5, z)
+        return self.base_sensor.ground_from_image((np.asarray(xy, float) + 0.5) * self.factor - 0.5, z)
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
-        return self.base.height_bounds()
+        return self.base_sensor.height_bounds()

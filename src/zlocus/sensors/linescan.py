@@ -145,26 +145,26 @@ class LineScanModel:
 class RectifiedModel:
     """A line scanner's image resampled to a plane (ADS40 level 1), as a `SensorModel`.
 
-    A pixel belongs to a point of the plane, that to a position in the raw image, and that to a ray. raw : the raw image
-    in the scene's frame; over_plane : the raw image in the frame of the plane; height : of the plane, m;
+    A pixel belongs to a point of the plane, that to a position in the raw image, and that to a ray. raw_sensor : the
+    raw image in the scene's frame; plane_sensor : the raw image in the frame of the plane; height : of the plane, m;
     plane_from_image : from pixels (column, row), with (0, 0) the centre of the first one, to x and y of the plane.
     """
 
-    raw: LineScanModel
-    over_plane: LineScanModel
+    raw_sensor: LineScanModel
+    plane_sensor: LineScanModel
     height: float
     plane_from_image: Affine
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`."""
-        on_plane = self.over_plane.ground_from_image(self.raw.image_from_ground(xyz), np.array(self.height))
+        on_plane = self.plane_sensor.ground_from_image(self.raw_sensor.image_from_ground(xyz), np.array(self.height))
         return _mapped(~self.plane_from_image, on_plane)
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`."""
         on_plane = _mapped(self.plane_from_image, np.asarray(xy, float))
         on_plane = np.column_stack([on_plane, np.full(len(on_plane), self.height)])
-        return self.raw.ground_from_image(self.over_plane.image_from_ground(on_plane), z)
+        return self.raw_sensor.ground_from_image(self.plane_sensor.image_from_ground(on_plane), z)
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
@@ -172,16 +172,16 @@ class RectifiedModel:
 
     def station_height(self) -> float:
         """See `Stationed`."""
-        return self.raw.station_height()
+        return self.raw_sensor.station_height()
 
     def flight_time(self) -> float:
         """See `Scanning`."""
-        return self.raw.flight_time()
+        return self.raw_sensor.flight_time()
 
     def corrected(self, drift: Drift) -> RectifiedModel:
         """The model with a drift of its trajectory added. The pixels were resampled with the old trajectory, which
         stays."""
-        return replace(self, raw=self.raw.corrected(drift))
+        return replace(self, raw_sensor=self.raw_sensor.corrected(drift))
 
 
 def _mapped(transform: Affine, xy: FloatArray) -> FloatArray:
@@ -221,22 +221,22 @@ class _Track:
     turns: bool
 
     @classmethod
-    def of(cls, model: LineScanModel) -> _Track:
+    def of(cls, sensor: LineScanModel) -> _Track:
         """The quantities of a model."""
         turn = np.zeros((3, 3))
-        turn[:2, :2], turn[2, 2] = model.line.along(), -1.0
-        path = model.trajectory
+        turn[:2, :2], turn[2, 2] = sensor.line.along(), -1.0
+        path = sensor.trajectory
         trajectory = Trajectory(path.times, path.centres, turn @ path.rotations)
-        n, margin = len(model.line.xy_mm), model.margin_px
+        n, margin = len(sensor.line.xy_mm), sensor.margin_px
         column = np.array([-0.5 - margin, *range(n), n - 0.5 + margin])
-        u, v = (_straight(column, column[1:-1], axis) for axis in turn[:2, :2] @ model.line.xy_mm.T)
-        ends = model.lines.rows[[0, -1]] + [-0.5 - margin, 0.5 + margin]
-        start, end = np.sort(model.lines.time(ends))
+        u, v = (_straight(column, column[1:-1], axis) for axis in turn[:2, :2] @ sensor.line.xy_mm.T)
+        ends = sensor.lines.rows[[0, -1]] + [-0.5 - margin, 0.5 + margin]
+        start, end = np.sort(sensor.lines.time(ends))
         instants = np.linspace(start, end, SCAN_KNOTS)
         forward = trajectory.pose(instants)[3:6]
         turns = bool((forward.T @ forward).min() < TURNS_COS)
         nothing = np.zeros(0)
-        track = cls(model.lines, trajectory, model.line.focal_mm, column, u, v, nothing, nothing, instants, turns)
+        track = cls(sensor.lines, trajectory, sensor.line.focal_mm, column, u, v, nothing, nothing, instants, turns)
         return track._with_guess()
 
     def _with_guess(self) -> _Track:

@@ -282,13 +282,13 @@ def _with_midpoints(flags: BoolArray) -> BoolArray:
     return out
 
 
-def _corner_runs(shown: ShownBlocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _corner_runs(shown_blocks: ShownBlocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last height index (b + 1, d + 1) of the longest run of heights at which a block around each corner is
     shown. Where there is none, the first index is the larger one."""
-    n_b, n_d, n = shown.around.shape
+    n_b, n_d, n = shown_blocks.around.shape
     around = np.zeros((n_b + 1, n_d + 1, n), bool)
     for corner in CORNERS:
-        around[corner] |= shown.around
+        around[corner] |= shown_blocks.around
     first, last = longest_run(around)
     some = around.any(axis=-1)
     return np.where(some, first, n - 1), np.where(some, last, 0)

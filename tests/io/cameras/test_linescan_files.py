@@ -209,7 +209,7 @@ def test_level_1(folder):
     np.testing.assert_allclose(first, [[x + 0.1, y - 0.1, GROUND_M]], rtol=0, atol=1e-6)
     earth = folder.scene(rectification=plane | {"crs": "EPSG:25832"}, first_column=0, rays="earth", crs="EPSG:32632")
     model = earth.views[0].sensor
-    assert isinstance(model.raw.space, EarthSpace)
+    assert isinstance(model.raw_sensor.space, EarthSpace)
     first = model.ground_from_image(np.zeros((1, 2)), np.array([GROUND_M]))
     np.testing.assert_allclose(first, [[x + 0.1, y - 0.1, GROUND_M]], rtol=0, atol=1e-3)
 

@@ -103,8 +103,8 @@ class Diagnosis:
             record |= {
                 "n_ties": oriented.n_ties,
                 "shift_px": [_rounded(shift) for shift in oriented.shift_px],
-                "residual_before_px": oriented.before.as_dict(),
-                "residual_after_px": oriented.after.as_dict(),
+                "residual_before_px": oriented.residuals_before.as_dict(),
+                "residual_after_px": oriented.residuals_after.as_dict(),
             }
         return record
 
@@ -146,7 +146,7 @@ def _view_rows(diagnosis: Diagnosis) -> Iterator[Sequence[str]]:
             greys = (*shares, _unit(quality.edge_px, "px"))
         ties = ("-",) * 3
         if oriented is not None:
-            ties = (str(oriented.n_ties), *(_unit(each.median, "px") for each in (oriented.before, oriented.after)))
+            ties = (str(oriented.n_ties), *(_unit(each.median, "px") for each in (oriented.residuals_before, oriented.residuals_after)))
         pixel = _unit(diagnosis.geometry[i].ground_px_m, "m") if diagnosis.geometry else "-"
         rows, cols = view.image.shape
         yield view.name, kind_of(view.sensor), f"{rows} x {cols}", pixel, *greys, *ties

@@ -1,4 +1,4 @@
-"""Plain twins of the joint orientation's linear algebra: dense matrices, every derivative by central differences."""
+"""Plain twins of the bundle adjustment's linear algebra: dense matrices, every derivative by central differences."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def dense_reduced(by_parameters, by_ground, weight, residual, precision, pull):
     """
     w = np.repeat(weight, 2)
     own = by_ground.T @ (w[:, None] * by_ground)
-    for i, block in enumerate(precision):
-        own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
+    for i, own_precision in enumerate(precision):
+        own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own_precision
     mixed = by_parameters.T @ (w[:, None] * by_ground)
     own_pull = by_ground.T @ (w * residual.ravel()) + pull.ravel()
     inverse = np.linalg.inv(own)

@@ -1,4 +1,4 @@
-"""Blocks of exact cameras of every kind, the ground they see, and what control there is."""
+"""Groups of exact cameras of every kind, with the ground that they see and control points."""
 
 from __future__ import annotations
 
