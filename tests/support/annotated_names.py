@@ -127,9 +127,11 @@ def snake_case(class_name: str) -> str:
 
 
 def plural(noun: str) -> str:
-    """`view` -> views, `box` -> boxes, `entry` -> entries, `options` -> options."""
+    """`view` -> views, `box` -> boxes, `entry` -> entries, `locus` -> loci, `options` -> options."""
     if noun.endswith(("options", "data")):
         return noun
+    if noun.endswith("locus"):
+        return noun[: -len("us")] + "i"
     if noun.endswith("s") and not noun.endswith("ss"):
         return noun
     if re.search(r"[^aeiou]y$", noun):
