@@ -1,4 +1,4 @@
-"""Heights for gaps, for those who want none: interpolated, and marked as such."""
+"""Filled gaps of a surface: interpolated or taken from a terrain model, and marked as such."""
 
 from __future__ import annotations
 
@@ -10,30 +10,32 @@ from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 
 
-def filled(surface: Surface, reach: int) -> Surface:
-    """The surface, (r, c), with gaps interpolated from the nearest heights in eight directions, at most `reach` cells
-    away.
+def filled(surface: Surface, max_distance_cells: int) -> Surface:
+    """The surface with gaps interpolated from the nearest heights in eight directions, up to a distance in cells.
 
-    Cells that no two images cover, or that were not asked for, stay empty. Filled cells carry `Quality.FILLED` beside
-    the reason why they were empty, use 0 images, and have no sigma.
+    Cells that fewer than two images cover, or outside the requested area, stay empty. Filled cells get `Quality.FILLED`
+    beside the flag that says why they were empty, 0 images, and no sigma.
     """
-    beyond = (surface.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
+    is_excluded = (surface.quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
     height = np.empty_like(surface.height)
-    interpolate_gaps(surface.height, beyond, reach, height)
-    gained = np.isnan(surface.height) & np.isfinite(height)
-    return _with_heights(surface, gained, height)
+    interpolate_gaps(surface.height, is_excluded, max_distance_cells, height)
+    is_filled = np.isnan(surface.height) & np.isfinite(height)
+    return _with_heights(surface, is_filled, height)
 
 
 def filled_from(surface: Surface, terrain: NDArray[np.float32]) -> Surface:
-    """The surface with other heights, (r, c) ellipsoidal m, NaN where there are none, in all its empty cells that were
-    asked for; they carry `Quality.FILLED` as those of `filled` do."""
+    """The surface with heights of a terrain model in its empty cells inside the requested area.
+
+    terrain : (r, c) ellipsoidal m, NaN where it has no height. Filled cells are marked as in `filled`.
+    """
     outside = (surface.quality & np.uint16(Quality.OUTSIDE)) != 0
-    gained = np.isnan(surface.height) & np.isfinite(terrain) & ~outside
-    return _with_heights(surface, gained, np.where(gained, terrain, surface.height))
+    is_filled = np.isnan(surface.height) & np.isfinite(terrain) & ~outside
+    return _with_heights(surface, is_filled, np.where(is_filled, terrain, surface.height))
 
 
-def _with_heights(surface: Surface, gained: NDArray[np.bool_], height: NDArray[np.float32]) -> Surface:
-    quality = np.where(gained, surface.quality | np.uint16(Quality.FILLED), surface.quality)
+def _with_heights(surface: Surface, is_filled: NDArray[np.bool_], height: NDArray[np.float32]) -> Surface:
+    """The surface with the given heights and the flag FILLED in filled cells."""
+    quality = np.where(is_filled, surface.quality | np.uint16(Quality.FILLED), surface.quality)
     return Surface(height, surface.sigma, quality, surface.views, surface.ortho)
 
 
@@ -41,14 +43,16 @@ FloatGrid = NDArray[np.float32]
 DIRECTIONS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 
 
-def filled_from_behind(height: FloatGrid, beyond: NDArray[np.bool_]) -> FloatGrid:
-    """Gaps with the second lowest of the nearest heights in eight directions: what is hidden lies behind what hides it.
+def filled_from_behind(height: FloatGrid, is_excluded: NDArray[np.bool_]) -> FloatGrid:
+    """Heights with gaps filled by the second lowest of the nearest heights in eight directions.
 
-    height : (r, c) float32, the higher the nearer, NaN in gaps; beyond : (r, c) bool, gaps to be left.
-    Source: Hirschmueller (2008), section 2.6, for occlusions. He gives other gaps the median of the eight; here they
-    are filled alike, for most are beside a jump too, where the median is the nearer side's.
+    An occluded place lies behind its occluder, so the gap gets a low height, not the mean.
+
+    height : (r, c) float32, larger is nearer, NaN in gaps; is_excluded : (r, c) bool, gaps that stay.
+    Source: Hirschmueller (2008), section 2.6, for occlusions. There other gaps get the median of the eight heights.
+    Here all gaps are filled alike, because most are beside a jump, where the median belongs to the nearer side.
     """
-    gaps = np.isnan(height) & ~beyond
+    gaps = np.isnan(height) & ~is_excluded
     if not gaps.any():
         return height
     around = np.stack([nearest(height, *step)[gaps] for step in DIRECTIONS])
@@ -59,7 +63,7 @@ def filled_from_behind(height: FloatGrid, beyond: NDArray[np.bool_]) -> FloatGri
 
 
 def nearest(height: FloatGrid, by_row: int, by_col: int) -> FloatGrid:
-    """The first height met from each cell in one direction; NaN where there is none. (r, c) -> (r, c)"""
+    """The nearest height (r, c) of each cell in a direction; NaN where there is none. by_row, by_col : -1, 0 or 1."""
     if by_row == 0:
         return nearest(height.T, by_col, 0).T
     out = height.copy()

@@ -1,4 +1,4 @@
-"""What a tile yields."""
+"""The surface of a block of cells: heights with their precision, flags, and ortho-image."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from zlocus.matching.quality import Quality
 
 @dataclass(frozen=True)
 class Surface:
-    """Height, its precision, reasons, images used and ortho-image of a block of cells, all (r, c), colours (r, c, 3).
+    """Heights of a block of cells, with their precision, flags, numbers of images and ortho-image.
 
-    height : float32, ellipsoidal m at the cell's centre, NaN where empty; sigma : float32 m, its standard deviation,
-    NaN where empty or interpolated; quality : uint16, see `Quality`; views :
-    uint8, images used, 0 where empty; ortho : float32, grey values or colours of the image, NaN where there is none.
+    height : (r, c) float32, ellipsoidal m at the centre of the cell (hypotheses in image space), NaN where there is
+    none; sigma : (r, c) float32, standard deviation of the height in the same unit, NaN where there is no height or an
+    interpolated one; quality : (r, c) uint16, see `Quality`; views : (r, c) uint8, number of images used, 0 where there
+    is no height; ortho : (r, c) float32 grey values, or (r, c, 3) colours, NaN where there are none.
     """
 
     height: NDArray[np.float32]
@@ -28,29 +29,29 @@ class Surface:
     views: NDArray[np.uint8]
     ortho: NDArray[np.float32]
 
-    def part(self, window: CellWindow, whole: CellWindow) -> Surface:
-        """The cells of `window`, from a surface that covers `whole`; cells beyond it are UNSEEN."""
+    def part(self, window: CellWindow, surface_window: CellWindow) -> Surface:
+        """The cells of `window`, from a surface on the cells `surface_window`; cells beyond it are UNSEEN."""
         out = Surface.nothing(window, self.ortho.shape[2:])
-        shared = window.within(whole)
-        to, since = shared.slices_in(window), shared.slices_in(whole)
-        for mine, theirs in zip(out.arrays, self.arrays, strict=True):
-            mine[to] = theirs[since]
+        shared = window.within(surface_window)
+        to, since = shared.slices_in(window), shared.slices_in(surface_window)
+        for target, source in zip(out.arrays, self.arrays, strict=True):
+            target[to] = source[since]
         return out
 
     def without(self, outside: NDArray[np.bool_]) -> Surface:
-        """The surface with some cells emptied because they were not asked for. outside : (r, c) bool."""
+        """The surface without the cells outside the requested area. outside : (r, c) bool."""
         return self._emptied(outside, np.where(outside, np.uint16(Quality.OUTSIDE), self.quality))
 
-    def precise(self, most_sigma_m: float | None) -> Surface:
-        """The surface without the heights whose standard deviation is larger; None keeps all."""
-        if most_sigma_m is None:
+    def precise(self, max_sigma_m: float | None) -> Surface:
+        """The surface without the heights whose standard deviation is larger than a limit; None: no limit."""
+        if max_sigma_m is None:
             return self
-        too_much = self.sigma > most_sigma_m
+        too_much = self.sigma > max_sigma_m
         quality = self.quality | np.where(too_much, np.uint16(Quality.IMPRECISE), np.uint16(0))
         return self._emptied(too_much, quality)
 
     def _emptied(self, cells: NDArray[np.bool_], quality: NDArray[np.uint16]) -> Surface:
-        """The surface without what stands in some cells (r, c), with other reasons."""
+        """The surface with some cells (r, c) made empty, and with the given flags."""
         nothing = np.float32(np.nan)
         height, sigma = (np.where(cells, nothing, v) for v in (self.height, self.sigma))
         ortho = np.where(cells if self.ortho.ndim == 2 else cells[..., None], nothing, self.ortho)
@@ -58,14 +59,17 @@ class Surface:
 
     @property
     def arrays(self) -> tuple[NDArray[Any], ...]:
-        """All of them, in the order above."""
+        """All arrays, in the order of the fields."""
         return self.height, self.sigma, self.quality, self.views, self.ortho
 
     @classmethod
     def nothing(
         cls, window: CellWindow, bands: tuple[int, ...] = (), full: Callable[..., NDArray[Any]] = np.full
     ) -> Surface:
-        """Cells that no two views cover. bands : () or (3,), of the ortho-image; full : makes the arrays."""
+        """A surface without heights, all of whose cells are UNSEEN.
+
+        bands : () or (3,), of the ortho-image; full : makes the arrays.
+        """
         shape = (window.rows, window.cols)
         return cls(
             full(shape, np.nan, np.float32),

@@ -55,7 +55,7 @@ class LineSegment(NamedTuple):
     """One block of a line. Records are kept in the rows of an array, see `line_segment_at`."""
 
     first: int  # i8: first height index
-    count: int  # i8: number of heights
+    n_heights: int  # i8: number of heights
     width: int  # i8: number of heights with those that fill the last vector
     position: int  # i8: position of its first cell in the line
     end: int  # i8: position after its last cell
@@ -179,7 +179,7 @@ def keep_ends(segment, stride, paths, min_costs, p1, ends):
             at = kind * (paths.shape[0] // N_KINDS) + 1 + cell * (segment.width + 1)
             i = segment.position + cell
             ends[kind, 0, i] = np.uint16(np.uint16(paths[at] + p1) - min_costs[kind, cell])
-            ends[kind, 1, i] = np.uint16(np.uint16(paths[at + segment.count - 1] + p1) - min_costs[kind, cell])
+            ends[kind, 1, i] = np.uint16(np.uint16(paths[at + segment.n_heights - 1] + p1) - min_costs[kind, cell])
 
 
 # (o,) u2, i8, LineSegment, i8, (e,c) u2, i8, LineSegment -> None
@@ -192,7 +192,7 @@ def copy_offers(offers, source, segment, position, ends, target, other):
     goes to the place of that position on a line, which is the room at the end of a segment for cells beyond it.
     """
     shift, wide = other.first - segment.first, other.width
-    count, last = segment.count, segment.count - shift
+    count, last = segment.n_heights, segment.n_heights - shift
     here = source + segment.place + (1 + position - segment.position) * segment.width + shift
     there = target + other.place + (1 + position - other.position) * wide
     for k in range(wide):
@@ -218,7 +218,7 @@ def line_segment_at(segments, e):
 @kernel
 def put_line_segment(segments, e, segment):
     """Write a record to row e of an array of segments."""
-    segments[e, 0], segments[e, 1], segments[e, 2] = segment.first, segment.count, segment.width
+    segments[e, 0], segments[e, 1], segments[e, 2] = segment.first, segment.n_heights, segment.width
     segments[e, 3], segments[e, 4] = segment.position, segment.end
     segments[e, 5], segments[e, 6] = segment.place, segment.sheet_place
 
@@ -236,7 +236,7 @@ def put_line_segments(layout, b, direction, segments, pads):
     for e in range(n):
         d = in_order(e, n, direction.cell_sign)
         br, bc = (d, b) if direction.is_by_column else (b, d)
-        count, n_cells = layout.count[br, bc], min(block, direction.n_cells - d * block)
+        count, n_cells = layout.n_heights[br, bc], min(block, direction.n_cells - d * block)
         wide = -(-count // LANES) * LANES
         put_line_segment(
             segments, e,
@@ -386,7 +386,7 @@ def lay_sheet(cost, patches, segments, pads, steps, sheet):
     for e in range(patches.shape[0] - 1):
         patch, segment = patch_at(patches, e), line_segment_at(segments, e)
         find_steps(patch, steps)
-        lay_costs(cost, patch, segment.count, pads[e, : segment.width], steps, sheet)
+        lay_costs(cost, patch, segment.n_heights, pads[e, : segment.width], steps, sheet)
 
 
 # (s,) u2, (e,n) i8, (e,n) i8, (t,v) u2, (b,) i8, (v,) u2 -> None
@@ -396,7 +396,7 @@ def add_sheet(sheet, patches, segments, pads, steps, total):
     for e in range(patches.shape[0] - 1):
         patch, segment = patch_at(patches, e), line_segment_at(segments, e)
         find_steps(patch, steps)
-        add_sums(sheet, patch, segment.count, pads[e, : segment.width], steps, total)
+        add_sums(sheet, patch, segment.n_heights, pads[e, : segment.width], steps, total)
 
 
 # (o,) u2, LineOffers, LineOffers, (k,e,c) u2, b1 -> None
@@ -494,7 +494,7 @@ def sweep_quarter(cost, layout, p2, p1, turn, total):
     shape, block = np.array(p2.shape[1:]), layout.block
     direction = turned(turn, shape[0], shape[1])
     n_lines, n_cells = direction.n_lines, direction.n_cells
-    n_segments, widest = -(-n_cells // block), -(-layout.count.max() // LANES) * LANES
+    n_segments, widest = -(-n_cells // block), -(-layout.n_heights.max() // LANES) * LANES
     length = (n_cells + 2 * n_segments) * widest
     offers, buffers = np.zeros(2 * N_KINDS * length, np.uint16), new_buffers(n_cells, block, widest)
     pads, steps = np.zeros((n_segments, widest), np.uint16), np.empty(block, np.int64)

@@ -1,4 +1,4 @@
-"""Sums of piecewise linear curves: an additive model, cell by cell."""
+"""Additive model of piecewise linear curves, cell by cell."""
 
 from __future__ import annotations
 

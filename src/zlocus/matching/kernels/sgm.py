@@ -47,7 +47,7 @@ class RowSegment(NamedTuple):
     """One block of a row, in the order of the sweep. Records are kept in the rows of an array, see `segment_at`."""
 
     first: int  # i8: first height index
-    count: int  # i8: number of heights, OUTSIDE where there is no segment
+    n_heights: int  # i8: number of heights, OUTSIDE where there is no segment
     position: int  # i8: position of its first cell in the row
     end: int  # i8: position after its last cell
     place: int  # i8: place of its first cell among the path costs of the row
@@ -197,7 +197,7 @@ def segment_at(segments, e):
 @kernel
 def put_segment(segments, e, segment):
     """Write a record to row e of an array of segments."""
-    segments[e, 0], segments[e, 1], segments[e, 2] = segment.first, segment.count, segment.position
+    segments[e, 0], segments[e, 1], segments[e, 2] = segment.first, segment.n_heights, segment.position
     segments[e, 3], segments[e, 4], segments[e, 5] = segment.end, segment.place, segment.reversed_place
 
 
@@ -208,12 +208,12 @@ def put_row_segments(layout, block_row, n_cols, sign, segments):
 
     sign : -1 where the sweep runs from the last column to the first.
     """
-    n_d, block = layout.count.shape[1], layout.block
+    n_d, block = layout.n_heights.shape[1], layout.block
     position, place, reversed_place = 0, PAD, 0
     put_segment(segments, 0, RowSegment(OUTSIDE, OUTSIDE, OUTSIDE, 0, OUTSIDE, OUTSIDE))
     for e in range(n_d):
         d = e if sign > 0 else n_d - 1 - e
-        first, count = layout.first[block_row, d], layout.count[block_row, d]
+        first, count = layout.first[block_row, d], layout.n_heights[block_row, d]
         n_cells = min(block, n_cols - d * block)
         put_segment(segments, e + 1, RowSegment(first, count, position, position + n_cells, place, reversed_place))
         position += n_cells
@@ -247,7 +247,7 @@ def penalties_of_row(p2, row, sign, out):
 @kernel
 def have_same_range(a, b):
     """Whether two segments search the same heights."""
-    return a.count == b.count and a.first == b.first
+    return a.n_heights == b.n_heights and a.first == b.first
 
 
 # SweptVolume, (e,) i8, i8, (e,n) i8, (3,r,l) u2, i8, (r,4,c) u2, u2 -> None
@@ -262,12 +262,12 @@ def sweep_west(volume, starts, row_step, segments, paths, n_rows, p2, p1):
     min_costs = np.zeros(n_rows, np.uint16)
     for e in range(1, starts.shape[0] - 1):
         segment, previous = segment_at(segments, e), segment_at(segments, e - 1)
-        count, n_cells = segment.count, segment.end - segment.position
+        count, n_cells = segment.n_heights, segment.end - segment.position
         read = turn
         if not have_same_range(segment, previous):
             read, shift = COPY_PLANE, segment.first - previous.first
             for row in range(n_rows):
-                copy_shifted(paths[turn, row], previous.count, shift, paths[COPY_PLANE, row], count)
+                copy_shifted(paths[turn, row], previous.n_heights, shift, paths[COPY_PLANE, row], count)
                 paths[0, row, PAD + count] = paths[1, row, PAD + count] = FAR
         run = WestRun(starts[e], row_step, count, n_cells, n_rows, segment.position, read, 1 - turn)
         run_west(volume, run, paths, min_costs, p2, p1)
@@ -283,10 +283,12 @@ def neighbour_above(costs, segment, above, column, row_start, copied):
     row_start : place of the previous row's costs. A neighbour with another range is copied to the place `copied`, by
     the heights of the cell.
     """
-    place = row_start + above.place + (column - above.position) * (above.count + PAD)
+    place = row_start + above.place + (column - above.position) * (above.n_heights + PAD)
     if have_same_range(segment, above):
         return place
-    copy_shifted(costs[place - PAD :], above.count, segment.first - above.first, costs[copied - PAD :], segment.count)
+    copy_shifted(
+        costs[place - PAD :], above.n_heights, segment.first - above.first, costs[copied - PAD :], segment.n_heights
+    )
     return copied
 
 
@@ -301,7 +303,7 @@ def sweep_segment(volume, start, store, parity, e, p2, p1):
     above, here = store.min_costs[1 - parity], store.min_costs[parity]
     segment, others = segment_at(store.segments[parity], e), store.segments[1 - parity]
     before, same, after = segment_at(others, e - 1), segment_at(others, e), segment_at(others, e + 1)
-    left, right, count = segment.position, segment.end, segment.count
+    left, right, count = segment.position, segment.end, segment.n_heights
     first_write, first_read = parity * PATHS_FROM_ABOVE * width, (1 - parity) * PATHS_FROM_ABOVE * width
     copied = 2 * PATHS_FROM_ABOVE * width + PAD
     run, end = left, right
@@ -357,7 +359,7 @@ def reverse_row(cost, starts, shift, segments, place, out):
     for e in range(1, starts.shape[0] - 1):
         segment = segment_at(segments, e)
         n_cells, at = segment.end - segment.position, place + segment.reversed_place
-        reverse_cells(cost, starts[e] + shift, segment.count, n_cells, out[at : at + n_cells * segment.count])
+        reverse_cells(cost, starts[e] + shift, segment.n_heights, n_cells, out[at : at + n_cells * segment.n_heights])
 
 
 # (s,) u2, (e,) i8, i8, (e,n) i8, i8, (v,) u2 -> None
@@ -367,15 +369,15 @@ def add_reversed_row(sums, starts, shift, segments, place, total):
     for e in range(1, starts.shape[0] - 1):
         segment = segment_at(segments, e)
         n_cells, at = segment.end - segment.position, place + segment.reversed_place
-        add_reversed(sums[at : at + n_cells * segment.count], starts[e] + shift, segment.count, n_cells, total)
+        add_reversed(sums[at : at + n_cells * segment.n_heights], starts[e] + shift, segment.n_heights, n_cells, total)
 
 
 # VolumeLayout, i8 -> PathStore
 @kernel
 def new_path_store(layout, n_cols):
     """Room for two rows of n_cols cells; all path costs are FAR, all segments are outside."""
-    width, longest = layout.row_length.max() + PAD * (n_cols + 2), layout.count.max() + 2 * PAD
-    segments = np.full((2, layout.count.shape[1] + 2, 6), OUTSIDE, np.int64)
+    width, longest = layout.row_length.max() + PAD * (n_cols + 2), layout.n_heights.max() + 2 * PAD
+    segments = np.full((2, layout.n_heights.shape[1] + 2, 6), OUTSIDE, np.int64)
     costs = np.full(2 * PATHS_FROM_ABOVE * width + PATHS_FROM_ABOVE * longest, FAR, np.uint16)
     return PathStore(segments, costs, np.zeros((2, PATHS_FROM_ABOVE, n_cols + 2), np.uint16), width, longest)
 
@@ -398,7 +400,7 @@ def sweep_row(volume, starts, shift, store, parity, has_new_segments, p2, p1):
 @kernel
 def find_starts(layout, row, sign, starts):
     """Write where the blocks of a row start in the volume, in the order of the sweep; block e stands at e + 1."""
-    n_d, b = layout.count.shape[1], row // layout.block
+    n_d, b = layout.n_heights.shape[1], row // layout.block
     first = layout.block_row_start[b, 0] + (row - b * layout.block) * layout.row_length[b, 0]
     for e in range(1, n_d + 1):
         starts[e] = first + layout.block_start[b, e - 1 if sign > 0 else n_d - e]
@@ -411,7 +413,7 @@ def sweep(cost, layout, p2, p1, sign, total):
 
     cost : (v,) uint8; p2 : (4, r, c) uint16, penalty of the jump into a cell from W, NW, N, NE; total : (v,) uint16.
     """
-    n_rows, n_cols, n_d, block = p2.shape[1], p2.shape[2], layout.count.shape[1], layout.block
+    n_rows, n_cols, n_d, block = p2.shape[1], p2.shape[2], layout.n_heights.shape[1], layout.block
     store, starts = new_path_store(layout, n_cols), np.empty(n_d + 2, np.int64)
     west_paths = np.full((3, ROWS_SIDE_BY_SIDE, store.longest), FAR, np.uint16)
     row_p2 = np.empty((ROWS_SIDE_BY_SIDE, 4, n_cols), np.uint16)
@@ -484,7 +486,7 @@ def winners(total, layout, best, second, uniqueness, vertex):
     the sums around `best`. All are written.
     """
     n_rows, n_cols = best.shape
-    first_of, count_of, block = layout.first, layout.count, layout.block
+    first_of, count_of, block = layout.first, layout.n_heights, layout.block
     block_row_start, row_length, block_start = layout.block_row_start, layout.row_length, layout.block_start
     for r in range(n_rows):
         b = r // block
@@ -514,7 +516,7 @@ def winner_takes_all(cost, layout, preferred, best):
     """Height index of the least cost of each cell, written to `best`; of equal costs that of `preferred`, else the
     first. preferred, best : (r, c) int32."""
     n_rows, n_cols = best.shape
-    first_of, count_of, block = layout.first, layout.count, layout.block
+    first_of, count_of, block = layout.first, layout.n_heights, layout.block
     block_row_start, row_length, block_start = layout.block_row_start, layout.row_length, layout.block_start
     for r in range(n_rows):
         b = r // block

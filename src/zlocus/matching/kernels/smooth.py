@@ -1,4 +1,4 @@
-"""Smoothing of a surface that keeps its jumps and its slopes."""
+"""Smoothing of a surface that preserves jumps and slopes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TAPS = (1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0)
 # f4, f4 -> f4
 @kernel
 def smaller_slope(before, after):
-    """The smaller of two slopes of one sign, else 0 (minmod): a jump on one side only is no slope."""
+    """The smaller of two slopes of equal sign, else 0 (minmod): a jump on one side only is not a slope."""
     if before * after <= 0.0:
         return np.float32(0.0)
     return before if abs(before) < abs(after) else after
@@ -22,39 +22,42 @@ def smaller_slope(before, after):
 # (n,) f4, (n,) f4, (n,) f4, f4, (n,) f4 -> None
 @kernel
 def slopes_between(before, here, after, inverse, out):
-    """Slopes of cells from those as far on both sides; inverse : of how far, in cells."""
+    """Write the slopes of cells from cells at an equal distance on both sides; inverse : of that distance, per cell."""
     for j in range(here.shape[0]):
         out[j] = smaller_slope(here[j] - before[j], after[j] - here[j]) * inverse
 
 
 # (r,c) f4, i8, (r,c) f4, (r,c) f4 -> None
 @kernel
-def slopes(surface, reach, by_row, by_col):
-    """Slope per cell along rows and columns, over `reach` cells to both sides; 0 beside jumps, and at the border that
-    of the nearest cell which has so many on both."""
+def slopes(surface, distance, by_row, by_col):
+    """Write the slopes per cell along rows and columns, over `distance` cells to both sides.
+
+    They are 0 beside jumps. At the edges of the surface they are those of the nearest cell with enough cells on both
+    sides.
+    """
     n_rows, n_cols = surface.shape
     by_row[:] = 0.0
     by_col[:] = 0.0
-    inverse = np.float32(1.0 / reach)
+    inverse = np.float32(1.0 / distance)
     for r in range(n_rows):
         here = surface[r]
-        if reach <= r < n_rows - reach:
-            slopes_between(surface[r - reach], here, surface[r + reach], inverse, by_row[r])
-        if n_cols > 2 * reach:
-            n = n_cols - reach
-            slopes_between(here[: n - reach], here[reach:n], here[2 * reach :], inverse, by_col[r, reach:n])
-    if n_rows > 2 * reach:
-        for r in range(reach):
-            by_row[r], by_row[n_rows - 1 - r] = by_row[reach], by_row[n_rows - 1 - reach]
-    if n_cols > 2 * reach:
+        if distance <= r < n_rows - distance:
+            slopes_between(surface[r - distance], here, surface[r + distance], inverse, by_row[r])
+        if n_cols > 2 * distance:
+            n = n_cols - distance
+            slopes_between(here[: n - distance], here[distance:n], here[2 * distance :], inverse, by_col[r, distance:n])
+    if n_rows > 2 * distance:
+        for r in range(distance):
+            by_row[r], by_row[n_rows - 1 - r] = by_row[distance], by_row[n_rows - 1 - distance]
+    if n_cols > 2 * distance:
         for r in range(n_rows):
-            by_col[r, :reach], by_col[r, n_cols - reach :] = by_col[r, reach], by_col[r, n_cols - 1 - reach]
+            by_col[r, :distance], by_col[r, n_cols - distance :] = by_col[r, distance], by_col[r, n_cols - 1 - distance]
 
 
 # (c,) f4, (c,) f4, (c,) f4, (c,) f4, (3,) f4, f4, (c,) f4, (c,) f4 -> None
 @kernel
 def add_tap(centre, other, by_row, by_col, tap, inverse, total, weight):
-    """Add one neighbour of every cell of a row, less the slope to it: weight (1 - (dz / jump)^2)^2, none beyond it.
+    """Add one neighbour of every cell of a row, minus the slope to it, with the weight (1 - (dz / jump)^2)^2; 0 beyond.
 
     tap : weight of the tap and its distance in rows and in columns.
     """
@@ -71,11 +74,11 @@ def add_tap(centre, other, by_row, by_col, tap, inverse, total, weight):
 # (r,c) f4, (r,c) f4, (r,c) f4, i8, f4, (r,c) f4 -> None
 @kernel
 def smooth_surface(surface, by_row, by_col, spacing, jump, out):
-    """Weighted mean over 5 x 5 cells `spacing` apart, around each cell's own plane; nothing reaches across a jump.
+    """Write the weighted mean over 5 x 5 cells `spacing` apart, around the plane of each cell and not across jumps.
 
     surface : (r, c) float32, any unit of height; by_row, by_col : (r, c), its slopes per cell; jump : distance from
-    the plane beyond which a cell has no weight; out : (r, c), written. Passes with growing spacings make a wide
-    smoothing of few taps. Source: Tomasi and Manduchi (1998), with Tukey's weight in height and the taps of Starck et
+    the plane beyond which a cell has no weight; out : (r, c), written. Passes with growing spacings smooth widely with
+    few taps. Source: Tomasi and Manduchi (1998), with Tukey's weight in height and the taps of Starck et
     al. (2007).
     """
     n_rows, n_cols = surface.shape

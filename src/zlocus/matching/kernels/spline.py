@@ -7,8 +7,8 @@ import numpy as np
 from zlocus.core.jit import kernel
 
 POLE = np.sqrt(3.0) - 2.0
-# The pole's powers fall below float32 rounding after so many pixels.
-REACH = 16
+# Number of pixels after which the powers of the pole are below the rounding of float32.
+BOUNDARY_PIXELS = 16
 
 
 # (r,c) f4 -> None
@@ -25,7 +25,7 @@ def filter_columns(image):
     pole = np.float32(POLE)
     first = np.zeros(n_cols, np.float32)
     power = np.float32(1.0)
-    for k in range(REACH):
+    for k in range(BOUNDARY_PIXELS):
         at = k % (2 * n_rows - 2)
         row = image[at if at < n_rows else 2 * n_rows - 2 - at]
         for c in range(n_cols):
@@ -49,7 +49,7 @@ def filter_columns(image):
 # (r,c) f4 -> (c,r) f4
 @kernel
 def transposed(image):
-    """Rows and columns exchanged, in 16 x 16 pieces that stay in cache."""
+    """The image with rows and columns exchanged, in pieces of 16 x 16 pixels that stay in the cache."""
     n_rows, n_cols = image.shape
     out = np.empty((n_cols, n_rows), np.float32)
     for r0 in range(0, n_rows, 16):
@@ -63,7 +63,7 @@ def transposed(image):
 # (r,c) f4 -> (r,c) f4
 @kernel
 def spline_coefficients(image):
-    """Cubic B-spline coefficients of an image, (r, c) float32: sampled with B-splines they give the image back."""
+    """Cubic B-spline coefficients (r, c) of an image, (r, c) float32; their B-splines pass through its pixels."""
     turned = transposed(image)
     filter_columns(turned)
     out = transposed(turned)
