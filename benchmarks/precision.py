@@ -6,10 +6,10 @@
 `fit` renders the scenes of TRAINING, or takes the FOLDERs given, runs `zlocus dsm` on them with six, three and two
 views, and writes src/zlocus/matching/precision_calibration.py, or FILE. Runs with fewer than N cells of a kind (seen by
 a pair, or by more images) do not count. `judge` runs `zlocus dsm` on folders with img_*.tif, truth_dsm.tif and
-truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and trees, the share
-of true errors within one and two sigma (68 and 95 % of a normal distribution); the share within one sigma in each
-quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the largest sigma is
-dropped. Draws calibration.png.
+truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for all cells, ground, roofs and
+trees, the share of true errors within one and two sigma (68 and 95 % of a normal distribution); the share within one
+sigma in each quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the
+largest sigma is dropped. Draws calibration.png.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
         parts.append(({k: v[cell] for k, v in predictors.items()}, is_refined[cell], errors[inside], kind[inside]))
     return Sample(
         {k: np.concatenate([part[0][k] for part in parts]) for k in parts[0][0]},
-        *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)), tiles[0][4].step_m,
+        *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)), tiles[0][4].height_step,
     )  # fmt: skip
 
 
