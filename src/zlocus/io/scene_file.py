@@ -203,13 +203,8 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
         frame = _default_crs(opened) if opened else None
     views = [] if frame is None else [v for each in opened for v in attempt(each.entry, partial(each.view, frame))]
     scene = scene_input.scene(views, frame) if views and frame is not None else None
-    return UsableViews(
-        scene,
-        (
-            *refused_entries,
-            *(refused_by_name[entry.name] for entry in scene_input.entries if entry.name in refused_by_name),
-        ),
-    )
+    refused = [refused_by_name[entry.name] for entry in scene_input.entries if entry.name in refused_by_name]
+    return UsableViews(scene, (*refused_entries, *refused))
 
 
 def read_scene_file(path: Path, refused: list[RefusedView] | None = None) -> SceneFile:
