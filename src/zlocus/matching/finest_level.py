@@ -73,7 +73,8 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     _mark_overlap(quality, result, ground, refined.height)
     height = result.lattice.metres(refined.height)
     sigma = sigma_steps(predictors, refined)
-    is_noise = ground.is_at_edge_in(result.level.window) & (spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps)
+    is_uneven = spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps
+    is_noise = ground.is_at_edge_in(result.level.window) & is_uneven
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)
     sigma *= np.float32(match_scene.height_step)
     height[is_empty(quality)] = np.nan
@@ -110,9 +111,12 @@ def ortho_of_surface(
     of_filled = (surface.height - np.float32(lattice.height_origin)) / np.float32(lattice.height_step)
     lattice_index = np.where(is_filled, of_filled, lattice_index)
     coarser = [CoarserHeights(r.level.number, r.level.window, r.heights.vertex) for r in reversed(coarser_results)]
-    surroundings = surroundings_of_tile(coarser, finest.tile_views, finest.level.window, lattice_index, config.pyramid.halo)
+    window, halo = finest.level.window, config.pyramid.halo
+    surroundings = surroundings_of_tile(coarser, finest.tile_views, window, lattice_index, halo)
     scale = tile.match_scene.grey_scales[0] if config.products.ortho_levels == "common" else None
     coloured = tile.match_scene.coloured(tile.view_numbers)
-    ortho = true_ortho(tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, surroundings, scale)
+    ortho = true_ortho(
+        tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, surroundings, scale
+    )
     ortho[np.isnan(surface.height)] = np.nan
     return ortho

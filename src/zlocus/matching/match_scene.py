@@ -144,7 +144,7 @@ def reference_first(scene: Scene, z: float, reference: str | None) -> tuple[View
 def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: float) -> float:
     """Height step (m) that shifts the most sensitive image by `max_shift_px` against the reference image.
 
-    Equivalent disparity (method section 1): |v_i - v_0| dz / g, with the parallax rates v and with g the larger of the
+    Equivalent disparity (method section 2): |v_i - v_0| dz / g, with the parallax rates v and with g the larger of the
     image's ground pixel and the cell, because nothing finer is compared. Frame cameras have no reference image for the
     whole scene: there all pairs count. views : the reference image first; z : m, a height of the ground.
 

@@ -119,7 +119,11 @@ def _views_around_ties(tile: TileInputs, window: CellWindow, ties: GridTies) -> 
     z = match_scene.ties[ties.inside(window), 2]
     z = z[np.isfinite(z)]
     z_reachable = (float(z.min()) - reach, float(z.max()) + reach) if len(z) else None
-    return tile_views(tile.view_pixels, TileGrid(0, match_scene.transform(window, 0), (window.rows, window.cols), config.pyramid.block, match_scene.height_origin, match_scene.height_step), z_range, large_window_side(config.cost) // 2, z_reachable)  # fmt: skip
+    cells = TileGrid(
+        0, match_scene.transform(window, 0), (window.rows, window.cols), config.pyramid.block,
+        match_scene.height_origin, match_scene.height_step,
+    )  # fmt: skip
+    return tile_views(tile.view_pixels, cells, z_range, large_window_side(config.cost) // 2, z_reachable)
 
 
 def label_pairs(

@@ -406,7 +406,8 @@ def views_around(
             view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey_scales[number]))
     shape, lattice = (window.rows, window.cols), (match_scene.height_origin, match_scene.height_step)
     half = large_window_side(config.cost) // 2
-    return numbers, tile_views(view_pixels, TileGrid(0, transform, shape, config.pyramid.block, *lattice), z_range, half)
+    cells = TileGrid(0, transform, shape, config.pyramid.block, *lattice)
+    return numbers, tile_views(view_pixels, cells, z_range, half)
 
 
 def heights_around(

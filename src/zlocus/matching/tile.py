@@ -53,7 +53,7 @@ from zlocus.matching.semiglobal import (
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.surface import Surface
-from zlocus.matching.tile_views import TileGrid, TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import PixelWindow, TileGrid, TileViews, pixel_window, read_pixels, tile_views
 from zlocus.matching.view_selection import ChosenViews, choose_views, preselected
 
 # Points along each side of a tile whose projections say which images may see it.
@@ -162,7 +162,7 @@ def read_tile(
 
 def windows_of(
     match_scene: MatchScene, core_window: CellWindow, config: RunConfig
-) -> tuple[NDArray[np.float64], dict[int, tuple[int, int, int, int]]]:
+) -> tuple[NDArray[np.float64], dict[int, PixelWindow]]:
     """Where the views see a tile.
 
     Ground points (n, 2) m all over the tile with its halo, and the window (row, col, rows, cols) px of each view that

@@ -9,7 +9,7 @@ from zlocus.core.options.option_fields import Checked, option
 
 @dataclass(frozen=True)
 class PyramidOptions(Checked):
-    """Levels, tiles and the range of heights that each block of cells searches (method sections 1, 6 and 9)."""
+    """Levels, tiles and the range of heights that each block of cells searches (method sections 2 and 3)."""
 
     max_shift_px: float = option(
         0.5, "Largest shift of the most sensitive image for one height step.", low=0.05, high=2.0, unit="px"

@@ -10,7 +10,7 @@ from zlocus.core.options.option_fields import Checked, option
 
 @dataclass(frozen=True)
 class SelectionOptions(Checked):
-    """Which search images a cell is matched with, in which order, and when they are enough (method sections 2 to 4)."""
+    """Which search images a cell is matched with, in which order, and when they are enough (method section 6)."""
 
     rho1_high: float = option(
         0.90, "A match curve is good where its highest correlation is above this and its ratio of peaks is above "
