@@ -235,8 +235,7 @@ def _read_control(path: Path) -> Leaves:
     }
     rows = control.observations
     positions = {
-        (control.names[point], int(view)): xy
-        for view, point, xy in zip(rows.view, rows.point, rows.xy, strict=True)
+        (control.names[point], int(view)): xy for view, point, xy in zip(rows.view, rows.point, rows.xy, strict=True)
     }
     return leaves({"points": points, "seen": positions})
 

@@ -50,7 +50,7 @@ def import_scene(request: ImportRequest) -> SceneFile:
     return scene
 
 
-def scene_of(imported: ImportedCameras, request: ImportRequest) -> SceneFile:
+def scene_of(cameras: ImportedCameras, request: ImportRequest) -> SceneFile:
     """The scene file of imported cameras, with paths of images relative to it.
 
     Raises
@@ -58,21 +58,21 @@ def scene_of(imported: ImportedCameras, request: ImportRequest) -> SceneFile:
     InputError
         There are fewer than two images, an image is missing or listed twice, or its size is not that of its camera.
     """
-    exposures = imported.exposures
+    exposures = cameras.exposures
     if len(exposures) < MIN_IMAGES:
         raise InputError(
-            f"{imported.path} holds {len(exposures)} oriented images, and a surface needs {MIN_IMAGES} or more. "
+            f"{cameras.path} holds {len(exposures)} oriented images, and a surface needs {MIN_IMAGES} or more. "
             f"{EXPORT_AGAIN}"
         )
     image, times = Counter(exposure.image for exposure in exposures).most_common(1)[0]
     if times > 1:
-        raise InputError(f"{imported.path}: the image {quoted(image)} is there twice. {EXPORT_AGAIN}")
-    paths = _image_paths(exposures, imported.path, request.images)
+        raise InputError(f"{cameras.path}: the image {quoted(image)} is there twice. {EXPORT_AGAIN}")
+    paths = _image_paths(exposures, cameras.path, request.images)
     folder = request.out.absolute().parent.resolve()
-    crs = None if imported.crs is None else scene_file_crs(parsed_crs(imported.crs))
-    earth = {"earth": "flat"} if crs is not None and imported.flat else {}
+    crs = None if cameras.crs is None else scene_file_crs(parsed_crs(cameras.crs))
+    earth = {"earth": "flat"} if crs is not None and cameras.flat else {}
     views = [
-        ViewEntry(name=name, image=_relative(path, folder), camera=_camera(exposure, path, imported.path, earth))
+        ViewEntry(name=name, image=_relative(path, folder), camera=_camera(exposure, path, cameras.path, earth))
         for exposure, path, name in zip(exposures, paths, _names(exposures), strict=True)
     ]
     frame: dict[str, Any] = {"local": True} if crs is None else {"crs": crs}
@@ -80,7 +80,7 @@ def scene_of(imported: ImportedCameras, request: ImportRequest) -> SceneFile:
         frame["up"] = request.up
     if request.north is not None:
         frame["north"] = request.north
-    return validate_document(SceneFile, {"schema": 1, "frame": frame, "views": views}, imported.path)
+    return validate_document(SceneFile, {"schema": 1, "frame": frame, "views": views}, cameras.path)
 
 
 def _camera(exposure: ImportedExposure, image: Path, path: Path, earth: dict[str, Any]) -> FrameCamera:
