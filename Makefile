@@ -9,7 +9,7 @@ ifneq ($(TEST_DATA),)
 export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
 endif
 
-.PHONY: demo docs test test-minimum audit lint bench peers acceptance acceptance-all clean
+.PHONY: demo docs test test-fast test-minimum audit lint bench peers acceptance acceptance-all clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -27,6 +27,10 @@ docs: $(STAMP)
 
 test: lint
 	$(BIN)/python -m pytest -n 2
+
+# Tests of single modules, for use while editing: under two minutes on two cores. tests/conftest.py lists what is left out.
+test-fast: $(STAMP)
+	$(BIN)/python -m pytest -n 2 -m "not slow"
 
 # The oldest versions that pyproject.toml allows, in an environment of their own.
 test-minimum: $(STAMP)

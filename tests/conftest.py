@@ -13,8 +13,29 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 from hypothesis import settings
 
+TESTS = Path(__file__).parent
+# What `make test-fast` leaves out (marker `slow`): whole runs, pages, and files that take more than some ten seconds.
+SLOW = (
+    "runs", "docs", "benchmarks", "pipeline", "inspector", "products/report", "cli",
+    "core/test_resources.py", "core/test_signals.py", "core/test_startup.py", "core/test_startup_imports.py",
+    "evaluation/test_evaluate_coarse_references.py", "io/test_io_damaged_files.py", "io/test_open_raster_remote.py",
+    "matching/test_fusion.py", "matching/test_stages_against_twins.py", "orientation/test_parameter_groups.py",
+    "test_api.py",
+)  # fmt: skip
+
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50, database=None)
 settings.load_profile("repeatable")
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "slow: left out of `make test-fast`; set by the table in tests/conftest.py")
+
+
+def pytest_collection_modifyitems(items):
+    slow = [TESTS / name for name in SLOW]
+    for item in items:
+        if any(item.path.is_relative_to(place) for place in slow):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")
