@@ -31,7 +31,7 @@ import zlocus.pipeline.dsm
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import CurvesRequest, DsmRequest
-from zlocus.pipeline.match_curves import run_point
+from zlocus.pipeline.match_curves import run_curves
 from zlocus.synthetic.files import RenderedScene, render_scene
 from zlocus.synthetic.scenes import city_spec
 
@@ -125,7 +125,7 @@ class PointCurves:
 def point_curves(town: Town, folder: Path) -> PointCurves:
     """Match curves of all images against n1, at `PLACE`."""
     request = CurvesRequest(inputs=town.images(SIX), out=folder, at=PLACE, reference="img_n1", resolution=CELL_M)
-    run_point(request, RunConfig(), SilentProgress())
+    run_curves(request, RunConfig(), SilentProgress())
     table = np.genfromtxt(folder / "curves.csv", delimiter=",", names=True, deletechars="")
     report = json.loads((folder / "point.json").read_text(encoding="utf-8"))
     return PointCurves({name: table[name] for name in table.dtype.names}, {c["image"]: c for c in report["curves"]})

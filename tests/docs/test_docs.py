@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import json
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -185,3 +187,22 @@ def test_options_of_the_choice_of_images_exist():
     named = set(re.findall(r"`([a-z]+(?:_[a-z]+)+)`", text))
     assert len(named) > 8
     assert named <= known | {"all_images"}
+
+
+def code_of(path: Path) -> str:
+    """The Python of a script, or of all code cells of a notebook."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        return text
+    cells = json.loads(text)["cells"]
+    return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+
+
+@pytest.mark.parametrize("path", sorted([*ROOT.glob("docs/*.py"), *ROOT.glob("docs/**/*.ipynb")]), ids=lambda p: p.name)
+def test_names_that_scripts_and_notebooks_import_exist(path):
+    """A rename is noticed before the notebooks are run, which takes minutes."""
+    for node in ast.walk(ast.parse(code_of(path))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("zlocus"):
+            module = importlib.import_module(node.module)
+            for name in node.names:
+                assert hasattr(module, name.name), f"{node.module} has no {name.name}"
