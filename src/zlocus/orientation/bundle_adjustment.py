@@ -26,8 +26,8 @@ class BundleAdjustment:
 
     sensors : corrected; adjustment : of the ties that were kept, with shifts of 0; control : the given points;
     control_points : (k, 3) m, their positions after the adjustment, NaN for check points that fewer than two images
-    show; control_residual : (j, 2) px, of `control.observations`; terrain_m : (n,) m, heights of the ties minus those of
-    the terrain.
+    show; control_residual : (j, 2) px, of `control.observations`; terrain_m : (n,) m, heights of the ties minus those
+    of the terrain.
     """
 
     sensors: tuple[SensorModel, ...]
