@@ -161,7 +161,7 @@ def test_a_tower_occludes_the_ground_behind_it():
     sees_ground = sees(visible, np.full((2, *SHAPE), 10.0))
     assert sees_ground[0].all()
     hidden = np.flatnonzero(~sees_ground[1, 15])
-    # 20 steps of 0.5 m, a metre of shadow a metre of height; the cells of the tower itself count as occluded at its foot.
+    # 20 steps of 0.5 m, a metre of shadow a metre of height; the cells of the tower count as occluded at its foot.
     assert hidden.min() in (15, 16)
     assert (np.diff(hidden) == 1).all()
     assert hidden.max() in (38, 39)
@@ -226,7 +226,7 @@ def test_slope_indices_and_level_indices():
 
 
 def test_a_wide_lens_sees_behind_a_tower_from_its_own_side():
-    """Above the middle of the tile: towers on both sides mark_occlusions what is outwards of them, and nothing inwards."""
+    """Above the middle of the tile: towers on both sides occlude the ground outwards of them, none inwards."""
     shape, block = (64, 256), 16
     transform = Affine(1.0, 0, CENTRE[0] - 128.0, 0, -1.0, CENTRE[1] + 32.0)
     turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))

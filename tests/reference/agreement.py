@@ -73,8 +73,8 @@ def mean_closeness(greys, visible, max_difference, excluded=0.0):
 def cell_costs(images, nodes, heights, index, block, halves, visible, parameters, relief):
     """64 (1 - mean NCC + weight (1 - mean closeness)) of a block's cells at one height, (r, c), before rounding.
 
-    Where fewer than two images cover that height, a fixed cost: see `block_costs`. parameters : `CostParameters`; relief :
-    (r + 2 half, c + 2 half) steps.
+    Where fewer than two images cover that height, a fixed cost: see `block_costs`. parameters :
+    `CostParameters`; relief : (r + 2 half, c + 2 half) steps.
     """
     half, p = max(halves), parameters
     low, high, free_from = visible

@@ -1,4 +1,4 @@
-"""Twins of `block_grid`, `resample_plane`, `resample_surface` and `tile_ortho`: where cells project to, and the values."""
+"""Twins of `block_grid`, `resample_plane`, `resample_surface` and `tile_ortho`: where cells project to, and values."""
 
 from __future__ import annotations
 

@@ -42,11 +42,6 @@ class KernelScene:
                 rows = slice(r0, min(r0 + self.block, self.shape[0]))
                 yield b, d, rows, slice(c0, min(c0 + self.block, self.shape[1]))
 
-    @property
-    def arrays(self):
-        """The views as the kernels take them."""
-        return ViewArrays(self.pixels, self.layout, self.nodes, self.heights, self.block)
-
     def all_visible(self):
         """Every view covers and sees every height."""
         shape = (self.n_views, *self.shape)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import RefineOptions
 from zlocus.matching.height_lattice import NARROW_BASE_STEP_CELLS
-from zlocus.matching.kernels.shared_records import ViewArrays
+from zlocus.matching.kernels.shared_records import ViewArrays, VisibleHeights
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.subpixel import (
     CUBIC,

@@ -252,7 +252,8 @@ def _grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
     if not unusable.any():
         return unusable
     side = 2 * (half + 2) + 1
-    return cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+    grown = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8))
+    return np.asarray(grown, np.bool_)
 
 
 @dataclass(frozen=True)

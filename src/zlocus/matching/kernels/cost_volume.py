@@ -37,11 +37,11 @@ NOTHING, PART, WHOLE = 0, 1, 2
 class CostParameters(NamedTuple):
     """Constants of the matching cost; see `zlocus.core.options.CostOptions`."""
 
-    window_variance: float  # f4: added to the variance of every window, grey values squared
-    grey_weight: float  # f4: weight of grey differences beside the correlation
-    grey_weight_two_images: float  # f4: the same in blocks that two of three or more views cover
-    max_grey_difference: float  # f4: grey difference at which two views do not agree at all
-    occluded_pairs_excluded: float  # f4: share of the pairs with an occluded view that is excluded from the mean
+    window_variance: np.float32  # f4: added to the variance of every window, grey values squared
+    grey_weight: np.float32  # f4: weight of grey differences beside the correlation
+    grey_weight_two_images: np.float32  # f4: the same in blocks that two of three or more views cover
+    max_grey_difference: np.float32  # f4: grey difference at which two views do not agree at all
+    occluded_pairs_excluded: np.float32  # f4: share of the pairs with an occluded view that is excluded from the mean
     max_images_for_large_window: int  # i8: blocks that more views cover take the smallest window only
 
 
@@ -148,7 +148,7 @@ def covering_views(block, span):
     views = np.empty(block.lowest_covering_any.shape[0], np.int64)
     n = 0
     for i in range(views.shape[0]):
-        if block.highest_covering_any[i] >= span.first and block.lowest_covering_any[i] < span.first + span.count:
+        if block.highest_covering_any[i] >= span.first and block.lowest_covering_any[i] < span.first + span.n_heights:
             views[n] = i
             n += 1
     return views[:n]
@@ -281,14 +281,14 @@ def block_costs(views, relief, span, windows, visible, parameters, out):
     size, cells = steps.shape[0] + SLACK, flat_cells(relief.shape[0], width)
     planes, greys = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
     mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
-    flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.empty((span.count, n), np.uint8)
+    flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.empty((span.n_heights, n), np.uint8)
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     counts, scratch = np.empty((2, size), np.float32), resample_scratch(size)
     work, totals = np.empty((4, size), np.float32), total.reshape((1, 1, size))
     flat_visibility(visible, half, flat, pairs)
     top, centre = weight * np.float32(n_sizes), np.float32(0.0)
     grey_factor = top / parameters.max_grey_difference
-    for k in range(span.count):
+    for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole
@@ -375,10 +375,10 @@ def tile_costs(views, slope, layout, windows, visible, parameters, volume):
     """
     n_rows, n_cols = visible.lowest_covered.shape[1], visible.lowest_covered.shape[2]
     block = views.block
-    for br in range(layout.count.shape[0]):
-        for bc in range(layout.count.shape[1]):
+    for br in range(layout.n_heights.shape[0]):
+        for bc in range(layout.n_heights.shape[1]):
             box = cells_of_block(br, bc, block, n_rows, n_cols)
-            span = HeightSpan(layout.first[br, bc], layout.count[br, bc])
+            span = HeightSpan(layout.first[br, bc], layout.n_heights[br, bc])
             r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
             first, length = layout.block_row_start[br, 0], layout.row_length[br, 0]
             rows = volume[first : first + (r1 - r0) * length].reshape((r1 - r0, length))
@@ -391,5 +391,5 @@ def tile_costs(views, slope, layout, windows, visible, parameters, volume):
             block_relief(around, corners, block, half, relief)
             block_costs(
                 views_of_block(views, br, bc), relief, span, sizes, of_block, parameters,
-                rows[:, start : start + (c1 - c0) * span.count],
+                rows[:, start : start + (c1 - c0) * span.n_heights],
             )  # fmt: skip

@@ -192,7 +192,7 @@ def find_longest_runs(views, view, mask, span, margin, run):
     """
     heights, (n_rows, n_cols), covered = views.heights, run.length.shape, 0
     run.lowest[:], run.highest[:], run.length[:], run.longest[:] = NEVER_COVERED, -1, 0, 0
-    end = span.first + span.count
+    end = span.first + span.n_heights
     for k in range(span.first, end):
         grid = block_grid(views.nodes, view, heights[0] + k * heights[1], views.block, 0)
         cover = plane_cover(grid, n_rows, n_cols, margin, mask)
@@ -223,7 +223,7 @@ def block_coverage(views, masks, span, limit_low, limit_high, margin, lowest, hi
     heights, shape = views.heights, lowest.shape[1:]
     length, longest = np.empty(shape, np.int32), np.empty(shape, np.int32)
     for i in range(views.layout.shape[0]):
-        first, end = max(span.first, limit_low[i]), min(span.first + span.count, limit_high[i] + 1)
+        first, end = max(span.first, limit_low[i]), min(span.first + span.n_heights, limit_high[i] + 1)
         t_low, t_high = heights[0] + first * heights[1], heights[0] + (end - 1) * heights[1]
         mask = mask_of(views, masks, i)
         if first < end and surely_covered(views.nodes, i, t_low, t_high, views.block, margin, mask):
@@ -238,7 +238,7 @@ def block_coverage(views, masks, span, limit_low, limit_high, margin, lowest, hi
 @kernel
 def move_ends_to_relief(relief, span, lowest, highest):
     """Move by the relief those ends of one view's runs that the edge of the image causes, not the searched heights."""
-    first, last = span.first, span.first + span.count - 1
+    first, last = span.first, span.first + span.n_heights - 1
     for r in range(relief.shape[0]):
         for c in range(relief.shape[1]):
             low, high = lowest[r, c], highest[r, c]
@@ -258,11 +258,11 @@ def tile_coverage(views, masks, layout, limits, margin, relief, lowest, highest)
     relief : (r, c) float32, steps by which that surface lies above the one that the nodes follow within each block.
     """
     n_rows, n_cols = lowest.shape[1], lowest.shape[2]
-    for br in range(layout.count.shape[0]):
-        for bc in range(layout.count.shape[1]):
+    for br in range(layout.n_heights.shape[0]):
+        for bc in range(layout.n_heights.shape[1]):
             box = cells_of_block(br, bc, views.block, n_rows, n_cols)
             r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
-            span, of_block = HeightSpan(layout.first[br, bc], layout.count[br, bc]), views_of_block(views, br, bc)
+            span, of_block = HeightSpan(layout.first[br, bc], layout.n_heights[br, bc]), views_of_block(views, br, bc)
             block_coverage(
                 of_block, masks, span, limits.low[:, br, bc], limits.high[:, br, bc], margin,
                 lowest[:, r0:r1, c0:c1], highest[:, r0:r1, c0:c1],

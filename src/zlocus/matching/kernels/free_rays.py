@@ -62,7 +62,7 @@ def add_ray_costs(rays, slope_cells, layout, ray_cost, max_cost, cost):
         b = r // layout.block
         for c in range(n_cols):
             d = c // layout.block
-            first, count = layout.first[b, d], layout.count[b, d]
+            first, count = layout.first[b, d], layout.n_heights[b, d]
             start = layout.block_row_start[b, 0] + (r - b * layout.block) * layout.row_length[b, 0]
             start += layout.block_start[b, d] + (c - d * layout.block) * count
             lowest = np.float32(np.inf)

@@ -43,8 +43,8 @@ class ColumnSums(NamedTuple):
 class ViewPair(NamedTuple):
     """Numbers of two views. Unsigned, which leaves no negative index to be checked in the loops."""
 
-    a: int  # u8: first view
-    b: int  # u8: second view
+    a: np.uint64  # u8: first view
+    b: np.uint64  # u8: second view
 
 
 # (p,) f4, i8, i8, (p,) f4 -> None

@@ -17,7 +17,7 @@ class RaySweep(NamedTuple):
 
     along_cols: bool  # b1: whether the sweep goes from column to column (else from row to row)
     sign: int  # i8: 1 where rays rise towards larger columns (rows), else -1
-    gain: float  # f4: height that a ray gains from one cell to the next
+    gain: np.float32  # f4: height that a ray gains from one cell to the next
     drift: float  # f8: cells that a ray moves across the sweep from one cell to the next
     n_along: int  # i8: cells along the sweep
     n_across: int  # i8: cells across it

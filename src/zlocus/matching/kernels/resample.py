@@ -134,7 +134,7 @@ def pixel_positions(image, grid, velocity, cells, relief, first, end, scratch):
     x_mixed, y_mixed = np.float32(grid.x.mixed), np.float32(grid.y.mixed)
     vx, vy = velocity.x, velocity.y
     rows, cols, steps = cells.rows[first:end], cells.cols[first:end], relief[first:end]
-    index, fx, fy = scratch.index, scratch.fraction[0], scratch.fraction[1]
+    index, fx, fy = scratch.pixel_index, scratch.fraction[0], scratch.fraction[1]
     for j in range(end - first):
         r, c, z = rows[j], cols[j], steps[j]
         x = min(max(x0 + c * (x_col + r * x_mixed) + r * x_row + z * vx, x_low), x_high)
@@ -153,7 +153,7 @@ def gather(image, scratch, out):
     A pixel and the one to the right of it are read together, as a complex number, so that one load reads both. Loads
     from an index are scalar code; once they are apart, the interpolation vectorises.
     """
-    pixels, index = image.pixels, scratch.index
+    pixels, index = image.pixels, scratch.pixel_index
     beside = as_strided(pixels[: pixels.shape[0] // 2 * 2].view(np.complex64), (pixels.shape[0] - 1,), (4,))
     below, upper, lower = np.uint64(image.n_cols), scratch.pairs[0], scratch.pairs[1]
     for j in range(out.shape[0]):
@@ -176,7 +176,7 @@ def resample_plane(image, grid, velocity, cells, relief, scratch, out):
     c of them; relief : (c,) float32, steps by which each cell stands above the plane; out : (c,) float32 or longer.
     Positions outside the image are clamped to its edge (the caller masks them).
     """
-    run = scratch.index.shape[0]
+    run = scratch.pixel_index.shape[0]
     for first in range(0, relief.shape[0], run):
         end = min(first + run, relief.shape[0])
         pixel_positions(image, grid, velocity, cells, relief, first, end, scratch)

@@ -59,7 +59,7 @@ class HeightSpan(NamedTuple):
     """The height indices that a block of cells searches."""
 
     first: int  # i8: first height index
-    count: int  # i8: number of heights
+    n_heights: int  # i8: number of heights
 
 
 class CellBox(NamedTuple):
@@ -99,8 +99,8 @@ class BlockGrid(NamedTuple):
 class PixelVelocity(NamedTuple):
     """Pixels that the image position of a cell moves per height index."""
 
-    x: float  # f4: columns
-    y: float  # f4: rows
+    x: np.float32  # f4: columns
+    y: np.float32  # f4: rows
 
 
 class FlatCells(NamedTuple):
@@ -113,7 +113,7 @@ class FlatCells(NamedTuple):
 class ResampleScratch(NamedTuple):
     """Arrays that are reused from call to call, for n cells at a time."""
 
-    index: np.ndarray  # (n,) u4: index of the upper left of the four pixels around each cell
+    pixel_index: np.ndarray  # (n,) u4: index of the upper left of the four pixels around each cell
     fraction: np.ndarray  # (2,n) f4: distance (x, y) of the cell from that pixel, px
     pairs: np.ndarray  # (2,n) c8: upper and lower pixels; the left one is the real, the right one the imaginary part
 

@@ -158,8 +158,8 @@ def resample_surface(image, grids, cells, level, degree, out):
     """Write the image values on cells at individual heights: bilinear, or cubic B-spline from coefficients.
 
     image : pixels or B-spline coefficients; level : (p,) float32 in [-1, 1], heights, in which positions are quadratic;
-    degree : LINEAR or CUBIC; out : (p,) or longer. Positions are float32, counted from a whole pixel near the grid; those
-    outside the image are moved to its edge.
+    degree : LINEAR or CUBIC; out : (p,) or longer. Positions are float32, counted from a whole pixel near the grid;
+    those outside the image are moved to its edge.
     """
     path, n_cols, pixels = np.empty((2, 14), np.float32), image.n_cols, image.pixels
     origin = surface_path(grids, image, degree, path)
@@ -167,7 +167,7 @@ def resample_surface(image, grids, cells, level, degree, out):
     start = np.int32((origin[1] - before) * n_cols + origin[0] - before)
     position, whole, scratch = np.empty((2, RUN), np.float32), np.empty((2, RUN), np.float32), resample_scratch(RUN)
     across, down = np.empty((4, RUN), np.float32), np.empty((4, RUN), np.float32)
-    index = scratch.index
+    index = scratch.pixel_index
     for first in range(0, level.shape[0], RUN):
         end = min(first + RUN, level.shape[0])
         n = end - first
@@ -190,8 +190,9 @@ def block_profile(views, surface, sampling, visible, out):
     """Write the mean NCC over all pairs of the views that see the surface, at the offsets of the sampling from it.
 
     The windows follow the surface. surface : (r + 2 half, c + 2 half) float32 height indices, with the cells around the
-    block that its windows need (half is the last half width); out : (w, g, j, r, c) float32, 0 where fewer than two views see the cell. The pairs are divided into g groups (see
-    `add_pairs`); the sum over the groups is the mean over all pairs.
+    block that its windows need (half is the last half width); out : (w, g, j, r, c) float32, 0 where fewer than two
+    views see the cell. The pairs are divided into g groups (see `add_pairs`); the sum over the groups is the mean over
+    all pairs.
     """
     offsets, windows, degree, variance = sampling.offsets, sampling.windows, sampling.degree, sampling.noise_variance
     n_windows, n_groups, rows, cols = out.shape[0], out.shape[1], out.shape[3], out.shape[4]

@@ -135,7 +135,8 @@ def warm(group: str) -> None:
         return
     pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey_scales[0]) for view in scene.views]
     shape, block = (SIDE, SIDE), config.pyramid.block
-    views = tile_views(pixels, TileGrid(0, scene.transform(scene.overlap_window, 0), shape, block, 0.0, 1.0), (0.0, 16.0), 2)
+    cells = TileGrid(0, scene.transform(scene.overlap_window, 0), shape, block, 0.0, 1.0)
+    views = tile_views(pixels, cells, (0.0, 16.0), 2)
     for view in pixels:
         spline_coefficients(view.pixels[0])
     CurveSamples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(
