@@ -230,7 +230,7 @@ function peak(found) {
   if (found.peak_m === null) return "There is no peak.";
   const sigma = found.sigma_m[found.stop.images - 1];
   const precisely = digitsFor(found.step_m) + 1;
-  return `The peak lies at ${metres(found.peak_m, precisely)}, predicted to ${sigma === null ? "no precision" : metres(sigma, precisely)}.`;
+  return `The peak lies at ${metres(found.peak_m, precisely)}, ${sigma === null ? "without a predicted standard deviation" : `with a predicted standard deviation of ${metres(sigma, precisely)}`}.`;
 }
 
 // Distance of the surface from the peak, and the reason for it.
