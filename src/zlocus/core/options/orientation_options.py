@@ -47,7 +47,7 @@ class BundleAdjustmentOptions(Checked):
 
 @dataclass(frozen=True)
 class OrientationOptions(Checked):
-    """Tie points and the correction of the images' orientation (method section 7)."""
+    """Tie points and the correction of the images' orientation (method section 1)."""
 
     model: str = option(
         "auto", "Correction of the cameras. shift: one shift of each image; joint: a bundle adjustment of all cameras "
