@@ -9,6 +9,7 @@ import pytest
 
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.search_range import MAX_COST_MARGIN_OF_SECOND_HEIGHT, range_from_coarser
 
 OPTIONS = PyramidOptions(block=16, margin_steps=6, neighbour_cells=2)
@@ -16,8 +17,8 @@ OPTIONS = PyramidOptions(block=16, margin_steps=6, neighbour_cells=2)
 
 def coarse_result(best, second, margin, winner_takes_all, window):
     heights = SimpleNamespace(best=best, second=second, uniqueness=margin)
-    visible = np.zeros((3, 3, *best.shape), np.int32)
-    visible[1] = 100
+    zeros = np.zeros((3, *best.shape), np.int32)
+    visible = VisibleHeights(zeros, zeros + 100, zeros)
     return SimpleNamespace(
         level=SimpleNamespace(window=window), heights=heights, winner_takes_all=winner_takes_all, visible=visible,
         slope_surface=SimpleNamespace(cells=np.zeros(best.shape, np.float32)),
@@ -35,7 +36,11 @@ def search_range(second_at, margin_at, ties=(), side=3, winner_at=20):
     some = np.s_[10 : 10 + side, 12 : 12 + side]
     second[some], margin[some], winner_takes_all[some] = second_at, margin_at, winner_at
     match_scene = SimpleNamespace(
-        ties=np.array(ties, float).reshape(-1, 3), cell_size=0.5, anchor=(1000.0, 2000.0), height_origin=10.0, height_step=0.25
+        ties=np.array(ties, float).reshape(-1, 3),
+        cell_size=0.5,
+        anchor=(1000.0, 2000.0),
+        height_origin=10.0,
+        height_step=0.25,
     )
     level = SimpleNamespace(window=CellWindow(0, 0, 40, 40), number=1, height_origin=10.0, height_step=0.5)
     return range_from_coarser(
