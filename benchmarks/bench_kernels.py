@@ -19,14 +19,21 @@ import pytest
 
 from zlocus.matching.free_rays import pair_agreement
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.kernels.cost_volume import flat_cells, tile_costs
-from zlocus.matching.kernels.coverage import block_reach
+from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
+from zlocus.matching.kernels.coverage import ViewMasks, block_coverage
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.occlusion import lowest_visible
-from zlocus.matching.kernels.resample import resample_plane
+from zlocus.matching.kernels.resample import flat_cells, image_of, resample_plane, resample_scratch
 from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
-from zlocus.matching.kernels.shared_records import ViewArrays
+from zlocus.matching.kernels.shared_records import (
+    AxisGrid,
+    BlockGrid,
+    HeightSpan,
+    PixelVelocity,
+    ViewArrays,
+    VisibleHeights,
+)
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling, tile_ortho, tile_profile
@@ -89,11 +96,10 @@ def views(n_views: int, side: int = SIDE):
     return pixels, layout, nodes, np.array([-1.0, 2.0 / 64.0])
 
 
-def all_seen(n_views: int, side: int = SIDE):
+def all_visible(n_views: int, side: int = SIDE) -> VisibleHeights:
     """Every view sees every cell at every height."""
-    seen = np.zeros((3, n_views, side, side), np.int32)
-    seen[1] = HIGHEST
-    return seen
+    low = np.zeros((n_views, side, side), np.int32)
+    return VisibleHeights(low, np.full_like(low, HIGHEST), low)
 
 
 def lattice(side: int, count: int | None) -> HeightLattice:
@@ -121,17 +127,15 @@ def rolling(side: int = SIDE) -> np.ndarray:
 
 def resample_case() -> Case:
     """Bilinear samples of one view on the plane of a block and its margin."""
-    pixels, layout, _, _ = views(1)
-    side = BLOCK + 6
-    grid = np.array([60.3, 60.7, 0.99, 0.01, -0.02, 1.01, 0.0, 0.0])
-    n, cells = side * side, flat_cells((side, side))
-    index, fraction, pairs = np.empty(n, np.uint32), np.empty((2, n), np.float32), np.empty((2, n), np.complex64)
+    image, side = image_of(ViewArrays(*views(1), BLOCK), 0), BLOCK + 6
+    grid = BlockGrid(AxisGrid(60.3, 0.99, -0.02, 0.0), AxisGrid(60.7, 0.01, 1.01, 0.0))
+    cells, scratch = flat_cells(side, side), resample_scratch(side * side)
     relief, out = np.zeros(side * side, np.float32), np.empty(side * side, np.float32)
-    velocity = np.array([0.5, 0.1], np.float32)
+    velocity = PixelVelocity(np.float32(0.5), np.float32(0.1))
 
     def call():
         for _ in range(500):
-            resample_plane(pixels, layout[0], grid, cells, relief, velocity, index, fraction, pairs, out)
+            resample_plane(image, grid, velocity, cells, relief, scratch, out)
 
     return Case(call, 500 * side * side, "sample")
 
@@ -140,13 +144,14 @@ def costs_case(n_views: int, windows: list[int], weight: float, side: int = SIDE
     """Costs of a tile: half widths of its windows, weight of grey differences."""
     heights = lattice(side, 32)
     volume = np.empty(heights.size, np.uint8)
-    seen, half = all_seen(n_views, side), np.array(windows, np.int64)
-    border, measure = 2 * max(windows), np.array([0.0, weight, 0.3, 0.5, n_views, weight], np.float32)
-    base = np.zeros((side + border, side + border), np.float32), np.zeros((side // BLOCK + 1, side // BLOCK + 1))
-    scene = views(n_views, side)
+    visible, half = all_visible(n_views, side), np.array(windows, np.int64)
+    values = (np.float32(value) for value in (0.0, weight, weight, 0.3, 0.5))
+    parameters, wide = CostParameters(*values, n_views), side + 2 * max(windows)
+    slope = SlopeArrays(np.zeros((wide, wide), np.float32), np.zeros((side // BLOCK + 1, side // BLOCK + 1)))
+    arrays, layout = ViewArrays(*views(n_views, side), BLOCK), heights.layout
 
     def call():
-        tile_costs(*scene, *base, heights.ranges, heights.address, half, seen, BLOCK, measure, volume)
+        tile_costs(arrays, slope, layout, half, visible, parameters, volume)
 
     return Case(call, heights.size * n_views, "cell, step and image")
 
@@ -214,7 +219,7 @@ def least_case(count: int | None, side: int = SGM_SIDE) -> Case:
 def profile_case(side: int = SIDE) -> Case:
     """Correlations at three offsets around a surface, cubic resampling, windows 5 x 5 and 9 x 9, three views."""
     half, offsets = 4, np.linspace(-0.5, 0.5, 3).astype(np.float32)
-    surface, visible = np.pad(rolling(side), half, mode="edge"), all_seen(3, side)
+    surface, visible = np.pad(rolling(side), half, mode="edge"), all_visible(3, side)
     out, arrays = np.empty((2, 1, len(offsets), side, side), np.float32), ViewArrays(*views(3, side), BLOCK)
     sampling = ProfileSampling(CUBIC, offsets, np.array([2, half]), np.float32(0))
 
@@ -257,7 +262,7 @@ def ray_costs_case(side: int = SIDE, n_views: int = 6, count: int = 32) -> Case:
     base, cost = np.zeros((side, side), np.float32), np.zeros(lattice.size, np.uint8)
 
     def call():
-        add_ray_costs(rays, base, lattice.ranges, lattice.address, lattice.block, 12, 80, cost)
+        add_ray_costs(rays, base, lattice.layout, 12, 80, cost)
 
     return Case(call, side * side, "cell")
 
@@ -273,16 +278,16 @@ def reach_case() -> Case:
     """Visible height range of a block that the borders of three images cross at each of 64 heights (the slow case)."""
     pixels, layout, nodes, heights = views(3)
     layout[:, 2] = 48 + BLOCK // 2
-    span, limits = np.array([0, 64]), np.array([[-1] * 3, [64] * 3])
+    span, low, high = HeightSpan(0, 64), np.full(3, -1), np.full(3, 64)
     lowest, highest = np.empty((3, BLOCK, BLOCK), np.int32), np.empty((3, BLOCK, BLOCK), np.int32)
-    blocked, none = np.zeros(pixels.shape, bool), np.zeros(3, bool)
-    nodes = np.ascontiguousarray(nodes[:, :2, :2])
+    masks = ViewMasks(np.zeros(pixels.shape, bool), np.zeros(3, bool))
+    arrays = ViewArrays(pixels, layout, np.ascontiguousarray(nodes[:, :2, :2]), heights, BLOCK)
 
     def call():
         for _ in range(50):
-            block_reach(blocked, none, layout, nodes, heights, span, limits, BLOCK, 3.0, lowest, highest)
+            block_coverage(arrays, masks, span, low, high, 3.0, lowest, highest)
 
-    return Case(call, 50 * span[1] * lowest.size, "cell, step and image")
+    return Case(call, 50 * span.n_heights * lowest.size, "cell, step and image")
 
 
 def spline_case() -> Case:

@@ -1,4 +1,4 @@
-"""Twins of `lowest_visible`, `block_reach` and `smooth_surface`."""
+"""Twins of `lowest_visible`, `block_coverage` and `smooth_surface`."""
 
 from __future__ import annotations
 
