@@ -79,7 +79,7 @@ class RectangleSides(NamedTuple):
 
 
 def with_planes(
-    views: TileViews,
+    tile_views: TileViews,
     ortho: NDArray[np.float32],
     known: PlanarHeights,
     visible: VisibleHeights,
@@ -106,7 +106,7 @@ def with_planes(
     row, col = segments.row, segments.col
     before = height[row, col].astype(np.float64)
     is_visible = sees(visible.at(np.s_[:, row, col]), height[row, col])
-    fitted = _fitted_planes(views, segments, before, is_visible, PlaneLimits(float(noise), options.max_cost))
+    fitted = _fitted_planes(tile_views, segments, before, is_visible, PlaneLimits(float(noise), options.max_cost))
     is_near = np.abs(fitted.heights - before) < options.near_steps
     is_accepted = accepted_planes(segments, fitted, is_near, options)
     kept = is_accepted[segments.of_cell] & (segments.is_inner | is_near) & (is_visible.sum(axis=0) >= 2)
@@ -117,7 +117,7 @@ def with_planes(
 
 
 def _fitted_planes(
-    views: TileViews,
+    tile_views: TileViews,
     segments: PlainSegments,
     height: NDArray[np.float64],
     is_visible: NDArray[np.bool_],
@@ -129,7 +129,7 @@ def _fitted_planes(
         np.zeros(n_segments, np.bool_), np.zeros((n_segments, 3)), np.zeros((n_segments, 2, 2)), height.copy()
     )
     cells = PlaneCells(segments.row, segments.col, height, segments.is_core, is_visible)
-    fit_segments(segments.start, cells, views.arrays, limits, fitted)
+    fit_segments(segments.start, cells, tile_views.arrays, limits, fitted)
     return fitted
 
 

@@ -97,7 +97,7 @@ def smoothed(surface: FloatGrid, jump_steps: float) -> FloatGrid:
 
 
 def refine(
-    views: TileViews,
+    tile_views: TileViews,
     coefficients: NDArray[np.float32],
     coarse: FloatGrid,
     visible: VisibleHeights,
@@ -114,9 +114,9 @@ def refine(
     of the result is reduced: first by what wide windows find beside narrow ones (see `combined_windows`), then towards
     the smooth surface (see `lee_filtered`).
 
-    coefficients : (p,) cubic B-spline coefficients, arranged as the pixels of `views`; visible : (3, i, r, c), see
-    `coverage`; step_cells : height step divided by the side of a cell; is_fixed : (r, c), cells whose correlation is
-    computed like that of the others, but whose heights stay.
+    coefficients : (p,) cubic B-spline coefficients, arranged as the pixels of `tile_views`; visible : see `occlusion`;
+    step_cells : height step divided by the side of a cell; is_fixed : (r, c), cells whose correlation is computed like
+    that of the others, but whose heights stay.
     """
     is_fixed = np.zeros(coarse.shape, np.bool_) if is_fixed is None else is_fixed
     half = (options.window or default_window(step_cells)) // 2
@@ -126,7 +126,7 @@ def refine(
     for number in range(options.rounds):
         surface, is_last = smoothed(height, options.jump_steps), number == options.rounds - 1
         sampling = _sampling(half, number == 0, is_last)
-        arrays = views.arrays._replace(pixels=coefficients) if is_last else views.arrays
+        arrays = tile_views.arrays._replace(pixels=coefficients) if is_last else tile_views.arrays
         profiles = profiles_around(arrays, surface, sampling, 2 if is_last else 1, visible)
         profile = profiles[-1].sum(axis=0)
         peaks = parabola_peaks(profile, sampling.offsets)
@@ -156,14 +156,14 @@ def _sampling(half: int, is_first: bool, is_last: bool) -> ProfileSampling:
 
 
 def profiles_around(
-    views: ViewArrays, surface: FloatGrid, sampling: ProfileSampling, n_groups: int, visible: VisibleHeights
+    view_arrays: ViewArrays, surface: FloatGrid, sampling: ProfileSampling, n_groups: int, visible: VisibleHeights
 ) -> NDArray[np.float32]:
     """Correlation around a surface (r, c): (w, g, j, r, c) by window, group of image pairs and offset.
 
     The sum over the groups is the mean NCC over all pairs.
     """
     profiles = np.empty((len(sampling.windows), n_groups, len(sampling.offsets), *surface.shape), np.float32)
-    tile_profile(views, np.pad(surface, int(sampling.windows[-1]), mode="edge"), sampling, visible, profiles)
+    tile_profile(view_arrays, np.pad(surface, int(sampling.windows[-1]), mode="edge"), sampling, visible, profiles)
     return profiles
 
 
