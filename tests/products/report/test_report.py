@@ -200,7 +200,10 @@ def test_labels_are_a_sample_where_no_images_were_ranked(made):
         assert pair["good"] + pair["fair"] + pair["poor"] == pair["points"] == labels["points"] > 20
         assert pair["poor"] < 0.1 * pair["points"] < pair["good"]
     text = page_of(made).text("pairs")
-    assert f"This run ranked no images, so this is a sample for this page: {labels['points']} tie points" in text
+    assert (
+        f"This run ranked no images. The labels come from a sample that was made for this page: {labels['points']} tie points"
+        in text
+    )
     titles = [each["title"] for each in page_of(made).of("td") if "against" in (each.get("title") or "")]
     assert len(titles) == 6
     good = {frozenset(pair["images"]): words.percent(pair["good"], pair["points"]) for pair in labels["pairs"]}
@@ -235,7 +238,7 @@ def test_pairs_and_why_there_are_no_labels(out):
     (made / "curves.json").unlink()
     write_report(made)
     text = page_of(made).text("pairs")
-    assert "The run left no ranking of these images (ranking.gpkg), and no sample of one (curves.json)." in text
+    assert "The run wrote no ranking of these images (ranking.gpkg), and no sample of one (curves.json)." in text
     record = json.loads((made / "footprints.geojson").read_text())
     pairs = [each["properties"] for each in record["features"] if each["properties"]["kind"] == "overlap"]
     assert len(pairs) == 3
@@ -291,8 +294,8 @@ def test_missing_parts_are_said_in_words(out):
     write_report(out)
     parsed = page_of(out)
     assert "no match curves" in parsed.text("curves")
-    assert "no footprints" in parsed.text("where")
-    assert "None was given" in parsed.text("reference")
+    assert "wrote no footprints" in parsed.text("where")
+    assert "no reference was given" in parsed.text("reference")
 
 
 def test_a_surface_without_any_height_has_a_page(out):
@@ -303,7 +306,7 @@ def test_a_surface_without_any_height_has_a_page(out):
     write_report(out)
     parsed = page_of(out)
     assert "cover, 0.00 % have a height" in parsed.text("summary")
-    assert "100.0 % of the cells asked for have no height, mostly because: images do not agree" in parsed.text(
+    assert "100.0 % of the requested cells have no height, mostly because: the images do not agree" in parsed.text(
         "summary"
     )
     assert "No height has a standard deviation" in parsed.text("precision")
@@ -332,7 +335,7 @@ def test_the_comparison_is_that_of_evaluate(out, tmp_path):
     assert "Within: share of all cells in error by less than 0.5 m; errors in m." in text
     assert "MVS3DM (single cells): completeness" in text
     assert "<b>truth.tif" in text
-    assert f"{100 * figures.within:.1f} % one that is right to 0.5 m" in page_of(out).text("summary")
+    assert f"{100 * figures.within:.1f} % have one with an error below 0.5 m" in page_of(out).text("summary")
     alts = [each["alt"] for each in page_of(out).of("img")]
     assert len([alt for alt in alts if alt.startswith("Error of height")]) == 1
     (histogram,) = (alt for alt in alts if alt.startswith("Histogram of the errors"))
