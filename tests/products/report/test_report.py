@@ -182,10 +182,10 @@ def test_the_footprints_hold_the_surface(made):
     assert [each["fill"] for each in page_of(made).of("text")] == [
         each["stroke"] for each in page_of(made).of("polygon")
     ][:3]
-    assert all((each >= -0.05).all() and (each <= page.DRAWN + 0.05).all() for each in outlines)
+    assert all((each >= -0.05).all() and (each <= page.DRAWING_SIDE + 0.05).all() for each in outlines)
     # What two images share is about what the surface covers.
     middle = [each.mean(axis=0) for each in outlines]
-    assert np.ptp(middle, axis=0).max() < 0.2 * page.DRAWN
+    assert np.ptp(middle, axis=0).max() < 0.2 * page.DRAWING_SIDE
 
 
 def test_labels_are_a_sample_where_no_images_were_ranked(made):
@@ -216,7 +216,9 @@ def test_labels_that_cannot_be_sampled_fail_no_run(images, tmp_path, monkeypatch
 
     monkeypatch.setattr(zlocus.pipeline.report_inputs, "rank_tile", broken)
     out = run(images("sine"), tmp_path / "out", SMALL_TILES).out
-    assert "There are no labels of pairs. None could be made: RuntimeError: no luck." in page_of(out).text("pairs")
+    assert "There are no labels of pairs. The sample could not be made: RuntimeError: no luck." in page_of(out).text(
+        "pairs"
+    )
     assert page_of(out).text("curves").count("Typical: ") == 3
 
 
