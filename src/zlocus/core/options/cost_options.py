@@ -13,7 +13,7 @@ GROUND_LARGE_WINDOW = 5
 
 @dataclass(frozen=True)
 class CostOptions(Checked):
-    """How images are compared: windows, grey differences and occluded images (method sections 1 and 5)."""
+    """How images are compared: windows, grey differences and occluded images (method sections 4 and 5)."""
 
     small_window: int = option(3, "Side of the smaller correlation window.", choices=WINDOW_SIDES, unit="cells")
     large_window: int | None = option(

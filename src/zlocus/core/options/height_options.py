@@ -9,7 +9,7 @@ from zlocus.core.options.option_fields import Checked, option
 
 @dataclass(frozen=True)
 class RefineOptions(Checked):
-    """The last stage: sub-step heights from windows that follow the surface (method section 6)."""
+    """The last stage: sub-step heights from windows that follow the surface (method section 9)."""
 
     window: int | None = option(
         None,
@@ -30,7 +30,7 @@ class RefineOptions(Checked):
 
 @dataclass(frozen=True)
 class PlaneOptions(Checked):
-    """Planes that replace the heights of plain segments, such as roofs without texture (method section 6)."""
+    """Planes that replace the heights of plain segments, such as roofs without texture (method section 8)."""
 
     texture: float = option(
         0.4, "Grey deviation below which a cell is plain, as a share of the tile's median deviation. 0: no planes.",

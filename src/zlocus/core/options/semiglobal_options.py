@@ -9,7 +9,7 @@ from zlocus.core.options.option_fields import Checked, option
 
 @dataclass(frozen=True)
 class SemiGlobalOptions(Checked):
-    """Penalties of the semi-global constraint, in units in which NCC 0 costs 64 (method section 5)."""
+    """Penalties of the semi-global constraint, in units in which NCC 0 costs 64 (method section 7)."""
 
     predecessors: int | None = option(
         None, "Neighbours on which each of the eight path costs depends: 1 (semi-global) or 2 (more global, slower). "
