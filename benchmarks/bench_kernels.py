@@ -25,7 +25,7 @@ from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.occlusion import lowest_visible
 from zlocus.matching.kernels.resample import flat_cells, image_of, resample_plane, resample_scratch
-from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
+from zlocus.matching.kernels.sgm import sweep
 from zlocus.matching.kernels.shared_records import (
     AxisGrid,
     BlockGrid,
@@ -37,6 +37,7 @@ from zlocus.matching.kernels.shared_records import (
 from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling, tile_ortho, tile_profile
+from zlocus.matching.kernels.winners import winner_takes_all, winners
 from zlocus.matching.subpixel import smoothed
 from zlocus.products.hillshade import hillshade
 

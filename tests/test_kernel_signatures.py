@@ -9,13 +9,13 @@ import importlib
 import inspect
 import pkgutil
 import re
+import sys
 
 import pytest
 from numba.core import types
 
 import zlocus.matching.kernels
 import zlocus.orientation.kernels
-from zlocus.matching.kernels import shared_records
 
 
 def all_kernels():
@@ -62,7 +62,8 @@ def typed(shape, kind, module):
     if kind == "None":
         return types.none
     if kind not in DTYPES:
-        return record(getattr(module, kind, None) or getattr(shared_records, kind))
+        kernel_modules = [m for name, m in sys.modules.items() if name.startswith("zlocus.matching.kernels.")]
+        return record(next(getattr(m, kind) for m in (module, *kernel_modules) if hasattr(m, kind)))
     places = [place for place in (shape or "").split(",") if place]
     return types.Array(DTYPES[kind], len(places), "C") if places else DTYPES[kind]
 

@@ -11,7 +11,8 @@ from zlocus.core.options import SemiGlobalOptions
 from zlocus.matching.height_lattice import NARROW_BASE_STEP_CELLS, HeightLattice
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.penalties import PenaltyOptions, image_penalties
-from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
+from zlocus.matching.kernels.sgm import sweep
+from zlocus.matching.kernels.winners import winner_takes_all, winners
 from zlocus.matching.local_contrast import ALL, Part, edge_unit
 
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
@@ -56,9 +57,9 @@ def jump_penalties(
     """Penalty P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
 
     P2 decreases with the grey difference g of the two cells in the ortho-image, p2 / (1 + g / (edge_contrast median
-    g)), but not below p2_edge (Hirschmueller 2008, section 2.3, with the contrast of the cells of `core` as the unit). Both
-    are lower at coarser levels: there the same roof has half as many cells to pay for its jumps, and a roof that is
-    lost there stays lost.
+    g)), but not below p2_edge (Hirschmueller 2008, section 2.3, with the contrast of the cells of `core` as the unit).
+    Both are lower at coarser levels: there the same roof has half as many cells to pay for its jumps, and a roof that
+    is lost there stays lost.
 
     ortho : (r, c), NaN where the grey value is not known; has_two_views : (r, c), cells that only two views cover, to
     which `edge_contrast_two_images` applies.

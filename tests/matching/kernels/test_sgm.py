@@ -9,7 +9,8 @@ import pytest
 
 from kernel_scene import even_lattice, ragged_lattice, random_cost, random_p2
 from reference.semiglobal import dense, path_sums, winner
-from zlocus.matching.kernels.sgm import sweep, winner_takes_all, winners
+from zlocus.matching.kernels.sgm import sweep
+from zlocus.matching.kernels.winners import winner_takes_all, winners
 
 NO_RIVAL = 65535
 # A parabola through three whole numbers, in float32.
