@@ -21,7 +21,9 @@ def scanner(side):
     exposure = exposures_of(spec)[1]
     interval = -exposure.sensor.advance_m / SPEED_M_S
     lines = LineTimes.regular(0.0, interval, exposure.shape[0])
-    model = LineScanModel(focal_line(exposure.sensor), lines, sampled_trajectory(exposure.sensor, exposure.shape[0]), FrameSpace())
+    model = LineScanModel(
+        focal_line(exposure.sensor), lines, sampled_trajectory(exposure.sensor, exposure.shape[0]), FrameSpace()
+    )
     n = side or SIDE
     x, y = np.meshgrid(np.linspace(0.0, 120.0, n), np.linspace(0.0, -120.0, n))
     xyz = np.column_stack([x.ravel() + spec.west_m, y.ravel() + spec.north_m, np.full(n * n, 440.0)])

@@ -65,7 +65,7 @@ def run_here(command: Sequence[str]) -> None:
     """
     with redirect_stdout(sys.stderr):
         # In this mode the command line returns the status of a failure instead of ending the process.
-        status = cli.app(list(command), standalone_mode=False)
+        status = cli(list(command), standalone_mode=False)
     if status:
         raise CannotRun(f"`zlocus {command[0]}` ends with status {status}: its message stands above.")
 

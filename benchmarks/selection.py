@@ -38,6 +38,7 @@ from workplace import CannotRun, ended
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.io.scene_file import open_scene
 from zlocus.matching import tile
+from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import GOOD, ProgressiveMean, curve_peaks, quality_labels
 from zlocus.matching.match_scene import parallax_rate, reference_first
@@ -98,27 +99,27 @@ def ranked_by_geometry(images: dict[str, Path], crs: str, z: float) -> list[str]
 
 
 @contextmanager
-def watched(tiles: list[tuple[Any, np.ndarray, RunConfig]]) -> Iterator[None]:
+def watched(tiles: list[tuple[Any, VisibleHeights, RunConfig]]) -> Iterator[None]:
     """While active, record the finest level of every matched tile, for `final_curves`."""
-    used: list[np.ndarray] = []
-    costs, finish = tile.cost_volume, tile._finish
+    matched_heights: list[VisibleHeights] = []
+    costs, refine = tile.cost_volume, tile.refined_surface
 
-    def cost_volume(views: Any, base: Any, lattice: Any, seen: Any, *rest: Any) -> Any:
-        used[:] = [seen]
-        return costs(views, base, lattice, seen, *rest)
+    def cost_volume(*arguments: Any, **options: Any) -> Any:
+        matched_heights[:] = [a for a in (*arguments, *options.values()) if isinstance(a, VisibleHeights)]
+        return costs(*arguments, **options)
 
-    def finished(scene: Any, pixels: Any, result: Any, beyond: Any, config: RunConfig) -> Any:
-        tiles.append((result, used[0], config))
-        return finish(scene, pixels, result, beyond, config)
+    def refined_surface(tile_inputs: Any, result: Any, *rest: Any) -> Any:
+        tiles.append((result, matched_heights[0], tile_inputs.config))
+        return refine(tile_inputs, result, *rest)
 
-    tile.cost_volume, tile._finish = cost_volume, finished
+    tile.cost_volume, tile.refined_surface = cost_volume, refined_surface
     try:
         yield
     finally:
-        tile.cost_volume, tile._finish = costs, finish
+        tile.cost_volume, tile.refined_surface = costs, refine
 
 
-def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int) -> np.ndarray:
+def final_curves(result: Any, matched_heights: VisibleHeights, config: RunConfig, spacing: int) -> np.ndarray:
     """Largest correlation, ratio of the peaks, label and number of views of mean match curves, (n, 4).
 
     They are taken at one cell in `spacing`. The reference is the first (most nadir) view used at a cell.
@@ -127,7 +128,7 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
     surface = smoothed(result.heights.vertex, config.refine.jump_steps)
     rows, cols = (np.arange(half + spacing // 2, n - half, spacing) for n in surface.shape)
     cells = np.stack([v.ravel() for v in np.meshgrid(rows, cols, indexing="ij")], axis=1)
-    takes = covers(used)[:, cells[:, 0], cells[:, 1]].T
+    takes = covers(matched_heights)[:, cells[:, 0], cells[:, 1]].T
     cells, takes = cells[takes.sum(axis=1) > 1], takes[takes.sum(axis=1) > 1]
     row, col = cells.T
     here = surface[row, col]
@@ -137,11 +138,11 @@ def final_curves(result: Any, used: np.ndarray, config: RunConfig, spacing: int)
     index = samples.first[:, None] + np.arange(samples.n_heights)
     windows = []
     for view in range(takes.shape[1]):
-        found = samples.windows(result.views, view, slice(None))
-        found[index < result.seen[2, view, row, col][:, None]] = np.nan
+        found = samples.windows(result.tile_views, view, slice(None))
+        found[index < result.visible.lowest_unoccluded[view, row, col][:, None]] = np.nan
         windows.append(found)
     reference, everyone = takes.argmax(axis=1), np.arange(len(cells))
-    per_step = np.array([cells_per_step(result.views, i) for i in range(takes.shape[1])])
+    per_step = np.array([cells_per_step(result.tile_views, i) for i in range(takes.shape[1])])
     mean, widest_px = ProgressiveMean.empty(len(cells), samples.n_heights), np.zeros(len(cells))
     first = np.stack(windows)[reference, everyone]
     for view, found in enumerate(windows):
@@ -165,7 +166,7 @@ def run(name: str, choice: Choice, folder: Path, out: Path, curves: int = CURVES
     spacing = max(int(np.sqrt((bounds.right - bounds.left) * (bounds.top - bounds.bottom) / curves) / cell), 1)
     place = out / name.replace(",", "").replace(" ", "-")
     images = [folder / f"img_{image}.tif" for image in choice.images]
-    tiles: list[tuple[Any, np.ndarray, RunConfig]] = []
+    tiles: list[tuple[Any, VisibleHeights, RunConfig]] = []
     with watched(tiles):
         work = matched(
             images, place, choice.config,

@@ -244,7 +244,6 @@ SECOND_NAMES: dict[tuple[str, str], str] = {
     ("SurfaceFolder", "out"): "says its part in cli/inspect.py, cli/products.py, cli/report.py",
     ("Tile", "task"): "says its part in pipeline/image_tiles.py",
     ("Tile", "tasks"): "says its part in pipeline/image_tiles.py",
-    ("TileViews", "views"): "says its part in matching/plane_fitting.py, matching/subpixel.py",
     ("VerticalDatum", "vertical"): "says its part in products/rasters.py",
     ("ViewSpec", "view"): "says its part in synthetic/linescan.py, synthetic/scenes.py",
     ("ViewSpec", "views"): "says its part in synthetic/scenes.py",

@@ -17,7 +17,7 @@ from scipy.ndimage import median_filter, spline_filter
 
 from orientation_scenes import image_of
 from reference import agreement, semiglobal, surfaces
-from reference.projection import slope_relief, bilinear, positions
+from reference.projection import bilinear, positions, slope_relief
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import (
     CostOptions,

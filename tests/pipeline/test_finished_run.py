@@ -29,6 +29,7 @@ from zlocus.core.requests import FINISHED, CloudRequest, CurvesRequest, OrientRe
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileCheckpoint
 from zlocus.pipeline.finished_record import checksum
+from zlocus.pipeline.match_curves import run_curves
 from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rank import run_rank
 from zlocus.products.stac_item import PRODUCTS

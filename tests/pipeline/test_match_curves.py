@@ -206,7 +206,7 @@ def test_the_match_ends_where_the_mean_is_good(worth, least, n_used, is_stopped)
     found = point_curves(windows_of(ncc), order_of(3, worth), np.full(3, 0.5), np.arange(81.0), options)
     assert found.single_curves.labels.tolist() == [0, 1, -1]
     assert found.mean_curves.labels[:2].tolist() == [0, 1]
-    np.testing.assert_allclose(found.mean.values[2], ncc.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found.mean_curves.values[2], ncc.mean(axis=0), atol=1e-6)
     assert (found.n_used, found.is_stopped) == (n_used, is_stopped)
     assert abs(found.peak_index - 30) < 0.2
 

@@ -43,7 +43,7 @@ def path_sums(cost, p1, p2):
     return total
 
 
-def more_global_sums(cost, p1, p2):
+def more_global_path_sums(cost, p1, p2):
     """Facciolo, de Franchis, Meinhardt (2015), two predecessors, means rounded down, summed over eight directions.
 
     As `path_sums`; each cell is asked for its two neighbours' path costs, whatever the order.

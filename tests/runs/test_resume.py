@@ -45,7 +45,7 @@ from zlocus.core.progress import progress_for
 from zlocus.core.resources import held_bytes
 from zlocus.matching.quality import Quality
 from zlocus.pipeline.execution.checkpoint import BEFORE, FOLDER
-from zlocus.pipeline.execution.tasks import ATTEMPTS
+from zlocus.pipeline.execution.tasks import MAX_ATTEMPTS
 
 # Number of signals at random moments; benchmarks/acceptance.py sends more.
 SIGNALS = int(os.environ.get("ZLOCUS_SIGNALS", "8"))
@@ -224,8 +224,8 @@ def failing(monkeypatch, error, where=CENTRE):
     ("error", "says", "attempts"),
     [
         (IndexError("index 7 is out of bounds"), "IndexError: index 7 is out of bounds (a fault of zlocus", 1),
-        (MemoryError(), "it does not fit into memory", ATTEMPTS),
-        (OSError(5, "Input/output error"), "Input/output error", ATTEMPTS),
+        (MemoryError(), "it does not fit into memory", MAX_ATTEMPTS),
+        (OSError(5, "Input/output error"), "Input/output error", MAX_ATTEMPTS),
     ],
 )
 def test_a_tile_that_fails_costs_no_other(images, straight, tmp_path, monkeypatch, error, says, attempts):

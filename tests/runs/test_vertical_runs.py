@@ -16,8 +16,8 @@ from rasterio.transform import from_origin
 from shapely import from_wkb, get_coordinates
 from typer.testing import CliRunner
 
-from geoids import write_geoid
 from bundle_scenes import views_of
+from geoids import write_geoid
 from rendered_scenes import CENTRE, HEIGHTS, PART, SMALL_TILES, UTM, read, run
 from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError, GeometryError, InputError

@@ -12,11 +12,11 @@ import numpy as np
 import rasterio
 import uvicorn
 
+from zlocus.evaluation.comparison import Comparison
 from zlocus.inspector.guard import new_token
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.server import application
 from zlocus.inspector.serving import checked_address, listening
-from zlocus.evaluation.comparison import Comparison
 
 # The scene of a small run is open by then, kernels and all.
 OPENED_S = 120.0

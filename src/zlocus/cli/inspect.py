@@ -50,8 +50,8 @@ def inspect(options: InspectOptions) -> None:
         options.reference,
         {"--align": options.align, "--coregister": options.coregister, "--geoid": options.geoid},
     )
-    from zlocus.inspector.serving import inspect_surface
     from zlocus.evaluation.comparison import Comparison
+    from zlocus.inspector.serving import inspect_surface
 
     comparison = None
     if options.reference is not None:

@@ -30,9 +30,9 @@ def report(options: ReportOptions) -> None:
     )  # fmt: skip
     arguments = options.arguments()
     from zlocus.core.progress import SilentProgress
+    from zlocus.evaluation.comparison import Comparison
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import link_all
-    from zlocus.evaluation.comparison import Comparison
     from zlocus.products.report.page import write_report
 
     comparison = None if options.reference is None else Comparison(options.reference, **arguments)

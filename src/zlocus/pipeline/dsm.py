@@ -119,7 +119,10 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
         progress.note(str(plan))
     job, digest = tile_job(request, setup, config, run.polygons), digest_of(setup.match_scene, orientation)
     tile_run = TileRun(job, tiles, checkpoint, EventLog(out))
-    with made_folder(out), checkpoint.open(digest, {} if orientation.refined_ties is None else orientation.refined_ties.arrays()):
+    with (
+        made_folder(out),
+        checkpoint.open(digest, {} if orientation.refined_ties is None else orientation.refined_ties.arrays()),
+    ):
         tile_runs.append(tile_run)
         with watch.stage("match") as elsewhere:
             make = tile_maker(request, job, checkpoint, setup, plan, tally, progress)

@@ -41,9 +41,9 @@ from zlocus.matching.ground_pixels import check_resolution, default_cell, median
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
-from zlocus.orientation.tie_refinement import RefinedTies
-from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.plausibility import Doubt
+from zlocus.orientation.tie_heights import supported
+from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.height_range import heights_below_cameras, possible_heights, search_range, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
 

@@ -25,8 +25,8 @@ from zlocus.core.options import OrientationOptions
 from zlocus.core.scene import View
 from zlocus.io.scene_file import open_scene, open_usable_views
 from zlocus.orientation.orientation import Orientation
-from zlocus.orientation.tie_residuals import Residuals, ViewOrientation
 from zlocus.orientation.plausibility import Doubt, ExcludedImage
+from zlocus.orientation.tie_residuals import Residuals, ViewOrientation
 from zlocus.orientation.triangulate import Observations
 from zlocus.pipeline.doctor.geometry import geometry_findings
 from zlocus.pipeline.doctor.plan import RunPlan, plan_findings

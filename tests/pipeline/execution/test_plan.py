@@ -84,7 +84,9 @@ def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
     assert needs_of(scene_of(6), candidates=2).n_bytes < 0.9 * needs_of(scene_of(6)).n_bytes
     # Coarse cells hold many pixels.
     fine, coarse = scene_of(4), scene_of(4, cell_m=2.0)
-    per_cell = [needs_of(scene).n_bytes / (scene.overlap_window.rows * scene.overlap_window.cols) for scene in (fine, coarse)]
+    per_cell = [
+        needs_of(scene).n_bytes / (scene.overlap_window.rows * scene.overlap_window.cols) for scene in (fine, coarse)
+    ]
     assert per_cell[1] > 2 * per_cell[0]
 
 

@@ -13,7 +13,7 @@ import pytest
 from worker_tasks import Hungry, Planted, Sleeping
 from zlocus.core.errors import GeometryError, InputError
 from zlocus.pipeline.execution.processes import ONE_THREAD, Processes
-from zlocus.pipeline.execution.tasks import ATTEMPTS, Cause, Here, Outcome, failure_of, run_tasks
+from zlocus.pipeline.execution.tasks import MAX_ATTEMPTS, Cause, Here, Outcome, failure_of, run_tasks
 
 STOPS_WITHIN_S = 5.0
 
@@ -48,7 +48,7 @@ def test_what_may_pass_is_tried_again_when_the_others_are_done(tmp_path, slots):
     outcomes = run(planted, range(8), slots)
     ends = final(outcomes)
     assert {n for n, o in ends.items() if o.failure} == {1, 3, 5}
-    assert [planted.attempts(n) for n in (0, 1, 3, 5)] == [1, ATTEMPTS, ATTEMPTS, 1]
+    assert [planted.attempts(n) for n in (0, 1, 3, 5)] == [1, MAX_ATTEMPTS, MAX_ATTEMPTS, 1]
     assert (ends[1].failure.cause, ends[3].failure.cause, ends[5].failure.cause) == (
         Cause.MEMORY, Cause.INPUT, Cause.FAULT,
     )  # fmt: skip
@@ -57,13 +57,13 @@ def test_what_may_pass_is_tried_again_when_the_others_are_done(tmp_path, slots):
     assert "_fail" in ends[5].failure.trace
     first_again = next(i for i, o in enumerate(outcomes) if o.attempt > 1)
     assert {o.task for o in outcomes[:first_again]} >= {0, 2, 4, 6, 7}
-    assert [o.is_final for o in outcomes if o.task == 1] == [False] * (ATTEMPTS - 1) + [True]
+    assert [o.is_final for o in outcomes if o.task == 1] == [False] * (MAX_ATTEMPTS - 1) + [True]
 
 
 def test_a_task_that_passes_at_last(tmp_path):
-    outcomes = run(Planted(tmp_path, kill=(2,), exhaust=(4,), passes_after=ATTEMPTS - 1), range(6), 2)
+    outcomes = run(Planted(tmp_path, kill=(2,), exhaust=(4,), passes_after=MAX_ATTEMPTS - 1), range(6), 2)
     assert {n: o.result[0] for n, o in final(outcomes).items()} == {n: n * n for n in range(6)}
-    assert sum(o.failure is not None for o in outcomes) == 2 * (ATTEMPTS - 1)
+    assert sum(o.failure is not None for o in outcomes) == 2 * (MAX_ATTEMPTS - 1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc and limits of memory, which Linux has")
@@ -71,7 +71,7 @@ def test_a_worker_that_runs_out_of_memory_works_on(tmp_path):
     ends = final(run(Hungry(3), range(8), 2))
     assert {n for n, o in ends.items() if o.failure} == {3}
     assert ends[3].failure.cause is Cause.MEMORY
-    assert ends[3].attempt == ATTEMPTS
+    assert ends[3].attempt == MAX_ATTEMPTS
     assert {n: o.result for n, o in ends.items() if n != 3} == {n: n for n in range(8) if n != 3}
 
 
@@ -107,7 +107,7 @@ class OneByOne:
 def test_what_failed_is_tried_again_alone():
     ready = OneByOne()
     outcomes = list(run_tasks(ready, ["a", "large", "b", "c"]))
-    assert len(outcomes) == 3 + ATTEMPTS
+    assert len(outcomes) == 3 + MAX_ATTEMPTS
     assert ready.most["c"] == 3
     ready = OneByOne()
     ready.most.clear()

@@ -6,7 +6,7 @@ outside the allowed range are refused with the name of the field, the value and 
 
 from zlocus.core.options.cost_options import CostOptions, large_window_side
 from zlocus.core.options.height_options import CheckOptions, PlaneOptions, RefineOptions
-from zlocus.core.options.orientation_options import JointOptions, OrientationOptions
+from zlocus.core.options.orientation_options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.options.product_options import ProductOptions
 from zlocus.core.options.run_config import RunConfig
 from zlocus.core.options.search_options import PyramidOptions
@@ -14,9 +14,9 @@ from zlocus.core.options.selection_options import SelectionOptions
 from zlocus.core.options.semiglobal_options import SemiGlobalOptions
 
 __all__ = [
+    "BundleAdjustmentOptions",
     "CheckOptions",
     "CostOptions",
-    "JointOptions",
     "OrientationOptions",
     "PlaneOptions",
     "ProductOptions",

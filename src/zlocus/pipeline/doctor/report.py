@@ -10,8 +10,8 @@ from typing import Any
 from zlocus.core.footprints import PairGeometry, ViewGeometry
 from zlocus.core.scene import View
 from zlocus.io.scene_file import RefusedView
-from zlocus.orientation.tie_residuals import PairOrientation, ViewOrientation
 from zlocus.orientation.parameter_groups import kind_of
+from zlocus.orientation.tie_residuals import PairOrientation, ViewOrientation
 from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding, worst
 from zlocus.pipeline.doctor.plan import ROUGHLY, RunPlan
 from zlocus.pipeline.doctor.quality import ImageQuality, percent
@@ -146,7 +146,10 @@ def _view_rows(diagnosis: Diagnosis) -> Iterator[Sequence[str]]:
             greys = (*shares, _unit(quality.edge_px, "px"))
         ties = ("-",) * 3
         if oriented is not None:
-            ties = (str(oriented.n_ties), *(_unit(each.median, "px") for each in (oriented.residuals_before, oriented.residuals_after)))
+            ties = (
+                str(oriented.n_ties),
+                *(_unit(each.median, "px") for each in (oriented.residuals_before, oriented.residuals_after)),
+            )
         pixel = _unit(diagnosis.geometry[i].ground_px_m, "m") if diagnosis.geometry else "-"
         rows, cols = view.image.shape
         yield view.name, kind_of(view.sensor), f"{rows} x {cols}", pixel, *greys, *ties
