@@ -145,7 +145,7 @@ def test_standard_deviations_are_calibrated(small_town, tmp_path, monkeypatch, c
         assert curves.keys() == known.keys()
         assert np.isfinite(constants).all()
         # What may only raise the standard deviation does.
-        assert all(np.diff(curves[sign][2]).min() >= 0 for sign in ("noise", "rough", "moved"))
+        assert all(np.diff(curves[predictor][2]).min() >= 0 for predictor in ("noise", "roughness", "refinement"))
     assert Path(calibration.__file__).read_bytes() == before
 
 
