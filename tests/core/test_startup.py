@@ -10,7 +10,8 @@ import gc, sys
 from zlocus.core import startup
 startup.prepare()
 import zlocus.pipeline.dsm, pyogrio.raw
-print(gc.isenabled(), gc.get_threshold()[0] == startup.OBJECTS_PER_COLLECTION, sys.modules["pandas"], sys.modules["dask"])
+is_rare = gc.get_threshold()[0] == startup.OBJECTS_PER_COLLECTION
+print(gc.isenabled(), is_rare, sys.modules["pandas"], sys.modules["dask"])
 heavy = {"matplotlib", "scipy.ndimage", "zlocus.pipeline.report_inputs", "zlocus.evaluation.evaluate"}
 print(*sorted(heavy & set(sys.modules)))
 """

@@ -12,7 +12,7 @@ import yaml
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.options.option_fields import Checked, group, option
-from zlocus.core.options.renamed_keys import RENAMED_KEYS
+from zlocus.core.options.renamed_keys import REMOVED_KEYS, RENAMED_KEYS
 from zlocus.io import config as config_io
 from zlocus.io.config import config_as_dict, config_from_dict, read_config, write_config
 
@@ -168,6 +168,14 @@ def test_a_key_of_an_earlier_version_is_refused_with_its_new_name(tmp_path, old)
     *groups, name = old.split(".")
     (path := tmp_path / "c.toml").write_text(f"[{'.'.join(groups)}]\n{name} = 1\n" if groups else f"{name} = 1\n")
     with pytest.raises(ConfigError, match=re.escape(f"{old} is now called {RENAMED_KEYS[old]}.")):
+        read_config(path)
+
+
+@pytest.mark.parametrize("old", sorted(REMOVED_KEYS))
+def test_a_key_that_is_gone_is_refused_with_the_value_that_applies(tmp_path, old):
+    group_name, name = old.split(".")
+    (path := tmp_path / "c.toml").write_text(f"[{group_name}]\n{name} = 1\n")
+    with pytest.raises(ConfigError, match=re.escape(f"{old} is no longer an option; its value is always")):
         read_config(path)
 
 

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.options import RunConfig
-from zlocus.core.options.renamed_keys import RENAMED_KEYS
+from zlocus.core.options.renamed_keys import REMOVED_KEYS, RENAMED_KEYS
 from zlocus.io.safe_documents import read_yaml
 from zlocus.io.safe_text import check_last_line_ended, read_text
 
@@ -113,19 +113,24 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
 
 
 def _check_renamed(key: str, value: Any, where: str) -> None:
-    """Refuse a key that earlier versions used, with the key that replaces it.
+    """Refuse a key that earlier versions used, with the key that replaces it or the value that always applies.
 
-    key : with the names of its groups; value : where it is a group, the first of its keys that was renamed is named.
+    key : with the names of its groups; value : where it is a group, the first of its old keys is named.
 
     Raises
     ------
     ConfigError
-        The key, or one inside it, was renamed.
+        The key, or one inside it, was renamed or removed.
     """
     inside = [f"{key}.{name}" for name in value] if isinstance(value, Mapping) else []
     for old in (*inside, key):
         if old in RENAMED_KEYS:
             raise ConfigError(f"{where}: {old} is now called {RENAMED_KEYS[old]}. Rename it in the file.")
+        if old in REMOVED_KEYS:
+            raise ConfigError(
+                f"{where}: {old} is no longer an option; its value is always {REMOVED_KEYS[old]}. Remove it from the "
+                "file."
+            )
 
 
 def _unknown(name: str, known: list[str], where: str, prefix: str) -> str:

@@ -83,6 +83,11 @@ def ground_pixels(views: Sequence[View], z: float) -> list[float]:
     return [ground_sample_distance(view, z) for view in views]
 
 
+def cell_side(resolution: float | None, scene: Scene, z: float) -> float:
+    """Cell size of a run, m: the requested resolution, or else the default for the images at height z."""
+    return resolution or default_cell(scene, z)
+
+
 def default_cell(scene: Scene, z: float) -> float:
     """Default side of the cells, m, rounded to two digits: the median ground pixel at height z (m).
 

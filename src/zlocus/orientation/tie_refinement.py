@@ -22,6 +22,8 @@ from zlocus.orientation.triangulate import Observations
 
 # A view with fewer observations that could be refined (another season, haze) keeps them all as SIFT found them.
 MIN_REFINED_OF_VIEW = 50
+# Side of the patch by which each tie is refined in the full-resolution images.
+PATCH_PX = 9
 # Pixels around the searched positions that cubic interpolation and the last steps need.
 BORDER_PX = 4
 
@@ -65,7 +67,7 @@ def refine_ties(
     expected = observations.xy + np.einsum("mij,mj->mi", warp, (whole - observations.xy)[reference])
     found = np.zeros((len(observations), 3))
     reach = math.ceil(max(reduction(held_window(view.image)[2:], options) for view in views) / 2.0)
-    half = 2 * (options.patch_px // 2) + reach + BORDER_PX
+    half = 2 * (PATCH_PX // 2) + reach + BORDER_PX
 
     def refine_view(i: int) -> None:
         """Refine the observations of one view."""
@@ -139,7 +141,7 @@ def reference_patches(
     view : (m,) of all observations; whole : (m, 2) column and row of their whole pixels; rows : (k,) which are read,
     the other patches are zero. Patches have a border of one pixel for slopes.
     """
-    half = options.patch_px // 2 + 1
+    half = PATCH_PX // 2 + 1
     patches, usable = np.zeros((len(view), 2 * half + 1, 2 * half + 1), np.float32), np.zeros(len(view), bool)
 
     def read(i: int) -> None:

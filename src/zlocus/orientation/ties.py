@@ -23,6 +23,8 @@ from zlocus.orientation.triangulate import Observations
 
 Progress = Callable[[str, float], None]
 
+# Largest descriptor distance of a match, as a share of that of the second-best match (Lowe 2004).
+MAX_DESCRIPTOR_RATIO = 0.8
 # Points along each side of a part of an image of which epipolar curves are computed, to see which images may show it.
 PART_POINTS = 5
 # Parts whose curves are in memory at once: those of an image of 64 000 px a side.
@@ -258,7 +260,7 @@ def match_pair(
         curves = epipolar_curves(line.only(sample), sensor, line.z_range)
         if not len(xy_b) or not may_fall_inside(curves, views[b].image.shape, max_px):
             continue
-        first, second = match_along_curves(curves, features[a].only(sample), features[b], max_px, options.match_ratio)
+        first, second = match_along_curves(curves, features[a].only(sample), features[b], max_px, MAX_DESCRIPTOR_RATIO)
         here = epipolar_offsets(line.only(sample[first]), sensor, xy_b[second], line.z_range)
         shift = find_shift(here, max_px, inlier_px)
         if pointing is None or shift.inliers.sum() > pointing.inliers.sum():
@@ -267,7 +269,7 @@ def match_pair(
         return empty
     likely, near_px = likely_range(found.z[pointing.inliers]), 2.0 * inlier_px
     curves = epipolar_curves(likely_lines, sensor, likely).moved(pointing.shift_px)
-    first, second = match_along_curves(curves, features[a], features[b], near_px, options.match_ratio)
+    first, second = match_along_curves(curves, features[a], features[b], near_px, MAX_DESCRIPTOR_RATIO)
     moved_b = xy_b[second] - pointing.shift_px
     rest = find_shift(epipolar_offsets(likely_lines.only(first), sensor, moved_b, likely), near_px, inlier_px)
     if not rest.is_certain(options.min_ties):

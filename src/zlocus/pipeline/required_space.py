@@ -15,7 +15,7 @@ from zlocus.core.footprints import shared_ground
 from zlocus.core.grid import Grid
 from zlocus.core.resources import DEFAULT_MEMORY_SHARE, free_bytes
 from zlocus.core.scene import ColourSource, Scene, is_local
-from zlocus.matching.ground_pixels import default_cell
+from zlocus.matching.ground_pixels import cell_side
 from zlocus.matching.match_scene import MatchScene
 from zlocus.pipeline.execution.checkpoint import FOLDER
 from zlocus.pipeline.height_range import possible_heights
@@ -73,7 +73,7 @@ def check_room_before_ties(
             shared = shared_ground(scene, (z, z))
         except GeometryError:  # at this height nothing may be left to match
             return
-        cell_m = resolution or default_cell(scene, z)
+        cell_m = cell_side(resolution, scene, z)
         low, high = np.array(bounds or scene.bounds or shared).reshape(2, 2)
         asked = (high - low) / cell_m
         matched = np.maximum(np.minimum(high, shared[2:]) - np.maximum(low, shared[:2]), 0.0) / cell_m

@@ -37,7 +37,7 @@ from zlocus.io.grid_inputs import dem_datum, read_dem, read_geobox
 from zlocus.io.input_files import files_of
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, named_vertical_datum
-from zlocus.matching.ground_pixels import check_resolution, default_cell, median_ground_pixel
+from zlocus.matching.ground_pixels import cell_side, check_resolution, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
@@ -264,7 +264,7 @@ def grid_of_run(
         grid = grid_from_geobox(like, str(request.like))
         check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
         return grid
-    cell_m = request.resolution or default_cell(scene, z)
+    cell_m = cell_side(request.resolution, scene, z)
     check_resolution(cell_m, scene, z, "--resolution")
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     bounds = request.bounds or area_to_match(scene, z_range, ties)

@@ -17,6 +17,9 @@ from zlocus.products.smrf import between_blocks, block_mean, block_min, membrane
 FloatImage = NDArray[np.float32]
 # Ground is searched on at most this many blocks, of which some ten float32 arrays are in memory at a time.
 MAX_BLOCKS = 20_000_000
+# Ground is searched on blocks of about this side. A cell is ground within the tolerance of the option, plus this many
+# metres times the slope of the ground.
+GROUND_BLOCK_M, TOLERANCE_PER_SLOPE_M = 1.0, 1.25
 # Heights with these flags lie beside walls and trees, anywhere between roof and ground.
 DOUBTFUL = np.uint16(Quality.JUMP | Quality.DISPUTED | Quality.FILLED)
 
@@ -49,7 +52,7 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
             """Each strip with its heights that are ground, NaN elsewhere."""
             for strip in strips_of(shape[0], 0, strip_rows):
                 z = height_reader.read(strip)
-                allowed = options.ground_tolerance_m + options.ground_scaling * between_blocks(
+                allowed = options.ground_tolerance_m + TOLERANCE_PER_SLOPE_M * between_blocks(
                     slope, side, strip.row, z.shape
                 )
                 off = np.abs(z - between_blocks(first, side, strip.row, z.shape))
@@ -72,7 +75,7 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
 def _cells_of_a_block(height_reader: BandReader, options: ProductOptions) -> int:
     """Cells along the side of a block on which ground is searched."""
     rows, cols = height_reader.geobox.shape
-    return max(1, round(options.ground_cell_m / height_reader.cell_m), int(np.ceil(np.sqrt(rows * cols / MAX_BLOCKS))))
+    return max(1, round(GROUND_BLOCK_M / height_reader.cell_m), int(np.ceil(np.sqrt(rows * cols / MAX_BLOCKS))))
 
 
 def _by_blocks(height_reader: BandReader, side: int, strip_rows: int) -> FloatImage:

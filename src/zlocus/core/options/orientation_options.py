@@ -64,17 +64,10 @@ class OrientationOptions(Checked):
         "root of their size above this, so that the work grows with the square root of the number of pixels.",
         low=1e-3, high=1e6, unit="Mpx",
     )  # fmt: skip
-    patch_px: int = option(
-        9, "Side of the patch by which each tie is refined by least squares in the full-resolution images.", low=5,
-        high=51, unit="px",
-    )  # fmt: skip
     min_ncc: float = option(
         0.7, "Smallest correlation of a refined patch: observations below it are not used to correct the cameras.",
         low=0.0, high=1.0,
     )  # fmt: skip
-    match_ratio: float = option(
-        0.8, "Largest descriptor distance of a match, as a share of that of the second-best match.", low=0.1, high=1.0
-    )
     max_pointing_px: float = option(
         30.0, "Largest pointing error within which ties are searched.", low=1.0, high=1000.0, unit="px"
     )

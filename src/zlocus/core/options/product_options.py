@@ -34,9 +34,6 @@ class ProductOptions(Checked):
         12.0, "Contours: closed lines shorter than this are left out; 0 keeps all.",
         low=0.0, high=1e6, unit="cells",
     )  # fmt: skip
-    ground_cell_m: float = option(
-        1.0, "Terrain: approximate side of the blocks on which ground is searched.", low=0.01, high=1e3, unit="m"
-    )
     ground_window_m: float = option(
         40.0, "Terrain: half the width of the largest building or wood that is removed.", low=0.1, high=1e4, unit="m"
     )
@@ -48,6 +45,3 @@ class ProductOptions(Checked):
         0.5, "Terrain: a cell is ground where its height is this close to the provisional terrain.",
         low=0.0, high=100.0, unit="m",
     )  # fmt: skip
-    ground_scaling: float = option(
-        1.25, "Terrain: multiple of the slope that is added to the tolerance.", low=0.0, high=100.0, unit="m"
-    )

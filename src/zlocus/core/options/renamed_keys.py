@@ -1,6 +1,6 @@
-"""Configuration keys that earlier versions used, and the keys that replace them.
+"""Configuration keys that earlier versions used: those that were renamed, and those that are gone.
 
-A configuration file with an old key is refused with a message that names the new key.
+A configuration file with an old key is refused with a message that names the new key, or says that there is none.
 """
 
 # Old key, with the names of its groups, and the new key.
@@ -53,4 +53,13 @@ RENAMED_KEYS: dict[str, str] = {
     "orientation.joint.drift_s": "orientation.bundle_adjustment.drift_knot_interval_s",
     "orientation.least_ncc": "orientation.min_ncc",
     "orientation.prior_px": "orientation.sigma_shift_px",
+}
+
+# Keys that are no longer options, because nobody had a reason to change their values, with the value that always
+# applies.
+REMOVED_KEYS: dict[str, str] = {
+    "orientation.match_ratio": "0.8",
+    "orientation.patch_px": "9 px",
+    "products.ground_cell_m": "1 m",
+    "products.ground_scaling": "1.25 m",
 }

@@ -101,7 +101,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     from zlocus.orientation.epipolar import Sightlines, epipolar_curves
     from zlocus.orientation.sift import DESCRIPTOR_LENGTH, Features
     from zlocus.orientation.tie_refinement import refine_ties
-    from zlocus.orientation.ties import match_along_curves
+    from zlocus.orientation.ties import MAX_DESCRIPTOR_RATIO, match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
 
     sensors, options = [view.sensor for view in match_scene.views], RunConfig().orientation
@@ -109,7 +109,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
     curves = epipolar_curves(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
     for moved in (curves, curves.moved(np.zeros(2))):
-        match_along_curves(moved, features.only(point), features, options.inlier_px, options.match_ratio)
+        match_along_curves(moved, features.only(point), features, options.inlier_px, MAX_DESCRIPTOR_RATIO)
     seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
     ground = sensors[0].ground_from_image(xy, np.zeros(4))
     refine_ties(match_scene.views, seen, ground_jacobian(sensors, seen, ground), options)
