@@ -11,7 +11,7 @@ import typer
 
 from zlocus.cli.evaluate import Align, Coregister, Geoid, Margin
 from zlocus.cli.report import check_reference
-from zlocus.cli.shared_options import Reference, SurfaceFolder
+from zlocus.cli.shared_options import Reference, SurfaceFolderArgument
 from zlocus.core.errors import ConfigError
 
 NEEDED = ("anyio", "starlette", "uvicorn")
@@ -21,7 +21,7 @@ NEEDED = ("anyio", "starlette", "uvicorn")
 class InspectOptions:
     """Arguments and options of `zlocus inspect`."""
 
-    out: SurfaceFolder
+    out: SurfaceFolderArgument
     reference: Reference = None
     align: Align = False
     coregister: Coregister = None

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from zlocus.cli.shared_options import SurfaceFolder
+from zlocus.cli.shared_options import SurfaceFolderArgument
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import ProductOptions
 from zlocus.core.progress import progress_for
@@ -22,7 +22,7 @@ PRODUCTS_HELP = f"Maps to make: {', '.join(PRODUCTS)} (separated by commas), or 
 class ProductsOptions:
     """Arguments and options of `zlocus products`."""
 
-    out: SurfaceFolder
+    out: SurfaceFolderArgument
     names: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(PRODUCTS)
     config: Annotated[
         Path | None,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from zlocus.cli.evaluate import ComparisonOptions
-from zlocus.cli.shared_options import Reference, SurfaceFolder
+from zlocus.cli.shared_options import Reference, SurfaceFolderArgument
 from zlocus.core.errors import ConfigError
 
 
@@ -15,7 +15,7 @@ from zlocus.core.errors import ConfigError
 class ReportOptions(ComparisonOptions):
     """Arguments and options of `zlocus report`."""
 
-    out: SurfaceFolder
+    out: SurfaceFolderArgument
     reference: Reference = None
 
 

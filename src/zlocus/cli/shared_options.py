@@ -39,5 +39,5 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace another ru
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="File with options of every stage; see `zlocus config`.", metavar="FILE")
 ]
-SurfaceFolder = Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")]
+SurfaceFolderArgument = Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")]
 Reference = Annotated[Path | None, typer.Option(help="Raster of reference heights to compare with.", metavar="RASTER")]

@@ -84,7 +84,7 @@ def what_was_applied(orientation: Orientation) -> str:
         by = f"up to {math.hypot(*farthest.shift_px):.2f} px ({farthest.name})."
     if orientation.bundle_adjustment is not None:
         return (
-            f"Cameras corrected jointly from {len(orientation.refined_xyz)} tie points, to "
+            f"Cameras corrected by a bundle adjustment of {len(orientation.refined_xyz)} tie points, to "
             f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px; their images moved by, {by}"
         )
     return f"Pointing corrected from {len(orientation.xyz)} tie points, {by}"
