@@ -80,7 +80,7 @@ def test_zlocus_alone_is_compared_with_the_truth(here, tmp_path, monkeypatch, ca
     # What was measured is not measured again, and corrections that zlocus found are handed to others.
     run_script(monkeypatch, command, *asked)
     assert json.loads((out / "results.json").read_text())["surfaces"] == found["surfaces"]
-    (measured,) = running.scenes(running.ProgramComparison(["town"], side=SIDE), out)
+    (measured,) = running.scenes(running.PeerComparison(["town"], side=SIDE), out)
     shifts = own.shifts(out / "surfaces" / measured.slug / "zlocus", measured)
     assert shifts.keys() == {"n1", "f1"}
     assert np.abs(list(shifts.values())).max() < 0.5
@@ -101,10 +101,10 @@ def test_scenes_asked_for_are_rendered(tmp_path, monkeypatch):
     monkeypatch.setattr(
         scenes.Rendered, "scenes", lambda self, name, folder: [(name, self.side, n) for n in self.views]
     )
-    sides = running.scenes(running.ProgramComparison(["town"], side=64), tmp_path)
+    sides = running.scenes(running.PeerComparison(["town"], side=64), tmp_path)
     assert list(sides) == [("town of 64 cells", 64, 2), ("town of 64 cells", 64, 3)]
-    assert list(running.scenes(running.ProgramComparison(["town"]), tmp_path)) == [("town", 1024, 2), ("town", 1024, 3)]
-    assert list(running.scenes(running.ProgramComparison(["hills"]), tmp_path)) == []
+    assert list(running.scenes(running.PeerComparison(["town"]), tmp_path)) == [("town", 1024, 2), ("town", 1024, 3)]
+    assert list(running.scenes(running.PeerComparison(["hills"]), tmp_path)) == []
 
 
 def test_aggregation_is_timed_beside_other_programs(here, tmp_path, monkeypatch, capsys):
