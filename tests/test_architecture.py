@@ -241,7 +241,6 @@ SECOND_NAMES: dict[tuple[str, str], str] = {
     ("Restored", "_scene"): "says its part in inspector/inspection.py",
     ("Scene", "corrected"): "says its part in pipeline/doctor/run.py",
     ("SearchBounds", "searched"): "says its part in matching/overlap.py",
-    ("SurfaceFolder", "out"): "says its part in cli/inspect.py, cli/products.py, cli/report.py",
     ("Tile", "task"): "says its part in pipeline/image_tiles.py",
     ("Tile", "tasks"): "says its part in pipeline/image_tiles.py",
     ("VerticalDatum", "vertical"): "says its part in products/rasters.py",

@@ -12,10 +12,10 @@ from pyproj import CRS
 from rendered_scenes import UTM, camera
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.options import CostOptions, OrientationOptions, PyramidOptions, RunConfig, large_window_side
+from zlocus.core.options.option_fields import value_of
 from zlocus.core.scene import ImageWindow, Scene, View
 from zlocus.matching.image_space import (
     BORDER_PX,
-    DEPTH_DEFAULTS,
     END_STEPS,
     BorderedImage,
     beyond_range,
@@ -158,11 +158,16 @@ def test_the_widest_search_ends_where_no_other_view_sees():
 
 def test_options_that_were_changed_stay():
     plain = depth_options(RunConfig())
-    for stage, values in DEPTH_DEFAULTS.items():
-        assert {name: getattr(getattr(plain, stage), name) for name in values} == values
-    mine = RunConfig(cost=CostOptions(occluded_pairs_excluded=0.25))
-    assert depth_options(mine).cost.occluded_pairs_excluded == 0.25
-    assert depth_options(mine).cost.large_window == DEPTH_DEFAULTS["cost"]["large_window"]
+    assert (plain.cost.large_window, plain.cost.occluded_pairs_excluded, plain.cost.occlusion_margin_steps) == (
+        3,
+        1,
+        24,
+    )
+    assert (plain.semiglobal.predecessors, plain.semiglobal.p1, plain.semiglobal.p2) == (1, 20, 240)
+    for value in (0.25, value_of(CostOptions(), "occluded_pairs_excluded")):
+        mine = RunConfig(cost=CostOptions(occluded_pairs_excluded=value))
+        assert depth_options(mine).cost.occluded_pairs_excluded == value
+        assert depth_options(mine).cost.large_window == 3
 
 
 @pytest.mark.parametrize("side", [3, 5, 7])

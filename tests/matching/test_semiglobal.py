@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from kernel_scene import even_lattice
 from reference.semiglobal import BEHIND
 from zlocus.core.options import SemiGlobalOptions
+from zlocus.core.options.option_fields import value_of
 from zlocus.matching.local_contrast import edge_unit
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties, winner_takes_all_heights
 
@@ -47,7 +48,7 @@ def test_penalties_of_all_cells(shape):
     for path, (dr, dc) in enumerate(BEHIND):
         for r, c in np.ndindex(shape):
             away = abs(ortho[r, c] - ortho[max(r + dr, 0), min(max(c + dc, 0), shape[1] - 1)])
-            contrast = options.edge_contrast_two_images if has_two_views[r, c] else options.edge_contrast
+            contrast = value_of(options, "edge_contrast_two_images" if has_two_views[r, c] else "edge_contrast")
             plain = 240 / (1 + (0 if np.isnan(away) else away) / (contrast * unit))
             assert abs(found[path, r, c] - max(plain, 60)) <= 1, (path, r, c)
 

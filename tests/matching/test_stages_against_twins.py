@@ -26,6 +26,7 @@ from zlocus.core.options import (
     SelectionOptions,
     large_window_side,
 )
+from zlocus.core.options.option_fields import value_of
 from zlocus.core.scene import Scene, View
 from zlocus.matching import subpixel
 from zlocus.matching.cost_volume import cost_volume
@@ -222,7 +223,7 @@ def test_views_cover_the_heights_at_which_a_cell_falls_into_the_image(stages):
 def test_a_surface_occludes_what_marched_rays_meet(stages):
     occluder = cv2.erode(stages.prior.surface, stages.prior.erosion)
     visible, slope_cells = stages.visible.copy(), stages.search.slope_surface.cells
-    margin_steps = CONFIG.cost.occlusion_margin_steps
+    margin_steps = value_of(CONFIG.cost, "occlusion_margin_steps")
     hide(visible, stages.search.tile_views, occluder, slope_cells, margin_steps)
     n_occluded = 0
     for i in range(len(stages.images)):
@@ -246,7 +247,7 @@ def test_costs_are_those_of_windows_cut_out_one_by_one(stages):
     halves = sorted({options.small_window // 2, large_window_side(options) // 2})
     weights = (
         options.noise_deviation**2, options.grey_weight, options.max_grey_difference,
-        options.occluded_pairs_excluded, options.grey_weight_two_images,
+        value_of(options, "occluded_pairs_excluded"), value_of(options, "grey_weight_two_images"),
     )  # fmt: skip
     volume, lowest = stages.dense(stages.cost), int(lattice.first.min())
     padded = slope_surface.padded(max(halves))
@@ -264,14 +265,14 @@ def test_costs_are_those_of_windows_cut_out_one_by_one(stages):
 def test_penalties_decrease_with_grey_differences(stages):
     """P2 / (1 + g / (edge_contrast median g)), not below p2_edge, between each cell and its W, NW, N and NE."""
     options, (rows, cols) = CONFIG.semiglobal, stages.level.shape
-    unit = options.edge_contrast * edge_unit(stages.ortho)
+    unit = value_of(options, "edge_contrast") * edge_unit(stages.ortho)
     expected = np.empty((4, rows, cols))
     for path, (dr, dc) in enumerate(semiglobal.BEHIND):
         for r, c in np.ndindex(rows, cols):
             other = max(r + dr, 0), min(max(c + dc, 0), cols - 1)
             difference = abs(float(stages.ortho[r, c]) - float(stages.ortho[other]))
             difference = 0.0 if np.isnan(difference) else difference
-            expected[path, r, c] = max(options.p2 / (1 + difference / unit), options.p2_edge)
+            expected[path, r, c] = max(value_of(options, "p2") / (1 + difference / unit), value_of(options, "p2_edge"))
     # Penalties are rounded down.
     assert np.abs(stages.penalties - (expected - 0.5)).max() <= 0.5 + GREY
 
@@ -282,7 +283,7 @@ def test_semiglobal_heights_have_the_least_sums_of_path_costs(stages, predecesso
     options = replace(CONFIG.semiglobal, predecessors=predecessors)
     found = stages.heights(options)
     twin = semiglobal.path_sums if predecessors == 1 else semiglobal.more_global_path_sums
-    sums = twin(stages.dense(stages.cost), options.p1, stages.penalties)
+    sums = twin(stages.dense(stages.cost), value_of(options, "p1"), stages.penalties)
     first, count = stages.lattice.cell_ranges()
     from_zero = first - stages.lattice.first.min()
     for r, c in np.ndindex(stages.level.shape):

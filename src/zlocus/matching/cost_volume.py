@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import CostOptions, large_window_side
+from zlocus.core.options.option_fields import value_of
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.shared_records import VisibleHeights
@@ -48,8 +49,10 @@ def cost_parameters(options: CostOptions, is_pair: bool) -> CostParameters:
     return CostParameters(
         window_variance=np.float32(options.noise_deviation**2),
         grey_weight=np.float32(options.grey_weight),
-        grey_weight_two_images=np.float32(options.grey_weight if is_pair else options.grey_weight_two_images),
+        grey_weight_two_images=np.float32(
+            options.grey_weight if is_pair else value_of(options, "grey_weight_two_images")
+        ),
         max_grey_difference=np.float32(options.max_grey_difference),
-        occluded_pairs_excluded=np.float32(options.occluded_pairs_excluded),
+        occluded_pairs_excluded=np.float32(value_of(options, "occluded_pairs_excluded")),
         max_images_for_large_window=options.max_images_for_large_window,
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.footprints import ground_sample_distance
 from zlocus.core.grid import cells_of_bounds
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
+from zlocus.core.options.option_fields import with_depth_values
 from zlocus.core.scene import ImageSource, ImageWindow, Scene, View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.match_scene import MatchScene, levels_for
@@ -43,24 +43,6 @@ DISPARITY_MARGIN_PX = 8.0
 MIN_DISPARITY_PX = 0.5
 # Views whose equivalent disparity grows more slowly than this, px per unit of the hypothesis, show no depths.
 MIN_DISPARITY_RATE_PX = 1e-4
-# Defaults of some options for depths, see `depth_options`.
-DEPTH_DEFAULTS: dict[str, dict[str, Any]] = {
-    "cost": {
-        "large_window": 3,
-        "occluded_pairs_excluded": 1.0,
-        "occlusion_margin_steps": 24.0,
-        "grey_weight_two_images": 1.0,
-    },
-    "semiglobal": {
-        "predecessors": 1,
-        "p1": 20,
-        "p1_two_images": 20,
-        "p2": 240,
-        "p2_edge": 100,
-        "edge_contrast": 2.0,
-        "edge_contrast_two_images": 2.0,
-    },
-}
 MIN_BLOCK_CELLS = 8
 # Disparities at which the overlap with the other views is tested.
 DISPARITY_SAMPLES = 64
@@ -218,25 +200,18 @@ def bordered(view: View) -> View:
 
 
 def depth_options(config: RunConfig) -> RunConfig:
-    """The configuration with the defaults for depths, where an option has its usual default.
+    """The configuration with the values for depths, where options are unset.
 
-    The usual defaults are chosen for ground seen from above. Close objects have deep jumps and sharp texture. So the
-    correlation window is narrow, because every jump is an outline in the reference image, and the least penalty of
-    jumps is higher. Pairs with an occluded view are excluded whole, because the reference image is never occluded. A
-    view counts as occluded only far below the occluder, because the coarser surface blurs outlines by some steps, and
-    the cross-consistency check finds occlusions exactly.
+    The values of the ground grid are chosen for ground seen from above. Close objects have deep jumps and sharp
+    texture. So the correlation window is narrow, because every jump is an outline in the reference image, and the least
+    penalty of jumps is higher. Pairs with an occluded view are excluded whole, because the reference image is never
+    occluded. A view counts as occluded only far below the occluder, because the coarser surface blurs outlines by some
+    steps, and the cross-consistency check finds occlusions exactly.
     """
-    return _with_defaults(config, DEPTH_DEFAULTS)
-
-
-def _with_defaults(config: RunConfig, defaults: dict[str, dict[str, Any]]) -> RunConfig:
-    """The configuration with other values where its options have their defaults. defaults : by stage and option."""
-    changed = {}
-    for stage, values in defaults.items():
-        mine, default = getattr(config, stage), getattr(RunConfig(), stage)
-        chosen = {name: value for name, value in values.items() if getattr(mine, name) == getattr(default, name)}
-        changed[stage] = replace(mine, **chosen)
-    return replace(config, **changed)
+    # With one predecessor per path: jumps are sharp, and the second one costs time.
+    semiglobal = with_depth_values(config.semiglobal)
+    semiglobal = replace(semiglobal, predecessors=semiglobal.predecessors or 1)
+    return replace(config, cost=with_depth_values(config.cost), semiglobal=semiglobal)
 
 
 def hypotheses_of_heights(image_space: ImageSpace, z_range: tuple[float, float]) -> tuple[float, float] | None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import SemiGlobalOptions
+from zlocus.core.options.option_fields import value_of
 from zlocus.matching.height_lattice import NARROW_BASE_STEP_CELLS, HeightLattice
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.penalties import PenaltyOptions, image_penalties
@@ -65,12 +66,14 @@ def jump_penalties(
     which `edge_contrast_two_images` applies.
     """
     factor = options.penalty_factor_per_level**level
-    p2, p2_edge = options.p2 * factor, min(options.p2_edge, options.p2) * factor
+    p2 = value_of(options, "p2") * factor
+    p2_edge = min(value_of(options, "p2_edge"), value_of(options, "p2")) * factor
     if ortho is None:
         return np.full((PATHS, *shape), p2, np.uint16)
     penalties = np.empty((PATHS, *shape), np.uint16)
     unit = np.float32(max(edge_unit(ortho, core), 1e-6))
-    units = np.array([options.edge_contrast, options.edge_contrast_two_images], np.float32) * unit
+    contrasts = [value_of(options, name) for name in ("edge_contrast", "edge_contrast_two_images")]
+    units = np.array(contrasts, np.float32) * unit
     has_two_views = np.zeros(shape, np.bool_) if has_two_views is None else has_two_views
     image_penalties(
         ortho, has_two_views, PenaltyOptions(np.float32(p2), np.float32(p2_edge), units[0], units[1]), penalties
@@ -93,7 +96,7 @@ def aggregate(
     find more roofs and take up to twice the time; with a narrow base, where a step is as high as a storey, they find
     few more.
     """
-    p1 = options.p1_two_images if is_pair else options.p1
+    p1 = value_of(options, "p1_two_images" if is_pair else "p1")
     if (options.predecessors or (1 if step_cells > NARROW_BASE_STEP_CELLS else 2)) == 2:
         return heights_of_sums(more_global_path_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
+from zlocus.core.options.option_fields import value_of
 from zlocus.matching.cost_volume import cost_volume
 from zlocus.matching.fill import filled
 from zlocus.matching.finest_level import ortho_of_surface, refined_surface, with_planes_of_segments
@@ -334,7 +335,7 @@ def visible_heights(tile: TileInputs, search: LevelSearch, prior: SearchPrior) -
     visible = covered_heights(search.slope_views, search.slope_surface, search.lattice)
     if prior.surface is not None and tile.handles_occlusion:
         occluder = cv2.erode(prior.surface, prior.erosion)
-        margin_steps = tile.config.cost.occlusion_margin_steps
+        margin_steps = value_of(tile.config.cost, "occlusion_margin_steps")
         mark_occlusions(visible, search.tile_views, occluder, search.slope_surface.cells, margin_steps)
         keep_both_views_of_pairs(visible)
     return visible

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field, fields
-from typing import Any
+from dataclasses import field, fields, replace
+from typing import Any, TypeVar
 
 from zlocus.core.errors import ConfigError
+
+Options = TypeVar("Options", bound=Any)
 
 
 def option(default: Any, doc: str, *, low: float | None = None, high: float | None = None,
@@ -14,6 +16,34 @@ def option(default: Any, doc: str, *, low: float | None = None, high: float | No
     """A dataclass field with its sentence, unit and allowed range (inclusive)."""
     meta = {"doc": doc, "low": low, "high": high, "choices": choices, "unit": unit}
     return field(default=default, metadata=meta)
+
+
+def option_by_method(ground: Any, depth: Any, doc: str, **limits: Any) -> Any:
+    """A field that is unset by default, so that the method decides its value, and a value that the user sets stays.
+
+    ground, depth : its value on the ground grid, and for depths in image space; limits : see `option`.
+    """
+    decided = f"Unset: decided by the method, {ground:g} on the ground grid, {depth:g} for depths in image space."
+    by_method = option(None, f"{doc} {decided}", **limits)
+    return field(default=None, metadata={**by_method.metadata, "ground": ground, "depth": depth})
+
+
+def value_of(options: Any, name: str) -> Any:
+    """The value of an option: as set, else as the method decides on the ground grid."""
+    value = getattr(options, name)
+    if value is not None:
+        return value
+    return next(f.metadata.get("ground") for f in fields(options) if f.name == name)
+
+
+def with_depth_values(options: Options) -> Options:
+    """The options with the values for depths in image space where they are unset."""
+    unset = {
+        f.name: f.metadata["depth"]
+        for f in fields(options)
+        if "depth" in f.metadata and getattr(options, f.name) is None
+    }
+    return replace(options, **unset)
 
 
 def group(factory: Callable[[], Any], doc: str) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zlocus.core.options.option_fields import Checked, option
+from zlocus.core.options.option_fields import Checked, option, option_by_method
 
 
 @dataclass(frozen=True)
@@ -15,24 +15,28 @@ class SemiGlobalOptions(Checked):
         None, "Neighbours on which each of the eight path costs depends: 1 (semi-global) or 2 (more global, slower). "
         "Unset: 1 where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
-    p1: int = option(45, "Penalty P1 of a height difference of one step between neighbours.", low=0, high=1000)
-    p1_two_images: int = option(
-        110, "Penalty P1 in scenes of two images: the match curves of a single pair are noisy.", low=0, high=1000
+    p1: int | None = option_by_method(
+        45, 20, "Penalty P1 of a height difference of one step between neighbours.", low=0, high=1000
     )
-    p2: int = option(
-        400, "Penalty P2 of a larger height difference where the ortho-image has no edge.", low=1, high=4000
+    p1_two_images: int | None = option_by_method(
+        110, 20, "Penalty P1 in scenes of two images: the match curves of a single pair are noisy.", low=0, high=1000
     )
-    p2_edge: int = option(45, "Penalty P2 across a strong edge of the ortho-image.", low=1, high=4000)
+    p2: int | None = option_by_method(
+        400, 240, "Penalty P2 of a larger height difference where the ortho-image has no edge.", low=1, high=4000
+    )
+    p2_edge: int | None = option_by_method(
+        45, 100, "Penalty P2 across a strong edge of the ortho-image.", low=1, high=4000
+    )
     penalty_factor_per_level: float = option(
         0.85, "Factor by which P2 decreases from each pyramid level to the next coarser one, where a roof has fewer "
         "cells.",
         low=0.1, high=1.0,
     )  # fmt: skip
-    edge_contrast: float = option(
-        1.0, "Grey difference in the ortho-image that halves P2. In units of the tile's median grey difference.",
+    edge_contrast: float | None = option_by_method(
+        1.0, 2.0, "Grey difference in the ortho-image that halves P2. In units of the tile's median grey difference.",
         low=0.01, high=1e3,
     )  # fmt: skip
-    edge_contrast_two_images: float = option(
-        4.0, "The same in cells that only two images cover: a single pair agrees by chance at many heights.",
+    edge_contrast_two_images: float | None = option_by_method(
+        4.0, 2.0, "The same in cells that only two images cover: a single pair agrees by chance at many heights.",
         low=0.01, high=1e3,
     )  # fmt: skip
