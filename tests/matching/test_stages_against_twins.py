@@ -29,13 +29,14 @@ from zlocus.core.options import (
 from zlocus.core.options.option_fields import value_of
 from zlocus.core.scene import Scene, View
 from zlocus.matching import subpixel
-from zlocus.matching.cost_volume import cost_volume
+from zlocus.matching.cost_volume import cost_parameters, cost_volume
+from zlocus.matching.kernels.shared_records import NEVER_OCCLUDED, VisibleHeights
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling
 from zlocus.matching.level_records import PyramidLevel, SearchPrior, TileInputs
 from zlocus.matching.local_contrast import edge_unit
 from zlocus.matching.match_scene import build_match_scene
-from zlocus.matching.occlusion import BORDER_PX, NOTHING_HIDDEN, above_base, coverage, covers, hide
+from zlocus.matching.occlusion import EDGE_PX, covered_heights, covers, in_level_indices, mark_occlusions
 from zlocus.matching.search_range import prior_from_coarser
 from zlocus.matching.semiglobal import aggregate, jump_penalties, winner_takes_all_indices
 from zlocus.matching.subpixel import parabola_peaks, profiles_around, smoothed
@@ -76,7 +77,7 @@ class Stages:
     level: PyramidLevel
     prior: SearchPrior
     search: LevelSearch
-    visible: np.ndarray
+    visible: VisibleHeights
     cost: np.ndarray
     ortho: np.ndarray
     penalties: np.ndarray
@@ -139,7 +140,7 @@ def stages():
     level = tile.level(0)
     prior = prior_from_coarser(tile, level, coarsest)
     search = search_along_slope(tile, level, prior)
-    visible = coverage(search.slope_views, search.slope_surface, search.lattice)
+    visible = covered_heights(search.slope_views, search.slope_surface, search.lattice)
     cost = cost_volume(search.slope_views, search.slope_surface, search.lattice, visible, CONFIG.cost)
     ortho = np.where(covers(visible)[0], ortho_image(search.tile_views, search.smooth, 0), np.float32(np.nan))
     penalties = jump_penalties(ortho, level.shape, 0, CONFIG.semiglobal)
@@ -167,7 +168,7 @@ def test_projection_tables_give_the_positions_of_the_cameras(stages):
                 z = np.full(x.shape, level.height_origin + index * level.height_step)
                 xyz = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
                 exact = view_pixels.sensor.image_from_ground(xyz) - np.array(view_pixels.origin[::-1])
-                t = views.heights[0] + index * views.heights[1]
+                t = views.t_of_index[0] + index * views.t_of_index[1]
                 found = positions(views.nodes[i, b : b + 2, d : d + 2], t, x.shape, views.block)
                 np.testing.assert_allclose(found.reshape(-1, 2), exact, rtol=0, atol=TABLE_PX)
 
@@ -186,7 +187,7 @@ def test_an_image_on_a_surface_is_resampled_at_the_projected_cells(stages):
     for i, image in enumerate(stages.images):
         found = ortho_image(views, stages.search.smooth, i)
         for b, d, rows, cols in stages.blocks():
-            t = views.heights[0] + smooth[rows, cols] * views.heights[1]
+            t = views.t_of_index[0] + smooth[rows, cols] * views.t_of_index[1]
             xy = positions(views.nodes[i, b : b + 2, d : d + 2], t, t.shape, views.block)
             inside = (xy > 1).all(axis=-1) & (xy < np.array(image.shape[::-1]) - 2).all(axis=-1)
             expected = bilinear(image, xy)
@@ -203,12 +204,12 @@ def test_views_cover_the_heights_at_which_a_cell_falls_into_the_image(stages):
             node, shape = views.nodes[i, b : b + 2, d : d + 2], (rows.stop - rows.start, cols.stop - cols.start)
             inside = []
             for k in range(first, first + count):
-                xy = positions(node, views.heights[0] + k * views.heights[1], shape, views.block)
-                last = np.array(image.shape[::-1]) - 1 - BORDER_PX
-                inside.append(((xy >= BORDER_PX) & (xy <= last)).all(axis=-1))
+                xy = positions(node, views.t_of_index[0] + k * views.t_of_index[1], shape, views.block)
+                last = np.array(image.shape[::-1]) - 1 - EDGE_PX
+                inside.append(((xy >= EDGE_PX) & (xy <= last)).all(axis=-1))
             inside = np.stack(inside, axis=-1)
             for r, c in np.ndindex(shape):
-                low, high = stages.visible[:2, i, rows.start + r, cols.start + c]
+                low, high, _ = stages.visible.at((i, rows.start + r, cols.start + c))
                 run = surfaces.longest_run(inside[r, c])
                 if run is None:
                     assert low > high
@@ -224,15 +225,15 @@ def test_a_surface_occludes_what_marched_rays_meet(stages):
     occluder = cv2.erode(stages.prior.surface, stages.prior.erosion)
     visible, slope_cells = stages.visible.copy(), stages.search.slope_surface.cells
     margin_steps = value_of(CONFIG.cost, "occlusion_margin_steps")
-    hide(visible, stages.search.tile_views, occluder, slope_cells, margin_steps)
+    mark_occlusions(visible, stages.search.tile_views, occluder, slope_cells, margin_steps)
     n_occluded = 0
     for i in range(len(stages.images)):
         for part in parts_of_one_direction(stages.search.tile_views, i):
             by_col, by_row = cells_per_step(stages.search.tile_views, i, part)
             lowest = surfaces.marched(occluder.astype(float), by_col, by_row) - margin_steps - slope_cells
-            found, expected = visible[2, i][part], lowest[part]
-            free = expected < NOTHING_HIDDEN
-            assert (found[free] == NOTHING_HIDDEN).all()
+            found, expected = visible.lowest_unoccluded[i][part], lowest[part]
+            free = expected < NEVER_OCCLUDED
+            assert (found[free] == NEVER_OCCLUDED).all()
             # The kernel rounds to whole steps, and interpolates a bound again at every cell, which lowers edges.
             difference = np.abs(found[~free] - expected[~free])
             assert np.quantile(difference, 0.95) <= 1.0
@@ -245,19 +246,16 @@ def test_costs_are_those_of_windows_cut_out_one_by_one(stages):
     views, lattice, slope_surface = stages.views, stages.lattice, stages.search.slope_surface
     options = CONFIG.cost
     halves = sorted({options.small_window // 2, large_window_side(options) // 2})
-    weights = (
-        options.noise_deviation**2, options.grey_weight, options.max_grey_difference,
-        value_of(options, "occluded_pairs_excluded"), value_of(options, "grey_weight_two_images"),
-    )  # fmt: skip
+    parameters = cost_parameters(options, is_pair=False)
     volume, lowest = stages.dense(stages.cost), int(lattice.first.min())
     padded = slope_surface.padded(max(halves))
     for b, d, rows, cols in stages.blocks():
         nodes, corners = views.nodes[:, b : b + 2, d : d + 2], slope_surface.nodes[b : b + 2, d : d + 2]
         relief = slope_relief(padded.astype(float), corners, rows, cols, views.block, max(halves))
-        visible = stages.visible[:, :, rows, cols]
+        visible = stages.visible.at(np.s_[:, rows, cols])
         for k in range(int(lattice.first[b, d]), int(lattice.first[b, d] + lattice.count[b, d])):
             expected = agreement.cell_costs(
-                stages.images, nodes, views.heights, k, views.block, halves, visible, weights, relief
+                stages.images, nodes, views.t_of_index, k, views.block, halves, visible, parameters, relief
             )
             assert np.abs(volume[rows, cols, k - lowest] - np.clip(expected, 0, 255)).max() < COST
 
@@ -312,7 +310,7 @@ def test_correlation_profiles_follow_the_smooth_surface(stages):
     splines = [spline_coefficients(image) for image in stages.images]
     for image, spline in zip(stages.images, splines, strict=True):
         np.testing.assert_allclose(spline, spline_filter(image, 3, output=np.float32, mode="mirror"), atol=10 * GREY)
-    visible = above_base(stages.visible.copy(), stages.search.slope_surface.cells)
+    visible = in_level_indices(stages.visible.copy(), stages.search.slope_surface.cells)
     sampling = ProfileSampling(CUBIC, subpixel.LATER_OFFSETS, np.array([half]), np.float32(0.0))
     arrays = views.arrays._replace(pixels=np.concatenate([spline.ravel() for spline in splines]))
     found = profiles_around(arrays, surface, sampling, 1, visible)[0, 0]
@@ -323,7 +321,14 @@ def test_correlation_profiles_follow_the_smooth_surface(stages):
         nodes = views.nodes[:, b : b + 2, d : d + 2]
         for j, offset in enumerate(subpixel.LATER_OFFSETS):
             expected[j, rows, cols] = agreement.profile(
-                stages.images, nodes, views.heights, around, float(offset), views.block, half, visible[:, :, rows, cols]
+                stages.images,
+                nodes,
+                views.t_of_index,
+                around,
+                float(offset),
+                views.block,
+                half,
+                visible.at(np.s_[:, rows, cols]),
             )
     np.testing.assert_allclose(found, expected, rtol=0, atol=NCC)
     assert found[1].mean() > 0.4

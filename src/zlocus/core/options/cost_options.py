@@ -42,8 +42,8 @@ class CostOptions(Checked):
         low=0.01, high=10.0,
     )  # fmt: skip
     occluded_pairs_excluded: float | None = option_by_method(
-        0.5, 1.0, "Share of the pairs with an occluded image that is excluded from the mean; the other such pairs count "
-        "as uncorrelated.",
+        0.5, 1.0, "Share of the pairs with an occluded image that is excluded from the mean; the other such pairs "
+        "count as uncorrelated.",
         low=0.0, high=1.0,
     )  # fmt: skip
     occlusion_margin_steps: float | None = option_by_method(
