@@ -38,7 +38,7 @@ from zlocus.orientation.parameter_groups import (
 )
 from zlocus.orientation.shift_adjustment import adjust
 from zlocus.orientation.triangulate import project_points
-from zlocus.sensors.correction import AffineModel, ShiftedModel
+from zlocus.sensors.correction import AffinelyShiftedModel, ShiftedModel
 from zlocus.sensors.trajectory import Drift
 
 OPTIONS = OrientationOptions()
@@ -156,7 +156,8 @@ def test_affine_errors_of_rpcs_are_recovered_with_control():
     exact = affine_sensors()
     rng = np.random.default_rng(6)
     flawed = [
-        AffineModel(s, *map(tuple, np.column_stack([rng.normal(0, 3, 2), rng.normal(0, 2e-3, (2, 2))]))) for s in exact
+        AffinelyShiftedModel(s, *map(tuple, np.column_stack([rng.normal(0, 3, 2), rng.normal(0, 2e-3, (2, 2))])))
+        for s in exact
     ]
     options = OrientationOptions(bundle_adjustment=replace(EXACT, rpc_correction="affine"))
     control = control_of(exact, random_ground(8, seed=4), AFFINE_SIZE)
@@ -256,7 +257,7 @@ def test_many_ties_do_not_move_cameras_that_they_hardly_hold():
 
 
 def test_an_affine_correction_there_and_back():
-    model = AffineModel(affine_sensors()[1], (3.0, 0.1, -0.2), (-5.0, 0.05, 0.15))
+    model = AffinelyShiftedModel(affine_sensors()[1], (3.0, 0.1, -0.2), (-5.0, 0.05, 0.15))
     xy = np.random.default_rng(1).uniform(0, 800, (50, 2))
     xyz = model.ground_from_image(xy, np.linspace(100.0, 160.0, 50))
     np.testing.assert_allclose(model.image_from_ground(xyz), xy, rtol=0, atol=1e-9)

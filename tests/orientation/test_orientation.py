@@ -16,7 +16,7 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.scene import Scene, View
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
-from zlocus.orientation.tie_heights import height_range as height_range_of_ties
+from zlocus.orientation.tie_heights import height_range_of_ties
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.orientation.triangulate import Observations, project_points
 from zlocus.sensors.correction import ShiftedModel

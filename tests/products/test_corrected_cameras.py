@@ -15,8 +15,9 @@ from rpc_fixtures import write_image
 from zlocus.core.errors import ConfigError
 from zlocus.io.cameras.linescan_files import write_calibration, write_trajectory
 from zlocus.io.scene_file import open_scene
-from zlocus.products.corrected_cameras import write_cameras
-from zlocus.sensors.correction import AffineModel, ShiftedModel
+from zlocus.products import corrected_cameras
+from zlocus.products.corrected_cameras import check_cameras_can_be_written, write_cameras
+from zlocus.sensors.correction import AffinelyShiftedModel, ShiftedModel
 from zlocus.sensors.trajectory import Drift
 
 SAME_PX = 1e-6
@@ -60,7 +61,7 @@ def test_affine_rpcs_are_fitted_and_say_how_well(images, tmp_path):
     scene = open_scene(images("plane").inputs)
     corrected, again, record = rewritten(
         scene, tmp_path, images("plane").inputs,
-        lambda sensor: AffineModel(sensor, (1.0, 2e-3, -3e-3), (-2.0, 1e-3, 4e-3)),
+        lambda sensor: AffinelyShiftedModel(sensor, (1.0, 2e-3, -3e-3), (-2.0, 1e-3, 4e-3)),
     )  # fmt: skip
     assert_same(corrected, again, (20.0, 90.0), FITTED_PX)
     assert 0.0 < record["fore"]["rpc_fit_max_px"] < FITTED_PX
@@ -166,3 +167,14 @@ def test_a_shift_of_a_line_scanner_cannot_be_written(tmp_path):
     inputs = scan_scene(tmp_path)
     with pytest.raises(ConfigError, match=r"orientation\.model = joint"):
         rewritten(open_scene(inputs), tmp_path, inputs, lambda s: ShiftedModel(s, 1.0, 0.0))
+
+
+def test_a_camera_of_a_new_kind_is_refused_before_any_work(tmp_path, monkeypatch):
+    """Its corrected form could be written as no known kind of camera."""
+
+    class Affine:
+        kind = "affine"
+
+    monkeypatch.setattr(corrected_cameras, "given_cameras", lambda inputs: {"a": (Affine(), tmp_path)})
+    with pytest.raises(ConfigError, match="camera of a in .*scene.yaml is of the kind affine"):
+        check_cameras_can_be_written([tmp_path / "scene.yaml"])

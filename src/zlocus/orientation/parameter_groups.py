@@ -11,9 +11,10 @@ import numpy as np
 from zlocus.core.options import OrientationOptions
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray, SensorModel
-from zlocus.sensors.correction import AffineModel, ShiftedModel
+from zlocus.sensors.correction import AffinelyShiftedModel, ShiftedModel
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.linescan import LineScanModel, RectifiedModel
+from zlocus.sensors.rpc import RpcModel
 from zlocus.sensors.trajectory import Drift
 
 Correct = Callable[[SensorModel, FloatArray], SensorModel]
@@ -60,17 +61,15 @@ class ParameterGroup:
 
 
 def kind_of(sensor: SensorModel) -> str:
-    """Kind of a sensor in reports: rpc, frame or linescan.
-
-    A sensor that is neither a frame camera nor a line scanner is corrected in its image, as an RPC is.
-    """
+    """Kind of a sensor in reports: frame, linescan, rpc or other; the last two are corrected in their images."""
     bare = uncorrected(sensor)
-    return "frame" if isinstance(bare, FrameModel) else "linescan" if isinstance(bare, Scanner) else "rpc"
+    kinds = ((FrameModel, "frame"), (Scanner, "linescan"), (RpcModel, "rpc"))
+    return next((kind for model, kind in kinds if isinstance(bare, model)), "other")
 
 
 def uncorrected(sensor: SensorModel) -> SensorModel:
     """The sensor model without corrections in its image."""
-    while isinstance(sensor, ShiftedModel | AffineModel):
+    while isinstance(sensor, ShiftedModel | AffinelyShiftedModel):
         sensor = sensor.base_sensor
     return sensor
 
@@ -121,7 +120,7 @@ def affine_group(number: int, view: View, options: OrientationOptions) -> Parame
         growth = values[2:].reshape(2, 2) / half
         constant = values[:2] - growth @ middle
         column, row = ((float(c), float(g[0]), float(g[1])) for c, g in zip(constant, growth, strict=True))
-        return AffineModel(sensor, column, row)
+        return AffinelyShiftedModel(sensor, column, row)
 
     sigma = np.append(np.full(2, options.sigma_shift_px), np.full(4, options.bundle_adjustment.sigma_affine_px))
     return ParameterGroup(AFFINE, (number,), SHIFT_NAMES + AFFINE_NAMES, sigma, MIN_INFORMATION_IN_IMAGE, correct)

@@ -27,7 +27,7 @@ MAX_HEIGHT_SIGMAS = 4.0
 KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex); its other trees are random
 
 
-def height_range(
+def height_range_of_ties(
     xyz: FloatArray,
     sigma_z_m: FloatArray,
     names: Sequence[str],

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+import zlocus
+from zlocus.core.jit import kernels_digest
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import DsmRequest
 from zlocus.io.config import config_as_dict
@@ -34,13 +36,14 @@ WITHOUT_EFFECT = (
 
 
 def key_of(request: DsmRequest, config: RunConfig, inputs: InputFiles) -> dict[str, Any]:
-    """Options, versions and inputs (their size and time of change when the run began), by name.
+    """Options, versions, kernels and inputs (their size and time of change when the run began), by name.
 
     The content of images is not read for it, because that would take as long as matching; `run.json` holds checksums.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in WITHOUT_EFFECT}
     return {
         "versions": versions_record(),
+        "kernels": kernels_digest(Path(zlocus.__file__).parent),
         "request": {name: str(value) if isinstance(value, Path) else value for name, value in asked.items()},
         "options": config_as_dict(config),
         "inputs": dict(inputs.states),

@@ -1,9 +1,14 @@
 """The height range that a run searches: as requested, around a terrain model, or found from the tie points.
 
-`search_range` decides, in this order: `--heights` or the heights of the scene file; `--dem`, extended by
-`pyramid.dem_down_m` and `pyramid.dem_up_m`; else the tie points (`zlocus.orientation.tie_heights.height_range`). A
-range never reaches up to the lowest camera. Before tie points are known, `possible_heights` says at which heights views
-are compared at all.
+`height_range_of_run` decides, in this order: `--heights` or the heights of the scene file; `--dem`, extended by
+`pyramid.dem_down_m` and `pyramid.dem_up_m`; else the tie points: nearly all of their heights, with the margins
+`orientation.range_margin`, `range_up_m` and `range_down_m` (`zlocus.orientation.tie_heights.height_range_of_ties`). A
+range never reaches up to the lowest camera.
+
+Two more modules limit heights. Before tie points are known, `possible_heights` says at which heights views are compared
+at all; where the cameras do not tell, a run needs `--heights`, also with `--dem`. And with `--dem` every cell of the
+coarsest level is limited to the surroundings of the DEM (`zlocus.pipeline.setup.limited_by_dem`). Below that, each
+block has a search range of its own (`zlocus.matching.search_range`).
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from zlocus.io.grid_inputs import dem_datum, read_dem
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.ground_pixels import median_ground_pixel
 from zlocus.orientation.orientation import Orientation
-from zlocus.orientation.tie_heights import height_range
+from zlocus.orientation.tie_heights import height_range_of_ties
 
 N_POSSIBLE_HEIGHTS = 5
 # Land on Earth lies between these heights above the ellipsoid.
@@ -37,7 +42,7 @@ SMALLEST_DEPTH_M, N_DEPTHS = 2.0, 49
 CLEARANCE_FOUND, CLEARANCE_REQUESTED = 0.25, 0.125
 
 
-def search_range(
+def height_range_of_run(
     request: SetupRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
 ) -> tuple[float, float]:
     """Lowest and highest height of the search, ellipsoidal, m.
@@ -69,7 +74,7 @@ def range_from_ties(scene: Scene, orientation: Orientation, options: Orientation
     """Height range (m) of the tie points with its margins, cut below the lowest camera."""
     station = lowest_station(view.sensor for view in scene.views)
     names = [view.name for view in orientation.views]
-    found = height_range(orientation.xyz, orientation.sigma_z_m, names, options, station)
+    found = height_range_of_ties(orientation.xyz, orientation.sigma_z_m, names, options, station)
     return capped(found, station, CLEARANCE_FOUND)
 
 

@@ -26,7 +26,7 @@ from zlocus.pipeline.height_range import possible_heights
 from zlocus.pipeline.messages import note_orientation, some_names
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.setup import open_inputs, orient_views
-from zlocus.products.corrected_cameras import SCENE, write_cameras
+from zlocus.products.corrected_cameras import SCENE, check_cameras_can_be_written, write_cameras
 from zlocus.products.orientation import orientation_record
 from zlocus.products.tie_layers import write_ties
 
@@ -53,6 +53,8 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     with watch.stage("open"), progress.stage("Opening images"):
         opened_inputs = open_inputs(SetupRequest.of(request), progress, "unless local")
         scene = opened_inputs.scene
+        if request.cameras:
+            check_cameras_can_be_written(request.inputs)
         control = None if request.control is None else control_points(request, scene)
         terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
     inputs = InputFiles.of([*opened_inputs.files, *control_files(request)], scene, before)

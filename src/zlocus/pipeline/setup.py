@@ -44,7 +44,7 @@ from zlocus.orientation.orientation import Orientation, OrientationRequest, orie
 from zlocus.orientation.plausibility import Doubt
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_refinement import RefinedTies
-from zlocus.pipeline.height_range import heights_below_cameras, possible_heights, search_range, with_heights
+from zlocus.pipeline.height_range import height_range_of_run, heights_below_cameras, possible_heights, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
 
 # A height takes at least this many images.
@@ -190,12 +190,12 @@ def set_up_run(
     """
     corrected = orientation.apply(opened_inputs.scene)
     scene = supported_views(corrected, orientation)
-    z_range = search_range(request, scene, orientation, config, progress)
+    z_range = height_range_of_run(request, scene, orientation, config, progress)
     grid = grid_of_run(request, opened_inputs.like, scene, orientation, z_range)
     match_scene = match_scene_of_run(request, scene, orientation, z_range, grid, config)
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)
-    match_scene = _limited_by_dem(request, match_scene, scene.crs, config)
+    match_scene = limited_by_dem(request, match_scene, scene.crs, config)
     return RunSetup(corrected, orientation, z_range, grid, match_scene, (*orientation.doubts, *far))
 
 
@@ -286,7 +286,7 @@ def match_scene_of_run(
     )  # fmt: skip
 
 
-def _limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
+def limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
     """The match scene with heights limited around the DEM at the coarsest level, where one is given."""
     if request.dem is None:
         return match_scene

@@ -81,6 +81,27 @@ def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]
     return {view.name: (view.camera, first.parent) for view in read_scene_file(first).views}
 
 
+def _kind_of(camera: CameraEntry) -> str:
+    """The kind of a camera, as its entry names it."""
+    return str(getattr(camera, "kind", "unknown"))
+
+
+def check_cameras_can_be_written(inputs: Sequence[Path]) -> None:
+    """Refuse, before any work, cameras of a kind whose corrected form cannot be written.
+
+    Raises
+    ------
+    ConfigError
+        A camera is neither an RPC nor a frame camera nor a line scanner.
+    """
+    for name, (camera, _) in given_cameras(inputs).items():
+        if not isinstance(camera, RpcCamera | FrameCamera | LineScanCamera):
+            raise ConfigError(
+                f"The camera of {name} in {inputs[0]} is of the kind {_kind_of(camera)}, and corrected "
+                "cameras are written for rpc, frame and linescan only. Use zlocus dsm, which corrects it inside the run."
+            )
+
+
 def write_camera(out: Path, name: str, camera: CameraEntry, folder: Path, view: View, scene: Scene) -> WrittenCamera:
     """Write the camera of a view. camera : of the input, with paths that start at `folder`."""
     if isinstance(camera, FrameCamera):

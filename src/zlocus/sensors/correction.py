@@ -35,7 +35,7 @@ class ShiftedModel:
 
 
 @dataclass(frozen=True)
-class AffineModel:
+class AffinelyShiftedModel:
     """A sensor model with a shift in the image that changes linearly over the image.
 
     column, row : (constant px, per column, per row), added to the column and to the row that `base_sensor` projects.
