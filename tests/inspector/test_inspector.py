@@ -188,7 +188,7 @@ def test_two_images_are_needed(page, out):
     inspection, client = page
     x, y = inspection.folder.centre_of(*a_cell(out))
     found = client.get("api/cell", params={"x": x, "y": y, "without": ["nadir", "fore"]}).json()
-    assert found["error"] == "Two images are needed at least. Switch another one on."
+    assert found["error"] == "At least two images are needed. Switch on another one."
     assert "match" not in found
     assert found["height_m"] is not None
 
@@ -553,7 +553,7 @@ def test_questions_are_checked():
     assert whole({"a": "7"}, "a", 0, 9) == 7
     with pytest.raises(BadQuery, match="a is given twice"):
         once([("a", "1"), ("a", "2")], ["a"])
-    with pytest.raises(BadQuery, match="nothing that can be asked"):
+    with pytest.raises(BadQuery, match="not a parameter of this request"):
         once([("b", "1")], ["a"])
     with pytest.raises(BadQuery, match="whole number"):
         whole({"a": "7.5"}, "a", 0, 9)

@@ -128,8 +128,8 @@ def report_of(out, folder, row, col, without=(), window=None) -> PointReport:
     if window is not None:
         config = replace(config, cost=replace(config.cost, large_window=window))
     kept = [i for i, view in enumerate(matching.views) if view.name not in without]
-    views, grey = (tuple(each[i] for i in kept) for each in (matching.views, matching.grey))
-    matching = replace(matching, views=views, grey=grey)
+    views, scales = (tuple(each[i] for i in kept) for each in (matching.views, matching.grey_scales))
+    matching = replace(matching, views=views, grey_scales=scales)
     place = place_of_cell(folder.centre_of(row, col), folder.cell(row, col)["dsm"], scene.run)
     looked = curves_at("the cell", None, matching, place, config, SHOWN_WITHIN_CELLS)
     return PointReport.of("the cell", looked, matching, scene.run.scene.crs)
@@ -430,7 +430,7 @@ def test_nothing_old_stays_beside_an_error(page, inspected, out):
     for name in ("fore", "aft"):
         page.get_by_label(f"Use {name}").uncheck()
         page.wait_for_timeout(300)
-    page.wait_for_selector("text=Two images are needed at least")
+    page.wait_for_selector("text=At least two images are needed")
     assert page.locator("#match").is_hidden()
     page.locator("#reset").click()
     match_scene(page)

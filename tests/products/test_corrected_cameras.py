@@ -176,5 +176,5 @@ def test_a_camera_of_a_new_kind_is_refused_before_any_work(tmp_path, monkeypatch
         kind = "affine"
 
     monkeypatch.setattr(corrected_cameras, "given_cameras", lambda inputs: {"a": (Affine(), tmp_path)})
-    with pytest.raises(ConfigError, match="camera of a in .*scene.yaml is of the kind affine"):
+    with pytest.raises(ConfigError, match=r"camera of a in .*scene\.yaml is of the kind affine"):
         check_cameras_can_be_written([tmp_path / "scene.yaml"])

@@ -98,7 +98,7 @@ def check_cameras_can_be_written(inputs: Sequence[Path]) -> None:
         if not isinstance(camera, RpcCamera | FrameCamera | LineScanCamera):
             raise ConfigError(
                 f"The camera of {name} in {inputs[0]} is of the kind {_kind_of(camera)}, and corrected "
-                "cameras are written for rpc, frame and linescan only. Use zlocus dsm, which corrects it inside the run."
+                "cameras are written for rpc, frame and linescan only. Use zlocus dsm, which corrects it in the run."
             )
 
 
