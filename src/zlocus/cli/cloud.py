@@ -45,7 +45,7 @@ class CloudOptions:
 
 
 def cloud(options: CloudOptions) -> None:
-    """Make a coloured point cloud, with a height for every pixel of the images."""
+    """Make a coloured point cloud with a height for every pixel."""
     request = CloudRequest(
         inputs=tuple(options.inputs), out=options.out, references=tuple(options.reference or ()), crs=options.crs,
         heights=options.heights, vertical=options.vertical, fill=options.fill, partial=options.partial,

@@ -15,11 +15,11 @@ from zlocus.core.errors import OutputError
 class ConfigOptions:
     """Options of `zlocus config`."""
 
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Default, and with -: print.")] = None
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Without it, or with -, print.")] = None
 
 
 def config(options: ConfigOptions) -> None:
-    """Write a complete configuration with a comment for every option."""
+    """Write a configuration with a comment for every option."""
     from zlocus.core.options import RunConfig
     from zlocus.io.atomic_write import atomic_file
     from zlocus.io.config import write_config

@@ -30,7 +30,7 @@ class CurvesOptions:
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for figures and tables.")] = Path("curves")
     height: Annotated[
         float | None,
-        typer.Option(help="Height around which is searched, m. Default: that of the nearest tie points.", metavar="Z"),
+        typer.Option(help="Middle of the heights searched, m. Default: height of the nearest tie points.", metavar="Z"),
     ] = None
     resolution: Resolution = None
     crs: Crs = None
@@ -43,7 +43,11 @@ class CurvesOptions:
 
 
 def curves(options: CurvesOptions) -> None:
-    """Show the match curves of one point: their labels, the order of the images, and where matching stops."""
+    """Show the match curves of one point.
+
+    Give the point with --at or --pixel. The text and figures show how distinct the peak of each image is, in which
+    order the images are used, and after how many of them matching stops.
+    """
     request = CurvesRequest(
         inputs=tuple(options.inputs), out=options.out, at=options.at, pixel=options.pixel, height=options.height,
         resolution=options.resolution, crs=options.crs, heights=options.heights, reference=options.reference,

@@ -22,7 +22,7 @@ class DemoOptions:
 
 
 def demo(options: DemoOptions) -> None:
-    """Render the built-in scene, run everything, and report the accuracy against its truth."""
+    """Render the built-in scene, make its surface, report accuracy."""
     out = options.out
     # The folder of an earlier demo may be used again, that of any other run may not.
     check_output(out, overwrite=any((out / name).exists() for name in (DEMO_ACCURACY, DEMO_BEGUN)))

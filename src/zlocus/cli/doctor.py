@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from zlocus.cli.commands import config_of
-from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Resolution, TieHeights, Workers
+from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Resolution, TieHeights
 from zlocus.core.progress import progress_for
 from zlocus.core.requests import DoctorRequest, check_output
 
@@ -28,13 +28,13 @@ class DoctorOptions:
     resolution: Resolution = None
     crs: Crs = None
     heights: TieHeights = None
-    workers: Workers = 1
+    workers: Annotated[int, typer.Option(help="Tiles worked on at a time in the planned run.", metavar="N")] = 1
     memory: Annotated[float | None, typer.Option(help="Memory limit of the planned run, GB.", metavar="GB")] = None
     config: ConfigFile = None
 
 
 def doctor(options: DoctorOptions) -> None:
-    """Check sensors, overlap, tie points and memory before a long run: what will fail, and why."""
+    """Check inputs, overlap, tie points and memory before a run."""
     request = DoctorRequest(
         inputs=tuple(options.inputs), out=options.out, resolution=options.resolution, crs=options.crs,
         heights=options.heights, workers=options.workers, memory_gb=options.memory,

@@ -45,14 +45,17 @@ class DsmOptions:
     like: Annotated[
         Path | None, typer.Option(help="Take CRS, transform and shape from a raster.", metavar="RASTER")
     ] = None
-    area: Annotated[Path | None, typer.Option(help="Polygons to work in.", metavar="VECTOR")] = None
-    mask: Annotated[Path | None, typer.Option(help="Polygons to leave out.", metavar="VECTOR")] = None
+    area: Annotated[Path | None, typer.Option(help="Match only inside these polygons.", metavar="VECTOR")] = None
+    mask: Annotated[Path | None, typer.Option(help="Match nothing inside these polygons.", metavar="VECTOR")] = None
     heights: SearchedHeights = None
-    dem: Annotated[Path | None, typer.Option(help="Search around the heights of a raster.", metavar="RASTER")] = None
+    dem: Annotated[Path | None, typer.Option(help="Search only near the heights of a raster.", metavar="RASTER")] = None
     dem_vertical: DemVertical = None
     reference: Annotated[
         str | None,
-        typer.Option(help="Reference image. With gc3-sgm: match only the pixels of this image.", metavar="VIEW"),
+        typer.Option(
+            help="Reference image, which sets height step and image order. With gc3-sgm: match only its pixels.",
+            metavar="VIEW",
+        ),
     ] = None
     views: Annotated[
         str, typer.Option(help="Images used for a cell: chosen for it, or all that show it.", metavar="auto|all")

@@ -21,14 +21,15 @@ Classes = Annotated[
     Path | None,
     typer.Option(help="Raster of classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
 ]
-Align = Annotated[bool, typer.Option("--align", help="Find the best shift first, remove it, and report it.")]
+Align = Annotated[bool, typer.Option("--align", help="Find the best shift by comparing heights, remove it, report it.")]
 Coregister = Annotated[
-    str | None, typer.Option(help="Find the shift by slope and aspect (Nuth and Kääb 2011).", metavar="nuth-kaab")
+    str | None,
+    typer.Option(help="Find the shift from slope and aspect instead (Nuth and Kääb 2011).", metavar="nuth-kaab"),
 ]
 Margin = Annotated[float, typer.Option(help="Width of the rim of the reference that is left out, m.", metavar="M")]
 Thresholds = Annotated[
     list[float] | None,
-    typer.Option(help="Errors below this count as within, m; may be repeated. Default: 1.", metavar="M"),
+    typer.Option(help="Report the share of errors below this, m; may be repeated. Default: 1.", metavar="M"),
 ]
 Slopes = Annotated[
     str, typer.Option(help="Limits between slope bands, degrees; none: no bands.", metavar="DEG,DEG...|none")
@@ -36,7 +37,7 @@ Slopes = Annotated[
 Geoid = Annotated[
     Path | None,
     typer.Option(
-        help="Geoid raster, added to heights above the geoid: where the CRS says so, else the reference.",
+        help="Geoid raster, added to the heights whose CRS is above a geoid, else to the reference.",
         metavar="RASTER",
     ),
 ]
@@ -78,7 +79,12 @@ class EvaluateOptions(ComparisonOptions):
     reference: Annotated[Path, typer.Argument(help="Reference heights.", metavar="REFERENCE")]
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Folder for figures, error map and histogram. Default: print.", metavar="OUT"),
+        typer.Option(
+            "-o",
+            "--out",
+            help="Folder for figures, error map and histogram. Default: none; the table is printed.",
+            metavar="OUT",
+        ),
     ] = None
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another evaluation in the output folder.")] = (
         False

@@ -41,7 +41,9 @@ class ImportOptions:
     ] = None
     earth: Annotated[
         str | None,
-        typer.Option(help="Whether maps lie on a curved Earth (eo). Default: curved.", metavar="curved|flat"),
+        typer.Option(
+            help="Take map coordinates as on a curved Earth or a plane (eo). Default: curved.", metavar="curved|flat"
+        ),
     ] = None
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the scene file.")] = False
 

@@ -27,21 +27,19 @@ class InspectOptions:
     coregister: Coregister = None
     geoid: Geoid = None
     margin: Margin = 0.0
-    remote: Annotated[
-        bool, typer.Option("--remote", help="Read images from servers again where the run read them there.")
-    ] = False
+    remote: Annotated[bool, typer.Option("--remote", help="Allow reading of images that lie on servers.")] = False
     view: Annotated[
-        str, typer.Option(help="Link of a view to begin with, or the part of it behind #.", metavar="LINK")
+        str, typer.Option(help="Start with a view copied from the address of the page.", metavar="LINK")
     ] = ""
     host: Annotated[
         str, typer.Option(help="Address of this machine at which the page is served.", metavar="ADDRESS")
     ] = "127.0.0.1"
-    port: Annotated[int, typer.Option(help="Port. Default: a free one.", min=0, max=65535, metavar="N")] = 0
+    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.", min=0, max=65535, metavar="N")] = 0
     open_it: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False
 
 
 def inspect(options: InspectOptions) -> None:
-    """Look at a surface in the browser: click a cell, and see why it has its height."""
+    """Look at a surface in the browser, cell by cell."""
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise ConfigError(
             f"The inspector needs {' and '.join(missing)}, not installed here: pip install '.[inspect]' in the clone."

@@ -51,7 +51,7 @@ class TiesOptions:
 
 
 def orient(options: OrientOptions) -> None:
-    """Correct the cameras of all images by a bundle adjustment, and write them with a report."""
+    """Correct all cameras by a bundle adjustment, and write them."""
     request = OrientRequest(
         inputs=tuple(options.inputs), out=options.out, control=options.control,
         control_vertical=options.control_vertical, dem=options.dem, dem_vertical=options.dem_vertical,
@@ -61,7 +61,7 @@ def orient(options: OrientOptions) -> None:
 
 
 def ties(options: TiesOptions) -> None:
-    """Find tie points between the images, without correcting cameras."""
+    """Find tie points between images; correct no camera."""
     request = OrientRequest(
         inputs=tuple(options.inputs), out=options.out, cameras=False, crs=options.crs, heights=options.heights,
         overwrite=options.overwrite,

@@ -31,7 +31,7 @@ class ProductsOptions:
 
 
 def products(options: ProductsOptions) -> None:
-    """Make maps of a finished surface; maps of the same name are replaced."""
+    """Make maps of a finished surface, replacing earlier ones."""
     chosen = product_names(options.names)
     check_output(options.out, overwrite=True)
     from zlocus.io.config import read_config

@@ -30,7 +30,7 @@ class RankOptions:
 
 
 def rank(options: RankOptions) -> None:
-    """Rank the images by how well each pair matches at the tie points."""
+    """Rank images by how well pairs match at the tie points."""
     request = RankRequest(
         tuple(options.inputs), options.out, options.resolution, options.crs, options.heights, options.workers,
         options.overwrite,

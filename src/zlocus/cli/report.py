@@ -20,7 +20,10 @@ class ReportOptions(ComparisonOptions):
 
 
 def report(options: ReportOptions) -> None:
-    """Make report.html of a surface again, with a comparison where a reference is given."""
+    """Make report.html of a surface again.
+
+    With --reference, the report compares the surface with it; the other options say how.
+    """
     check_reference(
         options.reference,
         {

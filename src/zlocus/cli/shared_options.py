@@ -25,7 +25,10 @@ Vertical = Annotated[
 ]
 TieHeights = Annotated[
     tuple[float, float] | None,
-    typer.Option(help="Height range in which tie points are searched, m. Default: found.", metavar="ZMIN ZMAX"),
+    typer.Option(
+        help="Height range of tie points and matching, m. Default: from the cameras and tie points.",
+        metavar="ZMIN ZMAX",
+    ),
 ]
 SearchedHeights = Annotated[
     tuple[float, float] | None,
@@ -33,7 +36,7 @@ SearchedHeights = Annotated[
 ]
 Workers = Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")]
 Partial = Annotated[
-    bool, typer.Option("--partial", help="Accept a result that is incomplete or whose cameras are doubtful.")
+    bool, typer.Option("--partial", help="End with status 0 although the result is incomplete or cameras are doubtful.")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace another run in the output folder.")]
 ConfigFile = Annotated[
