@@ -414,7 +414,7 @@ def test_the_page_is_used_while_the_scene_opens(browser, out, monkeypatch):
         page.wait_for_selector("#profile-figure svg")
         assert page.locator("#tab-profile").get_attribute("aria-selected") == "true"
         page.locator("#tab-cell").click()
-        page.wait_for_selector("text=curves follow")
+        page.wait_for_selector("text=curves will follow")
         assert page.locator("#cell-height").inner_text() != "none"
         assert "The images are being opened" in page.locator("#notice").inner_text()
         may_open.set()

@@ -24,7 +24,7 @@ from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import CloudRequest
 from zlocus.io.open_raster import open_raster
 from zlocus.matching.quality import Quality, is_empty
-from zlocus.pipeline import cloud
+from zlocus.pipeline import cloud, pixel_products
 from zlocus.pipeline import image_tiles as per_image
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.render import Sun, expose, render, visible_ground_points
@@ -68,7 +68,7 @@ def of_step(images, tmp_path_factory):
     out = tmp_path_factory.mktemp("cloud") / "out"
     with pytest.MonkeyPatch.context() as patch:
         # Several strips.
-        patch.setattr(cloud, "ROWS_AT_ONCE", 40)
+        patch.setattr(pixel_products, "ROWS_AT_ONCE", 40)
         return run(images("step").inputs, out, crs="EPSG:32632", heights=HEIGHTS)
 
 
@@ -210,15 +210,15 @@ def test_frame_cameras_without_heights_given(rig, of_rig):
 
 def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypatch):
     patch = (slice(60, 90), slice(60, 90))
-    whole = per_image.matched_image
+    whole = per_image.matched_pixels
 
-    def planted(space, scene, surface):
-        matched = whole(space, scene, surface)
-        if space.reference_view.name == "nadir":
+    def planted(image_scene, surface):
+        matched = whole(image_scene, surface)
+        if image_scene.image_space.reference_view.name == "nadir":
             matched.image.height[patch] += 20.0
         return matched
 
-    monkeypatch.setattr(per_image, "matched_image", planted)
+    monkeypatch.setattr(per_image, "matched_pixels", planted)
     run(images("plane").inputs, tmp_path / "out", crs="EPSG:32632", heights=HEIGHTS)
     height, quality = (read(tmp_path / "out" / f"nadir_{what}.tif") for what in ("height", "quality"))
     assert np.isnan(height[patch]).all()

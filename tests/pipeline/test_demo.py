@@ -97,7 +97,7 @@ def stopped_and_taken_on(out, monkeypatch):
     """A demo that is stopped when its tiles are made, and goes on with its scene and with them."""
     said = io.StringIO()
     with monkeypatch.context() as patch:
-        patch.setattr(tiles.Matching, "assemble", interrupt)
+        patch.setattr(tiles.TileRun, "assemble", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run_demo(out, LineProgress(said))
     found = re.search(r"(\d) of \1 tiles are finished and kept: the same command resumes from there\.", said.getvalue())

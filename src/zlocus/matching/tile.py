@@ -249,7 +249,11 @@ def match_finer_levels(
 ) -> list[LevelResult]:
     """Match all finer levels inside a window of coarsest cells; results of all levels, the coarsest first."""
     results, pair_labels = [coarsest_match.result], coarsest_match.pair_labels
-    coarsest_number = coarsest_match.result.level.number
+    level, prior, coarsest_number = (
+        coarsest_match.result.level,
+        coarsest_match.prior,
+        coarsest_match.result.level.number,
+    )
     for number in range(coarsest_number - 1, -1, -1):
         level = tile.level(number, overlap_window.finer(coarsest_number - number))
         prior = prior_from_coarser(tile, level, results[-1])

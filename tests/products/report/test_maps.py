@@ -84,7 +84,7 @@ def test_a_scale_bar_is_round_and_as_long_as_it_says():
     assert maps.scale_bar(10_000.0) == maps.ScaleBar(20.0, "2 km")
     assert maps.scale_bar(1.0) == maps.ScaleBar(20.0, "0.2 m")
     for width in np.geomspace(0.3, 3e5, 60):
-        assert 12 <= maps.scale_bar(float(width)).percent <= 100 * maps.BAR_SHARE + 1e-6
+        assert 12 <= maps.scale_bar(float(width)).percent <= 100 * maps.MAX_BAR_SHARE + 1e-6
 
 
 def test_corners_are_those_of_the_grid():
@@ -158,8 +158,12 @@ def test_whole_percent_is_all_only_of_all():
 def test_labels_of_a_sample():
     pairs = [{"images": ["a", "b"], "points": 4, "good": 3, "fair": 0, "poor": 1}]
     found = tables.sampled_matrix(pairs, ["b", "a", "c"])
-    assert [[cell.text for cell in row] for row in found.rows] == [["", "75", "–"], ["75", "", "–"], ["–", "–", ""]]
-    assert found.rows[0][1].title == "a against b: good at 75.0 %, fair at 0.00 %, poor at 25.0 % of 4 tie points"
+    assert [[cell.text for cell in row] for row in found.cell_rows] == [
+        ["", "75", "–"],
+        ["75", "", "–"],
+        ["–", "–", ""],
+    ]
+    assert found.cell_rows[0][1].title == "a against b: good at 75.0 %, fair at 0.00 %, poor at 25.0 % of 4 tie points"
     assert tables.sampled_matrix(pairs, ["a", "c"]) is None
 
 

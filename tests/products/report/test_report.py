@@ -170,7 +170,7 @@ def test_counts_are_those_of_the_rasters(made):
         assert row.n == ((quality & Quality[row.name]) != 0).sum() > 0
     text = page_of(made).text("reasons")
     for flag in Quality:
-        assert (flag.name in text[text.index("Reasons that no cell has") :]) == (not (quality & flag).any())
+        assert (flag.name in text[text.index("Reasons that do not occur") :]) == (not (quality & flag).any())
     np.testing.assert_array_equal(found.height, height)
 
 
@@ -363,7 +363,9 @@ def test_a_reference_above_a_geoid_is_compared_above_the_ellipsoid(out, tmp_path
     assert f"The geoid's heights were added to those of {reference}." in text
     assert "as it lies" in text
     assert "20-90 deg" in text
-    median_m = float(text[text.index("errors' median is") :].split()[3])
+    alts = [each["alt"] for each in page_of(out).of("img")]
+    (histogram,) = (alt for alt in alts if alt.startswith("Histogram of the errors"))
+    median_m = float(histogram.split("about their median ")[1].split()[0])
     assert abs(median_m) < UNDULATION_M / 10
     assert "Removed first:" in text
 
@@ -420,7 +422,7 @@ def test_a_surface_is_the_same_with_and_without_a_report(images, made, tmp_path)
         (lambda out: (out / "run.json").unlink(), (), "There is no run.json in"),
         (lambda out: (out / "run.json").write_text("{"), (), "(char 1). Make the surface again."),
         (lambda out: (out / "run.json").write_text("[]"), (), "holds no JSON object"),
-        (lambda out: (out / "run.json").write_text('{"schema": 1}'), (), "lacks config, versions"),
+        (lambda out: (out / "run.json").write_text('{"schema": 2}'), (), "lacks config, versions"),
         (lambda out: (out / "sigma.tif").unlink(), (), "There is no raster"),
         (lambda out: None, ("--classes", "c.tif"), "--classes is about a reference"),
         (lambda out: None, ("--align",), "--align is about a reference"),
@@ -533,10 +535,10 @@ def test_labels_of_pairs(tmp_path, monkeypatch, most_columns):
     ranked = LabelledTies(np.arange(12.0).reshape(4, 3), labels, np.arange(3))
     write_ranking(tmp_path / "ranking.gpkg", [ranked], names, CRS.from_epsg(32632))
     found = tables.label_matrix(tmp_path / "ranking.gpkg", ["aft", "fore", "nadir"])
-    text = {(found.names[i], found.names[j]): found.rows[i][j].text for i in range(3) for j in range(3)}
+    text = {(found.names[i], found.names[j]): found.cell_rows[i][j].text for i in range(3) for j in range(3)}
     assert (text["nadir", "fore"], text["fore", "nadir"], text["nadir", "aft"]) == ("75", "0", "100")
     assert (text["aft", "aft"], text["aft", "fore"]) == ("", "0")
-    titles = [cell.title for row in found.rows for cell in row]
+    titles = [cell.title for row in found.cell_rows for cell in row]
     assert "fore against nadir: good at 75.0 %, fair at 0.00 %, poor at 25.0 % of 4 tie points" in titles
     assert tables.label_matrix(tmp_path / "ranking.gpkg", ["aft", "fore"]) is None
     assert tables.label_matrix(tmp_path / "none.gpkg", names) is None
