@@ -84,7 +84,7 @@ def test_the_demo_runs_twice_into_one_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(scenes, "demo_spec", lambda: small)
     first = stopped_and_taken_on(tmp_path, monkeypatch)
     assert [limit.threshold_m for limit in first.evaluations] == [0.42, 1.0]
-    assert all(each.classes["ground"].within > 0.9 for each in first.evaluations)
+    assert all(each.class_statistics["ground"].within > 0.9 for each in first.evaluations)
     picture = (tmp_path / "demo.png").read_bytes()
     # Now it is finished, and starts anew.
     (tmp_path / DEMO_ACCURACY).write_text("{}")

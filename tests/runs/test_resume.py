@@ -176,7 +176,7 @@ def test_a_run_that_is_stopped_after_the_matching_keeps_its_tiles(images, straig
     said, out = io.StringIO(), tmp_path / "out"
     monkeypatch.setattr("rendered_scenes.progress_for", lambda _: progress_for(said))
     monkeypatch.setattr(step, stop)
-    asked = {"workers": 1, "report": step.endswith("_show")}
+    asked = {"workers": 1, "report": step.endswith("write_report_inputs")}
     with pytest.raises(KeyboardInterrupt):
         run(images("sine"), out, SMALL_TILES, **asked)
     assert "9 of 9 tiles are finished and kept: the same command resumes from there.\n" in said.getvalue()
