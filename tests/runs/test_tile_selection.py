@@ -10,6 +10,7 @@ import pytest
 import rasterio
 
 import zlocus.matching.tile
+import zlocus.matching.view_selection
 import zlocus.pipeline.setup
 from rendered_scenes import read, run
 from zlocus.core.options import PyramidOptions, RunConfig, SelectionOptions
@@ -147,7 +148,7 @@ def test_the_choice_does_not_lower_the_accuracy(guided, town):
 
 def test_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a_height(town, tmp_path, monkeypatch):
     """With a radius of three cells, blocks take the order of the scene, and cells without texture still get heights."""
-    rows, order = [], zlocus.matching.tile.order_views
+    rows, order = [], zlocus.matching.view_selection.order_views
 
     def watched(ranking, share, at, options):
         apart = np.hypot(*(at[:, None] - ranking.xy[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
@@ -156,7 +157,7 @@ def test_plain_roofs_and_roads_that_no_feature_point_covers_still_get_a_height(t
         assert (np.sort(np.column_stack([found.reference, found.search])) == np.arange(len(share))).all()
         return found
 
-    monkeypatch.setattr(zlocus.matching.tile, "order_views", watched)
+    monkeypatch.setattr(zlocus.matching.view_selection, "order_views", watched)
     height, _ = read(surface(town, tmp_path / "out", FAR_FROM_TIES) / "dsm.tif")
     assert rows[-1] > 0.8, "no feature point near most blocks"
     for kind, share in ((ROAD, 0.97), (BUILDING, 0.7)):

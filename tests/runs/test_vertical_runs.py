@@ -231,7 +231,7 @@ def test_what_a_terrain_model_is_taken_to_be_above_is_said(tmp_path):
     assert notes.said == []
     note_dem(plain, None, notes)
     (sentence,) = notes.said
-    assert sentence.startswith(f"{plain} does not say what its heights are above: taken to be ellipsoidal.")
+    assert sentence.startswith(f"{plain} does not name its vertical datum: its heights are taken to be ellipsoidal.")
     assert "--dem-vertical egm96|egm2008|FILE" in sentence
 
 
@@ -242,7 +242,7 @@ def test_runs_say_what_a_terrain_model_is_taken_to_be_above(images, tmp_path):
     run_dsm(DsmRequest(inputs, tmp_path / "dsm", crs="EPSG:32632", dem=dem, bounds=PART), SMALL_TILES, dsm)
     run_orient(OrientRequest(inputs, tmp_path / "oriented", crs="EPSG:32632", dem=dem), RunConfig(), orient)
     for notes in (dsm, orient):
-        assert sum("does not say what its heights are above" in sentence for sentence in notes.said) == 1
+        assert sum("does not name its vertical datum" in sentence for sentence in notes.said) == 1
 
 
 def test_geoids_may_be_written_in_capitals(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""`zlocus dsm`: the stages of a surface, in their order. This file names them and does nothing else.
+"""`zlocus dsm`: the stages of a surface, in their order, with finished runs and interrupts around them.
 
 1. open: inputs, and what an earlier run left in the folder (`open_run`);
 2. orient: tie points and cameras (`setup.orient_views`);

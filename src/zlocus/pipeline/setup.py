@@ -1,6 +1,6 @@
 """Run setup: the one place where inputs become views, orientation, heights, grid and match scene.
 
-Every command, the inspector and the Python interface start here, in this order:
+Every command that orients or matches images, the inspector and the Python interface start here, in this order:
 
 1. `open_inputs`: the scene that the request names, with its vertical datum and every file that the result depends on;
 2. `orient_views`: tie points and corrected cameras;

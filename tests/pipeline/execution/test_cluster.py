@@ -127,7 +127,7 @@ def test_a_scheduler_that_goes_keeps_what_is_done(images, straight, tmp_path):
         robber = threading.Thread(target=rob)
         robber.start()
         with pytest.raises(
-            StoppedError, match=r"The scheduler at tcp://127\.0\.0\.1:\d+ has gone\. What is done is kept"
+            StoppedError, match=r"The scheduler at tcp://127\.0\.0\.1:\d+ has gone\. Finished tiles are kept"
         ):
             run(images("sine"), out, SMALL_TILES, scheduler=found.address, report=False)
         robber.join()

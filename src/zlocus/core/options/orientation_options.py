@@ -80,15 +80,15 @@ class OrientationOptions(Checked):
         low=0.1, high=1000.0, unit="px",
     )  # fmt: skip
     range_margin: float = option(
-        0.2, "Search range from ties: margin added at both ends, as a share of the range of the ties' heights.",
+        0.2, "Height range from ties: margin added at both ends, as a share of the range of the ties' heights.",
         low=0.0, high=10.0,
     )  # fmt: skip
     range_up_m: float = option(
-        60.0, "Search range from ties: margin added above, for towers and trees without ties.", low=0.0, high=2000.0,
+        60.0, "Height range from ties: margin added above, for towers and trees without ties.", low=0.0, high=2000.0,
         unit="m",
     )  # fmt: skip
     range_down_m: float = option(
-        20.0, "Search range from ties: margin added below, for pits and streets without ties.", low=0.0, high=2000.0,
+        20.0, "Height range from ties: margin added below, for pits and streets without ties.", low=0.0, high=2000.0,
         unit="m",
     )  # fmt: skip
     bundle_adjustment: BundleAdjustmentOptions = group(
