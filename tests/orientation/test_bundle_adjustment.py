@@ -268,7 +268,7 @@ def test_an_affine_correction_there_and_back():
 def test_every_kind_of_sensor_at_once():
     frames_, scanners, satellites = flight_of_frames(1, 2), strips_of_lines((0.0,)), affine_sensors()[:1]
     views = views_of([*frames_, *scanners, *satellites], AFFINE_SIZE)
-    assert [kind_of(view.sensor) for view in views] == ["frame"] * 2 + ["linescan"] * 3 + ["rpc"]
+    assert [kind_of(view.sensor) for view in views] == ["frame"] * 2 + ["linescan"] * 3 + ["other"]
     groups = parameter_groups_of(views, OPTIONS)
     assert [(group.kind, group.views) for group in groups] == [
         (SHIFT, (5,)), (POSE, (0,)), (POSE, (1,)), (DRIFT, (2, 3, 4)),
