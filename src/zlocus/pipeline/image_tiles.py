@@ -324,6 +324,7 @@ def _interruption(
         yield
     except KeyboardInterrupt:
         if checkpoint is not None:
+            checkpoint.count_from_disk()
             done = sum(tile_name(*task) in checkpoint.finished for task in tasks)
             if done:
                 kept = f"{done} of {len(tasks)} tiles of images are finished and kept"

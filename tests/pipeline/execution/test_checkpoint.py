@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 
 import numpy as np
 import pytest
@@ -44,6 +45,25 @@ def test_tiles_are_there_for_the_same_run(tmp_path):
     assert set(store(tmp_path).finished) == {"0_0", "0_64", "64_0"}
     again.remove()
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_right_after_the_line_of_a_tile_costs_no_tile(tmp_path, monkeypatch):
+    """Before, the tile was not counted, and where it was the only one it was removed."""
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    fsync, calls = os.fsync, []
+    # The first two are of what comes before the tiles and of the manifest, the third of the tile, the fourth of the list.
+    monkeypatch.setattr(
+        store_module.os, "fsync", lambda n: [fsync(n), calls.append(n), len(calls) == 4 and interrupt(n)]
+    )
+    with pytest.raises(KeyboardInterrupt):
+        filled(tmp_path, names=["0_0"])
+    monkeypatch.undo()
+    held = store(tmp_path)
+    assert set(held.finished) == {"0_0"}
+    assert held.holds("0_0")
 
 
 def test_what_was_found_before_the_first_tile_is_there_for_the_same_run(tmp_path):

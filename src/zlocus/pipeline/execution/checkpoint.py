@@ -119,6 +119,8 @@ class TileCheckpoint:
             self._begin(setup_digest, before or {})
             yield self
         except BaseException:
+            if self._is_ours:
+                self.count_from_disk()
             if not self.finished and self._is_ours:
                 self.remove()  # a run that made nothing leaves nothing
             raise
@@ -181,6 +183,13 @@ class TileCheckpoint:
     def holds(self, name: str) -> bool:
         """Whether a tile is finished and its file is undamaged."""
         return name in self.finished and self.load(name) is not None
+
+    def count_from_disk(self) -> None:
+        """Take over the finished tiles that the list on disk names.
+
+        An interrupt may come between the line of a tile on disk and its entry in `finished`.
+        """
+        self.finished |= _finished_in(self.folder / DONE)
 
     @property
     def is_there(self) -> bool:
