@@ -54,7 +54,7 @@ def test_an_interrupt_right_after_the_line_of_a_tile_costs_no_tile(tmp_path, mon
         raise KeyboardInterrupt
 
     fsync, calls = os.fsync, []
-    # The first two are of what comes before the tiles and of the manifest, the third of the tile, the fourth of the list.
+    # Four files are written to disk: arrays before the tiles, manifest, tile, and the list of tiles.
     monkeypatch.setattr(
         store_module.os, "fsync", lambda n: [fsync(n), calls.append(n), len(calls) == 4 and interrupt(n)]
     )
