@@ -9,7 +9,14 @@ ifneq ($(TEST_DATA),)
 export ZLOCUS_TEST_DATA ?= $(abspath $(TEST_DATA))
 endif
 
-.PHONY: demo docs test test-fast test-minimum audit lint bench peers acceptance acceptance-all clean
+# `make measure city hills` is `make measure ROW="city hills"`: the words after `measure` are rows, not targets.
+ifeq (measure,$(firstword $(MAKECMDGOALS)))
+ROW ?= $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
+WORDS := $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
+endif
+
+.PHONY: demo docs test test-fast test-minimum audit lint bench peers acceptance acceptance-all measure measure-all figures stale \
+    numbers release-check clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -18,8 +25,16 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install $(PIP_OPTIONS) --editable '.[dev]'
 	touch $@
 
+ifneq (,$(WORDS))
+.PHONY: $(WORDS)
+$(WORDS): measure
+	@:
+endif
+
+ifeq (,$(filter demo,$(WORDS)))
 demo: $(STAMP)
 	$(BIN)/zlocus demo
+endif
 
 # The site, with its notebooks run; opens without a server: build/docs/index.html.
 docs: $(STAMP)
@@ -55,14 +70,40 @@ bench: $(STAMP)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only
 
 # Other programs on the same scenes, in environments of their own below build/peers: hours. S2P, MICMAC, SETSM: commands of builds.
+ifeq (,$(filter peers,$(WORDS)))
 peers: $(STAMP)
 	$(BIN)/python benchmarks/peers $(if $(S2P),--s2p $(S2P)) $(if $(MICMAC),--micmac $(MICMAC)) $(if $(SETSM),--setsm $(SETSM))
+endif
 
 acceptance: $(STAMP)
 	$(BIN)/python benchmarks/acceptance.py
 
 acceptance-all: $(STAMP)
 	$(BIN)/python benchmarks/acceptance.py --slow
+
+# Measures rows and writes their results files: make measure city, or make measure ROW=city.
+measure: $(STAMP)
+	$(if $(strip $(ROW)),,$(error Which row? make measure city. benchmarks/rows/registry.py lists the rows))
+	$(BIN)/python benchmarks/acceptance.py $(ROW) --record
+
+# All rows but the peers, a night on two cores. Rows that fail are told at the end.
+measure-all: $(STAMP)
+	$(BIN)/python benchmarks/acceptance.py --slow --record
+
+# Writes the figures of the pages from benchmarks/results: seconds, without scenes.
+figures: $(STAMP)
+	$(BIN)/python benchmarks/pages
+
+# Lists the results that are older than the code that they measure; release-check fails where there are any.
+stale: $(STAMP)
+	$(BIN)/python benchmarks/pages --stale
+
+release-check: $(STAMP)
+	$(BIN)/python benchmarks/pages --stale --fail
+
+# Accepts the numbers of the pages that are no measured figures, after a review of what changed.
+numbers: $(STAMP)
+	$(BIN)/python benchmarks/pages --numbers
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache .benchmarks build dist demo

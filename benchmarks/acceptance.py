@@ -1,9 +1,11 @@
 """The acceptance table: figures of the real commands on the shared scenes, beside the bars that they must reach.
 
-    python benchmarks/acceptance.py [ROW ...] [--slow] [--keep FOLDER]
+    python benchmarks/acceptance.py [ROW ...] [--slow] [--keep FOLDER] [--record]
 
-Rows: see `ROWS`; without any, all but the slow ones. The exit status is 1 if a row could not be run. A figure that
-misses its bar is marked SHORT and does not change the exit status.
+Rows: see `rows/registry.py`; without any, all but the slow ones. With `--record` (`make measure ROW`) the figures of
+each row are also written to its results file in benchmarks/results, from which the pages are written (`make figures`).
+The exit status is 1 if a row could not be run. A figure that misses its bar is marked SHORT and does not change the
+exit status.
 """
 
 from __future__ import annotations
@@ -12,31 +14,13 @@ import argparse
 import os
 import sys
 import tempfile
+import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 
-import inspecting
-from rows import demo, large_areas, methods, other_programs, photographs, rendered, resources, satellite
+from result_files import record_results
+from rows.registry import ROWS
 from workplace import CannotRun, Figure, Workplace
-
-ROWS: dict[str, Callable[[Workplace], list[Figure]]] = {
-    "demo": demo.demo, "mixed": demo.mixed,
-    "calanques": satellite.calanques,
-    "city": rendered.city, "city-views": rendered.city_views, "hills": rendered.hills, "joint": rendered.joint,
-    "new-scenes": rendered.new_scenes,
-    "ventoux": satellite.ventoux, "datum": satellite.datum,
-    "ortho": rendered.ortho,
-    "dmc": photographs.dmc, "tuniu": photographs.tuniu, "herzjesu": photographs.herzjesu,
-    "kernels": resources.kernels,
-    "selection": methods.selection, "features": methods.features, "middlebury": methods.middlebury,
-    "memory": resources.memory, "speed": resources.speed,
-    "inspect": inspecting.inspect, "inspect-large": inspecting.inspect_large,
-    "halo": large_areas.halo, "growth": large_areas.growth,
-    "signals": resources.signals, "clone": resources.clone,
-    "peers": other_programs.peers,
-}  # fmt: skip
-SLOW = ("new-scenes", "memory", "speed", "inspect-large", "growth", "clone")
 
 
 def show(name: str, lines: list[tuple[str, str, str, str]]) -> None:
@@ -49,18 +33,17 @@ def main() -> int:
     parser.add_argument("rows", nargs="*", metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--slow", action="store_true", help="the slow rows too")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the results here")
+    parser.add_argument("--record", action="store_true", help="write the results file of each row")
     options = parser.parse_args()
     if unknown := [name for name in options.rows if name not in ROWS]:
         parser.error(f"no row {unknown[0]}; there are {', '.join(ROWS)}")
-    chosen = options.rows or [name for name in ROWS if options.slow or name not in SLOW]
-    data = os.environ.get("ZLOCUS_TEST_DATA")
+    chosen = options.rows or [name for name in ROWS if options.slow or not ROWS[name].is_slow]
     failed = 0
     show("row", [("what", "figure", "bar", "")])
     with tempfile.TemporaryDirectory() as scratch:
         for name in chosen:
-            out = (options.keep or Path(scratch)).absolute() / name
             try:
-                figures = ROWS[name](Workplace(Path(data) if data else None, out))
+                figures = measured(name, (options.keep or Path(scratch)).absolute() / name, options.record)
             except CannotRun as reason:
                 failed += 1
                 print(f"{name:<10} cannot be run: {reason}", flush=True)
@@ -70,6 +53,17 @@ def main() -> int:
             else:
                 show(name, [figure.cells() for figure in figures])
     return 1 if failed else 0
+
+
+def measured(name: str, out: Path, is_recorded: bool) -> list[Figure]:
+    """Measure a row in the folder `out`, and write its results file if that is asked for."""
+    row, data = ROWS[name], os.environ.get("ZLOCUS_TEST_DATA")
+    workplace, start = Workplace(Path(data) if data else None, out), time.monotonic()
+    figures = row.measure(workplace)
+    if is_recorded:
+        seconds, command = time.monotonic() - start, f"make measure ROW={name}"
+        record_results(name, figures, command, seconds=seconds, parts=row.parts, inputs=workplace.inputs)
+    return figures
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from workplace import ZLOCUS, CannotRun, Figure, Workplace, ended, run
 N_CLICKS, N_TILES = 60, 200
 DEMO_MS, LARGE_MS, LARGE_M = 300.0, 1000.0, 100.0
 OPENED_S = 300.0
+SLOW = "a click reads whole rasters or images, or the page draws everything anew"
 SIZE = {"width": 1280, "height": 860}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # Measures the time from a click to the frame in which the whole cell is drawn.
@@ -70,15 +71,15 @@ def measured(out: Path, bar_ms: float, n_clicks: int = N_CLICKS, n_tiles: int = 
     million = about["shape"][0] * about["shape"][1] / 1e6
     figures = [
         Figure("million cells", million),
-        Figure("a click answered, median", float(np.median(clicks)), "ms", at_most=bar_ms),
-        Figure(f"the slowest of {n_clicks}", max(clicks), "ms", at_most=bar_ms),
+        Figure("a click answered, median", float(np.median(clicks)), "ms", at_most=bar_ms, fails_when=SLOW),
+        Figure(f"a click answered, slowest of {n_clicks}", max(clicks), "ms", at_most=bar_ms, fails_when=SLOW),
         Figure("a tile of the map, median", float(np.median(tiles)), "ms"),
-        Figure(f"the slowest of {n_tiles}", max(tiles), "ms"),
+        Figure(f"a tile of the map, slowest of {n_tiles}", max(tiles), "ms"),
     ]
     if drawn:
         figures += [
-            Figure("a click drawn in the browser, median", float(np.median(drawn)), "ms", at_most=bar_ms),
-            Figure(f"nine in ten of {n_clicks // 2}", float(np.percentile(drawn, 90)), "ms"),
+            Figure("a click drawn, median", float(np.median(drawn)), "ms", at_most=bar_ms, fails_when=SLOW),
+            Figure(f"a click drawn, nine in ten of {n_clicks // 2}", float(np.percentile(drawn, 90)), "ms"),
         ]
     return figures
 

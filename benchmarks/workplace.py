@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,41 +41,64 @@ def ended(main: Callable[[], object]) -> None:
 
 @dataclass(frozen=True)
 class Figure:
-    """One line of the table. at_least, at_most : values that pass; a figure with neither is only reported."""
+    """One line of the table. what : label, once in a row.
+
+    at_least, at_most : values that pass; a figure with neither is only reported. fails_when : the fault that would make
+    the figure miss its bar, in a few words; every figure with a bar has it. is_detail : the figure stands in the
+    results file and not in the table of the accuracy page.
+    """
 
     what: str
     value: float
     unit: str = ""
     at_least: float | None = None
     at_most: float | None = None
+    fails_when: str = ""
+    is_detail: bool = False
 
     def cells(self) -> tuple[str, str, str, str]:
         """Label, figure, bar and verdict as text."""
         unit = f" {self.unit}" if self.unit else ""
-        bar = "" if self.at_least is None else f">= {self.at_least:g}{unit}"
-        bar = bar if self.at_most is None else f"<= {self.at_most:g}{unit}"
+        verdict = "" if not self.bar else "pass" if self.passes else "SHORT"
+        return self.what, f"{self.value:.4g}{unit}", self.bar, verdict
+
+    @property
+    def bar(self) -> str:
+        """The bar as text with its unit, empty without one."""
+        unit = f" {self.unit}" if self.unit else ""
         if self.at_least is not None and self.at_most is not None:
-            bar = f"{self.at_least:g} to {self.at_most:g}{unit}"
+            return f"{self.at_least:g} to {self.at_most:g}{unit}"
+        if self.at_most is not None:
+            return f"<= {self.at_most:g}{unit}"
+        return "" if self.at_least is None else f">= {self.at_least:g}{unit}"
+
+    @property
+    def passes(self) -> bool:
+        """Whether the figure reaches its bar; a value that is NaN reaches none."""
         above = self.at_least is None or self.value >= self.at_least
         below = self.at_most is None or self.value <= self.at_most
-        verdict = "" if not bar else "pass" if above and below else "SHORT"
-        return self.what, f"{self.value:.4g}{unit}", bar, verdict
+        return above and below
 
 
 @dataclass(frozen=True)
 class Usage:
-    """CPU of a command with its children, and memory of its largest process (GB of 1024^3 bytes)."""
+    """CPU of a command with its children, memory of its largest process (GB of 1024^3 bytes), and its exit status."""
 
     cpu_s: float
     peak_gb: float
+    status: int = 0
 
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folder of the shared scenes (None if there is none), and folder for the results of a row."""
+    """Folder of the shared scenes (None if there is none), and folder for the results of a row.
+
+    inputs : what the row notes about its inputs, such as its seeds; the results file holds it.
+    """
 
     data: Path | None
     out: Path
+    inputs: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def scene(self, name: str) -> Path:
         """Folder of a shared scene."""
@@ -96,6 +119,20 @@ class Workplace:
         command = [sys.executable, script, dsm, scene / "truth_dsm.tif", "--class", scene / "truth_class.tif", "--json"]
         return json.loads(subprocess.run([*command, *options], check=True, capture_output=True).stdout)
 
+    def judge_twice(self, dsm: Path, scene: Path, *options: str) -> dict[str, dict[str, dict[str, float]]]:
+        """Accuracy of a surface as it is (key `absolute`) and after its shift was removed (key `aligned`)."""
+        return {"absolute": self.judge(dsm, scene, *options), "aligned": self.judge(dsm, scene, "--align", *options)}
+
+    def judge_registered(self, dsm: Path, reference: Path, classes: Path) -> dict[str, Any]:
+        """Accuracy of a surface by class after one shift in x, y and height, from the shared judge of lidar scenes."""
+        if self.data is None:
+            raise CannotRun("ZLOCUS_TEST_DATA is not set")
+        script = self.data.parent / "tools" / "judge_registered.py"
+        if not script.exists():
+            raise CannotRun(f"{script} is missing")
+        command = [sys.executable, script, reference, dsm, "--classes", classes, "--json"]
+        return json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+
 
 def run(command: list[Any], accept: tuple[int, ...] = (0,), cwd: Path | None = None) -> Usage:
     """Run a command and measure it. accept : exit statuses that are no failure."""
@@ -107,7 +144,7 @@ def run(command: list[Any], accept: tuple[int, ...] = (0,), cwd: Path | None = N
             said = (done.stderr.strip() or done.stdout.strip() or "nothing said").splitlines()
             raise CannotRun(f"`{' '.join(map(str, command[:3]))} ...` exits {done.returncode}: {said[-1]}")
         cpu_s, peak_kb = map(float, usage.read_text().split())
-    return Usage(cpu_s, peak_kb / 1024**2)
+    return Usage(cpu_s, peak_kb / 1024**2, done.returncode)
 
 
 def rendered_images(scene: Path, views: tuple[str, ...] = RENDERED_VIEWS) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from reprojection import Surface, reprojected
 from rows.resources import of_all_processes
 from strecha import write_strecha_scene
 from workplace import COVERAGE_SHORT, ZLOCUS, Figure, Workplace, run
+from zlocus.evaluation.comparison import Comparison
+from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import read_heights
 from zlocus.io.scene_file import open_scene, write_scene_file
 
@@ -34,7 +37,8 @@ def dmc(workplace: Workplace) -> list[Figure]:
     # The reference is a terrain model of 24 m cells; a difference of more than 50 m is a false height, not its error.
     error, _ = errors_where_two_see(workplace.out, scene / "reference" / "dem_24m_egm2008.tif")
     return [
-        *two_view_figures(error, min_filled=0.7, max_nmad_m=8.0, max_median_m=6.0),
+        *two_view_figures(error, Bars(min_filled=0.7, max_nmad_m=8.0, max_median_m=6.0)),
+        *aligned_figures(workplace.out, scene / "reference" / "dem_24m_egm2008.tif"),
         Figure("heights > 50 m off", float((np.abs(error[np.isfinite(error)]) > 50.0).mean())),
     ]
 
@@ -58,8 +62,9 @@ def tuniu(workplace: Workplace) -> list[Figure]:
     precise = np.where(sigma <= PRECISE_M, error, np.nan)
     left_out = json.loads((workplace.out / "dsm" / "run.json").read_text())["left_out_cells"]
     return [
-        *two_view_figures(error, min_filled=0.6, max_nmad_m=0.5),
-        *two_view_figures(precise, min_filled=0.6, max_nmad_m=0.5, which=f", sigma <= {PRECISE_M:g} m"),
+        *two_view_figures(error, Bars(min_filled=0.6, max_nmad_m=0.5)),
+        *two_view_figures(precise, Bars(min_filled=0.6, max_nmad_m=0.5), which=f", sigma <= {PRECISE_M:g} m"),
+        *aligned_figures(workplace.out, scene / "reference" / "odm_dsm_0.8m.tif"),
         Figure("cells an image was left out of", float(left_out)),
     ]
 
@@ -85,19 +90,49 @@ def errors_where_two_see(folder: Path, reference: Path) -> tuple[np.ndarray, np.
     return np.asarray(dsm.nearest(xyz[:, :2]) - xyz[:, 2]), np.asarray(sigma.nearest(xyz[:, :2]))
 
 
-def two_view_figures(
-    error: np.ndarray, min_filled: float, max_nmad_m: float, max_median_m: float | None = None, which: str = ""
-) -> list[Figure]:
-    """Completeness, median and NMAD of height differences.
+@dataclass(frozen=True)
+class Bars:
+    """Bars of a surface against a reference: least share filled, largest NMAD and absolute median difference, m."""
+
+    min_filled: float
+    max_nmad_m: float
+    max_median_m: float | None = None
+
+
+def two_view_figures(error: np.ndarray, bars: Bars, which: str = "") -> list[Figure]:
+    """Completeness, median and NMAD of height differences of the surface as it is.
 
     error : (n,) m, of ground that two images see, NaN without a height; which : end of the labels.
     """
     finite = error[np.isfinite(error)]
     median = float(np.median(finite))
     return [
-        Figure(f"ground seen by two, filled{which}", float(np.isfinite(error).mean()), at_least=min_filled),
-        Figure(f"|median difference|{which}", abs(median), "m", at_most=max_median_m),
-        Figure(f"NMAD{which}", float(1.4826 * np.median(np.abs(finite - median))), "m", at_most=max_nmad_m),
+        Figure(
+            f"ground seen by two, filled{which}", float(np.isfinite(error).mean()), at_least=bars.min_filled,
+            fails_when="cells are left empty, or standard deviations are too large",
+        ),
+        Figure(
+            f"absolute median difference{which}", abs(median), "m", at_most=bars.max_median_m,
+            fails_when="positions or angles of the cameras are read wrongly",
+        ),
+        Figure(
+            f"NMAD{which}", float(1.4826 * np.median(np.abs(finite - median))), "m", at_most=bars.max_nmad_m,
+            fails_when="cameras stay turned against each other, or many heights are false",
+        ),
+    ]  # fmt: skip
+
+
+def aligned_figures(folder: Path, reference: Path) -> list[Figure]:
+    """Accuracy against a reference before and after the best shift is removed, over all cells of the reference.
+
+    The area is that of the reference, so the figures before the shift differ from those of the ground that two see.
+    """
+    aligned = evaluate(folder / "dsm" / "dsm.tif", Comparison(reference, align=True, margin_m=0.0))
+    return [
+        Figure("all cells, NMAD", aligned.unshifted_statistics.nmad, "m"),
+        Figure("all cells, aligned, NMAD", aligned.statistics.nmad, "m"),
+        Figure("shift removed, horizontally", float(np.hypot(*aligned.shift.enu_m[:2])), "m"),
+        Figure("shift removed, up", aligned.shift.up_m, "m"),
     ]
 
 
@@ -115,11 +150,17 @@ def herzjesu(workplace: Workplace) -> list[Figure]:
     views, surface = open_scene([workplace.out / "scene.yaml"]).views, Surface.read(workplace.out / "dsm" / "dsm.tif")
     found = reprojected(surface, views[::2], views[1::2])
     together = np.concatenate([one.ncc for one in found.values()])
-    figures = [Figure("left-out images, median NCC", float(np.median(together)), at_least=0.7)]
+    figures = [
+        Figure(
+            "left-out images, median NCC", float(np.median(together)), at_least=0.7,
+            fails_when="heights are off by more than some centimetres, or lens and attitude are read wrongly",
+        )
+    ]  # fmt: skip
     for name, one in found.items():
         figures.append(Figure(f"image {name}, median NCC", one.median))
         for what in ("hidden", "outside", "untextured", "at_rim"):
-            figures.append(Figure(f"image {name}, {what.replace('_', ' ')}", getattr(one, what) / one.with_height))
+            share = getattr(one, what) / one.with_height
+            figures.append(Figure(f"image {name}, {what.replace('_', ' ')}", share, is_detail=True))
         figures.append(Figure(f"image {name}, compared", len(one.ncc) / one.with_height))
     worse = reprojected(surface, views[::2], views[1::2], MOVED_M)
     ncc = float(np.median(np.concatenate([one.ncc for one in worse.values()])))

@@ -1,0 +1,69 @@
+"""All rows of the acceptance table, by name. A new row is one line here, and its function in a module of the folder."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+
+from result_files import PACKAGE, RENDERER
+from workplace import Figure, Workplace
+
+WITH_RENDERER = (PACKAGE, RENDERER)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the acceptance table.
+
+    function : "module:name" of the function that measures it; the module is imported when the row is measured.
+    code : measured parts of the source; the file of the function is always one more. is_slow : left out unless it is
+    asked for by name or by `--slow`.
+    """
+
+    function: str
+    code: tuple[str, ...] = (PACKAGE,)
+    is_slow: bool = False
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Parts of the source whose change makes the results file of the row older than the code."""
+        module = self.function.partition(":")[0]
+        return (*self.code, f"benchmarks/{module.replace('.', '/')}.py")
+
+    def measure(self, workplace: Workplace) -> list[Figure]:
+        """Figures of the row, measured now."""
+        module, _, name = self.function.partition(":")
+        return getattr(importlib.import_module(module), name)(workplace)
+
+
+# In the order of the table of docs/reference/accuracy.md.
+ROWS: dict[str, Row] = {
+    "fresh-city": Row("rows.fresh:fresh_city", WITH_RENDERER, is_slow=True),
+    "fresh-hills": Row("rows.fresh:fresh_hills", WITH_RENDERER, is_slow=True),
+    "calanques": Row("rows.satellite:calanques"),
+    "ventoux": Row("rows.satellite:ventoux"),
+    "datum": Row("rows.satellite:datum"),
+    "dmc": Row("rows.photographs:dmc"),
+    "tuniu": Row("rows.photographs:tuniu"),
+    "herzjesu": Row("rows.photographs:herzjesu"),
+    "middlebury": Row("rows.methods:middlebury"),
+    "selection": Row("rows.methods:selection"),
+    "city": Row("rows.rendered:city"),
+    "city-views": Row("rows.rendered:city_views"),
+    "hills": Row("rows.rendered:hills"),
+    "joint": Row("rows.rendered:joint"),
+    "demo": Row("rows.demo:demo", WITH_RENDERER),
+    "mixed": Row("rows.demo:mixed", WITH_RENDERER),
+    "ortho": Row("rows.rendered:ortho"),
+    "features": Row("rows.methods:features", WITH_RENDERER),
+    "kernels": Row("rows.resources:kernels"),
+    "speed": Row("rows.resources:speed", WITH_RENDERER, is_slow=True),
+    "memory": Row("rows.resources:memory", WITH_RENDERER, is_slow=True),
+    "inspect": Row("inspecting:inspect", WITH_RENDERER),
+    "inspect-large": Row("inspecting:inspect_large", WITH_RENDERER, is_slow=True),
+    "halo": Row("rows.large_areas:halo", WITH_RENDERER),
+    "growth": Row("rows.large_areas:growth", WITH_RENDERER, is_slow=True),
+    "signals": Row("rows.resources:signals"),
+    "clone": Row("rows.resources:clone", WITH_RENDERER, is_slow=True),
+    "peers": Row("rows.other_programs:peers"),
+}
