@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import PIL.Image
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -65,11 +67,26 @@ def write_page(results: Path, folder: Path) -> Path:
     """Write peers.md and its pictures; return the path of the page. results : results.json of a comparison."""
     found = json.loads(results.read_text())
     folder.mkdir(parents=True, exist_ok=True)
-    draw_accuracy(found, folder / PICTURES[0])
-    draw_cost(found, folder / PICTURES[1])
+    for draw, name in ((draw_accuracy, PICTURES[0]), (draw_cost, PICTURES[1])):
+        draw_if_changed(draw, found, folder / name)
     page = folder / "peers.md"
     page.write_text(page_of(found), encoding="utf-8")
     return page
+
+
+def draw_if_changed(draw: Callable[[dict[str, Any], Path], None], found: dict[str, Any], path: Path) -> None:
+    """Draw a picture, unless it is there and was drawn from the same results: other versions draw otherwise."""
+    if path.exists():
+        with PIL.Image.open(path) as picture:
+            if picture.info.get("Description") == picture_metadata(found)["Description"]:
+                return
+    draw(found, path)
+
+
+def picture_metadata(found: dict[str, Any]) -> dict[str, str | None]:
+    """What a picture says of itself: the digest of the results that it shows, and no version of the software."""
+    digest = hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()
+    return {"Software": None, "Description": f"results.json {digest[:16]}"}
 
 
 def page_of(found: dict[str, Any]) -> str:
@@ -323,7 +340,7 @@ def draw_accuracy(found: dict[str, Any], path: Path) -> None:
         axis.grid(axis="y", alpha=0.3)
     axes[1].set_xticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
     axes[0].legend(ncols=max(len(found["programs"]), 1), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
-    picture.savefig(path, dpi=110, metadata={"Software": None})
+    picture.savefig(path, dpi=110, metadata=picture_metadata(found))
     plt.close(picture)
 
 
@@ -347,5 +364,5 @@ def draw_cost(found: dict[str, Any], path: Path) -> None:
     keys = [plt.Line2D([], [], marker="s", ls="", color=COLOURS.get(name), label=name) for name in found["programs"]]
     keys += [plt.Line2D([], [], marker=mark, ls="", color="grey", label=scene) for scene, mark in marks.items()]
     axis.legend(handles=keys, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    picture.savefig(path, dpi=110, metadata={"Software": None})
+    picture.savefig(path, dpi=110, metadata=picture_metadata(found))
     plt.close(picture)
