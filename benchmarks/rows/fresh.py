@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import rasterio
@@ -76,7 +77,10 @@ def seed_figures(views: str, dsm: Path, scene: Path, kind: str) -> list[Figure]:
         bars = {} if is_aligned else CITY_BARS[views]
         if kind == "hills":
             bars = {"nmad": HILLS_NMAD_BAR_M} if is_aligned else {}
-        figures += accuracy(label, found, kind, bars)
+        # Aligned figures stand side by side with the others in a table of their own on the page.
+        figures += [
+            replace(figure, is_detail=is_aligned and not figure.bar) for figure in accuracy(label, found, kind, bars)
+        ]
     return figures
 
 
