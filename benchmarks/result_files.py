@@ -26,6 +26,9 @@ PACKAGE, RENDERER = "src/zlocus", "src/zlocus/synthetic"
 # Figures are kept to so many significant digits.
 DIGITS = 7
 
+# Cells of a table as text, by line; the first line is its heading.
+Table = list[list[str]]
+
 
 @dataclass(frozen=True)
 class Results:
@@ -34,7 +37,7 @@ class Results:
     commit : of the checkout; it ends in `DIRTY` where measured files differed from it. date : UTC, ISO 8601. machine :
     processor, cores, memory_gb, system, python. seconds : wall time, None where it is not recorded. code : digest of
     each measured part of the source. inputs : noted by the row, such as its seeds. note : where the figures come from,
-    if not from the command.
+    if not from the command. tables : printed by a script, see `recording.py`.
     """
 
     row: str
@@ -47,6 +50,7 @@ class Results:
     figures: tuple[Figure, ...]
     inputs: dict[str, Any] = field(default_factory=dict)
     note: str = ""
+    tables: tuple[Table, ...] = ()
 
     def figure(self, what: str) -> Figure:
         """The figure with this label.
@@ -82,7 +86,7 @@ def read_results(row: str, folder: Path = RESULTS) -> Results:
         raise CannotRun(f"{path} is missing: measure the row with `make measure {row}`.")
     found = json.loads(path.read_text(encoding="utf-8"))
     figures = tuple(Figure(**_with_nan(figure)) for figure in found.pop("figures"))
-    return Results(**found, figures=figures)
+    return Results(**found | {"figures": figures, "tables": tuple(found.get("tables", ()))})
 
 
 def write_results(results: Results, folder: Path = RESULTS) -> Path:
@@ -109,8 +113,8 @@ def write_results(results: Results, folder: Path = RESULTS) -> Path:
 
 
 # Order of the keys in a file; the optional ones are left out where they are empty.
-KEYS = ("row", "commit", "date", "machine", "command", "seconds", "code", "inputs", "note", "figures")
-OPTIONAL_KEYS = ("inputs", "note")
+KEYS = ("row", "commit", "date", "machine", "command", "seconds", "code", "inputs", "note", "figures", "tables")
+OPTIONAL_KEYS = ("inputs", "note", "tables")
 
 
 def record_results(
@@ -121,6 +125,7 @@ def record_results(
     seconds: float | None = None,
     parts: Sequence[str] = (PACKAGE,),
     inputs: dict[str, Any] | None = None,
+    tables: Sequence[Table] = (),
     folder: Path = RESULTS,
 ) -> Results:
     """Write the results file of figures that were measured just now with the code of this checkout.
@@ -137,6 +142,7 @@ def record_results(
         code={part: digest_of(part) for part in parts},
         figures=tuple(replace(figure, value=_rounded(figure.value)) for figure in figures),
         inputs=dict(inputs or {}),
+        tables=tuple(tables),
     )
     write_results(results, folder)
     return results

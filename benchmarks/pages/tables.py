@@ -1,0 +1,270 @@
+"""Tables of the pages that are made from results files, by the name in `<!-- table: NAME -->`.
+
+A new table is a function with `@table("name")` that takes all results by row and returns the table in Markdown. A table
+that a script printed and that `recording.py` kept needs none: its name is `ROW-N`, the N-th table of that results file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from result_files import NOT_RECORDED, Results
+from rows.registry import ROWS
+from workplace import CannotRun, Figure
+
+AllResults = Mapping[str, Results]
+Maker = Callable[[AllResults], str]
+MAKERS: dict[str, Maker] = {}
+CLASSES = ("all", "ground", "building", "tree")
+
+
+class Tables(Mapping[str, Maker]):
+    """All makers of tables by name: those of this module, and the printed tables of the results files as `ROW-N`."""
+
+    def __getitem__(self, name: str) -> Maker:
+        if name in MAKERS:
+            return MAKERS[name]
+        row, _, number = name.rpartition("-")
+        if not (row and number.isdigit()):
+            raise KeyError(name)
+        return lambda results: printed_table(of_row(results, row), int(number))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(MAKERS)
+
+    def __len__(self) -> int:
+        return len(MAKERS)
+
+
+TABLES = Tables()
+
+
+def table(name: str) -> Callable[[Maker], Maker]:
+    """Register a function under the name of its table."""
+
+    def register(maker: Maker) -> Maker:
+        MAKERS[name] = maker
+        return maker
+
+    return register
+
+
+def of_row(results: AllResults, row: str) -> Results:
+    """Results of a row.
+
+    Raises
+    ------
+    CannotRun
+        The row has no results file.
+    """
+    if row not in results:
+        raise CannotRun(f"benchmarks/results/{row}.json is missing, and a table needs it: `make measure {row}`.")
+    return results[row]
+
+
+def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown. A bar in a cell would end the cell, so it is escaped."""
+    rows = [[cell.replace("|", "\\|") for cell in line] for line in (head, *lines)]
+    text = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([text[0], "|" + "---|" * len(head), *text[1:]])
+
+
+def printed_table(results: Results, number: int) -> str:
+    """A table that a script printed. number : from 1.
+
+    Raises
+    ------
+    CannotRun
+        The results file has fewer tables.
+    """
+    if not 1 <= number <= len(results.tables):
+        raise CannotRun(
+            f"benchmarks/results/{results.row}.json has {len(results.tables)} tables, and a page asks for number "
+            f"{number}. Correct the name in the page."
+        )
+    head, *lines = results.tables[number - 1]
+    return markdown(head, lines)
+
+
+def number(figure: Figure) -> str:
+    """A figure with its unit, as the tables show it."""
+    value, unit = figure.value, f" {figure.unit}" if figure.unit else ""
+    if math.isnan(value):
+        return "none"
+    if value == round(value) and abs(value) < 1e6:
+        return f"{value:.0f}{unit}"
+    if not figure.unit and abs(value) < 2:
+        return f"{value:.4f}" if abs(value) >= 1e-4 else f"{value:.1e}"
+    if abs(value) >= 100:
+        return f"{value:.0f}{unit}"
+    return f"{value:.3g}{unit}"
+
+
+@table("accuracy")
+def accuracy(results: AllResults) -> str:
+    """Every figure of the acceptance table, in the order of the registry; details only where they miss their bar."""
+    lines = []
+    for row in ROWS:
+        if row not in results:
+            lines.append([row, "not measured yet", "", "", ""])
+            continue
+        for figure in results[row].figures:
+            misses = bool(figure.bar) and not figure.passes
+            if figure.is_detail and not misses:
+                continue
+            shown = number(figure) + (" (short)" if misses else "")
+            lines.append([row, figure.what, figure.bar, shown, figure.fails_when if figure.bar else ""])
+    return markdown(["row", "what", "bar", "figure", "the figure would miss the bar if"], lines)
+
+
+@table("measurements")
+def measurements(results: AllResults) -> str:
+    """When, where and at which commit every results file was measured."""
+    ordered = [row for row in ROWS if row in results] + [row for row in results if row not in ROWS]
+    lines = []
+    for row in ordered:
+        it = results[row]
+        seconds = NOT_RECORDED if it.seconds is None else f"{it.seconds:.0f} s"
+        command = it.command if it.command == NOT_RECORDED else f"`{it.command}`"
+        lines.append([row, it.date[:10], it.commit, processor(it), seconds, command, it.note])
+    return markdown(["row", "date", "commit", "processor", "time", "command", "remark"], lines)
+
+
+def processor(results: Results) -> str:
+    """The machine of a measurement, in a few words."""
+    name, cores = results.machine.get("processor", NOT_RECORDED), results.machine.get("cores")
+    return name if not cores else f"{len(cores)} cores of {name}"
+
+
+@table("fresh-scenes")
+def fresh_scenes(results: AllResults) -> str:
+    """Means over the fresh seeds with their standard deviations, and the worst share of all cells within 1 m."""
+    lines = []
+    for row, scene in (("fresh-city", "towns"), ("fresh-hills", "hills")):
+        it = of_row(results, row)
+        for views in ("six", "three", "two"):
+            for name, label in ((views, "as it is"), (f"{views}, aligned", "aligned")):
+                if any(figure.what == f"{name}, RMSE, mean" for figure in it.figures):
+                    lines.append([f"{scene}, {views} views, {label}", *seed_cells(it, name)])
+    head = ["scenes", *(f"within 1 m: {kind}" for kind in CLASSES[:3]), "worst: all", "off by > 3 m", "off by > 10 m"]
+    return markdown([*head, "RMSE, m", "NMAD ground, m"], lines)
+
+
+def seed_cells(it: Results, name: str) -> list[str]:
+    """Cells of a line of the fresh scenes: mean and standard deviation of each figure."""
+    known = {figure.what: figure for figure in it.figures}
+
+    def spread(what: str, digits: int) -> str:
+        mean, deviation = (known.get(f"{name}, {what}, {which}") for which in ("mean", "standard deviation"))
+        return "" if mean is None or deviation is None else f"{mean.value:.{digits}f} ± {deviation.value:.{digits}f}"
+
+    return [
+        *(spread(f"within 1 m: {kind}", 3) for kind in CLASSES[:3]),
+        f"{known[f'{name}, within 1 m: all, worst'].value:.3f}",
+        spread("off by more than 3 m", 4),
+        spread("off by more than 10 m", 4),
+        spread("RMSE", 2),
+        spread("NMAD ground", 3),
+    ]
+
+
+@table("demo")
+def demo(results: AllResults) -> str:
+    """Accuracy of the demo by class, as it is and aligned."""
+    value = of_row(results, "demo").value
+    lines = [
+        [
+            kind,
+            f"{value(f'blocks: {kind}'):.0f}",
+            f"{value(f'with a height: {kind}'):.4f}",
+            *(f"{value(f'{way}within 1 m: {kind}'):.4f}" for way in ("", "aligned, ")),
+            *(f"{value(f'{way}NMAD: {kind}'):.3f}" for way in ("", "aligned, ")),
+        ]
+        for kind in CLASSES
+    ]
+    return markdown(
+        ["class", "blocks", "with a height", "within 1 m", "within 1 m, aligned", "NMAD, m", "NMAD, aligned, m"], lines
+    )
+
+
+@table("flights")
+def flights(results: AllResults) -> str:
+    """The ground of the demo from other images: raw ones, and those of a steady flight."""
+    value = of_row(results, "demo").value
+    lines = [
+        [
+            "level 1, unsteady (`make demo`)",
+            f"{value('within 1 m: ground'):.4f}",
+            f"{value('within 1 m: building'):.4f}",
+            f"{value('NMAD: ground'):.4f}",
+            "",
+        ]
+    ]
+    for name, what in (
+        ("raw, unsteady (`--level 0`)", "raw images"),
+        ("level 1, steady (`--steady`)", "steady flight"),
+        ("the same through RPC fitted to it", "steady flight through RPC"),
+    ):
+        lines.append(
+            [
+                name,
+                f"{value(f'{what}, within 1 m: ground'):.4f}",
+                f"{value(f'{what}, within 1 m: building'):.4f}",
+                f"{value(f'{what}, NMAD: ground'):.4f}",
+                f"{value(f'{what}, CPU'):.0f}",
+            ]
+        )
+    return markdown(
+        ["images", "ground within 1 m", "roofs within 1 m", "NMAD of ground, m", "CPU of `zlocus dsm`, s"], lines
+    )
+
+
+@table("sensors")
+def sensors(results: AllResults) -> str:
+    """One ground seen by three kinds of sensor, alone and together."""
+    value = of_row(results, "mixed").value
+    names = {"linescan": "line scanner", "frame": "frame", "rpc": "RPC", "mixed": "all nine"}
+    lines = [
+        [
+            title,
+            *(
+                ", ".join(f"{value(f'{name}: within {limit} m: {kind}'):.3f}" for kind in CLASSES)
+                for limit in ("0.42", "1")
+            ),
+            f"{value(f'{name}: NMAD ground'):.4f}",
+        ]
+        for name, title in names.items()
+    ]
+    head = ["images", "within 0.42 m: all, ground, building, tree", "within 1 m", "NMAD of ground, m"]
+    return markdown(head, lines)
+
+
+@table("middlebury")
+def middlebury(results: AllResults) -> str:
+    """Wrong pixels on rectified photographs, beside OpenCV."""
+    it = of_row(results, "middlebury")
+    end = ": bad > 1 px"
+    cases = [figure.what.removesuffix(end) for figure in it.figures if figure.what.endswith(end)]
+    lines = [
+        [
+            case,
+            f"{it.value(f'{case}{end}'):.2f} %",
+            f"{it.value(f'{case}: OpenCV, bad > 1 px'):.2f} %",
+            f"{it.value(f'{case}: left empty before gaps are filled'):.2f} %",
+        ]
+        for case in cases
+    ]
+    return markdown(["scene", "zlocus", "OpenCV", "left empty before gaps are filled"], lines)
+
+
+@table("kernels")
+def kernels(results: AllResults) -> str:
+    """Time of a unit of work of every benchmark of a kernel."""
+    it = of_row(results, "kernels")
+    lines = []
+    for figure in it.figures:
+        name, _, unit = figure.what.rpartition(", per ")
+        if name:
+            lines.append([f"`{name}`", unit, f"{figure.value:.3g}", f"{1e3 / figure.value:.3g}"])
+    return markdown(["benchmark", "unit of work", "ns per unit", "million units per second"], lines)
