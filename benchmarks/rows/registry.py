@@ -17,12 +17,14 @@ class Row:
 
     function : "module:name" of the function that measures it; the module is imported when the row is measured.
     code : measured parts of the source; the file of the function is always one more. is_slow : left out unless it is
-    asked for by name or by `--slow`.
+    asked for by name or by `--slow`. is_recorded : whether it has a results file; not where its figures come from another
+    file that holds when they were measured.
     """
 
     function: str
     code: tuple[str, ...] = (PACKAGE,)
     is_slow: bool = False
+    is_recorded: bool = True
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -45,6 +47,7 @@ ROWS: dict[str, Row] = {
     "datum": Row("rows.satellite:datum"),
     "dmc": Row("rows.photographs:dmc"),
     "tuniu": Row("rows.photographs:tuniu"),
+    "drone-block": Row("rows.drone_block:drone_block", WITH_RENDERER, is_slow=True),
     "herzjesu": Row("rows.photographs:herzjesu"),
     "middlebury": Row("rows.methods:middlebury"),
     "selection": Row("rows.methods:selection"),
@@ -65,5 +68,6 @@ ROWS: dict[str, Row] = {
     "growth": Row("rows.large_areas:growth", WITH_RENDERER, is_slow=True),
     "signals": Row("rows.resources:signals"),
     "clone": Row("rows.resources:clone", WITH_RENDERER, is_slow=True),
-    "peers": Row("rows.other_programs:peers"),
+    # Its figures are those of benchmarks/peers/results.json, and stand on a page of their own.
+    "peers": Row("rows.other_programs:peers", is_recorded=False),
 }
