@@ -27,13 +27,37 @@ MOVED_M = 0.05
 SEARCHED_M, FINEST_STEP_M = 4.0, 0.02
 
 
+def import_dmc(workplace: Workplace, out: Path) -> Path:
+    """Import the images of the mapping camera into a folder; the scene file."""
+    scene = workplace.scene("aerial_ngi_dmc")
+    out.mkdir(parents=True, exist_ok=True)
+    (camera := out / "camera.yaml").write_text(f"focal: {120 / 0.144}\n")
+    crs = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", out / "scene.yaml"])
+    return out / "scene.yaml"
+
+
+def import_tuniu(workplace: Workplace, out: Path) -> Path:
+    """Import the images of the drone into a folder; the scene file."""
+    scene = workplace.scene("drone_tuniu_oblique")
+    out.mkdir(parents=True, exist_ok=True)
+    (bundle,) = json.loads((scene / "opensfm_reconstruction.json").read_text())[0]["cameras"].values()
+    side, lens = bundle["width"], {name: bundle[name] for name in ("k1", "k2", "k3", "p1", "p2")}
+    point = [(bundle[f"c_{axis}"] * side + (bundle[size] - 1) / 2) for axis, size in (("x", "width"), ("y", "height"))]
+    (camera := out / "camera.yaml").write_text(
+        json.dumps(
+            {"focal": bundle["focal_x"] * side, "principal_point": point, "distortion": {"kind": "brown", **lens}}
+        )
+    )
+    table = ["--crs", "EPSG:32651", "--earth", "flat", "--camera", camera]
+    run([ZLOCUS, "import", "eo", scene, *table, "-o", out / "scene.yaml"])
+    return out / "scene.yaml"
+
+
 def dmc(workplace: Workplace) -> list[Figure]:
     """Four images of a mapping camera in two strips, with their exterior orientation and without a height range."""
     scene = workplace.scene("aerial_ngi_dmc")
-    workplace.out.mkdir(parents=True, exist_ok=True)
-    (camera := workplace.out / "camera.yaml").write_text(f"focal: {120 / 0.144}\n")
-    crs = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
-    run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", workplace.out / "scene.yaml"])
+    import_dmc(workplace, workplace.out)
     run([ZLOCUS, "dsm", workplace.out / "scene.yaml", "-o", workplace.out / "dsm"], accept=(0, COVERAGE_SHORT))
     # The reference is a terrain model of 24 m cells; a difference of more than 50 m is a false height, not its error.
     error, _ = errors_at(
@@ -49,17 +73,7 @@ def dmc(workplace: Workplace) -> list[Figure]:
 def tuniu(workplace: Workplace) -> list[Figure]:
     """Four oblique images of a drone, in four directions, without a height range."""
     scene = workplace.scene("drone_tuniu_oblique")
-    workplace.out.mkdir(parents=True, exist_ok=True)
-    (bundle,) = json.loads((scene / "opensfm_reconstruction.json").read_text())[0]["cameras"].values()
-    side, lens = bundle["width"], {name: bundle[name] for name in ("k1", "k2", "k3", "p1", "p2")}
-    point = [(bundle[f"c_{axis}"] * side + (bundle[size] - 1) / 2) for axis, size in (("x", "width"), ("y", "height"))]
-    (camera := workplace.out / "camera.yaml").write_text(
-        json.dumps(
-            {"focal": bundle["focal_x"] * side, "principal_point": point, "distortion": {"kind": "brown", **lens}}
-        )
-    )
-    table = ["--crs", "EPSG:32651", "--earth", "flat", "--camera", camera]
-    run([ZLOCUS, "import", "eo", scene, *table, "-o", workplace.out / "scene.yaml"])
+    import_tuniu(workplace, workplace.out)
     run([ZLOCUS, "dsm", workplace.out / "scene.yaml", "-o", workplace.out / "dsm"], accept=(0, COVERAGE_SHORT))
     ground = ground_where_two_see(workplace.out, scene / "reference" / "odm_dsm_0.8m.tif")
     error, sigma = errors_at(workplace.out, ground)

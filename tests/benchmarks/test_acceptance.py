@@ -282,7 +282,8 @@ class Photograph:
         inside = ((px >= 0) & (px < 120)).all(axis=1)
         values = cv2.resize(texture, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR).ravel()
         pixels[px[inside, 1], px[inside, 0]] = values[order][inside]
-        self.image = SimpleNamespace(shape=pixels.shape, read=lambda *_: SimpleNamespace(pixels=pixels))
+        window = SimpleNamespace(pixels=pixels, valid=np.ones(pixels.shape, bool))
+        self.image = SimpleNamespace(shape=pixels.shape, read=lambda *_: window)
 
 
 @pytest.fixture(scope="module")
@@ -313,13 +314,14 @@ def test_images_left_out_confirm_a_surface(tower):
     assert np.isnan(empty.median)
 
 
-def plainly_clear(z: np.ndarray, camera: tuple[float, float, float], margin: float) -> np.ndarray:
+def plainly_clear(z: np.ndarray, sight: np.ndarray, top: float, margin: float) -> np.ndarray:
     """The kernel's question by a plain loop: every step of the ray along its longer side, nothing passed over."""
     out = np.zeros(z.shape, bool)
     for row, col in np.ndindex(z.shape):
-        by = np.array(camera) - (col, row, z[row, col])
-        n = np.abs(by[:2]).max()
-        along = [np.array([col, row, z[row, col]]) + by / n * step for step in range(1, int(n) + 1)]
+        by = np.array([*sight[row, col].astype(float), 1.0])
+        longer = np.abs(by[:2]).max()
+        n = int((top - float(z[row, col])) * longer)
+        along = [np.array([col, row, z[row, col]]) + by / longer * step for step in range(1, n + 1)]
         on = [(int(np.rint(p[1])), int(np.rint(p[0])), p[2]) for p in along]
         out[row, col] = all(z[r, c] <= ray + margin for r, c, ray in on if 0 <= r < z.shape[0] and 0 <= c < z.shape[1])
     return out
@@ -331,9 +333,10 @@ def test_what_a_tower_hides_is_found_as_a_plain_loop_finds_it(tower):
     for view in views:
         x, y, height = view.sensor.centre
         out = np.empty(z.shape, bool)
-        camera = (float(x), float(-y), float(height))
-        reprojection.clear_cells(z, reprojection.highest_of(z), *camera, reprojection.CLEAR_CELLS, out)
-        expected = plainly_clear(z, camera, reprojection.CLEAR_CELLS)
+        col, row = np.meshgrid(np.arange(60.0), np.arange(60.0))
+        sight = (np.dstack([x - col, -y - row]) / (height - z)[..., None]).astype(np.float32)
+        reprojection.clear_cells(z, reprojection.highest_of(z), sight, height, reprojection.CLEAR_CELLS, out)
+        expected = plainly_clear(z, sight, height, reprojection.CLEAR_CELLS)
         # Squares of 2 x 2 cells are hidden together.
         alike = expected[::2, ::2].repeat(2, axis=0).repeat(2, axis=1)
         np.testing.assert_array_equal(out, alike)
