@@ -18,6 +18,7 @@ from zlocus.cli.app import app
 from zlocus.core import errors
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import DsmRequest
+from zlocus.evaluation.accuracy import Accuracy
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.statistics import ErrorStatistics
 
@@ -48,7 +49,8 @@ def pipeline(monkeypatch):
         def run_demo(self, out, progress):
             out.mkdir(exist_ok=True)
             figures = ErrorStatistics(1000, 0.99, 0.98, 0.01, 0.123, 0.2, 0.3)
-            evaluations = tuple(Evaluation(figures, {"ground": figures}, None, limit) for limit in (0.42, 1.0))
+            accuracy = Accuracy(figures, {"ground": figures})
+            evaluations = tuple(Evaluation(accuracy, limit) for limit in (0.42, 1.0))
             return SimpleNamespace(out=out, evaluations=evaluations)
 
     fake = Pipeline()

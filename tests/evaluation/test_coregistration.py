@@ -114,12 +114,14 @@ def test_what_is_left_does_not_move_again(tmp_path, reference):
 def test_the_shift_is_said_with_the_figures_before(tmp_path, reference):
     result = evaluate(moved(tmp_path / "d.tif", N, (1.0, 2.0, 3.0)), Comparison(reference, coregister="nuth-kaab"))
     table, record = evaluation_table(result), result.as_dict()
-    assert "removed first: +1.000 m east, +2.000 m north, +3.000 m up (nuth-kaab, " in table
+    assert "aligned: removed first: +1.000 m east, +2.000 m north, +3.000 m up (nuth-kaab, " in table
     assert record["shift_method"] == "nuth-kaab"
     assert record["shift_m"]["north"] == pytest.approx(2.0, abs=EXACT_CONVERGED_SHIFT_M)
     assert record["unshifted"]["median"] == pytest.approx(3.0, abs=1.0)
     assert record["all"]["rmse"] < 0.01
-    assert table.splitlines()[2].startswith("as it lies")
+    assert record["aligned"]["all"] == record["all"]
+    assert record["absolute"]["all"] == record["unshifted"]
+    assert record["aligned"]["shift_method"] == "nuth-kaab"
 
 
 @pytest.mark.parametrize(

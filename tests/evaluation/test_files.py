@@ -170,13 +170,45 @@ def test_no_input_is_written_over(tmp_path, pair):
 def test_the_contract_of_the_command_holds(pair):
     dsm, reference = pair
     table = run(dsm, reference, "--margin", 5).stdout.splitlines()
-    assert table[0].split() == ["cells", "complete", "within", "median", "NMAD", "RMSE", "LE90", "LE95"]
-    assert table[1].split()[:2] == ["all", "10000"]
+    assert table[0].split() == ["absolute", "aligned"]
+    assert table[1].split() == ["cells", "complete", *["within", "median", "NMAD", "RMSE", "LE90"] * 2]
+    assert table[2].split()[:2] == ["all", "10000"]
     assert "within: share of all cells in error by less than 1 m; errors in m" in table
-    assert any(line.startswith("removed first: ") for line in run(dsm, reference, "--align").stdout.splitlines())
-    several = run(dsm, reference, "--threshold", 1, "--threshold", 0.25).stdout
-    assert "< 1 m" in several.splitlines()[0]
-    assert "< 0.25 m" in several.splitlines()[0]
+    assert any(line.startswith("aligned: removed first: ") for line in table)
+    # The table shows both kinds of figures whether or not the shift is asked for.
+    assert run(dsm, reference, "--margin", 5, "--align").stdout.splitlines() == table
+    several = run(dsm, reference, "--threshold", 1, "--threshold", 0.25).stdout.splitlines()
+    thresholds = several[several.index("") + 2]
+    assert thresholds.split() == ["cells", "complete", *["<", "1", "m", "<", "0.25", "m"] * 2]
+
+
+def test_both_kinds_of_figures_are_in_every_output(tmp_path):
+    dsm, reference = moved(tmp_path / "d.tif", N, (0.7, -1.2, 0.4)), moved(tmp_path / "r.tif", N, (0, 0, 0))
+    for options, drawn, other in (((), "absolute", "aligned"), (("--align",), "aligned", "absolute")):
+        printed = json.loads(run(dsm, reference, "--json", *options, "-o", tmp_path / "out", "--overwrite").stdout)
+        kept = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+        for record in (printed, kept):
+            assert record["absolute"]["all"]["rmse"] > 0.4 > 10 * record["aligned"]["all"]["rmse"]
+            assert record["aligned"]["shift_m"]["north"] == pytest.approx(-1.2, abs=0.03)
+            assert record["all"] == record[drawn]["all"]
+            assert (record["shift_m"] is None) == (drawn == "absolute")
+        with rasterio.open(tmp_path / "out" / "error.tif") as source:
+            errors = source.read(1)
+        assert float(np.nanmedian(np.abs(errors))) == pytest.approx(printed["mvs3dm_median_error"], abs=0.02)
+        result = evaluate(dsm, Comparison(reference, align=bool(options)))
+        title = histogram_figure(result).axes[0].get_title(loc="left").splitlines()
+        assert title[0].endswith(f"drawn: {drawn} errors")
+        figures = printed[other]["all"]
+        assert title[1] == f"{other} errors: median {figures['median']:+z.3f} m, NMAD {figures['nmad']:.3f} m"
+
+
+def test_no_shift_is_no_failure_unless_it_is_asked_for(tmp_path, pair):
+    empty = write(tmp_path / "empty.tif", np.full((N, N), np.nan, np.float32))
+    plain, asked = run(empty, pair[1]), run(empty, pair[1], "--align")
+    assert plain.exit_code == 0
+    assert "aligned: there are no figures, because no cell has a height in both" in plain.stdout
+    assert (asked.exit_code, len(asked.stderr.splitlines())) == (2, 1)
+    assert "has no height where the reference has one: nothing to align" in asked.stderr
 
 
 @pytest.mark.parametrize(

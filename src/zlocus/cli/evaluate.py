@@ -21,10 +21,15 @@ Classes = Annotated[
     Path | None,
     typer.Option(help="Raster of classes on the reference's grid: 0-1 ground, 2 building, 3 tree.", metavar="RASTER"),
 ]
-Align = Annotated[bool, typer.Option("--align", help="Find the best shift by comparing heights, remove it, report it.")]
+Align = Annotated[
+    bool,
+    typer.Option("--align", help="Remove the best shift first, found by a search: aligned errors are the main ones."),
+]
 Coregister = Annotated[
     str | None,
-    typer.Option(help="Find the shift from slope and aspect instead (Nuth and Kääb 2011).", metavar="nuth-kaab"),
+    typer.Option(
+        help="Like --align, but find the shift from slope and aspect (Nuth and Kääb 2011).", metavar="nuth-kaab"
+    ),
 ]
 Margin = Annotated[float, typer.Option(help="Width of the rim of the reference that is left out, m.", metavar="M")]
 Thresholds = Annotated[

@@ -17,11 +17,12 @@ COREGISTRATIONS = (coregistration.METHOD,)
 class Comparison:
     """A reference surface and the options of the comparison with it.
 
-    reference : raster of heights. classes : raster of classes on the reference's grid, or None. align : search for the
-    best horizontal shift and remove it. coregister : method that finds the shift from slope and aspect ("nuth-kaab"),
-    or None. margin_m : width of the strip along the reference's edge that is left out. threshold_m : errors below it
-    count as within. more_thresholds_m : further thresholds. slope_edges_deg : limits between the bands of slope; none:
-    no bands. geoid : geoid raster or name that converts heights where the vertical datums differ, see `same_heights`.
+    reference : raster of heights. classes : raster of classes on the reference's grid, or None. align : the main
+    figures are those after the shift was removed. coregister : method that finds the shift from slope and aspect
+    ("nuth-kaab") instead of by a search, which makes the aligned figures the main ones too, or None. margin_m : width
+    of the strip along the reference's edge that is left out. threshold_m : errors below it count as within.
+    more_thresholds_m : further thresholds. slope_edges_deg : limits between the bands of slope; none: no bands.
+    geoid : geoid raster or name that converts heights where the vertical datums differ, see `same_heights`.
 
     Raises
     ------
@@ -38,6 +39,11 @@ class Comparison:
     slope_edges_deg: Sequence[float] = SLOPE_EDGES_DEG
     coregister: str | None = None
     geoid: Path | None = None
+
+    @property
+    def removes_shift(self) -> bool:
+        """Whether the main figures are those after the shift was removed."""
+        return self.align or self.coregister is not None
 
     def __post_init__(self) -> None:
         if not self.margin_m >= 0:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import HeightRaster
+from zlocus.evaluation.relief import MIN_BLOCKS, MIN_SLOPE_SPREAD, has_slope, slope_spread
 from zlocus.evaluation.statistics import NORMAL_SIGMA_FROM_MAD
 from zlocus.evaluation.truth import TruthBlocks
 
@@ -18,14 +18,6 @@ METHOD = "nuth-kaab"
 # The iterations end where the next shift is smaller than this.
 CONVERGED_SHIFT_M = 0.001
 MAX_ITERATIONS = 50
-# Slopes must spread at least this much in every direction. Below, a shift of a metre changes heights by less than a
-# centimetre.
-MIN_SLOPE_SPREAD = 0.01
-# Steeper blocks are walls: their heights say on which side of the wall a block lies, not how far from it.
-MAX_SLOPE = np.tan(np.radians(70.0))
-MIN_BLOCKS = 100
-# Gradients of blocks this far apart use no common height, so that noise of the reference does not count as slope.
-INDEPENDENT_BLOCKS_APART = 3
 # Tukey's biweight: 95 % efficient for normal errors (Beaton and Tukey 1974).
 TUKEY_SIGMAS = 4.685
 WEIGHT_ROUNDS = 5
@@ -68,8 +60,9 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
         of the shift exceeds half a cell.
     """
     rise, height = truth.gradient, truth.mean
-    usable = np.isfinite(rise).all(axis=1) & (np.hypot(*rise.T) < MAX_SLOPE)
-    _check_relief(surface, truth, usable)
+    usable = has_slope(truth)
+    _check_enough(surface, int(np.count_nonzero(usable)))
+    _check_relief(surface, truth)
     # (east, north) of the shift and the vertical offset, to heights.
     design = np.column_stack([-rise[usable], np.ones(np.count_nonzero(usable))])
     usable_points, height = points.where(usable), height[usable]
@@ -138,23 +131,13 @@ def _check_enough(surface: HeightRaster, n: int) -> None:
         )
 
 
-def _check_relief(surface: HeightRaster, truth: TruthBlocks, usable: NDArray[np.bool_]) -> None:
+def _check_relief(surface: HeightRaster, truth: TruthBlocks) -> None:
     """Refuse flat ground and a tilted plane: their slopes do not differ in some direction."""
-    _check_enough(surface, int(np.count_nonzero(usable)))
-    rise = np.full((*truth.shape, 2), np.nan)
-    rise[tuple(truth.cells[usable].T)] = truth.gradient[usable]
-    rise -= np.nanmean(rise, axis=(0, 1))
-    apart = INDEPENDENT_BLOCKS_APART
-    pairs = [(rise[:-apart], rise[apart:]), (rise[:, :-apart], rise[:, apart:])]
-    one, other = (np.concatenate([pair[side].reshape(-1, 2) for pair in pairs]) for side in (0, 1))
-    both = np.isfinite(one).all(axis=1) & np.isfinite(other).all(axis=1)
-    n = int(np.count_nonzero(both))
-    _check_enough(surface, n)
-    common = one[both].T @ other[both] / n
-    least = float(np.linalg.eigvalsh((common + common.T) / 2)[0])
-    spread = np.sqrt(max(least, 0.0))
-    if spread < MIN_SLOPE_SPREAD:
+    relief = slope_spread(truth)
+    _check_enough(surface, relief.n_pairs)
+    if relief.least < MIN_SLOPE_SPREAD:
         raise InputError(
             f"The ground under {surface.path} is too flat to co-register: in one direction its slopes differ by "
-            f"{100 * spread:.1f} %, and {100 * MIN_SLOPE_SPREAD:g} % are needed. Judge it as it is, or try --align."
+            f"{100 * relief.least:.1f} %, and {100 * MIN_SLOPE_SPREAD:g} % are needed. Judge it as it is, or remove "
+            "its height alone (--align)."
         )

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,38 +13,19 @@ from pyproj import CRS
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
-from zlocus.evaluation.alignment import best_shift
+from zlocus.evaluation.accuracy import Accuracy
+from zlocus.evaluation.alignment import nothing_to_align
 from zlocus.evaluation.comparison import Comparison
-from zlocus.evaluation.coregistration import coregister
 from zlocus.evaluation.frame import Points, frame_of, points_on
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.mvs3dm import Mvs3dm, mvs3dm_figures
+from zlocus.evaluation.shift import Shift, heights_without, horizontal_shift, shift_record
 from zlocus.evaluation.slopes import slope_bands
 from zlocus.evaluation.statistics import ErrorStatistics, error_statistics
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
 from zlocus.evaluation.vertical import same_heights
 
-SEARCH = "search"
-
-
-@dataclass(frozen=True)
-class Shift:
-    """Position of the surface relative to the reference, m; it is removed before errors are computed.
-
-    method : that found it. steps, sigma_m : iterations until convergence, and standard error, m; None for a search.
-    """
-
-    east_m: float
-    north_m: float
-    up_m: float
-    method: str = SEARCH
-    steps: int | None = None
-    sigma_m: float | None = None
-
-    @property
-    def enu_m(self) -> tuple[float, float, float]:
-        """East, north and up, m."""
-        return self.east_m, self.north_m, self.up_m
+NOTHING_IN_COMMON = "no cell has a height in both the surface and the reference"
 
 
 @dataclass(frozen=True)
@@ -58,25 +38,24 @@ class ErrorMap:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of a surface against a reference, over all blocks and over groups of them.
+    """Accuracy of a surface against a reference, as it lies and after the best shift was removed.
 
-    statistics : of all blocks. class_statistics : by class, empty where no classes were given. shift : that was removed
-    first, None where none was. threshold_m : limit of `within`. slope_statistics : by band of the reference's slope,
-    degrees. mvs3dm : figures by the definitions of that benchmark. unshifted_statistics : of all blocks before the
-    shift was removed. vertical_datums : of surface and reference as their files state them, None where one does not.
+    absolute_accuracy : as the surface lies. threshold_m : limit of `within`. aligned_accuracy : after the shift was
+    removed; None where no shift is known. found_shift : the shift that is removed for the aligned figures; None where
+    none is known. no_shift : why not, as a clause. is_aligned : whether the aligned figures are the main ones, of which
+    the error map is. vertical_datums : of surface and reference as their files state them, None where one does not.
     assumed_datum, assumed_crs : what had to be assumed about the vertical datum and the coordinates, as sentences.
     geoid_added_to : raster to whose heights the geoid's were added. places_per_block : rows and columns of places in a
     block over which the surface was averaged, where the reference is coarser; None where each block has one place.
     error_map : None of an evaluation without files.
     """
 
-    statistics: ErrorStatistics
-    class_statistics: dict[str, ErrorStatistics]
-    shift: Shift | None
+    absolute_accuracy: Accuracy
     threshold_m: float
-    slope_statistics: dict[str, ErrorStatistics] = field(default_factory=dict)
-    mvs3dm: Mvs3dm | None = None
-    unshifted_statistics: ErrorStatistics | None = None
+    aligned_accuracy: Accuracy | None = None
+    found_shift: Shift | None = None
+    no_shift: str | None = None
+    is_aligned: bool = False
     vertical_datums: tuple[str | None, str | None] = (None, None)
     assumed_datum: str | None = None
     assumed_crs: str | None = None
@@ -84,15 +63,48 @@ class Evaluation:
     places_per_block: tuple[int, int] | None = None
     error_map: ErrorMap | None = field(default=None, repr=False, compare=False)
 
+    @property
+    def main_accuracy(self) -> Accuracy:
+        """The figures that the comparison asks for: aligned with `align` or `coregister`, else absolute."""
+        return (
+            self.aligned_accuracy if self.is_aligned and self.aligned_accuracy is not None else self.absolute_accuracy
+        )
+
+    @property
+    def statistics(self) -> ErrorStatistics:
+        """Main figures of all blocks."""
+        return self.main_accuracy.statistics
+
+    @property
+    def class_statistics(self) -> dict[str, ErrorStatistics]:
+        """Main figures by class; empty where no classes were given."""
+        return self.main_accuracy.class_statistics
+
+    @property
+    def slope_statistics(self) -> dict[str, ErrorStatistics]:
+        """Main figures by band of the reference's slope, degrees."""
+        return self.main_accuracy.slope_statistics
+
+    @property
+    def mvs3dm(self) -> Mvs3dm | None:
+        """Main figures by the definitions of that benchmark."""
+        return self.main_accuracy.mvs3dm
+
+    @property
+    def shift(self) -> Shift | None:
+        """The shift that was removed before the main figures; None where they are the absolute ones."""
+        return self.found_shift if self.is_aligned else None
+
+    @property
+    def unshifted_statistics(self) -> ErrorStatistics | None:
+        """Absolute figures of all blocks where the aligned ones are the main ones, else None."""
+        return self.absolute_accuracy.statistics if self.is_aligned else None
+
     def as_dict(self) -> dict[str, Any]:
-        """The evaluation as JSON holds it."""
-        shift, mvs3dm = self.shift, self.mvs3dm
+        """The evaluation as JSON holds it: the main figures, then the absolute and the aligned ones side by side."""
         record: dict[str, Any] = {
             "threshold_m": self.threshold_m,
-            "shift_m": None if shift is None else {"east": shift.east_m, "north": shift.north_m, "up": shift.up_m},
-            "shift_method": None if shift is None else shift.method,
-            "shift_steps": None if shift is None else shift.steps,
-            "shift_sigma": None if shift is None else shift.sigma_m,
+            **shift_record(self.shift),
             "dsm_heights": self.vertical_datums[0],
             "reference_heights": self.vertical_datums[1],
             "assumed": self.assumed_datum,
@@ -105,10 +117,16 @@ class Evaluation:
         }
         if self.unshifted_statistics is not None:
             record["unshifted"] = self.unshifted_statistics.as_dict()
-        if mvs3dm is not None:
-            for name, value in (("completeness", mvs3dm.completeness), ("median_error", mvs3dm.median_error_m)):
-                record[f"mvs3dm_{name}"] = None if math.isnan(value) else value
-        return record
+        aligned = (
+            {"all": None, "classes": {}, "slopes_deg": {}}
+            if self.aligned_accuracy is None
+            else self.aligned_accuracy.as_dict()
+        )
+        reason = self.no_shift if self.found_shift is None else self.found_shift.undetermined
+        return record | self.main_accuracy.mvs3dm_record() | {
+            "absolute": self.absolute_accuracy.as_dict(),
+            "aligned": {**shift_record(self.found_shift), "reason": reason, **aligned},
+        }  # fmt: skip
 
 
 def evaluate(dsm: Path, comparison: Comparison) -> Evaluation:
@@ -118,13 +136,14 @@ def evaluate(dsm: Path, comparison: Comparison) -> Evaluation:
     cell, reprojected where the CRS differ). Where the reference's cells are at least twice as large as the surface's,
     the mean of the surface over the block is compared instead. The true height of a block is the mean of its cells; in
     a block that holds an edge, either side counts as right. A cell without height counts as missing, and as not within
-    the threshold. A shift that the comparison asks for is removed first; heights are then interpolated between cells.
+    the threshold. The errors are given as the surface lies, and after its best shift was removed; heights are then
+    interpolated between cells. Where no horizontal shift is determined, only the height is removed.
 
     Raises
     ------
     InputError
         A file is missing or is not a raster of heights; or the two do not overlap, have different vertical datums, or
-        cannot be co-registered.
+        cannot be aligned although the comparison asks for it.
     ConfigError
         The raster of classes is on another grid, or a geoid is given that is not needed.
     """
@@ -135,46 +154,64 @@ def evaluate(dsm: Path, comparison: Comparison) -> Evaluation:
     truth = truth_blocks(reference, comparison.margin_m, classes, frame)
     points = points_on(surface, reference, frame, truth.xy, truth.size, truth.is_edge)
     _check_overlap(surface, reference, points)
-    errors_unshifted = truth.errors(points.heights(surface.nearest))
-    aligned = _aligned(surface, truth, points, comparison)
-    shift, errors = (None, errors_unshifted) if aligned is None else aligned
-
-    def statistics(errors: FloatArray) -> ErrorStatistics:
-        return error_statistics(errors, comparison.threshold_m, comparison.more_thresholds_m)
-
-    class_names = () if classes is None else tuple(CLASS_NAMES)
     bands = slope_bands(truth.slope_deg, comparison.slope_edges_deg)
+    members = {} if classes is None else {name: truth.members(name) for name in CLASS_NAMES}
+
+    def accuracy(errors: FloatArray, shift: Shift | None) -> Accuracy:
+        def statistics(chosen: NDArray[np.bool_] | slice) -> ErrorStatistics:
+            return error_statistics(errors[chosen], comparison.threshold_m, comparison.more_thresholds_m)
+
+        return Accuracy(
+            statistics=statistics(slice(None)),
+            class_statistics={name: statistics(chosen) for name, chosen in members.items()},
+            slope_statistics={name: statistics(chosen) for name, chosen in bands.items()},
+            mvs3dm=mvs3dm_figures(surface, reference, frame, comparison.margin_m, shift),
+        )
+
+    errors = truth.errors(heights_without(None, surface, points))
+    aligned = _aligned(surface, truth, points, comparison)
+    is_aligned = comparison.removes_shift and aligned is not None
     return Evaluation(
-        statistics=statistics(errors),
-        class_statistics={name: statistics(errors[truth.members(name)]) for name in class_names},
-        shift=shift,
+        absolute_accuracy=accuracy(errors, None),
         threshold_m=comparison.threshold_m,
-        slope_statistics={name: statistics(errors[band]) for name, band in bands.items()},
-        mvs3dm=mvs3dm_figures(surface, reference, frame, comparison.margin_m, shift.enu_m if shift else None),
-        unshifted_statistics=None if shift is None else statistics(errors_unshifted),
+        aligned_accuracy=None if aligned is None else accuracy(aligned.errors, aligned.shift),
+        found_shift=None if aligned is None else aligned.shift,
+        no_shift=NOTHING_IN_COMMON if aligned is None else None,
+        is_aligned=is_aligned,
         vertical_datums=compared.datums,
         assumed_datum=compared.assumed,
         assumed_crs=_assumed_crs(surface, reference),
         geoid_added_to=compared.converted,
         places_per_block=None if points.areas is None else points.areas.shape,
-        error_map=_error_map(truth, reference.horizontal, errors),
+        error_map=_error_map(truth, reference.horizontal, aligned.errors if aligned and is_aligned else errors),
     )
 
 
-def _aligned(
-    surface: HeightRaster, truth: TruthBlocks, points: Points, comparison: Comparison
-) -> tuple[Shift, FloatArray] | None:
-    """The shift of the surface, and the errors (n,) m without it; None where the comparison asks for no shift."""
-    if comparison.coregister is not None:
-        fit = coregister(surface, truth, points)
-        shift = Shift(fit.east_m, fit.north_m, 0.0, comparison.coregister, fit.steps, fit.sigma_m)
-    elif comparison.align:
-        shift = Shift(*best_shift(surface, truth, points), 0.0)
-    else:
+class AlignedErrors(NamedTuple):
+    """Errors (n,) m after the shift of the surface was removed."""
+
+    shift: Shift
+    errors: FloatArray
+
+
+def _aligned(surface: HeightRaster, truth: TruthBlocks, points: Points, comparison: Comparison) -> AlignedErrors | None:
+    """Errors after the shift was removed; None where there is none, because no cell has a height in both rasters.
+
+    Raises
+    ------
+    InputError
+        The comparison asks for the removal of a shift, and there is none.
+    """
+    shift = horizontal_shift(surface, truth, points, comparison)
+    # The height is measured as the horizontal shift was: between cells.
+    z = points.heights(surface.nearest if shift.undetermined else surface.bilinear, shift.enu_m[:2])
+    errors = truth.errors(z)
+    if not np.isfinite(errors).any():
+        if comparison.removes_shift:
+            raise nothing_to_align(surface)
         return None
-    z = points.heights(surface.bilinear, (shift.east_m, shift.north_m))
-    up = float(np.nanmedian(truth.errors(z)))
-    return replace(shift, up_m=up), truth.errors(z - up)
+    shift = replace(shift, up_m=float(np.nanmedian(errors)))
+    return AlignedErrors(shift, truth.errors(heights_without(shift, surface, points)))
 
 
 def _check_overlap(surface: HeightRaster, reference: HeightRaster, points: Points) -> None:

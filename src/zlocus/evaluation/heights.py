@@ -74,17 +74,21 @@ class HeightRaster:
     def bilinear(self, xy: FloatArray) -> FloatArray:
         """Height (n,) m interpolated between four cell centres; as `nearest` where one of the four has no height."""
         z = self.between_cells(xy)
-        return np.where(np.isfinite(z), z, self.nearest(xy))
+        missing = ~np.isfinite(z)
+        z[missing] = self.nearest(xy[missing])
+        return z
 
     def between_cells(self, xy: FloatArray) -> FloatArray:
         """Height (n,) m interpolated between four cell centres; NaN where one of the four has no height."""
         cell = self.cells(xy) - 0.5
-        corner = np.floor(cell).astype(int)
+        corner = np.floor(cell)
         down, right = (cell - corner).T
-        inside = np.all((corner >= 0) & (corner < np.array(self.z.shape) - 1), axis=1)
-        row, col = np.where(inside[:, None], corner, 0).T
-        upper = self.z[row, col] * (1 - right) + self.z[row, col + 1] * right
-        lower = self.z[row + 1, col] * (1 - right) + self.z[row + 1, col + 1] * right
+        row, col = corner.astype(np.int64).T
+        rows, cols = self.z.shape
+        inside = (row >= 0) & (row < rows - 1) & (col >= 0) & (col < cols - 1)
+        first, z = np.where(inside, row * cols + col, 0), self.z.ravel()
+        upper = z.take(first) * (1 - right) + z.take(first + 1) * right
+        lower = z.take(first + cols) * (1 - right) + z.take(first + (cols + 1)) * right
         return np.where(inside, upper * (1 - down) + lower * down, np.nan)
 
     def cells(self, xy: FloatArray) -> FloatArray:

@@ -24,7 +24,8 @@ BAR, CURVE, LINE = "#7A9CC6", "#C03A2B", "#444444"
 def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = SIZE_INCHES) -> Figure:
     """Figure of the share of heights per bin of error, with the normal curve of the same median and NMAD.
 
-    The median is marked, and so are the limits of `within` where they lie inside the axis.
+    The median is marked, and so are the limits of `within` where they lie inside the axis. The main errors are drawn;
+    the title gives the figures of the others.
     """
     from matplotlib.figure import Figure
 
@@ -39,15 +40,23 @@ def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = 
         _draw(axes, errors, evaluation.statistics, evaluation.threshold_m)
     else:
         axes.text(0.5, 0.5, "no height where the reference has one", ha="center", transform=axes.transAxes)
-    shift = "" if evaluation.shift is None else ", shift removed"
+    axes.set_title(_title(evaluation), loc="left", fontsize=10)
+    return figure
+
+
+def _title(evaluation: Evaluation) -> str:
+    """Completeness, which errors are drawn, and the figures of both kinds of errors beside each other."""
     complete = f"{100 * evaluation.statistics.completeness:.1f} %"
     if complete == "100.0 %" and evaluation.statistics.completeness < 1:
         complete = "More than 99.9 %"
-    axes.set_title(
-        f"{complete} of {evaluation.statistics.n} cells have a height{shift}", loc="left",
-        fontsize=10,
-    )  # fmt: skip
-    return figure
+    drawn, other = ("aligned", "absolute") if evaluation.is_aligned else ("absolute", "aligned")
+    figures = {"absolute": evaluation.absolute_accuracy, "aligned": evaluation.aligned_accuracy}
+    beside = figures[other]
+    statistics = None if beside is None else beside.statistics
+    there = "not known" if statistics is None else f"median {statistics.median:+z.3f} m, NMAD {statistics.nmad:.3f} m"
+    return (
+        f"{complete} of {evaluation.statistics.n} cells have a height; drawn: {drawn} errors\n{other} errors: {there}"
+    )
 
 
 def _draw(axes: Axes, errors: FloatArray, statistics: ErrorStatistics, threshold_m: float) -> None:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS
 
-from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.frame import points_on, unit_m
 from zlocus.evaluation.heights import HeightRaster
+from zlocus.evaluation.shift import Shift, heights_without
 from zlocus.evaluation.truth import inside_margin, places
 
 WITHIN_M = 1.0
@@ -35,12 +35,12 @@ def mvs3dm_figures(
     reference: HeightRaster,
     frame: CRS | None,
     margin_m: float,
-    shift: tuple[float, float, float] | None,
+    shift: Shift | None,
 ) -> Mvs3dm:
     """Figures over single cells of the reference: without blocks, and without edges at which both sides are right.
 
-    shift : (east, north, up), m, removed from the surface first; None: the surface as it is (nearest cell). Larger
-    cells of the reference are compared with the mean of the surface in them, see `points_on`.
+    shift : removed from the surface first, see `heights_without`; None: the surface as it is. Larger cells of the
+    reference are compared with the mean of the surface in them, see `points_on`.
     """
     unit = unit_m(reference, frame)
     rows_at_a_time = max(1, CELLS_AT_A_TIME // reference.z.shape[1])
@@ -50,21 +50,9 @@ def mvs3dm_figures(
         row, col = (place.astype(np.float64) + 0.5 for place in np.nonzero(np.isfinite(band)))
         xy = places(reference.transform, row + first, col)
         keep = inside_margin(reference, margin_m, unit, xy)
-        error = np.abs(_sampled(surface, reference, frame, xy[keep], shift) - band[np.isfinite(band)][keep])
+        points = points_on(surface, reference, frame, xy[keep])
+        error = np.abs(heights_without(shift, surface, points) - band[np.isfinite(band)][keep])
         n, n_within = n + error.size, n_within + int(np.count_nonzero(error < WITHIN_M))
         errors_of_bands.append(error[np.isfinite(error)].astype(np.float32))
     errors = np.concatenate(errors_of_bands)
     return Mvs3dm(n_within / n if n else math.nan, float(np.median(errors)) if errors.size else math.nan)
-
-
-def _sampled(
-    surface: HeightRaster,
-    reference: HeightRaster,
-    frame: CRS | None,
-    xy: FloatArray,
-    shift: tuple[float, float, float] | None,
-) -> FloatArray:
-    points = points_on(surface, reference, frame, xy)
-    if shift is None:
-        return points.heights(surface.nearest)
-    return points.heights(surface.bilinear, shift[:2]) - shift[2]

@@ -9,8 +9,9 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 
 from zlocus.evaluation.comparison import Comparison
-from zlocus.evaluation.evaluate import Shift, evaluate
+from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.heights import HeightRaster, read_heights
+from zlocus.evaluation.shift import Shift
 from zlocus.evaluation.vertical import same_heights
 from zlocus.io.open_raster import existing_file, open_raster
 from zlocus.io.rasters import RasterBands, RasterSink

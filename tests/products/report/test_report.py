@@ -30,7 +30,7 @@ from zlocus.core.errors import InputError, OutputError
 from zlocus.core.options import RunConfig
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
-from zlocus.evaluation.table import evaluation_rows
+from zlocus.evaluation.table import accuracy_table
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.quality import Quality
 from zlocus.products.report import maps, tables
@@ -324,17 +324,21 @@ def test_the_comparison_is_that_of_evaluate(out, tmp_path):
     result = zl("report", out, "--reference", reference, "--margin", 5, "--threshold", 0.5)
     assert result.exit_code == 0, result.output
     evaluation = evaluate(out / "dsm.tif", Comparison(reference, margin_m=5, threshold_m=0.5))
-    figures = evaluation.statistics
+    figures, aligned = evaluation.absolute_accuracy.statistics, evaluation.aligned_accuracy.statistics
     text = page_of(out).text("reference")
-    headings, *rows = evaluation_rows(evaluation)
-    assert {"LE90", "LE95"} <= set(headings)
-    assert [row[0] for row in rows] == ["all", "0-5 deg", "5-15 deg", "15-30 deg", "30-45 deg", "45-90 deg"]
-    for row in rows:
-        assert " ".join(" ".join(row).split()) in text
+    table = accuracy_table(evaluation)
+    assert table.kind_headings == ("within", "median", "NMAD", "RMSE", "LE90", "LE95")
+    assert " ".join(("cells complete absolute aligned", *table.kind_headings * 2)) in text
+    assert [row[0][0] for row in table.rows] == ["all", "0-5 deg", "5-15 deg", "15-30 deg", "30-45 deg", "45-90 deg"]
+    for row in table.rows:
+        assert " ".join(" ".join(cell for part in row for cell in part).split()) in text
     assert "Within: share of all cells in error by less than 0.5 m; errors in m." in text
-    assert "MVS3DM (single cells): completeness" in text
+    assert "MVS3DM (single cells), absolute: completeness" in text
     assert "<b>truth.tif" in text
-    assert f"{100 * figures.within:.1f} % have one with an error below 0.5 m" in page_of(out).text("summary")
+    summary = page_of(out).text("summary")
+    assert f"As the surface lies (absolute), {100 * figures.within:.1f} % have one with an error below 0.5 m" in summary
+    assert f"is removed (aligned), {100 * aligned.within:.1f} % have one with an error below 0.5 m" in summary
+    assert "Map of the absolute errors" in text
     alts = [each["alt"] for each in page_of(out).of("img")]
     assert len([alt for alt in alts if alt.startswith("Error of height")]) == 1
     (histogram,) = (alt for alt in alts if alt.startswith("Histogram of the errors"))
@@ -361,13 +365,13 @@ def test_a_reference_above_a_geoid_is_compared_above_the_ellipsoid(out, tmp_path
     assert result.exit_code == 0, result.output
     text = page_of(out).text("reference")
     assert f"The geoid's heights were added to those of {reference}." in text
-    assert "as it lies" in text
+    assert "Map of the aligned errors" in text
     assert "20-90 deg" in text
     alts = [each["alt"] for each in page_of(out).of("img")]
     (histogram,) = (alt for alt in alts if alt.startswith("Histogram of the errors"))
     median_m = float(histogram.split("about their median ")[1].split()[0])
     assert abs(median_m) < UNDULATION_M / 10
-    assert "Removed first:" in text
+    assert "Aligned: removed first:" in text
 
 
 def test_means_of_blocks_leave_out_what_is_not_known():

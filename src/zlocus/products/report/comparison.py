@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import Evaluation, evaluate
 from zlocus.evaluation.histogram import histogram_figure
-from zlocus.evaluation.table import evaluation_rows, notes
+from zlocus.evaluation.table import KINDS, accuracy_table, notes
 from zlocus.products.match_curve_figures import svg_of
 from zlocus.products.report import maps
 from zlocus.products.report import text as words
@@ -31,11 +31,11 @@ def comparison_part(out: Path, comparison: Comparison) -> dict[str, Any]:
         See `evaluate`.
     """
     evaluation = evaluate(out / "dsm.tif", comparison)
-    headings, *rows = evaluation_rows(evaluation)
+    table = accuracy_table(evaluation)
     return {
         "sentence": words.against_reference(evaluation, comparison.reference.name), "name": comparison.reference.name,
-        "headings": headings, "rows": rows, "notes": [_sentence(note) for note in notes(evaluation)],
-        "margin": f"{comparison.margin_m:g}", "is_shifted": evaluation.shift is not None,
+        "table": table, "kinds": KINDS, "notes": [_sentence(note) for note in notes(evaluation)],
+        "margin": f"{comparison.margin_m:g}", "is_shifted": evaluation.is_aligned,
         "histogram": _histogram(evaluation), "map": _error_map(evaluation), "bar": _scale_bar(evaluation),
     }  # fmt: skip
 

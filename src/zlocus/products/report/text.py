@@ -12,6 +12,8 @@ from pyproj import CRS, Transformer
 
 from zlocus.core.scene import is_local
 from zlocus.evaluation.evaluate import Evaluation
+from zlocus.evaluation.statistics import ErrorStatistics
+from zlocus.evaluation.table import shift_text
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.report.sampling import Survey
 
@@ -235,14 +237,31 @@ def what_is_doubtful(survey: Survey) -> str:
 
 
 def against_reference(evaluation: Evaluation, reference: str) -> str:
-    """Result of the comparison with a reference, in a sentence."""
-    statistics = evaluation.statistics
-    moved = "" if evaluation.shift is None else ", after the shift between the two is removed"
+    """Result of the comparison with a reference, in sentences: as the surface lies, and after its shift is removed."""
+    absolute = evaluation.absolute_accuracy.statistics
     return (
-        f"Comparison with the reference {reference}{moved}: {percent(statistics.completeness, 1)} of its cells have a "
-        f"height, and {percent(statistics.within, 1)} have one with an error below {evaluation.threshold_m:g} m. The "
-        f"median of the errors is {number(statistics.median, 'm', 3)}, their spread (NMAD) is "
-        f"{number(statistics.nmad, 'm', 3)}."
+        f"Comparison with the reference {reference}: {percent(absolute.completeness, 1)} of its cells have a height. "
+        f"As the surface lies (absolute), {_errors(absolute, evaluation.threshold_m)}. {_aligned(evaluation)}"
+    )
+
+
+def _aligned(evaluation: Evaluation) -> str:
+    """The aligned figures, with the shift that was removed, in a sentence; or why there are none."""
+    shift, aligned = evaluation.found_shift, evaluation.aligned_accuracy
+    if shift is None or aligned is None:
+        return f"There are no aligned figures, because {evaluation.no_shift}."
+    if shift.undetermined is not None:
+        removed = f"the difference in height of {number(shift.up_m, 'm', 3)}"
+        after = f" The horizontal shift is not determined: {shift.undetermined}."
+    else:
+        removed, after = f"the shift of {shift_text(shift)}", ""
+    return f"After {removed} is removed (aligned), {_errors(aligned.statistics, evaluation.threshold_m)}.{after}"
+
+
+def _errors(statistics: ErrorStatistics, threshold_m: float) -> str:
+    return (
+        f"{percent(statistics.within, 1)} have one with an error below {threshold_m:g} m, the median of the errors is "
+        f"{number(statistics.median, 'm', 3)}, and their spread (NMAD) is {number(statistics.nmad, 'm', 3)}"
     )
 
 
