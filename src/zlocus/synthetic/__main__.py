@@ -42,9 +42,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
     parser.add_argument(
-        "--kind", choices=("city", "hills", "demo", "mixed"), default="city",
+        "--kind", choices=("city", "hills", "real", "demo", "mixed"), default="city",
         help="mixed: ground like that of the demo, seen by three kinds of sensor; uses --seed and --size",
     )  # fmt: skip
+    parser.add_argument("--trouble", metavar="NAME", help="paint one trouble into a town: lake, glitter, snow ...")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
     parser.add_argument("--views", type=int, help="render only the first N views")
@@ -68,10 +69,21 @@ def _parser() -> argparse.ArgumentParser:
 
 def _spec(given: argparse.Namespace) -> SceneSpec:
     """The scene that the command line describes."""
-    from zlocus.synthetic.scenes import LARGE_SIZE, city_spec, demo_spec, hills_spec, with_ads40, with_pointing_errors
+    from zlocus.synthetic.realistic import realistic_spec
+    from zlocus.synthetic.scenes import (
+        LARGE_SIZE,
+        city_spec,
+        demo_spec,
+        hills_spec,
+        trouble_spec,
+        with_ads40,
+        with_pointing_errors,
+    )
 
-    make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec}
+    make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "real": realistic_spec}
     spec = make.get(given.kind, demo_spec)(given.seed)
+    if given.trouble:
+        spec = trouble_spec(given.trouble, given.seed)
     if given.kind == "mixed":
         return replace(spec, size=given.size or spec.size)
     if given.cameras == "linescan":

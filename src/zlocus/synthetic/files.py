@@ -17,15 +17,19 @@ from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
 
 from zlocus.core.errors import OutputError
+from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.rpc import RpcCoefficients
 from zlocus.sensors.rpc_fit import RpcFit, fit_rpc
+from zlocus.synthetic.appearance import Changes, Moment, ground_in_view
 from zlocus.synthetic.cameras import RectifiedScanner
 from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
 from zlocus.synthetic.rectify import rectified
-from zlocus.synthetic.render import Sun, expose, render, sunlit
+from zlocus.synthetic.render import Sun, expose, render, sunlit, visible_ground_points
 from zlocus.synthetic.scenes import Exposure, SceneSpec, build_ground, exposures_of, steady
+from zlocus.synthetic.sensor_errors import WavySatelliteCamera
 from zlocus.synthetic.terrain import SyntheticGround
 from zlocus.synthetic.truth import write_truth
+from zlocus.synthetic.weather import weathered
 
 NOISE_STREAM = 9
 HEIGHT_MARGIN_M = 20.0
@@ -129,19 +133,45 @@ def render_exposures(
     for index, exposure in enumerate(exposures):
         view, taken = exposure.view, exposure.taken
         progress(view.name)
-        if view.sun not in lit:
-            lit = {view.sun: sunlit(ground, view.sun)}
-        radiance = render(ground, taken.sensor, taken.shape, view.sun, spec.samples, lit[view.sun])
-        numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]))
+        seen = ground
+        if spec.changes != Changes() or spec.trouble is not None:
+            moment = Moment(view.along_deg, view.across_deg, view.day, index)
+            seen = ground_in_view(ground, spec.changes, moment, spec.seed)
+        if view.sun not in lit or spec.changes.cars_per_km:
+            lit = {view.sun: sunlit(seen, view.sun)}
+        radiance = render(seen, taken.sensor, taken.shape, view.sun, spec.samples, lit[view.sun])
+        radiance = _through_weather(spec, exposure, seen, radiance)
+        numbers = expose(radiance, view.optics, np.random.default_rng([spec.seed, NOISE_STREAM, index]), view.errors)
         if isinstance(exposure.sensor, RectifiedScanner):
             numbers = rectified(numbers, exposure.sensor, exposure.shape)
         yield exposure, numbers
 
 
+def _through_weather(
+    spec: SceneSpec, exposure: Exposure, ground: SyntheticGround, radiance: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """The radiance (r, c) of an image through the weather of its day."""
+    view = exposure.view
+    if view.day >= len(spec.weather) or spec.weather[view.day].is_clear:
+        return radiance
+    sensor, (rows, cols) = exposure.taken.sensor, radiance.shape
+    xy = np.stack(np.meshgrid(np.arange(cols), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
+    shown = visible_ground_points(ground, sensor, xy)
+    # A pixel beyond the height field shows nothing, so its weather does not matter.
+    shown = np.where(np.isfinite(shown), shown, shown[np.isfinite(shown).all(axis=1)].mean(axis=0))
+    low, high = (sensor.ground_from_image(xy[:1], np.array([z]))[0] for z in ground.height_range)
+    to_sensor: FloatArray = (high - low)[:2] / (high - low)[2]
+    azimuth, elevation = np.deg2rad(view.sun.azimuth_deg), np.deg2rad(view.sun.elevation_deg)
+    to_sun = np.array([np.sin(azimuth), np.cos(azimuth)]) / np.tan(elevation)
+    places = shown[:, :2].reshape(rows, cols, 2)
+    return weathered(radiance, places, spec.weather[view.day], to_sensor, to_sun, (spec.seed, view.day))
+
+
 def fit_exposure(spec: SceneSpec, exposure: Exposure) -> RpcFit:
-    """The RPC fitted to the camera of an exposure, with the pointing error of its view added."""
+    """The RPC fitted to the camera of an exposure without its waves, with the pointing error of its view added."""
     low, high = spec.height_range
-    fit = fit_rpc(exposure.sensor, exposure.shape, spec.crs, (low - HEIGHT_MARGIN_M, high + HEIGHT_MARGIN_M))
+    sensor = exposure.sensor.steady if isinstance(exposure.sensor, WavySatelliteCamera) else exposure.sensor
+    fit = fit_rpc(sensor, exposure.shape, spec.crs, (low - HEIGHT_MARGIN_M, high + HEIGHT_MARGIN_M))
     view = exposure.view
     return RpcFit(fit.rpc.moved(column=view.bias_col_px, row=view.bias_row_px), fit.max_error_px)
 

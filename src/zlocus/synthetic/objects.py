@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,7 +46,7 @@ class Objects:
     plain_roofs : share of roofs without a pattern, whose texture is hardly above the noise; half of the others are
     striped, half look like gravel. tower_m : lowest and highest height of towers; up to 2 m are added. rough_m :
     standard deviation of the heights of single cells on bare ground (grass, stones). crop_side_m : side of square
-    fields of crops in periodic rows, on bare ground; 0: no crops.
+    fields of crops in periodic rows, on bare ground; 0: no crops. roof_albedos : of roofs.
     """
 
     road_spacing_m: float
@@ -57,6 +58,7 @@ class Objects:
     tower_m: tuple[float, float] = (21.0, 32.0)
     rough_m: float = 0.0
     crop_side_m: float = 0.0
+    roof_albedos: tuple[float, ...] = ROOF_ALBEDOS
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,9 @@ def add_objects(ground: SyntheticGround, objects: Objects, seed: int) -> Synthet
         _draw_roads(painted, objects.road_spacing_m, rng)
     for per_ha, is_tower in ((objects.towers_per_ha, True), (objects.buildings_per_ha, False)):
         for _ in range(round(per_ha * hectares)):
-            materials += _place_building(painted, is_tower, objects, len(materials), rng)
+            materials += place_building(painted, is_tower, objects, len(materials), rng)
     for _ in range(round(objects.trees_per_ha * hectares)):
-        _place_tree(painted, objects.max_tree_m, rng)
+        place_tree(painted, objects.max_tree_m, rng)
     if objects.crop_side_m:
         materials += _plant_crops(painted, objects.crop_side_m, len(materials), rng)
     if objects.rough_m:
@@ -134,7 +136,7 @@ def _draw_roads(ground: SyntheticGround, spacing_m: float, rng: np.random.Genera
             material[row[dashed], col[dashed]] = PAINT
 
 
-def _place_building(
+def place_building(
     ground: SyntheticGround, is_tower: bool, objects: Objects, index: int, rng: np.random.Generator
 ) -> list[NDArray[np.void]]:  # fmt: skip
     """Place a building where there is room for it, and return its materials; empty where no room was found."""
@@ -154,15 +156,13 @@ def _place_building(
         if (ground.material[window][near] != BARE).any():
             continue
         storey_height = rng.uniform(*objects.tower_m) if is_tower else float(rng.choice(EAVES_M))
-        return _build(
-            ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, objects.plain_roofs, index, rng
-        )
+        return _build(ground, footprint, window, storey_height + rng.uniform(0.0, 2.0), is_tower, objects, index, rng)
     return []
 
 
 def _build(
     ground: SyntheticGround, footprint: Footprint, window: tuple[slice, slice], height: float, is_tower: bool,
-    plain_roofs: float, index: int, rng: np.random.Generator,
+    objects: Objects, index: int, rng: np.random.Generator,
 ) -> list[NDArray[np.void]]:  # fmt: skip
     """Build roof and roof furniture of one building, and return its materials."""
     p, q = footprint.axes(ground, window)
@@ -174,7 +174,7 @@ def _build(
     heights[inside] = eave + pitch * (footprint.width / 2 - np.abs(q[inside]))
     towards = -pitch * np.sign(q[inside]) * ground.step
     slopes[inside] = towards[:, None] * (-np.sin(footprint.angle), np.cos(footprint.angle))
-    material = _building_material(footprint, base, plain_roofs, rng)
+    material = _building_material(footprint, base, objects, rng)
     ground.material[window][inside] = index
     if pitch:
         return [material]
@@ -191,13 +191,14 @@ def _build(
 
 
 def _building_material(
-    footprint: Footprint, base: float, plain_roofs: float, rng: np.random.Generator
+    footprint: Footprint, base: float, objects: Objects, rng: np.random.Generator
 ) -> NDArray[np.void]:
     """The material of a building: a plain, striped or textured roof, and walls with rows of windows."""
+    plain_roofs = objects.plain_roofs
     patterned = (1.0 - plain_roofs) / 2
     pattern = int(rng.choice([PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_NATURAL], p=[plain_roofs, patterned, patterned]))
     contrast = {PATTERN_GRAIN: 0.006, PATTERN_STRIPES: rng.uniform(0.05, 0.25), PATTERN_NATURAL: 0.03}[pattern]
-    material = plain_material(BUILDING, pattern, float(rng.choice(ROOF_ALBEDOS)), contrast)
+    material = plain_material(BUILDING, pattern, float(rng.choice(objects.roof_albedos)), contrast)
     material["period"] = rng.uniform(0.7, 2.4)
     material["x"], material["y"] = footprint.x, footprint.y
     material["cos"], material["sin"] = np.cos(footprint.angle), np.sin(footprint.angle)
@@ -207,35 +208,73 @@ def _building_material(
     return material
 
 
-def _place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Generator) -> None:
-    """Place a tree: half an ellipsoid above the height of the trunk, broken up into clumps. Trees may touch."""
+def place_tree(ground: SyntheticGround, max_tree_m: float, rng: np.random.Generator) -> None:
+    """Place a tree on bare ground where there is room for it. Trees may touch."""
     for _ in range(TRIES_PER_OBJECT):
         rows, cols = ground.heights.shape
         radius = rng.uniform(*CROWN_RADIUS_M)
         height = min(max_tree_m, radius * rng.uniform(1.8, 3.2))
-        footprint = Footprint(
-            rng.uniform(0, cols * ground.step), rng.uniform(0, rows * ground.step), 0.0, 2 * radius, 2 * radius
-        )
-        window = footprint.window(ground, 0.0)
-        if window is None:
-            continue
-        p, q = footprint.axes(ground, window)
-        squared = (p * p + q * q) / radius**2
-        lobes = 1.0 + 0.16 * np.sin(5.0 * np.arctan2(q, p) + rng.uniform(0.0, 6.0))
-        crown = squared < lobes**2
-        if not np.isin(ground.material[window][crown], (BARE, *range(FIRST_TREE, FIRST_BUILDING))).all():
-            continue
-        trunk = 0.35 * height
-        top = trunk + (height - trunk) * np.sqrt(np.maximum(1.0 - squared, 0.02))
+        x, y = rng.uniform(0, cols * ground.step), rng.uniform(0, rows * ground.step)
+        if plant_tree(ground, Tree(x, y, radius, height), rng):
+            return
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A tree. x, y : m east and south of the corner of the height field; radius_m : of the crown; height_m : of its
+    top above its foot.
+
+    sparse : the foliage is sparse: leaves of a cell lie `rough_m` (standard deviation) off the crown's ellipsoid, and a
+    share `gaps` of the crown's cells shows the ground below; otherwise the crown is closed and broken up into clumps.
+    """
+
+    x: float
+    y: float
+    radius_m: float
+    height_m: float
+    sparse: bool = False
+    rough_m: float = 0.7
+    gaps: float = 0.07
+
+
+def plant_tree(
+    ground: SyntheticGround,
+    tree: Tree,
+    rng: np.random.Generator,
+    bare_heights: NDArray[np.float32] | None = None,
+    allowed: Sequence[int] = (BARE, *range(FIRST_TREE, FIRST_BUILDING)),
+) -> bool:
+    """Plant a tree, half an ellipsoid above the height of its trunk; whether there was room for it.
+
+    bare_heights : (r, c) m that trunks stand on, None: those of the ground with what was planted before; allowed :
+    materials that the crown may stand on.
+    """
+    footprint = Footprint(tree.x, tree.y, 0.0, 2 * tree.radius_m, 2 * tree.radius_m)
+    window = footprint.window(ground, 0.0)
+    if window is None:
+        return False
+    p, q = footprint.axes(ground, window)
+    squared = (p * p + q * q) / tree.radius_m**2
+    lobes = 1.0 + 0.16 * np.sin(5.0 * np.arctan2(q, p) + rng.uniform(0.0, 6.0))
+    crown = squared < lobes**2
+    if not np.isin(ground.material[window][crown], allowed).all():
+        return False
+    trunk = 0.35 * tree.height_m
+    top = trunk + (tree.height_m - trunk) * np.sqrt(np.maximum(1.0 - squared, 0.02))
+    if tree.sparse:
+        rough = np.asarray(top + tree.rough_m * rng.standard_normal(top.shape), np.float64)
+        crown &= rng.random(top.shape) >= tree.gaps
+    else:
         clump = max(1, round(CLUMP_M / ground.step))
-        rough = np.kron(rng.uniform(ROUGHEST_CROWN, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
-        rough = top * rough[: top.shape[0], : top.shape[1]]
-        foot = float(ground.heights[window][top.shape[0] // 2, top.shape[1] // 2])
-        crown &= foot + rough > ground.heights[window] + 0.3
-        ground.heights[window][crown] = (foot + rough)[crown]
-        ground.slopes[window][crown] = 0.0
-        ground.material[window][crown] = FIRST_TREE + rng.integers(len(TREE_ALBEDOS))
-        return
+        clumps = np.kron(rng.uniform(ROUGHEST_CROWN, 1.0, [n // clump + 1 for n in top.shape]), np.ones((clump, clump)))
+        rough = np.asarray(top * clumps[: top.shape[0], : top.shape[1]], np.float64)
+    below = ground.heights if bare_heights is None else bare_heights
+    foot = float(below[window][top.shape[0] // 2, top.shape[1] // 2])
+    crown &= foot + rough > ground.heights[window] + 0.3
+    ground.heights[window][crown] = (foot + rough)[crown]
+    ground.slopes[window][crown] = 0.0
+    ground.material[window][crown] = FIRST_TREE + rng.integers(len(TREE_ALBEDOS))
+    return True
 
 
 def _plant_crops(

@@ -16,10 +16,13 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.terrain import (
     BLOCK,
     BUILDING,
+    PATTERN_FOLIAGE,
+    PATTERN_GLITTER,
     PATTERN_LEAVES,
     PATTERN_NATURAL,
     PATTERN_ROWS,
     PATTERN_STRIPES,
+    PATTERN_WAVES,
     TREE,
 )
 from zlocus.synthetic.textures import FRACTAL, GRASS, GRAVEL
@@ -29,6 +32,10 @@ SKY = 0.27
 WEEDS = 0.15  # amplitude of natural texture in crops, where that of the rows is 1
 # Amplitude of a texture finer than a pixel on natural ground, so that rays of different images meet different grains.
 GRAIN = 0.5
+# A crest of a wave reflects the sun where the texture is higher than this (standard deviations).
+GLITTER_CREST = 1.3
+# Amplitude of leaves that flutter and glint, where that of the leaves that stay is 1.
+FLUTTER = 2.0
 NEVER = 1e-30
 OFF_SURFACE_M = 0.02
 OFF_WALL_CELLS = 1.5
@@ -198,6 +205,15 @@ def top_albedo(x, y, texel_m, material, textures):
             value += (1.0 - mixed) * _texel(textures[GRASS], 0.96 * a - 0.28 * b, 0.96 * b + 0.28 * a)
         value += GRAIN * _texel(textures[GRASS], 5.3 * a, 5.3 * b)
         value += 0.4 * _texel(textures[FRACTAL], 0.083 * a - 0.031 * b + 71.0, 0.083 * b + 0.031 * a)
+    elif pattern == PATTERN_WAVES:
+        value = 0.5 * _texel(textures[FRACTAL], 0.21 * a + material.x, 0.21 * b + material.y)
+        value += _texel(textures[GRASS], 1.3 * a + material.x, 1.3 * b + material.y)
+    elif pattern == PATTERN_GLITTER:
+        crest = _texel(textures[GRASS], 1.3 * a + material.x, 1.3 * b + material.y)
+        value = crest - GLITTER_CREST if crest > GLITTER_CREST else 0.0
+    elif pattern == PATTERN_FOLIAGE:
+        value = _texel(textures[GRAVEL], 1.7 * a, 1.7 * b)
+        value += FLUTTER * _texel(textures[GRASS], 2.3 * a + material.x, 2.3 * b + material.y)
     elif pattern == PATTERN_LEAVES:
         value = _texel(textures[GRAVEL], 1.7 * a, 1.7 * b)
     else:

@@ -28,12 +28,15 @@ from zlocus.synthetic.raycast import (
     render_rows,
     sunlit_cells,
 )
+from zlocus.synthetic.sensor_errors import SensorErrors, compressed, noisy_signal, saturated
 from zlocus.synthetic.terrain import SyntheticGround
 
-SPACINGS_PX = (64, 32, 16, 8, 4, 2, 1)
+# Less than a pixel is needed by lenses of short focal length (in px) with distortion.
+SPACINGS_PX = (64, 32, 16, 8, 4, 2, 1, 0.5)
 TABLE_TOLERANCE_PX = 1e-3
 HEIGHT_MARGIN_M = 1.0
 ROWS_PER_BAND = 64
+NO_ERRORS = SensorErrors()
 
 
 @dataclass(frozen=True)
@@ -133,7 +136,7 @@ def _field_from_image(ground: SyntheticGround, sensor: SensorModel, xy: FloatArr
 
 def ray_table(
     ground: SyntheticGround, sensor: SensorModel, shape: tuple[int, int], z_range: tuple[float, float]
-) -> tuple[int, FloatArray]:
+) -> tuple[float, FloatArray]:
     """Rays at the nodes of a coarse lattice in the image, for bilinear interpolation between them.
 
     Returns the spacing (px) and a table (a, b, 4) float64: field coordinates at the upper and at the lower height, for
@@ -180,13 +183,17 @@ def visible_ground_points(ground: SyntheticGround, sensor: SensorModel, xy: Floa
     )
 
 
-def expose(radiance: NDArray[np.float32], optics: Optics, rng: np.random.Generator) -> NDArray[np.integer]:
+def expose(
+    radiance: NDArray[np.float32], optics: Optics, rng: np.random.Generator, errors: SensorErrors = NO_ERRORS
+) -> NDArray[np.integer]:
     """Digital numbers (r, c) of `optics.dtype` from radiance; 0 where the radiance is 0, at least 1 elsewhere."""
     signal = optics.gain * gaussian_filter(radiance, optics.blur_px, mode="nearest")
     if optics.n_clouds:
         _add_clouds(signal, optics, rng)
     sigma = np.sqrt((optics.noise * signal) ** 2 + np.float32(optics.noise_floor) ** 2)
     signal += sigma * rng.standard_normal(signal.shape, dtype=np.float32) + np.float32(optics.haze)
+    signal = compressed(saturated(noisy_signal(signal, errors, rng), errors), errors)
+    signal = saturated(signal, errors)
     dtype = np.dtype(optics.dtype)
     numbers = np.clip(np.rint(signal), 1, np.iinfo(dtype).max).astype(dtype)
     numbers[radiance == 0.0] = 0

@@ -11,21 +11,31 @@ from pyproj import CRS
 from zlocus.core.errors import ConfigError
 from zlocus.core.options.option_fields import Checked, option
 from zlocus.core.sensor_model import FloatArray, SensorModel
+from zlocus.synthetic.appearance import Changes
 from zlocus.synthetic.cameras import LineScanner, RectifiedScanner, SatelliteCamera, Shake, axes_of_heading
 from zlocus.synthetic.objects import Objects, add_objects
+from zlocus.synthetic.painting import Area
+from zlocus.synthetic.realistic_ground import Cover, realistic_ground
 from zlocus.synthetic.render import Optics, Sun
+from zlocus.synthetic.sensor_errors import SensorErrors, WavySatelliteCamera
 from zlocus.synthetic.terrain import Relief, RoundHill, SyntheticGround, natural_ground
+from zlocus.synthetic.troubles import TROUBLES, with_trouble
+from zlocus.synthetic.weather import Weather
 
 FLIGHT_HEIGHT_M = 2000.0
 ADVANCE_M = 0.208
 WOBBLE_M, WOBBLE_DEG = 0.5, 0.03
 LEVEL_1_M = 0.21
 BORDER_PX = 4
-TALLEST_M = {"city": 66.0, "hills": 15.0}
+TALLEST_M = {"city": 66.0, "hills": 15.0, "real": 160.0}
 LARGE_SIZE = 3000  # cells; in larger scenes heights and truth are as coarse as the images, to save memory
 
 MORNING, AFTERNOON = Sun(152.0, 46.0), Sun(232.0, 33.0)
 CLEAR = Optics()
+TROUBLE_SEED = 5
+NO_ERRORS, TWELVE_BITS = SensorErrors(), SensorErrors(saturation=4095)
+# Moving cars on the places of a trouble (see `Changes.cars_per_km`): three of ten bays of the car park are taken.
+CARS_PER_KM = {"cars": 150.0}
 SOFTER = Optics(gain=1020.0, haze=145.0, blur_px=0.62)
 OTHER_DATE = Optics(gain=760.0, haze=135.0, blur_px=0.7, noise=0.01, noise_floor=9.0)
 HAZY = Optics(gain=900.0, haze=330.0, blur_px=1.3, noise=0.02, noise_floor=22.0, n_clouds=5)
@@ -37,7 +47,8 @@ class ViewSpec:
 
     along_deg, across_deg : view angles from the nadir, positive forward and to the right in flight direction.
     heading_deg : of the flight, clockwise from north. bias_row_px, bias_col_px : pointing error of the RPC, by which
-    every point is projected too far down and to the right.
+    every point is projected too far down and to the right. day : number of the day; images of one day see the same
+    weather. errors : of the sensor. wave_px : largest displacement of lines by an attitude that RPCs do not describe.
     """
 
     name: str
@@ -48,6 +59,9 @@ class ViewSpec:
     optics: Optics = CLEAR
     bias_row_px: float = 0.0
     bias_col_px: float = 0.0
+    day: int = 0
+    errors: SensorErrors = NO_ERRORS
+    wave_px: float = 0.0
 
 
 SATELLITE_VIEWS = (
@@ -72,9 +86,13 @@ ADS40_VIEWS = (
 
 @dataclass(frozen=True)
 class SceneSpec(Checked):
-    """A scene to render. Equal specifications give equal bytes."""
+    """A scene to render. Equal specifications give equal bytes.
 
-    kind: str = option("city", "Kind of objects on the ground.", choices=("city", "hills"))
+    objects : of a town or of hills; cover : of a realistic scene (kind "real"). changes : what differs between its
+    images. weather : of each day, in order; later days are clear.
+    """
+
+    kind: str = option("city", "Kind of objects on the ground.", choices=("city", "hills", "real"))
     seed: int = option(1, "Seed of terrain, objects, texture and noise.", low=0)
     size: int = option(520, "Side of the area with truth, in cells of `gsd_m`.", low=32, high=20000)
     gsd_m: float = option(0.5, "Ground pixel.", low=0.05, high=5.0, unit="m")
@@ -90,9 +108,14 @@ class SceneSpec(Checked):
     relief_m: float = option(
         38.0, "Difference from lowest to highest terrain, without the hill.", low=0.1, high=1000.0, unit="m"
     )
+    longest_m: float = option(240.0, "Longest wavelength of the terrain.", low=10.0, high=20000.0, unit="m")
     hill_m: float = option(0.0, "Height of a round hill in the north-east of the area.", low=0.0, high=100.0, unit="m")
     objects: Objects = field(default=Objects(145.0, 1.15, 0.4, 10.5, rough_m=0.08))
     views: tuple[ViewSpec, ...] = SATELLITE_VIEWS
+    cover: Cover = field(default=Cover())
+    changes: Changes = field(default=Changes())
+    trouble: str | None = option(None, "One trouble painted into a town; unset: none.", choices=tuple(TROUBLES))
+    weather: tuple[Weather, ...] = ()
     west_m: float = option(462000.0, "Western border of the area, easting.", unit="m")
     north_m: float = option(5247000.0, "Northern border of the area, northing.", unit="m")
     epsg: int = option(32632, "Projected CRS of the truth; heights are ellipsoidal.", low=1024, high=32767)
@@ -128,7 +151,8 @@ class SceneSpec(Checked):
     def height_range(self) -> tuple[float, float]:
         """Lower and upper bound of all heights, with objects, m."""
         low, high = self.terrain_range
-        return low - 1.0, high + TALLEST_M[self.kind]
+        tallest_m = TALLEST_M["real"] if self.trouble == "towers" else TALLEST_M[self.kind]
+        return low - 1.0, high + tallest_m
 
 
 @dataclass(frozen=True)
@@ -153,6 +177,13 @@ def city_spec(seed: int, **changes: object) -> SceneSpec:
     Its difficulty was tuned with other matching methods, see `benchmarks/baselines.py`.
     """
     return replace(SceneSpec(kind="city", seed=seed), **changes)  # type: ignore[arg-type]
+
+
+def trouble_spec(trouble: str, seed: int = TROUBLE_SEED, **changes: object) -> SceneSpec:
+    """A town with one painted trouble, seen by sensors of 12 bits in three views of one pass."""
+    views = tuple(replace(view, errors=TWELVE_BITS) for view in SATELLITE_VIEWS[:3])
+    spec = city_spec(seed, views=views, trouble=trouble, changes=Changes(cars_per_km=CARS_PER_KM.get(trouble, 0.0)))
+    return replace(spec, **changes)  # type: ignore[arg-type]
 
 
 def hills_spec(seed: int, **changes: object) -> SceneSpec:
@@ -249,7 +280,11 @@ def _camera(
 ) -> SatelliteCamera | LineScanner:  # fmt: skip
     """A camera that sees the middle of the area at the view's angles. The origin of its image is not set yet."""
     if spec.camera == "satellite":
-        return SatelliteCamera(middle, (0.0, 0.0), spec.gsd_m, view.along_deg, view.across_deg, view.heading_deg)
+        angles = view.along_deg, view.across_deg, view.heading_deg
+        if not view.wave_px:
+            return SatelliteCamera(middle, (0.0, 0.0), spec.gsd_m, *angles)
+        wave_seed = (spec.seed, *view.name.encode())
+        return WavySatelliteCamera(middle, (0.0, 0.0), spec.gsd_m, *angles, wave_px=view.wave_px, wave_seed=wave_seed)
     heading = np.deg2rad(view.heading_deg)
     aside = FLIGHT_HEIGHT_M * np.tan(np.deg2rad(view.across_deg))
     east, north = aside * float(np.cos(heading)), -aside * float(np.sin(heading))
@@ -279,10 +314,14 @@ def build_ground(spec: SceneSpec, exposures: tuple[Exposure, ...]) -> SyntheticG
     side = spec.size * spec.gsd_m
     origin = (spec.west_m - int(margin[0]) * step, spec.north_m + int(margin[1]) * step)
     hill = RoundHill(spec.west_m + 0.7 * side, spec.north_m - 0.3 * side, side / 7, spec.hill_m)
-    relief = Relief(spec.base_m, spec.relief_m, longest_m=240.0, roughness=3.0, hill=hill if spec.hill_m else None)
+    relief = Relief(spec.base_m, spec.relief_m, spec.longest_m, roughness=3.0, hill=hill if spec.hill_m else None)
     shape = (int(margin[1] + margin[3]), int(margin[0] + margin[2]))
     bare = natural_ground(spec.seed, origin, step, shape, relief, spec.gsd_m / 2)
-    return add_objects(bare, spec.objects, spec.seed)
+    area = Area(int(margin[0]) * step, int(margin[1]) * step, side)
+    if spec.kind == "real":
+        return realistic_ground(bare, spec.cover, area, spec.seed)
+    built = add_objects(bare, spec.objects, spec.seed)
+    return built if spec.trouble is None else with_trouble(built, spec.trouble, area, spec.seed)
 
 
 def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:

@@ -7,7 +7,7 @@ exact by construction, roofs are planes, and walls are vertical. There is nothin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from zlocus.core.errors import ConfigError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.textures import fractal_surface, natural_textures
 
-GROUND, ROAD, BUILDING, TREE = 0, 1, 2, 3
+GROUND, ROAD, BUILDING, TREE, WATER, FIELD = 0, 1, 2, 3, 4, 5
 BLOCK = 16
 TEXTURE_STREAM, TERRAIN_STREAM, OBJECT_STREAM = 1, 2, 3
 ROWS_AT_ONCE = 512
@@ -26,12 +26,13 @@ ANALYTIC_KINDS = ("plane", "tilt", "step", "sphere", "sine")
 
 MATERIAL = np.dtype(
     [
-        ("kind", "i4"),  # GROUND, ROAD, BUILDING or TREE
+        ("kind", "i4"),  # class of the truth: GROUND, ROAD, BUILDING, TREE, WATER or FIELD
         ("pattern", "i4"),  # pattern of the top: one of the PATTERN_ constants
         ("albedo", "f8"),
         ("contrast", "f8"),  # contrast of the pattern, relative to the albedo
         ("period", "f8"),  # period of stripes and rows, m
-        ("x", "f8"),  # m, centre of a building, corner of a crop, in field coordinates (east and south of the field's)
+        # m, centre of a building, corner of a crop, in field coordinates (east and south of the field's); texels, waves
+        ("x", "f8"),
         ("y", "f8"),
         ("cos", "f8"),  # direction of a building's first axis, of rows
         ("sin", "f8"),
@@ -44,6 +45,10 @@ MATERIAL = np.dtype(
     ]
 )
 PATTERN_NATURAL, PATTERN_GRAIN, PATTERN_STRIPES, PATTERN_LEAVES, PATTERN_ROWS = 0, 1, 2, 3, 4
+PATTERN_WAVES, PATTERN_GLITTER, PATTERN_FOLIAGE = 5, 6, 7
+# Patterns that look different in every image.
+MOVING_PATTERNS = (PATTERN_WAVES, PATTERN_GLITTER, PATTERN_FOLIAGE)
+NO_LANES = np.zeros((0, 4))
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ class SyntheticGround:
     planes : (r, c, 3) float32: ellipsoidal height (m) at the cell's centre, slope towards the next column and towards
     the next row (m per cell). material : (r, c) uint16, index into materials : (m,) of dtype MATERIAL.
     textures : (3, t, t) float32, see `natural_textures`; texel_m : size of a texel.
+    lanes : (n, 4) m, places on roads where cars can drive, east and south of the corner of cell [0, 0], and the unit
+    vector along the road, east and south. marked : (r, c) bool, cells of a painted trouble, None where there is none.
     """
 
     x0: float
@@ -64,6 +71,8 @@ class SyntheticGround:
     materials: NDArray[np.void]
     textures: NDArray[np.float32]
     texel_m: float
+    lanes: NDArray[np.float64] = field(default_factory=NO_LANES.copy)
+    marked: NDArray[np.bool_] | None = None
 
     @property
     def heights(self) -> NDArray[np.float32]:
@@ -82,7 +91,7 @@ class SyntheticGround:
 
     @cached_property
     def classes(self) -> NDArray[np.uint8]:
-        """(r, c) uint8: 0 ground, 1 road, 2 building, 3 tree."""
+        """(r, c) uint8: 0 ground, 1 road, 2 building, 3 tree, 4 water, 5 field."""
         return np.asarray(self.materials["kind"].astype(np.uint8)[self.material])
 
     @cached_property

@@ -13,7 +13,7 @@ from rasterio.transform import from_origin
 
 from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.scenes import Exposure, SceneSpec
-from zlocus.synthetic.terrain import SyntheticGround
+from zlocus.synthetic.terrain import WATER, SyntheticGround
 
 # A camera is evaluated at nodes at this spacing, and interpolated in between. The error is below 0.1 px, so it matters
 # only for cells at the border of an image.
@@ -21,10 +21,12 @@ NODE_CELLS, NODE_HEIGHT_M = 32, 10.0
 
 
 def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Exposure], folder: Path) -> None:
-    """Write `truth_dsm.tif` and `truth_class.tif` at the step of the height field.
+    """Write `truth_dsm.tif` and `truth_class.tif`, and with a painted trouble `trouble.tif`, at the step of the height
+    field.
 
     They cover the area of the scene, or with `spec.whole_truth` all ground that two or more of the exposures show; then
-    heights are NaN where fewer do. Occlusion is ignored: an image shows every point that lies inside it.
+    heights are NaN where fewer do. Occlusion is ignored: an image shows every point that lies inside it. In realistic
+    scenes heights of water are NaN too: images show nothing of it that stays.
     """
     known: NDArray[np.bool_] | None = None
     if spec.whole_truth:
@@ -37,15 +39,20 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Ex
     heights, classes = ground.heights[cells], ground.classes[cells]
     if known is not None:
         heights = np.where(known[cells], heights, np.float32(np.nan))
+    if spec.kind == "real":
+        heights = np.where(classes == WATER, np.float32(np.nan), heights)
+    has_gaps = known is not None or spec.kind == "real"
     west, north = ground.x0 + cells[1].start * ground.step, ground.y0 - cells[0].start * ground.step
     profile = {
         "driver": "GTiff", "height": heights.shape[0], "width": heights.shape[1], "count": 1, "compress": "deflate",
         "crs": f"EPSG:{spec.epsg}", "transform": from_origin(west, north, spec.step_m, spec.step_m),
     }  # fmt: skip
     layers: tuple[tuple[str, NDArray[np.generic], str, float | None], ...] = (
-        ("truth_dsm.tif", heights, "height above the ellipsoid", None if known is None else np.nan),
+        ("truth_dsm.tif", heights, "height above the ellipsoid", np.nan if has_gaps else None),
         ("truth_class.tif", classes, "class", None),
     )
+    if ground.marked is not None:
+        layers += (("trouble.tif", ground.marked[cells].astype(np.uint8), "cells of the painted trouble", None),)
     for name, values, description, nodata in layers:
         with rasterio.open(folder / name, "w", dtype=values.dtype, nodata=nodata, **profile) as file:
             file.write(np.ascontiguousarray(values), 1)
