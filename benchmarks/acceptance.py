@@ -18,7 +18,7 @@ import time
 import traceback
 from pathlib import Path
 
-from result_files import record_results
+from result_files import code_of, record_results
 from rows.registry import ROWS
 from workplace import CannotRun, Figure, Workplace
 
@@ -58,11 +58,11 @@ def main() -> int:
 def measured(name: str, out: Path, is_recorded: bool) -> list[Figure]:
     """Measure a row in the folder `out`, and write its results file if that is asked for."""
     row, data = ROWS[name], os.environ.get("ZLOCUS_TEST_DATA")
-    workplace, start = Workplace(Path(data) if data else None, out), time.monotonic()
+    workplace, code, start = Workplace(Path(data) if data else None, out), code_of(row.parts), time.monotonic()
     figures = row.measure(workplace)
     if is_recorded and row.is_recorded:
         seconds, command = time.monotonic() - start, f"make measure ROW={name}"
-        record_results(name, figures, command, seconds=seconds, parts=row.parts, inputs=workplace.inputs)
+        record_results(name, figures, command, seconds=seconds, code=code, inputs=workplace.inputs)
     return figures
 
 

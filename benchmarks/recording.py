@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 
-from result_files import PACKAGE, RENDERER, Table, record_results
+from result_files import PACKAGE, RENDERER, Table, code_of, record_results
 from workplace import ROOT, CannotRun, ended
 
 RULE = re.compile(r"^\|(?:\s*:?-+:?\s*\|)+$")
@@ -48,7 +48,8 @@ def main() -> None:
     parser.add_argument("script", metavar="SCRIPT", help="name of a script of benchmarks/, such as roofline.py")
     parser.add_argument("options", nargs=argparse.REMAINDER, metavar="OPTION", help="of the script")
     words = parser.parse_args()
-    script, start = f"benchmarks/{words.script}", time.monotonic()
+    script = f"benchmarks/{words.script}"
+    code, start = code_of((PACKAGE, RENDERER, script)), time.monotonic()
     command = [sys.executable, str(ROOT / script), *words.options]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     print(done.stdout, end="", flush=True)
@@ -58,8 +59,7 @@ def main() -> None:
             f"{script} ends with status {done.returncode} and prints {len(tables)} tables: nothing is kept."
         )
     told = shlex.join(["python", "benchmarks/recording.py", words.name, words.script, *words.options])
-    parts = (PACKAGE, RENDERER, script)
-    record_results(words.name, (), told, seconds=time.monotonic() - start, parts=parts, tables=tables)
+    record_results(words.name, (), told, seconds=time.monotonic() - start, code=code, tables=tables)
 
 
 if __name__ == "__main__":

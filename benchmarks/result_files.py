@@ -123,23 +123,29 @@ def record_results(
     command: str,
     *,
     seconds: float | None = None,
-    parts: Sequence[str] = (PACKAGE,),
+    code: dict[str, str] | None = None,
     inputs: dict[str, Any] | None = None,
     tables: Sequence[Table] = (),
     folder: Path = RESULTS,
 ) -> Results:
     """Write the results file of figures that were measured just now with the code of this checkout.
 
-    Scripts call it with their figures; `make measure ROW` calls it for the rows of the acceptance table.
+    code : digests of the measured parts before the measurement began (`code_of`), None for those of the package now.
+    Where they are others now, files were changed meanwhile, and the commit is marked. Scripts call it with their
+    figures; `make measure ROW` calls it for the rows of the acceptance table.
     """
+    code = code_of((PACKAGE,)) if code is None else code
+    commit = commit_of(list(code))
+    if code != code_of(code) and not commit.endswith(DIRTY):
+        commit += DIRTY
     results = Results(
         row=row,
-        commit=commit_of(parts),
+        commit=commit,
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         machine=this_machine(),
         command=command,
         seconds=None if seconds is None else round(seconds, 1),
-        code={part: digest_of(part) for part in parts},
+        code=code,
         figures=tuple(replace(figure, value=_rounded(figure.value)) for figure in figures),
         inputs=dict(inputs or {}),
         tables=tuple(tables),
@@ -154,10 +160,13 @@ def all_results(folder: Path = RESULTS) -> dict[str, Results]:
 
 
 def stale_parts(results: Results) -> list[str]:
-    """Measured parts of the source that differ from those of today, or whose state was not recorded."""
-    if not results.code:
-        return ["code not recorded"]
+    """Measured parts of the source that differ from those of today; none where no code is recorded."""
     return [part for part, digest in results.code.items() if digest != digest_of(part)]
+
+
+def code_of(parts: Iterable[str]) -> dict[str, str]:
+    """Digest of each part of the source as it lies in this checkout."""
+    return {part: digest_of(part) for part in parts}
 
 
 def digest_of(part: str) -> str:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from pages import numbers, spans
 from pages.tables import TABLES
-from peers.page import page_of, write_page
-from result_files import RESULTS, Results, all_results, stale_parts
-from workplace import ROOT
+from peers.page import OWN, page_of, write_page
+from result_files import DIRTY, NOT_RECORDED, PACKAGE, RESULTS, Results, all_results, digest_at, digest_of, stale_parts
+from workplace import ROOT, CannotRun
 
 NUMBERS = ROOT / "benchmarks" / "unmeasured_numbers.json"
 PEERS_RESULTS, PEERS_PAGE = ROOT / "benchmarks" / "peers" / "results.json", "docs/reference/peers.md"
@@ -79,16 +79,40 @@ def accept_numbers() -> None:
 
 
 def stale_results(folder: Path = RESULTS) -> list[str]:
-    """One sentence for each results file that is older than the code that it measures."""
-    return [sentence for results in all_results(folder).values() if (sentence := stale_sentence(results))]
+    """One sentence for each results file that is older than the code that it measures, that of the peers included."""
+    found = [sentence for results in all_results(folder).values() if (sentence := stale_sentence(results))]
+    return [*found, *stale_peers()]
+
+
+def stale_peers() -> list[str]:
+    """A sentence if zlocus was compared with other programs at commits whose package was another, else nothing."""
+    if not PEERS_RESULTS.exists():
+        return []
+    rows = json.loads(PEERS_RESULTS.read_text(encoding="utf-8"))["surfaces"]
+    commits = sorted({row["commit"] for row in rows if row["program"] == OWN})
+    now = digest_of(PACKAGE)
+    old = [commit for commit in commits if commit.endswith(DIRTY) or package_at(commit) != now]
+    if not old:
+        return []
+    return [f"The comparison with other programs, measured at {', '.join(old)}, is older than {PACKAGE}: `make peers`."]
+
+
+def package_at(commit: str) -> str:
+    """Digest of the package at a commit; empty where the history does not reach it."""
+    try:
+        return digest_at(PACKAGE, commit)
+    except CannotRun:
+        return ""
 
 
 def stale_sentence(results: Results) -> str:
     """What has changed since a row was measured, or nothing."""
+    how = "no command is recorded" if results.command == NOT_RECORDED else f"`{results.command}`"
+    if not results.code:
+        return f"{results.row}, of {results.date[:10]}, does not say which code it measured: {how}."
     changed = stale_parts(results)
     if not changed:
         return ""
     return (
-        f"{results.row}, measured {results.date[:10]} at {results.commit}, is older than {', '.join(changed)}: "
-        f"`{results.command}`."
+        f"{results.row}, measured {results.date[:10]} at {results.commit}, is older than {', '.join(changed)}: {how}."
     )

@@ -9,6 +9,8 @@ from result_files import PACKAGE, RENDERER
 from workplace import Figure, Workplace
 
 WITH_RENDERER = (PACKAGE, RENDERER)
+# Rows on real images are measured by these scripts too.
+WITHOUT_TRUTH = (PACKAGE, *(f"benchmarks/{n}.py" for n in ("independent_surfaces", "lines_of_sight", "reprojection")))
 
 
 @dataclass(frozen=True)
@@ -17,8 +19,7 @@ class Row:
 
     function : "module:name" of the function that measures it; the module is imported when the row is measured.
     code : measured parts of the source; the file of the function is always one more. is_slow : left out unless it is
-    asked for by name or by `--slow`. is_recorded : whether it has a results file; not where its figures come from another
-    file that holds when they were measured.
+    asked for by name or by `--slow`. is_recorded : whether it has a results file of its own.
     """
 
     function: str
@@ -49,6 +50,9 @@ ROWS: dict[str, Row] = {
     "tuniu": Row("rows.photographs:tuniu"),
     "drone-block": Row("rows.drone_block:drone_block", WITH_RENDERER, is_slow=True),
     "herzjesu": Row("rows.photographs:herzjesu"),
+    "pairs-of-triplet": Row("rows.real_images:pairs_of_triplet", WITHOUT_TRUTH),
+    "independent-surfaces": Row("rows.real_images:independent_surfaces", WITHOUT_TRUTH),
+    "left-out-views": Row("rows.real_images:left_out_views", WITHOUT_TRUTH),
     "middlebury": Row("rows.methods:middlebury"),
     "selection": Row("rows.methods:selection"),
     "city": Row("rows.rendered:city"),

@@ -15,6 +15,7 @@ RUN_BY = {
     "acceptance.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "audit.py": "test_acceptance.py::test_known_vulnerabilities_are_found",
     "baselines.py": "test_surfaces.py::test_the_benchmark_of_other_methods",
+    "before_after.py": "test_real_images.py::test_figures_before_and_after_a_change_stand_side_by_side",
     "bench_kernels.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "bench_linescan.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "rows/other_programs.py": "test_acceptance.py::test_the_rows_of_other_programs_are_those_of_their_last_run",
@@ -23,9 +24,17 @@ RUN_BY = {
     "double_mapping.py": "test_surfaces.py::test_cells_that_show_what_hides_them",
     "inspecting.py": "test_speed.py::test_clicks_on_a_surface_are_timed",
     "judging.py": "test_surfaces.py::test_the_benchmark_of_the_choice_of_views",
+    "independent_surfaces.py": "test_real_images.py::test_two_surfaces_disagree_in_exactly_the_planted_share",
     "rows/large_areas.py": "test_speed.py::test_what_a_wider_halo_changes",
+    "lines_of_sight.py": "test_real_images.py::test_a_tower_occludes_what_lies_behind_it_in_a_view_with_rpc",
     "machine.py": "test_speed.py::test_rates_of_a_core_are_measured",
     "middlebury.py": "test_acceptance.py::test_the_benchmark_of_rectified_photographs",
+    "pages/__init__.py": "test_figures.py::test_the_pages_show_their_results",
+    "pages/__main__.py": "test_figures.py::test_the_command_tells_what_differs",
+    "pages/all_pages.py": "test_figures.py::test_the_pages_show_their_results",
+    "pages/numbers.py": "test_figures.py::test_the_pages_show_their_results",
+    "pages/spans.py": "test_figures.py::test_the_pages_show_their_results",
+    "pages/tables.py": "test_figures.py::test_the_pages_show_their_results",
     "peers/__main__.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
     "peers/builds.py": "test_peers.py::test_micmac_as_its_documents_say",
     "peers/cars.py": "test_peers_command.py::test_cars_is_run_with_its_configuration",
@@ -44,17 +53,20 @@ RUN_BY = {
     "peers/scenes.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
     "peers/sgm_speed.py": "test_peers_command.py::test_aggregation_is_timed_beside_other_programs",
     "precision.py": "test_surfaces.py::test_standard_deviations_are_calibrated",
+    "recording.py": "test_result_files.py::test_the_tables_that_a_script_prints_are_kept",
     "rectifying.py": "test_surfaces.py::test_the_benchmark_of_other_methods",
     "reprojection.py": "test_acceptance.py::test_images_left_out_confirm_a_surface",
     "roofline.py": "test_speed.py::test_the_roofline_of_a_kernel_and_of_the_program",
     "roofline_counts.py": "test_speed.py::test_bounds_follow_from_counts",
     "result_files.py": "test_result_files.py::test_a_measured_row_is_read_back_as_it_was_written",
     "rows/__init__.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/drone_block.py": "test_drone_block_row.py::test_the_row_renders_matches_and_judges",
     "rows/demo.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/fresh.py": "test_seeds.py::test_the_figures_of_a_seed_are_those_of_its_surface",
     "rows/methods.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/photographs.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/registry.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/real_images.py": "test_real_images.py::test_a_row_judges_a_surface_by_the_image_that_was_left_out",
     "rows/rendered.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/resources.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "rows/satellite.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
@@ -72,7 +84,7 @@ RUN_BY = {
 # What has a command line of its own, by how it is called; the other files are parts of these, or are run by pytest.
 COMMANDS = {
     path.name: path.stem for path in sorted(BENCHMARKS.glob("*.py")) if "ArgumentParser(" in path.read_text("utf-8")
-} | {"peers": "peers.__main__"}
+} | {"pages": "pages.__main__", "peers": "peers.__main__"}
 
 
 def test_every_script_is_run_by_a_test():
