@@ -237,7 +237,7 @@ def test_an_empty_surface_is_judged_not_refused(tmp_path, hills):
     assert "nan" not in "\n".join(lines)
     assert "no error is known" not in evaluation_table(evaluate(good, Comparison(good)))
     assert result.statistics.completeness == 0.0
-    assert lines[2].split() == ["all", "400", "0.00", "%", "0.00", "%", *["-"] * 9]
+    assert lines[2].split() == ["all", "1600", "0.00", "%", "0.00", "%", *["-"] * 9]
     assert (result.mvs3dm.completeness, result.as_dict()["mvs3dm_median_error"]) == (0.0, None)
     json.dumps(result.as_dict(), allow_nan=False)
 

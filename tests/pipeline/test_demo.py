@@ -16,6 +16,7 @@ from rasterio.transform import from_origin
 from zlocus.core.errors import OutputError
 from zlocus.core.progress import LineProgress, SilentProgress
 from zlocus.core.requests import DEMO_ACCURACY, DEMO_BEGUN
+from zlocus.evaluation.table import evaluation_table
 from zlocus.pipeline import tile_run as tiles
 from zlocus.pipeline.demo import run_demo
 from zlocus.products.demo_figure import CAPTION, GAP, error_map, picture_beside_truth, relief
@@ -85,6 +86,11 @@ def test_the_demo_runs_twice_into_one_folder(tmp_path, monkeypatch):
     first = stopped_and_taken_on(tmp_path, monkeypatch)
     assert [limit.threshold_m for limit in first.evaluations] == [0.42, 1.0]
     assert all(each.class_statistics["ground"].within > 0.9 for each in first.evaluations)
+    for each in first.evaluations:
+        # Its cameras are corrected on exact trajectories: no shift to speak of, and both kinds of figures in the table.
+        assert np.hypot(*each.found_shift.enu_m[:2]) < each.threshold_m
+        assert each.aligned_accuracy.class_statistics["ground"].within > 0.9
+        assert evaluation_table(each).splitlines()[0].split() == ["absolute", "aligned"]
     picture = (tmp_path / "demo.png").read_bytes()
     # Now it is finished, and starts anew.
     (tmp_path / DEMO_ACCURACY).write_text("{}")
