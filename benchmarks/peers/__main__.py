@@ -4,8 +4,9 @@
                             [--out FOLDER] [--cores 0,1] [--s2p PATH] [--micmac PATH] [--setsm PATH]
 
 Installs CARS, Pandora with libSGM, and OpenCV from the package registry into environments of their own below FOLDER.
-s2p, MicMac and SETSM run if a path to their command is options. Rendered scenes are made on demand; the Pleiades sets
-and the Middlebury photographs are used if `ZLOCUS_TEST_DATA` has them. The whole comparison takes hours; an
+s2p, MicMac and SETSM run if a path to their command is given. Rendered scenes are made on demand; `seeds` are ten
+realistic scenes whose seeds follow from the last commit that touches src/. The shared scenes are used if
+`ZLOCUS_TEST_DATA` has them. The whole comparison takes hours; an
 interrupted one is resumed. Writes results.json, and from it peers.md with its pictures; `--page FOLDER` only writes
 the page, from `--results FILE`. For a first look, `--side` sets the size of the rendered scenes and `--runs` the
 number of runs of zlocus.
@@ -29,8 +30,9 @@ from peers.own import Own  # noqa: E402
 from peers.page import write_page  # noqa: E402
 from peers.running import OWN_RUNS, PeerComparison, Program, run_all  # noqa: E402
 from peers.scenes import RENDERED  # noqa: E402
+from seeds import fresh_seeds  # noqa: E402
 
-NAMES = (*RENDERED, "pleiades", "middlebury", "kernels")
+NAMES = (*RENDERED, "realistic", "seeds", "jax068", "pleiades", "middlebury", "kernels")
 PROGRAMS = ("zlocus", "CARS", "OpenCV", "Pandora", "s2p", "MicMac", "SETSM")
 BUILDS = {"s2p": builds.S2p, "MicMac": builds.MicMac, "SETSM": builds.Setsm}
 
@@ -97,7 +99,8 @@ def main() -> None:
     usable = sorted(os.sched_getaffinity(0))
     cores = tuple(map(int, options.cores.split(","))) if options.cores else tuple(usable[:2])
     environments: dict[str, Environment] = {}
-    comparison = PeerComparison(options.scenes, options.views, options.side, options.runs)
+    seeds = fresh_seeds() if "seeds" in options.scenes else ()
+    comparison = PeerComparison(options.scenes, options.views, options.side, options.runs, seeds)
     results = run_all(programs(options, environments), comparison, options.out, cores, environments)
     print(write_page(results, options.out))
 

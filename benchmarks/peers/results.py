@@ -8,7 +8,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,13 @@ class Results:
         kept = [each for each in self.found[part] if not same.items() <= each.items()]
         it = self.found["machine"]
         self.found[part] = [*kept, row | {"when": now(), "cores": it["cores"], "commit": it["commit"]}]
+        self.write()
+
+    def forget_scenes(self, matches: Callable[[str], object], but: Sequence[str]) -> None:
+        """Drop the measurements of scenes that match, but of those whose name begins with one of `but`."""
+        gone = {name for name in self.found["scenes"] if matches(name) and not name.startswith(tuple(but))}
+        self.found["scenes"] = {name: it for name, it in self.found["scenes"].items() if name not in gone}
+        self.found["surfaces"] = [row for row in self.found["surfaces"] if row["scene"] not in gone]
         self.write()
 
     def describe(self, part: str, name: str, what: dict[str, Any]) -> None:

@@ -17,13 +17,15 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from judging import JUDGE, judged
+from judging import JUDGE
 from peers import own
 from peers.environments import Environment
 from peers.measuring import Failed, Usage, measured
 from peers.middlebury import middlebury
+from peers.realistic import RealisticScene, jax_scenes, judged_scene, seed_scenes, shared_scenes
 from peers.results import Results, say
 from peers.scenes import RENDERED, WARM_UP, Scene, shared
+from peers.verdicts import SEED_SCENE
 from zlocus.core.errors import ZlocusError
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
@@ -54,13 +56,14 @@ class PeerComparison:
 
     names : scenes of RENDERED, `pleiades`, `middlebury`, `kernels`; views : numbers of views of rendered scenes, None
     for all; side : cells along a side of the rendered scenes, None for their own; own_runs : runs of zlocus, of which
-    the median counts.
+    the median counts; seeds : of the realistic recipe.
     """
 
     names: Sequence[str]
     views: Sequence[int] | None = None
     side: int | None = None
     own_runs: int = OWN_RUNS
+    seeds: Sequence[int] = ()
 
 
 def run_all(
@@ -72,6 +75,8 @@ def run_all(
 ) -> Path:
     """Make all measurements that the results do not hold yet; return the file of results."""
     results = Results(out / "results.json", cores)
+    if "seeds" in comparison.names:
+        results.forget_scenes(SEED_SCENE.match, [f"realistic {seed}, " for seed in comparison.seeds])
     for program in programs:
         results.describe("programs", program.name, program.versions())
         warm_up(program, out, cores, comparison)
@@ -108,6 +113,12 @@ def scenes(comparison: PeerComparison, out: Path) -> Iterator[Scene]:
                 name, rendered = f"{name} of {comparison.side} cells", replace(rendered, side=comparison.side)
             found = rendered.scenes(name, out / "scenes")
             yield from (scene for scene in found if comparison.views is None or len(scene.images) in comparison.views)
+    if "realistic" in comparison.names:
+        yield from shared_scenes(out / "scenes")
+    if "seeds" in comparison.names:
+        yield from seed_scenes(comparison.seeds, out / "scenes")
+    if "jax068" in comparison.names:
+        yield from jax_scenes(out / "scenes")
     if "pleiades" in comparison.names:
         yield from shared(out / "scenes")
 
@@ -128,7 +139,7 @@ def surfaces_of(
     made: dict[str, Path] = {} if scene.reference is None else {"s2p, delivered": scene.reference}
     for program in programs:
         key = {"scene": scene.name, "program": program.name, "versions": results.found["programs"][program.name]}
-        if scene.truth is None:
+        if scene.truth is None or isinstance(scene, RealisticScene):
             scene = replace(scene, shifts=own.shifts(out / "surfaces" / scene.slug / OWN, scene))
         if not results.has("surfaces", **key):
             say(f"{scene.name}: {program.name}")
@@ -140,7 +151,7 @@ def surfaces_of(
     for row in rows:
         # If the surface of an earlier run is gone, its figures stay.
         if scene.truth is not None and scene.classes is not None and made[row["program"]].exists():
-            row["classes"] = judged(made[row["program"]], scene.truth, scene.classes)
+            row["classes"] = judged_scene(scene, made[row["program"]])
             row["judge"] = JUDGE.name if JUDGE.exists() else "zlocus evaluate"
     results.write()
     if scene.truth is None:

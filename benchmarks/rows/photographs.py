@@ -33,7 +33,7 @@ def import_dmc(workplace: Workplace, out: Path) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     (camera := out / "camera.yaml").write_text(f"focal: {120 / 0.144}\n")
     crs = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
-    run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", out / "scene.yaml"])
+    run([ZLOCUS, "import", "eo", scene, "--crs", crs, "--camera", camera, "-o", out / "scene.yaml", "--overwrite"])
     return out / "scene.yaml"
 
 
@@ -50,7 +50,7 @@ def import_tuniu(workplace: Workplace, out: Path) -> Path:
         )
     )
     table = ["--crs", "EPSG:32651", "--earth", "flat", "--camera", camera]
-    run([ZLOCUS, "import", "eo", scene, *table, "-o", out / "scene.yaml"])
+    run([ZLOCUS, "import", "eo", scene, *table, "-o", out / "scene.yaml", "--overwrite"])
     return out / "scene.yaml"
 
 

@@ -43,6 +43,11 @@ class Row:
 ROWS: dict[str, Row] = {
     "fresh-city": Row("rows.fresh:fresh_city", WITH_RENDERER, is_slow=True),
     "fresh-hills": Row("rows.fresh:fresh_hills", WITH_RENDERER, is_slow=True),
+    "fresh-realistic": Row("rows.realistic:fresh_realistic", WITH_RENDERER, is_slow=True),
+    "realistic": Row("rows.realistic:realistic"),
+    "troubles": Row("rows.troubles:troubles", WITH_RENDERER, is_slow=True),
+    # How hard the recipe is for other programs: from benchmarks/peers/results.json.
+    "hardness": Row("rows.realistic:hardness", is_recorded=False),
     "calanques": Row("rows.satellite:calanques"),
     "ventoux": Row("rows.satellite:ventoux"),
     "datum": Row("rows.satellite:datum"),

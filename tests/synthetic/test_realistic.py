@@ -96,7 +96,10 @@ def test_equal_seeds_give_equal_scenes_and_others_do_not(folder, tmp_path):
 @pytest.mark.parametrize("name", RARE)
 def test_each_rare_thing_can_be_asked_for(name):
     bare = analytic_ground("tilt", (0.0, 0.0), 0.5, (400, 400))
-    without, present = (realistic_ground(bare, Cover(rare_objects=rare, n_terraces=0, houses_per_ha=0.0), AREA, SEED) for rare in ((), (name,)))
+    without, present = (
+        realistic_ground(bare, Cover(rare_objects=rare, n_terraces=0, houses_per_ha=0.0), AREA, SEED)
+        for rare in ((), (name,))
+    )
     assert len(present.materials) > 0
     assert not np.array_equal(without.material, present.material)
     if name == "tower":

@@ -22,6 +22,7 @@ from zlocus.synthetic.terrain import (
     PATTERN_GRAIN,
     PATTERN_NATURAL,
     PATTERN_ROWS,
+    PATTERN_STRIPES,
     PATTERN_WAVES,
     ROAD,
     WATER,
@@ -33,7 +34,7 @@ BoolArray = NDArray[np.bool_]
 # Heights within a lake are those of its rim at this percentile, less its bank.
 RIM_PERCENTILE, BANK_M = 2.0, 0.3
 LANE_SPACING_M = 2.0
-GREENHOUSE_BAY_M, GREENHOUSE_EAVE_M, GREENHOUSE_RISE_M = 6.4, 3.0, 1.2
+GREENHOUSE_BAY_M, GREENHOUSE_EAVE_M, GREENHOUSE_RISE_M = 3.7, 3.0, 1.2
 
 
 @dataclass(frozen=True)
@@ -217,3 +218,10 @@ def crops(place: Footprint, period_m: float, albedo: float, contrast: float) -> 
     material["cos"], material["sin"], material["period"] = np.cos(place.angle), np.sin(place.angle), period_m
     material["x"], material["y"] = place.x, place.y
     return material
+
+
+def striped(material: NDArray[np.void]) -> NDArray[np.void]:
+    """The material with even stripes in place of its pattern, so that nothing tells one period from the next."""
+    changed = material.copy()
+    changed["pattern"] = PATTERN_STRIPES
+    return changed

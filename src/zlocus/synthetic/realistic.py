@@ -18,7 +18,7 @@ from zlocus.synthetic.sensor_errors import SensorErrors
 from zlocus.synthetic.weather import Weather
 
 RECIPE_STREAM = 101
-SIZE_PX, RELIEF_M, LONGEST_M = 720, 100.0, 450.0
+SIZE_PX, MARGIN_M, RELIEF_M, LONGEST_M = 720, 20.0, 100.0, 450.0
 MAX_POINTING_PX, MAX_WAVE_PX = 0.8, (0.1, 0.35)
 BLUR_PX = (0.75, 0.9)
 CHANGES = Changes(directional=0.08, daily=0.12, cars_per_km=6.0)
@@ -38,7 +38,8 @@ def realistic_spec(seed: int) -> SceneSpec:
     views = tuple(_view(rng, *angles) for angles in ANGLES)
     weather = tuple(_weather(rng, cloudy_share) for cloudy_share in CLOUDY_SHARES)
     return SceneSpec(
-        kind="real", seed=seed, size=SIZE_PX, gsd_m=0.5, base_m=400.0, relief_m=RELIEF_M, longest_m=LONGEST_M,
+        kind="real", seed=seed, size=SIZE_PX, gsd_m=0.5, margin_m=MARGIN_M, base_m=400.0, relief_m=RELIEF_M,
+        longest_m=LONGEST_M,
         objects=Objects(0.0, 0.0, 0.0, 0.0), views=views, changes=CHANGES, weather=weather,
         west_m=500100.0, north_m=5205900.0,
     )  # fmt: skip

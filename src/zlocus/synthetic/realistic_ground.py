@@ -27,11 +27,12 @@ from zlocus.synthetic.terrain import (
 from zlocus.synthetic.textures import fractal_surface
 
 COVER_STREAM = 31
-GROUND_ALBEDO, GROUND_CONTRAST = 0.25, 0.12
-TREE_ALBEDOS, LEAF_CONTRAST = (0.15, 0.19, 0.24), 0.4
+GROUND_ALBEDO, GROUND_CONTRAST = 0.25, 0.135
+TREE_ALBEDOS, LEAF_CONTRAST = (0.15, 0.19, 0.24), 0.55
 ROOFS = (0.18, 0.22, 0.27, 0.33, 0.42, 0.75, 0.95)
 WOOD_M, WOOD_EXPONENT = 90.0, 2.2
 CROWN_RADIUS_M, SLENDERNESS = (1.8, 4.2), (2.1, 3.4)
+ROAD_CONTRAST = 0.01
 CROWN_ROUGH_M = 0.45
 MAX_TREE_M, MAX_STANDS_PER_TREE = 15.0, 3
 ROUGH_M = 0.08
@@ -45,7 +46,7 @@ class Cover(Checked):
 
     houses_per_ha: float = option(0.8, "Houses on open ground, per hectare.", low=0.0, high=50.0)
     plain_roofs: float = option(0.5, "Share of the roofs without texture.", low=0.0, high=1.0)
-    forest_share: float = option(0.24, "Share of the ground that is forest.", low=0.0, high=0.9)
+    forest_share: float = option(0.27, "Share of the ground that is forest.", low=0.0, high=0.9)
     trees_per_forest_ha: float = option(330.0, "Trees in a hectare of forest.", low=0.0, high=2000.0)
     single_trees_per_ha: float = option(7.0, "Single trees on open ground, per hectare.", low=0.0, high=200.0)
     roads_along: int = option(3, "Roads along the base line.", low=0, high=20)
@@ -110,11 +111,11 @@ def _build_roads(painter: Painter, cover: Cover, area: Area, rng: np.random.Gene
     for k in range(cover.roads_along):
         start = area.x + (k + rng.uniform(0.2, 0.8)) / max(cover.roads_along, 1) * area.side_m
         middle = start + rng.normal(0.0, 0.08) * (y - area.y - area.side_m / 2) + _bend(y, rng)
-        painter.road(middle, rng.uniform(6.0, 10.0), plain_road(rng.uniform(*cover.road_albedo)))
+        painter.road(middle, rng.uniform(6.0, 10.0), plain_road(rng.uniform(*cover.road_albedo), ROAD_CONTRAST))
     for _ in range(cover.roads_across):
         start = area.y + rng.uniform(0.1, 0.9) * area.side_m
         middle = start + rng.normal(0.0, 0.08) * (x - area.x - area.side_m / 2) + _bend(x, rng)
-        painter.road_across(middle, rng.uniform(5.0, 9.0), plain_road(rng.uniform(*cover.road_albedo)))
+        painter.road_across(middle, rng.uniform(5.0, 9.0), plain_road(rng.uniform(*cover.road_albedo), ROAD_CONTRAST))
 
 
 def _bend(along: FloatArray, rng: np.random.Generator) -> FloatArray:

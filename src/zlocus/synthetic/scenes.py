@@ -32,7 +32,8 @@ LARGE_SIZE = 3000  # cells; in larger scenes heights and truth are as coarse as 
 
 MORNING, AFTERNOON = Sun(152.0, 46.0), Sun(232.0, 33.0)
 CLEAR = Optics()
-TROUBLE_SEED = 5
+# Seeds of the towns that troubles are painted into.
+TROUBLE_SEEDS = (5, 6, 7)
 NO_ERRORS, TWELVE_BITS = SensorErrors(), SensorErrors(saturation=4095)
 # Moving cars on the places of a trouble (see `Changes.cars_per_km`): three of ten bays of the car park are taken.
 CARS_PER_KM = {"cars": 150.0}
@@ -103,6 +104,9 @@ class SceneSpec(Checked):
     level: int = option(0, "Level of airborne images: raw, or resampled to a plane.", choices=(0, 1))
     truth_step_m: float | None = option(None, "Cell of heights and truth; unset: half of `gsd_m`.", low=0.02, unit="m")
     whole_truth: bool = option(False, "Truth covers all ground that two images show, not only the area.")
+    margin_m: float = option(
+        0.0, "Width of the ground around the area that all satellite images show too.", low=0.0, high=1000.0, unit="m"
+    )
     samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
     base_m: float = option(430.0, "Lowest ellipsoidal height of the terrain.", low=-400.0, high=8000.0, unit="m")
     relief_m: float = option(
@@ -179,7 +183,7 @@ def city_spec(seed: int, **changes: object) -> SceneSpec:
     return replace(SceneSpec(kind="city", seed=seed), **changes)  # type: ignore[arg-type]
 
 
-def trouble_spec(trouble: str, seed: int = TROUBLE_SEED, **changes: object) -> SceneSpec:
+def trouble_spec(trouble: str, seed: int = TROUBLE_SEEDS[0], **changes: object) -> SceneSpec:
     """A town with one painted trouble, seen by sensors of 12 bits in three views of one pass."""
     views = tuple(replace(view, errors=TWELVE_BITS) for view in SATELLITE_VIEWS[:3])
     spec = city_spec(seed, views=views, trouble=trouble, changes=Changes(cars_per_km=CARS_PER_KM.get(trouble, 0.0)))
@@ -238,16 +242,16 @@ def exposures_of(spec: SceneSpec) -> tuple[Exposure, ...]:
         if isinstance(camera, LineScanner) and spec.level == 1:
             result.append(_level_1(view, camera, middle, corners))
             continue
-        first, shape = first_pixel_and_shape(camera.image_from_ground(corners))
+        first, shape = first_pixel_and_shape(camera.image_from_ground(area_corners(spec, spec.margin_m)))
         result.append(Exposure(view, replace(camera, centre=(-first[0], -first[1])), shape))
     return tuple(result)
 
 
-def area_corners(spec: SceneSpec) -> FloatArray:
-    """Corners (8, 3) m of the area at its lowest and highest terrain."""
-    side = spec.size * spec.gsd_m
+def area_corners(spec: SceneSpec, margin_m: float = 0.0) -> FloatArray:
+    """Corners (8, 3) m of the area at its lowest and highest terrain, with a margin around it."""
+    low, high = -margin_m, spec.size * spec.gsd_m + margin_m
     return np.array([
-        (spec.west_m + e * side, spec.north_m - s * side, z) for e in (0, 1) for s in (0, 1) for z in spec.terrain_range
+        (spec.west_m + e, spec.north_m - s, z) for e in (low, high) for s in (low, high) for z in spec.terrain_range
     ])  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from zlocus.synthetic.objects import Footprint
 from zlocus.synthetic.painting import (
@@ -19,17 +20,19 @@ from zlocus.synthetic.painting import (
     glitter,
     plain_ground,
     plain_road,
+    striped,
     water,
 )
 from zlocus.synthetic.terrain import BUILDING, GROUND, PATTERN_GRAIN, SyntheticGround, plain_material
 
 TROUBLE_STREAM = 37
 # Diameter of lakes and side of rectangles, m.
-LAKE_M, SIDE_M, TERRACE_SIDE_M = 64.0, 96.0, 64.0
-SNOW_SMOOTHING_M = 3.0
-TOWER_M, TOWER_SIDE_M, N_TOWERS = 130.0, 24.0, 3
+LAKE_M, SIDE_M, TERRACE_SIDE_M, ROWS_SIDE_M = 68.0, 96.0, 64.0, 54.0
+WAVE_CONTRAST, CALM_CONTRAST, SNOW_ALBEDO = 0.15, 0.06, 3.0
+SNOW_M, SNOW_SMOOTHING_M = 120.0, 6.0
+TOWER_M, N_TOWERS, TOWER_SIDE_M, FOOT_M = 130.0, 3, 16.0, 3.0
 TERRACE_M = 12.0
-ROAD_M = 16.0
+ROAD_M = 10.0
 BAY_M, AISLE_M, OCCUPIED = (2.6, 5.2), 7.0, 0.7
 # Albedo of what saturates sensors of 12 bits with the gain of the town's images.
 BLINDING = 6.0
@@ -61,7 +64,7 @@ def _cleared_rectangle(painter: Painter, area: Area, side_m: float = SIDE_M) -> 
 
 def _rough_lake(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
     lake = _cleared_disc(painter, area)
-    painter.cover(lake, water(0.12, 0.5))
+    painter.cover(lake, water(0.12, WAVE_CONTRAST))
     return lake
 
 
@@ -73,15 +76,16 @@ def _glittering_lake(painter: Painter, area: Area, rng: np.random.Generator) -> 
 
 def _calm_lake(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
     lake = _cleared_disc(painter, area)
-    painter.cover(lake, water(0.05, 0.06))
+    painter.cover(lake, water(0.05, CALM_CONTRAST))
     return lake
 
 
 def _snow(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
-    """Smooth snow that follows the relief."""
-    snow = painter.is_bare(painter.disc(*area.middle, 50.0))
+    """An open field of smooth snow that follows the relief."""
+    snow = painter.disc(*area.middle, SNOW_M / 2)
+    painter.clear(snow)
     painter.smooth(snow, SNOW_SMOOTHING_M)
-    painter.cover(snow, plain_ground(3.0, 0.002))
+    painter.cover(snow, plain_ground(SNOW_ALBEDO, 0.0))
     return snow
 
 
@@ -89,8 +93,8 @@ def _rows(period_m: float) -> Callable[[Painter, Area, np.random.Generator], Boo
     """Crops in rows across the base line, so that they repeat along it."""
 
     def paint(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
-        place, where = _cleared_rectangle(painter, area)
-        painter.cover(where, crops(place, period_m, 0.4, 0.3))
+        place, where = _cleared_rectangle(painter, area, ROWS_SIDE_M)
+        painter.cover(where, striped(crops(place, period_m, 0.4, 0.3)))
         return where
 
     return paint
@@ -139,11 +143,12 @@ def _cars(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
 
 
 def _towers(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
+    """Towers that stand far above the town; they and the ground at their feet are marked."""
     marked = np.zeros(painter.ground.heights.shape, bool)
     for k in range(N_TOWERS):
         x = area.middle[0] + (k - (N_TOWERS - 1) / 2) * 55.0
         marked |= painter.tower((x, area.middle[1] + rng.uniform(-20.0, 20.0)), TOWER_SIDE_M, TOWER_M)
-    return marked
+    return np.asarray(binary_dilation(marked, iterations=round(FOOT_M / painter.ground.step)))
 
 
 def _saturated_roofs(painter: Painter, area: Area, rng: np.random.Generator) -> BoolArray:
