@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from pages import numbers, spans
+from pages import numbers, scene_tables, spans  # noqa: F401 (scene_tables registers its tables)
 from pages.tables import TABLES
 from peers.page import OWN, page_of, write_page
 from result_files import DIRTY, NOT_RECORDED, PACKAGE, RESULTS, Results, all_results, digest_at, digest_of, stale_parts

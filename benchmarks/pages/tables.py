@@ -153,20 +153,25 @@ def fresh_scenes(results: AllResults) -> str:
 
 def seed_cells(it: Results, name: str) -> list[str]:
     """Cells of a line of the fresh scenes: mean and standard deviation of each figure."""
-    known = {figure.what: figure for figure in it.figures}
 
     def spread(what: str, digits: int) -> str:
-        mean, deviation = (known.get(f"{name}, {what}, {which}") for which in ("mean", "standard deviation"))
-        return "" if mean is None or deviation is None else f"{mean.value:.{digits}f} ± {deviation.value:.{digits}f}"
+        return seed_spread(it, f"{name}, {what}", digits)
 
     return [
         *(spread(f"within 1 m: {kind}", 3) for kind in CLASSES[:3]),
-        f"{known[f'{name}, within 1 m: all, worst'].value:.3f}",
+        f"{it.value(f'{name}, within 1 m: all, worst'):.3f}",
         spread("off by more than 3 m", 4),
         spread("off by more than 10 m", 4),
         spread("RMSE", 2),
         spread("NMAD ground", 3),
     ]
+
+
+def seed_spread(it: Results, what: str, digits: int) -> str:
+    """Mean and standard deviation over the seeds of a figure; empty where it was not measured."""
+    known = {figure.what: figure.value for figure in it.figures}
+    mean, deviation = (known.get(f"{what}, {which}") for which in ("mean", "standard deviation"))
+    return "" if mean is None or deviation is None else f"{mean:.{digits}f} ± {deviation:.{digits}f}"
 
 
 @table("demo")

@@ -20,6 +20,8 @@ from peers.scenes import RESOLUTION_M, Scene
 
 # Images with fewer pixels along a side are small.
 SMALL_PX = 1000
+# Realistic scenes are matched as hills are, JAX_068 as a town.
+METHOD_OF = {"real": "hills", "registered": "city"}
 PACKAGES = ("cars", "pandora", "libSGM", "shareloc", "cars-rasterize", "numba", "numpy")
 
 
@@ -49,7 +51,7 @@ def configuration(scene: Scene, out: Path) -> dict[str, Any]:
     recommended = yaml.safe_load((CONFIGURATIONS / "cars.yaml").read_text(encoding="utf-8"))
     pairs = scene.pairs
     views = [view for view in scene.images if view in set(itertools.chain(*pairs))]
-    matching = {"dense_matching": {"method": recommended["methods"][scene.kind]}}
+    matching = {"dense_matching": {"method": recommended["methods"][METHOD_OF.get(scene.kind, scene.kind)]}}
     low, high = scene.heights
     margins = dict.fromkeys(("lower_margin", "upper_margin"), round(high - low))
     return {

@@ -28,6 +28,7 @@ RUN_BY = {
     "rows/large_areas.py": "test_speed.py::test_what_a_wider_halo_changes",
     "lines_of_sight.py": "test_real_images.py::test_a_tower_occludes_what_lies_behind_it_in_a_view_with_rpc",
     "machine.py": "test_speed.py::test_rates_of_a_core_are_measured",
+    "pages/scene_tables.py": "test_realistic_scenes.py::test_tables_of_realistic_scenes",
     "marked_cells.py": "test_realistic_scenes.py::test_errors_in_marked_cells",
     "peers/realistic.py": "test_realistic_scenes.py::test_scenes_of_seeds_are_rendered_and_judged",
     "peers/verdicts.py": "test_realistic_scenes.py::test_the_heaviest_loss_comes_first_with_its_reason",

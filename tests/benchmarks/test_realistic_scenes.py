@@ -12,11 +12,13 @@ from rasterio.transform import from_origin
 
 import rows.realistic as realistic_rows
 from marked_cells import MarkedErrors, marked_errors
+from pages import scene_tables
 from peers import realistic as peer_scenes
-from peers.results import Results
+from peers.results import Results as PeerResults
 from peers.verdicts import MEAN_SCENE, lost_classes, severity, verdict_lines, with_means_of_seeds
+from result_files import Results
 from rows import troubles as trouble_rows
-from workplace import CannotRun, Workplace
+from workplace import CannotRun, Figure, Workplace
 
 TRUTH_STEP_M, CELLS = 0.25, 80
 SHARE = 1e-9
@@ -184,10 +186,33 @@ def test_scenes_of_seeds_are_rendered_and_judged(tmp_path, monkeypatch):
 
 
 def test_results_of_earlier_seeds_are_dropped(tmp_path):
-    results = Results(tmp_path / "results.json", (0,))
+    results = PeerResults(tmp_path / "results.json", (0,))
     for scene in ("town, 2 views", "realistic 1, 2 views", "realistic 7, 2 views"):
         results.describe("scenes", scene, {"truth": True})
         results.add("surfaces", {"scene": scene, "program": "zlocus"}, "scene", "program")
     results.forget_scenes(lambda name: name.startswith("realistic "), ["realistic 7, "])
     assert list(results.found["scenes"]) == ["town, 2 views", "realistic 7, 2 views"]
     assert [r["scene"] for r in results.found["surfaces"]] == ["town, 2 views", "realistic 7, 2 views"]
+
+
+def test_tables_of_realistic_scenes(found, tmp_path, monkeypatch):
+    """Lines are those of the results, the heaviest loss first; a missing results file is one sentence."""
+    monkeypatch.setattr(scene_tables, "PEERS_RESULTS", tmp_path / "results.json")
+    with pytest.raises(CannotRun, match="run `make peers`"):
+        scene_tables.programs({})
+    found["scenes"] = {name: about | {"views": 3} for name, about in found["scenes"].items()}
+    (tmp_path / "results.json").write_text(json.dumps(found), encoding="utf-8")
+    lines = scene_tables.programs_short({}).splitlines()[2:]
+    assert lines[0] == "| lost | 0.600 | 0.800 CARS | 30.00 m | 2.00 m CARS |"
+    assert "| won | **0.900** | 0.800 CARS | **1.00 m** | 2.00 m CARS |" in lines
+    assert scene_tables.programs({}).splitlines()[2].startswith("| lost | **CARS 0.800**, zlocus 0.600 |")
+    whats = ("with a height", "off by more than 3 m", "off by more than 10 m")
+    figures = tuple(
+        Figure(f"lake, {views} views: {what}", value)
+        for views in ("two", "three")
+        for what, value in zip(whats, (1.0, 0.5, 0.25), strict=True)
+    )
+    of_troubles = Results("troubles", "abc", "2026", {}, "make", None, {}, figures)
+    assert scene_tables.troubles({"troubles": of_troubles}).splitlines()[2:] == [
+        "| lake | 1.00 / 0.50 / 0.25 | 1.00 / 0.50 / 0.25 |"
+    ]

@@ -12,14 +12,14 @@ from pyproj import Transformer
 
 from zlocus.io.scene_file import open_scene
 from zlocus.synthetic.files import render_scene
-from zlocus.synthetic.painting import Area
+from zlocus.synthetic.painting import TruthArea
 from zlocus.synthetic.realistic import MAX_POINTING_PX, realistic_spec
 from zlocus.synthetic.realistic_ground import RARE, Cover, realistic_ground
 from zlocus.synthetic.scenes import SceneSpec, build_ground, exposures_of
 from zlocus.synthetic.terrain import FIELD, GROUND, ROAD, TREE, WATER, SyntheticGround, analytic_ground
 
 SEED, SMALL_PX = 12, 240
-AREA = Area(0.0, 0.0, 200.0)
+AREA = TruthArea(0.0, 0.0, 200.0)
 
 
 def small(seed: int = SEED, n_views: int = 2) -> SceneSpec:

@@ -12,13 +12,13 @@ import rasterio
 from zlocus.core.errors import ConfigError
 from zlocus.synthetic.files import render_scene
 from zlocus.synthetic.objects import Footprint, Objects, add_objects
-from zlocus.synthetic.painting import Area
+from zlocus.synthetic.painting import TruthArea
 from zlocus.synthetic.scenes import SATELLITE_VIEWS, city_spec, trouble_spec
 from zlocus.synthetic.terrain import BUILDING, WATER, SyntheticGround, analytic_ground
 from zlocus.synthetic.troubles import BLINDING, TOWER_M, TROUBLES, with_trouble
 
 STEP_M, CELLS, SEED = 0.5, 460, 3
-AREA = Area(10.0, 10.0, 210.0)
+AREA = TruthArea(10.0, 10.0, 210.0)
 HEIGHT_M = 1e-4
 
 

@@ -38,7 +38,7 @@ GREENHOUSE_BAY_M, GREENHOUSE_EAVE_M, GREENHOUSE_RISE_M = 3.7, 3.0, 1.2
 
 
 @dataclass(frozen=True)
-class Area:
+class TruthArea:
     """The area with truth. x, y : of its corner, m from the corner of the height field; side_m : its side."""
 
     x: float
@@ -95,15 +95,15 @@ class Painter:
         """Cells of a disc, (r, c) bool."""
         return np.asarray((self.x() - x) ** 2 + (self.y() - y) ** 2 < radius_m**2)
 
-    def axes(self, place: Footprint) -> tuple[FloatArray, FloatArray]:
+    def axes(self, footprint: Footprint) -> tuple[FloatArray, FloatArray]:
         """Distances (r, c) m of all cells from the centre of a footprint, along its length and along its width."""
         rows, cols = self.ground.heights.shape
-        return place.axes(self.ground, (slice(0, rows), slice(0, cols)))
+        return footprint.axes(self.ground, (slice(0, rows), slice(0, cols)))
 
-    def rectangle(self, place: Footprint) -> BoolArray:
+    def rectangle(self, footprint: Footprint) -> BoolArray:
         """Cells of a footprint, (r, c) bool."""
-        p, q = self.axes(place)
-        return np.asarray((np.abs(p) < place.length / 2) & (np.abs(q) < place.width / 2))
+        p, q = self.axes(footprint)
+        return np.asarray((np.abs(p) < footprint.length / 2) & (np.abs(q) < footprint.width / 2))
 
     def level(self, where: BoolArray, height_m: float) -> None:
         """Make cells horizontal at one height."""
@@ -151,27 +151,27 @@ class Painter:
         """Paint a road that runs from west to east on bare ground. middle_y : (c,) southing of its middle line, m."""
         self.cover(self.is_bare(np.abs(self.y() - middle_y[None, :]) < width_m / 2), material)
 
-    def greenhouses(self, place: Footprint) -> BoolArray:
+    def greenhouses(self, footprint: Footprint) -> BoolArray:
         """Build rows of joined greenhouses with glossy, even roofs, and return their cells (r, c) bool.
 
         The width of the footprint is divided into bays, each with a low gable.
         """
-        p, q = self.axes(place)
-        where = (np.abs(p) < place.length / 2) & (np.abs(q) < place.width / 2)
+        p, q = self.axes(footprint)
+        where = (np.abs(p) < footprint.length / 2) & (np.abs(q) < footprint.width / 2)
         foot = float(np.median(self.ground.heights[where]))
-        across = (q + place.width / 2) / GREENHOUSE_BAY_M
+        across = (q + footprint.width / 2) / GREENHOUSE_BAY_M
         gable = 1.0 - np.abs(2.0 * (across - np.floor(across)) - 1.0)
         self.level(where, foot)
         self.ground.heights[where] = (foot + GREENHOUSE_EAVE_M + GREENHOUSE_RISE_M * gable)[where]
         rise = 2.0 * GREENHOUSE_RISE_M / GREENHOUSE_BAY_M * np.where(across - np.floor(across) < 0.5, 1.0, -1.0)
-        by_step = rise[..., None] * (-np.sin(place.angle), np.cos(place.angle)) * self.ground.step
+        by_step = rise[..., None] * (-np.sin(footprint.angle), np.cos(footprint.angle)) * self.ground.step
         self.ground.slopes[where] = by_step[where]
         glass = plain_material(BUILDING, PATTERN_GRAIN, 0.8, 0.004)
         frame = plain_material(BUILDING, PATTERN_GRAIN, 0.55, 0.004)
         for material in (glass, frame):
-            material["x"], material["y"] = place.x, place.y
-            material["cos"], material["sin"] = np.cos(place.angle), np.sin(place.angle)
-            material["half_length"], material["half_width"] = place.length / 2, place.width / 2
+            material["x"], material["y"] = footprint.x, footprint.y
+            material["cos"], material["sin"] = np.cos(footprint.angle), np.sin(footprint.angle)
+            material["half_length"], material["half_width"] = footprint.length / 2, footprint.width / 2
             material["base"] = foot
         self.cover(where, glass)
         self.cover(where & (np.abs(across - np.rint(across)) * GREENHOUSE_BAY_M < 0.45), frame)
@@ -179,12 +179,12 @@ class Painter:
 
     def tower(self, xy: tuple[float, float], side_m: float, height_m: float) -> BoolArray:
         """Build a square tower whose flat roof is `height_m` above its foot, and return its cells (r, c) bool."""
-        place = Footprint(*xy, 0.3, side_m, side_m)
-        where = self.rectangle(place)
+        footprint = Footprint(*xy, 0.3, side_m, side_m)
+        where = self.rectangle(footprint)
         foot = float(self.ground.heights[where].min())
         material = plain_material(BUILDING, PATTERN_NATURAL, 0.3, 0.1)
         material["x"], material["y"] = xy
-        material["cos"], material["sin"] = np.cos(place.angle), np.sin(place.angle)
+        material["cos"], material["sin"] = np.cos(footprint.angle), np.sin(footprint.angle)
         material["half_length"] = material["half_width"] = side_m / 2
         material["base"], material["floor"], material["window"], material["wall"] = foot, 3.0, 2.4, 0.35
         self.level(where, foot + height_m)
@@ -212,11 +212,11 @@ def plain_ground(albedo: float, contrast: float = 0.003) -> NDArray[np.void]:
     return plain_material(GROUND, PATTERN_GRAIN, albedo, contrast)
 
 
-def crops(place: Footprint, period_m: float, albedo: float, contrast: float) -> NDArray[np.void]:
+def crops(footprint: Footprint, period_m: float, albedo: float, contrast: float) -> NDArray[np.void]:
     """Crops in rows along the length of a footprint, `period_m` apart."""
     material = plain_material(FIELD, PATTERN_ROWS, albedo, contrast)
-    material["cos"], material["sin"], material["period"] = np.cos(place.angle), np.sin(place.angle), period_m
-    material["x"], material["y"] = place.x, place.y
+    material["cos"], material["sin"], material["period"] = np.cos(footprint.angle), np.sin(footprint.angle), period_m
+    material["x"], material["y"] = footprint.x, footprint.y
     return material
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from zlocus.core.options.option_fields import Checked, option
 from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.objects import Footprint, Objects, Tree, place_building, plant_tree
-from zlocus.synthetic.painting import Area, BoolArray, Painter, crops, glitter, plain_ground, plain_road, water
+from zlocus.synthetic.painting import BoolArray, Painter, TruthArea, crops, glitter, plain_ground, plain_road, water
 from zlocus.synthetic.terrain import (
     FIELD,
     GROUND,
@@ -28,7 +28,7 @@ from zlocus.synthetic.textures import fractal_surface
 
 COVER_STREAM = 31
 GROUND_ALBEDO, GROUND_CONTRAST = 0.25, 0.135
-TREE_ALBEDOS, LEAF_CONTRAST = (0.15, 0.19, 0.24), 0.55
+TREE_ALBEDOS, LEAF_CONTRAST = (0.15, 0.19, 0.24), 0.3
 ROOFS = (0.18, 0.22, 0.27, 0.33, 0.42, 0.75, 0.95)
 WOOD_M, WOOD_EXPONENT = 90.0, 2.2
 CROWN_RADIUS_M, SLENDERNESS = (1.8, 4.2), (2.1, 3.4)
@@ -59,37 +59,37 @@ class Cover(Checked):
     rare_objects: tuple[str, ...] | None = None  # None: drawn; else these
 
 
-def realistic_ground(bare: SyntheticGround, cover: Cover, area: Area, seed: int) -> SyntheticGround:
+def realistic_ground(bare_ground: SyntheticGround, cover: Cover, truth_area: TruthArea, seed: int) -> SyntheticGround:
     """The bare terrain with all cover. Equal arguments give equal bytes.
 
     Whatever is drawn later gives way to what was drawn before: objects do not overlap, but trees hang over roads.
     """
     rng = np.random.default_rng([seed, COVER_STREAM])
-    painter = Painter.on(bare)
+    painter = Painter.on(bare_ground)
     painter.materials = [
         plain_material(GROUND, PATTERN_NATURAL, GROUND_ALBEDO, GROUND_CONTRAST),
         plain_road(0.2), plain_road(0.5),
         *(plain_material(TREE, PATTERN_FOLIAGE, albedo, LEAF_CONTRAST) for albedo in TREE_ALBEDOS),
     ]  # fmt: skip
     for _ in range(cover.n_terraces):
-        _raise_terraces(painter, area, rng)
+        _raise_terraces(painter, truth_area, rng)
     for _ in range(cover.n_lakes):
-        _dig_lake(painter, area, rng)
-    _build_roads(painter, cover, area, rng)
+        _dig_lake(painter, truth_area, rng)
+    _build_roads(painter, cover, truth_area, rng)
     rare = tuple(name for name in RARE if rng.random() < cover.rare_share)
     for name in rare if cover.rare_objects is None else cover.rare_objects:
-        _add_rare(painter, name, area, rng)
+        _add_rare(painter, name, truth_area, rng)
     _build_houses(painter, cover, rng)
     for _ in range(cover.n_fields):
-        _sow_field(painter, area, rng)
+        _sow_field(painter, truth_area, rng)
     _roughen(painter, rng)
     _plant_trees(painter, cover, rng)
     return painter.painted()
 
 
-def _raise_terraces(painter: Painter, area: Area, rng: np.random.Generator) -> None:
+def _raise_terraces(painter: Painter, truth_area: TruthArea, rng: np.random.Generator) -> None:
     """Raise a hill in steps with walls of rock, as vineyards and quarries have them."""
-    x, y = area.place(rng, 0.1 * area.side_m)
+    x, y = truth_area.place(rng, 0.1 * truth_area.side_m)
     radius, n_steps = rng.uniform(60.0, 100.0), int(rng.integers(3, 6))
     dx, dy = painter.x() - x, painter.y() - y
     angle = np.arctan2(dy, dx)
@@ -98,23 +98,23 @@ def _raise_terraces(painter: Painter, area: Area, rng: np.random.Generator) -> N
         painter.ground.heights[bent < radius * (1.0 - k / n_steps)] += rng.uniform(2.5, 5.0)
 
 
-def _dig_lake(painter: Painter, area: Area, rng: np.random.Generator) -> None:
-    x, y = area.place(rng, 40.0)
+def _dig_lake(painter: Painter, truth_area: TruthArea, rng: np.random.Generator) -> None:
+    x, y = truth_area.place(rng, 40.0)
     radius = rng.uniform(16.0, 26.0)
     flat = painter.disc(x, y, radius)
     painter.lake(flat, water(rng.uniform(0.03, 0.06), rng.uniform(0.1, 0.3)))
 
 
-def _build_roads(painter: Painter, cover: Cover, area: Area, rng: np.random.Generator) -> None:
+def _build_roads(painter: Painter, cover: Cover, truth_area: TruthArea, rng: np.random.Generator) -> None:
     """Build roads with even surfaces, some of them brighter than the sensor can tell."""
     y, x = painter.y()[:, 0], painter.x()[0]
     for k in range(cover.roads_along):
-        start = area.x + (k + rng.uniform(0.2, 0.8)) / max(cover.roads_along, 1) * area.side_m
-        middle = start + rng.normal(0.0, 0.08) * (y - area.y - area.side_m / 2) + _bend(y, rng)
+        start = truth_area.x + (k + rng.uniform(0.2, 0.8)) / max(cover.roads_along, 1) * truth_area.side_m
+        middle = start + rng.normal(0.0, 0.08) * (y - truth_area.y - truth_area.side_m / 2) + _bend(y, rng)
         painter.road(middle, rng.uniform(6.0, 10.0), plain_road(rng.uniform(*cover.road_albedo), ROAD_CONTRAST))
     for _ in range(cover.roads_across):
-        start = area.y + rng.uniform(0.1, 0.9) * area.side_m
-        middle = start + rng.normal(0.0, 0.08) * (x - area.x - area.side_m / 2) + _bend(x, rng)
+        start = truth_area.y + rng.uniform(0.1, 0.9) * truth_area.side_m
+        middle = start + rng.normal(0.0, 0.08) * (x - truth_area.x - truth_area.side_m / 2) + _bend(x, rng)
         painter.road_across(middle, rng.uniform(5.0, 9.0), plain_road(rng.uniform(*cover.road_albedo), ROAD_CONTRAST))
 
 
@@ -129,9 +129,9 @@ def _build_houses(painter: Painter, cover: Cover, rng: np.random.Generator) -> N
         painter.materials += place_building(painter.ground, False, objects, len(painter.materials), rng)
 
 
-def _sow_field(painter: Painter, area: Area, rng: np.random.Generator) -> None:
+def _sow_field(painter: Painter, truth_area: TruthArea, rng: np.random.Generator) -> None:
     """Sow a field of crops in rows 1.5 to 3 m apart, along or across the base line."""
-    x, y = area.place(rng, 0.0)
+    x, y = truth_area.place(rng, 0.0)
     angle = rng.normal(0.0, 0.08) + (0.0 if rng.random() < 0.5 else np.pi / 2)
     place = Footprint(x, y, angle, rng.uniform(50.0, 95.0), rng.uniform(40.0, 85.0))
     row = crops(place, rng.uniform(1.5, 3.0), rng.uniform(0.16, 0.3), rng.uniform(0.1, 0.3))
@@ -174,9 +174,9 @@ def _may_stand(ground: SyntheticGround, kinds: np.ndarray) -> BoolArray:
     return np.isin(kind, (GROUND, FIELD))
 
 
-def _add_rare(painter: Painter, name: str, area: Area, rng: np.random.Generator) -> None:
+def _add_rare(painter: Painter, name: str, truth_area: TruthArea, rng: np.random.Generator) -> None:
     """Add one of the rare things of `RARE` at a random place."""
-    x, y = area.place(rng, 0.15 * area.side_m)
+    x, y = truth_area.place(rng, 0.15 * truth_area.side_m)
     ground = painter.ground
     if name == "greenhouses":
         painter.greenhouses(Footprint(x, y, rng.uniform(0.0, np.pi), rng.uniform(25.0, 45.0), 24.0))

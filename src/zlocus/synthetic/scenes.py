@@ -14,7 +14,7 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.synthetic.appearance import Changes
 from zlocus.synthetic.cameras import LineScanner, RectifiedScanner, SatelliteCamera, Shake, axes_of_heading
 from zlocus.synthetic.objects import Objects, add_objects
-from zlocus.synthetic.painting import Area
+from zlocus.synthetic.painting import TruthArea
 from zlocus.synthetic.realistic_ground import Cover, realistic_ground
 from zlocus.synthetic.render import Optics, Sun
 from zlocus.synthetic.sensor_errors import SensorErrors, WavySatelliteCamera
@@ -321,11 +321,11 @@ def build_ground(spec: SceneSpec, exposures: tuple[Exposure, ...]) -> SyntheticG
     relief = Relief(spec.base_m, spec.relief_m, spec.longest_m, roughness=3.0, hill=hill if spec.hill_m else None)
     shape = (int(margin[1] + margin[3]), int(margin[0] + margin[2]))
     bare = natural_ground(spec.seed, origin, step, shape, relief, spec.gsd_m / 2)
-    area = Area(int(margin[0]) * step, int(margin[1]) * step, side)
+    truth_area = TruthArea(int(margin[0]) * step, int(margin[1]) * step, side)
     if spec.kind == "real":
-        return realistic_ground(bare, spec.cover, area, spec.seed)
+        return realistic_ground(bare, spec.cover, truth_area, spec.seed)
     built = add_objects(bare, spec.objects, spec.seed)
-    return built if spec.trouble is None else with_trouble(built, spec.trouble, area, spec.seed)
+    return built if spec.trouble is None else with_trouble(built, spec.trouble, truth_area, spec.seed)
 
 
 def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:
