@@ -201,5 +201,7 @@ def judged_scene(scene: Scene, dsm: Path) -> dict[str, Any]:
     classes = judging.judged(dsm, scene.truth, scene.classes)
     aligned = judging.judged(dsm, scene.truth, scene.classes, align=True)
     for name, of in classes.items():
-        of["within_aligned"] = aligned[name]["within"]
+        # The judge of the project itself also tells its thresholds and datums.
+        if isinstance(of, dict) and "within" in of:
+            of["within_aligned"] = aligned[name]["within"]
     return classes

@@ -302,3 +302,11 @@ def test_a_surface_of_the_small_block(block: RenderedDroneBlock, spec: DroneBloc
     error = (found - parts.mean(axis=0))[is_smooth]
     assert is_smooth.mean() > 0.7
     assert (np.abs(error) < NEAR_M).mean() > SHARE_NEAR
+
+
+def test_the_command_renders_a_small_block(tmp_path: Path) -> None:
+    """`--kind small-drone` writes the block of its seed."""
+    from zlocus.synthetic.__main__ import main
+
+    assert main(["--kind", "small-drone", "--seed", "3", "-o", str(tmp_path / "block")]) == 0
+    assert len(open_scene([tmp_path / "block" / "scene.yaml"]).views) == 6

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str] | None = None) -> int:
     """Render the scene that the command line describes, and return the exit status."""
+    from zlocus.synthetic.drone_block import DroneBlockSpec, render_drone_block, small_drone_block_spec
     from zlocus.synthetic.files import render_scene
     from zlocus.synthetic.linescan import TrajectoryNoise
     from zlocus.synthetic.mixed import render_mixed_scene
@@ -25,6 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if given.kind == "mixed":
             render_mixed_scene(_spec(given), given.output, _say)
+        elif given.kind in ("drone", "small-drone"):
+            make_block = small_drone_block_spec if given.kind == "small-drone" else DroneBlockSpec
+            render_drone_block(make_block(seed=given.seed), given.output, _say)
         else:
             linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
             render_scene(_spec(given), given.output, _say, linescan)
@@ -42,8 +46,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
     parser.add_argument(
-        "--kind", choices=("city", "hills", "real", "demo", "mixed"), default="city",
-        help="mixed: ground like that of the demo, seen by three kinds of sensor; uses --seed and --size",
+        "--kind", choices=("city", "hills", "real", "demo", "mixed", "drone", "small-drone"), default="city",
+        help="real: as hard as real images; drone: 20 frames of 12 Mpx; small-drone: 6 small ones (both: --seed only); "
+        "mixed: ground like that of the demo, seen by three kinds of sensor (uses --seed and --size)",
     )  # fmt: skip
     parser.add_argument("--trouble", metavar="NAME", help="paint one trouble into a town: lake, glitter, snow ...")
     parser.add_argument("--seed", type=int, default=1)

@@ -13,8 +13,8 @@ from zlocus.synthetic.cameras import SatelliteCamera
 
 BLOCK_PX = 8
 WAVE_STREAM = 59
-N_WAVES = 4
-WAVE_ROWS = (60.0, 500.0)
+N_WAVES = 3
+WAVE_ROWS = (200.0, 1200.0)
 INVERSE_STEPS = 6
 
 
