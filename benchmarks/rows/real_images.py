@@ -101,7 +101,7 @@ def left_out_views(workplace: Workplace) -> list[Figure]:
         figures += left_out_figures(f"triplet {name[-1]}", oriented, name, Bars(0.95, 0.01, 0.9))
     for scene, imported, name, bars in (
         ("DMC", import_dmc, "3324c_2015_1004_05_0184_RGB", Bars(0.82, 0.02, 0.19)),
-        ("tuniu", import_tuniu, "100_0005_0136", Bars(0, 1, 0)),
+        ("tuniu", import_tuniu, "100_0005_0136", Bars(0.84, 0.085, 0.11)),
     ):
         oriented = orient([imported(workplace, workplace.out / scene)], workplace.out / scene / "oriented")
         figures += left_out_figures(scene, oriented, name, bars)

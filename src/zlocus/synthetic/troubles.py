@@ -33,7 +33,7 @@ SNOW_M, SNOW_SMOOTHING_M = 120.0, 6.0
 TOWER_M, N_TOWERS, TOWER_SIDE_M, FOOT_M = 130.0, 3, 16.0, 3.0
 TERRACE_M = 12.0
 ROAD_M = 10.0
-BAY_M, AISLE_M, OCCUPIED = (2.6, 5.2), 7.0, 0.7
+BAY_M, AISLE_M = (2.6, 5.2), 7.0
 # Albedo of what saturates sensors of 12 bits with the gain of the town's images.
 BLINDING = 6.0
 N_HALLS, HALL_M, HALL_HEIGHT_M = 3, (48.0, 40.0), 9.0
@@ -129,7 +129,7 @@ def _saturated_road(painter: Painter, truth_area: TruthArea, rng: np.random.Gene
 
 
 def _cars(painter: Painter, truth_area: TruthArea, rng: np.random.Generator) -> BoolArray:
-    """A car park along the base line, whose cars change from image to image, and a road with moving cars."""
+    """A car park along the base line whose bays are taken by other cars in each image."""
     place, where = _cleared_rectangle(painter, truth_area)
     painter.cover(where, plain_road(0.3, 0.03))
     x0, y0 = place.x - SIDE_M / 2, place.y - SIDE_M / 2
