@@ -35,7 +35,7 @@ GRAIN = 0.5
 # A crest of a wave reflects the sun where the texture is higher than this (standard deviations).
 GLITTER_CREST = 1.3
 # Amplitude of leaves that flutter and glint, where that of the leaves that stay is 1.
-FLUTTER = 3.5
+FLUTTER = 3.2
 NEVER = 1e-30
 OFF_SURFACE_M = 0.02
 OFF_WALL_CELLS = 1.5
