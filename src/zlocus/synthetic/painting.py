@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt
 
 from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.objects import BARE, Footprint
@@ -117,12 +117,6 @@ class Painter:
         planes = self.ground.planes[tuple(nearest)]
         self.ground.planes[where] = planes[where]
         self.ground.material[where] = BARE
-
-    def smooth(self, where: BoolArray, sigma_m: float) -> None:
-        """Smooth the heights of cells by a Gaussian. sigma_m : its standard deviation."""
-        heights = gaussian_filter(self.ground.heights, sigma_m / self.ground.step, mode="nearest")
-        by_row, by_col = np.gradient(heights)
-        self.ground.planes[where] = np.stack([heights, by_col, by_row], axis=-1)[where]
 
     def is_bare(self, where: BoolArray) -> BoolArray:
         """Those of the cells that are bare, (r, c) bool."""

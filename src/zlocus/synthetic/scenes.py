@@ -34,6 +34,8 @@ MORNING, AFTERNOON = Sun(152.0, 46.0), Sun(232.0, 33.0)
 CLEAR = Optics()
 # Seeds of the towns that troubles are painted into.
 TROUBLE_SEEDS = (5, 6, 7)
+# Angles along the flight in which they are seen: even steps, so that rows repeat at equal heights in all pairs.
+TROUBLE_ALONG_DEG = (0.0, 20.0, -20.0)
 NO_ERRORS, TWELVE_BITS = SensorErrors(), SensorErrors(saturation=4095)
 # Moving cars on the places of a trouble (see `Changes.cars_per_km`): three of ten bays of the car park are taken.
 CARS_PER_KM = {"cars": 150.0}
@@ -185,7 +187,8 @@ def city_spec(seed: int, **changes: object) -> SceneSpec:
 
 def trouble_spec(trouble: str, seed: int = TROUBLE_SEEDS[0], **changes: object) -> SceneSpec:
     """A town with one painted trouble, seen by sensors of 12 bits in three views of one pass."""
-    views = tuple(replace(view, errors=TWELVE_BITS) for view in SATELLITE_VIEWS[:3])
+    seen = zip(SATELLITE_VIEWS, TROUBLE_ALONG_DEG, strict=False)
+    views = tuple(replace(view, along_deg=along_deg, errors=TWELVE_BITS) for view, along_deg in seen)
     spec = city_spec(seed, views=views, trouble=trouble, changes=Changes(cars_per_km=CARS_PER_KM.get(trouble, 0.0)))
     return replace(spec, **changes)  # type: ignore[arg-type]
 

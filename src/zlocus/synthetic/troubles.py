@@ -26,10 +26,11 @@ from zlocus.synthetic.painting import (
 from zlocus.synthetic.terrain import BUILDING, GROUND, PATTERN_GRAIN, SyntheticGround, plain_material
 
 TROUBLE_STREAM = 37
-# Diameter of lakes and side of rectangles, m.
-LAKE_M, SIDE_M, TERRACE_SIDE_M, ROWS_SIDE_M = 68.0, 96.0, 64.0, 54.0
+# Diameter of lakes and of snow, and sides of squares, m.
+LAKE_M, SNOW_M, SIDE_M, TERRACE_SIDE_M = 68.0, 110.0, 96.0, 64.0
+# Side of a field, m, by the distance of its rows, m.
+ROWS_SIDE_M = {2.0: 62.0, 4.0: 110.0}
 WAVE_CONTRAST, CALM_CONTRAST, SNOW_ALBEDO = 0.15, 0.06, 3.0
-SNOW_M, SNOW_SMOOTHING_M = 120.0, 6.0
 TOWER_M, N_TOWERS, TOWER_SIDE_M, FOOT_M = 130.0, 3, 16.0, 3.0
 TERRACE_M = 12.0
 ROAD_M = 10.0
@@ -47,9 +48,9 @@ def with_trouble(ground: SyntheticGround, name: str, truth_area: TruthArea, seed
     return replace(painter.painted(), marked=marked)
 
 
-def _cleared_disc(painter: Painter, truth_area: TruthArea) -> BoolArray:
+def _cleared_disc(painter: Painter, truth_area: TruthArea, diameter_m: float = LAKE_M) -> BoolArray:
     """A horizontal disc in the middle of the area, from which all objects were taken."""
-    disc = painter.disc(*truth_area.middle, LAKE_M / 2)
+    disc = painter.disc(*truth_area.middle, diameter_m / 2)
     painter.level(disc, float(np.percentile(painter.ground.heights[disc], 5.0)))
     return disc
 
@@ -81,10 +82,8 @@ def _calm_lake(painter: Painter, truth_area: TruthArea, rng: np.random.Generator
 
 
 def _snow(painter: Painter, truth_area: TruthArea, rng: np.random.Generator) -> BoolArray:
-    """An open field of smooth snow that follows the relief."""
-    snow = painter.disc(*truth_area.middle, SNOW_M / 2)
-    painter.clear(snow)
-    painter.smooth(snow, SNOW_SMOOTHING_M)
+    """An even field under snow that is brighter than the sensor can tell."""
+    snow = _cleared_disc(painter, truth_area, SNOW_M)
     painter.cover(snow, plain_ground(SNOW_ALBEDO, 0.0))
     return snow
 
@@ -93,7 +92,7 @@ def _rows(period_m: float) -> Callable[[Painter, TruthArea, np.random.Generator]
     """Crops in rows across the base line, so that they repeat along it."""
 
     def paint(painter: Painter, truth_area: TruthArea, rng: np.random.Generator) -> BoolArray:
-        place, where = _cleared_rectangle(painter, truth_area, ROWS_SIDE_M)
+        place, where = _cleared_rectangle(painter, truth_area, ROWS_SIDE_M[period_m])
         painter.cover(where, striped(crops(place, period_m, 0.4, 0.3)))
         return where
 
