@@ -27,7 +27,7 @@ from zlocus.synthetic.terrain import (
 from zlocus.synthetic.textures import fractal_surface
 
 COVER_STREAM = 31
-GROUND_ALBEDO, GROUND_CONTRAST = 0.25, 0.16
+GROUND_ALBEDO, GROUND_CONTRAST = 0.25, 0.17
 TREE_ALBEDOS, LEAF_CONTRAST = (0.15, 0.19, 0.24), 0.3
 ROOFS = (0.18, 0.22, 0.27, 0.33, 0.42, 0.75, 0.95)
 WOOD_M, WOOD_EXPONENT = 90.0, 2.2
