@@ -22,6 +22,7 @@ REASONS = {
     "building": "roofs without texture take the height that noise gives them",
     "ground": "the search range is wide, so that noise finds false heights far away",
 }
+PLURALS = {"road": "roads", "tree": "trees", "field": "fields", "building": "roofs", "ground": "ground"}
 GROSS = "gross errors of cells that the images say nothing about: no height is refused there"
 SEED_SCENE = re.compile(r"^realistic \d+, (\d) views$")
 MEAN_SCENE = "realistic scenes of {n} fresh seeds, {views} views"
@@ -136,7 +137,9 @@ def why(rows: dict[str, dict[str, Any]]) -> str:
     losses, classes = lost(rows), lost_classes(rows)
     if not losses:
         return ""
-    parts = [f"{kind}s {own:.3f}, {program} {other:.3f} ({REASONS[kind]})" for kind, program, other, own in classes]
+    parts = [
+        f"{PLURALS[kind]} {own:.3f}, {program} {other:.3f} ({REASONS[kind]})" for kind, program, other, own in classes
+    ]
     if "rmse" in losses and losses["rmse"][2] > 1.2 * losses["rmse"][1]:
         parts.append(GROSS)
     return "; ".join(parts) or "a small difference in all classes"
