@@ -123,8 +123,11 @@ def where(found: dict[str, Any]) -> Iterator[str]:
     yield f"Measured {span} on {computer}; commit {', '.join(commits)}; judged by {', '.join(judges)}."
     busy = [row for row in rows if row.get("beside", 0.0) > BESIDE]
     if busy:
-        listed = ", ".join(f"{row['program']} on {row['scene']} ({row['beside']:.0%} of the cores)" for row in busy)
-        yield f"Other processes used the cores during {listed}: these wall times are too long, and CPU slightly."
+        scenes = ", ".join(dict.fromkeys(row["scene"] for row in busy))
+        yield (
+            f"Other processes used up to {max(row['beside'] for row in busy):.0%} of the cores while these "
+            f"scenes were measured: {scenes}. Their wall times are too long, and their CPU slightly."
+        )
 
 
 PARTS = ("surfaces", "differences", "kernels", "middlebury")
