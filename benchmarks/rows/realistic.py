@@ -43,9 +43,8 @@ def fresh_realistic(workplace: Workplace) -> list[Figure]:
 def _on_seed(out: Path, seed: int) -> list[Figure]:
     scene, figures = out / f"real{seed}", []
     if not (scene / "scene.json").exists():
-        n_views = str(max(map(len, VIEWS.values())))
-        synthetic = [sys.executable, "-m", "zlocus.synthetic", "-o", scene, "--kind", "real"]
-        run([*synthetic, "--seed", seed, "--views", n_views])
+        # All images are rendered, as for the other programs: the ground reaches as far as they see, and follows from that.
+        run([sys.executable, "-m", "zlocus.synthetic", "-o", scene, "--kind", "real", "--seed", seed])
     for number, views in VIEWS.items():
         figures += realistic_figures(f"{number} views", scene, views, out / f"real{seed}-{number}")
     return figures
