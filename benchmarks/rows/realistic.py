@@ -43,7 +43,7 @@ def fresh_realistic(workplace: Workplace) -> list[Figure]:
 def _on_seed(out: Path, seed: int) -> list[Figure]:
     scene, figures = out / f"real{seed}", []
     if not (scene / "scene.json").exists():
-        # All images are rendered, as for the other programs: the ground reaches as far as they see, and follows from that.
+        # All images, as for the other programs: the ground reaches as far as they see, so its details follow from them.
         run([sys.executable, "-m", "zlocus.synthetic", "-o", scene, "--kind", "real", "--seed", seed])
     for number, views in VIEWS.items():
         figures += realistic_figures(f"{number} views", scene, views, out / f"real{seed}-{number}")
