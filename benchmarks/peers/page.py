@@ -352,7 +352,7 @@ def draw_accuracy(found: dict[str, Any], path: Path) -> None:
             )
         axis.set_ylabel(label)
         axis.grid(axis="y", alpha=0.3)
-    axes[1].set_xticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
+    axes[1].set_xticks(range(len(names)), names, rotation=35, ha="right")
     axes[0].legend(ncols=max(len(found["programs"]), 1), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     picture.savefig(path, dpi=110, metadata=metadata)
     plt.close(picture)
