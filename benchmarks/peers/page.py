@@ -120,7 +120,9 @@ def where(found: dict[str, Any]) -> Iterator[str]:
     dates, commits = (sorted({row[what] for row in rows}) for what in ("when", "commit"))
     span = " to ".join(dict.fromkeys(date[:10] for date in (dates[:1] + dates[-1:])))
     judges = sorted({row["judge"] for row in rows if "judge" in row})
-    yield f"Measured {span} on {computer}; commit {', '.join(commits)}; judged by {', '.join(judges)}."
+    # Rows of an earlier day may come from another machine; only the last one is recorded.
+    where_from = "last on" if " to " in span else "on"
+    yield f"Measured {span} {where_from} {computer}; commit {', '.join(commits)}; judged by {', '.join(judges)}."
     busy = [row for row in rows if row.get("beside", 0.0) > BESIDE]
     if busy:
         scenes = ", ".join(dict.fromkeys(row["scene"] for row in busy))
