@@ -38,8 +38,8 @@ def figure(row: dict[str, Any], kind: str, what: str) -> float | None:
 def with_means_of_seeds(found: dict[str, Any]) -> dict[str, Any]:
     """The results in which all scenes of fresh seeds with equally many views are one scene: their mean.
 
-    A program that has no surface on some of them has failed, and its row says on how many. `spread` of a row is the
-    standard deviation of its share within 1 m.
+    A program that has no surface on some of them has failed, and its row says on how many (`n_failed`). `spread` of a
+    row is the standard deviation of its share within 1 m.
     """
     groups: dict[str, list[str]] = {}
     for scene in found["scenes"]:
@@ -54,7 +54,8 @@ def with_means_of_seeds(found: dict[str, Any]) -> dict[str, Any]:
             of_program = [r for r in found["surfaces"] if r["program"] == program and r["scene"] in members]
             n_failed = sum("failed" in row for row in of_program)
             if len(of_program) == len(members):
-                failed = {"scene": name, "failed": f"no surface on {n_failed} of {len(members)} scenes"}
+                said = f"no surface on {n_failed} of {len(members)} scenes"
+                failed = {"scene": name, "failed": said, "n_failed": n_failed}
                 rows.append(of_program[-1] | failed if n_failed else mean_row(name, of_program))
     return found | {"scenes": scenes, "surfaces": rows}
 

@@ -19,9 +19,12 @@ def peers(_workplace: Workplace) -> list[Figure]:
         raise CannotRun(f"{RESULTS} is not there: run `make peers`")
     found, figures = with_means_of_seeds(json.loads(RESULTS.read_text(encoding="utf-8"))), []
     for scene in judged(found):
-        rows = succeeded(of_scene(found, scene))
+        run = of_scene(found, scene)
+        rows = succeeded(run)
         if OWN not in rows or len(rows) < 2:
             raise CannotRun(f"{RESULTS} has no surface of {scene} by {OWN} and by another program")
+        if CARS not in run:
+            raise CannotRun(f"{RESULTS} has no run of {CARS} on {scene}, whose CPU is compared: run `make peers`")
         own, others = rows.pop(OWN), rows.values()
         within, nmad = (figure(own, "all", what) for what in ("within", "nmad"))
         most = max(figure(row, "all", "within") for row in others)
@@ -39,6 +42,9 @@ def peers(_workplace: Workplace) -> list[Figure]:
                     fails_when="zlocus becomes slower, or CARS faster",
                 )
             )
+        else:
+            # The cost of a run that ends in an error says nothing.
+            figures.append(Figure(f"{scene}, runs in which {CARS} failed", run[CARS].get("n_failed", 1)))
     speeds: dict[int, dict[bool, float]] = {}
     for row in found["kernels"]:
         best, is_own = speeds.setdefault(row["heights"], {}), row["program"] == OWN

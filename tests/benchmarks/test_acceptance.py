@@ -108,6 +108,17 @@ def test_the_rows_of_other_programs_are_those_of_their_last_run(monkeypatch, cap
     cpu = rows["CARS"]["cpu_s"] / own["cpu_s"]
     assert float(figures[f"{scene}, CPU of CARS over ours"][0]) == pytest.approx(cpu, rel=1e-3)
     monkeypatch.setattr(other_programs, "RESULTS", tmp_path / "results.json")
+    # Where CARS failed there is no ratio of costs; where it never ran, there is no row.
+    rows["CARS"]["failed"] = "out of memory"
+    other_programs.RESULTS.write_text(json.dumps(found), encoding="utf-8")
+    labels = [figure.what for figure in other_programs.peers(Workplace(None, tmp_path))]
+    assert f"{scene}, CPU of CARS over ours" not in labels
+    assert f"{scene}, runs in which CARS failed" in labels
+    found["surfaces"].remove(rows["CARS"])
+    other_programs.RESULTS.write_text(json.dumps(found), encoding="utf-8")
+    with pytest.raises(CannotRun, match=f"no run of CARS on {scene}"):
+        other_programs.peers(Workplace(None, tmp_path))
+    other_programs.RESULTS.unlink()
     with pytest.raises(CannotRun, match="is not there: run `make peers`"):
         other_programs.peers(Workplace(None, tmp_path))
 

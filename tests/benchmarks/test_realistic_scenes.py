@@ -163,6 +163,16 @@ def test_how_hard_the_recipe_is_for_others(found, tmp_path, monkeypatch):
     assert near.passes
     assert far.value == pytest.approx(-0.06)
     assert not far.passes
+    # A run that failed leaves the other seeds; one that was never made is asked for.
+    seeds = [row for row in found["surfaces"] if row["scene"].startswith("realistic ") and row["program"] == "CARS"]
+    seeds[0]["failed"] = "no surface"
+    results.write_text(json.dumps(found), encoding="utf-8")
+    with pytest.raises(CannotRun, match="too few realistic scenes matched by CARS"):
+        realistic_rows.hardness(Workplace(None, tmp_path))
+    found["surfaces"].remove(seeds[0])
+    results.write_text(json.dumps(found), encoding="utf-8")
+    with pytest.raises(CannotRun, match=f"no run of CARS on {seeds[0]['scene']}: run `make peers`"):
+        realistic_rows.hardness(Workplace(None, tmp_path))
     results.unlink()
     with pytest.raises(CannotRun, match="run `make peers`"):
         realistic_rows.hardness(Workplace(None, tmp_path))
