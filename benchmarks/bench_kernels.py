@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
+from zlocus.matching.evidence import NO_EVIDENCE
 from zlocus.matching.free_rays import pair_agreement
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
@@ -152,7 +153,7 @@ def costs_case(n_views: int, windows: list[int], weight: float, side: int = SIDE
     arrays, layout = ViewArrays(*views(n_views, side), BLOCK), heights.layout
 
     def call():
-        tile_costs(arrays, slope, layout, half, visible, parameters, volume)
+        tile_costs(arrays, slope, layout, half, visible, parameters, NO_EVIDENCE, volume)
 
     return Case(call, heights.size * n_views, "cell, step and image")
 

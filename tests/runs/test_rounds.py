@@ -21,9 +21,9 @@ def levels_matched(monkeypatch):
     """(level, whether occlusions are found, cells by which the occluding surface is eroded) of every matched level."""
     calls, one = [], tile.match_level
 
-    def counted(inputs, level, prior, pair_labels):
+    def counted(inputs, level, prior, pair_labels, earlier_result=None):
         calls.append((level.number, inputs.handles_occlusion, len(prior.erosion) // 2))
-        return one(inputs, level, prior, pair_labels)
+        return one(inputs, level, prior, pair_labels, earlier_result)
 
     monkeypatch.setattr(tile, "match_level", counted)
     return calls

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import CostOptions, large_window_side
 from zlocus.core.options.option_fields import value_of
+from zlocus.matching.evidence import NO_EVIDENCE, learned_evidence
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.shared_records import VisibleHeights
@@ -21,11 +22,16 @@ def cost_volume(
     visible: VisibleHeights,
     options: CostOptions,
     is_pair: bool = False,
+    reference: NDArray[np.float32] | None = None,
 ) -> NDArray[np.uint8]:
-    """Matching cost 64 (1 - NCC) + 64 w d of every cell and height, (v,) uint8, in the order of `HeightLattice.layout`.
+    """Matching cost of every cell and height, (v,) uint8, in the order of `HeightLattice.layout`.
 
     slope_views : projections of slope indices, see `SlopeSurface.along`; visible : in slope indices; is_pair : whether
-    the whole scene has two images only.
+    the whole scene has two images only; reference : (r, c) float32, slope indices, heights from which the evidence of
+    the images is learned, NaN where none is trusted.
+
+    With reference heights the cost of a height is the evidence against it, see `zlocus.matching.evidence`. Without them
+    it is 64 (1 - NCC) + 64 w d.
 
     NCC is the mean over all pairs of views and over the window sizes. For two views and two window sizes it is the SNCC
     of the paper, equation 2. For more views there is no reference image, so that the noise of no single view is in
@@ -36,10 +42,12 @@ def cost_volume(
     `grey_weight_two_images` in blocks that only two of three or more views cover.
     """
     windows = np.unique([options.small_window // 2, large_window_side(options) // 2])
-    volume = np.empty(lattice.size, np.uint8)
+    volume, parameters = np.empty(lattice.size, np.uint8), cost_parameters(options, is_pair)
+    slope, evidence = SlopeArrays(slope_surface.padded(int(windows.max())), slope_surface.nodes), NO_EVIDENCE
+    if reference is not None:
+        evidence = learned_evidence(slope_views, slope, lattice, windows, visible, parameters, reference)
     tile_costs(
-        slope_views.arrays, SlopeArrays(slope_surface.padded(int(windows.max())), slope_surface.nodes), lattice.layout,
-        windows, visible, cost_parameters(options, is_pair), volume,
+        slope_views.arrays, slope, lattice.layout, windows, visible, parameters, evidence, volume
     )  # fmt: skip
     return volume
 

@@ -34,9 +34,9 @@ class TileInputs:
     """Everything that a tile is matched from.
 
     match_scene : the scene; core_window : finest cells whose surface is wanted, without halo; view_pixels : the views
-    that take part, the reference image first; view_numbers : which views of the scene they are; method : mvll-sgm, or
-    mvll without the semi-global constraint; choose_images : whether each block is matched with a choice of the images,
-    else with all of them.
+    that take part, the reference image first; view_numbers : which views of the scene they are; method : mvll-sgm,
+    mvll without the semi-global constraint, or gc3-sgm in image space; choose_images : whether each block is matched
+    with a choice of the images, else with all of them.
     """
 
     match_scene: MatchScene

@@ -55,23 +55,27 @@ def prior_from_coarser(tile: TileInputs, level: PyramidLevel, coarser_result: Le
 def range_from_coarser(
     match_scene: MatchScene, coarser_result: LevelResult, level: PyramidLevel, options: PyramidOptions
 ) -> tuple[FloatGrid, FloatGrid]:
-    """Lowest and highest height to search in each cell, two (r, c) float32 arrays; NaN where no two views see a cell.
-
-    Winner-takes-all heights are added because the semi-global constraint removes a tower or a tree of few coarse cells:
-    its cells agree with each other, but are too few to pay for the jump at its edges (see `shared_heights`).
-    """
-    heights, winner_takes_all = coarser_result.heights, coarser_result.winner_takes_all
-    assert winner_takes_all is not None, "of every level but the finest"
+    """Lowest and highest height to search in each cell, two (r, c) float32 arrays; NaN where fewer than two views."""
     is_seen = covers(coarser_result.visible).sum(axis=0) >= PAIR
-    second = np.where(heights.uniqueness < MAX_COST_MARGIN_OF_SECOND_HEIGHT, heights.second, heights.best)
-    shared = shared_heights(winner_takes_all, heights.best, coarser_result.slope_surface.cells, options)
-    candidates = np.stack([heights.best, second, shared])
-    low, high = without_spikes(
-        candidates.min(axis=0).astype(np.float32), candidates.max(axis=0).astype(np.float32), is_seen
-    )
+    found = candidates(coarser_result, options)
+    low, high = without_spikes(found.min(axis=0).astype(np.float32), found.max(axis=0).astype(np.float32), is_seen)
     low, high = (2 * on_cells(bound, coarser_result.level.window, level.window) for bound in (low, high))
     _widen_to_ties(match_scene, level, low, high)
     return low, high
+
+
+def candidates(coarser_result: LevelResult, options: PyramidOptions) -> NDArray[np.int32]:
+    """Heights of a level between which the next finer one searches, (3, r, c) int32 level indices of the coarser level.
+
+    The best height; a second one of nearly the same cost; and the winner-takes-all height where neighbours agree on it.
+    The last is there because the semi-global constraint removes a tower or a tree of few coarse cells: its cells agree
+    with each other, but are too few to pay for the jump at its edges (see `shared_heights`).
+    """
+    heights, winner_takes_all = coarser_result.heights, coarser_result.winner_takes_all
+    assert winner_takes_all is not None, "of every level but the finest"
+    second = np.where(heights.uniqueness < MAX_COST_MARGIN_OF_SECOND_HEIGHT, heights.second, heights.best)
+    shared = shared_heights(winner_takes_all, heights.best, coarser_result.slope_surface.cells, options)
+    return np.stack([heights.best, second, shared])
 
 
 def _widen_to_ties(match_scene: MatchScene, level: PyramidLevel, low: FloatGrid, high: FloatGrid) -> None:

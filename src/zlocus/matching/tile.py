@@ -17,6 +17,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
 from zlocus.matching.cost_volume import cost_volume
+from zlocus.matching.evidence import reference_heights
 from zlocus.matching.fill import filled
 from zlocus.matching.finest_level import ortho_of_surface, refined_surface, with_planes_of_segments
 from zlocus.matching.free_rays import add_costs_of_rays
@@ -42,6 +43,12 @@ from zlocus.matching.occlusion import (
 )
 from zlocus.matching.overlap import CoarsestHeights, OverlapGround, SearchBounds, find_overlap_window, overlap_ground
 from zlocus.matching.pair_labels import PairLabels, TileLabels, label_pairs_at_ties
+from zlocus.matching.prior_costs import (
+    add_costs_far_from_surface,
+    add_costs_of_coarser,
+    misfit,
+    penalties_after_misfit,
+)
 from zlocus.matching.search_range import coarsest_prior, prior_from_coarser, reachable_range, table_range
 from zlocus.matching.semiglobal import (
     SemiGlobalHeights,
@@ -96,10 +103,10 @@ def match_tile(
 ) -> TileResult:
     """Match one tile.
 
-    core_window : finest cells whose surface is wanted; every level adds a halo around them. method : mvll-sgm, or mvll
-    without the semi-global constraint. choose_images : match each block with a choice of the images; False: with all.
-    fill : none, or interpolate to fill gaps that images cover. Occlusions are found wherever three images or more see
-    the tile.
+    core_window : finest cells whose surface is wanted; every level adds a halo around them. method : mvll-sgm, mvll
+    without the semi-global constraint, or gc3-sgm in image space. choose_images : match each block with a choice of the
+    images; False: with all. fill : none, or interpolate to fill gaps that images cover. Occlusions are found wherever
+    three images or more see the tile.
     """
     if not (core_window.rows and core_window.cols):
         return TileResult(Surface.nothing(core_window))
@@ -197,18 +204,24 @@ def rank_tile(match_scene: MatchScene, core_window: CellWindow, config: RunConfi
 
 
 def match_coarsest_level(tile: TileInputs) -> CoarsestMatch:
-    """Match the coarsest level; where it is steep, a second time along the slopes that the first pass found."""
+    """Match the coarsest level twice: the second time with the evidence that the first pass taught, and, where it is
+    steep, along the slopes that the first pass found. Without the semi-global constraint nothing is learned."""
     level = tile.level(tile.match_scene.levels - 1)
     prior = coarsest_prior(tile.match_scene, level, None)
     pair_labels = pair_labels_for_choice(tile, None)
     result = match_level(tile, level, prior, pair_labels)
-    slope_surface = _slope_of_heights(tile, result)
-    if not slope_surface.is_steep(level.core):
-        return CoarsestMatch(replace(result, slope_surface=slope_surface), prior, pair_labels)
-    prior = coarsest_prior(tile.match_scene, level, result.heights.vertex)
-    pair_labels = pair_labels_for_choice(tile, result)
-    result = add_evaluations(match_level(tile, level, prior, pair_labels), result)
+    is_steep = _slope_of_heights(tile, result).is_steep(level.core)
+    if is_steep:
+        prior = coarsest_prior(tile.match_scene, level, result.heights.vertex)
+        pair_labels = pair_labels_for_choice(tile, result)
+    if is_steep or learns_evidence(tile):
+        result = add_evaluations(match_level(tile, level, prior, pair_labels, result), result)
     return CoarsestMatch(replace(result, slope_surface=_slope_of_heights(tile, result)), prior, pair_labels)
+
+
+def learns_evidence(tile: TileInputs) -> bool:
+    """Whether costs are evidence: not in image space, and not for single cells, where they are those of the papers."""
+    return tile.method == "mvll-sgm"
 
 
 def _slope_of_heights(tile: TileInputs, result: LevelResult) -> SlopeSurface:
@@ -257,10 +270,10 @@ def match_finer_levels(
     for number in range(coarsest_number - 1, -1, -1):
         level = tile.level(number, overlap_window.finer(coarsest_number - number))
         prior = prior_from_coarser(tile, level, results[-1])
-        results.append(match_level(tile, level, prior, pair_labels))
+        results.append(match_level(tile, level, prior, pair_labels, results[-1]))
     for _ in range(1, tile.config.pyramid.finest_level_rounds if tile.handles_occlusion else 1):
         prior = replace(prior, surface=results[-1].heights.vertex, erosion=ERODE_OWN_SURFACE)
-        results[-1] = add_evaluations(match_level(tile, level, prior, pair_labels), results[-1])
+        results[-1] = add_evaluations(match_level(tile, level, prior, pair_labels, results[-1]), results[-1])
     return results
 
 
@@ -281,27 +294,40 @@ class LevelSearch:
 
 
 def match_level(
-    tile: TileInputs, level: PyramidLevel, prior: SearchPrior, pair_labels: PairLabels | None
+    tile: TileInputs,
+    level: PyramidLevel,
+    prior: SearchPrior,
+    pair_labels: PairLabels | None,
+    earlier_result: LevelResult | None = None,
 ) -> LevelResult:
     """Match one pyramid level of a tile.
 
     The steps are those of docs/explanation/method.md: slanted support surface and search range, visibility, choice of
-    images, cost volume, semi-global heights. pair_labels : None uses all images.
+    images, cost volume, semi-global heights. pair_labels : None uses all images; earlier_result : of an earlier pass
+    over this level, or of the coarser one, from which the evidence is learned. None: costs are those of correlation.
     """
     config = tile.config
     search = search_along_slope(tile, level, prior)
     visible = visible_heights(tile, search, prior)
     chosen = _chosen_views(tile, level, search, visible, prior, pair_labels)
+    reference = None
+    if earlier_result is not None and learns_evidence(tile):
+        reference = reference_heights(earlier_result, level, search.slope_surface)
+    is_evidence = reference is not None and prior.coarser_result is not None
     cost = cost_volume(
-        search.slope_views, search.slope_surface, search.lattice, chosen.matched, config.cost, tile.is_pair
+        search.slope_views, search.slope_surface, search.lattice, chosen.matched, config.cost, tile.is_pair, reference
     )
     covered = covers(visible)
     alike = view_agreement(tile, level, search, covered, prior)
     if tile.method == "mvll":
         heights = winner_takes_all_heights(cost, search.lattice)
     else:
+        if is_evidence and prior.coarser_result is not None:
+            add_costs_of_coarser(
+                cost, search.lattice, search.slope_surface, level, prior.coarser_result, config.pyramid
+            )
         penalties = penalties_from_edges(tile, level, search, covered, alike)
-        heights = semiglobal_heights(tile, level, search, cost, penalties, visible)
+        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, is_evidence)
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
 
@@ -397,19 +423,28 @@ def semiglobal_heights(
     cost: NDArray[np.uint8],
     penalties: NDArray[np.uint16],
     visible: VisibleHeights,
+    is_evidence: bool = False,
 ) -> SemiGlobalHeights:
-    """Heights of a level under the semi-global constraint, slope indices.
+    """Heights of a level under the semi-global constraint, slope indices; this changes `cost`.
 
-    Where a surface was known before, heights that stand in free rays of sight become more expensive and the constraint
-    is applied once more; this changes `cost`.
+    Where a surface was known before, the constraint is applied a second time. Heights that stand in free rays of sight
+    are more expensive then. is_evidence : whether jumps are cheaper then where the surface of the first time
+    contradicts the images, see `zlocus.matching.prior_costs`.
     """
     options, step_cells = tile.config.semiglobal, tile.match_scene.step_cells
     heights = aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
-    if search.smooth is not None and add_costs_of_rays(
+    if search.smooth is None:
+        return heights
+    has_rays = add_costs_of_rays(
         cost, search.tile_views, search.slope_surface, search.lattice, visible, heights.vertex, level.number
-    ):
-        heights = aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
-    return heights
+    )
+    if is_evidence:
+        of_patch = misfit(cost, search.lattice, heights)
+        penalties = penalties_after_misfit(penalties, of_patch)
+        add_costs_far_from_surface(cost, search.lattice, search.slope_surface, heights, level.number)
+    elif not has_rays:
+        return heights
+    return aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
 
 
 def _level_result(

@@ -304,7 +304,9 @@ def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, choose_
         A fault of our own, with the tile in which it happened.
     """
     try:
-        result = match_tile(image_scene.match_scene, tile.core_window, config, choose_images=choose_images)
+        result = match_tile(
+            image_scene.match_scene, tile.core_window, config, method="gc3-sgm", choose_images=choose_images
+        )
     except ZlocusError:
         raise
     except Exception as error:

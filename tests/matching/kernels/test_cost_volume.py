@@ -13,6 +13,7 @@ from kernel_scene import even_lattice, kernel_scene, ragged_lattice
 from reference import agreement as twin
 from reference.projection import slope_relief
 from reference.semiglobal import dense
+from zlocus.matching.evidence import NO_EVIDENCE
 from zlocus.matching.kernels.cost_volume import (
     NOTHING,
     WHOLE,
@@ -83,7 +84,7 @@ def costs(scene, lattice, visible, halves=HALVES, options=PLAIN, bumps=0.0):
 
 def costs_along(slope, scene, lattice, visible, halves, options):
     volume = np.zeros(lattice.size, np.uint8)
-    tile_costs(scene.arrays, slope, lattice.layout, halves, visible, options, volume)
+    tile_costs(scene.arrays, slope, lattice.layout, halves, visible, options, NO_EVIDENCE, volume)
     return volume
 
 
@@ -279,7 +280,7 @@ def test_costs_of_one_block():
     visible, count = partly_visible(scene), 16
     relief = np.random.default_rng(2).uniform(-1.0, 1.0, (10 + 2 * half, 12 + 2 * half)).astype(np.float32)
     out = np.zeros((10, 12 * count), np.uint8)
-    block_costs(scene.arrays, relief, HeightSpan(5, count), HALVES, visible, GREYS, out)
+    block_costs(scene.arrays, relief, HeightSpan(5, count), HALVES, visible, GREYS, NO_EVIDENCE, out)
     for k in range(count):
         expected = twin.cell_costs(scene.images, scene.nodes, scene.heights, 5 + k, 16, HALVES, visible, GREYS, relief)
         assert np.abs(out[:, k::count] - expected).max() < COST

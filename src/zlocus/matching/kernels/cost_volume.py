@@ -7,6 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 from zlocus.core.jit import kernel
+from zlocus.matching.kernels.evidence import (
+    Learning,
+    PairWindows,
+    TableAndCounts,
+    add_evidence,
+    count_bins,
+    evidence_costs,
+    pair_scratch,
+)
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
 from zlocus.matching.kernels.resample import (
     block_grid,
@@ -50,6 +59,16 @@ class SlopeArrays(NamedTuple):
 
     cells: np.ndarray  # (r,c) f4: height index of the surface in the cells and in the cells around the tile
     corners: np.ndarray  # (b,d) f8: height index at the corners of the blocks, which the nodes of the views follow
+
+
+class PairWeights(NamedTuple):
+    """How the pairs of views of a block count at one height."""
+
+    of_pair: np.ndarray  # (p,) f4: weight of a pair of views that see the cell
+    n_covering: np.ndarray  # (p,) f4: views that cover the cell at this height
+    n_views: int  # i8: views that cover the block
+    grey_weight: np.float32  # f4: weight of grey differences
+    height: np.int32  # i4: height index
 
 
 class FlatVisibility(NamedTuple):
@@ -259,11 +278,33 @@ def subtract_centre(plane, size, centre, start, grey_factor, n, grey):
             grey[j] = inner[j] * grey_factor
 
 
-# ViewArrays, (r,c) f4, HeightSpan, (w,) i8, VisibleHeights, CostParameters, (r,d) u1 -> None
+# PairWindows, WindowMoments, PairScratch, PairWeights, TableAndCounts, (p,) f4, (n,) u1 -> None
 @kernel
-def block_costs(views, relief, span, windows, visible, parameters, out):
+def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
+    """Write the costs of the cells of a block at one height; where a table is being learned, count its bins instead.
+
+    total : (p,), 0 at all places, changed; out : (n,).
+    """
+    n, n_sizes, weight = out.shape[0], at_height.windows.shape[0], weights.grey_weight
+    if evidence.learning.right.shape[0] > 0:
+        count_bins(at_height, moments, scratch, n, weights.height, evidence)
+    elif evidence.table.log_ratios.shape[0] > 0:
+        add_evidence(at_height, moments, scratch, n, evidence.table, total)
+        evidence_costs(total, weights.of_pair, weights.n_covering, evidence.table, weights.n_views, n, out)
+    else:
+        if weight > 0.0:
+            add_closeness(at_height.greys, weight * np.float32(n_sizes), n, total)
+        totals = total.reshape((1, 1, total.shape[0]))
+        add_pairs(at_height.planes, at_height.windows, moments, at_height.width, n, scratch.work, totals)
+        rounded_costs(total, weights.of_pair, weights.n_covering, weight, n_sizes, n, out)
+
+
+# ViewArrays, (r,c) f4, HeightSpan, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (r,d) u1 -> None
+@kernel
+def block_costs(views, relief, span, windows, visible, parameters, evidence, out):
     """Write the costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and
-    as much, weighted, for the grey differences of the same pairs.
+    as much, weighted, for the grey differences of the same pairs; or, with a table of `evidence`, the costs that follow
+    from it. Where a table is being learned, its bins are counted, and the costs have no meaning.
 
     views : with the nodes of this block; relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; windows
     : half widths, ascending, the last is `half`; visible : of this block; out : (r, c * count) uint8. Views that see
@@ -284,10 +325,11 @@ def block_costs(views, relief, span, windows, visible, parameters, out):
     flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.empty((span.n_heights, n), np.uint8)
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     counts, scratch = np.empty((2, size), np.float32), resample_scratch(size)
-    work, totals = np.empty((4, size), np.float32), total.reshape((1, 1, size))
+    work, centre = np.empty((4, size), np.float32), np.float32(0.0)
     flat_visibility(visible, half, flat, pairs)
-    top, centre = weight * np.float32(n_sizes), np.float32(0.0)
-    grey_factor = top / parameters.max_grey_difference
+    of_pairs = pair_scratch(n_views, size, work)
+    uses_bins = evidence.table.log_ratios.shape[0] > 0 or evidence.learning.right.shape[0] > 0
+    grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
@@ -309,12 +351,12 @@ def block_costs(views, relief, span, windows, visible, parameters, out):
             if extent < WHOLE:
                 exclude_unseen(shown, n, scale[m], grey, GREY_OF_UNSEEING_VIEW * np.float32(m + 1))
             m += 1
-        if weight > 0.0:
-            add_closeness(greys[:m], top, n, total)
-        add_pairs(planes[:m], windows, WindowMoments(mean[:m], scale[:m]), width, n, work, totals)
         if n_whole < n_views:
             weights_with_occlusion(pairs, counts, parameters.occluded_pairs_excluded, n, shown)
-        rounded_costs(total, shown if n_whole < n_views else pairs, counts[0], weight, n_sizes, n, codes[k])
+        weights = PairWeights(shown if n_whole < n_views else pairs, counts[0], n_views, weight, height)
+        at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width)
+        moments = WindowMoments(mean[:m], scale[:m])
+        costs_at_height(at_height, moments, of_pairs, weights, evidence, total, codes[k])
     heights_last(codes, width, out)
 
 
@@ -365,10 +407,19 @@ def cells_of_block(block_row, block_col, block, n_rows, n_cols):
     )  # fmt: skip
 
 
-# ViewArrays, SlopeArrays, VolumeLayout, (w,) i8, VisibleHeights, CostParameters, (v,) u1 -> None
+# as TableAndCounts, sliced: TableAndCounts, CellBox -> TableAndCounts
 @kernel
-def tile_costs(views, slope, layout, windows, visible, parameters, volume):
-    """Write `block_costs` of every block of a tile.
+def evidence_in(evidence, box):
+    """The table, and the counts with the reference heights of the cells of a rectangle."""
+    of_tile = evidence.learning
+    reference = of_tile.reference[box.first_row : box.end_row, box.first_col : box.end_col]
+    return TableAndCounts(evidence.table, Learning(reference, of_tile.right, of_tile.wrong))
+
+
+# ViewArrays, SlopeArrays, VolumeLayout, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (v,) u1 -> None
+@kernel
+def tile_costs(views, slope, layout, windows, visible, parameters, evidence, volume):
+    """Write `block_costs` of every block of a tile. A table is learned from blocks with reference heights.
 
     views : whose nodes follow the slanted support surface; slope : with as many cells around the tile as the half width
     of the largest window; windows : half widths, ascending; volume : (v,) uint8, laid out as `layout` says.
@@ -380,6 +431,9 @@ def tile_costs(views, slope, layout, windows, visible, parameters, volume):
             box = cells_of_block(br, bc, block, n_rows, n_cols)
             span = HeightSpan(layout.first[br, bc], layout.n_heights[br, bc])
             r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
+            evidence_of_block = evidence_in(evidence, box)
+            if evidence.learning.right.shape[0] > 0 and np.isnan(evidence_of_block.learning.reference).all():
+                continue
             first, length = layout.block_row_start[br, 0], layout.row_length[br, 0]
             rows = volume[first : first + (r1 - r0) * length].reshape((r1 - r0, length))
             start, of_block = layout.block_start[br, bc], visible_in(visible, box)
@@ -390,6 +444,6 @@ def tile_costs(views, slope, layout, windows, visible, parameters, volume):
             around = slope.cells[r : r + relief.shape[0], c : c + relief.shape[1]]
             block_relief(around, corners, block, half, relief)
             block_costs(
-                views_of_block(views, br, bc), relief, span, sizes, of_block, parameters,
+                views_of_block(views, br, bc), relief, span, sizes, of_block, parameters, evidence_of_block,
                 rows[:, start : start + (c1 - c0) * span.n_heights],
             )  # fmt: skip

@@ -1,0 +1,171 @@
+"""Evidence: log-likelihood ratios of what image pairs look like at right and at wrong heights, learned from the images.
+
+A correlation of 0.6 is strong evidence on ground with texture, and none at all on a plain road. How much correlation,
+local contrast and grey difference say between these images is therefore counted: at the heights that were already found
+for the cells of a tile (of the coarser level, or of an earlier pass), and at heights of the same cells that are wrong
+because they lie far from them. The logarithm of the ratio of the two frequencies is the evidence of one pair for one
+height. A plain window, a pair whose grey values do not compare, or a blurred patch has the same frequencies at right
+and at wrong heights, so that it says nothing.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.core.grid import on_cells
+from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
+from zlocus.matching.kernels.evidence import TABLE_SHAPE, EvidenceTable, Learning, TableAndCounts
+from zlocus.matching.kernels.shared_records import VisibleHeights
+from zlocus.matching.level_records import LevelResult, PyramidLevel
+from zlocus.matching.local_contrast import rounded
+from zlocus.matching.slope_surface import SlopeSurface
+from zlocus.matching.tile_views import TileViews
+
+# Cost of one natural unit of mean evidence of one pair.
+UNIT_COST = 18.0
+# The evidence of n pairs counts n ** PAIR_EXPONENT times their mean: pairs share images, so that they err together.
+PAIR_EXPONENT = 0.3
+# Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
+MAX_MIDDLE_COST = 160.0
+# Evidence of one pair is at most this, natural units.
+MAX_LOG_RATIO = 5.0
+# The part of the evidence that the grey difference adds to that of correlation and contrast counts by this: grey values
+# of neighbouring heights are alike, so that the two are not independent.
+GREY_SHARE = 0.6
+# Counts that every bin gets at right heights before the images are looked at; wrong heights get the same frequency.
+PRIOR_COUNTS = 20.0
+# A cell is not learned from where the heights of 3 x 3 cells differ by so many steps: one of them is wrong, or there is
+# a jump.
+MAX_STEPS_ACROSS = 6.0
+# From fewer cells nothing is learned: bins would stay empty, and heights would depend on how the ground is cut into
+# tiles (with tiles of 128 x 128 cells 1.3 % of the cells move by more than half a step under a halo twice as wide).
+MIN_TRUSTED_CELLS = 20_000
+# The noise of an image is the variance that this share of its small windows is below.
+NOISE_SHARE, NOISE_WINDOW, LEAST_VARIANCE = 0.05, (5, 5), 1e-7
+# Cells of a level from which all, every second, and every fourth block is counted.
+CELLS_OF_ALL_BLOCKS, CELLS_OF_HALF = 60_000, 250_000
+
+NO_TABLE = EvidenceTable(np.zeros(0, np.float32), *(np.float32(value) for value in (1, 0, 0, 0, 0, 0)))
+NO_COUNTS = Learning(np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.int64))
+NO_EVIDENCE = TableAndCounts(NO_TABLE, NO_COUNTS)
+
+
+def learned_evidence(
+    slope_views: TileViews,
+    slope_arrays: SlopeArrays,
+    lattice: HeightLattice,
+    windows: NDArray[np.int64],
+    visible: VisibleHeights,
+    parameters: CostParameters,
+    reference: NDArray[np.float32],
+) -> TableAndCounts:
+    """The table of a level, counted at reference heights (r, c) float32, slope indices, NaN where none is trusted.
+
+    slope_views, slope_arrays, lattice, windows, visible, parameters : as for the costs, see `tile_costs`.
+    """
+    size = int(np.prod(TABLE_SHAPE))
+    # One more bin, because correlations are counted at the nearest bin.
+    right, wrong = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
+    learning = Learning(sampled_blocks(reference, lattice.block), right, wrong)
+    noise = noise_variance(slope_views)
+    counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise), learning)
+    volume = np.empty(lattice.size, np.uint8)
+    tile_costs(
+        slope_views.arrays, slope_arrays, lattice.layout, windows, visible, parameters, counting, volume
+    )  # fmt: skip
+    ratios, neutral = log_ratios(right[:-1].reshape(TABLE_SHAPE), wrong[:-1].reshape(TABLE_SHAPE))
+    table = np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32)
+    found = EvidenceTable(
+        log_ratios=table,
+        noise_variance=noise,
+        unit=np.float32(UNIT_COST),
+        highest=np.float32(ratios.max()),
+        neutral=np.float32(neutral),
+        pair_exponent=np.float32(PAIR_EXPONENT),
+        max_cost=np.float32(MAX_MIDDLE_COST),
+    )
+    return TableAndCounts(found, NO_COUNTS)
+
+
+def log_ratios(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> tuple[NDArray[np.float32], float]:
+    """Log-likelihood ratios of the bins from their counts, and the value that stands for no evidence.
+
+    right, wrong : `TABLE_SHAPE`, counts. The ratios are shifted so that their mean at wrong heights is 0: a pair in
+    which a view is occluded adds 0, and must be worth as much as a pair that compares what does not belong together.
+    """
+    of_right, of_wrong = smoothed_counts(right), smoothed_counts(wrong)
+    n_right, n_wrong = max(of_right.sum(), 1.0), max(of_wrong.sum(), 1.0)
+    prior = PRIOR_COUNTS / n_right
+    whole = np.log((of_right / n_right + prior) / (of_wrong / n_wrong + prior))
+    right_of_any_grey, wrong_of_any_grey = (
+        np.broadcast_to(counts.sum(axis=2, keepdims=True), counts.shape) for counts in (of_right, of_wrong)
+    )
+    without_grey = np.log((right_of_any_grey / n_right + prior) / (wrong_of_any_grey / n_wrong + prior))
+    ratios = without_grey + GREY_SHARE * (whole - without_grey)
+    ratios = np.clip(ratios, -MAX_LOG_RATIO, MAX_LOG_RATIO)
+    neutral = -float((of_wrong * ratios).sum() / n_wrong)
+    return (ratios + neutral).astype(np.float32), neutral
+
+
+def smoothed_counts(counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Counts of which each bin shares some with its neighbours along grey difference and correlation."""
+    smooth = counts.astype(np.float64)
+    for _ in range(2):
+        wide = np.pad(smooth, [(0, 0), (0, 0), (1, 1), (1, 1)], mode="edge")
+        inner = wide[:, :, 1:-1, 1:-1]
+        beside = wide[:, :, :-2, 1:-1] + wide[:, :, 2:, 1:-1] + wide[:, :, 1:-1, :-2] + wide[:, :, 1:-1, 2:]
+        smooth = (4 * inner + beside) / 8
+    return smooth
+
+
+def noise_variance(slope_views: TileViews) -> np.float32:
+    """Variance of the noise of the images of a level, in units of the grey variance of an image: of the windows with
+    the least texture."""
+    found = []
+    for offset, rows, cols in slope_views.layout:
+        grey = slope_views.arrays.pixels[offset : offset + rows * cols].reshape(rows, cols)
+        mean, squares = cv2.blur(grey, NOISE_WINDOW), cv2.blur(grey * grey, NOISE_WINDOW)
+        variance = squares - mean * mean
+        variance = variance[variance > LEAST_VARIANCE]
+        if variance.size:
+            found.append(float(np.quantile(variance, NOISE_SHARE)))
+    return np.float32(rounded(float(np.mean(found)))) if found else np.float32(LEAST_VARIANCE)
+
+
+def sampled_blocks(reference: NDArray[np.float32], block: int) -> NDArray[np.float32]:
+    """Reference heights (r, c) of a part of the blocks, NaN elsewhere: of all blocks where the level is small."""
+    rows, cols = np.arange(reference.shape[0]) // block, np.arange(reference.shape[1]) // block
+    if reference.size < CELLS_OF_ALL_BLOCKS:
+        return reference.astype(np.float32)
+    if reference.size < CELLS_OF_HALF:
+        is_taken = (rows[:, None] + cols[None, :]) % 2 == 0
+    else:
+        is_taken = ((rows[:, None] % 2) * 2 + (cols[None, :] + rows[:, None] // 2) % 2) % 4 == 0
+    return np.where(is_taken, reference, np.float32(np.nan)).astype(np.float32)
+
+
+def trusted_heights(result: LevelResult) -> NDArray[np.float32]:
+    """Heights of a level that its evidence can be learned from, (r, c) level indices, NaN at jumps."""
+    height = result.heights.vertex
+    around = np.ones((3, 3), np.uint8)
+    across = cv2.dilate(height, around) - cv2.erode(height, around)
+    return np.where(across < MAX_STEPS_ACROSS, height, np.float32(np.nan)).astype(np.float32)
+
+
+def reference_heights(
+    result: LevelResult, level: PyramidLevel, slope_surface: SlopeSurface
+) -> NDArray[np.float32] | None:
+    """Heights that the evidence of a level is learned from, (r, c) slope indices; NaN where none is trusted, and
+    outside the tile's core.
+
+    result : of an earlier pass over the level, or of the next coarser one. None where it has too few such heights.
+    """
+    trusted = trusted_heights(result)
+    if result.level.number != level.number:
+        trusted = np.float32(2.0) * on_cells(trusted, result.level.window, level.window)
+    of_core = np.full(level.shape, np.nan, np.float32)
+    of_core[level.core] = (trusted - slope_surface.cells)[level.core]
+    return of_core if np.isfinite(of_core).sum() >= MIN_TRUSTED_CELLS else None

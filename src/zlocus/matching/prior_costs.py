@@ -1,0 +1,94 @@
+"""What is known of the surface as a part of the costs, and penalties of jumps that follow from how well it fits.
+
+Costs of candidates
+    The search range of a block is wide wherever one of its cells needs it, and noise finds false heights in it. Heights
+    far from everything that the coarser level considers around a cell, with its wider windows, therefore cost more.
+Misfit
+    After a first aggregation, the costs of most cells are least at, or near, the height found. Where a whole patch of
+    cells has much lower costs at other heights, the smooth surface contradicts the images: a crown or a roof was
+    smoothed away. There jumps become cheaper, and the costs are aggregated once more. Noise alone makes small misfits,
+    and a plain road has none, because all heights cost the same there.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.core.options import PyramidOptions
+from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.prior_costs import (
+    CoarserCells,
+    DistanceCost,
+    add_costs_beyond,
+    add_costs_of_candidates,
+    write_misfit,
+)
+from zlocus.matching.level_records import LevelResult, PyramidLevel
+from zlocus.matching.search_range import candidates
+from zlocus.matching.semiglobal import SemiGlobalHeights
+from zlocus.matching.slope_surface import SlopeSurface
+
+# Coarser cells on each side whose candidates are known to a cell, and the cost of heights far from all of them.
+CANDIDATE_REACH = 2
+COST_OF_CANDIDATES = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
+# Where jumps become cheaper, heights far from the surface of the first aggregation become more expensive: so many steps
+# of the finest level are free, below and above the heights of NEARBY_CELLS.
+NEARBY_CELLS = np.ones((5, 5), np.uint8)
+FREE_STEPS, COST_BEYOND, MAX_COST_BEYOND = 12.0, 3.0, 30.0
+# The misfit is averaged over windows of this side, so that it is that of a patch. The penalty of a jump is halved where
+# it is HALVING_MISFIT; one cell counts with MAX_MISFIT at most.
+MISFIT_WINDOW, HALVING_MISFIT, MISFIT_POWER, MAX_MISFIT = (9, 9), 20.0, 3, 40.0
+LEAST_PENALTY = 10
+
+
+def add_costs_of_coarser(
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    slope_surface: SlopeSurface,
+    level: PyramidLevel,
+    coarser_result: LevelResult,
+    options: PyramidOptions,
+) -> None:
+    """Add the costs of heights far from the candidates of the coarser level; changes `cost`, (v,) uint8."""
+    window, coarser_window = level.window, coarser_result.level.window
+    cells = CoarserCells(window.row - 2 * coarser_window.row, window.col - 2 * coarser_window.col, CANDIDATE_REACH)
+    found = np.ascontiguousarray(candidates(coarser_result, options), np.float32)
+    add_costs_of_candidates(cost, lattice.layout, slope_surface.cells, found, cells, COST_OF_CANDIDATES)
+
+
+def misfit(cost: NDArray[np.uint8], lattice: HeightLattice, heights: SemiGlobalHeights) -> NDArray[np.float32]:
+    """Mean over a window of how much the cost of the heights found is above the least cost, (r, c) float32."""
+    of_cells = np.empty(lattice.shape, np.float32)
+    write_misfit(cost, lattice.layout, heights.best, of_cells)
+    return np.asarray(cv2.blur(np.minimum(of_cells, np.float32(MAX_MISFIT)), MISFIT_WINDOW))
+
+
+def penalties_after_misfit(penalties: NDArray[np.uint16], of_patch: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Penalties (4, r, c) of jumps from W, NW, N and NE, made smaller where the surface fits badly.
+
+    of_patch : (r, c), see `misfit`.
+    """
+    factor = 1.0 / (1.0 + (of_patch / np.float32(HALVING_MISFIT)) ** MISFIT_POWER)
+    wide = np.pad(factor, 1, mode="edge")
+    rows, cols = factor.shape
+    smaller = np.empty_like(penalties)
+    for path, (row, col) in enumerate(((1, 0), (0, 0), (0, 1), (0, 2))):
+        other = wide[row : row + rows, col : col + cols]
+        smaller[path] = np.maximum(penalties[path] * (factor + other) / 2, LEAST_PENALTY)
+    return smaller
+
+
+def add_costs_far_from_surface(
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    slope_surface: SlopeSurface,
+    heights: SemiGlobalHeights,
+    level: int,
+) -> None:
+    """Add the costs of heights far below or above the surface found around a cell; changes `cost`, (v,) uint8."""
+    surface = np.asarray(heights.vertex + slope_surface.cells, np.float32)
+    low, high = cv2.erode(surface, NEARBY_CELLS), cv2.dilate(surface, NEARBY_CELLS)
+    by_distance = DistanceCost(np.float32(FREE_STEPS / 2**level), np.float32(COST_BEYOND), np.float32(MAX_COST_BEYOND))
+    add_costs_beyond(cost, lattice.layout, slope_surface.cells, low, high, by_distance)

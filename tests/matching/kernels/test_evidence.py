@@ -1,0 +1,138 @@
+"""Evidence in the cost volume against its slow twin, and the counts that it is learned from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kernel_scene import even_lattice, kernel_scene
+from reference import evidence as twin
+from reference.semiglobal import dense
+from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE, NO_TABLE
+from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
+from zlocus.matching.kernels.evidence import TABLE_SHAPE, EvidenceTable, Learning, TableAndCounts
+from zlocus.matching.kernels.shared_records import NEVER_COVERED
+
+HALVES = np.array([1, 2])
+EXCLUDED = 0.4
+PARAMETERS = CostParameters(*(np.float32(v) for v in (0.0, 1.0, 0.3, 0.3, EXCLUDED)), max_images_for_large_window=255)
+NOISE = 0.05
+# Costs are whole numbers; a feature on the limit of a bin may fall into the next one, which few do.
+COST, FEW = 0.51, 0.01
+BLOCK, SHAPE, N_HEIGHTS = 16, (20, 27), 12
+
+
+def scene_and_visibility(n_views=3, seed=0):
+    """A scene of which view 0 is occluded in some cells below height 4, and view 1 covers nothing in others."""
+    scene = kernel_scene(n_views, SHAPE, BLOCK, seed=seed)
+    for image in scene.images:
+        image /= 5
+    scene = type(scene)(**(vars(scene) | {"pixels": np.concatenate([image.ravel() for image in scene.images])}))
+    visible = scene.all_visible()
+    visible.lowest_unoccluded[0, :9, :13] = 4
+    visible.lowest_covered[1, 12:], visible.highest_covered[1, 12:] = NEVER_COVERED, -1
+    return scene, visible
+
+
+def flat_slope(scene):
+    """A level support surface for windows of half width 2."""
+    return SlopeArrays(np.zeros((scene.shape[0] + 4, scene.shape[1] + 4), np.float32), np.zeros(scene.nodes.shape[1:3]))
+
+
+def run(scene, visible, evidence):
+    """Costs (v,) of a tile."""
+    lattice = even_lattice(N_HEIGHTS, SHAPE, BLOCK)
+    volume = np.zeros(lattice.size, np.uint8)
+    tile_costs(scene.arrays, flat_slope(scene), lattice.layout, HALVES, visible, PARAMETERS, evidence, volume)
+    return volume, lattice
+
+
+def planes_of(scene, block_row, block_col, rows, cols, index):
+    shape = (rows.stop - rows.start, cols.stop - cols.start)
+    nodes = scene.nodes[:, block_row : block_row + 2, block_col : block_col + 2]
+    relief = np.zeros((shape[0] + 4, shape[1] + 4))
+    return twin.planes_at(scene.images, nodes, scene.heights, index, BLOCK, 2, shape, relief)
+
+
+def table_with(ratios):
+    """A table whose costs neither reach 0 nor 255."""
+    values = (NOISE, 18.0, float(ratios.max()), 0.5, 0.3, 160.0)
+    return EvidenceTable(
+        np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32), *(np.float32(v) for v in values)
+    )
+
+
+def seen(visible, rows, cols, index):
+    """(2, i, r, c): which views see the cells at a height, and cover them at any."""
+    low, high, from_here = (bound[:, rows, cols] for bound in visible)
+    covered = (low <= index) & (index <= high)
+    return np.stack([covered & (from_here <= index), low <= high]), covered.sum(axis=0)
+
+
+def test_costs_are_the_sums_of_the_table():
+    scene, visible = scene_and_visibility()
+    ratios = np.random.default_rng(1).uniform(-1.5, 2.0, TABLE_SHAPE).astype(np.float32)
+    table = table_with(ratios)
+    found, lattice = run(scene, visible, TableAndCounts(table, NO_COUNTS))
+    found = dense(found, lattice, np.inf)
+    expected = np.full(found.shape, np.inf)
+    for b, d, rows, cols in scene.blocks():
+        for index in range(lattice.first[b, d], lattice.first[b, d] + lattice.count[b, d]):
+            views, n_covering = seen(visible, rows, cols, index)
+            n_of_block = (visible.lowest_covered[:, rows, cols] <= visible.highest_covered[:, rows, cols]).any(
+                axis=(1, 2)
+            )
+            scale = 18.0 * (n_of_block.sum() * (n_of_block.sum() - 1) / 2) ** 0.3
+            highest = min(scale * ratios.max(), 160.0)
+            planes = planes_of(scene, b, d, rows, cols, index)
+            mean = twin.cell_evidence(planes, HALVES, NOISE, ratios.astype(float), views, EXCLUDED)
+            cost = np.where(n_covering > 1, highest - scale * mean, highest - scale * 0.5)
+            expected[rows, cols, index] = np.clip(cost, 0, 255)
+    is_searched = np.isfinite(expected)
+    assert is_searched.all()
+    assert (np.abs(found - expected) > COST).mean() < FEW
+
+
+def test_counts_are_those_of_right_and_of_wrong_heights():
+    """Cells without a reference, views that do not see a cell, and heights that are neither right nor wrong are not
+    counted."""
+    scene, visible = scene_and_visibility()
+    reference = np.full(SHAPE, 2.25, np.float32)
+    reference[:, 20:] = np.nan
+    size = int(np.prod(TABLE_SHAPE)) + 1
+    learning = Learning(reference, np.zeros(size, np.int64), np.zeros(size, np.int64))
+    _, lattice = run(scene, visible, TableAndCounts(NO_TABLE._replace(noise_variance=np.float32(NOISE)), learning))
+    right, wrong = np.zeros(TABLE_SHAPE, int), np.zeros(TABLE_SHAPE, int)
+    for b, d, rows, cols in scene.blocks():
+        known = np.isfinite(reference[rows, cols])
+        for index in range(lattice.first[b, d], lattice.first[b, d] + lattice.count[b, d]):
+            here = seen(visible, rows, cols, index)[0][0]
+            planes, away = planes_of(scene, b, d, rows, cols, index), abs(index - 2.25)
+            if away <= 3:
+                right += twin.counted(planes, HALVES, NOISE, known, here)
+            elif away > 5:
+                wrong += twin.counted(planes, HALVES, NOISE, known, here)
+    assert right.sum() > 4000
+    assert wrong.sum() > 2000
+    for found, expected in ((learning.right, right), (learning.wrong, wrong)):
+        assert found[:-1].sum() == expected.sum()
+        assert np.abs(found[:-1].reshape(TABLE_SHAPE) - expected).sum() < FEW * expected.sum()
+
+
+def test_without_a_table_the_cost_is_that_of_correlation():
+    scene, visible = scene_and_visibility()
+    correlation, _ = run(scene, visible, NO_EVIDENCE)
+    flat, lattice = run(scene, visible, TableAndCounts(table_with(np.zeros(TABLE_SHAPE, np.float32)), NO_COUNTS))
+    assert len(np.unique(correlation)) > 20
+    assert len(np.unique(dense(flat, lattice, np.inf)[:9])) == 1
+
+
+@pytest.mark.parametrize("n_views", [2, 4])
+def test_the_order_of_the_views_does_not_matter(n_views):
+    scene, _ = scene_and_visibility(n_views)
+    ratios = np.random.default_rng(2).uniform(-1.0, 1.0, TABLE_SHAPE).astype(np.float32)
+    evidence = TableAndCounts(table_with(ratios), NO_COUNTS)
+    order = list(reversed(range(n_views)))
+    turned = type(scene)(**(vars(scene) | {"layout": scene.layout[order].copy(), "nodes": scene.nodes[order].copy()}))
+    volumes = [run(s, s.all_visible(), evidence)[0].astype(int) for s in (scene, turned)]
+    assert (np.abs(volumes[0] - volumes[1]) > 1).mean() < FEW

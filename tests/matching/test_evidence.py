@@ -1,0 +1,118 @@
+"""What is learned from the images: tables of log-likelihood ratios, noise, and the heights that teach them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zlocus.core.grid import CellWindow
+from zlocus.matching import evidence
+from zlocus.matching.evidence import (
+    MAX_LOG_RATIO,
+    log_ratios,
+    noise_variance,
+    reference_heights,
+    sampled_blocks,
+    smoothed_counts,
+)
+from zlocus.matching.kernels.evidence import N_CORRELATION, TABLE_SHAPE
+
+# Relative: a low quantile of variances of 25 values is below that of the noise, and is rounded.
+NOISE_SHARE = 0.6
+
+
+def counts(seed, total=200_000):
+    share = np.random.default_rng(seed).gamma(0.3, size=TABLE_SHAPE)
+    return np.rint(share / share.sum() * total).astype(np.int64)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_mean_of_wrong_heights_is_nothing(seed):
+    wrong = counts(seed)
+    ratios, neutral = log_ratios(counts(seed + 1), wrong)
+    smooth = smoothed_counts(wrong)
+    assert (smooth * ratios).sum() / smooth.sum() == pytest.approx(0.0, abs=1e-4)
+    assert np.abs(ratios - np.float32(neutral)).max() <= MAX_LOG_RATIO + 1e-4
+
+
+def test_bins_as_frequent_at_wrong_heights_say_nothing():
+    """The plain windows of a road look the same at all heights; windows with texture do not."""
+    right, wrong = np.zeros(TABLE_SHAPE, np.int64), np.zeros(TABLE_SHAPE, np.int64)
+    right[1], wrong[1] = 40, 400
+    right[10, :, :, 15:], wrong[10, :, :, 5:15] = 300, 1500
+    ratios, neutral = log_ratios(right, wrong)
+    plain = ratios[1] - neutral
+    assert np.abs(plain - plain.mean()).max() < 0.05
+    assert ratios[10, :, :, N_CORRELATION - 2].min() > neutral + 2
+    assert ratios[10, :, :, 8].max() < neutral - 2
+
+
+def test_bins_that_no_image_filled_say_nothing():
+    right, wrong = np.zeros(TABLE_SHAPE, np.int64), np.zeros(TABLE_SHAPE, np.int64)
+    right[5, 0, 3, 10], wrong[5, 0, 3, 4] = 5000, 5000
+    ratios, neutral = log_ratios(right, wrong)
+    assert ratios[0, 2, 12] == pytest.approx(np.full(N_CORRELATION, neutral), abs=1e-5)
+
+
+def views_of(*images):
+    """What `noise_variance` reads of the views of a tile."""
+    layout, start = [], 0
+    for image in images:
+        layout.append((start, *image.shape))
+        start += image.size
+    pixels = np.concatenate([image.ravel() for image in images]).astype(np.float32)
+    return SimpleNamespace(layout=np.array(layout), arrays=SimpleNamespace(pixels=pixels))
+
+
+def test_noise_is_what_the_plainest_windows_show():
+    rng, deviation = np.random.default_rng(3), 0.05
+    image = rng.normal(0.0, deviation, (200, 200))
+    image[:150] += rng.normal(0.0, 1.0, (150, 200))
+    found = float(noise_variance(views_of(image, image[::-1].copy())))
+    assert NOISE_SHARE * deviation**2 < found <= deviation**2
+
+
+def test_images_of_one_grey_value_have_the_least_noise():
+    assert float(noise_variance(views_of(np.full((20, 20), 2.0)))) == pytest.approx(evidence.LEAST_VARIANCE)
+
+
+@pytest.mark.parametrize(("side", "share"), [(100, 1.0), (400, 0.5), (800, 0.25)])
+def test_a_part_of_the_blocks_of_large_levels_is_counted(side, share):
+    reference = np.ones((side, side), np.float32)
+    taken = np.isfinite(sampled_blocks(reference, 8))
+    assert taken.mean() == pytest.approx(share)
+    for quarter in (taken[: side // 2], taken[:, : side // 2]):
+        assert quarter.mean() == pytest.approx(share, abs=0.02)
+
+
+def result_with(height, number=1):
+    window = CellWindow(0, 0, *height.shape)
+    level = SimpleNamespace(number=number, window=window)
+    return SimpleNamespace(level=level, heights=SimpleNamespace(vertex=height.astype(np.float32)))
+
+
+def test_heights_at_jumps_teach_nothing():
+    height = np.full((200, 200), 10.0)
+    height[:, 100:] = 30.0
+    level = SimpleNamespace(number=0, window=CellWindow(0, 0, 400, 400), shape=(400, 400), core=np.s_[40:360, :])
+    slope = SimpleNamespace(cells=np.full((400, 400), 3.0, np.float32))
+    found = reference_heights(result_with(height), level, slope)
+    assert np.isnan(found[:, 198:202]).all()
+    assert np.isnan(found[:40]).all()
+    assert np.isnan(found[360:]).all()
+    assert (found[40:360, :198] == 17.0).all()
+    assert (found[40:360, 202:] == 57.0).all()
+    again = SimpleNamespace(number=1, window=CellWindow(0, 0, 200, 200), shape=(200, 200), core=np.s_[:, :])
+    slope = SimpleNamespace(cells=np.zeros((200, 200), np.float32))
+    assert (reference_heights(result_with(height), again, slope)[:, :99] == 10.0).all()
+
+
+def test_few_cells_teach_nothing():
+    level = SimpleNamespace(number=1, window=CellWindow(0, 0, 140, 140), shape=(140, 140), core=np.s_[:, :])
+    slope = SimpleNamespace(cells=np.zeros((140, 140), np.float32))
+    assert reference_heights(result_with(np.zeros((140, 140))), level, slope) is None

@@ -1,0 +1,111 @@
+"""Costs of heights far from what is known, the misfit of a surface, and the penalties that follow from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kernel_scene import ragged_lattice
+from reference.semiglobal import dense
+from zlocus.matching.kernels.prior_costs import (
+    CoarserCells,
+    DistanceCost,
+    add_costs_beyond,
+    add_costs_of_candidates,
+    write_misfit,
+)
+from zlocus.matching.prior_costs import HALVING_MISFIT, LEAST_PENALTY, penalties_after_misfit
+
+SHAPE, BLOCK = (13, 22), 8
+BY_DISTANCE = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
+
+
+def volume(seed):
+    """A ragged volume of costs, and the surface from which its heights are counted."""
+    rng, lattice = np.random.default_rng(seed), ragged_lattice(SHAPE, BLOCK)
+    cost = rng.integers(0, 256, lattice.size).astype(np.uint8)
+    return cost, lattice, rng.uniform(-2, 2, SHAPE).astype(np.float32)
+
+
+def heights_of(lattice, slope_cells):
+    """Level index of every place of the dense volume, (r, c, h)."""
+    first, count = lattice.cell_ranges()
+    return np.arange(int((first + count).max())) + slope_cells[..., None].astype(float)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000))
+def test_heights_far_from_all_candidates_cost_more(seed):
+    cost, lattice, slope = volume(seed)
+    rng = np.random.default_rng(seed + 1)
+    coarse = (SHAPE[0] // 2 + 2, SHAPE[1] // 2 + 2)
+    candidates = rng.uniform(0, 10, (3, *coarse)).astype(np.float32)
+    cells, before = CoarserCells(1, 2, 1), dense(cost.copy(), lattice, np.inf)
+    add_costs_of_candidates(cost, lattice.layout, slope, candidates, cells, BY_DISTANCE)
+    found = dense(cost, lattice, np.inf)
+    first, count = lattice.cell_ranges()
+    for r in range(SHAPE[0]):
+        for c in range(SHAPE[1]):
+            row, col = (1 + r) // 2, (2 + c) // 2
+            near = candidates[:, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2].ravel()
+            k = np.arange(count[r, c])
+            at = np.clip(np.rint(2 * near - (slope[r, c] + np.float32(first[r, c]))), 0, count[r, c] - 1)
+            away = np.abs(k[:, None] - at).min(axis=1)
+            added = np.floor(np.minimum(5.0 * np.maximum(away - 3.0, 0), 30.0) + 0.5)
+            expected = np.minimum(before[r, c, first[r, c] + k] + added, 255)
+            np.testing.assert_array_equal(found[r, c, first[r, c] + k], expected)
+
+
+def test_heights_beyond_the_surface_cost_more():
+    cost, lattice, slope = volume(3)
+    before = dense(cost.copy(), lattice, np.inf)
+    low, high = np.full(SHAPE, 6.0, np.float32), np.full(SHAPE, 9.0, np.float32)
+    add_costs_beyond(cost, lattice.layout, slope, low, high, BY_DISTANCE)
+    height = heights_of(lattice, slope)
+    away = np.maximum(np.maximum(6.0 - height, height - 9.0) - 3.0, 0)
+    expected = np.minimum(before + np.floor(np.minimum(5.0 * away, 30.0) + 0.5), 255)
+    searched = np.isfinite(before)
+    # A cost between two whole numbers may fall either way.
+    assert np.abs(dense(cost, lattice, np.inf)[searched] - expected[searched]).max() <= 1
+    assert (expected[searched] > before[searched]).any()
+
+
+def test_misfit_is_the_cost_above_the_least():
+    cost, lattice, _ = volume(5)
+    first, count = lattice.cell_ranges()
+    height = (first + np.random.default_rng(6).integers(0, count)).astype(np.int32)
+    found = np.empty(SHAPE, np.float32)
+    write_misfit(cost, lattice.layout, height, found)
+    all_costs = dense(cost, lattice, np.inf)
+    expected = np.take_along_axis(all_costs, height[..., None].astype(int), axis=2)[..., 0] - all_costs.min(axis=2)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_jumps_are_cheaper_where_the_surface_contradicts_the_images():
+    penalties = np.full((4, 20, 30), 400, np.uint16)
+    of_patch = np.zeros((20, 30), np.float32)
+    assert (penalties_after_misfit(penalties, of_patch) == 400).all()
+    of_patch[5:15, 10:20] = HALVING_MISFIT
+    found = penalties_after_misfit(penalties, of_patch)
+    assert (found[:, 6:15, 11:19] == 200).all()
+    assert (found[0, 5:15, 10] == 300).all()  # the cell in the west is outside the patch
+    assert (found[2, 5, 10:20] == 300).all()
+    assert (found[3, 5:15, 19] == 300).all()
+    assert (found[1, 5:15, 20] != 400).sum() == 9
+    of_patch[:] = 1e6
+    assert (penalties_after_misfit(penalties, of_patch) == LEAST_PENALTY).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0, 200), st.floats(0, 200), st.integers(1, 2000))
+def test_a_worse_fit_never_makes_jumps_dearer(one, other, penalty):
+    penalties = np.full((4, 3, 3), penalty, np.uint16)
+    small, large = (
+        penalties_after_misfit(penalties, np.full((3, 3), value, np.float32)) for value in sorted((one, other))
+    )
+    assert (large <= small).all()
+    assert pytest.approx(penalty, abs=max(1, LEAST_PENALTY)) == int(
+        penalties_after_misfit(penalties, np.zeros((3, 3), np.float32)).max()
+    )
