@@ -204,17 +204,19 @@ def rank_tile(match_scene: MatchScene, core_window: CellWindow, config: RunConfi
 
 
 def match_coarsest_level(tile: TileInputs) -> CoarsestMatch:
-    """Match the coarsest level twice: the second time with the evidence that the first pass taught, and, where it is
-    steep, along the slopes that the first pass found. Without the semi-global constraint nothing is learned."""
+    """Match the coarsest level, and a second time where the first pass taught the evidence of the images, or found
+    slopes along which to search."""
     level = tile.level(tile.match_scene.levels - 1)
     prior = coarsest_prior(tile.match_scene, level, None)
     pair_labels = pair_labels_for_choice(tile, None)
     result = match_level(tile, level, prior, pair_labels)
-    is_steep = _slope_of_heights(tile, result).is_steep(level.core)
+    slope_surface = _slope_of_heights(tile, result)
+    is_steep = slope_surface.is_steep(level.core)
+    teaches = learns_evidence(tile) and reference_heights(result, level, slope_surface) is not None
     if is_steep:
         prior = coarsest_prior(tile.match_scene, level, result.heights.vertex)
         pair_labels = pair_labels_for_choice(tile, result)
-    if is_steep or learns_evidence(tile):
+    if is_steep or teaches:
         result = add_evaluations(match_level(tile, level, prior, pair_labels, result), result)
     return CoarsestMatch(replace(result, slope_surface=_slope_of_heights(tile, result)), prior, pair_labels)
 
