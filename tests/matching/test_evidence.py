@@ -19,7 +19,7 @@ from zlocus.matching.evidence import (
     sampled_blocks,
     smoothed_counts,
 )
-from zlocus.matching.kernels.evidence import N_CORRELATION, TABLE_SHAPE
+from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE
 
 # Relative: a low quantile of variances of 25 values is below that of the noise, and is rounded.
 NOISE_SHARE = 0.6
@@ -48,7 +48,7 @@ def test_bins_as_frequent_at_wrong_heights_say_nothing():
     ratios, neutral = log_ratios(right, wrong)
     plain = ratios[1] - neutral
     assert np.abs(plain - plain.mean()).max() < 0.05
-    assert ratios[10, :, :, N_CORRELATION - 2].min() > neutral + 2
+    assert ratios[10, :, :, N_LIKENESS - 2].min() > neutral + 2
     assert ratios[10, :, :, 8].max() < neutral - 2
 
 
@@ -56,7 +56,7 @@ def test_bins_that_no_image_filled_say_nothing():
     right, wrong = np.zeros(TABLE_SHAPE, np.int64), np.zeros(TABLE_SHAPE, np.int64)
     right[5, 0, 3, 10], wrong[5, 0, 3, 4] = 5000, 5000
     ratios, neutral = log_ratios(right, wrong)
-    assert ratios[0, 2, 12] == pytest.approx(np.full(N_CORRELATION, neutral), abs=1e-5)
+    assert ratios[0, 2, 12] == pytest.approx(np.full(N_LIKENESS, neutral), abs=1e-5)
 
 
 def views_of(*images):
@@ -101,7 +101,7 @@ def test_heights_at_jumps_teach_nothing():
     height[:, 100:] = 30.0
     level = SimpleNamespace(number=0, window=CellWindow(0, 0, 400, 400), shape=(400, 400), core=np.s_[40:360, :])
     slope = SimpleNamespace(cells=np.full((400, 400), 3.0, np.float32))
-    found = reference_heights(result_with(height), level, slope)
+    found = reference_heights(result_with(height), level, slope).height
     assert np.isnan(found[:, 198:202]).all()
     assert np.isnan(found[:40]).all()
     assert np.isnan(found[360:]).all()
@@ -109,7 +109,7 @@ def test_heights_at_jumps_teach_nothing():
     assert (found[40:360, 202:] == 57.0).all()
     again = SimpleNamespace(number=1, window=CellWindow(0, 0, 200, 200), shape=(200, 200), core=np.s_[:, :])
     slope = SimpleNamespace(cells=np.zeros((200, 200), np.float32))
-    assert (reference_heights(result_with(height), again, slope)[:, :99] == 10.0).all()
+    assert (reference_heights(result_with(height), again, slope).height[:, :99] == 10.0).all()
 
 
 def test_few_cells_teach_nothing():

@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 
 from reference.agreement import ncc, over_pairs, windows
-from reference.projection import along_slope, bilinear
+from reference.projection import along_slope, bilinear, derivative, position
 
-N_CONTRAST, N_DIFFERENCE, N_GREY, N_CORRELATION = 14, 3, 14, 20
+N_CONTRAST, N_DIFFERENCE, N_GREY, N_LIKENESS = 14, 3, 14, 20
 
 
 def planes_at(images, nodes, heights, index, block, half, shape, relief):
@@ -21,46 +21,101 @@ def planes_at(images, nodes, heights, index, block, half, shape, relief):
     ]
 
 
-def pair_bins(a, b, halves, noise):
-    """Contrast, difference, grey and correlation bin (r, c) of two planes; the last with its fraction."""
+def movements(nodes, heights, index, block, half):
+    """Rows and columns (i, 2) that each view moves on a block when the height index rises by one."""
+    t, found = np.float64(heights[0] + index * heights[1]), []
+    for node in nodes:
+        first = position(node, t, -half, -half, block)
+        by_row, by_col = (position(node, t, -half + r, -half + c, block) - first for r, c in ((1, 0), (0, 1)))
+        speed = position(derivative(node), t, block / 2, block / 2, block) * heights[1]
+        found.append(np.linalg.solve(np.stack([by_row, by_col], axis=1), speed))
+    return np.array(found)
+
+
+def along_lines(x):
+    """log2 at powers of two, and on straight lines between them."""
+    mantissa, exponent = np.frexp(x)
+    return exponent - 1 + (2 * mantissa - 1)
+
+
+def mean_gradients(plane, half):
+    """Mean squares of the differences along columns and rows, and mean of their products, (r, c) each."""
+    shape = (plane.shape[0] - 2 * half, plane.shape[1] - 2 * half)
+    found = np.zeros((3, *shape))
+    for r in range(shape[0]):
+        for c in range(shape[1]):
+            window = plane[r : r + 2 * half + 1, c : c + 2 * half + 1]
+            down, across = window[2:] - window[:-2], window[:, 2:] - window[:, :-2]
+            found[:, r, c] = (down**2).mean(), (across**2).mean(), (down[:, 1:-1] * across[1:-1]).mean()
+    return found
+
+
+def contrast(plane, half, direction, noise):
+    """Doublings (r, c) of the mean squared difference along a direction (row, column) over that of noise."""
+    of_rows, of_cols, mixed = mean_gradients(plane, half)
+    row, col = direction
+    square = row**2 * of_rows + col**2 * of_cols + 2 * row * col * mixed
+    return along_lines(np.maximum(square, 0) / (2 * noise) + 0.25)
+
+
+def same_order(a, b, half):
+    """Share (r, c) of the neighbours in a window that are brighter than its middle in both planes, or in neither."""
+    brighter = []
+    for plane in (a, b):
+        around = windows(plane, half)
+        brighter.append(np.delete(around > around[..., around.shape[-1] // 2, None], around.shape[-1] // 2, axis=-1))
+    return (brighter[0] == brighter[1]).mean(axis=-1)
+
+
+def pair_bins(a, b, direction, halves, noise):
+    """Contrast, difference, grey and likeness bin (r, c) of two planes; the last with its fraction."""
     half, correlation = max(halves), []
     for small in halves:
         trim = half - small
         inner = [plane[trim : plane.shape[0] - trim, trim : plane.shape[1] - trim] for plane in (a, b)]
         correlation.append(ncc(windows(inner[0], small), windows(inner[1], small)))
-    contrast = [np.log2(windows(plane, half).var(axis=-1) / noise + 0.25) for plane in (a, b)]
-    apart = np.abs(contrast[0] - contrast[1])
+    contrasts = [contrast(plane, half, direction, noise) for plane in (a, b)]
+    apart = np.abs(contrasts[0] - contrasts[1])
     grey = np.abs(a - b)[half:-half, half:-half]
+    likeness = 0.35 * np.mean(correlation, axis=0) + 0.65 * (2 * same_order(a, b, half) - 1)
     return (
-        np.clip(contrast[0] + contrast[1] + 4, 0, N_CONTRAST - 1).astype(int),
+        np.clip(contrasts[0] + contrasts[1] + 4, 0, N_CONTRAST - 1).astype(int),
         (apart >= 1.2).astype(int) + (apart >= 2.5),
         np.minimum(np.sqrt(grey) * N_GREY / 1.2, N_GREY - 1).astype(int),
-        np.clip((np.mean(correlation, axis=0) + 1) / 2 * (N_CORRELATION - 1), 0, N_CORRELATION - 1.001),
+        np.clip((likeness + 1) / 2 * (N_LIKENESS - 1), 0, N_LIKENESS - 1.001),
     )
 
 
+def bins_of_pair(planes, movement, a, b, halves, noise):
+    """Bins of the views a and b of a block."""
+    relative = movement[a] - movement[b]
+    return pair_bins(planes[a], planes[b], relative / np.linalg.norm(relative), halves, noise)
+
+
 def from_table(table, bins):
-    """Entries of a table (14, 3, 14, 20), interpolated along the correlation."""
+    """Entries of a table (14, 3, 14, 20), interpolated along the likeness."""
     contrast, difference, grey, place = bins
     lower = place.astype(int)
     share = place - lower
     return (1 - share) * table[contrast, difference, grey, lower] + share * table[contrast, difference, grey, lower + 1]
 
 
-def cell_evidence(planes, halves, noise, table, visible, excluded):
+def cell_evidence(planes, movement, halves, noise, table, visible, excluded):
     """Mean evidence over the pairs of views, (r, c), see `reference.agreement.over_pairs`."""
     here = visible[0]
     total = np.zeros(here.shape[1:])
     for a, b in combinations(range(len(planes)), 2):
-        total += np.where(here[a] & here[b], from_table(table, pair_bins(planes[a], planes[b], halves, noise)), 0.0)
+        total += np.where(
+            here[a] & here[b], from_table(table, bins_of_pair(planes, movement, a, b, halves, noise)), 0.0
+        )
     return over_pairs(total, visible, excluded)
 
 
-def counted(planes, halves, noise, is_counted, here):
+def counted(planes, movement, halves, noise, is_counted, here):
     """Counts (14, 3, 14, 20) of the nearest bins of all pairs that see a cell, where `is_counted` (r, c)."""
-    counts = np.zeros((N_CONTRAST, N_DIFFERENCE, N_GREY, N_CORRELATION), int)
+    counts = np.zeros((N_CONTRAST, N_DIFFERENCE, N_GREY, N_LIKENESS), int)
     for a, b in combinations(range(len(planes)), 2):
-        contrast, difference, grey, place = pair_bins(planes[a], planes[b], halves, noise)
+        contrast, difference, grey, place = bins_of_pair(planes, movement, a, b, halves, noise)
         nearest = place.astype(int) + (place - place.astype(int) > 0.5)
         which = is_counted & here[a] & here[b]
         np.add.at(counts, (contrast[which], difference[which], grey[which], nearest[which]), 1)

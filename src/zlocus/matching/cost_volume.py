@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import CostOptions, large_window_side
 from zlocus.core.options.option_fields import value_of
-from zlocus.matching.evidence import NO_EVIDENCE, learned_evidence
+from zlocus.matching.evidence import NO_EVIDENCE, ReferenceHeights, learned_evidence
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.shared_records import VisibleHeights
@@ -22,13 +22,12 @@ def cost_volume(
     visible: VisibleHeights,
     options: CostOptions,
     is_pair: bool = False,
-    reference: NDArray[np.float32] | None = None,
+    reference: ReferenceHeights | None = None,
 ) -> NDArray[np.uint8]:
     """Matching cost of every cell and height, (v,) uint8, in the order of `HeightLattice.layout`.
 
     slope_views : projections of slope indices, see `SlopeSurface.along`; visible : in slope indices; is_pair : whether
-    the whole scene has two images only; reference : (r, c) float32, slope indices, heights from which the evidence of
-    the images is learned, NaN where none is trusted.
+    the whole scene has two images only; reference : heights from which the evidence of the images is learned.
 
     With reference heights the cost of a height is the evidence against it, see `zlocus.matching.evidence`. Without them
     it is 64 (1 - NCC) + 64 w d.

@@ -10,6 +10,8 @@ and at wrong heights, so that it says nothing.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +26,19 @@ from zlocus.matching.local_contrast import rounded
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 
-# Cost of one natural unit of mean evidence of one pair.
-UNIT_COST = 18.0
+# Cost of one natural unit of mean evidence of one pair. Windows of neighbouring cells overlap, so that their evidence
+# is counted several times: small windows overlap less, and each of their units is worth more.
+UNIT_COST, SMALL_WINDOW_UNIT_COST = 14.0, 18.0
+# From each level to the next coarser one a unit costs so many times more: a roof or a crown has fewer cells there that
+# pay for its jumps, and one that is lost there stays lost.
+UNIT_FACTOR_PER_LEVEL = 1.25
 # The evidence of n pairs counts n ** PAIR_EXPONENT times their mean: pairs share images, so that they err together.
 PAIR_EXPONENT = 0.3
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
 # Evidence of one pair is at most this, natural units.
 MAX_LOG_RATIO = 5.0
-# The part of the evidence that the grey difference adds to that of correlation and contrast counts by this: grey values
+# The part of the evidence that the grey difference adds to that of likeness and contrast counts by this: grey values
 # of neighbouring heights are alike, so that the two are not independent.
 GREY_SHARE = 0.6
 # Counts that every bin gets at right heights before the images are looked at; wrong heights get the same frequency.
@@ -48,9 +54,20 @@ NOISE_SHARE, NOISE_WINDOW, LEAST_VARIANCE = 0.05, (5, 5), 1e-7
 # Cells of a level from which all, every second, and every fourth block is counted.
 CELLS_OF_ALL_BLOCKS, CELLS_OF_HALF = 60_000, 250_000
 
-NO_TABLE = EvidenceTable(np.zeros(0, np.float32), *(np.float32(value) for value in (1, 0, 0, 0, 0, 0)))
+NO_TABLE = EvidenceTable(np.zeros(0, np.float32), *(np.float32(value) for value in (1, 0, 0, 0, 0, 0, 0)))
 NO_COUNTS = Learning(np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.int64))
 NO_EVIDENCE = TableAndCounts(NO_TABLE, NO_COUNTS)
+
+
+@dataclass(frozen=True)
+class ReferenceHeights:
+    """Heights that the evidence of a level is learned from.
+
+    height : (r, c) float32, slope indices, NaN where none is trusted; level : number of the level, 0 is the finest.
+    """
+
+    height: NDArray[np.float32]
+    level: int
 
 
 def learned_evidence(
@@ -60,16 +77,16 @@ def learned_evidence(
     windows: NDArray[np.int64],
     visible: VisibleHeights,
     parameters: CostParameters,
-    reference: NDArray[np.float32],
+    reference: ReferenceHeights,
 ) -> TableAndCounts:
-    """The table of a level, counted at reference heights (r, c) float32, slope indices, NaN where none is trusted.
+    """The table of a level, counted at reference heights.
 
     slope_views, slope_arrays, lattice, windows, visible, parameters : as for the costs, see `tile_costs`.
     """
     size = int(np.prod(TABLE_SHAPE))
-    # One more bin, because correlations are counted at the nearest bin.
+    # One more bin, because a likeness is counted at the nearest bin.
     right, wrong = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    learning = Learning(sampled_blocks(reference, lattice.block), right, wrong)
+    learning = Learning(sampled_blocks(reference.height, lattice.block), right, wrong)
     noise = noise_variance(slope_views)
     counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise), learning)
     volume = np.empty(lattice.size, np.uint8)
@@ -78,10 +95,12 @@ def learned_evidence(
     )  # fmt: skip
     ratios, neutral = log_ratios(right[:-1].reshape(TABLE_SHAPE), wrong[:-1].reshape(TABLE_SHAPE))
     table = np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32)
+    factor = UNIT_FACTOR_PER_LEVEL**reference.level
     found = EvidenceTable(
         log_ratios=table,
         noise_variance=noise,
-        unit=np.float32(UNIT_COST),
+        unit=np.float32(UNIT_COST * factor),
+        small_window_unit=np.float32(SMALL_WINDOW_UNIT_COST * factor),
         highest=np.float32(ratios.max()),
         neutral=np.float32(neutral),
         pair_exponent=np.float32(PAIR_EXPONENT),
@@ -111,7 +130,7 @@ def log_ratios(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> tuple[NDAr
 
 
 def smoothed_counts(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Counts of which each bin shares some with its neighbours along grey difference and correlation."""
+    """Counts of which each bin shares some with its neighbours along grey difference and likeness."""
     smooth = counts.astype(np.float64)
     for _ in range(2):
         wide = np.pad(smooth, [(0, 0), (0, 0), (1, 1), (1, 1)], mode="edge")
@@ -155,11 +174,8 @@ def trusted_heights(result: LevelResult) -> NDArray[np.float32]:
     return np.where(across < MAX_STEPS_ACROSS, height, np.float32(np.nan)).astype(np.float32)
 
 
-def reference_heights(
-    result: LevelResult, level: PyramidLevel, slope_surface: SlopeSurface
-) -> NDArray[np.float32] | None:
-    """Heights that the evidence of a level is learned from, (r, c) slope indices; NaN where none is trusted, and
-    outside the tile's core.
+def reference_heights(result: LevelResult, level: PyramidLevel, slope_surface: SlopeSurface) -> ReferenceHeights | None:
+    """Heights that the evidence of a level is learned from; none outside the tile's core.
 
     result : of an earlier pass over the level, or of the next coarser one. None where it has too few such heights.
     """
@@ -168,4 +184,4 @@ def reference_heights(
         trusted = np.float32(2.0) * on_cells(trusted, result.level.window, level.window)
     of_core = np.full(level.shape, np.nan, np.float32)
     of_core[level.core] = (trusted - slope_surface.cells)[level.core]
-    return of_core if np.isfinite(of_core).sum() >= MIN_TRUSTED_CELLS else None
+    return ReferenceHeights(of_core, level.number) if np.isfinite(of_core).sum() >= MIN_TRUSTED_CELLS else None

@@ -33,7 +33,8 @@ MIN_NCC, MAX_GREY_DIFFERENCE = 0.6, 0.3
 MAX_DEVIATION_WITHOUT_TEXTURE = 0.15
 # The variance of a window is at least this in a correlation (grey values in units of an image's standard deviation).
 MIN_VARIANCE = 1e-6
-# An image clearly sees a cell where it agrees with so many others, over at least the cells of this shape.
+# An image clearly sees a cell where it agrees with so many others (of a pair: with the other), over at least the cells
+# of this shape.
 MIN_AGREEING_TO_SEE = 2
 MIN_SEEN_SHAPE = np.ones((3, 3), np.uint8)
 # An image that agrees with so many others at a cell's own height has no ray that passes below it. With many images some
@@ -42,8 +43,6 @@ MIN_AGREEING_AT_HEIGHT, MIN_AGREEING_OF_MANY, MANY_VIEWS = 2, 4, 13
 # Holes of this shape between such cells are closed where so many images take part.
 MIN_VIEWS_TO_CLOSE = 5
 CLOSED_SHAPE = np.ones((5, 5), np.uint8)
-# Rays of two images prove nothing: an image needs two others to be sure of what it sees.
-MIN_VIEWS = 3
 # Height steps by which a height must stand above a ray to obstruct it, and the cost of doing so for each ray, at the
 # finest level and at coarser ones, where a step is higher and jumps are cheaper; and the largest cost.
 MARGIN_STEPS, COARSER_MARGIN_STEPS = 8.0, 4.0
@@ -64,7 +63,7 @@ class PairAgreement:
     @property
     def clearly_seen(self) -> NDArray[np.bool_]:
         """(i, r, c), cells that an image clearly sees."""
-        enough = (self.textured >= MIN_AGREEING_TO_SEE).astype(np.uint8)
+        enough = (self.textured >= min(MIN_AGREEING_TO_SEE, len(self.textured) - 1)).astype(np.uint8)
         return np.stack([cv2.morphologyEx(mask, cv2.MORPH_OPEN, MIN_SEEN_SHAPE) for mask in enough]) > 0
 
     @property
@@ -168,8 +167,6 @@ def add_costs_of_rays(
     the heights of the volume are counted; visible : slope indices; height : (r, c) float32, the heights found, slope
     indices; level : 0 is the finest.
     """
-    if len(tile_views.layout) < MIN_VIEWS:
-        return False
     highest = float((lattice.first + lattice.count).max()) + float(slope_surface.cells.max())
     rays = free_rays(tile_views, height + slope_surface.cells, covers_at(visible, height), highest)
     if not np.isfinite(rays).any():

@@ -29,6 +29,7 @@ from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.search_range import candidates
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.slope_surface import SlopeSurface
+from zlocus.matching.unsupported_patches import heights_of_surroundings
 
 # Coarser cells on each side whose candidates are known to a cell, and the cost of heights far from all of them.
 CANDIDATE_REACH = 2
@@ -37,9 +38,13 @@ COST_OF_CANDIDATES = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(3
 # of the finest level are free, below and above the heights of NEARBY_CELLS.
 NEARBY_CELLS = np.ones((5, 5), np.uint8)
 FREE_STEPS, COST_BEYOND, MAX_COST_BEYOND = 12.0, 3.0, 30.0
+# The same for patches that stand off their surroundings without evidence, and the heights of the surroundings.
+COST_OFF_SURROUNDINGS, MAX_COST_OFF_SURROUNDINGS = 6.0, 90.0
+# A height that no cell has.
+FAR = np.float32(1e6)
 # The misfit is averaged over windows of this side, so that it is that of a patch. The penalty of a jump is halved where
 # it is HALVING_MISFIT; one cell counts with MAX_MISFIT at most.
-MISFIT_WINDOW, HALVING_MISFIT, MISFIT_POWER, MAX_MISFIT = (9, 9), 20.0, 3, 40.0
+MISFIT_WINDOW, HALVING_MISFIT, MISFIT_POWER, MAX_MISFIT = (9, 9), 15.0, 3, 40.0
 LEAST_PENALTY = 10
 
 
@@ -87,8 +92,21 @@ def add_costs_far_from_surface(
     heights: SemiGlobalHeights,
     level: int,
 ) -> None:
-    """Add the costs of heights far below or above the surface found around a cell; changes `cost`, (v,) uint8."""
-    surface = np.asarray(heights.vertex + slope_surface.cells, np.float32)
+    """Add the costs of heights far below or above the surface found around a cell; changes `cost`, (v,) uint8.
+
+    Where a patch of the surface stands off its surroundings without evidence, their heights take its place.
+    """
+    surface, free_steps = (
+        np.asarray(heights.vertex + slope_surface.cells, np.float32),
+        np.float32(FREE_STEPS / 2**level),
+    )
+    surroundings = heights_of_surroundings(cost, lattice, slope_surface, surface, level)
+    is_replaced = np.isfinite(surroundings)
+    if is_replaced.any():
+        surface = np.where(is_replaced, surroundings, surface)
+        off = DistanceCost(free_steps, np.float32(COST_OFF_SURROUNDINGS), np.float32(MAX_COST_OFF_SURROUNDINGS))
+        low, high = np.where(is_replaced, surface, -FAR), np.where(is_replaced, surface, FAR)
+        add_costs_beyond(cost, lattice.layout, slope_surface.cells, low, high, off)
     low, high = cv2.erode(surface, NEARBY_CELLS), cv2.dilate(surface, NEARBY_CELLS)
-    by_distance = DistanceCost(np.float32(FREE_STEPS / 2**level), np.float32(COST_BEYOND), np.float32(MAX_COST_BEYOND))
+    by_distance = DistanceCost(free_steps, np.float32(COST_BEYOND), np.float32(MAX_COST_BEYOND))
     add_costs_beyond(cost, lattice.layout, slope_surface.cells, low, high, by_distance)

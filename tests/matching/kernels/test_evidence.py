@@ -10,15 +10,25 @@ from reference import evidence as twin
 from reference.semiglobal import dense
 from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE, NO_TABLE
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
-from zlocus.matching.kernels.evidence import TABLE_SHAPE, EvidenceTable, Learning, TableAndCounts
+from zlocus.matching.kernels.evidence import (
+    TABLE_SHAPE,
+    EvidenceTable,
+    Learning,
+    TableAndCounts,
+    mean_gradients,
+    write_contrast,
+)
 from zlocus.matching.kernels.shared_records import NEVER_COVERED
 
 HALVES = np.array([1, 2])
 EXCLUDED = 0.4
 PARAMETERS = CostParameters(*(np.float32(v) for v in (0.0, 1.0, 0.3, 0.3, EXCLUDED)), max_images_for_large_window=255)
 NOISE = 0.05
+UNIT, SMALL_UNIT = 14.0, 20.0
 # Costs are whole numbers; a feature on the limit of a bin may fall into the next one, which few do.
 COST, FEW = 0.51, 0.01
+# Sums in float32, and a logarithm on straight lines.
+CONTRAST_DOUBLINGS = 1e-2
 BLOCK, SHAPE, N_HEIGHTS = 16, (20, 27), 12
 
 
@@ -48,15 +58,17 @@ def run(scene, visible, evidence):
 
 
 def planes_of(scene, block_row, block_col, rows, cols, index):
+    """The planes of the views of a block at a height, and how they move."""
     shape = (rows.stop - rows.start, cols.stop - cols.start)
     nodes = scene.nodes[:, block_row : block_row + 2, block_col : block_col + 2]
     relief = np.zeros((shape[0] + 4, shape[1] + 4))
-    return twin.planes_at(scene.images, nodes, scene.heights, index, BLOCK, 2, shape, relief)
+    planes = twin.planes_at(scene.images, nodes, scene.heights, index, BLOCK, 2, shape, relief)
+    return planes, twin.movements(nodes, scene.heights, index, BLOCK, 2)
 
 
 def table_with(ratios):
     """A table whose costs neither reach 0 nor 255."""
-    values = (NOISE, 18.0, float(ratios.max()), 0.5, 0.3, 160.0)
+    values = (NOISE, UNIT, SMALL_UNIT, float(ratios.max()), 0.5, 0.3, 160.0)
     return EvidenceTable(
         np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32), *(np.float32(v) for v in values)
     )
@@ -82,10 +94,10 @@ def test_costs_are_the_sums_of_the_table():
             n_of_block = (visible.lowest_covered[:, rows, cols] <= visible.highest_covered[:, rows, cols]).any(
                 axis=(1, 2)
             )
-            scale = 18.0 * (n_of_block.sum() * (n_of_block.sum() - 1) / 2) ** 0.3
+            scale = UNIT * (n_of_block.sum() * (n_of_block.sum() - 1) / 2) ** 0.3
             highest = min(scale * ratios.max(), 160.0)
-            planes = planes_of(scene, b, d, rows, cols, index)
-            mean = twin.cell_evidence(planes, HALVES, NOISE, ratios.astype(float), views, EXCLUDED)
+            planes, movement = planes_of(scene, b, d, rows, cols, index)
+            mean = twin.cell_evidence(planes, movement, HALVES, NOISE, ratios.astype(float), views, EXCLUDED)
             cost = np.where(n_covering > 1, highest - scale * mean, highest - scale * 0.5)
             expected[rows, cols, index] = np.clip(cost, 0, 255)
     is_searched = np.isfinite(expected)
@@ -107,11 +119,11 @@ def test_counts_are_those_of_right_and_of_wrong_heights():
         known = np.isfinite(reference[rows, cols])
         for index in range(lattice.first[b, d], lattice.first[b, d] + lattice.count[b, d]):
             here = seen(visible, rows, cols, index)[0][0]
-            planes, away = planes_of(scene, b, d, rows, cols, index), abs(index - 2.25)
+            (planes, movement), away = planes_of(scene, b, d, rows, cols, index), abs(index - 2.25)
             if away <= 3:
-                right += twin.counted(planes, HALVES, NOISE, known, here)
+                right += twin.counted(planes, movement, HALVES, NOISE, known, here)
             elif away > 5:
-                wrong += twin.counted(planes, HALVES, NOISE, known, here)
+                wrong += twin.counted(planes, movement, HALVES, NOISE, known, here)
     assert right.sum() > 4000
     assert wrong.sum() > 2000
     for found, expected in ((learning.right, right), (learning.wrong, wrong)):
@@ -136,3 +148,42 @@ def test_the_order_of_the_views_does_not_matter(n_views):
     turned = type(scene)(**(vars(scene) | {"layout": scene.layout[order].copy(), "nodes": scene.nodes[order].copy()}))
     volumes = [run(s, s.all_visible(), evidence)[0].astype(int) for s in (scene, turned)]
     assert (np.abs(volumes[0] - volumes[1]) > 1).mean() < FEW
+
+
+def test_evidence_of_small_windows_is_worth_more():
+    """The unit of a block where all views are compared in the smallest window only."""
+    scene, _ = scene_and_visibility()
+    ratios = np.full(TABLE_SHAPE, -0.5, np.float32)
+    table = table_with(ratios)._replace(highest=np.float32(0.0))
+    costs = []
+    for windows in (HALVES, HALVES[:1]):
+        volume = np.zeros(even_lattice(N_HEIGHTS, SHAPE, BLOCK).size, np.uint8)
+        around = int(windows[-1])
+        slope = SlopeArrays(
+            np.zeros((SHAPE[0] + 2 * around, SHAPE[1] + 2 * around), np.float32), np.zeros(scene.nodes.shape[1:3])
+        )
+        lattice = even_lattice(N_HEIGHTS, SHAPE, BLOCK)
+        evidence = TableAndCounts(table, NO_COUNTS)
+        tile_costs(scene.arrays, slope, lattice.layout, windows, scene.all_visible(), PARAMETERS, evidence, volume)
+        costs.append(np.median(volume))
+    pairs = 3**0.3
+    assert costs == [round(UNIT * pairs * 0.5), round(SMALL_UNIT * pairs * 0.5)]
+
+
+def test_an_edge_along_the_parallax_has_no_contrast():
+    """A plane that is bright on one side of an edge: its contrast counts across the edge, and not along it."""
+    plane = np.zeros((9, 12))
+    plane[:, 6:] = 1.0
+    plane[:] += np.random.default_rng(4).normal(0, 0.001, plane.shape)
+    out = np.empty(plane.size, np.float32)
+    gradients = np.empty((3, plane.size), np.float32)
+    flat, n = np.append(plane.ravel(), np.zeros(40)).astype(np.float32), 5 * 12
+    mean_gradients(flat, 2, 12, n, gradients)
+    found = {}
+    for name, direction in (("across", (0.0, 1.0)), ("along", (1.0, 0.0))):
+        write_contrast(gradients, *(np.float32(v) for v in direction), np.float32(1e-6), n, out)
+        found[name] = out[:n].reshape(5, 12)[:, 3].copy()
+        expected = twin.contrast(flat[: plane.size].reshape(plane.shape).astype(float), 2, direction, 1e-6)
+        np.testing.assert_allclose(out[:n].reshape(5, 12)[:, :8], expected, rtol=0, atol=CONTRAST_DOUBLINGS)
+    assert (found["across"] > 15).all()
+    assert (found["along"] < 2).all()

@@ -12,9 +12,11 @@ from zlocus.matching.kernels.evidence import (
     PairWindows,
     TableAndCounts,
     add_evidence,
+    cost_of_unit,
     count_bins,
     evidence_costs,
     pair_scratch,
+    put_movement,
 )
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
 from zlocus.matching.kernels.resample import (
@@ -290,7 +292,8 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
         count_bins(at_height, moments, scratch, n, weights.height, evidence)
     elif evidence.table.log_ratios.shape[0] > 0:
         add_evidence(at_height, moments, scratch, n, evidence.table, total)
-        evidence_costs(total, weights.of_pair, weights.n_covering, evidence.table, weights.n_views, n, out)
+        scale = cost_of_unit(evidence.table, weights.n_views, n_sizes)
+        evidence_costs(total, weights.of_pair, weights.n_covering, evidence.table, scale, n, out)
     else:
         if weight > 0.0:
             add_closeness(at_height.greys, weight * np.float32(n_sizes), n, total)
@@ -342,6 +345,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
             if extent == NOTHING and i > 0:
                 continue
             grid, velocity = block_grid(nodes, view, t, block, half), block_velocity(nodes, view, t, heights[1])
+            put_movement(grid, velocity, of_pairs.movement[m])
             resample_plane(image_of(views, view), grid, velocity, cells, steps, scratch, plane)
             centre = plane[start] if i == 0 else centre
             if extent == NOTHING:

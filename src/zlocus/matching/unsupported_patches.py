@@ -1,0 +1,89 @@
+"""Patches that stand far above or below their surroundings, with too little evidence for it.
+
+Where the images say little, two of them agree by chance somewhere within a wide search range, and a small patch of
+cells stands at a height that is wrong by tens of metres. A tower stands off its surroundings too, but its cells, taken
+together, cost far less at its height than at that of the surroundings. How much less they must cost grows with the
+height of the patch, because the more heights lie between, the likelier is an agreement by chance; and it decreases with
+the root of the area, because errors of many cells average out.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.prior_costs import write_misfit
+from zlocus.matching.slope_surface import SlopeSurface
+
+# Side of the window, in finest cells, beyond which surroundings are sought; at coarser levels it has at least as many
+# cells as MIN_SIDE_CELLS.
+SIDE_CELLS, MIN_SIDE_CELLS = 41, 9
+# A cell stands off where it differs from its surroundings by more than this; a patch of such cells is judged where it
+# does so by more than MIN_MEAN_STEPS in the mean. Steps are those of the finest level.
+MIN_STEPS, MIN_MEAN_STEPS = 12.0, 20.0
+# A pit is judged only where it lies so far below the lowest surroundings: streets between tall roofs do not.
+MIN_STEPS_BELOW_LOWEST = 3.0
+# Mean gain in cost that a patch of REFERENCE_CELLS finest cells needs for each step, and for any number of them.
+GAIN_PER_STEP, MAX_GAIN, REFERENCE_CELLS = 2.2, 150.0, 100.0
+# The same as a factor from each level to the next coarser one, where a patch may still grow.
+GAIN_FACTOR_PER_LEVEL = 0.5
+
+
+def heights_of_surroundings(
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    slope_surface: SlopeSurface,
+    surface: NDArray[np.float32],
+    level: int,
+) -> NDArray[np.float32]:
+    """Heights (r, c) of the surroundings where a patch of the surface stands off them without evidence, NaN elsewhere.
+
+    cost : (v,) uint8; surface : (r, c) float32, level indices; level : 0 is the finest.
+    """
+    side = max(SIDE_CELLS >> level, MIN_SIDE_CELLS) | 1
+    window, wide_window = np.ones((side, side), np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)
+    below, above = (_filtered(surface, operation, window) for operation in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE))
+    steps = np.float32(2**level)
+    height, depth = (surface - below) * steps, (above - surface) * steps
+    depth[(cv2.erode(above, wide_window) - surface) * steps <= MIN_STEPS_BELOW_LOWEST] = 0.0
+    found = np.full(surface.shape, np.nan, np.float32)
+    at_surface = _cost_at(cost, lattice, slope_surface, surface)
+    for off, surroundings in ((height, below), (depth, above)):
+        if off.max() > MIN_MEAN_STEPS:
+            gain = _cost_at(cost, lattice, slope_surface, surroundings) - at_surface
+            where = lacks_evidence(off, gain, level)
+            found[where] = surroundings[where]
+    return found
+
+
+def lacks_evidence(off: NDArray[np.float32], gain: NDArray[np.float32], level: int = 0) -> NDArray[np.bool_]:
+    """Cells (r, c) of patches that stand off their surroundings without evidence.
+
+    off : (r, c), finest steps by which a cell stands off; gain : (r, c), by how much its cost at the height of its
+    surroundings is above that at its own height; level : 0 is the finest.
+    """
+    count, labels = cv2.connectedComponents((off > MIN_STEPS).astype(np.uint8), connectivity=4)
+    cells = np.bincount(labels.ravel(), minlength=count)
+    mean_off, mean_gain = (np.bincount(labels.ravel(), values.ravel(), count) / cells for values in (off, gain))
+    needed = np.minimum(GAIN_PER_STEP * mean_off, MAX_GAIN) * GAIN_FACTOR_PER_LEVEL**level
+    lacks = (mean_gain * np.sqrt(cells * 4.0**level / REFERENCE_CELLS) < needed) & (mean_off > MIN_MEAN_STEPS)
+    lacks[0] = False
+    return np.asarray(lacks[labels])
+
+
+def _filtered(surface: NDArray[np.float32], operation: int, window: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Opening or closing (r, c) of a surface, which goes on beyond the borders of the tile at its heights there."""
+    side = window.shape[0]
+    wide = cv2.copyMakeBorder(surface, side, side, side, side, cv2.BORDER_REPLICATE)
+    return np.ascontiguousarray(cv2.morphologyEx(wide, operation, window)[side:-side, side:-side])
+
+
+def _cost_at(
+    cost: NDArray[np.uint8], lattice: HeightLattice, slope_surface: SlopeSurface, surface: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Cost (r, c) above the least of each cell at the nearest height to a surface, (r, c) level indices."""
+    found = np.empty(lattice.shape, np.float32)
+    write_misfit(cost, lattice.layout, np.rint(surface - slope_surface.cells).astype(np.int32), found)
+    return found
