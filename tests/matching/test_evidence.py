@@ -13,9 +13,9 @@ from zlocus.core.grid import CellWindow
 from zlocus.matching import evidence
 from zlocus.matching.evidence import (
     MAX_LOG_RATIO,
+    heights_to_learn_from,
     log_ratios,
     noise_variance,
-    reference_heights,
     sampled_blocks,
     smoothed_counts,
 )
@@ -101,7 +101,7 @@ def test_heights_at_jumps_teach_nothing():
     height[:, 100:] = 30.0
     level = SimpleNamespace(number=0, window=CellWindow(0, 0, 400, 400), shape=(400, 400), core=np.s_[40:360, :])
     slope = SimpleNamespace(cells=np.full((400, 400), 3.0, np.float32))
-    found = reference_heights(result_with(height), level, slope).height
+    found = heights_to_learn_from(result_with(height), level, slope).height
     assert np.isnan(found[:, 198:202]).all()
     assert np.isnan(found[:40]).all()
     assert np.isnan(found[360:]).all()
@@ -109,10 +109,10 @@ def test_heights_at_jumps_teach_nothing():
     assert (found[40:360, 202:] == 57.0).all()
     again = SimpleNamespace(number=1, window=CellWindow(0, 0, 200, 200), shape=(200, 200), core=np.s_[:, :])
     slope = SimpleNamespace(cells=np.zeros((200, 200), np.float32))
-    assert (reference_heights(result_with(height), again, slope).height[:, :99] == 10.0).all()
+    assert (heights_to_learn_from(result_with(height), again, slope).height[:, :99] == 10.0).all()
 
 
 def test_few_cells_teach_nothing():
     level = SimpleNamespace(number=1, window=CellWindow(0, 0, 140, 140), shape=(140, 140), core=np.s_[:, :])
     slope = SimpleNamespace(cells=np.zeros((140, 140), np.float32))
-    assert reference_heights(result_with(np.zeros((140, 140))), level, slope) is None
+    assert heights_to_learn_from(result_with(np.zeros((140, 140))), level, slope) is None

@@ -13,13 +13,14 @@ from zlocus.matching.semiglobal import SemiGlobalHeights, winner_takes_all_heigh
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.unsupported_patches import (
     MAX_GAIN,
-    MIN_MEAN_STEPS,
+    MIN_MEAN_OFF,
     heights_of_surroundings,
     lacks_evidence,
 )
 
 BLOCK, SHAPE, N_HEIGHTS = 16, (128, 128), 120
 GROUND = 60
+STEP_CELLS = 1.8
 PATCH = np.s_[50:62, 40:56]
 
 
@@ -48,7 +49,7 @@ def surface_with(patch, height, base=GROUND):
 def replaced(surface, depth, level=0):
     """Where a surface stands off its surroundings without evidence, and what takes its place."""
     volume, lattice = costs(surface, np.broadcast_to(np.float32(depth), SHAPE))
-    return heights_of_surroundings(volume, lattice, SlopeSurface.flat(SHAPE, BLOCK), surface, level)
+    return heights_of_surroundings(volume, lattice, SlopeSurface.flat(SHAPE, BLOCK), surface, level, STEP_CELLS)
 
 
 @pytest.mark.parametrize("height", [GROUND + 45, GROUND - 45])
@@ -66,7 +67,7 @@ def test_a_patch_with_much_evidence_stays(height):
 
 
 def test_low_patches_need_no_more_evidence_than_any_cell():
-    assert np.isnan(replaced(surface_with(PATCH, GROUND + MIN_MEAN_STEPS - 1), depth=0)).all()
+    assert np.isnan(replaced(surface_with(PATCH, GROUND + MIN_MEAN_OFF / STEP_CELLS - 1), depth=0)).all()
 
 
 def test_streets_between_tall_roofs_are_no_pits():
@@ -77,7 +78,18 @@ def test_streets_between_tall_roofs_are_no_pits():
             surface[row : row + 16, col : col + 16] = GROUND + 30
     depth = np.where(surface == GROUND, 5, 90)
     volume, lattice = costs(surface, depth)
-    assert np.isnan(heights_of_surroundings(volume, lattice, SlopeSurface.flat(SHAPE, BLOCK), surface, 0)).all()
+    assert np.isnan(
+        heights_of_surroundings(volume, lattice, SlopeSurface.flat(SHAPE, BLOCK), surface, 0, STEP_CELLS)
+    ).all()
+
+
+def test_trees_seen_with_a_wide_base_are_no_patches():
+    """Twice as many steps for the same height: what stands off is measured in sides of a cell."""
+    surface = surface_with(PATCH, GROUND + 36)
+    volume, lattice = costs(surface, np.full(SHAPE, 20.0))
+    base = SlopeSurface.flat(SHAPE, BLOCK)
+    assert np.isfinite(heights_of_surroundings(volume, lattice, base, surface, 0, STEP_CELLS)).any()
+    assert np.isnan(heights_of_surroundings(volume, lattice, base, surface, 0, STEP_CELLS / 2)).all()
 
 
 def test_a_slope_is_no_patch():
@@ -87,7 +99,7 @@ def test_a_slope_is_no_patch():
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.floats(21, 200), st.floats(0, 60), st.integers(2, 20))
+@given(st.floats(37, 200), st.floats(0, 60), st.integers(2, 20))
 def test_more_evidence_or_more_cells_never_remove_a_patch(off, gain, side):
     def lacks(with_gain, cells):
         away = np.zeros((40, 40), np.float32)
@@ -103,7 +115,7 @@ def test_heights_off_the_surroundings_cost_more_where_a_patch_is_replaced():
     volume, lattice = costs(surface, np.full(SHAPE, 20.0))
     before = winner_takes_all_heights(volume, lattice)
     heights = SemiGlobalHeights(before.best, before.second, before.uniqueness, surface)
-    add_costs_far_from_surface(volume, lattice, SlopeSurface.flat(SHAPE, BLOCK), heights, 0)
+    add_costs_far_from_surface(volume, lattice, SlopeSurface.flat(SHAPE, BLOCK), heights, 0, STEP_CELLS)
     after = winner_takes_all_heights(volume, lattice).best
     assert (before.best[PATCH] == GROUND + 45).all()
     assert (np.abs(after[PATCH] - GROUND) <= 12).all()

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.options import CostOptions, large_window_side
 from zlocus.core.options.option_fields import value_of
-from zlocus.matching.evidence import NO_EVIDENCE, ReferenceHeights, learned_evidence
+from zlocus.matching.evidence import NO_EVIDENCE, TaughtHeights, learned_evidence
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.shared_records import VisibleHeights
@@ -22,14 +22,14 @@ def cost_volume(
     visible: VisibleHeights,
     options: CostOptions,
     is_pair: bool = False,
-    reference: ReferenceHeights | None = None,
+    taught_heights: TaughtHeights | None = None,
 ) -> NDArray[np.uint8]:
     """Matching cost of every cell and height, (v,) uint8, in the order of `HeightLattice.layout`.
 
     slope_views : projections of slope indices, see `SlopeSurface.along`; visible : in slope indices; is_pair : whether
-    the whole scene has two images only; reference : heights from which the evidence of the images is learned.
+    the whole scene has two images only; taught_heights : heights from which the evidence of the images is learned.
 
-    With reference heights the cost of a height is the evidence against it, see `zlocus.matching.evidence`. Without them
+    With such heights the cost of a height is the evidence against it, see `zlocus.matching.evidence`. Without them
     it is 64 (1 - NCC) + 64 w d.
 
     NCC is the mean over all pairs of views and over the window sizes. For two views and two window sizes it is the SNCC
@@ -43,8 +43,8 @@ def cost_volume(
     windows = np.unique([options.small_window // 2, large_window_side(options) // 2])
     volume, parameters = np.empty(lattice.size, np.uint8), cost_parameters(options, is_pair)
     slope, evidence = SlopeArrays(slope_surface.padded(int(windows.max())), slope_surface.nodes), NO_EVIDENCE
-    if reference is not None:
-        evidence = learned_evidence(slope_views, slope, lattice, windows, visible, parameters, reference)
+    if taught_heights is not None:
+        evidence = learned_evidence(slope_views, slope, lattice, windows, visible, parameters, taught_heights)
     tile_costs(
         slope_views.arrays, slope, lattice.layout, windows, visible, parameters, evidence, volume
     )  # fmt: skip

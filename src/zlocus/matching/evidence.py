@@ -49,6 +49,9 @@ MAX_STEPS_ACROSS = 6.0
 # From fewer cells nothing is learned: bins would stay empty, and heights would depend on how the ground is cut into
 # tiles (with tiles of 128 x 128 cells 1.3 % of the cells move by more than half a step under a halo twice as wide).
 MIN_TRUSTED_CELLS = 20_000
+# Tiles of fewer finest cells would learn at their finest level only, between coarser heights that were found without
+# evidence: of a town in 40 000 cells 2.05 % of the heights are then off by more than 10 m, and 1.86 % without evidence.
+MIN_CELLS_OF_TILE = 4 * MIN_TRUSTED_CELLS
 # The noise of an image is the variance that this share of its small windows is below.
 NOISE_SHARE, NOISE_WINDOW, LEAST_VARIANCE = 0.05, (5, 5), 1e-7
 # Cells of a level from which all, every second, and every fourth block is counted.
@@ -60,7 +63,7 @@ NO_EVIDENCE = TableAndCounts(NO_TABLE, NO_COUNTS)
 
 
 @dataclass(frozen=True)
-class ReferenceHeights:
+class TaughtHeights:
     """Heights that the evidence of a level is learned from.
 
     height : (r, c) float32, slope indices, NaN where none is trusted; level : number of the level, 0 is the finest.
@@ -77,16 +80,16 @@ def learned_evidence(
     windows: NDArray[np.int64],
     visible: VisibleHeights,
     parameters: CostParameters,
-    reference: ReferenceHeights,
+    taught_heights: TaughtHeights,
 ) -> TableAndCounts:
-    """The table of a level, counted at reference heights.
+    """The table of a level, counted at heights that are known already.
 
     slope_views, slope_arrays, lattice, windows, visible, parameters : as for the costs, see `tile_costs`.
     """
     size = int(np.prod(TABLE_SHAPE))
     # One more bin, because a likeness is counted at the nearest bin.
     right, wrong = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    learning = Learning(sampled_blocks(reference.height, lattice.block), right, wrong)
+    learning = Learning(sampled_blocks(taught_heights.height, lattice.block), right, wrong)
     noise = noise_variance(slope_views)
     counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise), learning)
     volume = np.empty(lattice.size, np.uint8)
@@ -95,7 +98,7 @@ def learned_evidence(
     )  # fmt: skip
     ratios, neutral = log_ratios(right[:-1].reshape(TABLE_SHAPE), wrong[:-1].reshape(TABLE_SHAPE))
     table = np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32)
-    factor = UNIT_FACTOR_PER_LEVEL**reference.level
+    factor = UNIT_FACTOR_PER_LEVEL**taught_heights.level
     found = EvidenceTable(
         log_ratios=table,
         noise_variance=noise,
@@ -174,7 +177,9 @@ def trusted_heights(result: LevelResult) -> NDArray[np.float32]:
     return np.where(across < MAX_STEPS_ACROSS, height, np.float32(np.nan)).astype(np.float32)
 
 
-def reference_heights(result: LevelResult, level: PyramidLevel, slope_surface: SlopeSurface) -> ReferenceHeights | None:
+def heights_to_learn_from(
+    result: LevelResult, level: PyramidLevel, slope_surface: SlopeSurface
+) -> TaughtHeights | None:
     """Heights that the evidence of a level is learned from; none outside the tile's core.
 
     result : of an earlier pass over the level, or of the next coarser one. None where it has too few such heights.
@@ -184,4 +189,4 @@ def reference_heights(result: LevelResult, level: PyramidLevel, slope_surface: S
         trusted = np.float32(2.0) * on_cells(trusted, result.level.window, level.window)
     of_core = np.full(level.shape, np.nan, np.float32)
     of_core[level.core] = (trusted - slope_surface.cells)[level.core]
-    return ReferenceHeights(of_core, level.number) if np.isfinite(of_core).sum() >= MIN_TRUSTED_CELLS else None
+    return TaughtHeights(of_core, level.number) if np.isfinite(of_core).sum() >= MIN_TRUSTED_CELLS else None

@@ -91,16 +91,18 @@ def add_costs_far_from_surface(
     slope_surface: SlopeSurface,
     heights: SemiGlobalHeights,
     level: int,
+    step_cells: float,
 ) -> None:
     """Add the costs of heights far below or above the surface found around a cell; changes `cost`, (v,) uint8.
 
-    Where a patch of the surface stands off its surroundings without evidence, their heights take its place.
+    Where a patch of the surface stands off its surroundings without evidence, their heights take its place. step_cells
+    : finest height step divided by the side of a finest cell.
     """
     surface, free_steps = (
         np.asarray(heights.vertex + slope_surface.cells, np.float32),
         np.float32(FREE_STEPS / 2**level),
     )
-    surroundings = heights_of_surroundings(cost, lattice, slope_surface, surface, level)
+    surroundings = heights_of_surroundings(cost, lattice, slope_surface, surface, level, step_cells)
     is_replaced = np.isfinite(surroundings)
     if is_replaced.any():
         surface = np.where(is_replaced, surroundings, surface)

@@ -17,7 +17,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
 from zlocus.matching.cost_volume import cost_volume
-from zlocus.matching.evidence import reference_heights
+from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
 from zlocus.matching.fill import filled
 from zlocus.matching.finest_level import ortho_of_surface, refined_surface, with_planes_of_segments
 from zlocus.matching.free_rays import add_costs_of_rays
@@ -212,7 +212,7 @@ def match_coarsest_level(tile: TileInputs) -> CoarsestMatch:
     result = match_level(tile, level, prior, pair_labels)
     slope_surface = _slope_of_heights(tile, result)
     is_steep = slope_surface.is_steep(level.core)
-    teaches = learns_evidence(tile) and reference_heights(result, level, slope_surface) is not None
+    teaches = learns_evidence(tile) and heights_to_learn_from(result, level, slope_surface) is not None
     if is_steep:
         prior = coarsest_prior(tile.match_scene, level, result.heights.vertex)
         pair_labels = pair_labels_for_choice(tile, result)
@@ -222,8 +222,10 @@ def match_coarsest_level(tile: TileInputs) -> CoarsestMatch:
 
 
 def learns_evidence(tile: TileInputs) -> bool:
-    """Whether costs are evidence: not in image space, and not for single cells, where they are those of the papers."""
-    return tile.method == "mvll-sgm"
+    """Whether costs are evidence: not in image space, not for single cells, where they are those of the papers, and not
+    in small tiles."""
+    n_cells = tile.core_window.rows * tile.core_window.cols
+    return tile.method == "mvll-sgm" and n_cells >= MIN_CELLS_OF_TILE
 
 
 def _slope_of_heights(tile: TileInputs, result: LevelResult) -> SlopeSurface:
@@ -312,12 +314,18 @@ def match_level(
     search = search_along_slope(tile, level, prior)
     visible = visible_heights(tile, search, prior)
     chosen = _chosen_views(tile, level, search, visible, prior, pair_labels)
-    reference = None
+    taught_heights = None
     if earlier_result is not None and learns_evidence(tile):
-        reference = reference_heights(earlier_result, level, search.slope_surface)
-    is_evidence = reference is not None and prior.coarser_result is not None
+        taught_heights = heights_to_learn_from(earlier_result, level, search.slope_surface)
+    is_evidence = taught_heights is not None and prior.coarser_result is not None
     cost = cost_volume(
-        search.slope_views, search.slope_surface, search.lattice, chosen.matched, config.cost, tile.is_pair, reference
+        search.slope_views,
+        search.slope_surface,
+        search.lattice,
+        chosen.matched,
+        config.cost,
+        tile.is_pair,
+        taught_heights,
     )
     covered = covers(visible)
     alike = view_agreement(tile, level, search, covered, prior)
@@ -443,7 +451,7 @@ def semiglobal_heights(
     if is_evidence:
         of_patch = misfit(cost, search.lattice, heights)
         penalties = penalties_after_misfit(penalties, of_patch)
-        add_costs_far_from_surface(cost, search.lattice, search.slope_surface, heights, level.number)
+        add_costs_far_from_surface(cost, search.lattice, search.slope_surface, heights, level.number, step_cells)
     elif not has_rays:
         return heights
     return aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)

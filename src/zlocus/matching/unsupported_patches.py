@@ -20,13 +20,15 @@ from zlocus.matching.slope_surface import SlopeSurface
 # Side of the window, in finest cells, beyond which surroundings are sought; at coarser levels it has at least as many
 # cells as MIN_SIDE_CELLS.
 SIDE_CELLS, MIN_SIDE_CELLS = 41, 9
-# A cell stands off where it differs from its surroundings by more than this; a patch of such cells is judged where it
-# does so by more than MIN_MEAN_STEPS in the mean. Steps are those of the finest level.
-MIN_STEPS, MIN_MEAN_STEPS = 12.0, 20.0
+# Heights are in sides of a finest cell, so that a tree is as high for images with a wide base, whose steps are small. A
+# cell stands off where it differs from its surroundings by more than MIN_OFF; a patch of such cells is judged where it
+# does so by more than MIN_MEAN_OFF in the mean: 18 m for cells of half a metre.
+MIN_OFF, MIN_MEAN_OFF = 21.0, 36.0
 # A pit is judged only where it lies so far below the lowest surroundings: streets between tall roofs do not.
-MIN_STEPS_BELOW_LOWEST = 3.0
-# Mean gain in cost that a patch of REFERENCE_CELLS finest cells needs for each step, and for any number of them.
-GAIN_PER_STEP, MAX_GAIN, REFERENCE_CELLS = 2.2, 150.0, 100.0
+MIN_BELOW_LOWEST = 5.0
+# Mean gain in cost that a patch of REFERENCE_CELLS finest cells needs for each side of a cell that it stands off, and
+# at most.
+GAIN_PER_SIDE, MAX_GAIN, REFERENCE_CELLS = 1.25, 150.0, 100.0
 # The same as a factor from each level to the next coarser one, where a patch may still grow.
 GAIN_FACTOR_PER_LEVEL = 0.5
 
@@ -37,21 +39,23 @@ def heights_of_surroundings(
     slope_surface: SlopeSurface,
     surface: NDArray[np.float32],
     level: int,
+    step_cells: float,
 ) -> NDArray[np.float32]:
     """Heights (r, c) of the surroundings where a patch of the surface stands off them without evidence, NaN elsewhere.
 
-    cost : (v,) uint8; surface : (r, c) float32, level indices; level : 0 is the finest.
+    cost : (v,) uint8; surface : (r, c) float32, level indices; level : 0 is the finest; step_cells : finest height step
+    divided by the side of a finest cell.
     """
     side = max(SIDE_CELLS >> level, MIN_SIDE_CELLS) | 1
     window, wide_window = np.ones((side, side), np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)
     below, above = (_filtered(surface, operation, window) for operation in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE))
-    steps = np.float32(2**level)
-    height, depth = (surface - below) * steps, (above - surface) * steps
-    depth[(cv2.erode(above, wide_window) - surface) * steps <= MIN_STEPS_BELOW_LOWEST] = 0.0
+    sides = np.float32(2**level * step_cells)
+    height, depth = (surface - below) * sides, (above - surface) * sides
+    depth[(cv2.erode(above, wide_window) - surface) * sides <= MIN_BELOW_LOWEST] = 0.0
     found = np.full(surface.shape, np.nan, np.float32)
     at_surface = _cost_at(cost, lattice, slope_surface, surface)
     for off, surroundings in ((height, below), (depth, above)):
-        if off.max() > MIN_MEAN_STEPS:
+        if off.max() > MIN_MEAN_OFF:
             gain = _cost_at(cost, lattice, slope_surface, surroundings) - at_surface
             where = lacks_evidence(off, gain, level)
             found[where] = surroundings[where]
@@ -61,14 +65,14 @@ def heights_of_surroundings(
 def lacks_evidence(off: NDArray[np.float32], gain: NDArray[np.float32], level: int = 0) -> NDArray[np.bool_]:
     """Cells (r, c) of patches that stand off their surroundings without evidence.
 
-    off : (r, c), finest steps by which a cell stands off; gain : (r, c), by how much its cost at the height of its
-    surroundings is above that at its own height; level : 0 is the finest.
+    off : (r, c), sides of a finest cell by which a cell stands off; gain : (r, c), by how much its cost at the height
+    of its surroundings is above that at its own height; level : 0 is the finest.
     """
-    count, labels = cv2.connectedComponents((off > MIN_STEPS).astype(np.uint8), connectivity=4)
+    count, labels = cv2.connectedComponents((off > MIN_OFF).astype(np.uint8), connectivity=4)
     cells = np.bincount(labels.ravel(), minlength=count)
     mean_off, mean_gain = (np.bincount(labels.ravel(), values.ravel(), count) / cells for values in (off, gain))
-    needed = np.minimum(GAIN_PER_STEP * mean_off, MAX_GAIN) * GAIN_FACTOR_PER_LEVEL**level
-    lacks = (mean_gain * np.sqrt(cells * 4.0**level / REFERENCE_CELLS) < needed) & (mean_off > MIN_MEAN_STEPS)
+    needed = np.minimum(GAIN_PER_SIDE * mean_off, MAX_GAIN) * GAIN_FACTOR_PER_LEVEL**level
+    lacks = (mean_gain * np.sqrt(cells * 4.0**level / REFERENCE_CELLS) < needed) & (mean_off > MIN_MEAN_OFF)
     lacks[0] = False
     return np.asarray(lacks[labels])
 
