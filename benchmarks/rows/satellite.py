@@ -60,7 +60,7 @@ def staircase(out: Path) -> list[Figure]:
     heights = json.loads((out / "run.json").read_text())["heights"]
     with rasterio.open(out / "dsm.tif") as file:
         heights_m = file.read(1).astype(float)
-    steps = (heights_m[np.isfinite(heights_m)] - heights["range_m"][0]) / heights["step_m"]
+    steps = (heights_m[np.isfinite(heights_m)] - heights["searched_m"][0]) / heights["step_m"]
     share = np.bincount((10 * (steps % 1)).astype(int).clip(0, 9), minlength=10) / len(steps) * 10
     return [
         Figure("least of the tenths of a step", share.min(), at_least=0.8, fails_when=PIXEL_LOCKING),

@@ -97,7 +97,7 @@ def test_applied_shifts_are_the_reported_ones(scene, oriented):
         assert np.abs(moved - found.shift_px).max() < 1e-9
     again = orient(corrected, OPTIONS)
     assert np.abs([v.shift_px for v in again.views]).max() < SHIFT_TOLERANCE_PX / 2
-    assert height_range(again, OPTIONS) == pytest.approx(height_range(oriented, OPTIONS), abs=3.0)
+    assert height_range(again, OPTIONS).searched == pytest.approx(height_range(oriented, OPTIONS).searched, abs=3.0)
 
 
 def test_the_report_is_plain_and_says_what_was_not_applied(oriented):
@@ -187,19 +187,25 @@ def test_the_range_keeps_a_tower_and_drops_lone_wrong_heights():
     plain = np.column_stack([xy, 100.0 + 0.05 * xy[:, 0]])
     tower = np.column_stack([rng.uniform(240, 260, (25, 2)), np.full(25, 160.0)])
     wrong = np.column_stack([rng.uniform(0, 500, (60, 2)), rng.uniform(0, 1000, 60)])
-    low, high = height_range(ground(np.vstack([plain, tower, wrong])), OPTIONS)
-    assert 40.0 < low < 85.0
-    assert 180.0 < high < 260.0
+    found = height_range(ground(np.vstack([plain, tower, wrong])), OPTIONS)
+    assert 75.0 < found.expected[0] < 100.0
+    assert 160.0 < found.expected[1] < 190.0
+    assert found.searched == pytest.approx((found.expected[0] - 18.0, found.expected[1] + 72.0))
 
 
 def test_the_margins_are_those_of_the_options():
     xy = np.random.default_rng(2).uniform(0, 500, (3000, 2))
     flat = ground(np.column_stack([xy, 100.0 + 0.1 * xy[:, 0]]))
     bare = replace(OPTIONS, range_margin=0.0, range_up_m=0.0, range_down_m=0.0)
-    low, high = height_range(flat, bare)
+    low, high = height_range(flat, bare).expected
     assert (low, high) == pytest.approx((100.25, 149.75), abs=0.3)
-    wide = height_range(flat, replace(bare, range_margin=0.5, range_up_m=7.0, range_down_m=2.0))
-    assert wide == pytest.approx((low - (high - low) / 2 - 2.0, high + (high - low) / 2 + 7.0))
+    wide = height_range(
+        flat,
+        replace(bare, range_margin=0.5, range_up_m=7.0, range_down_m=2.0, search_up_m=11.0, search_down_m=3.0),
+    )
+    expected = (low - (high - low) / 2 - 2.0, high + (high - low) / 2 + 7.0)
+    assert wide.expected == pytest.approx(expected)
+    assert wide.searched == pytest.approx((expected[0] - 3.0, expected[1] + 11.0))
 
 
 def test_too_few_ties_are_no_range():
@@ -231,7 +237,7 @@ def test_rendered_hills_with_wrong_pointing(shared_data):
     found = orient(scene, OrientationOptions())
     shift = np.array([v.shift_px for v in found.views])
     assert np.abs(after_ground_translation(shift + planted, scene, found.xyz.mean(axis=0))).max() < SHIFT_TOLERANCE_PX
-    low, high = height_range(found, OrientationOptions())
+    low, high = height_range(found, OrientationOptions()).searched
     assert truth["zmin"] - 100.0 < low < truth["zmin"]
     assert truth["zmax"] < high < truth["zmax"] + 150.0
 

@@ -46,7 +46,9 @@ class MatchScene:
     lattice of heights at the finest level; levels : of the pyramid; overlap_window : finest cells that two views may
     cover; grey_scales : grey scale of each image; ties : (n, 3) ground points, to which the search ranges of their
     cells extend; dem_limits : (2, r, c) float32, lowest and highest height to search on the cells of `overlap_window`
-    at the coarsest level, NaN where the terrain model has no height; None without one.
+    at the coarsest level, NaN where the terrain model has no height; None without one; trusted_ties : (k, 3) those of
+    the ties that neighbours confirm; expected_range : lowest and highest height at which they suggest a surface, None
+    where they suggest nothing.
 
     Lengths and heights are metres on the ground. In image space (`zlocus.matching.image_space`) the ground is a
     reference image: lengths are its pixels, and heights are hypotheses along its rays. That is why these names have no
@@ -64,6 +66,8 @@ class MatchScene:
     grey_scales: tuple[GreyScale, ...]
     ties: NDArray[np.float64] = field(repr=False)
     dem_limits: NDArray[np.float32] | None = field(default=None, repr=False)
+    trusted_ties: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)), repr=False)
+    expected_range: tuple[float, float] | None = None
 
     @property
     def z_range(self) -> tuple[float, float]:

@@ -1,5 +1,8 @@
 """What is known of the surface as a part of the costs, and penalties of jumps that follow from how well it fits.
 
+Costs of unexpected heights
+    At the coarsest level, heights far from what the tie points around a place suggest cost more, see
+    `zlocus.matching.expected_heights`.
 Costs of candidates
     The search range of a block is wide wherever one of its cells needs it, and noise finds false heights in it. Heights
     far from everything that the coarser level considers around a cell, with its wider windows, therefore cost more.
@@ -17,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import PyramidOptions
+from zlocus.matching.expected_heights import expected_heights
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.prior_costs import (
     CoarserCells,
@@ -26,6 +30,7 @@ from zlocus.matching.kernels.prior_costs import (
     write_misfit,
 )
 from zlocus.matching.level_records import LevelResult, PyramidLevel
+from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.search_range import candidates
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.slope_surface import SlopeSurface
@@ -34,6 +39,8 @@ from zlocus.matching.unsupported_patches import heights_of_surroundings
 # Coarser cells on each side whose candidates are known to a cell, and the cost of heights far from all of them.
 CANDIDATE_REACH = 2
 COST_OF_CANDIDATES = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
+# The cost of heights far from what the tie points suggest, at the coarsest level.
+COST_BEYOND_EXPECTED = DistanceCost(np.float32(0.0), np.float32(15.0), np.float32(60.0))
 # Where jumps become cheaper, heights far from the surface of the first aggregation become more expensive: so many steps
 # of the finest level are free, below and above the heights of NEARBY_CELLS.
 NEARBY_CELLS = np.ones((5, 5), np.uint8)
@@ -61,6 +68,19 @@ def add_costs_of_coarser(
     cells = CoarserCells(window.row - 2 * coarser_window.row, window.col - 2 * coarser_window.col, CANDIDATE_REACH)
     found = np.ascontiguousarray(candidates(coarser_result, options), np.float32)
     add_costs_of_candidates(cost, lattice.layout, slope_surface.cells, found, cells, COST_OF_CANDIDATES)
+
+
+def add_costs_beyond_expected(
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    slope_surface: SlopeSurface,
+    match_scene: MatchScene,
+    level: PyramidLevel,
+) -> None:
+    """Add the costs of heights below or above those that tie points suggest; changes `cost`, (v,) uint8."""
+    expected = expected_heights(match_scene, level)
+    if expected is not None:
+        add_costs_beyond(cost, lattice.layout, slope_surface.cells, *expected, COST_BEYOND_EXPECTED)
 
 
 def misfit(cost: NDArray[np.uint8], lattice: HeightLattice, heights: SemiGlobalHeights) -> NDArray[np.float32]:

@@ -44,6 +44,7 @@ from zlocus.matching.occlusion import (
 from zlocus.matching.overlap import CoarsestHeights, OverlapGround, SearchBounds, find_overlap_window, overlap_ground
 from zlocus.matching.pair_labels import PairLabels, TileLabels, label_pairs_at_ties
 from zlocus.matching.prior_costs import (
+    add_costs_beyond_expected,
     add_costs_far_from_surface,
     add_costs_of_coarser,
     misfit,
@@ -327,6 +328,8 @@ def match_level(
         tile.is_pair,
         taught_heights,
     )
+    if tile.method != "mvll" and prior.coarser_result is None:
+        add_costs_beyond_expected(cost, search.lattice, search.slope_surface, tile.match_scene, level)
     covered = covers(visible)
     alike = view_agreement(tile, level, search, covered, prior)
     if tile.method == "mvll":

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError
+from zlocus.core.nearest_points import nearest_points
 from zlocus.core.options import OrientationOptions
 from zlocus.core.sensor_model import FloatArray
 
@@ -24,7 +25,19 @@ NEIGHBOURS = 8
 MIN_AGREEING_NEIGHBOURS = 3
 MAX_SLOPE = 1.5
 MAX_HEIGHT_SIGMAS = 4.0
-KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex); its other trees are random
+
+
+@dataclass(frozen=True)
+class HeightRange:
+    """Lowest and highest height, m: `expected` of the surface, and `searched` where images clearly agree beyond it."""
+
+    expected: tuple[float, float]
+    searched: tuple[float, float]
+
+    @classmethod
+    def limited_to(cls, heights: tuple[float, float]) -> HeightRange:
+        """A range beyond which nothing is searched."""
+        return cls(heights, heights)
 
 
 def height_range_of_ties(
@@ -33,17 +46,16 @@ def height_range_of_ties(
     names: Sequence[str],
     options: OrientationOptions,
     station: float | None = None,
-) -> tuple[float, float]:
-    """Lowest and highest height (m) to search, from the heights of the ties.
+) -> HeightRange:
+    """Heights (m) at which the surface is expected, and those to search, from the heights of the ties.
 
     xyz : (n, 3) m, ground points of the ties; sigma_z_m : (n,) precision of their heights; names : of the views, for
     the message; station : height of the lowest camera (m), where it is known.
 
-    The range is that of the 0.5 to 99.5 percentiles of the trusted ties. It is widened at both ends by `range_margin`
-    times itself (peaks and valleys between ties), then by `range_up_m` above (towers and trees carry few ties) and
-    `range_down_m` below, but by no more than `MAX_MARGIN_SHARE_OF_DEPTH` of the depth below the station. A range that
-    is too wide costs time at the coarsest level only (and, for a drone, accuracy of the projection tables); one that is
-    too narrow loses the tower.
+    The expected range is that of the 0.5 to 99.5 percentiles of the trusted ties, widened at both ends by
+    `range_margin` times itself (peaks and valleys between ties), then by `range_up_m` above (roofs and trees carry few
+    ties) and `range_down_m` below. What is searched goes on beyond it by `search_up_m` and `search_down_m`, for towers
+    and pits. Neither margin in metres is more than `MAX_MARGIN_SHARE_OF_DEPTH` of the depth below the station.
 
     Raises
     ------
@@ -57,14 +69,21 @@ def height_range_of_ties(
             f"height range of the ground ({MIN_TIES_FOR_RANGE} are needed). Give --heights ZMIN ZMAX or --dem, or "
             "check that the images overlap."
         )
-    low, high = np.percentile(xyz[trusted, 2], RANGE_PERCENT)
+    low, high = (float(z) for z in np.percentile(xyz[trusted, 2], RANGE_PERCENT))
     margin = options.range_margin * (high - low)
-    low, high = float(low - margin), float(high + margin)
-    down, up = (
-        more if station is None else min(more, MAX_MARGIN_SHARE_OF_DEPTH * max(station - z, 0.0))
-        for more, z in ((options.range_down_m, low), (options.range_up_m, high))
-    )
-    return low - down, high + up
+    expected = _widened((low - margin, high + margin), options.range_down_m, options.range_up_m, station)
+    return HeightRange(expected, _widened(expected, options.search_down_m, options.search_up_m, station))
+
+
+def _widened(heights: tuple[float, float], down_m: float, up_m: float, station: float | None) -> tuple[float, float]:
+    """A height range with margins (m) below and above, no more than a share of the depth below the station."""
+    low, high = heights
+    if station is not None:
+        down_m, up_m = (
+            min(margin, MAX_MARGIN_SHARE_OF_DEPTH * max(station - z, 0.0))
+            for margin, z in ((down_m, low), (up_m, high))
+        )
+    return low - down_m, high + up_m
 
 
 def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> NDArray[np.bool_]:
@@ -83,11 +102,3 @@ def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> NDArray[np.bool_]:
     agrees = difference <= MAX_SLOPE * distance[:, 1:] + MAX_HEIGHT_SIGMAS * sigma
     trusted[good] = agrees.sum(axis=1) >= MIN_AGREEING_NEIGHBOURS
     return trusted
-
-
-def nearest_points(xy: FloatArray, count: int) -> tuple[FloatArray, NDArray[np.int32]]:
-    """Distances and numbers, (n, count) each, of the points nearest to each of xy (n, 2), itself among them."""
-    points = (xy - xy.mean(axis=0)).astype(np.float32)
-    index = cv2.flann.Index(points, {"algorithm": KD_TREE, "leaf_max_size": 10})
-    near, squared = index.knnSearch(points, count, params={"checks": -1, "eps": 0.0, "sorted": True})
-    return np.sqrt(squared.astype(float)), near

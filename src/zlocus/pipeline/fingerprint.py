@@ -56,12 +56,12 @@ def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:
     setup = {
         "orientation": orientation.as_dict(),
         "names": [view.name for view in match_scene.views],
-        "lattice": [*lattice, match_scene.n_steps, match_scene.levels],
+        "lattice": [*lattice, match_scene.n_steps, match_scene.levels, match_scene.expected_range],
         "overlap": vars(match_scene.overlap_window),
         "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in match_scene.grey_scales],
     }
     digest = hashlib.sha256(json.dumps(setup, sort_keys=True).encode())
-    for array in (match_scene.ties, match_scene.dem_limits):
+    for array in (match_scene.ties, match_scene.dem_limits, match_scene.trusted_ties):
         if array is not None:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

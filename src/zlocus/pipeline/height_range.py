@@ -2,8 +2,9 @@
 
 `height_range_of_run` decides, in this order: `--heights` or the heights of the scene file; `--dem`, extended by
 `pyramid.dem_down_m` and `pyramid.dem_up_m`; else the tie points: nearly all of their heights, with the margins
-`orientation.range_margin`, `range_up_m` and `range_down_m` (`zlocus.orientation.tie_heights.height_range_of_ties`). A
-range never reaches up to the lowest camera.
+`orientation.range_margin`, `range_up_m` and `range_down_m`, are where the surface is expected, and `search_up_m` and
+`search_down_m` beyond them are searched too (`zlocus.orientation.tie_heights.height_range_of_ties`). A range never
+reaches up to the lowest camera.
 
 Two more modules limit heights. Before tie points are known, `possible_heights` says at which heights views are compared
 at all; where the cameras do not tell, a run needs `--heights`, also with `--dem`. And with `--dem` every cell of the
@@ -30,7 +31,7 @@ from zlocus.io.grid_inputs import dem_datum, read_dem
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.ground_pixels import median_ground_pixel
 from zlocus.orientation.orientation import Orientation
-from zlocus.orientation.tie_heights import height_range_of_ties
+from zlocus.orientation.tie_heights import HeightRange, height_range_of_ties
 
 N_POSSIBLE_HEIGHTS = 5
 # Land on Earth lies between these heights above the ellipsoid.
@@ -44,8 +45,8 @@ CLEARANCE_FOUND, CLEARANCE_REQUESTED = 0.25, 0.125
 
 def height_range_of_run(
     request: SetupRequest, scene: Scene, orientation: Orientation, config: RunConfig, progress: Progress
-) -> tuple[float, float]:
-    """Lowest and highest height of the search, ellipsoidal, m.
+) -> HeightRange:
+    """Heights at which the surface is expected and those that are searched, ellipsoidal, m.
 
     scene : views that take part, with corrected cameras, and the heights requested.
 
@@ -55,7 +56,7 @@ def height_range_of_run(
         The DEM has no heights where the images overlap, or tie points tell no range.
     """
     if scene.heights:
-        return range_below_cameras(scene, scene.heights, progress)
+        return HeightRange.limited_to(range_below_cameras(scene, scene.heights, progress))
     if request.dem is None:
         return range_from_ties(scene, orientation, config.orientation)
     z = possible_heights(scene, None)
@@ -67,15 +68,17 @@ def height_range_of_run(
         raise GeometryError(f"{request.dem} has no heights where the images overlap. Give one that covers them.")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     low, high = low - config.pyramid.dem_down_m, high + config.pyramid.dem_up_m
-    return range_below_cameras(scene, (low, high), progress, f"The heights around {request.dem}")
+    around = range_below_cameras(scene, (low, high), progress, f"The heights around {request.dem}")
+    return HeightRange.limited_to(around)
 
 
-def range_from_ties(scene: Scene, orientation: Orientation, options: OrientationOptions) -> tuple[float, float]:
+def range_from_ties(scene: Scene, orientation: Orientation, options: OrientationOptions) -> HeightRange:
     """Height range (m) of the tie points with its margins, cut below the lowest camera."""
     station = lowest_station(view.sensor for view in scene.views)
     names = [view.name for view in orientation.views]
     found = height_range_of_ties(orientation.xyz, orientation.sigma_z_m, names, options, station)
-    return capped(found, station, CLEARANCE_FOUND)
+    expected, searched = (capped(heights, station, CLEARANCE_FOUND) for heights in (found.expected, found.searched))
+    return HeightRange(expected, searched)
 
 
 def range_below_cameras(

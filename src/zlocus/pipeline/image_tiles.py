@@ -199,7 +199,7 @@ def set_up_images(scene: Scene, config: RunConfig, progress: Progress) -> ImageS
         check_overlap(scene, possible_heights(scene, scene.heights))
         orientation = orient_views(scene, options, progress)
         is_supported = supported(orientation.xyz, orientation.sigma_z_m)
-        z_range = scene.heights or range_from_ties(scene, orientation, options)
+        z_range = scene.heights or range_from_ties(scene, orientation, options).searched
         used = supported_views(orientation.apply(scene), orientation)
         return ImageSetup(used, orientation, orientation.xyz, is_supported, z_range)
     space = image_space(scene, scene.views[0].name, (0.0, 0.0))
@@ -439,12 +439,12 @@ def tile_maker(
     orientation, grid, match_scene = setup.orientation, tile_job.grid, setup.match_scene
     used = supported_views(setup.scene, orientation)
     is_supported = supported(orientation.xyz, orientation.sigma_z_m)
-    image_setup = ImageSetup(used, orientation, orientation.xyz, is_supported, setup.z_range)
+    image_setup = ImageSetup(used, orientation, orientation.xyz, is_supported, setup.height_range.searched)
     references = [view.name for view in match_scene.views if request.reference in (None, view.name)]
     box, margin = grid.geobox.extent.boundingbox, tile_job.config.pyramid.halo * grid.cell_m
     bounds = (box.left - margin, box.bottom - margin, box.right + margin, box.top + margin)
     spill_arrays = SpillArrays(request.out, plan.allowed_bytes - plan.n_bytes)
-    area = GroundArea(bounds, setup.z_range)
+    area = GroundArea(bounds, setup.height_range.searched)
     matching = ImageMatching(tile_job.config, tile_job.choose_images, plan.slots, spill_arrays, area, checkpoint)
     grid_images = heights_for_grid(image_setup, references, matching, progress)
     tally.evaluations, tally.all_images = grid_images.evaluations, grid_images.all_images

@@ -42,7 +42,7 @@ from zlocus.matching.match_scene import MatchScene, build_match_scene, height_st
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
 from zlocus.orientation.plausibility import Doubt
-from zlocus.orientation.tie_heights import supported
+from zlocus.orientation.tie_heights import HeightRange, supported
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.height_range import height_range_of_run, heights_below_cameras, possible_heights, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
@@ -75,14 +75,14 @@ class OpenedInputs:
 class RunSetup:
     """What all tiles of a surface share.
 
-    scene : all views, with corrected cameras; orientation : tie points and corrections; z_range : heights searched, m;
-    grid : of the products; match_scene : the views that take part, and everything that a tile is matched with; doubts :
-    about the cameras.
+    scene : all views, with corrected cameras; orientation : tie points and corrections; height_range : heights at
+    which the surface is expected, and those searched; grid : of the products; match_scene : the views that take part,
+    and everything that a tile is matched with; doubts : about the cameras.
     """
 
     scene: Scene
     orientation: Orientation
-    z_range: tuple[float, float]
+    height_range: HeightRange
     grid: Grid
     match_scene: MatchScene
     doubts: tuple[Doubt, ...] = ()
@@ -190,13 +190,15 @@ def set_up_run(
     """
     corrected = orientation.apply(opened_inputs.scene)
     scene = supported_views(corrected, orientation)
-    z_range = height_range_of_run(request, scene, orientation, config, progress)
+    height_range = height_range_of_run(request, scene, orientation, config, progress)
+    z_range = height_range.searched
     grid = grid_of_run(request, opened_inputs.like, scene, orientation, z_range)
     match_scene = match_scene_of_run(request, scene, orientation, z_range, grid, config)
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)
     match_scene = limited_by_dem(request, match_scene, scene.crs, config)
-    return RunSetup(corrected, orientation, z_range, grid, match_scene, (*orientation.doubts, *far))
+    match_scene = with_expected_heights(match_scene, orientation, height_range)
+    return RunSetup(corrected, orientation, height_range, grid, match_scene, (*orientation.doubts, *far))
 
 
 def supported_views(scene: Scene, orientation: Orientation) -> Scene:
@@ -296,6 +298,12 @@ def limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, con
     dem = read_dem(request.dem, geobox, dem_datum(request.dem, request.dem_vertical))
     limits = np.stack([dem - config.pyramid.dem_down_m, dem + config.pyramid.dem_up_m]).astype(np.float32)
     return replace(match_scene, dem_limits=limits)
+
+
+def with_expected_heights(match_scene: MatchScene, orientation: Orientation, height_range: HeightRange) -> MatchScene:
+    """The match scene with the heights that tie points suggest, see `zlocus.matching.expected_heights`."""
+    trusted = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
+    return replace(match_scene, trusted_ties=trusted, expected_range=height_range.expected)
 
 
 def _crs_of(geobox: GeoBox) -> CRS:

@@ -152,9 +152,10 @@ def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
 
 
 def _heights_record(setup: RunSetup) -> dict[str, Any]:
-    """The heights searched, and the reference image of the scene."""
+    """The heights at which the surface was expected and those searched, and the reference image of the scene."""
     return {
-        "range_m": [round(z, 3) for z in setup.z_range],
+        "range_m": [round(z, 3) for z in setup.height_range.expected],
+        "searched_m": [round(z, 3) for z in setup.height_range.searched],
         "step_m": setup.match_scene.height_step,
         "levels": setup.match_scene.levels,
         "reference_image": setup.match_scene.views[0].name,

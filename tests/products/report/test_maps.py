@@ -207,7 +207,7 @@ def card(kind: str, why: str, rho1: float) -> list[str]:
         "kind": kind, "why": why, "row": 1, "col": 2, "x": 3.0, "y": 4.0, "height_m": None, "sigma_m": None,
         "quality": int(Quality.NO_MATCH), "n_shown": 1, "svg": "<svg/>", "point": {"reference": "a", "means": [mean]},
     }  # fmt: skip
-    run = {"heights": {"range_m": [1.25, 99.0]}, "config": {"options": {"checks": {"min_ncc": -0.2}}}}
+    run = {"heights": {"searched_m": [1.25, 99.0]}, "config": {"options": {"checks": {"min_ncc": -0.2}}}}
     return curve_card(cell, run)["lines"]
 
 

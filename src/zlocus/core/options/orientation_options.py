@@ -84,12 +84,19 @@ class OrientationOptions(Checked):
         low=0.0, high=10.0,
     )  # fmt: skip
     range_up_m: float = option(
-        60.0, "Height range from ties: margin added above, for towers and trees without ties.", low=0.0, high=2000.0,
+        8.0, "Height range from ties: margin added above, for roofs and trees without ties.", low=0.0, high=2000.0,
         unit="m",
     )  # fmt: skip
     range_down_m: float = option(
-        20.0, "Height range from ties: margin added below, for pits and streets without ties.", low=0.0, high=2000.0,
-        unit="m",
+        2.0, "Height range from ties: margin added below, for streets without ties.", low=0.0, high=2000.0, unit="m",
+    )  # fmt: skip
+    search_up_m: float = option(
+        72.0, "Heights above the range from ties at which a surface is found only where the images clearly agree.",
+        low=0.0, high=2000.0, unit="m",
+    )  # fmt: skip
+    search_down_m: float = option(
+        18.0, "Heights below the range from ties at which a surface is found only where the images clearly agree.",
+        low=0.0, high=2000.0, unit="m",
     )  # fmt: skip
     bundle_adjustment: BundleAdjustmentOptions = group(
         BundleAdjustmentOptions, "Bundle adjustment of all cameras (`model` joint)."

@@ -81,7 +81,7 @@ def _ties(
     orientation = orient_views(replace(scene, heights=asked), options, progress)
     corrected = orientation.apply(scene)
     z_range = (
-        range_from_ties(corrected, orientation, options)
+        range_from_ties(corrected, orientation, options).searched
         if asked is None
         else range_below_cameras(scene, asked, progress)
     )

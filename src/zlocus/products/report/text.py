@@ -175,7 +175,7 @@ def despite_peak(flag: Quality, rho1: float | None, run: Mapping[str, Any]) -> s
     """Why a cell is empty although its mean curve has a high peak, as a sentence; "" where the peak is not high."""
     if rho1 is None or rho1 < HIGH_PEAK or flag not in DESPITE_PEAK:
         return ""
-    low, high = run["heights"]["range_m"]
+    low, high = run["heights"]["searched_m"]
     text = DESPITE_PEAK[flag].format(min_ncc=run["config"]["options"]["checks"]["min_ncc"], low=low, high=high)
     return f"No height in spite of the peak: {text}."
 
