@@ -240,7 +240,7 @@ SECOND_NAMES: dict[tuple[str, str], str] = {
     ("RefinedHeights", "refined"): "says its part in matching/height_checks.py, matching/precision.py",
     ("Restored", "_scene"): "says its part in inspector/inspection.py",
     ("Scene", "corrected"): "says its part in pipeline/doctor/run.py",
-    ("SearchBounds", "searched"): "says its part in matching/overlap.py",
+    ("ExpectedBounds", "expected"): "says its part in matching/overlap.py",
     ("Tile", "task"): "says its part in pipeline/image_tiles.py",
     ("Tile", "tasks"): "says its part in pipeline/image_tiles.py",
     ("VerticalDatum", "vertical"): "says its part in products/rasters.py",

@@ -15,8 +15,8 @@ from zlocus.matching.overlap import (
     MAX_GROUND_STEPS,
     MAX_RISE_BY_DISTANCE,
     CoarsestHeights,
+    ExpectedBounds,
     OverlapGround,
-    SearchBounds,
     covered_ground,
     ground_nearby,
     overlap_ground,
@@ -46,10 +46,10 @@ def views(edge=EDGE, n=2):
 
 
 def found(surface=None, shown=None, matched=None):
-    searched = SearchBounds(np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32))
+    expected = ExpectedBounds(np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32))
     shown = views() if shown is None else shown
     matched = views(EDGE - WINDOW) if matched is None else matched
-    return covered_ground(shown, matched, ground() if surface is None else surface, searched, CELL_STEPS)
+    return covered_ground(shown, matched, ground() if surface is None else surface, expected, CELL_STEPS)
 
 
 def ground():
@@ -170,11 +170,11 @@ def test_heights_off_the_ground_need_support_beside_it():
 def test_where_most_cells_are_at_the_edge_none_is(edge, monkeypatch):
     """Of oblique views hardly a cell is compared at all heights, and the ground beside would be guessed far away."""
     matched = views(edge)
-    searched = SearchBounds(np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32))
+    expected = ExpectedBounds(np.zeros((ROWS, COLS), np.float32), np.full((ROWS, COLS), LAST, np.float32))
     monkeypatch.setattr(stage, "heights_shown", lambda *_: views(EDGE + 24))
     lattice = HeightLattice(0.0, 1.0, (ROWS, COLS), 4, np.zeros((3, 15), np.int64), np.full((3, 15), LAST, np.int64))
     window = CellWindow(0, 0, ROWS, COLS)
-    coarsest = CoarsestHeights(None, lattice, matched, window, 0, ground(), searched)
+    coarsest = CoarsestHeights(None, lattice, matched, window, 0, ground(), expected)
     found = overlap_ground([], coarsest, LAST, CELL_STEPS)
     assert found.is_at_edge.any() == (edge > EDGE)
     assert found.is_outside.any() == (edge > EDGE)

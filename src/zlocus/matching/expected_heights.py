@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.nearest_points import nearest_points
 from zlocus.core.sensor_model import lowest_station
-from zlocus.matching.level_records import PyramidLevel
+from zlocus.matching.level_records import PyramidLevel, SearchPrior
 from zlocus.matching.match_scene import MatchScene
 
 FloatGrid = NDArray[np.float32]
@@ -50,6 +50,16 @@ def expected_heights(match_scene: MatchScene, level: PyramidLevel) -> tuple[Floa
         offset_row, offset_col = level.window.row % SQUARE_CELLS, level.window.col % SQUARE_CELLS
         bounds.append(np.ascontiguousarray(cells[offset_row : offset_row + rows, offset_col : offset_col + cols]))
     return bounds[0], bounds[1]
+
+
+def expected_of_searched(
+    match_scene: MatchScene, level: PyramidLevel, prior: SearchPrior
+) -> tuple[FloatGrid, FloatGrid]:
+    """Lowest and highest expected height of each cell among those searched, (r, c) float32 level indices."""
+    expected = expected_heights(match_scene, level)
+    if expected is None:
+        return prior.low, prior.high
+    return np.maximum(prior.low, expected[0]), np.minimum(prior.high, expected[1])
 
 
 def _middles_of_squares(match_scene: MatchScene, level: PyramidLevel) -> NDArray[np.float64]:

@@ -34,13 +34,13 @@ MAX_SLOPE, HALF_STEP, TOLERANCE_STEPS = 1.0, 0.5, 4.0
 MAX_GROUND_STEPS, MAX_RISE_BY_DISTANCE = 8.0, 0.5
 # Buildings and woods narrower than this are not taken for ground.
 MAX_OBJECT_WIDTH_M = 50.0
-# Cells are judged by the overlap only where two views could be compared at all heights in at least this share of the
-# cells that they cover.
+# Cells are judged by the overlap only where two views could be compared at all expected heights in at least this share
+# of the cells that they cover.
 MIN_COMPARED_SHARE = 0.5
 
 
-class SearchBounds(NamedTuple):
-    """Lowest and highest height index that was searched in each cell."""
+class ExpectedBounds(NamedTuple):
+    """Lowest and highest height index at which the surface is expected in each cell, of those that were searched."""
 
     lowest: NDArray[np.float32]
     highest: NDArray[np.float32]
@@ -51,7 +51,8 @@ class CoarsestHeights:
     """What the coarsest level found, as the ground around the overlap is estimated from it.
 
     tile_views, lattice, visible : of the level, see `LevelResult`; window : its cells; level : its number; surface :
-    (r, c) float32, heights; searched : the search range of each cell. Heights are level indices.
+    (r, c) float32, heights; expected : where the surface is expected in each
+    cell. Heights are level indices.
     """
 
     tile_views: TileViews
@@ -60,7 +61,7 @@ class CoarsestHeights:
     window: CellWindow
     level: int
     surface: NDArray[np.float32]
-    searched: SearchBounds
+    expected: ExpectedBounds
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class OverlapGround:
     """The ground at the edge of the overlap of the images, as the coarsest level found it.
 
     window : cells of level `level`; covered : (r, c) bool, see `covered_ground`; is_at_edge : (r, c) bool, cells at
-    which two views could not be compared at every height searched; is_outside : (r, c) bool, those of them at which
+    which two views could not be compared at every expected height; is_outside : (r, c) bool, those of them at which
     they could not be compared at the height of the ground either; max_ground : (r, c) float32, height index up to which
     a height may be that of the ground. Where most cells would be at the edge, as for oblique views, none is.
     """
@@ -107,8 +108,8 @@ def overlap_ground(
     """
     cell_steps = cell_size / coarsest.lattice.height_step
     covering = heights_shown(view_pixels, coarsest, n_steps)
-    covered = covered_ground(covering, coarsest.visible, coarsest.surface, coarsest.searched, cell_steps)
-    known = compared_at_all_heights(coarsest.visible, coarsest.searched)
+    covered = covered_ground(covering, coarsest.visible, coarsest.surface, coarsest.expected, cell_steps)
+    known = compared_at_all_heights(coarsest.visible, coarsest.expected)
     window, level = coarsest.window, coarsest.level
     if known.sum() < MIN_COMPARED_SHARE * covered.sum():
         nowhere = np.zeros_like(known)
@@ -138,10 +139,10 @@ def unsupported(
     return doubtful & ~agreement_on(tile_views, height, covers_at(visible, height)).height_is_seen.any(axis=0)
 
 
-def compared_at_all_heights(visible: VisibleHeights, searched: SearchBounds) -> NDArray[np.bool_]:
-    """Cells (r, c) at which two views could be compared at every height searched. visible : heights covered there."""
-    from_lowest = visible.lowest_covered <= searched.lowest + 1
-    to_highest = visible.highest_covered >= searched.highest - 1
+def compared_at_all_heights(visible: VisibleHeights, expected: ExpectedBounds) -> NDArray[np.bool_]:
+    """Cells (r, c) at which two views could be compared at every expected height. visible : heights covered there."""
+    from_lowest = visible.lowest_covered <= expected.lowest + 1
+    to_highest = visible.highest_covered >= expected.highest - 1
     return np.asarray((from_lowest & to_highest).sum(axis=0) >= PAIR)
 
 
@@ -193,19 +194,19 @@ def covered_ground(
     shown: VisibleHeights,
     visible: VisibleHeights,
     surface: NDArray[np.float32],
-    searched: SearchBounds,
+    expected: ExpectedBounds,
     cell_steps: float,
 ) -> NDArray[np.bool_]:
     """Cells (r, c) that two views cover at the height of the ground around them, as far as that is known.
 
-    The ground is followed outwards from the cells that two views cover at all heights searched, as long as two views
+    The ground is followed outwards from the cells that two views cover at all expected heights, as long as two views
     cover it. Cells that cannot be reached in this way, and that no uncovered ground separates from it, count as
     covered.
 
     shown : heights up to the last pixel of each image, see `heights_shown`; visible : heights at which the images could
     be compared; surface : (r, c) float32, the heights found; cell_steps : side of a cell in height steps.
     """
-    known = compared_at_all_heights(visible, searched)
+    known = compared_at_all_heights(visible, expected)
     covered = np.asarray(covers(shown).sum(axis=0) >= PAIR)
     if not known.any() or known[covered].all():
         return covered

@@ -40,7 +40,7 @@ from zlocus.matching.unsupported_patches import heights_of_surroundings
 CANDIDATE_REACH = 2
 COST_OF_CANDIDATES = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
 # The cost of heights far from what the tie points suggest, at the coarsest level.
-COST_BEYOND_EXPECTED = DistanceCost(np.float32(0.0), np.float32(15.0), np.float32(60.0))
+COST_BEYOND_EXPECTED = DistanceCost(np.float32(0.0), np.float32(5.0), np.float32(20.0))
 # Where jumps become cheaper, heights far from the surface of the first aggregation become more expensive: so many steps
 # of the finest level are free, below and above the heights of NEARBY_CELLS.
 NEARBY_CELLS = np.ones((5, 5), np.uint8)

@@ -18,6 +18,7 @@ from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
 from zlocus.matching.cost_volume import cost_volume
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
+from zlocus.matching.expected_heights import expected_of_searched
 from zlocus.matching.fill import filled
 from zlocus.matching.finest_level import ortho_of_surface, refined_surface, with_planes_of_segments
 from zlocus.matching.free_rays import add_costs_of_rays
@@ -41,7 +42,7 @@ from zlocus.matching.occlusion import (
     keep_both_views_of_pairs,
     mark_occlusions,
 )
-from zlocus.matching.overlap import CoarsestHeights, OverlapGround, SearchBounds, find_overlap_window, overlap_ground
+from zlocus.matching.overlap import CoarsestHeights, ExpectedBounds, OverlapGround, find_overlap_window, overlap_ground
 from zlocus.matching.pair_labels import PairLabels, TileLabels, label_pairs_at_ties
 from zlocus.matching.prior_costs import (
     add_costs_beyond_expected,
@@ -257,7 +258,7 @@ def ground_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> Overla
     result, level, prior = coarsest_match.result, coarsest_match.result.level, coarsest_match.prior
     heights = CoarsestHeights(
         result.tile_views, result.lattice, result.visible, level.window, level.number, result.heights.vertex,
-        SearchBounds(prior.low, prior.high),
+        ExpectedBounds(*expected_of_searched(tile.match_scene, level, prior)),
     )  # fmt: skip
     return overlap_ground(tile.view_pixels, heights, level.n_steps, level.cell_size)
 

@@ -91,7 +91,7 @@ class OrientationOptions(Checked):
         2.0, "Height range from ties: margin added below, for streets without ties.", low=0.0, high=2000.0, unit="m",
     )  # fmt: skip
     search_up_m: float = option(
-        72.0, "Heights above the range from ties at which a surface is found only where the images clearly agree.",
+        130.0, "Heights above the range from ties at which a surface is found only where the images clearly agree.",
         low=0.0, high=2000.0, unit="m",
     )  # fmt: skip
     search_down_m: float = option(
