@@ -23,7 +23,7 @@ def all_kernels():
     found = {}
     packages = (zlocus.matching.kernels, zlocus.orientation.kernels)
     names = [f"{package.__name__}.{m.name}" for package in packages for m in pkgutil.iter_modules(package.__path__)]
-    for name_of_module in [*names, "zlocus.products.shade_kernel"]:
+    for name_of_module in [*names, "zlocus.products.shade_kernel", "zlocus.sensors.straighten_kernel"]:
         loaded = importlib.import_module(name_of_module)
         source = inspect.getsource(loaded)
         for comment, name in re.findall(r"# (.*)\n@(?:parallel_)?kernel\ndef (\w+)\(", source):

@@ -105,6 +105,7 @@ def test_the_report_is_plain_and_says_what_was_not_applied(oriented):
     assert list(report["views"]) == ["view0", "view1", "view2"]
     assert set(report["views"]["view1"]) == {
         "sensor", "shift_px", "n_ties", "residual_before_px", "residual_after_px",
+        "line_shifts_px",
     }  # fmt: skip
     assert report["pairs"][0]["views"] == ["view0", "view1"]
     assert "3 of the 6" in report["unobservable"]

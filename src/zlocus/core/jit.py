@@ -21,7 +21,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 MIN_FREE_BYTES = 50_000_000
 # Files of the package whose content compiled kernels depend on: Numba looks at a kernel's own file alone, but a kernel
 # contains the code of the kernels that it calls and the values of the constants that it uses.
-KERNEL_FILES = ("core/jit.py", "*/kernels/*.py", "products/shade_kernel.py", "synthetic/*.py")
+KERNEL_FILES = ("core/jit.py", "*/kernels/*.py", "products/shade_kernel.py", "sensors/*_kernel.py", "synthetic/*.py")
 
 
 def cache_folder(package: Path) -> Path | None:

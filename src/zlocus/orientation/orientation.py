@@ -13,6 +13,7 @@ from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.corrections import CameraSolver, excluded_images_of, without_contradicting_images
+from zlocus.orientation.line_adjustment import estimated_line_shifts, no_line_shifts, without_line_shifts
 from zlocus.orientation.parameter_groups import needs_bundle_adjustment
 from zlocus.orientation.plausibility import Doubt, ExcludedImage, doubts_about
 from zlocus.orientation.tie_heights import supported
@@ -22,6 +23,7 @@ from zlocus.orientation.tie_residuals import PairOrientation, ViewOrientation, p
 from zlocus.orientation.ties import Progress, find_ties, sift_tolerance_factor
 from zlocus.orientation.triangulate import Observations, ground_jacobian
 from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.line_shifts import StraightenedImage
 
 if TYPE_CHECKING:
     from zlocus.orientation.bundle_adjustment import BundleAdjustment
@@ -52,12 +54,12 @@ class Orientation:
     """Corrections of the cameras, and the ties they rest on.
 
     xyz : (n, 3) m, ground points of the ties, with the corrections applied; sigma_z_m : (n,) standard deviations of
-    their heights; observations : their image points. model : the kind of correction (shift, joint or none);
-    n_determined : how many directions of the corrections the ties determine (of the shifts' 2 i components, or of the
-    bundle adjustment's parameters). z_bounds : heights (m) within which ties were searched. n_refined : the first so
-    many ties were refined and agree with the adjustment, the others were not, see `with_rough_ties`. bundle_adjustment
-    : None where none was made. refined_ties : the measurements in the images. excluded_images : images that take no
-    part in the matching. doubts : about the cameras.
+    their heights; observations : their image points, without the displacements of lines. model : the kind of correction
+    (shift, joint or none); n_determined : how many directions of the corrections the ties determine (of the shifts' 2 i
+    components, or of the bundle adjustment's parameters). z_bounds : heights (m) within which ties were searched.
+    n_refined : the first so many ties were refined and agree with the adjustment, the others were not, see
+    `with_rough_ties`. bundle_adjustment : None where none was made. refined_ties : the measurements in the images.
+    excluded_images : images that take no part in the matching. doubts : about the cameras.
     """
 
     views: tuple[ViewOrientation, ...]
@@ -94,14 +96,18 @@ class Orientation:
         return self.xyz[: self.n_refined]
 
     def apply(self, scene: Scene) -> Scene:
-        """The scene with corrected sensors."""
-        if self.bundle_adjustment is not None:
-            pairs = zip(scene.views, self.bundle_adjustment.sensors, strict=True)
-            return replace(scene, views=tuple(replace(view, sensor=sensor) for view, sensor in pairs))
+        """The scene with corrected sensors, and with images whose lines lie where the sensors say."""
         views = []
-        for view, found in zip(scene.views, self.views, strict=True):
-            moved = found.shift_px != (0.0, 0.0)
-            views.append(replace(view, sensor=ShiftedModel(view.sensor, *found.shift_px)) if moved else view)
+        for number, (view, found) in enumerate(zip(scene.views, self.views, strict=True)):
+            sensor, image = view.sensor, view.image
+            if self.bundle_adjustment is not None:
+                sensor = self.bundle_adjustment.sensors[number]
+            elif found.shift_px != (0.0, 0.0):
+                sensor = ShiftedModel(sensor, *found.shift_px)
+            if found.line_shifts is not None:
+                image = StraightenedImage(image, found.line_shifts)
+            is_as_before = sensor is view.sensor and image is view.image
+            views.append(view if is_as_before else replace(view, sensor=sensor, image=image))
         return replace(scene, views=tuple(views))
 
     @property
@@ -135,6 +141,7 @@ class Orientation:
                     "n_ties": v.n_ties,
                     "residual_before_px": v.residuals_before.as_dict(),
                     "residual_after_px": v.residuals_after.as_dict(),
+                    "line_shifts_px": None if v.line_shifts is None else v.line_shifts.as_dict(),
                 }
                 for v in self.views
             },
@@ -176,11 +183,19 @@ def orient(
     strict = replace(options, inlier_px=options.inlier_px * INLIER_SHARE_OF_REFINED_TIES)
     solver = CameraSolver(scene, strict, options.model == "joint", request.control, request.terrain)
     cameras, wrong, contradictions = without_contradicting_images(solver, refined.observations, xyz)
+    line_shifts = no_line_shifts(scene.views)
+    if options.line_shifts and options.model != "none":
+        line_shifts = estimated_line_shifts(scene.views, cameras.adjustment)
+    if any(line_shifts):
+        straight = without_line_shifts(refined.observations, line_shifts)
+        cameras, wrong, contradictions = without_contradicting_images(solver, straight, xyz)
     adjustment, sensors = cameras.adjustment, cameras.sensors
-    rough = ties.observations.kept(~np.isin(ties.observations.view, wrong))
+    rough = without_line_shifts(ties.observations.kept(~np.isin(ties.observations.view, wrong)), line_shifts)
     rough_inlier_px = options.inlier_px * sift_tolerance_factor(scene.views, options)
     tie_points = with_rough_ties(adjustment, sensors, rough, xyz, rough_inlier_px)
-    views = tuple(view_orientation(view, i, adjustment, sensors[i]) for i, view in enumerate(scene.views))
+    views = tuple(
+        view_orientation(view, i, adjustment, sensors[i], line_shifts[i]) for i, view in enumerate(scene.views)
+    )
     heights = tie_points.xyz[supported(tie_points.xyz, tie_points.sigma_z_m), 2]
     doubts = doubts_about(scene.views, [v.residuals_after.median for v in views], [v.shift_px for v in views], heights)
     return Orientation(

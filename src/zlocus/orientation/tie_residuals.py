@@ -14,6 +14,7 @@ from zlocus.orientation.epipolar import Sightlines, epipolar_offsets
 from zlocus.orientation.parameter_groups import kind_of
 from zlocus.orientation.shift_adjustment import Adjustment
 from zlocus.orientation.triangulate import Observations, rows_of_views
+from zlocus.sensors.line_shifts import LineShifts
 
 # Points of which it is computed at once which images see them, so that the memory for it stays small.
 POINTS_AT_ONCE = 4096
@@ -49,7 +50,7 @@ class ViewOrientation:
 
     shift_px : (column, row) added to what its sensor model projects; where more than a shift was corrected, the median
     of the correction at its ties; residuals_before, residuals_after : of its ties; sensor : see
-    `parameter_groups.kind_of`.
+    `parameter_groups.kind_of`; line_shifts : displacements of its lines, None where there are none.
     """
 
     name: str
@@ -58,6 +59,7 @@ class ViewOrientation:
     residuals_before: Residuals
     residuals_after: Residuals
     sensor: str = "rpc"
+    line_shifts: LineShifts | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,13 @@ class PairOrientation:
     epipolar_distance_after_px: float
 
 
-def view_orientation(view: View, number: int, adjustment: Adjustment, corrected_sensor: SensorModel) -> ViewOrientation:
+def view_orientation(
+    view: View,
+    number: int,
+    adjustment: Adjustment,
+    corrected_sensor: SensorModel,
+    line_shifts: LineShifts | None = None,
+) -> ViewOrientation:
     """Correction and residuals of the view of that number. corrected_sensor : its sensor, but for its shift."""
     mine = adjustment.observations.view == number
     column, row = adjustment.shift_px[number]
@@ -81,7 +89,7 @@ def view_orientation(view: View, number: int, adjustment: Adjustment, corrected_
         column, row = np.nanmedian(moved, axis=0)
     before, after = Residuals.of(adjustment.before_px[mine]), Residuals.of(adjustment.after_px[mine])
     shift = (float(column), float(row))
-    return ViewOrientation(view.name, shift, int(mine.sum()), before, after, kind_of(view.sensor))
+    return ViewOrientation(view.name, shift, int(mine.sum()), before, after, kind_of(view.sensor), line_shifts)
 
 
 def pair_orientations(

@@ -79,6 +79,9 @@ class OrientationOptions(Checked):
         20.0, "Standard deviation of every image's shift before the adjustment. This weak prior fixes the datum.",
         low=0.1, high=1000.0, unit="px",
     )  # fmt: skip
+    line_shifts: bool = option(
+        True, "Estimate from the ties how lines of satellite images are displaced in slow waves, and put them right."
+    )
     range_margin: float = option(
         0.2, "Height range from ties: margin added at both ends, as a share of the range of the ties' heights.",
         low=0.0, high=10.0,
