@@ -43,27 +43,32 @@ from zlocus.pipeline import tile_run
 CALIBRATION = Path(__file__).resolve().parents[1] / "src" / "zlocus" / "matching" / "precision_calibration.py"
 SIZE, POINTING_PX = 520, 2.0
 # (kind, seed): those that calibrate, and those that judge.
-TRAINING = (("city", 61), ("city", 62), ("city", 63), ("hills", 61), ("hills", 62))
-JUDGED = (("city", 16), ("city", 20), ("hills", 43), ("hills", 50))
-VIEWS = {6: ("n1", "f1", "b1", "n2", "f2", "b2"), 3: ("n1", "f1", "b1"), 2: ("n1", "f1")}
+TRAINING = (
+    ("city", 61), ("city", 62), ("city", 63), ("hills", 61), ("hills", 62), *(("real", seed) for seed in range(61, 67)),
+)  # fmt: skip
+JUDGED = (("city", 16), ("city", 20), ("hills", 43), ("hills", 50), ("real", 71), ("real", 72))
+# Realistic scenes have no b2; s1 is their sixth view.
+VIEWS = {6: ("n1", "f1", "b1", "n2", "f2", "b2", "s1"), 3: ("n1", "f1", "b1"), 2: ("n1", "f1")}
 MARGIN_M, LARGE_ERROR_M = 10.0, 1.0
 KNOTS, SMOOTHNESS, LEAST_ERROR_STEPS = 9, 0.02, 1e-3
+# Bounds of the logarithm of the error that displaced lines leave, as a share of their displacement.
+LOG_OF_LINES = (-4.0, 1.5)
 # What is asked of one and of two sigma, and what each weighs; of each run at least and at most so many cells, each
 # class so much.
 # Predictors that may only raise sigma (1) or lower it (-1).
 DIRECTION = {
     "noise": 1, "group_distance": 1, "roughness": 1, "cell_roughness": 1, "spread": 1, "refinement": 1,
-    "curvature": -1, "ncc": -1, "uniqueness": -1,
+    "curvature": -1, "ncc": -1, "uniqueness": -1, "texture": -1,
 }  # fmt: skip
 ASKED = ((0.68, 0.0, 1.0), (0.94, float(np.log(2.0)), 2.0))
-FEWEST, CELLS, CLASS_WEIGHT = 5000, 60000, {"ground": 1.0, "building": 0.4, "tree": 0.3}
+FEWEST, CELLS, CLASS_WEIGHT = 5000, 60000, {"ground": 1.0, "building": 0.4, "tree": 0.05}
 
 
 @dataclass(frozen=True)
 class Sample:
     """Cells of a run with known errors: predictors, error_m, kind (index in CLASS_NAMES), (n,) each.
 
-    step_m : height step of the run.
+    step_m : height step of the run; line_shift_steps : see `MatchScene`.
     """
 
     predictors: dict[str, np.ndarray]
@@ -71,6 +76,7 @@ class Sample:
     error_m: np.ndarray
     kind: np.ndarray
     step_m: float
+    line_shift_steps: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -88,9 +94,9 @@ def watched(found: list[tuple[Any, ...]]):
     predict, refine, match = finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile
     last: dict[str, Any] = {}
 
-    def predicted(predictors, refined):
+    def predicted(predictors, refined, line_shift_steps):
         last.update(predictors=predictors, is_refined=refined.is_refined)
-        return predict(predictors, refined)
+        return predict(predictors, refined, line_shift_steps)
 
     def refined(tile_inputs, result, *rest):
         last["window"] = result.level.window
@@ -115,7 +121,7 @@ def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]
     with rasterio.open(folder / "truth_dsm.tif") as file:
         bounds, crs, cell = file.bounds, file.crs.to_string(), 2 * file.res[0]
     found: list[tuple[Any, ...]] = []
-    images = [str(folder / f"img_{name}.tif") for name in views]
+    images = [str(path) for name in views if (path := folder / f"img_{name}.tif").exists()]
     with watched(found):
         run_here(["dsm", *images, "-o", str(out), "--crs", crs, "--resolution", str(cell), "--bounds",
                   *map(str, bounds), "--overwrite", "--workers", "1", "--no-report"])  # fmt: skip
@@ -125,12 +131,13 @@ def run(folder: Path, views: tuple[str, ...], out: Path) -> list[tuple[Any, ...]
 def errors_of(folder: Path, dsm: Path) -> tuple[TruthBlocks, np.ndarray, np.ndarray]:
     """Blocks of truth, where each is looked up in the surface (n, 2), and the errors there (n,) m, NaN where empty.
 
-    A common shift of the ground, which no matcher can see, is removed where the RPCs have pointing errors.
+    A common shift of the ground, which no matcher can see, is removed where the RPCs have pointing errors (all but
+    those of towns).
     """
     surface, heights = read_heights(dsm), read_heights(folder / "truth_dsm.tif")
     truth = truth_blocks(heights, MARGIN_M, read_classes(folder / "truth_class.tif", heights))
     xy = truth.xy
-    if "hills" not in folder.name:
+    if "city" in folder.name or "town" in folder.name:
         return truth, xy, truth.errors(surface.nearest(xy))
     xy = xy + np.array(best_shift(surface, truth, Points(xy)))
     errors = truth.errors(surface.bilinear(xy))
@@ -159,7 +166,8 @@ def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
         parts.append(({k: v[cell] for k, v in predictors.items()}, is_refined[cell], errors[inside], kind[inside]))
     return Sample(
         {k: np.concatenate([part[0][k] for part in parts]) for k in parts[0][0]},
-        *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)), tiles[0][4].height_step,
+        *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)),
+        tiles[0][4].height_step, tiles[0][4].line_shift_steps,
     )  # fmt: skip
 
 
@@ -220,7 +228,7 @@ def enough(samples: list[Sample], rows: list[np.ndarray], fewest: int, kind: str
 def part(one: Sample, rows: np.ndarray) -> Sample:
     """Some cells of a sample."""
     predictors = {k: v[rows] for k, v in one.predictors.items()}
-    return Sample(predictors, one.is_refined[rows], one.error_m[rows], one.kind[rows], one.step_m)
+    return Sample(predictors, one.is_refined[rows], one.error_m[rows], one.kind[rows], one.step_m, one.line_shift_steps)
 
 
 def fit_model(samples: list[Sample]) -> dict[str, Any]:
@@ -237,6 +245,7 @@ def fit_model(samples: list[Sample]) -> dict[str, Any]:
     pooled = {k: np.concatenate([s.predictors[k][r] for s, r in rows]) for k in samples[0].predictors}
     refined = np.concatenate([s.is_refined[r] for s, r in rows])
     target = np.concatenate([np.log(np.abs(s.error_m[r]) / s.step_m + LEAST_ERROR_STEPS) for s, r in rows])
+    displaced = np.concatenate([np.full(len(r), s.line_shift_steps) for s, r in rows])
     weight = np.concatenate(weights)
     weight /= weight.mean()
     grid = {k: np.quantile(v, [0.005, 0.995]) for k, v in pooled.items()}
@@ -249,28 +258,30 @@ def fit_model(samples: list[Sample]) -> dict[str, Any]:
         for k in range(KNOTS - 2):
             bend[i * (KNOTS - 2) + k, i * KNOTS + k : i * KNOTS + k + 3] = [1, -2, 1]
 
-    def loss(b: np.ndarray) -> tuple[float, np.ndarray]:
-        predicted = design @ b.astype(np.float32)
+    whole, bounds = rising(list(grid), design.shape[1])
+
+    def loss(unknowns: np.ndarray) -> tuple[float, np.ndarray]:
+        b, of_lines = whole @ unknowns[:-1], np.exp(unknowns[-1])
+        of_cells = np.exp(2 * (design @ b.astype(np.float32)))
+        of_both = of_cells + (of_lines * displaced) ** 2
+        predicted, share_of_cells = 0.5 * np.log(of_both), of_cells / of_both
         value, slope = 0.0, np.zeros(len(target))
         for asked, above, share in ASKED:
             r = target - predicted - above
             soft = 0.05
             value += share * float(np.mean(weight * (asked * r + soft * np.logaddexp(0, -r / soft))))
             slope += share * (asked - 1 / (1 + np.exp(np.clip(r / soft, -50, 50))))
-        bent = bend @ b
-        gradient = -(design.T @ (weight * slope).astype(np.float32)) / len(target)
-        return value + SMOOTHNESS * bent @ bent + 1e-5 * b @ b, gradient + 2 * SMOOTHNESS * bend.T @ bent + 2e-5 * b
+        bent, slope = bend @ b, weight * slope
+        gradient = -(design.T @ (slope * share_of_cells).astype(np.float32)) / len(target)
+        gradient = gradient + 2 * SMOOTHNESS * bend.T @ bent + 2e-5 * b
+        by_lines = -float(np.mean(slope * (1 - share_of_cells)))
+        return value + SMOOTHNESS * bent @ bent + 1e-5 * b @ b, np.append(whole.T @ gradient, by_lines)
 
-    whole, bounds = rising(list(grid), design.shape[1])
-
-    def loss_of_steps(steps: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = loss(whole @ steps)
-        return value, whole.T @ gradient
-
-    start = np.zeros(design.shape[1])
-    b = whole @ minimize(loss_of_steps, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 800}).x
+    start, bounds = np.append(np.zeros(design.shape[1]), -1.0), [*bounds, LOG_OF_LINES]
+    unknowns = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 800}).x
+    b = whole @ unknowns[:-1]
     curves = {k: (*grid[k], b[i * KNOTS : (i + 1) * KNOTS]) for i, k in enumerate(grid)}
-    return {"curves": curves, "constant": b[-2], "not_refined": b[-1]}
+    return {"curves": curves, "constant": b[-2], "not_refined": b[-1], "of_lines": float(np.exp(unknowns[-1]))}
 
 
 def write(model: dict[str, Any], path: Path) -> None:
@@ -279,12 +290,13 @@ def write(model: dict[str, Any], path: Path) -> None:
         '"""Curves of the precision model, made by benchmarks/precision.py; not to be edited."""', "",
         "from __future__ import annotations", "",
         "# fmt: off",
-        "# The logarithm of sigma: a constant; what is added where a height was not refined; and for each predictor",
-        "# the position of the first knot, the spacing of the knots, and the logarithm of the factor at each knot.",
-        "Model = tuple[float, float, dict[str, tuple[float, float, tuple[float, ...]]]]",
+        "# The logarithm of sigma: a constant; what is added where a height was not refined; the error that displaced",
+        "# lines leave, as a share of their displacement, whose square is added; and for each predictor the position",
+        "# of the first knot, the spacing of the knots, and the logarithm of the factor at each knot.",
+        "Model = tuple[float, float, float, dict[str, tuple[float, float, tuple[float, ...]]]]",
     ]  # fmt: skip
     for kind, one in model.items():
-        lines.append(f"{kind}: Model = ({one['constant']:.4f}, {one['not_refined']:.4f}, {{")
+        lines.append(f"{kind}: Model = ({one['constant']:.4f}, {one['not_refined']:.4f}, {one['of_lines']:.4f}, {{")
         for name, (first, spacing, curve) in one["curves"].items():
             if not np.isfinite([first, spacing, *curve]).all():
                 raise ValueError(f"The curve of {name} is not finite: look at its values before anything is written.")
@@ -295,12 +307,13 @@ def write(model: dict[str, Any], path: Path) -> None:
 
 def predicted_sigma(model: dict[str, Any], one: Sample) -> np.ndarray:
     """Sigma of a sample by a model, m (n,)."""
-    split, total = is_split(one.predictors), np.zeros(len(one.error_m))
+    split, total, left = is_split(one.predictors), np.zeros(len(one.error_m)), np.zeros(len(one.error_m))
     for kind, rows in (("SPLIT", split), ("PAIR", ~split)):
         total[rows] = model[kind]["constant"] + np.where(one.is_refined[rows], 0, model[kind]["not_refined"])
         for name, (first, spacing, curve) in model[kind]["curves"].items():
             total[rows] += hats(one.predictors[name][rows], first, spacing) @ curve
-    return np.exp(total) * one.step_m
+        left[rows] = model[kind]["of_lines"] * one.line_shift_steps
+    return np.hypot(np.exp(total), left) * one.step_m
 
 
 def judgement(judged: Judged) -> str:
@@ -350,7 +363,8 @@ def rendered(kind: str, seed: int, out: Path) -> Path:
     folder = out / f"{kind}-{seed}"
     if not folder.exists():
         pointing = ["--pointing", str(POINTING_PX)] if kind == "hills" else []
-        command = ["--kind", kind, "--seed", str(seed), "--size", str(SIZE), "--views", "6", *pointing]
+        size = [] if kind == "real" else ["--size", str(SIZE), "--views", "6"]
+        command = ["--kind", kind, "--seed", str(seed), *size, *pointing]
         subprocess.run([sys.executable, "-m", "zlocus.synthetic", "-o", str(folder), *command], check=True)
     return folder
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from zlocus.matching import precision
 from zlocus.matching.kernels.precision import add_curve
 from zlocus.matching.match_curve import predicted_sigma
 from zlocus.matching.precision import MIN_ROUGHNESS_STEPS, is_split, sigma_steps, spread_around, uncertainty_predictors
@@ -39,9 +40,9 @@ def semi_global(height) -> SemiGlobalHeights:
     return SemiGlobalHeights(best, best, np.full(SHAPE, 500, np.uint16), np.asarray(height, np.float32))
 
 
-def predictors(found: RefinedHeights, n_seeing=4, vertex=None):
+def predictors(found: RefinedHeights, n_seeing=4, vertex=None, texture=0.3):
     heights = semi_global(found.height if vertex is None else vertex)
-    return uncertainty_predictors(heights, found, np.full(SHAPE, n_seeing))
+    return uncertainty_predictors(heights, found, np.full(SHAPE, n_seeing), np.full(SHAPE, texture, np.float32))
 
 
 def sigma(found: RefinedHeights, **kwargs) -> np.ndarray:
@@ -101,7 +102,7 @@ def test_every_predictor_has_a_curve_and_every_cell_a_sigma():
         group_distance=np.full(SHAPE, np.nan, np.float32), curvature=np.zeros(SHAPE, np.float32),
         ncc=np.full(SHAPE, -1, np.float32), is_refined=np.zeros(SHAPE, bool),
     )  # fmt: skip
-    assert set(predictors(nothing)) == set(PAIR[2]) == set(SPLIT[2])
+    assert set(predictors(nothing)) == set(PAIR[3]) == set(SPLIT[3])
     for n_seeing in (0, 1, 2, 200):
         found = sigma(nothing, n_seeing=n_seeing)
         assert found.dtype == np.float32
@@ -116,14 +117,43 @@ def test_each_cell_has_the_sigma_of_its_model(is_known):
     group_distance[is_known] = 0.3
     height = rng.normal(20, 1, SHAPE).astype(np.float32)
     found = refined(group_distance=group_distance, height=height, is_refined=rng.random(SHAPE) < 0.5)
-    said = predictors(found)
-    split, sigmas = is_split(said), sigma_steps(said, found)
+    said, line_shift_steps = predictors(found), 0.2
+    split, sigmas = is_split(said), sigma_steps(said, found, line_shift_steps)
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
-        constant, not_refined, curves = model
+        constant, not_refined, of_lines, curves = model
         expected = constant + np.where(found.is_refined, 0.0, not_refined)
         for name, (first, spacing, curve) in curves.items():
             expected += np.interp(said[name], first + spacing * np.arange(len(curve)), curve)
+        expected = np.log(np.hypot(np.exp(expected), of_lines * line_shift_steps))
         np.testing.assert_allclose(np.log(sigmas[cells]), expected[cells], rtol=0, atol=LOGARITHM)
+
+
+def test_displaced_lines_are_an_error_of_their_own():
+    found = refined()
+    without, with_lines = (sigma_steps(predictors(found), found, steps) for steps in (0.0, 0.5))
+    of_lines = SPLIT[2]
+    assert of_lines > 0.1
+    np.testing.assert_allclose(with_lines, np.hypot(without, of_lines * 0.5), rtol=LOGARITHM)
+
+
+def test_a_place_without_texture_is_less_precise():
+    found = refined()
+    plain, textured = (sigma_steps(predictors(found, texture=texture), found) for texture in (0.0, 0.3))
+    assert (plain > 1.1 * textured).all()
+
+
+def test_texture_is_that_of_the_views_that_cover_a_cell(monkeypatch):
+    stripes = np.broadcast_to(np.where(np.arange(SHAPE[1]) % 2, 1.0, -1.0).astype(np.float32), SHAPE)
+    orthos = [np.ascontiguousarray(stripes), np.zeros(SHAPE, np.float32)]
+    monkeypatch.setattr(precision, "ortho_image", lambda tile_views, height, view: orthos[view])
+    is_covered = np.ones((2, *SHAPE), bool)
+    is_covered[1, :, :10] = False
+    is_covered[:, :5] = False
+    found = precision.texture_around(None, np.zeros(SHAPE, np.float32), is_covered)
+    of_stripes = np.sqrt(1.0 - 1.0 / 25.0)  # of 5 x 5 cells, two or three columns are bright
+    np.testing.assert_allclose(found[8:-3, 3:10], of_stripes, atol=LOGARITHM)
+    np.testing.assert_allclose(found[8:-3, 10:-3], of_stripes / 2, atol=LOGARITHM)
+    assert (found[:5] == 0.0).all()
 
 
 @pytest.mark.parametrize(

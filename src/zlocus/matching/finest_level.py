@@ -16,7 +16,7 @@ from zlocus.matching.local_contrast import texture_unit
 from zlocus.matching.occlusion import covers, excluded_view_mask, n_seeing
 from zlocus.matching.overlap import OverlapGround, unsupported
 from zlocus.matching.plane_fitting import PlanarHeights, with_planes
-from zlocus.matching.precision import sigma_steps, spread_around, uncertainty_predictors
+from zlocus.matching.precision import sigma_steps, spread_around, texture_around, uncertainty_predictors
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.subpixel import refine
 from zlocus.matching.surface import Surface
@@ -64,15 +64,17 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
         result.tile_views, splines, result.heights.vertex, result.visible, match_scene.step_cells, config.refine,
         result.is_planar,
     )  # fmt: skip
-    n_covering = covers(result.visible).sum(axis=0)
+    is_covered = covers(result.visible)
+    n_covering = is_covered.sum(axis=0)
     n_views = n_seeing(result.visible, refined.height)
-    predictors = uncertainty_predictors(result.heights, refined, n_views)
+    texture = texture_around(result.tile_views, refined.height, is_covered)
+    predictors = uncertainty_predictors(result.heights, refined, n_views, texture)
     last_index = match_scene.n_steps - 1
     group_distance = np.exp(predictors["group_distance"])
     quality = judge(result.heights, refined, n_covering, n_views, group_distance, last_index, config.checks)
     _mark_overlap(quality, result, ground, refined.height)
     height = result.lattice.metres(refined.height)
-    sigma = sigma_steps(predictors, refined)
+    sigma = sigma_steps(predictors, refined, match_scene.line_shift_steps)
     is_uneven = spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps
     is_noise = ground.is_at_edge_in(result.level.window) & is_uneven
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)

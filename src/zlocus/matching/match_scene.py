@@ -48,7 +48,8 @@ class MatchScene:
     cells extend; dem_limits : (2, r, c) float32, lowest and highest height to search on the cells of `overlap_window`
     at the coarsest level, NaN where the terrain model has no height; None without one; trusted_ties : (k, 3) those of
     the ties that neighbours confirm; expected_range : lowest and highest height at which they suggest a surface, None
-    where they suggest nothing.
+    where they suggest nothing; line_shift_steps : root mean square displacement of the lines of the images that ties
+    showed and that was put right, as a height: what they do not show is as large.
 
     Lengths and heights are metres on the ground. In image space (`zlocus.matching.image_space`) the ground is a
     reference image: lengths are its pixels, and heights are hypotheses along its rays. That is why these names have no
@@ -68,6 +69,7 @@ class MatchScene:
     dem_limits: NDArray[np.float32] | None = field(default=None, repr=False)
     trusted_ties: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)), repr=False)
     expected_range: tuple[float, float] | None = None
+    line_shift_steps: float = 0.0
 
     @property
     def z_range(self) -> tuple[float, float]:

@@ -15,28 +15,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.matching.kernels.precision import add_curve
+from zlocus.matching.local_contrast import deviation
 from zlocus.matching.median import median
 from zlocus.matching.precision_calibration import PAIR, SPLIT
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.subpixel import MIN_PEAK_CURVATURE, RefinedHeights
+from zlocus.matching.tile_views import TileViews
+from zlocus.matching.true_ortho import ortho_image
 
 FloatGrid = NDArray[np.float32]
 # Sides of the windows around a cell from which predictors of the surface are computed.
 NEAR_CELLS, WIDE_CELLS = 5, 9
 # Side of the window from which the spread of heights and the distance of the groups of image pairs are computed.
 AROUND_CELLS = 7
+TEXTURE_WINDOW = (NEAR_CELLS, NEAR_CELLS)
 # Constants that keep logarithms finite: roughness and spread, distance of groups, range, refinement (all steps), and
 # uniqueness (path cost units).
 MIN_ROUGHNESS_STEPS, MIN_GROUP_DISTANCE_STEPS, MIN_RANGE_STEPS, MIN_REFINEMENT_STEPS = 0.03, 0.01, 0.1, 0.05
 MIN_UNIQUENESS, MAX_UNIQUENESS = 20, 2000.0
+# The same for texture, in standard deviations of the grey values of an image.
+MIN_TEXTURE = 0.01
 
 
-def sigma_steps(predictors: dict[str, FloatGrid], refined: RefinedHeights) -> FloatGrid:
-    """Standard deviation of the heights in steps, (r, c) float32. predictors : see `uncertainty_predictors`."""
+def sigma_steps(predictors: dict[str, FloatGrid], refined: RefinedHeights, line_shift_steps: float = 0.0) -> FloatGrid:
+    """Standard deviation of the heights in steps, (r, c) float32.
+
+    predictors : see `uncertainty_predictors`; line_shift_steps : see `MatchScene`: displacements of lines along the
+    parallax, which nothing shows, are as large as those across it, and their errors come on top of all others.
+    """
     sigma, split = np.empty(refined.height.shape, np.float32), is_split(predictors)
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         if cells.any():
-            constant, not_refined, curves = model
+            constant, not_refined, of_lines, curves = model
             # Most tiles need one model only; then no cells are selected, which saves copies.
             of_model = ... if cells.all() else cells
             is_refined = refined.is_refined[of_model]
@@ -44,7 +54,8 @@ def sigma_steps(predictors: dict[str, FloatGrid], refined: RefinedHeights) -> Fl
             for name, (first, spacing, curve) in curves.items():
                 values = predictors[name][of_model].ravel()
                 add_curve(values, np.float32(first), np.float32(spacing), np.array(curve, np.float32), total)
-            sigma[of_model] = np.exp(total, out=total).reshape(is_refined.shape)
+            of_cells = np.exp(total, out=total).reshape(is_refined.shape)
+            sigma[of_model] = np.hypot(of_cells, np.float32(of_lines * line_shift_steps))
     return sigma
 
 
@@ -66,7 +77,7 @@ def is_split(predictors: dict[str, FloatGrid]) -> NDArray[np.bool_]:
 
 
 def uncertainty_predictors(
-    heights: SemiGlobalHeights, refined: RefinedHeights, n_seeing: NDArray[np.integer]
+    heights: SemiGlobalHeights, refined: RefinedHeights, n_seeing: NDArray[np.integer], texture: FloatGrid
 ) -> dict[str, FloatGrid]:
     """Predictors of the standard deviation of the heights, each (r, c) float32; logarithms but for `ncc` and `plane`.
 
@@ -76,7 +87,8 @@ def uncertainty_predictors(
     surface that the windows follow, around the cell and at the cell; spread : standard deviation of the heights around
     the cell; range_5, range_9 : highest minus lowest height within 5 and within 9 cells; uniqueness : by how much the
     path costs of the secondary minimum are larger; refinement : distance from the semi-global height; images : number
-    of images that see the cell; plane : 1 for the height of a plane through a plain segment, else 0.
+    of images that see the cell; plane : 1 for the height of a plane through a plain segment, else 0; texture : standard
+    deviation of the grey values around the cell, (r, c) in units of that of an image, see `texture_around`.
     """
     height, n_images = refined.height, np.maximum(n_seeing, 1).astype(np.float32)
     plain = cv2.medianBlur(height, NEAR_CELLS)
@@ -99,8 +111,20 @@ def uncertainty_predictors(
         "refinement": np.log(refinement + np.float32(MIN_REFINEMENT_STEPS)),
         "images": np.log(n_images),
         "plane": refined.is_fixed,
+        "texture": np.log(texture + np.float32(MIN_TEXTURE)),
     }
     return {name: values.astype(np.float32, copy=False) for name, values in predictors.items()}
+
+
+def texture_around(tile_views: TileViews, height: FloatGrid, is_covered: NDArray[np.bool_]) -> FloatGrid:
+    """Standard deviation of the grey values around every cell, (r, c), the mean of the views that cover it.
+
+    height : (r, c) float32 level indices; is_covered : (i, r, c), cells that each view covers. 0 where none does.
+    """
+    total = np.zeros(height.shape, np.float32)
+    for view, is_shown in enumerate(is_covered):
+        total += np.where(is_shown, deviation(ortho_image(tile_views, height, view), TEXTURE_WINDOW), np.float32(0.0))
+    return np.asarray(total / np.maximum(is_covered.sum(axis=0, dtype=np.float32), np.float32(1.0)), np.float32)
 
 
 def _group_distance(refined: RefinedHeights) -> FloatGrid:

@@ -27,7 +27,7 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import ConfigError, CoverageError, GeometryError
 from zlocus.core.footprints import area_to_match, check_overlap, ground_sample_distance
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
-from zlocus.core.options import OrientationOptions, RunConfig
+from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import SetupRequest
 from zlocus.core.resources import cores
@@ -37,7 +37,7 @@ from zlocus.io.grid_inputs import dem_datum, read_dem, read_geobox
 from zlocus.io.input_files import files_of
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, named_vertical_datum
-from zlocus.matching.ground_pixels import cell_side, check_resolution, median_ground_pixel
+from zlocus.matching.ground_pixels import cell_side, check_resolution, ground_pixels, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
@@ -198,6 +198,7 @@ def set_up_run(
     note_doubts(far, progress)
     match_scene = limited_by_dem(request, match_scene, scene.crs, config)
     match_scene = with_expected_heights(match_scene, orientation, height_range)
+    match_scene = with_line_shifts(match_scene, orientation, config.pyramid)
     return RunSetup(corrected, orientation, height_range, grid, match_scene, (*orientation.doubts, *far))
 
 
@@ -304,6 +305,19 @@ def with_expected_heights(match_scene: MatchScene, orientation: Orientation, hei
     """The match scene with the heights that tie points suggest, see `zlocus.matching.expected_heights`."""
     trusted = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     return replace(match_scene, trusted_ties=trusted, expected_range=height_range.expected)
+
+
+def with_line_shifts(match_scene: MatchScene, orientation: Orientation, options: PyramidOptions) -> MatchScene:
+    """The match scene with the size of the displacements of lines, as a height: a step shifts an image by
+    `pyramid.max_shift_px` of its pixels, or of the cells where these are larger."""
+    found = [v.line_shifts.rms_px for v in orientation.views if v.line_shifts is not None]
+    if not found:
+        return match_scene
+    z = sum(match_scene.z_range) / 2
+    pixel = float(np.median(ground_pixels(match_scene.views, z)))
+    shift_px = float(np.sqrt(np.mean(np.square(found).sum(axis=1))))
+    step_px = options.max_shift_px * max(match_scene.cell_size / pixel, 1.0)
+    return replace(match_scene, line_shift_steps=shift_px / step_px)
 
 
 def _crs_of(geobox: GeoBox) -> CRS:
