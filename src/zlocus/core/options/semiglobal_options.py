@@ -16,7 +16,7 @@ class SemiGlobalOptions(Checked):
         "Unset: 1 where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
     p1: int | None = option_by_method(
-        60, 20, "Penalty P1 of a height difference of one step between neighbours.", low=0, high=1000
+        45, 20, "Penalty P1 of a height difference of one step between neighbours.", low=0, high=1000
     )
     p1_two_images: int | None = option_by_method(
         110, 20, "Penalty P1 in scenes of two images: the match curves of a single pair are noisy.", low=0, high=1000
