@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +13,19 @@ from pyproj import CRS
 from orientation_scenes import image_of
 from zlocus.core.errors import GeometryError
 from zlocus.core.footprints import is_shared
+from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
+from zlocus.core.requests import SetupRequest
 from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import capped, lowest_station
 from zlocus.orientation.ties import height_slabs
-from zlocus.pipeline.height_range import LOWEST_LAND_M, heights_below_cameras, possible_heights, range_below_cameras
+from zlocus.pipeline.height_range import (
+    LOWEST_LAND_M,
+    height_range_of_run,
+    heights_below_cameras,
+    possible_heights,
+    range_below_cameras,
+)
 from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -83,6 +92,19 @@ def test_heights_asked_for_are_searched_up_to_the_cameras():
     assert "100 to 1250 m" in notes.said[0]
     assert "1300.0 m" in notes.said[0]
     assert "1150.0 m are searched" in notes.said[0]
+
+
+@pytest.mark.parametrize(("method", "is_wider"), [("mvll-sgm", True), ("mvll", False), ("gc3-sgm", False)])
+def test_only_costs_as_evidence_search_beyond_the_expected_heights(method, is_wider):
+    rng = np.random.default_rng(1)
+    xyz = np.column_stack([rng.uniform(0.0, 300.0, (200, 2)), rng.uniform(100.0, 130.0, 200)])
+    ties = SimpleNamespace(xyz=xyz, sigma_z_m=np.full(200, 10.0), views=())
+    request, views = SetupRequest((), method=method), Scene((), CRS.from_epsg(32632))
+    found = height_range_of_run(request, views, ties, RunConfig(), SilentProgress())
+    assert found.expected[0] < 100.0
+    assert found.expected[1] > 130.0
+    assert (found.searched != found.expected) == is_wider
+    assert (found.searched[1] > found.expected[1] + 100.0) == is_wider
 
 
 def test_what_cannot_be_told_is_asked_for():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from zlocus.core.sensor_model import FloatArray
 
 KD_TREE = 4  # FLANN's exact k-d tree (KDTreeSingleIndex); its other trees are random
 

@@ -143,6 +143,7 @@ class SetupRequest:
     vertical: str = "ellipsoid"
     reference: str | None = None
     workers: int | None = None
+    method: str = "mvll-sgm"
 
     @classmethod
     def of(cls, request: object) -> SetupRequest:

@@ -3,8 +3,8 @@
 `height_range_of_run` decides, in this order: `--heights` or the heights of the scene file; `--dem`, extended by
 `pyramid.dem_down_m` and `pyramid.dem_up_m`; else the tie points: nearly all of their heights, with the margins
 `orientation.range_margin`, `range_up_m` and `range_down_m`, are where the surface is expected, and `search_up_m` and
-`search_down_m` beyond them are searched too (`zlocus.orientation.tie_heights.height_range_of_ties`). A range never
-reaches up to the lowest camera.
+`search_down_m` beyond them are searched too, but not for single cells and not in image space
+(`zlocus.orientation.tie_heights.height_range_of_ties`). A range never reaches up to the lowest camera.
 
 Two more modules limit heights. Before tie points are known, `possible_heights` says at which heights views are compared
 at all; where the cameras do not tell, a run needs `--heights`, also with `--dem`. And with `--dem` every cell of the
@@ -58,7 +58,9 @@ def height_range_of_run(
     if scene.heights:
         return HeightRange.limited_to(range_below_cameras(scene, scene.heights, progress))
     if request.dem is None:
-        return range_from_ties(scene, orientation, config.orientation)
+        found = range_from_ties(scene, orientation, config.orientation)
+        # Without evidence nothing tells a clear agreement from one by chance.
+        return found if request.method == "mvll-sgm" else HeightRange.limited_to(found.expected)
     z = possible_heights(scene, None)
     bounds = shared_ground(scene, (z[0], z[-1]))
     cell = median_ground_pixel(scene, sum(z) / len(z)) * 16

@@ -199,7 +199,7 @@ def set_up_images(scene: Scene, config: RunConfig, progress: Progress) -> ImageS
         check_overlap(scene, possible_heights(scene, scene.heights))
         orientation = orient_views(scene, options, progress)
         is_supported = supported(orientation.xyz, orientation.sigma_z_m)
-        z_range = scene.heights or range_from_ties(scene, orientation, options).searched
+        z_range = scene.heights or range_from_ties(scene, orientation, options).expected
         used = supported_views(orientation.apply(scene), orientation)
         return ImageSetup(used, orientation, orientation.xyz, is_supported, z_range)
     space = image_space(scene, scene.views[0].name, (0.0, 0.0))
