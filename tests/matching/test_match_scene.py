@@ -12,6 +12,7 @@ from orientation_scenes import image_of
 from rendered_scenes import CENTRE, UTM, line_scanner
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.grid import CellWindow
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import PyramidOptions
 from zlocus.core.scene import Scene, View
 from zlocus.matching.ground_pixels import check_resolution, median_ground_pixel
@@ -85,7 +86,8 @@ def test_ground_pixel_and_resolution():
 def test_the_match_scene_of_two_views():
     views = scene(view("n", 2), view("f", 20))
     ties = np.random.default_rng(1).uniform(-20, 20, (60, 3)) + np.array([*CENTRE, 60.0])
-    match_scene = build_match_scene(views, 0.5, (0.0, 0.0), (30.0, 90.0), ties, None, PyramidOptions())
+    heights = HeightRange.limited_to((30.0, 90.0))
+    match_scene = build_match_scene(views, 0.5, (0.0, 0.0), heights, ties, None, PyramidOptions())
     assert match_scene.views[0].name == "n"
     assert match_scene.n_steps == np.ceil(60 / match_scene.height_step)
     assert match_scene.height_origin == 30.0
@@ -95,6 +97,20 @@ def test_the_match_scene_of_two_views():
     assert transform * (0, 0) == (12.0, 8.0)
     assert transform.a == 2.0
     assert transform.e == -2.0
+
+
+def test_what_is_searched_beyond_the_expected_heights_changes_no_step():
+    """The step follows from the ground pixels at the heights expected, whatever else is searched."""
+    views, ties = scene(view("n", 2), view("f", 20)), np.empty((0, 3))
+
+    def found(searched):
+        heights = HeightRange(expected=(30.0, 90.0), searched=searched)
+        return build_match_scene(views, 0.5, (0.0, 0.0), heights, ties, None, PyramidOptions())
+
+    narrow, wide = found((30.0, 90.0)), found((30.0, 20_090.0))
+    assert wide.n_steps > 300 * narrow.n_steps
+    assert wide.height_step == narrow.height_step
+    assert wide.ground_height == narrow.ground_height == 60.0
 
 
 def scanners(*looks):

@@ -19,6 +19,7 @@ from orientation_scenes import image_of
 from reference import agreement, semiglobal, surfaces
 from reference.projection import bilinear, positions, slope_relief
 from zlocus.core.grid import CellWindow
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import (
     CostOptions,
     PyramidOptions,
@@ -132,7 +133,8 @@ def scene():
 def stages():
     x, y = np.random.default_rng(1).uniform(-8, 8, (2, 40)) + np.array(CENTRE)[:, None]
     ties = np.column_stack([x, y, np.where(x >= CENTRE[0], 65.0, 50.0)])
-    match_scene = build_match_scene(scene(), GSD_M, (0.0, 0.0), HEIGHTS_M, ties, None, CONFIG.pyramid)
+    heights = HeightRange.limited_to(HEIGHTS_M)
+    match_scene = build_match_scene(scene(), GSD_M, (0.0, 0.0), heights, ties, None, CONFIG.pyramid)
     first = round(-CENTRE[1] / GSD_M) - SHAPE[0] // 2, round(CENTRE[0] / GSD_M) - SHAPE[1] // 2
     tile = read_tile(match_scene, CellWindow(*first, *SHAPE), CONFIG)
     assert len(tile.view_pixels) == 3

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.footprints import footprint, ground_box, ground_sample_distance, shared_ground
 from zlocus.core.grid import CellWindow, cells_of_bounds, window_transform
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import PyramidOptions
 from zlocus.core.scene import ColourSource, Scene, View, held_window
 from zlocus.core.sensor_model import Scanning, bare
@@ -75,6 +76,11 @@ class MatchScene:
     def z_range(self) -> tuple[float, float]:
         """Lowest and highest height of the search."""
         return self.height_origin, self.height_origin + self.n_steps * self.height_step
+
+    @property
+    def ground_height(self) -> float:
+        """A height of the ground: the middle of the heights at which the surface is expected."""
+        return sum(self.expected_range or self.z_range) / 2
 
     @property
     def step_cells(self) -> float:
@@ -253,7 +259,7 @@ def build_match_scene(
     scene: Scene,
     cell_m: float,
     anchor: tuple[float, float],
-    z_range: tuple[float, float],
+    height_range: HeightRange,
     ties: NDArray[np.float64],
     reference: str | None,
     options: PyramidOptions,
@@ -261,7 +267,7 @@ def build_match_scene(
 ) -> MatchScene:
     """Build the match scene of views on a ground grid.
 
-    cell_m, anchor : of the lattice of cells, see `MatchScene`; z_range : heights to search, m; ties : (n, 3) m;
+    cell_m, anchor : of the lattice of cells, see `MatchScene`; height_range : heights to search; ties : (n, 3) m;
     reference : name of the reference image, None for the most nadir one; ground : (k, 3) m, places at which the grey
     values of the images are compared, None: at the ties. An image that is much finer than all others is reduced, see
     `with_common_pixel`.
@@ -273,7 +279,7 @@ def build_match_scene(
     GeometryError
         The views show no heights, or no two of them see the same ground.
     """
-    z = (z_range[0] + z_range[1]) / 2
+    z, z_range = height_range.middle, height_range.searched
     views = with_common_pixel(reference_first(scene, z, reference), z)
     step = height_step(views, z, cell_m, options.max_shift_px)
     n_steps = max(int(np.ceil((z_range[1] - z_range[0]) / step)), MIN_STEPS)
@@ -289,4 +295,5 @@ def build_match_scene(
         overlap_window=cells_of_bounds(shared_ground(scene, z_range), anchor, cell_m, levels),
         grey_scales=grey_scales(views, ties if ground is None else ground),
         ties=ties,
+        expected_range=height_range.expected,
     )

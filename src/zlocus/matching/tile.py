@@ -161,8 +161,8 @@ def read_tile(
     ground_xy, windows = windows_of(match_scene, core_window, config)
     numbers = list(windows)
     if choose_images and len(numbers) > config.selection.max_candidates + 1:
-        middle = sum(match_scene.z_range) / 2
-        rows = preselected([match_scene.views[n] for n in numbers], ground_xy, middle, config.selection)
+        views = [match_scene.views[n] for n in numbers]
+        rows = preselected(views, ground_xy, match_scene.ground_height, config.selection)
         numbers = [numbers[row] for row in rows]
     view_pixels = [
         read_pixels(match_scene.views[n], windows[n], match_scene.levels, match_scene.grey_scales[n]) for n in numbers

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError
+from zlocus.core.height_range import HeightRange
 from zlocus.core.nearest_points import nearest_points
 from zlocus.core.options import OrientationOptions
 from zlocus.core.sensor_model import FloatArray
@@ -25,19 +25,6 @@ NEIGHBOURS = 8
 MIN_AGREEING_NEIGHBOURS = 3
 MAX_SLOPE = 1.5
 MAX_HEIGHT_SIGMAS = 4.0
-
-
-@dataclass(frozen=True)
-class HeightRange:
-    """Lowest and highest height, m: `expected` of the surface, and `searched` where images clearly agree beyond it."""
-
-    expected: tuple[float, float]
-    searched: tuple[float, float]
-
-    @classmethod
-    def limited_to(cls, heights: tuple[float, float]) -> HeightRange:
-        """A range beyond which nothing is searched."""
-        return cls(heights, heights)
 
 
 def height_range_of_ties(

@@ -22,6 +22,7 @@ import numpy as np
 from zlocus.core.errors import GeometryError
 from zlocus.core.footprints import footprint, is_shared, shared_ground
 from zlocus.core.grid import grid_from_bounds
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import SetupRequest
@@ -31,7 +32,7 @@ from zlocus.io.grid_inputs import dem_datum, read_dem
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.ground_pixels import median_ground_pixel
 from zlocus.orientation.orientation import Orientation
-from zlocus.orientation.tie_heights import HeightRange, height_range_of_ties
+from zlocus.orientation.tie_heights import height_range_of_ties
 
 N_POSSIBLE_HEIGHTS = 5
 # Land on Earth lies between these heights above the ellipsoid.

@@ -27,6 +27,7 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import ConfigError, CoverageError, GeometryError
 from zlocus.core.footprints import area_to_match, check_overlap, ground_sample_distance
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import SetupRequest
@@ -42,7 +43,7 @@ from zlocus.matching.match_scene import MatchScene, build_match_scene, height_st
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
 from zlocus.orientation.plausibility import Doubt
-from zlocus.orientation.tie_heights import HeightRange, supported
+from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.height_range import height_range_of_run, heights_below_cameras, possible_heights, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
@@ -191,13 +192,11 @@ def set_up_run(
     corrected = orientation.apply(opened_inputs.scene)
     scene = supported_views(corrected, orientation)
     height_range = height_range_of_run(request, scene, orientation, config, progress)
-    z_range = height_range.searched
-    grid = grid_of_run(request, opened_inputs.like, scene, orientation, z_range)
-    match_scene = match_scene_of_run(request, scene, orientation, z_range, grid, config)
+    grid = grid_of_run(request, opened_inputs.like, scene, orientation, height_range)
+    match_scene = match_scene_of_run(request, scene, orientation, height_range, grid, config)
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)
     match_scene = limited_by_dem(request, match_scene, scene.crs, config)
-    match_scene = with_expected_heights(match_scene, orientation, height_range)
     match_scene = with_line_shifts(match_scene, orientation, config.pyramid)
     return RunSetup(corrected, orientation, height_range, grid, match_scene, (*orientation.doubts, *far))
 
@@ -259,10 +258,13 @@ def grid_of_run(
     like: GeoBox | None,
     scene: Scene,
     orientation: Orientation,
-    z_range: tuple[float, float],
+    height_range: HeightRange,
 ) -> Grid:
-    """The grid of the products: that of --like, or the area to match at the resolution asked for."""
-    z = (z_range[0] + z_range[1]) / 2
+    """The grid of the products: that of --like, or the area to match at the resolution asked for.
+
+    Both follow from the heights at which the surface is expected: ground pixels differ where cameras are near.
+    """
+    z = height_range.middle
     if like is not None:
         grid = grid_from_geobox(like, str(request.like))
         check_resolution(grid.cell_m, scene, z, f"--like {request.like}: its cell of")
@@ -270,7 +272,7 @@ def grid_of_run(
     cell_m = cell_side(request.resolution, scene, z)
     check_resolution(cell_m, scene, z, "--resolution")
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
-    bounds = request.bounds or area_to_match(scene, z_range, ties)
+    bounds = request.bounds or area_to_match(scene, height_range.expected, ties)
     return grid_from_bounds(bounds, cell_m, scene.crs)
 
 
@@ -278,15 +280,16 @@ def match_scene_of_run(
     request: SetupRequest,
     scene: Scene,
     orientation: Orientation,
-    z_range: tuple[float, float],
+    height_range: HeightRange,
     grid: Grid,
     config: RunConfig,
 ) -> MatchScene:
     """The match scene of the views that take part, on the lattice of a grid. scene : with corrected cameras."""
-    return build_match_scene(
-        scene, grid.cell_m, grid.anchor, z_range, orientation.xyz, request.reference, config.pyramid,
+    match_scene = build_match_scene(
+        scene, grid.cell_m, grid.anchor, height_range, orientation.xyz, request.reference, config.pyramid,
         orientation.refined_xyz,
     )  # fmt: skip
+    return replace(match_scene, trusted_ties=orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)])
 
 
 def limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, config: RunConfig) -> MatchScene:
@@ -301,20 +304,13 @@ def limited_by_dem(request: SetupRequest, match_scene: MatchScene, crs: CRS, con
     return replace(match_scene, dem_limits=limits)
 
 
-def with_expected_heights(match_scene: MatchScene, orientation: Orientation, height_range: HeightRange) -> MatchScene:
-    """The match scene with the heights that tie points suggest, see `zlocus.matching.expected_heights`."""
-    trusted = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
-    return replace(match_scene, trusted_ties=trusted, expected_range=height_range.expected)
-
-
 def with_line_shifts(match_scene: MatchScene, orientation: Orientation, options: PyramidOptions) -> MatchScene:
     """The match scene with the size of the displacements of lines, as a height: a step shifts an image by
     `pyramid.max_shift_px` of its pixels, or of the cells where these are larger."""
     found = [v.line_shifts.rms_px for v in orientation.views if v.line_shifts is not None]
     if not found:
         return match_scene
-    z = sum(match_scene.z_range) / 2
-    pixel = float(np.median(ground_pixels(match_scene.views, z)))
+    pixel = float(np.median(ground_pixels(match_scene.views, match_scene.ground_height)))
     shift_px = float(np.sqrt(np.mean(np.square(found).sum(axis=1))))
     step_px = options.max_shift_px * max(match_scene.cell_size / pixel, 1.0)
     return replace(match_scene, line_shift_steps=shift_px / step_px)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from orientation_scenes import hill_scene
 from zlocus.core.grid import CellWindow
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import PyramidOptions, RunConfig
 from zlocus.matching.match_scene import build_match_scene
 from zlocus.pipeline.execution.plan import CELL_S, VIEW_CELL_S, TileNeeds, core_size, plan_tiles, tile_needs
@@ -63,7 +64,13 @@ def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):
     scene = hill_scene([(0.0, 0.0)] * (n_views - 1), looks, size, [0.0] * (n_views - 1))
     away = replace(scene.views[0], name="away", sensor=ShiftedModel(scene.views[0].sensor, 9000.0, 0.0))
     return build_match_scene(
-        replace(scene, views=(*scene.views, away)), cell_m, (0.0, 0.0), z, np.empty((0, 3)), "view0", PyramidOptions()
+        replace(scene, views=(*scene.views, away)),
+        cell_m,
+        (0.0, 0.0),
+        HeightRange.limited_to(z),
+        np.empty((0, 3)),
+        "view0",
+        PyramidOptions(),
     )
 
 

@@ -57,9 +57,9 @@ def run_plan(
     ConfigError, GeometryError, OutputError
         A run would stop for the same reason.
     """
-    setup_request, z_range = SetupRequest.of(request), ties.z_range
-    grid = grid_of_run(setup_request, None, scene, ties.orientation, z_range)
-    match_scene = match_scene_of_run(setup_request, scene, ties.orientation, z_range, grid, config)
+    setup_request, height_range = SetupRequest.of(request), ties.height_range
+    grid = grid_of_run(setup_request, None, scene, ties.orientation, height_range)
+    match_scene = match_scene_of_run(setup_request, scene, ties.orientation, height_range, grid, config)
     matched = grid.window.within(match_scene.overlap_window)
     if not (matched.rows and matched.cols):
         raise GeometryError("The area asked for lies outside the ground that two images see. Check area.bounds.")
@@ -74,7 +74,7 @@ def run_plan(
     return RunPlan(
         cell_m=grid.cell_m,
         shape=(grid.window.rows, grid.window.cols),
-        heights=z_range,
+        heights=height_range.searched,
         step_m=match_scene.height_step,
         n_steps=match_scene.n_steps,
         n_tiles=len(tiles),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from zlocus.core.errors import GeometryError
 from zlocus.core.footprints import PairGeometry
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.scene import Scene, held_window
@@ -29,12 +30,12 @@ NEAR_LIMIT = 0.7
 class QuickTies:
     """Result of the quick search.
 
-    orientation : as in a run; z_range : heights (m) that a run would search; is_quick : whether fewer features were
+    orientation : as in a run; height_range : heights that a run would search; is_quick : whether fewer features were
     used than in a run.
     """
 
     orientation: Orientation
-    z_range: tuple[float, float]
+    height_range: HeightRange
     is_quick: bool
 
 
@@ -80,12 +81,12 @@ def _ties(
 ) -> QuickTies:
     orientation = orient_views(replace(scene, heights=asked), options, progress)
     corrected = orientation.apply(scene)
-    z_range = (
-        range_from_ties(corrected, orientation, options).searched
+    height_range = (
+        range_from_ties(corrected, orientation, options)
         if asked is None
-        else range_below_cameras(scene, asked, progress)
+        else HeightRange.limited_to(range_below_cameras(scene, asked, progress))
     )
-    return QuickTies(orientation, z_range, is_quick)
+    return QuickTies(orientation, height_range, is_quick)
 
 
 def tie_findings(
