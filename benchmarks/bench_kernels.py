@@ -17,14 +17,16 @@ import cv2
 import numpy as np
 import pytest
 
-from zlocus.matching.evidence import NO_EVIDENCE
+from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE
 from zlocus.matching.free_rays import pair_agreement
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.coverage import ViewMasks, block_coverage
+from zlocus.matching.kernels.evidence import TABLE_SHAPE, EvidenceTable, TableAndCounts
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.mgm import sweep_quarter
 from zlocus.matching.kernels.occlusion import lowest_visible
+from zlocus.matching.kernels.prior_costs import CoarserCells, add_costs_of_candidates
 from zlocus.matching.kernels.resample import flat_cells, image_of, resample_plane, resample_scratch
 from zlocus.matching.kernels.sgm import sweep
 from zlocus.matching.kernels.shared_records import (
@@ -39,6 +41,7 @@ from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling, tile_ortho, tile_profile
 from zlocus.matching.kernels.winners import winner_takes_all, winners
+from zlocus.matching.prior_costs import CANDIDATE_REACH, COST_OF_CANDIDATES
 from zlocus.matching.subpixel import smoothed
 from zlocus.products.hillshade import hillshade
 
@@ -142,7 +145,16 @@ def resample_case() -> Case:
     return Case(call, 500 * side * side, "sample")
 
 
-def costs_case(n_views: int, windows: list[int], weight: float, side: int = SIDE) -> Case:
+def some_evidence() -> TableAndCounts:
+    """A table of evidence; what it holds does not change the time."""
+    ratios = np.random.default_rng(9).uniform(-2, 3, int(np.prod(TABLE_SHAPE)) + 1).astype(np.float32)
+    values = (np.float32(value) for value in (0.01, 14.0, 18.0, 3.0, 0.5, 0.3, 160.0))
+    return TableAndCounts(EvidenceTable(ratios, *values), NO_COUNTS)
+
+
+def costs_case(
+    n_views: int, windows: list[int], weight: float, side: int = SIDE, evidence: TableAndCounts = NO_EVIDENCE
+) -> Case:
     """Costs of a tile: half widths of its windows, weight of grey differences."""
     heights = lattice(side, 32)
     volume = np.empty(heights.size, np.uint8)
@@ -153,9 +165,22 @@ def costs_case(n_views: int, windows: list[int], weight: float, side: int = SIDE
     arrays, layout = ViewArrays(*views(n_views, side), BLOCK), heights.layout
 
     def call():
-        tile_costs(arrays, slope, layout, half, visible, parameters, NO_EVIDENCE, volume)
+        tile_costs(arrays, slope, layout, half, visible, parameters, evidence, volume)
 
     return Case(call, heights.size * n_views, "cell, step and image")
+
+
+def candidates_case(side: int = SIDE) -> Case:
+    """Costs of heights far from the candidates of a coarser level, on ragged ranges."""
+    heights, rng = lattice(side, None), np.random.default_rng(11)
+    cost = np.zeros(heights.size, np.uint8)
+    found = rng.integers(0, 16, (3, side // 2, side // 2)).astype(np.int32)
+    flat, cells = np.zeros((side, side), np.float32), CoarserCells(0, 0, CANDIDATE_REACH)
+
+    def call():
+        add_costs_of_candidates(cost, heights.layout, flat, found, cells, COST_OF_CANDIDATES)
+
+    return Case(call, heights.size, "cell-step")
 
 
 def sums_scene(side: int, heights: HeightLattice):
@@ -318,6 +343,17 @@ def test_costs(benchmark, side, n_views, windows, weight):
     seconds = timed(benchmark, case)
     if windows == [3]:
         benchmark.extra_info["resample_ncc_ns"] = seconds / case.n * 1e9
+
+
+@pytest.mark.parametrize(
+    ("n_views", "windows"), [(2, [1, 2]), (3, [1, 2]), (6, [1])], ids=["2-views", "3-views", "6-views-3x3"]
+)
+def test_costs_of_evidence(benchmark, side, n_views, windows):
+    timed(benchmark, costs_case(n_views, windows, 1.0, side or SIDE, some_evidence()))
+
+
+def test_costs_of_candidates(benchmark, side):
+    timed(benchmark, candidates_case(side or SIDE))
 
 
 @pytest.mark.parametrize("count", [16, 32, 64, 128, None], ids=["16", "32", "64", "128", "ragged"])

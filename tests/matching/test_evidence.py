@@ -14,6 +14,7 @@ from zlocus.matching import evidence
 from zlocus.matching.evidence import (
     MAX_LOG_RATIO,
     heights_to_learn_from,
+    log_of_sampling,
     log_ratios,
     noise_variance,
     sampled_blocks,
@@ -34,7 +35,7 @@ def counts(seed, total=200_000):
 @given(st.integers(0, 10_000))
 def test_the_mean_of_wrong_heights_is_nothing(seed):
     wrong = counts(seed)
-    ratios, neutral = log_ratios(counts(seed + 1), wrong)
+    ratios, neutral = log_ratios(counts(seed + 1), wrong, 20.0)
     smooth = smoothed_counts(wrong)
     assert (smooth * ratios).sum() / smooth.sum() == pytest.approx(0.0, abs=1e-4)
     assert np.abs(ratios - np.float32(neutral)).max() <= MAX_LOG_RATIO + 1e-4
@@ -45,7 +46,7 @@ def test_bins_as_frequent_at_wrong_heights_say_nothing():
     right, wrong = np.zeros(TABLE_SHAPE, np.int64), np.zeros(TABLE_SHAPE, np.int64)
     right[1], wrong[1] = 40, 400
     right[10, :, :, 15:], wrong[10, :, :, 5:15] = 300, 1500
-    ratios, neutral = log_ratios(right, wrong)
+    ratios, neutral = log_ratios(right, wrong, 20.0)
     plain = ratios[1] - neutral
     assert np.abs(plain - plain.mean()).max() < 0.05
     assert ratios[10, :, :, N_LIKENESS - 2].min() > neutral + 2
@@ -55,7 +56,7 @@ def test_bins_as_frequent_at_wrong_heights_say_nothing():
 def test_bins_that_no_image_filled_say_nothing():
     right, wrong = np.zeros(TABLE_SHAPE, np.int64), np.zeros(TABLE_SHAPE, np.int64)
     right[5, 0, 3, 10], wrong[5, 0, 3, 4] = 5000, 5000
-    ratios, neutral = log_ratios(right, wrong)
+    ratios, neutral = log_ratios(right, wrong, 20.0)
     assert ratios[0, 2, 12] == pytest.approx(np.full(N_LIKENESS, neutral), abs=1e-5)
 
 
@@ -81,13 +82,20 @@ def test_images_of_one_grey_value_have_the_least_noise():
     assert float(noise_variance(views_of(np.full((20, 20), 2.0)))) == pytest.approx(evidence.LEAST_VARIANCE)
 
 
-@pytest.mark.parametrize(("side", "share"), [(100, 1.0), (400, 0.5), (800, 0.25)])
+@pytest.mark.parametrize(("side", "share"), [(100, 1.0), (420, 0.5), (800, 0.125), (1600, 1 / 16), (4000, 1 / 16)])
 def test_a_part_of_the_blocks_of_large_levels_is_counted(side, share):
     reference = np.ones((side, side), np.float32)
-    taken = np.isfinite(sampled_blocks(reference, 8))
-    assert taken.mean() == pytest.approx(share)
+    taken = np.isfinite(sampled_blocks(reference, 8, log_of_sampling(reference.size)))
+    assert taken.mean() == pytest.approx(share, abs=0.01)
     for quarter in (taken[: side // 2], taken[:, : side // 2]):
         assert quarter.mean() == pytest.approx(share, abs=0.02)
+
+
+def test_a_part_of_the_counts_with_its_part_of_the_prior_says_the_same():
+    right, wrong = counts(5), counts(6)
+    whole, of_quarter = log_ratios(4 * right, 4 * wrong, 40.0), log_ratios(right, wrong, 10.0)
+    np.testing.assert_allclose(whole[0], of_quarter[0], rtol=0, atol=1e-5)
+    assert whole[1] == pytest.approx(of_quarter[1], abs=1e-6)
 
 
 def result_with(height, number=1):

@@ -41,18 +41,22 @@ def test_heights_far_from_all_candidates_cost_more(seed):
     cost, lattice, slope = volume(seed)
     rng = np.random.default_rng(seed + 1)
     coarse = (SHAPE[0] // 2 + 2, SHAPE[1] // 2 + 2)
-    candidates = rng.uniform(0, 10, (3, *coarse)).astype(np.float32)
+    candidates = rng.integers(0, 10, (3, *coarse)).astype(np.int32)
     cells, before = CoarserCells(1, 2, 1), dense(cost.copy(), lattice, np.inf)
     add_costs_of_candidates(cost, lattice.layout, slope, candidates, cells, BY_DISTANCE)
     found = dense(cost, lattice, np.inf)
     first, count = lattice.cell_ranges()
+    lowest = first + np.rint(slope).astype(int)
+    row_of, col_of = (1 + np.arange(SHAPE[0])) // 2, (2 + np.arange(SHAPE[1])) // 2
     for r in range(SHAPE[0]):
         for c in range(SHAPE[1]):
-            row, col = (1 + r) // 2, (2 + c) // 2
+            row, col = row_of[r], col_of[c]
             near = candidates[:, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2].ravel()
+            # Candidates beyond the heights of all cells in the same coarser cell count as the nearest of these.
+            siblings = np.ix_(row_of == row, col_of == col)
+            at = np.clip(2 * near, lowest[siblings].min(), (lowest + count)[siblings].max() - 1)
             k = np.arange(count[r, c])
-            at = np.clip(np.rint(2 * near - (slope[r, c] + np.float32(first[r, c]))), 0, count[r, c] - 1)
-            away = np.abs(k[:, None] - at).min(axis=1)
+            away = np.abs(lowest[r, c] + k[:, None] - at).min(axis=1)
             added = np.floor(np.minimum(5.0 * np.maximum(away - 3.0, 0), 30.0) + 0.5)
             expected = np.minimum(before[r, c, first[r, c] + k] + added, 255)
             np.testing.assert_array_equal(found[r, c, first[r, c] + k], expected)
@@ -77,10 +81,11 @@ def test_misfit_is_the_cost_above_the_least():
     first, count = lattice.cell_ranges()
     height = (first + np.random.default_rng(6).integers(0, count)).astype(np.int32)
     found = np.empty(SHAPE, np.float32)
-    write_misfit(cost, lattice.layout, height, found)
+    is_wanted = np.random.default_rng(7).random(SHAPE) < 0.8
+    write_misfit(cost, lattice.layout, height, is_wanted, found)
     all_costs = dense(cost, lattice, np.inf)
     expected = np.take_along_axis(all_costs, height[..., None].astype(int), axis=2)[..., 0] - all_costs.min(axis=2)
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(found, np.where(is_wanted, expected, 0))
 
 
 def test_jumps_are_cheaper_where_the_surface_contradicts_the_images():

@@ -41,8 +41,9 @@ MAX_LOG_RATIO = 5.0
 # The part of the evidence that the grey difference adds to that of likeness and contrast counts by this: grey values
 # of neighbouring heights are alike, so that the two are not independent.
 GREY_SHARE = 0.6
-# Counts that every bin gets at right heights before the images are looked at; wrong heights get the same frequency.
-PRIOR_COUNTS = 20.0
+# Counts that every bin gets at right heights before the images are looked at, where all blocks of a tile are counted;
+# wrong heights get the same frequency. More counts make rare features, such as those of trees, say less.
+PRIOR_COUNTS = 40.0
 # A cell is not learned from where the heights of 3 x 3 cells differ by so many steps: one of them is wrong, or there is
 # a jump.
 MAX_STEPS_ACROSS = 6.0
@@ -54,8 +55,10 @@ MIN_TRUSTED_CELLS = 20_000
 MIN_CELLS_OF_TILE = 4 * MIN_TRUSTED_CELLS
 # The noise of an image is the variance that this share of its small windows is below.
 NOISE_SHARE, NOISE_WINDOW, LEAST_VARIANCE = 0.05, (5, 5), 1e-7
-# Cells of a level from which all, every second, and every fourth block is counted.
-CELLS_OF_ALL_BLOCKS, CELLS_OF_HALF = 60_000, 250_000
+# Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain.
+LEAST_CELLS = 80_000
+# Of every 2^k blocks of a row the same one is counted as in the row above, shifted by the k-th of these.
+ROW_SHIFTS = (0, 1, 2, 3, 4)
 
 NO_TABLE = EvidenceTable(np.zeros(0, np.float32), *(np.float32(value) for value in (1, 0, 0, 0, 0, 0, 0)))
 NO_COUNTS = Learning(np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -89,14 +92,17 @@ def learned_evidence(
     size = int(np.prod(TABLE_SHAPE))
     # One more bin, because a likeness is counted at the nearest bin.
     right, wrong = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    learning = Learning(sampled_blocks(taught_heights.height, lattice.block), right, wrong)
+    log_every = log_of_sampling(taught_heights.height.size)
+    reference = sampled_blocks(taught_heights.height, lattice.block, log_every)
+    learning = Learning(reference, right, wrong)
     noise = noise_variance(slope_views)
     counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise), learning)
     volume = np.empty(lattice.size, np.uint8)
     tile_costs(
         slope_views.arrays, slope_arrays, lattice.layout, windows, visible, parameters, counting, volume
     )  # fmt: skip
-    ratios, neutral = log_ratios(right[:-1].reshape(TABLE_SHAPE), wrong[:-1].reshape(TABLE_SHAPE))
+    of_right, of_wrong = right[:-1].reshape(TABLE_SHAPE), wrong[:-1].reshape(TABLE_SHAPE)
+    ratios, neutral = log_ratios(of_right, of_wrong, PRIOR_COUNTS / 2**log_every)
     table = np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32)
     factor = UNIT_FACTOR_PER_LEVEL**taught_heights.level
     found = EvidenceTable(
@@ -112,15 +118,18 @@ def learned_evidence(
     return TableAndCounts(found, NO_COUNTS)
 
 
-def log_ratios(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> tuple[NDArray[np.float32], float]:
+def log_ratios(
+    right: NDArray[np.int64], wrong: NDArray[np.int64], prior_counts: float
+) -> tuple[NDArray[np.float32], float]:
     """Log-likelihood ratios of the bins from their counts, and the value that stands for no evidence.
 
-    right, wrong : `TABLE_SHAPE`, counts. The ratios are shifted so that their mean at wrong heights is 0: a pair in
-    which a view is occluded adds 0, and must be worth as much as a pair that compares what does not belong together.
+    right, wrong : `TABLE_SHAPE`, counts; prior_counts : see PRIOR_COUNTS. The ratios are shifted so that their mean at
+    wrong heights is 0: a pair in which a view is occluded adds 0, and must be worth as much as a pair that compares
+    what does not belong together.
     """
     of_right, of_wrong = smoothed_counts(right), smoothed_counts(wrong)
     n_right, n_wrong = max(of_right.sum(), 1.0), max(of_wrong.sum(), 1.0)
-    prior = PRIOR_COUNTS / n_right
+    prior = prior_counts / n_right
     whole = np.log((of_right / n_right + prior) / (of_wrong / n_wrong + prior))
     right_of_any_grey, wrong_of_any_grey = (
         np.broadcast_to(counts.sum(axis=2, keepdims=True), counts.shape) for counts in (of_right, of_wrong)
@@ -133,8 +142,9 @@ def log_ratios(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> tuple[NDAr
 
 
 def smoothed_counts(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Counts of which each bin shares some with its neighbours along grey difference and likeness."""
-    smooth = counts.astype(np.float64)
+    """Counts of which each bin shares some with its neighbours along contrast, grey difference and likeness."""
+    wide = np.pad(counts.astype(np.float64), [(1, 1), (0, 0), (0, 0), (0, 0)], mode="edge")
+    smooth = (2 * wide[1:-1] + wide[:-2] + wide[2:]) / 4
     for _ in range(2):
         wide = np.pad(smooth, [(0, 0), (0, 0), (1, 1), (1, 1)], mode="edge")
         inner = wide[:, :, 1:-1, 1:-1]
@@ -157,15 +167,15 @@ def noise_variance(slope_views: TileViews) -> np.float32:
     return np.float32(rounded(float(np.mean(found)))) if found else np.float32(LEAST_VARIANCE)
 
 
-def sampled_blocks(reference: NDArray[np.float32], block: int) -> NDArray[np.float32]:
-    """Reference heights (r, c) of a part of the blocks, NaN elsewhere: of all blocks where the level is small."""
-    rows, cols = np.arange(reference.shape[0]) // block, np.arange(reference.shape[1]) // block
-    if reference.size < CELLS_OF_ALL_BLOCKS:
-        return reference.astype(np.float32)
-    if reference.size < CELLS_OF_HALF:
-        is_taken = (rows[:, None] + cols[None, :]) % 2 == 0
-    else:
-        is_taken = ((rows[:, None] % 2) * 2 + (cols[None, :] + rows[:, None] // 2) % 2) % 4 == 0
+def log_of_sampling(n_cells: int) -> int:
+    """k, where one of 2^k blocks of a level of so many cells is counted."""
+    return max((k for k in range(len(ROW_SHIFTS)) if n_cells >> k >= LEAST_CELLS), default=0)
+
+
+def sampled_blocks(reference: NDArray[np.float32], block: int, log_every: int) -> NDArray[np.float32]:
+    """Reference heights (r, c) of one of 2^log_every blocks, NaN elsewhere."""
+    row, col = np.arange(reference.shape[0]) // block, np.arange(reference.shape[1]) // block
+    is_taken = (col[None, :] + ROW_SHIFTS[log_every] * row[:, None]) % 2**log_every == 0
     return np.where(is_taken, reference, np.float32(np.nan)).astype(np.float32)
 
 

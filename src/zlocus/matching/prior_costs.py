@@ -66,7 +66,7 @@ def add_costs_of_coarser(
     """Add the costs of heights far from the candidates of the coarser level; changes `cost`, (v,) uint8."""
     window, coarser_window = level.window, coarser_result.level.window
     cells = CoarserCells(window.row - 2 * coarser_window.row, window.col - 2 * coarser_window.col, CANDIDATE_REACH)
-    found = np.ascontiguousarray(candidates(coarser_result, options), np.float32)
+    found = np.ascontiguousarray(candidates(coarser_result, options), np.int32)
     add_costs_of_candidates(cost, lattice.layout, slope_surface.cells, found, cells, COST_OF_CANDIDATES)
 
 
@@ -86,7 +86,7 @@ def add_costs_beyond_expected(
 def misfit(cost: NDArray[np.uint8], lattice: HeightLattice, heights: SemiGlobalHeights) -> NDArray[np.float32]:
     """Mean over a window of how much the cost of the heights found is above the least cost, (r, c) float32."""
     of_cells = np.empty(lattice.shape, np.float32)
-    write_misfit(cost, lattice.layout, heights.best, of_cells)
+    write_misfit(cost, lattice.layout, heights.best, np.ones(lattice.shape, np.bool_), of_cells)
     return np.asarray(cv2.blur(np.minimum(of_cells, np.float32(MAX_MISFIT)), MISFIT_WINDOW))
 
 

@@ -53,10 +53,10 @@ def heights_of_surroundings(
     height, depth = (surface - below) * sides, (above - surface) * sides
     depth[(cv2.erode(above, wide_window) - surface) * sides <= MIN_BELOW_LOWEST] = 0.0
     found = np.full(surface.shape, np.nan, np.float32)
-    at_surface = _cost_at(cost, lattice, slope_surface, surface)
     for off, surroundings in ((height, below), (depth, above)):
         if off.max() > MIN_MEAN_OFF:
-            gain = _cost_at(cost, lattice, slope_surface, surroundings) - at_surface
+            gain = _cost_at(cost, lattice, slope_surface, surroundings, off > MIN_OFF)
+            gain -= _cost_at(cost, lattice, slope_surface, surface, off > MIN_OFF)
             where = lacks_evidence(off, gain, level)
             found[where] = surroundings[where]
     return found
@@ -85,9 +85,14 @@ def _filtered(surface: NDArray[np.float32], operation: int, window: NDArray[np.u
 
 
 def _cost_at(
-    cost: NDArray[np.uint8], lattice: HeightLattice, slope_surface: SlopeSurface, surface: NDArray[np.float32]
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    slope_surface: SlopeSurface,
+    surface: NDArray[np.float32],
+    is_wanted: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """Cost (r, c) above the least of each cell at the nearest height to a surface, (r, c) level indices."""
+    """Cost (r, c) above the least of each cell at the nearest height to a surface, (r, c) level indices; 0 elsewhere
+    than in the cells that are wanted."""
     found = np.empty(lattice.shape, np.float32)
-    write_misfit(cost, lattice.layout, np.rint(surface - slope_surface.cells).astype(np.int32), found)
+    write_misfit(cost, lattice.layout, np.rint(surface - slope_surface.cells).astype(np.int32), is_wanted, found)
     return found

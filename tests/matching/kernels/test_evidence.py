@@ -11,18 +11,27 @@ from reference.semiglobal import dense
 from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE, NO_TABLE
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.evidence import (
+    CONTRAST_A,
+    CONTRAST_B,
     TABLE_SHAPE,
     EvidenceTable,
     Learning,
     TableAndCounts,
-    mean_gradients,
-    write_contrast,
+    bit_count,
+    doublings,
+    pair_scratch,
+    write_census,
+    write_contrasts,
+    write_gradients,
 )
+from zlocus.matching.kernels.ncc import ViewPair
 from zlocus.matching.kernels.shared_records import NEVER_COVERED
 
 HALVES = np.array([1, 2])
 EXCLUDED = 0.4
 PARAMETERS = CostParameters(*(np.float32(v) for v in (0.0, 1.0, 0.3, 0.3, EXCLUDED)), max_images_for_large_window=255)
+WORK = np.zeros((4, 0), np.float32)
+PAIR = ViewPair(np.uint64(0), np.uint64(1))
 NOISE = 0.05
 UNIT, SMALL_UNIT = 14.0, 20.0
 # Costs are whole numbers; a feature on the limit of a bin may fall into the next one, which few do.
@@ -175,15 +184,39 @@ def test_an_edge_along_the_parallax_has_no_contrast():
     plane = np.zeros((9, 12))
     plane[:, 6:] = 1.0
     plane[:] += np.random.default_rng(4).normal(0, 0.001, plane.shape)
-    out = np.empty(plane.size, np.float32)
-    gradients = np.empty((3, plane.size), np.float32)
-    flat, n = np.append(plane.ravel(), np.zeros(40)).astype(np.float32), 5 * 12
-    mean_gradients(flat, 2, 12, n, gradients)
-    found = {}
+    flat, n = np.append(plane.ravel(), np.zeros(40)).astype(np.float32)[None], 5 * 12
+    scratch, found = pair_scratch(2, 2, flat.shape[1], WORK), {}
+    write_gradients(flat, np.uint64(0), 2, 12, n, scratch.rows, scratch.gradients)
+    scratch.gradients[1] = scratch.gradients[0]
     for name, direction in (("across", (0.0, 1.0)), ("along", (1.0, 0.0))):
-        write_contrast(gradients, *(np.float32(v) for v in direction), np.float32(1e-6), n, out)
-        found[name] = out[:n].reshape(5, 12)[:, 3].copy()
-        expected = twin.contrast(flat[: plane.size].reshape(plane.shape).astype(float), 2, direction, 1e-6)
-        np.testing.assert_allclose(out[:n].reshape(5, 12)[:, :8], expected, rtol=0, atol=CONTRAST_DOUBLINGS)
+        movement = np.array([direction, (0.0, 0.0)], np.float32)
+        write_contrasts(scratch.gradients, movement, PAIR, np.float32(1e-6), n, scratch.rows)
+        contrasts = [[doublings(word) for word in bits[:n]] for bits in scratch.bits[[CONTRAST_A, CONTRAST_B]]]
+        contrast, other = np.reshape(contrasts, (2, 5, 12))
+        found[name] = contrast[:, 3]
+        expected = twin.contrast(flat[0, : plane.size].reshape(plane.shape).astype(float), 2, direction, 1e-6)
+        np.testing.assert_allclose(contrast[:, :8], expected, rtol=0, atol=CONTRAST_DOUBLINGS)
+        np.testing.assert_array_equal(contrast[:, :8], other[:, :8])
     assert (found["across"] > 15).all()
     assert (found["along"] < 2).all()
+
+
+@pytest.mark.parametrize("half", [1, 2, 3, 5])
+def test_the_census_tells_which_neighbours_are_brighter(half):
+    """In windows of any side, some of which need several words, and with neighbours that are as bright as the cell."""
+    rows, cols = 6, 7
+    width = cols + 2 * half
+    planes = np.random.default_rng(half).integers(0, 5, (2, rows + 2 * half, width)).astype(np.float32)
+    flat, n = np.concatenate([planes.reshape(2, -1), np.zeros((2, 32))], axis=1).astype(np.float32), rows * width
+    scratch = pair_scratch(2, half, flat.shape[1], WORK)
+    for view in range(2):
+        write_census(flat, np.uint64(view), half, width, n, scratch.census)
+    differing = sum(np.bitwise_count(a ^ b).astype(int) for a, b in scratch.census.swapaxes(0, 1))
+    expected = twin.same_order(*planes.astype(float), half)
+    n_neighbours = (2 * half + 1) ** 2 - 1
+    np.testing.assert_array_equal(n_neighbours - differing[:n].reshape(rows, width)[:, :cols], expected * n_neighbours)
+
+
+def test_bits_are_counted():
+    every_byte = np.arange(256, dtype=np.uint8)
+    assert [bit_count(byte) for byte in every_byte] == np.bitwise_count(every_byte).tolist()

@@ -330,7 +330,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     counts, scratch = np.empty((2, size), np.float32), resample_scratch(size)
     work, centre = np.empty((4, size), np.float32), np.float32(0.0)
     flat_visibility(visible, half, flat, pairs)
-    of_pairs = pair_scratch(n_views, size, work)
+    of_pairs = pair_scratch(n_views, half, size, work)
     uses_bins = evidence.table.log_ratios.shape[0] > 0 or evidence.learning.right.shape[0] > 0
     grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):

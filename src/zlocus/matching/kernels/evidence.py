@@ -46,6 +46,8 @@ SOME_DIFFERENCE, LARGE_DIFFERENCE = np.float32(1.2), np.float32(2.5)
 LARGEST_GREY_ROOT = np.float32(1.2)
 # Grey values beyond this are those of views that do not see the cell.
 GREY_LIMIT = np.float32(1e5)
+# Rows of scratch that the features of a pair are made in.
+SUMS, BEYOND, POSITION, CONTRAST_A, CONTRAST_B = range(5)
 # Heights so many steps from the reference are wrong, nearer ones may be right.
 FIRST_WRONG_STEP, LAST_WRONG_STEP = np.float32(5.0), np.float32(40.0)
 RIGHT_STEPS = np.float32(3.0)
@@ -82,11 +84,12 @@ class TableAndCounts(NamedTuple):
 class PairScratch(NamedTuple):
     """Arrays that the pairs of a block use one after the other."""
 
-    gradients: np.ndarray  # (i,3,p) f4: mean products of the grey differences of every view, see `mean_gradients`
+    work: np.ndarray  # (4,p) f4: sums of correlation without evidence
+    gradients: np.ndarray  # (i,3,p) f4: mean products of the grey differences of every view, see `write_gradients`
+    census: np.ndarray  # (i,k,p) u1: which neighbours of each cell are brighter than it, in every view
     movement: np.ndarray  # (i,2) f4: rows and columns that every view moves per step, see `put_movement`
-    contrast: np.ndarray  # (2,p) f4: contrasts of the two views of a pair, see `write_contrast`
-    work: np.ndarray  # (4,p) f4: sums
-    position: np.ndarray  # (p,) f4: position between two bins of likeness, from 0 at the lower to 1 at the higher
+    rows: np.ndarray  # (5,p) f4: sums, contrasts and positions between two bins of likeness, see SUMS and others
+    bits: np.ndarray  # (5,p) i4: the bits of `rows`
     bins: np.ndarray  # (p,) i4: index of the lower bin
 
 
@@ -100,13 +103,14 @@ class PairWindows(NamedTuple):
     width: int  # i8: floats from a row to the next
 
 
-# i8, i8, (4,p) f4 -> PairScratch
+# i8, i8, i8, (4,p) f4 -> PairScratch
 @kernel
-def pair_scratch(n_views, size, work):
-    """Arrays for the pairs of views of a block on flat planes of a size, not filled."""
+def pair_scratch(n_views, half, size, work):
+    """Arrays for the pairs of views of a block on flat planes of a size, not filled. half : of the largest window."""
     gradients, movement = np.empty((n_views, 3, size), np.float32), np.empty((n_views, 2), np.float32)
-    contrast, position = np.empty((2, size), np.float32), np.empty(size, np.float32)
-    return PairScratch(gradients, movement, contrast, work, position, np.empty(size, np.int32))
+    census, bins = np.empty((n_views, n_beside(half) // 8, size), np.uint8), np.empty(size, np.int32)
+    rows = np.empty((5, size), np.float32)
+    return PairScratch(work, gradients, census, movement, rows, rows.view(np.int32), bins)
 
 
 # BlockGrid, PixelVelocity, (2,) f4 -> None
@@ -120,131 +124,246 @@ def put_movement(grid, velocity, movement):
     movement[1] = np.float32((velocity.x * y.by_row - velocity.y * x.by_row) / area)
 
 
-# (p,) f4, i8, i8, i8, (3,p) f4 -> None
+# i8 -> i8
 @kernel
-def mean_gradients(plane, half, width, n, out):
-    """Write the mean products of the grey differences in the window of each cell, at the first n places.
+def n_beside(half):
+    """Neighbours of a cell in a window of a half width."""
+    return (2 * half + 1) ** 2 - 1
 
-    Differences are those of the cells on both sides. out : (3, p), means of their squares along the columns, along the
-    rows, and of their products, over the part of the window in which both cells lie inside it.
+
+# (5,p) f4, i8, i8, i8, i8, (i,3,p) f4, u8, u8 -> None
+@kernel
+def write_window_means(rows, half_rows, half_cols, width, n, out, view, product):
+    """Write the means of the first scratch row in the window of which each place is the first, at the first n places.
+
+    The window has 2 half_rows + 1 rows and 2 half_cols + 1 columns; out : see `write_gradients`.
     """
-    by_row, by_col, mixed, inner = out[0], out[1], out[2], half - 1
-    by_row[:n], by_col[:n], mixed[:n] = 0.0, 0.0, 0.0
-    per_long = np.float32(1.0) / np.float32((2 * inner + 1) * (2 * half + 1))
-    per_inner = np.float32(1.0) / np.float32((2 * inner + 1) ** 2)
-    for d in range(-half, half + 1):
-        for e in range(-inner, inner + 1):
-            across, down = (half + d) * width + half + e, (half + e) * width + half + d
-            west, east = plane[across - 1 :], plane[across + 1 :]
-            north, south = plane[down - width :], plane[down + width :]
-            for j in range(n):
-                along_col, along_row = south[j] - north[j], east[j] - west[j]
-                by_row[j] += along_col * along_col * per_long
-                by_col[j] += along_row * along_row * per_long
-            if abs(d) <= inner:
-                west, east = plane[down - 1 :], plane[down + 1 :]
-                for j in range(n):
-                    mixed[j] += (east[j] - west[j]) * (south[j] - north[j]) * per_inner
+    values, sums, n_sums = np.uint64(SUMS), np.uint64(BEYOND), np.uint64(n + 2 * half_cols)
+    for j in range(n_sums):
+        rows[sums, j] = rows[values, j]
+    for r in range(1, 2 * half_rows + 1):
+        first = np.uint64(r * width)
+        for j in range(n_sums):
+            rows[sums, j] += rows[values, first + j]
+    per_cell = np.float32(1.0) / np.float32((2 * half_rows + 1) * (2 * half_cols + 1))
+    for j in range(np.uint64(n)):
+        out[view, product, j] = rows[sums, j] * per_cell
+    for c in range(1, 2 * half_cols + 1):
+        first = np.uint64(c)
+        for j in range(np.uint64(n)):
+            out[view, product, j] += rows[sums, first + j] * per_cell
 
 
-# (3,p) f4, f4, f4, f4, i8, (p,) f4 -> None
+# (i,p) f4, u8, i8, i8, i8, (5,p) f4, (i,3,p) f4 -> None
 @kernel
-def write_contrast(gradients, by_row, by_col, noise_variance, n, out):
-    """Write log2 of the mean squared grey difference along a direction over that of noise, at the first n places.
+def write_gradients(planes, view, half, width, n, rows, out):
+    """Write the mean products of the grey differences of a view in the window of each cell, at the first n places.
 
-    gradients : see `mean_gradients`; by_row, by_col : the direction, a vector of length 1. See BITS_PER_DOUBLING.
+    Differences are those of the cells on both sides. out : (i, 3, p), means of their squares along the columns, along
+    the rows, and of their products, over the part of the window in which both cells lie inside it; rows : scratch.
     """
-    of_rows, of_cols, mixed = gradients[0], gradients[1], gradients[2]
-    per_noise, zero = np.float32(1.0) / (NOISE_OF_DIFFERENCE * noise_variance), np.float32(0.0)
-    both = np.float32(2.0) * by_row * by_col
-    for j in range(n):
-        square = by_row * by_row * of_rows[j] + by_col * by_col * of_cols[j] + both * mixed[j]
-        out[j] = max(square, zero) * per_noise + CONTRAST_FLOOR
-    bits, per_doubling = out.view(np.int32), np.float32(1.0) / BITS_PER_DOUBLING
-    for j in range(n):
-        out[j] = np.float32(bits[j]) * per_doubling - EXPONENT_OF_ONE
+    values, one, two, inner = np.uint64(SUMS), np.uint64(1), np.uint64(2), half - 1
+    row, end = np.uint64(width), np.uint64(n + 2 * half * width + 2 * half)
+    for j in range(end - two * row):
+        along_col = planes[view, j + two * row] - planes[view, j]
+        rows[values, j] = along_col * along_col
+    write_window_means(rows, inner, half, width, n, out, view, np.uint64(0))
+    for j in range(end - two):
+        along_row = planes[view, j + two] - planes[view, j]
+        rows[values, j] = along_row * along_row
+    write_window_means(rows, half, inner, width, n, out, view, one)
+    for j in range(end - two * row - two):
+        along_col = planes[view, j + one + two * row] - planes[view, j + one]
+        rows[values, j] = along_col * (planes[view, j + row + two] - planes[view, j + row])
+    write_window_means(rows, inner, inner, width, n, out, view, two)
 
 
-# PairWindows, ViewPair, PairScratch, f4, i8 -> None
+# i8, i8, i8 -> u8
 @kernel
-def pair_contrasts(views, pair, scratch, noise_variance, n):
-    """Write the contrasts of a pair of views along the direction in which they move against each other."""
-    movement, contrast = scratch.movement, scratch.contrast
-    by_row, by_col = (
-        movement[pair.a, 0] - movement[pair.b, 0],
-        movement[pair.a, 1] - movement[pair.b, 1],
-    )
+def place_of_neighbour(number, half, width):
+    """Place on a flat plane of the neighbour with a number of the cell in the middle of its first window."""
+    after_middle = number + np.int64(number >= n_beside(half) // 2)
+    side = 2 * half + 1
+    return np.uint64(after_middle // side * width + after_middle % side)
+
+
+# (i,p) f4, u8, i8, i8, i8, (i,k,p) u1 -> None
+@kernel
+def write_census(planes, view, half, width, n, out):
+    """Write which neighbours of each cell are brighter than it in a view, one bit each, at the first n places.
+
+    Each byte holds eight neighbours; every window has a multiple of that.
+    """
+    middle, zero = np.uint64(half * (width + 1)), np.uint8(0)
+    for word in range(np.uint64(out.shape[1])):
+        number = 8 * np.int64(word)
+        p, q = place_of_neighbour(number, half, width), place_of_neighbour(number + 1, half, width)
+        r, s = place_of_neighbour(number + 2, half, width), place_of_neighbour(number + 3, half, width)
+        t, u = place_of_neighbour(number + 4, half, width), place_of_neighbour(number + 5, half, width)
+        v, w = place_of_neighbour(number + 6, half, width), place_of_neighbour(number + 7, half, width)
+        for j in range(np.uint64(n)):
+            here = planes[view, middle + j]
+            a = np.uint8(1) if planes[view, p + j] > here else zero
+            b = np.uint8(2) if planes[view, q + j] > here else zero
+            c = np.uint8(4) if planes[view, r + j] > here else zero
+            d = np.uint8(8) if planes[view, s + j] > here else zero
+            e = np.uint8(16) if planes[view, t + j] > here else zero
+            f = np.uint8(32) if planes[view, u + j] > here else zero
+            g = np.uint8(64) if planes[view, v + j] > here else zero
+            h = np.uint8(128) if planes[view, w + j] > here else zero
+            out[view, word, j] = np.uint8(a | b | c | d | e | f | g | h)
+
+
+# u1 -> u1
+@kernel
+def bit_count(byte):
+    """How many bits of a byte are set."""
+    pairs = np.uint8(byte - ((byte >> np.uint8(1)) & np.uint8(0x55)))
+    fours = np.uint8((pairs & np.uint8(0x33)) + ((pairs >> np.uint8(2)) & np.uint8(0x33)))
+    return np.uint8((fours + (fours >> np.uint8(4))) & np.uint8(0x0F))
+
+
+# (i,p) f4, ViewPair, WindowMoments, i8, i8, i8, (5,p) f4 -> None
+@kernel
+def write_smallest_correlation(planes, pair, moments, half, width, n, rows):
+    """Write a pair's correlation in the first windows, of 3 x 3 cells, to a scratch row, at the first n places.
+
+    half : cells around the block.
+    """
+    a, b, mean, scale, first = pair.a, pair.b, moments.mean, moments.scale, np.uint64(half - 1)
+    sums, total, zero, one, two = np.uint64(SUMS), np.uint64(POSITION), np.uint64(0), np.uint64(1), np.uint64(2)
+    p, q, r = np.uint64((half - 1) * width), np.uint64(half * width), np.uint64((half + 1) * width)
+    for j in range(np.uint64(n + SLACK)):
+        upper, middle = planes[a, p + j] * planes[b, p + j], planes[a, q + j] * planes[b, q + j]
+        rows[sums, j] = upper + middle + planes[a, r + j] * planes[b, r + j]
+    for j in range(np.uint64(n)):
+        cross = rows[sums, first + j] + rows[sums, first + one + j] + rows[sums, first + two + j]
+        product = cross - mean[a, zero, j] * mean[b, zero, j]
+        rows[total, j] = scale[a, zero, j] * scale[b, zero, j] * product
+
+
+# PairWindows, ViewPair, WindowMoments, (5,p) f4, i8 -> None
+@kernel
+def write_pair_correlation(views, pair, moments, rows, n):
+    """Write the sum of a pair's correlations over the windows to a scratch row, at the first n places."""
+    windows, half, width, done = views.windows, views.windows[-1], views.width, 0
+    if windows[0] == 1:
+        write_smallest_correlation(views.planes, pair, moments, half, width, n, rows)
+        done = 1
+    else:
+        rows[POSITION, :n] = 0.0
+    for w in range(done, windows.shape[0]):
+        window, columns = windows[w], rows[SUMS]
+        column_products(views.planes, pair, ColumnSums(half, done, window, width, n + SLACK), columns)
+        add_correlation(columns[half - window :], window, n, pair, w, moments, rows[BEYOND], rows[POSITION])
+        done = window
+
+
+# (i,3,p) f4, (i,2) f4, ViewPair, f4, i8, (5,p) f4 -> None
+@kernel
+def write_contrasts(gradients, movement, pair, noise_variance, n, rows):
+    """Write the contrasts of a pair of views to scratch rows, before their logarithm, at the first n places.
+
+    A contrast is the mean squared grey difference, along the direction in which the two views move against each other,
+    over that of noise, and CONTRAST_FLOOR.
+    """
+    a, b, one, two, zero = pair.a, pair.b, np.uint64(1), np.uint64(2), np.uint64(0)
+    by_row, by_col = movement[a, zero] - movement[b, zero], movement[a, one] - movement[b, one]
     length = max(np.sqrt(by_row * by_row + by_col * by_col), np.float32(1e-9))
     by_row, by_col = by_row / length, by_col / length
-    write_contrast(scratch.gradients[pair.a], by_row, by_col, noise_variance, n, contrast[0])
-    write_contrast(scratch.gradients[pair.b], by_row, by_col, noise_variance, n, contrast[1])
+    per_noise, none = np.float32(1.0) / (NOISE_OF_DIFFERENCE * noise_variance), np.float32(0.0)
+    squares_row, squares_col, both = by_row * by_row, by_col * by_col, np.float32(2.0) * by_row * by_col
+    for j in range(np.uint64(n)):
+        square = squares_row * gradients[a, zero, j] + squares_col * gradients[a, one, j] + both * gradients[a, two, j]
+        rows[np.uint64(CONTRAST_A), j] = max(square, none) * per_noise + CONTRAST_FLOOR
+    for j in range(np.uint64(n)):
+        square = squares_row * gradients[b, zero, j] + squares_col * gradients[b, one, j] + both * gradients[b, two, j]
+        rows[np.uint64(CONTRAST_B), j] = max(square, none) * per_noise + CONTRAST_FLOOR
 
 
-# PairWindows, ViewPair, i8, (p,) f4 -> None
+# i4 -> f4
 @kernel
-def count_same_order(views, pair, n, out):
-    """Write how many neighbours of each cell are brighter than it in both views, or in neither, at the first n places.
+def doublings(bits):
+    """Logarithm to the base 2 of the float32 with these bits, see BITS_PER_DOUBLING."""
+    return np.float32(bits) * (np.float32(1.0) / BITS_PER_DOUBLING) - EXPONENT_OF_ONE
 
-    The neighbours are those of the largest window.
+
+# (5,p) i4, i8, (p,) i4 -> None
+@kernel
+def write_contrast_bins(bits, n, bins):
+    """Write the bin of the contrasts of a pair of views and of their difference, at the first n places."""
+    zero, last = np.float32(0.0), np.float32(N_CONTRAST - 1)
+    for j in range(np.uint64(n)):
+        of_a, of_b = doublings(bits[np.uint64(CONTRAST_A), j]), doublings(bits[np.uint64(CONTRAST_B), j])
+        both = min(max(of_a + of_b - LOWEST_CONTRAST, zero), last)
+        apart = abs(of_a - of_b)
+        difference = np.int32(apart >= SOME_DIFFERENCE) + np.int32(apart >= LARGE_DIFFERENCE)
+        bins[j] = np.int32(both) * np.int32(N_CONTRAST_DIFFERENCE) + difference
+
+
+# (i,p) f4, f4, ViewPair, i8, (p,) i4 -> None
+@kernel
+def add_grey_bins(greys, grey_factor, pair, n, bins):
+    """Make bins of contrast those of contrast and grey difference, at the first n places. grey_factor : of `greys`."""
+    to_grey, per_factor = np.float32(N_GREY) / LARGEST_GREY_ROOT, np.float32(1.0) / grey_factor
+    a, b, last = pair.a, pair.b, np.float32(N_GREY - 1)
+    for j in range(np.uint64(n)):
+        grey = min(np.sqrt(abs(greys[a, j] - greys[b, j]) * per_factor) * to_grey, last)
+        bins[j] = bins[j] * np.int32(N_GREY) + np.int32(grey)
+
+
+# (i,k,p) u1, ViewPair, i8, i8, i8, (5,p) f4, (p,) i4 -> None
+@kernel
+def add_likeness_bins(census, pair, half, n_sizes, n, rows, bins):
+    """Make bins of contrast and grey difference those of all features, at the first n places.
+
+    The sum of the correlations over n_sizes windows, in a scratch row, becomes the position between two bins of
+    likeness. half : of the largest window, whose cells the census compares.
     """
-    half, width = views.windows[-1], views.width
-    centre = half * (width + 1)
-    one, other = views.planes[pair.a], views.planes[pair.b]
-    here, here_too = one[centre:], other[centre:]
-    out[:n] = 0.0
-    for r in range(2 * half + 1):
-        for c in range(2 * half + 1):
-            if r == half and c == half:
-                continue
-            beside, beside_too = one[r * width + c :], other[r * width + c :]
-            for j in range(n):
-                out[j] += np.float32((beside[j] > here[j]) == (beside_too[j] > here_too[j]))
-
-
-# PairWindows, ViewPair, WindowMoments, PairScratch, i8 -> None
-@kernel
-def add_pair_correlation(views, pair, moments, scratch, n):
-    """Write the sum of a pair's correlations over the windows to `scratch.position`, at the first n places."""
-    work, windows, half, columns, done = scratch.work, views.windows, views.windows[-1], scratch.work[0], 0
-    scratch.position[:n] = 0.0
-    for w in range(windows.shape[0]):
-        window = windows[w]
-        column_products(views.planes, pair, ColumnSums(half, done, window, views.width, n + SLACK), columns)
-        add_correlation(columns[half - window :], window, n, pair, w, moments, work[1], scratch.position)
-        done = window
+    position, differing, zero = np.uint64(POSITION), np.uint64(SUMS), np.uint64(0)
+    for j in range(np.uint64(n)):
+        rows[differing, j] = np.float32(bit_count(np.uint8(census[pair.a, zero, j] ^ census[pair.b, zero, j])))
+    for k in range(1, census.shape[1]):
+        byte = np.uint64(k)
+        for j in range(np.uint64(n)):
+            other = np.uint8(census[pair.a, byte, j] ^ census[pair.b, byte, j])
+            rows[differing, j] += np.float32(bit_count(other))
+    to_bin, none, last = np.float32(0.5 * (N_LIKENESS - 1)), np.float32(0.0), np.float32(N_LIKENESS - 1.001)
+    of_correlation, of_all = CORRELATION_SHARE * to_bin / np.float32(n_sizes), np.float32(n_beside(half))
+    of_order = np.float32(2.0) * (np.float32(1.0) - CORRELATION_SHARE) * to_bin / of_all
+    for j in range(np.uint64(n)):
+        same_order = (of_all - rows[differing, j]) * of_order
+        place = rows[position, j] * of_correlation + same_order + CORRELATION_SHARE * to_bin
+        place = min(max(place, none), last)
+        lower = np.int32(place)
+        rows[position, j] = place - np.float32(lower)
+        bins[j] = bins[j] * np.int32(N_LIKENESS) + lower
 
 
 # PairWindows, ViewPair, WindowMoments, PairScratch, f4, i8 -> None
 @kernel
-def pair_bins(views, pair, moments, scratch, noise_variance, n):
-    """Write the bin of a pair of views, and its position between two bins of likeness, at the first n places."""
-    position, bins, same_order, windows = scratch.position, scratch.bins, scratch.work[2], views.windows
-    add_pair_correlation(views, pair, moments, scratch, n)
-    count_same_order(views, pair, n, same_order)
-    pair_contrasts(views, pair, scratch, noise_variance, n)
-    one, zero, last = np.float32(1.0), np.float32(0.0), np.float32(N_LIKENESS - 1.001)
-    n_beside = np.float32((2 * windows[-1] + 1) ** 2 - 1)
-    to_bin = np.float32(0.5 * (N_LIKENESS - 1))
-    of_correlation = CORRELATION_SHARE * to_bin / np.float32(windows.shape[0])
-    of_order, least = np.float32(2.0) * (one - CORRELATION_SHARE) * to_bin / n_beside, CORRELATION_SHARE * to_bin
-    to_grey, per_factor = np.float32(N_GREY) / LARGEST_GREY_ROOT, one / views.grey_factor
-    grey_a, grey_b, contrast_a, contrast_b = (
-        views.greys[pair.a],
-        views.greys[pair.b],
-        scratch.contrast[0],
-        scratch.contrast[1],
-    )
-    for j in range(n):
-        both = contrast_a[j] + contrast_b[j] - LOWEST_CONTRAST
-        both = min(max(both, zero), np.float32(N_CONTRAST - 1))
-        apart = abs(contrast_a[j] - contrast_b[j])
-        difference = np.int32(apart >= SOME_DIFFERENCE) + np.int32(apart >= LARGE_DIFFERENCE)
-        grey = min(np.sqrt(abs(grey_a[j] - grey_b[j]) * per_factor) * to_grey, np.float32(N_GREY - 1))
-        place = min(max(position[j] * of_correlation + same_order[j] * of_order + least, zero), last)
-        lower = np.int32(place)
-        position[j] = place - np.float32(lower)
-        row = np.int32(both) * np.int32(N_CONTRAST_DIFFERENCE) + difference
-        bins[j] = (row * np.int32(N_GREY) + np.int32(grey)) * np.int32(N_LIKENESS) + lower
+def write_pair_bins(views, pair, moments, scratch, noise_variance, n):
+    """Write the bin of a pair of views, and its position between two bins of likeness, at the first n places.
+
+    Each feature has loops of its own, because a loop over the arrays of all features is not vectorised. Arrays are
+    indexed by unsigned numbers, without slices, whose references would be counted: this takes a third of the time.
+    """
+    windows, rows, bins = views.windows, scratch.rows, scratch.bins
+    write_pair_correlation(views, pair, moments, rows, n)
+    write_contrasts(scratch.gradients, scratch.movement, pair, noise_variance, n, rows)
+    write_contrast_bins(scratch.bits, n, bins)
+    add_grey_bins(views.greys, views.grey_factor, pair, n, bins)
+    add_likeness_bins(scratch.census, pair, windows[-1], windows.shape[0], n, rows, bins)
+
+
+# PairWindows, PairScratch, i8 -> None
+@kernel
+def describe_views(views, scratch, n):
+    """Write what the pairs need of each view: its gradients and its census."""
+    half, width = views.windows[-1], views.width
+    for view in range(np.uint64(views.planes.shape[0])):
+        write_gradients(views.planes, view, half, width, n, scratch.rows, scratch.gradients)
+        write_census(views.planes, view, half, width, n, scratch.census)
 
 
 # PairWindows, WindowMoments, PairScratch, i8, i4, TableAndCounts -> None
@@ -253,13 +372,12 @@ def count_bins(views, moments, scratch, n, height, evidence):
     """Count the bins of all pairs of views at one height, at right and at wrong heights of the cells of a block."""
     learning = evidence.learning
     reference, right, wrong = learning.reference, learning.right, learning.wrong
-    noise_variance, position, bins = evidence.table.noise_variance, scratch.position, scratch.bins
-    for view in range(views.planes.shape[0]):
-        mean_gradients(views.planes[view], views.windows[-1], views.width, n, scratch.gradients[view])
+    noise_variance, position, bins = evidence.table.noise_variance, scratch.rows[POSITION], scratch.bins
+    describe_views(views, scratch, n)
     rows, cols = reference.shape
     for a in range(views.planes.shape[0]):
         for b in range(a + 1, views.planes.shape[0]):
-            pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, noise_variance, n)
+            write_pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, noise_variance, n)
             for r in range(rows):
                 for c in range(cols):
                     j = r * views.width + c
@@ -275,22 +393,30 @@ def count_bins(views, moments, scratch, n, height, evidence):
                         wrong[nearest] += 1
 
 
+# (e,) f4, (i,p) f4, ViewPair, i8, (5,p) f4, (p,) i4, (p,) f4 -> None
+@kernel
+def add_ratios(table, greys, pair, n, rows, bins, total):
+    """Add the log-likelihood ratios of a pair of views where both see the cell, at the first n places."""
+    a, b, one, next_bin, none = pair.a, pair.b, np.float32(1.0), np.uint64(1), np.float32(0.0)
+    position, ratio = np.uint64(POSITION), np.uint64(SUMS)
+    for j in range(np.uint64(n)):
+        at, share = np.uint64(bins[j]), rows[position, j]
+        rows[ratio, j] = table[at] * (one - share) + table[at + next_bin] * share
+    for j in range(np.uint64(n)):
+        is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
+        total[j] += rows[ratio, j] if is_seen else none
+
+
 # PairWindows, WindowMoments, PairScratch, i8, EvidenceTable, (p,) f4 -> None
 @kernel
 def add_evidence(views, moments, scratch, n, evidence, total):
     """Add the log-likelihood ratios of all pairs of views that see the cell, at the first n places."""
-    table, position, bins, one = evidence.log_ratios, scratch.position, scratch.bins, np.float32(1.0)
-    for view in range(views.planes.shape[0]):
-        mean_gradients(views.planes[view], views.windows[-1], views.width, n, scratch.gradients[view])
-    for a in range(views.planes.shape[0]):
-        for b in range(a + 1, views.planes.shape[0]):
-            pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, evidence.noise_variance, n)
-            grey_a, grey_b = views.greys[a], views.greys[b]
-            for j in range(n):
-                at, share = np.uint64(bins[j]), position[j]
-                ratio = table[at] * (one - share) + table[at + np.uint64(1)] * share
-                is_seen = abs(grey_a[j]) < GREY_LIMIT and abs(grey_b[j]) < GREY_LIMIT
-                total[j] += ratio if is_seen else np.float32(0.0)
+    describe_views(views, scratch, n)
+    for a in range(np.uint64(views.planes.shape[0])):
+        for b in range(a + np.uint64(1), np.uint64(views.planes.shape[0])):
+            pair = ViewPair(a, b)
+            write_pair_bins(views, pair, moments, scratch, evidence.noise_variance, n)
+            add_ratios(evidence.log_ratios, views.greys, pair, n, scratch.rows, scratch.bins, total)
 
 
 # EvidenceTable, i8, i8 -> f4

@@ -7,8 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from zlocus.core.jit import kernel
+from zlocus.matching.kernels.shared_records import CellBox, HeightSpan
 
-MAX_COST = 255
+MAX_COST = np.int32(255)
+# A height index above all others.
+MAX_HEIGHT = 1 << 30
 
 
 class DistanceCost(NamedTuple):
@@ -45,72 +48,117 @@ def cost_of_distance(steps, by_distance):
     return min(by_distance.cost_per_step * beyond, by_distance.max_cost)
 
 
-# (n,) f4 -> None
+# (n,) i4 -> None
 @kernel
 def spread_distances(distance):
     """Replace distances of heights by the least sum of a distance and the steps from there."""
-    one = np.float32(1.0)
+    one = np.int32(1)
     for k in range(1, distance.shape[0]):
         distance[k] = min(distance[k], distance[k - 1] + one)
     for k in range(distance.shape[0] - 2, -1, -1):
         distance[k] = min(distance[k], distance[k + 1] + one)
 
 
-# (v,) u1, VolumeLayout, (r,c) f4, (m,e,f) f4, CoarserCells, DistanceCost -> None
+# VolumeLayout, i8, i8, f4 -> i8
+@kernel
+def lowest_height(layout, r, c, slope):
+    """Level index of the lowest height that a cell searches, to the nearest whole one. slope : of the cell."""
+    return layout.first[r // layout.block, c // layout.block] + np.int64(np.rint(slope))
+
+
+# VolumeLayout, (r,c) f4, CellBox -> HeightSpan
+@kernel
+def span_of_cells(layout, slope_cells, box):
+    """The heights that any cell of a rectangle searches, level indices."""
+    low, high = MAX_HEIGHT, -MAX_HEIGHT
+    for r in range(box.first_row, box.end_row):
+        for c in range(box.first_col, box.end_col):
+            lowest = lowest_height(layout, r, c, slope_cells[r, c])
+            low = min(low, lowest)
+            high = max(high, lowest + layout.n_heights[r // layout.block, c // layout.block])
+    return HeightSpan(low, high - low)
+
+
+# (m,e,f) i4, i8, i8, i8, HeightSpan, DistanceCost, (n,) i4, (n,) i4 -> None
+@kernel
+def costs_around(candidates, row, col, reach, span, by_distance, distance, out):
+    """Write the cost of every height of a span by its distance from the candidates around a coarser cell.
+
+    A candidate beyond the span counts as the nearest of its heights. distance : scratch.
+    """
+    n_candidates, n_rows, n_cols = candidates.shape
+    n, last = span.n_heights, span.n_heights - 1
+    distance[:n] = MAX_HEIGHT
+    for e in range(max(row - reach, 0), min(row + reach + 1, n_rows)):
+        for f in range(max(col - reach, 0), min(col + reach + 1, n_cols)):
+            for m in range(n_candidates):
+                distance[min(max(2 * np.int64(candidates[m, e, f]) - span.first, 0), last)] = 0
+    spread_distances(distance[:n])
+    for k in range(n):
+        out[k] = np.int32(cost_of_distance(np.float32(distance[k]), by_distance) + np.float32(0.5))
+
+
+# (v,) u1, VolumeLayout, (r,c) f4, (m,e,f) i4, CoarserCells, DistanceCost -> None
 @kernel
 def add_costs_of_candidates(cost, layout, slope_cells, candidates, coarser, by_distance):
     """Add the cost of the distance to the nearest candidate of the coarser cells around each cell.
 
-    slope_cells : (r, c), height index of the slanted support surface; candidates : (m, e, f) float32, heights of the
-    coarser cells, height indices of the coarser level. A candidate beyond the heights searched counts as the nearest of
-    them.
+    slope_cells : (r, c), height index of the slanted support surface; candidates : (m, e, f), height indices of the
+    coarser level. The costs are those of all finer cells of a coarser one, whose heights are counted together.
     """
-    n_candidates, n_rows, n_cols = candidates.shape
-    distance = np.empty(np.max(layout.n_heights), np.float32)
-    far = by_distance.free_steps + by_distance.max_cost / by_distance.cost_per_step
-    for r in range(slope_cells.shape[0]):
-        for c in range(slope_cells.shape[1]):
-            b, d = r // layout.block, c // layout.block
-            n, start = layout.n_heights[b, d], cell_start(layout, r, c)
-            lowest = slope_cells[r, c] + np.float32(layout.first[b, d])
-            distance[:n] = far
-            row, col = (coarser.row + r) // 2, (coarser.col + c) // 2
-            for e in range(max(row - coarser.reach, 0), min(row + coarser.reach + 1, n_rows)):
-                for f in range(max(col - coarser.reach, 0), min(col + coarser.reach + 1, n_cols)):
-                    for m in range(n_candidates):
-                        k = int(np.rint(np.float32(2.0) * candidates[m, e, f] - lowest))
-                        distance[min(max(k, 0), n - 1)] = 0.0
-            spread_distances(distance[:n])
-            for k in range(n):
-                added = int(cost_of_distance(distance[k], by_distance) + np.float32(0.5))
-                cost[start + k] = np.uint8(min(int(cost[start + k]) + added, MAX_COST))
+    (rows, cols), reach, block = slope_cells.shape, coarser.reach, layout.block
+    of_tile = span_of_cells(layout, slope_cells, CellBox(0, rows, 0, cols))
+    distance, added = np.empty(of_tile.n_heights, np.int32), np.empty(of_tile.n_heights, np.int32)
+    for row in range(coarser.row // 2, (coarser.row + rows - 1) // 2 + 1):
+        for col in range(coarser.col // 2, (coarser.col + cols - 1) // 2 + 1):
+            box = CellBox(
+                max(2 * row - coarser.row, 0), min(2 * row + 2 - coarser.row, rows),
+                max(2 * col - coarser.col, 0), min(2 * col + 2 - coarser.col, cols),
+            )  # fmt: skip
+            span = span_of_cells(layout, slope_cells, box)
+            costs_around(candidates, row, col, reach, span, by_distance, distance, added)
+            for r in range(box.first_row, box.end_row):
+                for c in range(box.first_col, box.end_col):
+                    n, start = layout.n_heights[r // block, c // block], np.uint64(cell_start(layout, r, c))
+                    first = np.uint64(lowest_height(layout, r, c, slope_cells[r, c]) - span.first)
+                    for k in range(np.uint64(n)):
+                        total = np.int32(cost[start + k]) + added[first + k]
+                        cost[start + k] = np.uint8(min(total, MAX_COST))
 
 
 # (v,) u1, VolumeLayout, (r,c) f4, (r,c) f4, (r,c) f4, DistanceCost -> None
 @kernel
 def add_costs_beyond(cost, layout, slope_cells, low, high, by_distance):
     """Add the cost of the distance below `low` or above `high`, (r, c) height indices, to every height."""
+    half, none, free = np.float32(0.5), np.float32(0.0), by_distance.free_steps
     for r in range(slope_cells.shape[0]):
         for c in range(slope_cells.shape[1]):
             b, d = r // layout.block, c // layout.block
-            start, lowest = cell_start(layout, r, c), slope_cells[r, c] + np.float32(layout.first[b, d])
-            for k in range(layout.n_heights[b, d]):
-                height = lowest + np.float32(k)
-                distance = max(low[r, c] - height, height - high[r, c])
-                added = int(cost_of_distance(distance, by_distance) + np.float32(0.5))
-                cost[start + k] = np.uint8(min(int(cost[start + k]) + added, MAX_COST))
+            n, lowest = layout.n_heights[b, d], slope_cells[r, c] + np.float32(layout.first[b, d])
+            below, above, start = low[r, c], high[r, c], np.uint64(cell_start(layout, r, c))
+            if max(below - lowest, lowest + np.float32(n) - above) <= free:
+                continue
+            for k in range(np.uint64(n)):
+                height = lowest + np.float32(np.int32(k))
+                beyond = max(max(below - height, height - above) - free, none)
+                added = np.int32(min(by_distance.cost_per_step * beyond, by_distance.max_cost) + half)
+                cost[start + k] = np.uint8(min(np.int32(cost[start + k]) + added, MAX_COST))
 
 
-# (v,) u1, VolumeLayout, (r,c) i4, (r,c) f4 -> None
+# (v,) u1, VolumeLayout, (r,c) i4, (r,c) b1, (r,c) f4 -> None
 @kernel
-def write_misfit(cost, layout, height, misfit):
-    """Write by how much the cost of each cell at its height, (r, c) slope index, is above its least cost."""
+def write_misfit(cost, layout, height, is_wanted, misfit):
+    """Write by how much the cost of each cell at its height, (r, c) slope index, is above its least cost; 0 where it is
+    not wanted."""
     for r in range(height.shape[0]):
         for c in range(height.shape[1]):
+            misfit[r, c] = np.float32(0.0)
+            if not is_wanted[r, c]:
+                continue
             b, d = r // layout.block, c // layout.block
-            start, n = cell_start(layout, r, c), layout.n_heights[b, d]
-            least = MAX_COST
-            for k in range(n):
-                least = min(least, int(cost[start + k]))
-            at = min(max(int(height[r, c]) - layout.first[b, d], 0), n - 1)
-            misfit[r, c] = np.float32(int(cost[start + at]) - least)
+            start, n, least = np.uint64(cell_start(layout, r, c)), layout.n_heights[b, d], np.uint8(255)
+            for k in range(np.uint64(n)):
+                here = cost[start + k]
+                least = here if here < least else least
+            at = min(max(np.int64(height[r, c]) - layout.first[b, d], 0), n - 1)
+            misfit[r, c] = np.float32(np.int32(cost[start + np.uint64(at)]) - np.int32(least))
