@@ -412,9 +412,9 @@ def add_ratios(table, greys, pair, n, rows, bins, total):
 def add_evidence(views, moments, scratch, n, evidence, total):
     """Add the log-likelihood ratios of all pairs of views that see the cell, at the first n places."""
     describe_views(views, scratch, n)
-    for a in range(np.uint64(views.planes.shape[0])):
-        for b in range(a + np.uint64(1), np.uint64(views.planes.shape[0])):
-            pair = ViewPair(a, b)
+    for a in range(views.planes.shape[0]):
+        for b in range(a + 1, views.planes.shape[0]):
+            pair = ViewPair(np.uint64(a), np.uint64(b))
             write_pair_bins(views, pair, moments, scratch, evidence.noise_variance, n)
             add_ratios(evidence.log_ratios, views.greys, pair, n, scratch.rows, scratch.bins, total)
 
