@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zlocus.core.options.option_fields import Checked, option
+from zlocus.core.options.option_fields import Checked, option, option_by_method
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,11 @@ class RefineOptions(Checked):
     max_correction_steps: float = option(
         1.5, "Largest difference between a refined height and the semi-global height. Beyond it the semi-global height "
         "is kept.", low=0.1, high=10.0, unit="steps",
+    )  # fmt: skip
+    max_plane_side: int | None = option_by_method(
+        17, 0, "Side of the largest windows whose heights are smoothed by a plane where it explains them within their "
+        "precision. 0: no smoothing.",
+        choices=(0, 5, 9, 17, 33), unit="cells",
     )  # fmt: skip
 
 
