@@ -14,6 +14,7 @@ from zlocus.matching.local_planes import (
     MIN_KNOWN_SHARE,
     mean_of_planes,
     planes_of_windows,
+    remaining_error,
     smoothed_by_planes,
 )
 
@@ -35,7 +36,7 @@ def slope(shape, by_row=0.21, by_col=-0.13):
 def smooth(height, sigma=SIGMA_STEPS, is_known=None, sides=SIDES):
     sigma = np.broadcast_to(np.float32(sigma), height.shape).copy()
     is_known = np.ones(height.shape, bool) if is_known is None else is_known
-    return smoothed_by_planes(height.astype(np.float32), sigma, is_known, WHOLE, sides)
+    return smoothed_by_planes(height.astype(np.float32), sigma, is_known, WHOLE, sides).height
 
 
 def noise(shape, seed=0):
@@ -100,7 +101,7 @@ def test_heights_do_not_depend_on_the_strips_nor_on_cells_far_away(monkeypatch):
     whole = smooth(height)
     monkeypatch.setattr(local_planes, "STRIP_ROWS", 37)
     np.testing.assert_allclose(smooth(height), whole, rtol=0, atol=ROUNDING_STEPS)
-    part = smoothed_by_planes(height[30:120], sigma[30:120], is_known[30:120], WHOLE, SIDES)
+    part = smoothed_by_planes(height[30:120], sigma[30:120], is_known[30:120], WHOLE, SIDES).height
     np.testing.assert_allclose(part[reach:-reach], whole[30 + reach : 120 - reach], rtol=0, atol=ROUNDING_STEPS)
 
 
@@ -146,3 +147,19 @@ def test_no_plane_where_a_window_has_few_heights(side):
     assert np.isnan(
         mean_of_planes(planes_of_windows(slope((40, 40)), np.ones((40, 40), np.float32), is_known, side), side)
     ).all()
+
+
+def test_each_height_tells_the_windows_that_it_came_from():
+    height = slope((70, 70)) + noise((70, 70), 6)
+    height[:, 50:] += 9.0
+    sigma, is_known = np.full((70, 70), SIGMA_STEPS, np.float32), np.ones((70, 70), bool)
+    is_known[:8] = False
+    found = smoothed_by_planes(height, sigma, is_known, WHOLE, SIDES)
+    assert set(np.unique(found.side)) <= {0, *SIDES}
+    assert (found.side[30:40, 10:20] == SIDES[-1]).all()
+    np.testing.assert_array_equal(found.height[found.side == 0], height[found.side == 0])
+    assert (found.side[~is_known] == 0).all()
+    shares = remaining_error(found.side)
+    assert (shares[found.side == 0] == 1).all()
+    assert (shares > 0).all()
+    assert (shares <= 1).all()

@@ -14,7 +14,7 @@ from zlocus.matching.height_checks import judge
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.level_records import LevelResult, TileInputs
 from zlocus.matching.local_contrast import texture_unit
-from zlocus.matching.local_planes import SIDES, smoothed_by_planes
+from zlocus.matching.local_planes import SIDES, remaining_error, smoothed_by_planes
 from zlocus.matching.occlusion import covers, excluded_view_mask, n_seeing
 from zlocus.matching.overlap import OverlapGround, unsupported
 from zlocus.matching.plane_fitting import PlanarHeights, with_planes
@@ -82,7 +82,9 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     lattice_index = refined.height
     if tile.method != "mvll":
         sides = [side for side in SIDES if side <= value_of(config.refine, "max_plane_side")]
-        lattice_index = smoothed_by_planes(lattice_index, sigma, ~is_empty(quality), result.level.core, sides)
+        smooth = smoothed_by_planes(lattice_index, sigma, ~is_empty(quality), result.level.core, sides)
+        lattice_index = smooth.height
+        sigma *= remaining_error(smooth.side)
     height = result.lattice.metres(lattice_index)
     sigma *= np.float32(match_scene.height_step)
     height[is_empty(quality)] = np.nan

@@ -20,6 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.matching.precision_calibration import REMAINING_OF_PLANES
+
 FloatGrid = NDArray[np.float32]
 # Sides of the windows, cells, from the smallest to the largest.
 SIDES = (5, 9, 17, 33)
@@ -53,26 +55,45 @@ class Planes(NamedTuple):
     n_known: NDArray[np.float64]
 
 
+class SmoothedHeights(NamedTuple):
+    """height : (r, c) float32; side : (r, c) uint8, side of the windows whose planes a height was taken from, cells, 0
+    where it was kept."""
+
+    height: FloatGrid
+    side: NDArray[np.uint8]
+
+
+def remaining_error(side: NDArray[np.uint8]) -> FloatGrid:
+    """Standard deviation of heights smoothed by planes of windows of a side, over what it was before, (r, c) float32.
+
+    Measured by `benchmarks/precision.py`.
+    """
+    by_side = np.ones(max(SIDES) + 1, np.float32)
+    for each, share in REMAINING_OF_PLANES.items():
+        by_side[each] = share
+    return by_side[side]
+
+
 def smoothed_by_planes(
     height: FloatGrid,
     sigma: FloatGrid,
     is_known: NDArray[np.bool_],
     core: tuple[slice, slice],
     sides: Sequence[int],
-) -> FloatGrid:
-    """Heights smoothed by local planes, (r, c) float32; those of cells that are not known stay.
+) -> SmoothedHeights:
+    """Heights smoothed by local planes; those of cells that are not known stay.
 
     height, sigma : (r, c) float32, of the cells and their standard deviations, in one unit; is_known : (r, c) bool;
     core : the part of the cells whose usual standard deviation counts; sides : of the windows, cells, ascending.
     """
-    smooth, usual = height.copy(), sigma[core][is_known[core]]
+    smooth = SmoothedHeights(height.copy(), np.zeros(height.shape, np.uint8))
+    usual = sigma[core][is_known[core]]
     if not (usual.size and len(sides)):
         return smooth
     limit, reach = np.float32(MAX_SIGMA_OF_USUAL * np.median(usual)), 2 * (max(sides) // 2)
     for wide, inner, strip in _strips(height.shape[0], reach):
-        known = is_known[wide]
-        of_strip = _smoothed(height[wide], np.minimum(sigma[wide], limit), known, sides)
-        smooth[strip] = np.where(known, of_strip, height[wide])[inner]
+        of_strip = _smoothed(height[wide], np.minimum(sigma[wide], limit), is_known[wide], sides)
+        smooth.height[strip], smooth.side[strip] = of_strip.height[inner], of_strip.side[inner]
     return smooth
 
 
@@ -83,13 +104,15 @@ def _strips(n_rows: int, reach: int) -> Iterator[tuple[slice, slice, slice]]:
         yield slice(top, min(end + reach, n_rows)), slice(first - top, end - top), slice(first, end)
 
 
-def _smoothed(height: FloatGrid, sigma: FloatGrid, is_known: NDArray[np.bool_], sides: Sequence[int]) -> FloatGrid:
-    """The same for the rows of a strip, with limited standard deviations; unknown cells have no meaning."""
-    smooth = height.copy()
+def _smoothed(
+    height: FloatGrid, sigma: FloatGrid, is_known: NDArray[np.bool_], sides: Sequence[int]
+) -> SmoothedHeights:
+    """The same for the rows of a strip, with limited standard deviations."""
+    smooth = SmoothedHeights(height.copy(), np.zeros(height.shape, np.uint8))
     for side in sides:
         found = mean_of_planes(planes_of_windows(height, sigma, is_known, side), side)
-        takes = np.abs(found - height) < np.float32(MAX_MOVE_SIGMAS) * sigma
-        smooth[takes] = found[takes]
+        takes = is_known & (np.abs(found - height) < np.float32(MAX_MOVE_SIGMAS) * sigma)
+        smooth.height[takes], smooth.side[takes] = found[takes], np.uint8(side)
     return smooth
 
 
