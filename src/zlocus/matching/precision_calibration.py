@@ -8,7 +8,7 @@ from __future__ import annotations
 # of the first knot, the spacing of the knots, and the logarithm of the factor at each knot.
 Model = tuple[float, float, float, dict[str, tuple[float, float, tuple[float, ...]]]]
 # Where heights are smoothed by planes of windows of a side, cells: the share of sigma that remains.
-REMAINING_OF_PLANES: dict[int, float] = {5: 1.000, 9: 1.000, 17: 0.774, 33: 0.774}
+REMAINING_OF_PLANES: dict[int, float] = {5: 1.000, 9: 1.000, 17: 0.959, 33: 0.959}
 SPLIT: Model = (0.0302, 0.1778, 0.6233, {
     "noise": (-3.6186, 0.61548, (-0.1435, -0.0532, 0.0388, 0.0743, 0.0743, 0.0743, 0.0743, 0.0743, 0.0807)),
     "curvature": (-6.9078, 0.82573, (0.0957, 0.0957, 0.0957, 0.0957, 0.0957, 0.0804, -0.0018, -0.0870, -0.1567)),
