@@ -1,7 +1,7 @@
 """Heights smoothed by local planes, wherever these explain the heights within their precision.
 
-The height of a cell comes from the few cells of its windows, and on ground with little texture its error is as large as
-many steps are small. The ground itself is mostly smooth over a few metres. A plane is therefore fitted to the heights
+The height of a cell comes from the few cells of its windows, so that it errs by a step or more where these show little.
+The ground itself is mostly smooth over a few metres. A plane is therefore fitted to the heights
 in a window around every cell, each with the weight of its precision. Where the heights differ from the plane by no more
 than their standard deviations say, the plane is a better estimate than they are. Where they differ by more, the window
 holds an edge, a tree or relief, and its plane is not used. A cell takes the mean of the planes of all windows that hold
