@@ -14,7 +14,7 @@ from zlocus.matching.occlusion import (
     covered_heights,
     covers,
     in_level_indices,
-    keep_both_views_of_pairs,
+    keep_enough_views,
     mark_occlusions,
     sees,
 )
@@ -200,11 +200,27 @@ def test_nothing_occludes_a_view_from_cells_that_two_cover():
     visible = visible_everywhere(3, (4, 6))
     visible.lowest_covered[2, :, 4:], visible.highest_covered[2, :, 4:] = NEVER_COVERED, -1
     before = visible.copy()
-    keep_both_views_of_pairs(visible)
+    keep_enough_views(visible)
     np.testing.assert_array_equal(visible.lowest_unoccluded[..., :4], before.lowest_unoccluded[..., :4])
     np.testing.assert_array_equal(visible.lowest_covered, before.lowest_covered)
     np.testing.assert_array_equal(visible.highest_covered, before.highest_covered)
     assert (visible.lowest_unoccluded[:, :, 4:] == NEVER_OCCLUDED).all()
+
+
+def test_of_four_views_the_three_that_are_seen_lowest_are_not_occluded():
+    """Views that do not cover a cell are none of them, and views of equal rank are treated alike."""
+    visible = visible_everywhere(5, (2, 3))
+    visible.lowest_unoccluded[:] = np.array([9, 3, 4, 8, 5])[:, None, None]
+    visible.lowest_covered[1, :, 0], visible.highest_covered[1, :, 0] = NEVER_COVERED, -1
+    visible.lowest_unoccluded[3, :, 2] = 5
+    visible.lowest_covered[:2, 1, 1], visible.highest_covered[:2, 1, 1] = NEVER_COVERED, -1
+    keep_enough_views(visible)
+    of_column = visible.lowest_unoccluded[:, 0]
+    assert (of_column[[0, 2, 3, 4], 0] == [9, NEVER_OCCLUDED, NEVER_OCCLUDED, NEVER_OCCLUDED]).all()
+    assert (of_column[:, 1] == [9, NEVER_OCCLUDED, NEVER_OCCLUDED, 8, NEVER_OCCLUDED]).all()
+    assert (of_column[:, 2] == [9, *[NEVER_OCCLUDED] * 4]).all()
+    # Three views cover this cell, and each may be occluded.
+    assert (visible.lowest_unoccluded[2:, 1, 1] == [4, 8, 5]).all()
 
 
 def test_slope_indices_and_level_indices():

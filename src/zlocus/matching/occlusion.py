@@ -20,6 +20,8 @@ from zlocus.matching.view_directions import cells_per_step, parts_of_one_directi
 EDGE_PX = 3.0
 # A height takes two views.
 PAIR = 2
+# Where more views cover a cell, at least so many count as unoccluded.
+MIN_UNOCCLUDED = 3
 
 
 def covered_heights(
@@ -79,13 +81,22 @@ def mark_occlusions(
             )  # fmt: skip
 
 
-def keep_both_views_of_pairs(visible: VisibleHeights) -> None:
-    """Remove the occlusions from cells that only two views cover; changes `visible`.
+def keep_enough_views(visible: VisibleHeights) -> None:
+    """Remove occlusions from cells that would keep too few views; changes `visible`.
 
-    A height that is wrong occludes as much as one that is right. Without the second view no comparison would be left to
-    correct the error.
+    A height that is wrong occludes as much as one that is right. Of two views neither counts as occluded, because no
+    comparison would be left to correct the error. Of four or more, the `MIN_UNOCCLUDED` that are seen lowest do not:
+    in a forest, or beside a false tower, most views would be lost, and those that are left would hold too little
+    evidence. Of three views every one may be occluded: beside a wall only one may see the ground, and comparing it with
+    views of the roof gives false heights.
     """
-    visible.lowest_unoccluded[:, covers(visible).sum(axis=0) <= PAIR] = NEVER_OCCLUDED
+    covered = covers(visible)
+    n_covering = covered.sum(axis=0)
+    visible.lowest_unoccluded[:, n_covering <= PAIR] = NEVER_OCCLUDED
+    if len(covered) > MIN_UNOCCLUDED:
+        of_covering = np.where(covered, visible.lowest_unoccluded, np.iinfo(np.int32).max)
+        limit = np.partition(of_covering, MIN_UNOCCLUDED - 1, axis=0)[MIN_UNOCCLUDED - 1]
+        visible.lowest_unoccluded[(of_covering <= limit) & (n_covering > MIN_UNOCCLUDED)] = NEVER_OCCLUDED
 
 
 def sees(visible: VisibleHeights, height: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -39,7 +39,7 @@ from zlocus.matching.occlusion import (
     covered_heights,
     covers,
     in_level_indices,
-    keep_both_views_of_pairs,
+    keep_enough_views,
     mark_occlusions,
 )
 from zlocus.matching.overlap import CoarsestHeights, ExpectedBounds, OverlapGround, find_overlap_window, overlap_ground
@@ -381,7 +381,7 @@ def visible_heights(tile: TileInputs, search: LevelSearch, prior: SearchPrior) -
         occluder = cv2.erode(prior.surface, prior.erosion)
         margin_steps = value_of(tile.config.cost, "occlusion_margin_steps")
         mark_occlusions(visible, search.tile_views, occluder, search.slope_surface.cells, margin_steps)
-        keep_both_views_of_pairs(visible)
+        keep_enough_views(visible)
     return visible
 
 
