@@ -19,6 +19,7 @@ from zlocus.matching.evidence import (
     noise_variance,
     sampled_blocks,
     smoothed_counts,
+    worth_of_pairs,
 )
 from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE
 
@@ -58,6 +59,24 @@ def test_bins_that_no_image_filled_say_nothing():
     right[5, 0, 3, 10], wrong[5, 0, 3, 4] = 5000, 5000
     ratios, neutral = log_ratios(right, wrong, 20.0)
     assert ratios[0, 2, 12] == pytest.approx(np.full(N_LIKENESS, neutral), abs=1e-5)
+
+
+def test_pairs_are_worth_what_their_likeness_tells():
+    """Likeness of two Gauss distributions d standard deviations apart has the divergence d squared."""
+    likeness, rng = np.arange(N_LIKENESS) + 0.5, np.random.default_rng(8)
+    right, wrong = np.zeros((3, 3, N_LIKENESS), np.int64), np.zeros((3, 3, N_LIKENESS), np.int64)
+    for (a, b), apart in {(0, 1): 1.5, (0, 2): 0.0}.items():
+        for counts, middle in ((right, 10.0 + 3.0 * apart / 2), (wrong, 10.0 - 3.0 * apart / 2)):
+            drawn = np.clip(rng.normal(middle, 3.0, 500_000), likeness[0], likeness[-1])
+            counts[a, b] = np.histogram(drawn, N_LIKENESS, (0, N_LIKENESS))[0]
+    worth = worth_of_pairs(right, wrong)
+    np.testing.assert_array_equal(worth, worth.T)
+    assert worth[0, 1] == pytest.approx(1.5**2, rel=0.05)
+    assert worth[0, 2] < 0.01
+    # Nothing was counted of this pair: it is worth what all pairs together are.
+    assert worth[1, 2] == pytest.approx(
+        worth_of_pairs(*(c.sum(axis=(0, 1)) * np.ones((2, 2, 1), int) for c in (right, wrong)))[0, 1], rel=0.02
+    )
 
 
 def views_of(*images):

@@ -100,14 +100,16 @@ def from_table(table, bins):
     return (1 - share) * table[contrast, difference, grey, lower] + share * table[contrast, difference, grey, lower + 1]
 
 
-def cell_evidence(planes, movement, halves, noise, table, visible, excluded):
-    """Mean evidence over the pairs of views, (r, c), see `reference.agreement.over_pairs`."""
+def cell_evidence(planes, movement, halves, noise, table, visible, excluded, weights):
+    """Weighted mean evidence over the pairs of views, (r, c), see `reference.agreement.over_pairs`.
+
+    weights : (i, i), of the pairs, whose mean over the pairs is 1.
+    """
     here = visible[0]
     total = np.zeros(here.shape[1:])
     for a, b in combinations(range(len(planes)), 2):
-        total += np.where(
-            here[a] & here[b], from_table(table, bins_of_pair(planes, movement, a, b, halves, noise)), 0.0
-        )
+        ratio = from_table(table, bins_of_pair(planes, movement, a, b, halves, noise))
+        total += weights[a, b] * np.where(here[a] & here[b], ratio, 0.0)
     return over_pairs(total, visible, excluded)
 
 
@@ -120,3 +122,14 @@ def counted(planes, movement, halves, noise, is_counted, here):
         which = is_counted & here[a] & here[b]
         np.add.at(counts, (contrast[which], difference[which], grey[which], nearest[which]), 1)
     return counts
+
+
+def pair_weights(worth, views, pairs_per_view):
+    """Weights (i, i) of the pairs of some views by what they are worth, and the number of equally good pairs."""
+    pairs = list(combinations(range(len(views)), 2))
+    ranked = sorted(pairs, key=lambda pair: -worth[views[pair[0]], views[pair[1]]])
+    weights = np.zeros((len(views), len(views)))
+    for a, b in ranked[: int(pairs_per_view * len(views))]:
+        weights[a, b] = weights[b, a] = worth[views[a], views[b]]
+    n_effective = weights.sum() ** 2 / (weights**2).sum() / 2
+    return weights * (2 * len(pairs) / weights.sum()), n_effective

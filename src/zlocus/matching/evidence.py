@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import on_cells
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
-from zlocus.matching.kernels.evidence import TABLE_SHAPE, EvidenceTable, Learning, TableAndCounts
+from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE, EvidenceTable, Learning, TableAndCounts
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.local_contrast import rounded
@@ -44,6 +44,11 @@ GREY_SHARE = 0.6
 # Counts that every bin gets at right heights before the images are looked at, where all blocks of a tile are counted;
 # wrong heights get the same frequency. More counts make rare features, such as those of trees, say less.
 PRIOR_COUNTS = 40.0
+# Each likeness of a pair of views gets so many counts more, in the frequencies of all pairs: pairs that were counted in
+# few cells are worth as much as the others.
+COUNTS_OF_ALL_PAIRS = 200.0
+# No pair is worth less, so that weights exist where no pair says anything.
+LEAST_WORTH = 1e-3
 # A cell is not learned from where the heights of 3 x 3 cells differ by so many steps: one of them is wrong, or there is
 # a jump.
 MAX_STEPS_ACROSS = 6.0
@@ -60,8 +65,18 @@ LEAST_CELLS = 80_000
 # Of every 2^k blocks of a row the same one is counted as in the row above, shifted by the k-th of these.
 ROW_SHIFTS = (0, 1, 2, 3, 4)
 
-NO_TABLE = EvidenceTable(np.zeros(0, np.float32), *(np.float32(value) for value in (1, 0, 0, 0, 0, 0, 0)))
-NO_COUNTS = Learning(np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.int64))
+NO_TABLE = EvidenceTable(
+    log_ratios=np.zeros(0, np.float32), noise_variance=np.float32(1.0), unit=np.float32(0.0),
+    small_window_unit=np.float32(0.0), highest=np.float32(0.0), neutral=np.float32(0.0),
+    pair_exponent=np.float32(0.0), max_cost=np.float32(0.0), worth=np.zeros((0, 0), np.float32),
+)  # fmt: skip
+NO_COUNTS = Learning(
+    np.zeros((0, 0), np.float32),
+    np.zeros(0, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros((0, 0, 0), np.int64),
+    np.zeros((0, 0, 0), np.int64),
+)
 NO_EVIDENCE = TableAndCounts(NO_TABLE, NO_COUNTS)
 
 
@@ -94,7 +109,9 @@ def learned_evidence(
     right, wrong = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
     log_every = log_of_sampling(taught_heights.height.size)
     reference = sampled_blocks(taught_heights.height, lattice.block, log_every)
-    learning = Learning(reference, right, wrong)
+    n_views = len(slope_views.layout)
+    right_of_pair, wrong_of_pair = (np.zeros((n_views, n_views, N_LIKENESS), np.int64) for _ in range(2))
+    learning = Learning(reference, right, wrong, right_of_pair, wrong_of_pair)
     noise = noise_variance(slope_views)
     counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise), learning)
     volume = np.empty(lattice.size, np.uint8)
@@ -114,6 +131,7 @@ def learned_evidence(
         neutral=np.float32(neutral),
         pair_exponent=np.float32(PAIR_EXPONENT),
         max_cost=np.float32(MAX_MIDDLE_COST),
+        worth=worth_of_pairs(right_of_pair, wrong_of_pair),
     )
     return TableAndCounts(found, NO_COUNTS)
 
@@ -139,6 +157,24 @@ def log_ratios(
     ratios = np.clip(ratios, -MAX_LOG_RATIO, MAX_LOG_RATIO)
     neutral = -float((of_wrong * ratios).sum() / n_wrong)
     return (ratios + neutral).astype(np.float32), neutral
+
+
+def worth_of_pairs(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> NDArray[np.float32]:
+    """How well each pair of views tells right heights from wrong ones, natural units, (i, i) float32.
+
+    right, wrong : (i, i, k), how often each likeness of a pair occurs at them; only those of views in ascending order
+    are counted. The worth is the divergence of the two frequencies (Jeffreys 1946): the mean log-likelihood ratio at
+    right heights less that at wrong ones. Two images of one pass are worth several times as much as two of different
+    days, and a pair that points elsewhere is worth nothing.
+    """
+    of_right, of_wrong = (
+        counts + COUNTS_OF_ALL_PAIRS * (counts.sum(axis=(0, 1)) + 1) / (counts.sum() + counts.shape[2])
+        for counts in (right, wrong)
+    )
+    of_right, of_wrong = (counts / counts.sum(axis=2, keepdims=True) for counts in (of_right, of_wrong))
+    divergence = ((of_right - of_wrong) * np.log(of_right / of_wrong)).sum(axis=2)
+    upper = np.triu(np.maximum(divergence, LEAST_WORTH), 1)
+    return np.asarray(upper + upper.T, np.float32)
 
 
 def smoothed_counts(counts: NDArray[np.int64]) -> NDArray[np.float64]:

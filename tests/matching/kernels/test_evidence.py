@@ -13,6 +13,7 @@ from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, til
 from zlocus.matching.kernels.evidence import (
     CONTRAST_A,
     CONTRAST_B,
+    N_LIKENESS,
     TABLE_SHAPE,
     EvidenceTable,
     Learning,
@@ -25,6 +26,7 @@ from zlocus.matching.kernels.evidence import (
     write_gradients,
 )
 from zlocus.matching.kernels.ncc import ViewPair
+from zlocus.matching.kernels.pairs_of_block import PAIRS_PER_VIEW, pairs_of_block
 from zlocus.matching.kernels.shared_records import NEVER_COVERED
 
 HALVES = np.array([1, 2])
@@ -75,11 +77,19 @@ def planes_of(scene, block_row, block_col, rows, cols, index):
     return planes, twin.movements(nodes, scene.heights, index, BLOCK, 2)
 
 
-def table_with(ratios):
+def worth_of(n_views, seed=5):
+    """What each pair of views is worth, (i, i)."""
+    worth = np.random.default_rng(seed).uniform(0.2, 2.0, (n_views, n_views)).astype(np.float32)
+    return worth + worth.T
+
+
+def table_with(ratios, n_views=3):
     """A table whose costs neither reach 0 nor 255."""
     values = (NOISE, UNIT, SMALL_UNIT, float(ratios.max()), 0.5, 0.3, 160.0)
     return EvidenceTable(
-        np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32), *(np.float32(v) for v in values)
+        np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32),
+        *(np.float32(v) for v in values),
+        worth_of(n_views),
     )
 
 
@@ -100,13 +110,16 @@ def test_costs_are_the_sums_of_the_table():
     for b, d, rows, cols in scene.blocks():
         for index in range(lattice.first[b, d], lattice.first[b, d] + lattice.count[b, d]):
             views, n_covering = seen(visible, rows, cols, index)
-            n_of_block = (visible.lowest_covered[:, rows, cols] <= visible.highest_covered[:, rows, cols]).any(
-                axis=(1, 2)
+            covering = np.flatnonzero(
+                (visible.lowest_covered[:, rows, cols] <= visible.highest_covered[:, rows, cols]).any(axis=(1, 2))
             )
-            scale = UNIT * (n_of_block.sum() * (n_of_block.sum() - 1) / 2) ** 0.3
+            of_block, n_effective = twin.pair_weights(table.worth, covering, PAIRS_PER_VIEW)
+            weights = np.zeros((3, 3))
+            weights[np.ix_(covering, covering)] = of_block
+            scale = UNIT * n_effective**0.3
             highest = min(scale * ratios.max(), 160.0)
             planes, movement = planes_of(scene, b, d, rows, cols, index)
-            mean = twin.cell_evidence(planes, movement, HALVES, NOISE, ratios.astype(float), views, EXCLUDED)
+            mean = twin.cell_evidence(planes, movement, HALVES, NOISE, ratios.astype(float), views, EXCLUDED, weights)
             cost = np.where(n_covering > 1, highest - scale * mean, highest - scale * 0.5)
             expected[rows, cols, index] = np.clip(cost, 0, 255)
     is_searched = np.isfinite(expected)
@@ -121,7 +134,8 @@ def test_counts_are_those_of_right_and_of_wrong_heights():
     reference = np.full(SHAPE, 2.25, np.float32)
     reference[:, 20:] = np.nan
     size = int(np.prod(TABLE_SHAPE)) + 1
-    learning = Learning(reference, np.zeros(size, np.int64), np.zeros(size, np.int64))
+    by_table, by_pair = ([np.zeros(shape, np.int64) for _ in range(2)] for shape in (size, (3, 3, N_LIKENESS)))
+    learning = Learning(reference, *by_table, *by_pair)
     _, lattice = run(scene, visible, TableAndCounts(NO_TABLE._replace(noise_variance=np.float32(NOISE)), learning))
     right, wrong = np.zeros(TABLE_SHAPE, int), np.zeros(TABLE_SHAPE, int)
     for b, d, rows, cols in scene.blocks():
@@ -138,6 +152,12 @@ def test_counts_are_those_of_right_and_of_wrong_heights():
     for found, expected in ((learning.right, right), (learning.wrong, wrong)):
         assert found[:-1].sum() == expected.sum()
         assert np.abs(found[:-1].reshape(TABLE_SHAPE) - expected).sum() < FEW * expected.sum()
+    for of_pair, of_all in ((learning.right_of_pair, learning.right), (learning.wrong_of_pair, learning.wrong)):
+        likeness = of_all[:-1].reshape(TABLE_SHAPE).sum(axis=(0, 1, 2))
+        np.testing.assert_array_equal(of_pair.sum(axis=(0, 1)), likeness)
+        # View 1 covers half of the cells, so that its pairs are counted less often; none is counted twice.
+        assert (of_pair.sum(axis=2)[[0, 1], [1, 2]] < of_pair[0, 2].sum()).all()
+        assert not of_pair[np.tril_indices(3)].any()
 
 
 def test_without_a_table_the_cost_is_that_of_correlation():
@@ -152,10 +172,14 @@ def test_without_a_table_the_cost_is_that_of_correlation():
 def test_the_order_of_the_views_does_not_matter(n_views):
     scene, _ = scene_and_visibility(n_views)
     ratios = np.random.default_rng(2).uniform(-1.0, 1.0, TABLE_SHAPE).astype(np.float32)
-    evidence = TableAndCounts(table_with(ratios), NO_COUNTS)
+    table = table_with(ratios, n_views)
     order = list(reversed(range(n_views)))
     turned = type(scene)(**(vars(scene) | {"layout": scene.layout[order].copy(), "nodes": scene.nodes[order].copy()}))
-    volumes = [run(s, s.all_visible(), evidence)[0].astype(int) for s in (scene, turned)]
+    tables = (table, table._replace(worth=table.worth[np.ix_(order, order)].copy()))
+    volumes = [
+        run(s, s.all_visible(), TableAndCounts(t, NO_COUNTS))[0].astype(int)
+        for s, t in zip((scene, turned), tables, strict=True)
+    ]
     assert (np.abs(volumes[0] - volumes[1]) > 1).mean() < FEW
 
 
@@ -163,7 +187,7 @@ def test_evidence_of_small_windows_is_worth_more():
     """The unit of a block where all views are compared in the smallest window only."""
     scene, _ = scene_and_visibility()
     ratios = np.full(TABLE_SHAPE, -0.5, np.float32)
-    table = table_with(ratios)._replace(highest=np.float32(0.0))
+    table = table_with(ratios)._replace(highest=np.float32(0.0), worth=np.ones((3, 3), np.float32))
     costs = []
     for windows in (HALVES, HALVES[:1]):
         volume = np.zeros(even_lattice(N_HEIGHTS, SHAPE, BLOCK).size, np.uint8)
@@ -177,6 +201,30 @@ def test_evidence_of_small_windows_is_worth_more():
         costs.append(np.median(volume))
     pairs = 3**0.3
     assert costs == [round(UNIT * pairs * 0.5), round(SMALL_UNIT * pairs * 0.5)]
+
+
+@pytest.mark.parametrize("views", [[0, 1], [1, 2, 4], [0, 1, 2, 3, 4, 5, 6]])
+def test_the_pairs_of_a_block_are_those_that_are_worth_most(views):
+    worth = worth_of(7)
+    found = pairs_of_block(worth, np.array(views))
+    weights, n_effective = twin.pair_weights(worth.astype(float), views, PAIRS_PER_VIEW)
+    np.testing.assert_allclose(found.weights, weights, rtol=1e-5)
+    assert found.n_effective == pytest.approx(n_effective, rel=1e-5)
+    assert np.count_nonzero(found.weights) // 2 == min(PAIRS_PER_VIEW * len(views), len(views) * (len(views) - 1) // 2)
+
+
+def test_pairs_that_are_worth_nothing_change_no_cost():
+    """A third view that agrees with nobody, and the cost of the other two alone."""
+    scene, _ = scene_and_visibility()
+    ratios = np.random.default_rng(3).uniform(-1.0, 1.0, TABLE_SHAPE).astype(np.float32)
+    worth = np.full((3, 3), 1e-6, np.float32)
+    worth[0, 1] = worth[1, 0] = 1.0
+    table = table_with(ratios)._replace(worth=worth)
+    visible = scene.all_visible()
+    without = visible.copy()
+    without.lowest_covered[2], without.highest_covered[2] = NEVER_COVERED, -1
+    costs = [run(scene, v, TableAndCounts(table, NO_COUNTS))[0].astype(int) for v in (visible, without)]
+    assert (np.abs(costs[0] - costs[1]) > 1).mean() < FEW
 
 
 def test_an_edge_along_the_parallax_has_no_contrast():

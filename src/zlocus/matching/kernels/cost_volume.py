@@ -19,6 +19,7 @@ from zlocus.matching.kernels.evidence import (
     put_movement,
 )
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
+from zlocus.matching.kernels.pairs_of_block import PairsOfBlock, pairs_of_block
 from zlocus.matching.kernels.resample import (
     block_grid,
     block_velocity,
@@ -68,7 +69,7 @@ class PairWeights(NamedTuple):
 
     of_pair: np.ndarray  # (p,) f4: weight of a pair of views that see the cell
     n_covering: np.ndarray  # (p,) f4: views that cover the cell at this height
-    n_views: int  # i8: views that cover the block
+    of_block: PairsOfBlock  # PairsOfBlock: the pairs of the views that cover the block
     grey_weight: np.float32  # f4: weight of grey differences
     height: np.int32  # i4: height index
 
@@ -291,8 +292,8 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
     if evidence.learning.right.shape[0] > 0:
         count_bins(at_height, moments, scratch, n, weights.height, evidence)
     elif evidence.table.log_ratios.shape[0] > 0:
-        add_evidence(at_height, moments, scratch, n, evidence.table, total)
-        scale = cost_of_unit(evidence.table, weights.n_views, n_sizes)
+        add_evidence(at_height, moments, scratch, n, weights.of_block.weights, evidence.table, total)
+        scale = cost_of_unit(evidence.table, weights.of_block.n_effective, n_sizes)
         evidence_costs(total, weights.of_pair, weights.n_covering, evidence.table, scale, n, out)
     else:
         if weight > 0.0:
@@ -330,7 +331,8 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     counts, scratch = np.empty((2, size), np.float32), resample_scratch(size)
     work, centre = np.empty((4, size), np.float32), np.float32(0.0)
     flat_visibility(visible, half, flat, pairs)
-    of_pairs = pair_scratch(n_views, half, size, work)
+    of_pairs, in_block = pair_scratch(n_views, half, size, work), np.empty(n_views, np.int64)
+    pairs_compared = pairs_of_block(evidence.table.worth, takes)
     uses_bins = evidence.table.log_ratios.shape[0] > 0 or evidence.learning.right.shape[0] > 0
     grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):
@@ -354,11 +356,12 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
             window_moments(plane, windows, width, n, variance, work, mean[m], scale[m])
             if extent < WHOLE:
                 exclude_unseen(shown, n, scale[m], grey, GREY_OF_UNSEEING_VIEW * np.float32(m + 1))
+            in_block[m] = i
             m += 1
         if n_whole < n_views:
             weights_with_occlusion(pairs, counts, parameters.occluded_pairs_excluded, n, shown)
-        weights = PairWeights(shown if n_whole < n_views else pairs, counts[0], n_views, weight, height)
-        at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width)
+        weights = PairWeights(shown if n_whole < n_views else pairs, counts[0], pairs_compared, weight, height)
+        at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width, in_block[:m], takes[in_block[:m]])
         moments = WindowMoments(mean[:m], scale[:m])
         costs_at_height(at_height, moments, of_pairs, weights, evidence, total, codes[k])
     heights_last(codes, width, out)
@@ -417,7 +420,8 @@ def evidence_in(evidence, box):
     """The table, and the counts with the reference heights of the cells of a rectangle."""
     of_tile = evidence.learning
     reference = of_tile.reference[box.first_row : box.end_row, box.first_col : box.end_col]
-    return TableAndCounts(evidence.table, Learning(reference, of_tile.right, of_tile.wrong))
+    learning = Learning(reference, of_tile.right, of_tile.wrong, of_tile.right_of_pair, of_tile.wrong_of_pair)
+    return TableAndCounts(evidence.table, learning)
 
 
 # ViewArrays, SlopeArrays, VolumeLayout, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (v,) u1 -> None

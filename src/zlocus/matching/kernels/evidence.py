@@ -62,8 +62,9 @@ class EvidenceTable(NamedTuple):
     small_window_unit: np.float32  # f4: the same where only the smallest window is used
     highest: np.float32  # f4: largest log ratio
     neutral: np.float32  # f4: log ratio of no evidence
-    pair_exponent: np.float32  # f4: the mean over n pairs counts n ** pair_exponent times
+    pair_exponent: np.float32  # f4: the mean over n pairs that say equally much counts n ** pair_exponent times
     max_cost: np.float32  # f4: cost of a height without evidence for or against it, at most
+    worth: np.ndarray  # (i,i) f4: what each pair of views is worth, see `zlocus.matching.evidence.worth_of_pairs`
 
 
 class Learning(NamedTuple):
@@ -72,6 +73,8 @@ class Learning(NamedTuple):
     reference: np.ndarray  # (r,c) f4: height index that counts as right in each cell, NaN where no cell is counted
     right: np.ndarray  # (e,) i8: how often each bin occurs at right heights
     wrong: np.ndarray  # (e,) i8: how often at wrong heights
+    right_of_pair: np.ndarray  # (i,i,k) i8: how often each likeness occurs at right heights in each pair of views
+    wrong_of_pair: np.ndarray  # (i,i,k) i8: how often at wrong heights
 
 
 class TableAndCounts(NamedTuple):
@@ -101,6 +104,8 @@ class PairWindows(NamedTuple):
     greys: np.ndarray  # (i,p) f4: grey values of the cells, times grey_factor
     grey_factor: np.float32  # f4: see greys
     width: int  # i8: floats from a row to the next
+    in_block: np.ndarray  # (i,) i8: place of each of these views among all views of the block
+    in_tile: np.ndarray  # (i,) i8: and among all views of the tile
 
 
 # i8, i8, i8, (4,p) f4 -> PairScratch
@@ -372,12 +377,14 @@ def count_bins(views, moments, scratch, n, height, evidence):
     """Count the bins of all pairs of views at one height, at right and at wrong heights of the cells of a block."""
     learning = evidence.learning
     reference, right, wrong = learning.reference, learning.right, learning.wrong
+    right_of_pair, wrong_of_pair = learning.right_of_pair, learning.wrong_of_pair
     noise_variance, position, bins = evidence.table.noise_variance, scratch.rows[POSITION], scratch.bins
     describe_views(views, scratch, n)
     rows, cols = reference.shape
     for a in range(views.planes.shape[0]):
         for b in range(a + 1, views.planes.shape[0]):
             write_pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, noise_variance, n)
+            first, second = views.in_tile[a], views.in_tile[b]
             for r in range(rows):
                 for c in range(cols):
                     j = r * views.width + c
@@ -387,45 +394,53 @@ def count_bins(views, moments, scratch, n, height, evidence):
                     if abs(views.greys[a, j]) > GREY_LIMIT or abs(views.greys[b, j]) > GREY_LIMIT:
                         continue
                     nearest = bins[j] + np.int32(position[j] > np.float32(0.5))
+                    likeness = nearest % np.int32(N_LIKENESS)
                     if away <= RIGHT_STEPS:
                         right[nearest] += 1
+                        right_of_pair[first, second, likeness] += 1
                     elif away > FIRST_WRONG_STEP:
                         wrong[nearest] += 1
+                        wrong_of_pair[first, second, likeness] += 1
 
 
-# (e,) f4, (i,p) f4, ViewPair, i8, (5,p) f4, (p,) i4, (p,) f4 -> None
+# (e,) f4, f4, (i,p) f4, ViewPair, i8, (5,p) f4, (p,) i4, (p,) f4 -> None
 @kernel
-def add_ratios(table, greys, pair, n, rows, bins, total):
-    """Add the log-likelihood ratios of a pair of views where both see the cell, at the first n places."""
+def add_ratios(table, weight, greys, pair, n, rows, bins, total):
+    """Add the weighted log-likelihood ratios of a pair of views where both see the cell, at the first n places."""
     a, b, one, next_bin, none = pair.a, pair.b, np.float32(1.0), np.uint64(1), np.float32(0.0)
     position, ratio = np.uint64(POSITION), np.uint64(SUMS)
     for j in range(np.uint64(n)):
         at, share = np.uint64(bins[j]), rows[position, j]
-        rows[ratio, j] = table[at] * (one - share) + table[at + next_bin] * share
+        rows[ratio, j] = weight * (table[at] * (one - share) + table[at + next_bin] * share)
     for j in range(np.uint64(n)):
         is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
         total[j] += rows[ratio, j] if is_seen else none
 
 
-# PairWindows, WindowMoments, PairScratch, i8, EvidenceTable, (p,) f4 -> None
+# PairWindows, WindowMoments, PairScratch, i8, (i,i) f4, EvidenceTable, (p,) f4 -> None
 @kernel
-def add_evidence(views, moments, scratch, n, evidence, total):
-    """Add the log-likelihood ratios of all pairs of views that see the cell, at the first n places."""
+def add_evidence(views, moments, scratch, n, weights, evidence, total):
+    """Add the weighted log-likelihood ratios of all pairs of views that see the cell, at the first n places.
+
+    weights : of the pairs of the block's views, see `PairsOfBlock`; pairs without weight are left out.
+    """
     describe_views(views, scratch, n)
     for a in range(views.planes.shape[0]):
         for b in range(a + 1, views.planes.shape[0]):
-            pair = ViewPair(np.uint64(a), np.uint64(b))
-            write_pair_bins(views, pair, moments, scratch, evidence.noise_variance, n)
-            add_ratios(evidence.log_ratios, views.greys, pair, n, scratch.rows, scratch.bins, total)
+            weight = weights[views.in_block[a], views.in_block[b]]
+            if weight > np.float32(0.0):
+                pair = ViewPair(np.uint64(a), np.uint64(b))
+                write_pair_bins(views, pair, moments, scratch, evidence.noise_variance, n)
+                add_ratios(evidence.log_ratios, weight, views.greys, pair, n, scratch.rows, scratch.bins, total)
 
 
-# EvidenceTable, i8, i8 -> f4
+# EvidenceTable, f4, i8 -> f4
 @kernel
-def cost_of_unit(evidence, n_views, n_sizes):
-    """Cost of one natural unit of the mean evidence of all pairs of n_views that cover a block, compared in windows of
+def cost_of_unit(evidence, n_pairs, n_sizes):
+    """Cost of one natural unit of the mean evidence of so many pairs, see `PairsOfBlock`, compared in windows of
     n_sizes."""
     unit = evidence.unit if n_sizes > 1 else evidence.small_window_unit
-    return unit * np.float32((n_views * (n_views - 1) / 2) ** evidence.pair_exponent)
+    return unit * n_pairs**evidence.pair_exponent
 
 
 # (p,) f4, (p,) f4, (p,) f4, EvidenceTable, f4, i8, (p,) u1 -> None

@@ -1,0 +1,55 @@
+"""Which pairs of views a block is compared in, and how much each of them counts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zlocus.core.jit import kernel
+
+# So many pairs for each view are compared, those that are worth most: the time grows like the number of views, and not
+# like its square.
+PAIRS_PER_VIEW = 2.0
+
+
+class PairsOfBlock(NamedTuple):
+    """The pairs of the views of a block."""
+
+    weights: np.ndarray  # (i,i) f4: weight of a pair by the places of its views in the block; their mean is 1
+    n_effective: np.float32  # f4: number of equally good pairs that say as much, (sum of weights)^2 / sum of squares
+
+
+# (i,i) f4, (i,) i8 -> PairsOfBlock
+@kernel
+def pairs_of_block(worth, views):
+    """The pairs of a block's views, each with the weight of what it is worth; 0 for those that are not compared.
+
+    worth : of every pair of views of the tile, see `zlocus.matching.evidence.worth_of_pairs`; views : numbers of the
+    views of the block. Without anything worth (no elements) there are no weights.
+    """
+    n = views.shape[0]
+    n_pairs = n * (n - 1) // 2
+    weights = np.zeros((n, n), np.float32)
+    if worth.shape[0] == 0 or n_pairs == 0:
+        return PairsOfBlock(weights, np.float32(n_pairs))
+    of_pairs = np.empty(n_pairs, np.float32)
+    k = 0
+    for a in range(n):
+        for b in range(a + 1, n):
+            of_pairs[k] = worth[views[a], views[b]]
+            k += 1
+    n_compared = min(np.int64(PAIRS_PER_VIEW * n), n_pairs)
+    least = np.sort(of_pairs)[n_pairs - n_compared]
+    total, squares = np.float32(0.0), np.float32(0.0)
+    for value in of_pairs:
+        if value >= least:
+            total += value
+            squares += value * value
+    for a in range(n):
+        for b in range(a + 1, n):
+            value = worth[views[a], views[b]]
+            if value >= least:
+                weights[a, b] = value * np.float32(n_pairs) / total
+                weights[b, a] = weights[a, b]
+    return PairsOfBlock(weights, total * total / squares)
