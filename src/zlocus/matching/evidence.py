@@ -164,8 +164,7 @@ def worth_of_pairs(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> NDArra
 
     right, wrong : (i, i, k), how often each likeness of a pair occurs at them; only those of views in ascending order
     are counted. The worth is the divergence of the two frequencies (Jeffreys 1946): the mean log-likelihood ratio at
-    right heights less that at wrong ones. Two images of one pass are worth several times as much as two of different
-    days, and a pair that points elsewhere is worth nothing.
+    right heights less that at wrong ones. Two images of one pass are worth more than two of different days.
     """
     of_right, of_wrong = (
         counts + COUNTS_OF_ALL_PAIRS * (counts.sum(axis=(0, 1)) + 1) / (counts.sum() + counts.shape[2])
