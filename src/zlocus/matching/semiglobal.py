@@ -54,6 +54,7 @@ def jump_penalties(
     options: SemiGlobalOptions,
     has_two_views: NDArray[np.bool_] | None = None,
     core: Part = ALL,
+    edge_weight: NDArray[np.float32] | None = None,
 ) -> NDArray[np.uint16]:
     """Penalty P2 of the steps from W, NW, N and NE into each cell, (4, r, c) uint16.
 
@@ -63,7 +64,8 @@ def jump_penalties(
     is lost there stays lost.
 
     ortho : (r, c), NaN where the grey value is not known; has_two_views : (r, c), cells that only two views cover, to
-    which `edge_contrast_two_images` applies.
+    which `edge_contrast_two_images` applies; edge_weight : (r, c) from 0 to 1, how much of the decrease an edge at each
+    cell is worth, None for all of it.
     """
     factor = options.penalty_factor_per_level**level
     p2 = value_of(options, "p2") * factor
@@ -75,9 +77,9 @@ def jump_penalties(
     contrasts = [value_of(options, name) for name in ("edge_contrast", "edge_contrast_two_images")]
     units = np.array(contrasts, np.float32) * unit
     has_two_views = np.zeros(shape, np.bool_) if has_two_views is None else has_two_views
-    image_penalties(
-        ortho, has_two_views, PenaltyOptions(np.float32(p2), np.float32(p2_edge), units[0], units[1]), penalties
-    )
+    edge_weight = np.ones(shape, np.float32) if edge_weight is None else edge_weight
+    constants = PenaltyOptions(np.float32(p2), np.float32(p2_edge), units[0], units[1])
+    image_penalties(ortho, has_two_views, edge_weight, constants, penalties)
     return penalties
 
 

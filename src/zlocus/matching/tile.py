@@ -17,6 +17,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
 from zlocus.matching.cost_volume import cost_volume
+from zlocus.matching.edge_penalties import penalties_at_edges
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
 from zlocus.matching.expected_heights import expected_of_searched
 from zlocus.matching.fill import filled
@@ -32,7 +33,7 @@ from zlocus.matching.level_records import (
     TileInputs,
     level_window,
 )
-from zlocus.matching.local_contrast import agreement, edge_image
+from zlocus.matching.local_contrast import agreement
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.occlusion import (
     PAIR,
@@ -55,7 +56,6 @@ from zlocus.matching.search_range import coarsest_prior, prior_from_coarser, rea
 from zlocus.matching.semiglobal import (
     SemiGlobalHeights,
     aggregate,
-    jump_penalties,
     level_indices,
     winner_takes_all_heights,
     winner_takes_all_indices,
@@ -340,7 +340,9 @@ def match_level(
             add_costs_of_coarser(
                 cost, search.lattice, search.slope_surface, level, prior.coarser_result, config.pyramid
             )
-        penalties = penalties_from_edges(tile, level, search, covered, alike)
+        penalties = penalties_at_edges(
+            search.tile_views, search.smooth, covered, alike, level, config.semiglobal
+        )  # fmt: skip
         heights = semiglobal_heights(tile, level, search, cost, penalties, visible, is_evidence)
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
@@ -409,25 +411,6 @@ def view_agreement(
     if of_coarser is not None or tile.method == "mvll" or search.smooth is None:
         return of_coarser
     return agreement(search.tile_views, search.smooth, covered, level.core)
-
-
-def penalties_from_edges(
-    tile: TileInputs,
-    level: PyramidLevel,
-    search: LevelSearch,
-    covered: NDArray[np.bool_],
-    alike: NDArray[np.float64] | None,
-) -> NDArray[np.uint16]:
-    """Penalties of height jumps, lower across the edges of the ortho-image; see `jump_penalties`.
-
-    covered : (i, r, c) bool, cells that each view covers; alike : see `view_agreement`.
-    """
-    ortho = None
-    if search.smooth is not None:
-        assert alike is not None, "wherever a surface is known"
-        ortho = edge_image(search.tile_views, search.smooth, covered, level.core, alike)
-    has_two_views = covered.sum(axis=0) <= PAIR
-    return jump_penalties(ortho, level.shape, level.number, tile.config.semiglobal, has_two_views, level.core)
 
 
 def semiglobal_heights(

@@ -6,6 +6,7 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.matching.tile_views import TileViews
 
@@ -33,6 +34,29 @@ def _block_cells(tile_views: TileViews, b: int, d: int) -> tuple[slice, slice]:
     """Rows and columns of the cells of a block."""
     block = tile_views.block
     return slice(b * block, (b + 1) * block), slice(d * block, (d + 1) * block)
+
+
+def directions_of_blocks(tile_views: TileViews) -> NDArray[np.float64]:
+    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, of every view and block.
+
+    (i, b, d, 2) float64; see `cells_per_step`. 0 where a view does not show a block.
+    """
+    nodes, (t_0, t_step) = tile_views.nodes, tile_views.t_of_index
+    low, high = np.moveaxis(t_0 + tile_views.index_range * t_step, -1, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        powers = np.clip(0.0, low, high)[..., None] ** np.arange(nodes.shape[-1])
+        here, right, below = (
+            np.einsum("ibdxk,ibdk->ibdx", at, powers)
+            for at in (nodes[:, :-1, :-1], nodes[:, :-1, 1:], nodes[:, 1:, :-1])
+        )
+        slopes = np.arange(1, nodes.shape[-1]) * powers[..., :-1]
+        by_step = np.einsum("ibdxk,ibdk->ibdx", nodes[:, :-1, :-1, :, 1:], slopes) * t_step
+        by_col, by_row = (right - here) / tile_views.block, (below - here) / tile_views.block
+        determinant = by_col[..., 0] * by_row[..., 1] - by_col[..., 1] * by_row[..., 0]
+        col = (by_row[..., 0] * by_step[..., 1] - by_row[..., 1] * by_step[..., 0]) / determinant
+        row = (by_col[..., 1] * by_step[..., 0] - by_col[..., 0] * by_step[..., 1]) / determinant
+    is_shown = (tile_views.is_projected & np.isfinite(col) & np.isfinite(row))[..., None]
+    return np.where(is_shown, np.stack([col, row], axis=-1), 0.0)
 
 
 def cells_per_step(tile_views: TileViews, view: int, part: tuple[slice, slice] | None = None) -> tuple[float, float]:
