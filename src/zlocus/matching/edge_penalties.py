@@ -24,7 +24,7 @@ from zlocus.matching.view_directions import directions_of_blocks
 # The window whose gradients are taken together, cells.
 TENSOR_WINDOW = (5, 5)
 # Edges count in full from this share on; it is one half where the grey values have no direction, as in noise.
-FULL_SHARE = 0.25
+FULL_SHARE = 0.1
 # Squared grey gradients are at least this, so that nothing is divided by zero.
 LEAST_GRADIENT = 1e-12
 

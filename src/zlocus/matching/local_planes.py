@@ -120,7 +120,7 @@ def planes_of_windows(height: FloatGrid, sigma: FloatGrid, is_known: NDArray[np.
     """Planes fitted to the heights in windows of `side` cells, with weights 1 / sigma^2; see `smoothed_by_planes`."""
     row, col = _places(height.shape)
     # Numbers near zero keep the differences of squares exact.
-    origin = float(np.median(height[is_known])) if is_known.any() else 0.0
+    origin = float(height[is_known].mean(dtype=np.float64)) if is_known.any() else 0.0
     z = np.where(is_known, height - origin, 0.0).astype(np.float64)
     weight = np.where(is_known, 1.0 / np.square(sigma.astype(np.float64)), 0.0)
     total = np.maximum(_box(weight, side), MIN_TOTAL_WEIGHT)
