@@ -15,6 +15,7 @@ from zlocus.matching.unsupported_patches import (
     MAX_GAIN,
     MIN_MEAN_OFF,
     heights_of_surroundings,
+    joined_share,
     lacks_evidence,
 )
 
@@ -92,6 +93,31 @@ def test_trees_seen_with_a_wide_base_are_no_patches():
     assert np.isnan(heights_of_surroundings(volume, lattice, base, surface, 0, STEP_CELLS / 2)).all()
 
 
+def test_the_corner_of_a_plain_roof_is_no_patch():
+    """The window of the surroundings does not fit into the corners of a roof that lies across the grid."""
+    row, col = np.indices(SHAPE)
+    is_roof = np.abs(row - 64) + np.abs(col - 64) < 50
+    surface = np.where(is_roof, GROUND + 30, GROUND).astype(np.float32)
+    assert np.isnan(replaced(surface, depth=5)).all()
+
+
+def test_a_patch_beside_a_roof_of_another_height_is_one():
+    surface = np.full(SHAPE, GROUND, np.float32)
+    surface[60:, 30:100] = GROUND + 20
+    surface[48:60, 50:62] = GROUND + 50
+    assert np.isfinite(replaced(surface, depth=5)[48:60, 50:62]).all()
+
+
+def test_share_of_the_border_over_which_the_surface_goes_on():
+    """A patch of 4 x 6 cells at height 40, beside 40 + 4.9 on one long side and 40 - 5.1 on the other sides."""
+    labels, height = np.zeros((20, 20), np.int32), np.full((20, 20), 40 - 5.1, np.float32)
+    labels[8:12, 6:12], height[8:12, 6:12] = 1, 40
+    height[7, 6:12] = 40 + 4.9
+    np.testing.assert_allclose(joined_share(labels, height, 2), [0, 6 / 20])
+    labels[0, 0] = 2
+    np.testing.assert_allclose(joined_share(labels, height, 3), [0, 6 / 20, 1])
+
+
 def test_a_slope_is_no_patch():
     rows = np.arange(SHAPE[0])[:, None] * np.ones(SHAPE)
     surface = (10 + 0.6 * rows).astype(np.float32)
@@ -104,7 +130,7 @@ def test_more_evidence_or_more_cells_never_remove_a_patch(off, gain, side):
     def lacks(with_gain, cells):
         away = np.zeros((40, 40), np.float32)
         away[5 : 5 + cells, 5 : 5 + cells] = off
-        return bool(lacks_evidence(away, np.full((40, 40), with_gain, np.float32)).any())
+        return bool(lacks_evidence(away, np.full((40, 40), with_gain, np.float32), away).any())
 
     assert lacks(gain, side) or not (lacks(gain + 5, side) or lacks(gain, side + 3))
     assert not lacks(MAX_GAIN * 10.1, 1)

@@ -4,7 +4,8 @@ Where the images say little, two of them agree by chance somewhere within a wide
 cells stands at a height that is wrong by tens of metres. A tower stands off its surroundings too, but its cells, taken
 together, cost far less at its height than at that of the surroundings. How much less they must cost grows with the
 height of the patch, because the more heights lie between, the likelier is an agreement by chance; and it decreases with
-the root of the area, because errors of many cells average out.
+the root of the area, because errors of many cells average out. A patch along whose border the surface goes on is part
+of something larger, such as the corner of a roof into which the window of the surroundings does not fit.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ MIN_BELOW_LOWEST = 5.0
 GAIN_PER_SIDE, MAX_GAIN, REFERENCE_CELLS = 1.25, 150.0, 100.0
 # The same as a factor from each level to the next coarser one, where a patch may still grow.
 GAIN_FACTOR_PER_LEVEL = 0.5
+# A patch is part of something larger where, over this share of its border, the surface goes on: neighbouring cells
+# differ by less than so many sides.
+MIN_JOINED_SHARE, MAX_STEP_OF_JOINED = 0.25, 5.0
 
 
 def heights_of_surroundings(
@@ -57,24 +61,42 @@ def heights_of_surroundings(
         if off.max() > MIN_MEAN_OFF:
             gain = _cost_at(cost, lattice, slope_surface, surroundings, off > MIN_OFF)
             gain -= _cost_at(cost, lattice, slope_surface, surface, off > MIN_OFF)
-            where = lacks_evidence(off, gain, level)
+            where = lacks_evidence(off, gain, surface * sides, level)
             found[where] = surroundings[where]
     return found
 
 
-def lacks_evidence(off: NDArray[np.float32], gain: NDArray[np.float32], level: int = 0) -> NDArray[np.bool_]:
+def lacks_evidence(
+    off: NDArray[np.float32], gain: NDArray[np.float32], height: NDArray[np.float32], level: int = 0
+) -> NDArray[np.bool_]:
     """Cells (r, c) of patches that stand off their surroundings without evidence.
 
     off : (r, c), sides of a finest cell by which a cell stands off; gain : (r, c), by how much its cost at the height
-    of its surroundings is above that at its own height; level : 0 is the finest.
+    of its surroundings is above that at its own height; height : (r, c), sides; level : 0 is the finest.
     """
     count, labels = cv2.connectedComponents((off > MIN_OFF).astype(np.uint8), connectivity=4)
     cells = np.bincount(labels.ravel(), minlength=count)
     mean_off, mean_gain = (np.bincount(labels.ravel(), values.ravel(), count) / cells for values in (off, gain))
     needed = np.minimum(GAIN_PER_SIDE * mean_off, MAX_GAIN) * GAIN_FACTOR_PER_LEVEL**level
     lacks = (mean_gain * np.sqrt(cells * 4.0**level / REFERENCE_CELLS) < needed) & (mean_off > MIN_MEAN_OFF)
+    lacks &= joined_share(labels, height, count) < MIN_JOINED_SHARE
     lacks[0] = False
     return np.asarray(lacks[labels])
+
+
+def joined_share(labels: NDArray[np.int32], height: NDArray[np.float32], count: int) -> NDArray[np.float64]:
+    """Share of the border of each patch over which the surface goes on, (count,).
+
+    labels : (r, c), number of the patch of each cell, 0 where there is none; height : (r, c), sides of a finest cell.
+    """
+    border, joined = np.zeros(count), np.zeros(count)
+    for here, beside in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        goes_on = np.abs(height[here] - height[beside]) < MAX_STEP_OF_JOINED
+        for of_patch, of_other in ((labels[here], labels[beside]), (labels[beside], labels[here])):
+            is_border = (of_patch > 0) & (of_other == 0)
+            border += np.bincount(of_patch[is_border], minlength=count)
+            joined += np.bincount(of_patch[is_border & goes_on], minlength=count)
+    return joined / np.maximum(border, 1.0)
 
 
 def _filtered(surface: NDArray[np.float32], operation: int, window: NDArray[np.uint8]) -> NDArray[np.float32]:

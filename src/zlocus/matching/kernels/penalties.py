@@ -52,13 +52,13 @@ def image_penalties(ortho, has_two_views, edge_weight, options, out):
     last = ortho.shape[1] - 1
     for r in range(ortho.shape[0]):
         up = max(r - 1, 0)
-        here, above, two, weight, weight_above = ortho[r], ortho[up], has_two_views[r], edge_weight[r], edge_weight[up]
-        penalties_between(here[1:], here[:last], weight[1:], weight[:last], two[1:], options, out[0, r, 1:])
-        penalties_between(here[1:], above[:last], weight[1:], weight_above[:last], two[1:], options, out[1, r, 1:])
-        penalties_between(here, above, weight, weight_above, two, options, out[2, r])
-        penalties_between(here[:last], above[1:], weight[:last], weight_above[1:], two[:last], options, out[3, r, :last])
-        out[0, r, 0] = jump_penalty(here[0], here[0], weight[0], two[0], options)
-        out[1, r, 0] = jump_penalty(here[0], above[0], min(weight[0], weight_above[0]), two[0], options)
+        here, above, two, edge, edge_above = ortho[r], ortho[up], has_two_views[r], edge_weight[r], edge_weight[up]
+        penalties_between(here[1:], here[:last], edge[1:], edge[:last], two[1:], options, out[0, r, 1:])
+        penalties_between(here[1:], above[:last], edge[1:], edge_above[:last], two[1:], options, out[1, r, 1:])
+        penalties_between(here, above, edge, edge_above, two, options, out[2, r])
+        penalties_between(here[:last], above[1:], edge[:last], edge_above[1:], two[:last], options, out[3, r, :last])
+        out[0, r, 0] = jump_penalty(here[0], here[0], edge[0], two[0], options)
+        out[1, r, 0] = jump_penalty(here[0], above[0], min(edge[0], edge_above[0]), two[0], options)
         out[3, r, last] = jump_penalty(
-            here[last], above[last], min(weight[last], weight_above[last]), two[last], options
+            here[last], above[last], min(edge[last], edge_above[last]), two[last], options
         )  # fmt: skip
