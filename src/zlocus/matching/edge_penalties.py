@@ -25,8 +25,10 @@ from zlocus.matching.view_directions import directions_of_blocks
 TENSOR_WINDOW = (5, 5)
 # Edges count in full from this share on; it is one half where the grey values have no direction, as in noise.
 FULL_SHARE = 0.1
-# Squared grey gradients are at least this, so that nothing is divided by zero.
-LEAST_GRADIENT = 1e-12
+# Squared gradients below this share of their mean are those of rounding, where nothing has an edge.
+PLAIN_SHARE = 1e-6
+# Parallaxes, in cells per height step and squared, below this have no direction.
+LEAST_PARALLAX = 1e-12
 
 
 def penalties_at_edges(
@@ -56,7 +58,7 @@ def weights_of_edges(ortho: NDArray[np.float32], tile_views: TileViews) -> NDArr
     """How much an edge at each cell says about heights, (r, c) float32 from 0 to 1. ortho : (r, c), NaN where not
     known."""
     share = share_along_parallax(ortho, by_cell(parallax_tensors(tile_views), tile_views.block, ortho.shape))
-    return np.asarray(np.minimum(share / np.float32(FULL_SHARE), np.float32(1.0)))
+    return np.clip(share / np.float32(FULL_SHARE), np.float32(0.0), np.float32(1.0))
 
 
 def parallax_tensors(tile_views: TileViews) -> NDArray[np.float32]:
@@ -71,7 +73,7 @@ def parallax_tensors(tile_views: TileViews) -> NDArray[np.float32]:
     squares = n * (direction**2).sum(axis=0) - total**2
     product = n[..., 0] * direction.prod(axis=-1).sum(axis=0) - total.prod(axis=-1)
     trace = squares.sum(axis=-1)
-    is_known = trace > LEAST_GRADIENT
+    is_known = trace > LEAST_PARALLAX
     trace = np.where(is_known, trace, 1.0)
     parts = (squares[..., 0], squares[..., 1], product)
     return np.stack(
@@ -99,5 +101,5 @@ def share_along_parallax(ortho: NDArray[np.float32], tensor: NDArray[np.float32]
     )
     along = tensor[..., 0] * cols + tensor[..., 1] * rows + np.float32(2.0) * tensor[..., 2] * both
     total = cols + rows
-    is_plain = total < np.float32(LEAST_GRADIENT)
+    is_plain = total <= np.float32(PLAIN_SHARE) * total.mean()
     return np.where(is_plain, np.float32(1.0), along / np.where(is_plain, np.float32(1.0), total)).astype(np.float32)
