@@ -58,7 +58,7 @@ def weights_of_edges(ortho: NDArray[np.float32], tile_views: TileViews) -> NDArr
     """How much an edge at each cell says about heights, (r, c) float32 from 0 to 1. ortho : (r, c), NaN where not
     known."""
     share = share_along_parallax(ortho, by_cell(parallax_tensors(tile_views), tile_views.block, ortho.shape))
-    return np.clip(share / np.float32(FULL_SHARE), np.float32(0.0), np.float32(1.0))
+    return np.asarray(np.clip(share / np.float32(FULL_SHARE), 0.0, 1.0), np.float32)
 
 
 def parallax_tensors(tile_views: TileViews) -> NDArray[np.float32]:
