@@ -127,7 +127,7 @@ def test_edges_along_the_base_line_are_worth_nothing_and_others_all():
     views = views_of((17.0, 0.0), (-16.0, 0.0))
     road = np.zeros(SHAPE, np.float32)
     road[:, 25:35] = 1.0
-    assert (weights_of_edges(road, views)[:, [*range(22, 28), *range(32, 38)]] < 0.02 / FULL_SHARE).all()
+    assert (weights_of_edges(road, views)[:, [*range(22, 28), *range(32, 38)]] < 0.01 / FULL_SHARE).all()
     across = np.zeros(SHAPE, np.float32)
     across[15:25] = 1.0
     assert (weights_of_edges(across, views) == 1).all()

@@ -24,7 +24,7 @@ from zlocus.matching.view_directions import directions_of_blocks
 # The window whose gradients are taken together, cells.
 TENSOR_WINDOW = (5, 5)
 # Edges count in full from this share on; it is one half where the grey values have no direction, as in noise.
-FULL_SHARE = 0.1
+FULL_SHARE = 0.05
 # Squared gradients below this share of their mean are those of rounding, where nothing has an edge.
 PLAIN_SHARE = 1e-6
 # Parallaxes, in cells per height step and squared, below this have no direction.
