@@ -40,17 +40,20 @@ def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
 
 @pytest.mark.parametrize("shape", [(9, 14), (1, 6), (5, 1), (1, 1)])
 def test_penalties_of_all_cells(shape):
-    """At the border too, where the image goes on as it ends; to a rounding of P2."""
+    """At the border too, where the image goes on as it ends; to a rounding of P2. An edge is worth what it is worth at
+    both cells."""
     rng, options = np.random.default_rng(3), replace(OPTIONS, edge_contrast_two_images=6.0)
     ortho, has_two_views = rng.normal(size=shape).astype(np.float32), rng.random(shape) < 0.5
     ortho[rng.random(shape) < 0.1] = np.nan
-    found, unit = jump_penalties(ortho, shape, 0, options, has_two_views), max(edge_unit(ortho), 1e-6)
+    weight, unit = rng.random(shape).astype(np.float32), max(edge_unit(ortho), 1e-6)
+    found = jump_penalties(ortho, shape, 0, options, has_two_views, edge_weight=weight)
     for path, (dr, dc) in enumerate(BEHIND):
         for r, c in np.ndindex(shape):
-            away = abs(ortho[r, c] - ortho[max(r + dr, 0), min(max(c + dc, 0), shape[1] - 1)])
+            other = max(r + dr, 0), min(max(c + dc, 0), shape[1] - 1)
+            away, worth = abs(ortho[r, c] - ortho[other]), min(weight[r, c], weight[other])
             contrast = value_of(options, "edge_contrast_two_images" if has_two_views[r, c] else "edge_contrast")
             plain = 240 / (1 + (0 if np.isnan(away) else away) / (contrast * unit))
-            assert abs(found[path, r, c] - max(plain, 60)) <= 1, (path, r, c)
+            assert abs(found[path, r, c] - (240 - worth * (240 - max(plain, 60)))) <= 1, (path, r, c)
 
 
 def test_a_strong_edge_is_cheap_to_cross_only_where_it_is():
