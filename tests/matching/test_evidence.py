@@ -17,6 +17,8 @@ from zlocus.matching.evidence import (
     log_of_sampling,
     log_ratios,
     noise_variance,
+    rough_ratios,
+    rough_share,
     sampled_blocks,
     smoothed_counts,
     worth_of_pairs,
@@ -25,6 +27,8 @@ from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE
 
 # Relative: a low quantile of variances of 25 values is below that of the noise, and is rounded.
 NOISE_SHARE = 0.6
+# Natural units.
+MORE_LIKELY = 0.5
 
 
 def counts(seed, total=200_000):
@@ -52,6 +56,30 @@ def test_bins_as_frequent_at_wrong_heights_say_nothing():
     assert np.abs(plain - plain.mean()).max() < 0.05
     assert ratios[10, :, :, N_LIKENESS - 2].min() > neutral + 2
     assert ratios[10, :, :, 8].max() < neutral - 2
+
+
+def test_of_two_heights_of_a_tree_the_more_alike_is_the_more_likely():
+    """Counted right heights are those of smooth ground, and a few that are wrong after all.
+
+    Below the likeness of smooth ground their frequencies fall like those of wrong heights, so that they alone do not
+    tell a likeness that a tree has at its height from one that it has elsewhere.
+    """
+    right, wrong = np.zeros(TABLE_SHAPE, np.int64), np.zeros(TABLE_SHAPE, np.int64)
+    wrong[:] = np.rint(6000 * np.exp(-0.5 * ((np.arange(N_LIKENESS) - 8) / 3.0) ** 2))
+    right[:, :, :, -3:] = 4000
+    right += wrong // 20
+    ratios, _ = log_ratios(right, wrong, 20.0)
+    textured, plain = ratios[11, 0, 3], ratios[2, 0, 3]
+    assert textured[13] - textured[8] > MORE_LIKELY
+    assert plain[13] - plain[8] < MORE_LIKELY / 2
+
+
+def test_rough_surfaces_of_plain_windows_say_nothing():
+    """Where right and wrong heights look the same, rough surfaces do so too."""
+    alike = counts(3).astype(float)
+    assert np.abs(rough_ratios(alike, 3 * alike, 20.0) - 1).max() < 1e-9
+    assert rough_share()[:5].max() == 0
+    assert 0 < rough_share()[8:].min() <= rough_share().max() < 1
 
 
 def test_bins_that_no_image_filled_say_nothing():

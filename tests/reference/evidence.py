@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from reference.agreement import ncc, over_pairs, windows
+from reference.agreement import ncc, windows
 from reference.projection import along_slope, bilinear, derivative, position
 
 N_CONTRAST, N_DIFFERENCE, N_GREY, N_LIKENESS = 14, 3, 14, 20
@@ -101,16 +101,20 @@ def from_table(table, bins):
 
 
 def cell_evidence(planes, movement, halves, noise, table, visible, excluded, weights):
-    """Weighted mean evidence over the pairs of views, (r, c), see `reference.agreement.over_pairs`.
+    """Weighted mean evidence over the pairs of views, (r, c).
 
-    weights : (i, i), of the pairs, whose mean over the pairs is 1.
+    visible : (2, i, r, c), see `reference.agreement.over_pairs`; weights : (i, i), of the pairs, whose mean over the
+    pairs is 1. The mean is that over the pairs that see the cell, as far as the others are excluded, and else that over
+    the pairs that cover it; few pairs are as many as one of mean weight.
     """
-    here = visible[0]
-    total = np.zeros(here.shape[1:])
+    here, covering = visible
+    total, of_seeing, of_covering = np.zeros(here.shape[1:]), np.zeros(here.shape[1:]), np.zeros(here.shape[1:])
     for a, b in combinations(range(len(planes)), 2):
         ratio = from_table(table, bins_of_pair(planes, movement, a, b, halves, noise))
         total += weights[a, b] * np.where(here[a] & here[b], ratio, 0.0)
-    return over_pairs(total, visible, excluded)
+        of_seeing += weights[a, b] * (here[a] & here[b])
+        of_covering += weights[a, b] * (covering[a] & covering[b])
+    return total * (excluded / np.maximum(of_seeing, 1) + (1 - excluded) / np.maximum(of_covering, 1))
 
 
 def counted(planes, movement, halves, noise, is_counted, here):

@@ -6,6 +6,10 @@ for the cells of a tile (of the coarser level, or of an earlier pass), and at he
 because they lie far from them. The logarithm of the ratio of the two frequencies is the evidence of one pair for one
 height. A plain window, a pair whose grey values do not compare, or a blurred patch has the same frequencies at right
 and at wrong heights, so that it says nothing.
+
+Nearly all heights that can be counted are those of smooth ground. Their frequencies alone would say that the windows of
+a tree, which are less alike, are at no height right. Among windows with texture, some right heights are therefore taken
+to be those of rough surfaces, see `rough_ratios`.
 """
 
 from __future__ import annotations
@@ -40,7 +44,15 @@ MAX_MIDDLE_COST = 160.0
 MAX_LOG_RATIO = 5.0
 # The part of the evidence that the grey difference adds to that of likeness and contrast counts by this: grey values
 # of neighbouring heights are alike, so that the two are not independent.
-GREY_SHARE = 0.6
+GREY_SHARE = 0.8
+# This share of the right heights is that of rough surfaces, such as trees, which are too seldom counted. It grows from
+# nothing in the first of these bins of contrast, that of noise, to the whole share in the second.
+ROUGH_SHARE, FIRST_ROUGH_CONTRAST, FULL_ROUGH_CONTRAST = 0.4, 4, 9
+# On rough surfaces the mean likeness and grey difference of right heights are so far from those of wrong heights, as a
+# share of the way to those that were counted; half as far where a bin of contrast has no more counts than the prior of
+# so many bins.
+ROUGH_DISTANCE, ROUGH_PRIOR_BINS = 0.8, 50
+LEAST_VARIANCE_OF_FEATURE, LEAST_SHARE = 1e-4, 1e-9
 # Counts that every bin gets at right heights before the images are looked at, where all blocks of a tile are counted;
 # wrong heights get the same frequency. More counts make rare features, such as those of trees, say less.
 PRIOR_COUNTS = 40.0
@@ -154,9 +166,48 @@ def log_ratios(
     )
     without_grey = np.log((right_of_any_grey / n_right + prior) / (wrong_of_any_grey / n_wrong + prior))
     ratios = without_grey + GREY_SHARE * (whole - without_grey)
+    share = rough_share()
+    ratios = np.log((1 - share) * np.exp(ratios) + share * rough_ratios(of_right, of_wrong, prior_counts))
     ratios = np.clip(ratios, -MAX_LOG_RATIO, MAX_LOG_RATIO)
     neutral = -float((of_wrong * ratios).sum() / n_wrong)
     return (ratios + neutral).astype(np.float32), neutral
+
+
+def rough_share() -> NDArray[np.float64]:
+    """Share of right heights that are those of rough surfaces, by bin of contrast, (c, 1, 1, 1): see ROUGH_SHARE."""
+    contrast, bins = np.arange(TABLE_SHAPE[0]), FULL_ROUGH_CONTRAST - FIRST_ROUGH_CONTRAST
+    share = ROUGH_SHARE * np.clip((contrast - FIRST_ROUGH_CONTRAST) / bins, 0.0, 1.0)
+    return np.asarray(share[:, None, None, None])
+
+
+def rough_ratios(
+    of_right: NDArray[np.float64], of_wrong: NDArray[np.float64], prior_counts: float
+) -> NDArray[np.float64]:
+    """Likelihood ratios of right heights of rough surfaces, over wrong heights, `TABLE_SHAPE`.
+
+    of_right, of_wrong : `TABLE_SHAPE`, smoothed counts; prior_counts : see PRIOR_COUNTS. Among windows of one contrast,
+    the frequency of a likeness and grey difference at wrong heights is tilted by an exponential function of the two
+    (Esscher 1932), so that their means move towards those of right heights, see ROUGH_DISTANCE. Where both have the
+    same means, as in plain windows, the ratio is 1. It does not fall to nothing where no counted window was as little
+    alike, so that the more alike of two heights of a tree is still the more likely one.
+    """
+    of_features = (2, 3)
+    likeness = np.linspace(-1.0, 1.0, TABLE_SHAPE[3])[None, :]
+    grey = np.linspace(0.0, 1.0, TABLE_SHAPE[2])[:, None]
+    n_right = of_right.sum(axis=of_features, keepdims=True)
+    right, wrong = (
+        (counts + LEAST_SHARE) / (counts + LEAST_SHARE).sum(axis=of_features, keepdims=True)
+        for counts in (of_right, of_wrong)
+    )
+    distance = ROUGH_DISTANCE * n_right / (n_right + ROUGH_PRIOR_BINS * prior_counts)
+    exponent = np.zeros(TABLE_SHAPE)
+    for feature in (likeness, grey):
+        mean_right, mean_wrong = ((share * feature).sum(axis=of_features, keepdims=True) for share in (right, wrong))
+        variance = (wrong * (feature - mean_wrong) ** 2).sum(axis=of_features, keepdims=True)
+        slope = distance * (mean_right - mean_wrong) / (variance + LEAST_VARIANCE_OF_FEATURE)
+        exponent += slope * (feature - mean_wrong)
+    tilt = np.exp(exponent - exponent.max(axis=of_features, keepdims=True))
+    return np.asarray(tilt / (wrong * tilt).sum(axis=of_features, keepdims=True))
 
 
 def worth_of_pairs(right: NDArray[np.int64], wrong: NDArray[np.int64]) -> NDArray[np.float32]:

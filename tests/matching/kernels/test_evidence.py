@@ -44,7 +44,10 @@ BLOCK, SHAPE, N_HEIGHTS = 16, (20, 27), 12
 
 
 def scene_and_visibility(n_views=3, seed=0):
-    """A scene of which view 0 is occluded in some cells below height 4, and view 1 covers nothing in others."""
+    """A scene of which view 0 is occluded in some cells below height 4, and view 1 covers nothing in others.
+
+    Of more than three views the last two are occluded in some cells too.
+    """
     scene = kernel_scene(n_views, SHAPE, BLOCK, seed=seed)
     for image in scene.images:
         image /= 5
@@ -52,6 +55,8 @@ def scene_and_visibility(n_views=3, seed=0):
     visible = scene.all_visible()
     visible.lowest_unoccluded[0, :9, :13] = 4
     visible.lowest_covered[1, 12:], visible.highest_covered[1, 12:] = NEVER_COVERED, -1
+    if n_views > 3:
+        visible.lowest_unoccluded[-2:, 4:, 6:] = 7
     return scene, visible
 
 
@@ -100,10 +105,11 @@ def seen(visible, rows, cols, index):
     return np.stack([covered & (from_here <= index), low <= high]), covered.sum(axis=0)
 
 
-def test_costs_are_the_sums_of_the_table():
-    scene, visible = scene_and_visibility()
+@pytest.mark.parametrize("n_views", [3, 6])
+def test_costs_are_the_sums_of_the_table(n_views):
+    scene, visible = scene_and_visibility(n_views)
     ratios = np.random.default_rng(1).uniform(-1.5, 2.0, TABLE_SHAPE).astype(np.float32)
-    table = table_with(ratios)
+    table = table_with(ratios, n_views)
     found, lattice = run(scene, visible, TableAndCounts(table, NO_COUNTS))
     found = dense(found, lattice, np.inf)
     expected = np.full(found.shape, np.inf)
@@ -114,7 +120,7 @@ def test_costs_are_the_sums_of_the_table():
                 (visible.lowest_covered[:, rows, cols] <= visible.highest_covered[:, rows, cols]).any(axis=(1, 2))
             )
             of_block, n_effective = twin.pair_weights(table.worth, covering, PAIRS_PER_VIEW)
-            weights = np.zeros((3, 3))
+            weights = np.zeros((n_views, n_views))
             weights[np.ix_(covering, covering)] = of_block
             scale = UNIT * n_effective**0.3
             highest = min(scale * ratios.max(), 160.0)
@@ -211,6 +217,22 @@ def test_the_pairs_of_a_block_are_those_that_are_worth_most(views):
     np.testing.assert_allclose(found.weights, weights, rtol=1e-5)
     assert found.n_effective == pytest.approx(n_effective, rel=1e-5)
     assert np.count_nonzero(found.weights) // 2 == min(PAIRS_PER_VIEW * len(views), len(views) * (len(views) - 1) // 2)
+
+
+def test_pairs_that_see_a_cell_say_no_more_than_all_pairs():
+    """Six views of which only two, the pair that is worth most, see the cells at low heights: all bins speak against
+    these heights, and there as at the others the evidence is at most that of all pairs."""
+    scene, _ = scene_and_visibility(6)
+    ratio, visible, n_low = -0.5, scene.all_visible(), 5
+    worth = np.ones((6, 6), np.float32)
+    worth[0, 1] = worth[1, 0] = 4.0
+    visible.lowest_unoccluded[2:] = n_low
+    table = table_with(np.full(TABLE_SHAPE, ratio, np.float32), 6)._replace(highest=np.float32(0.0), worth=worth)
+    volume, lattice = run(scene, visible, TableAndCounts(table, NO_COUNTS))
+    cost = dense(volume, lattice, np.inf)
+    assert np.ptp(cost[..., n_low:]) == 0
+    assert (cost[..., :n_low] <= cost[..., n_low:].max()).all()
+    assert (cost[..., :n_low] > 0).all()
 
 
 def test_pairs_that_are_worth_nothing_change_no_cost():

@@ -19,7 +19,12 @@ from zlocus.matching.kernels.evidence import (
     put_movement,
 )
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
-from zlocus.matching.kernels.pairs_of_block import PairsOfBlock, pairs_of_block
+from zlocus.matching.kernels.pairs_of_block import (
+    PairsOfBlock,
+    pairs_of_block,
+    weights_of_covering,
+    weights_of_seeing,
+)
 from zlocus.matching.kernels.resample import (
     block_grid,
     block_velocity,
@@ -67,8 +72,11 @@ class SlopeArrays(NamedTuple):
 class PairWeights(NamedTuple):
     """How the pairs of views of a block count at one height."""
 
-    of_pair: np.ndarray  # (p,) f4: weight of a pair of views that see the cell
-    n_covering: np.ndarray  # (p,) f4: views that cover the cell at this height
+    of_covering: np.ndarray  # (p,) f4: weight of a pair of views where all that cover the cell see it
+    of_seeing: np.ndarray  # (p,) f4: scratch; weight of a pair that sees the cell where others are occluded
+    counts: np.ndarray  # (2,p) f4: how many views cover, and how many see, each cell at this height
+    is_part: bool  # b1: whether a view is occluded in a cell, or does not cover it
+    excluded: np.float32  # f4: share of the pairs with an occluded view that is left out of the mean
     of_block: PairsOfBlock  # PairsOfBlock: the pairs of the views that cover the block
     grey_weight: np.float32  # f4: weight of grey differences
     height: np.int32  # i4: height index
@@ -289,18 +297,25 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
     total : (p,), 0 at all places, changed; out : (n,).
     """
     n, n_sizes, weight = out.shape[0], at_height.windows.shape[0], weights.grey_weight
+    of_pair, n_covering = weights.of_seeing if weights.is_part else weights.of_covering, weights.counts[0]
     if evidence.learning.right.shape[0] > 0:
         count_bins(at_height, moments, scratch, n, weights.height, evidence)
     elif evidence.table.log_ratios.shape[0] > 0:
-        add_evidence(at_height, moments, scratch, n, weights.of_block.weights, evidence.table, total)
+        seen = weights.of_seeing if weights.is_part else weights.of_seeing[:0]
+        seen[:] = 0.0
+        add_evidence(at_height, moments, scratch, n, weights.of_block.weights, evidence.table, total, seen)
+        if weights.is_part:
+            weights_of_seeing(weights.of_covering, weights.excluded, n, seen)
         scale = cost_of_unit(evidence.table, weights.of_block.n_effective, n_sizes)
-        evidence_costs(total, weights.of_pair, weights.n_covering, evidence.table, scale, n, out)
+        evidence_costs(total, of_pair, n_covering, evidence.table, scale, n, out)
     else:
+        if weights.is_part:
+            weights_with_occlusion(weights.of_covering, weights.counts, weights.excluded, n, weights.of_seeing)
         if weight > 0.0:
             add_closeness(at_height.greys, weight * np.float32(n_sizes), n, total)
         totals = total.reshape((1, 1, total.shape[0]))
         add_pairs(at_height.planes, at_height.windows, moments, at_height.width, n, scratch.work, totals)
-        rounded_costs(total, weights.of_pair, weights.n_covering, weight, n_sizes, n, out)
+        rounded_costs(total, of_pair, n_covering, weight, n_sizes, n, out)
 
 
 # ViewArrays, (r,c) f4, HeightSpan, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (r,d) u1 -> None
@@ -333,6 +348,8 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     flat_visibility(visible, half, flat, pairs)
     of_pairs, in_block = pair_scratch(n_views, half, size, work), np.empty(n_views, np.int64)
     pairs_compared = pairs_of_block(evidence.table.worth, takes)
+    if evidence.table.log_ratios.shape[0] > 0:
+        weights_of_covering(flat, takes, pairs_compared.weights, pairs)
     uses_bins = evidence.table.log_ratios.shape[0] > 0 or evidence.learning.right.shape[0] > 0
     grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):
@@ -358,9 +375,8 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
                 exclude_unseen(shown, n, scale[m], grey, GREY_OF_UNSEEING_VIEW * np.float32(m + 1))
             in_block[m] = i
             m += 1
-        if n_whole < n_views:
-            weights_with_occlusion(pairs, counts, parameters.occluded_pairs_excluded, n, shown)
-        weights = PairWeights(shown if n_whole < n_views else pairs, counts[0], pairs_compared, weight, height)
+        excluded, is_part = parameters.occluded_pairs_excluded, n_whole < n_views
+        weights = PairWeights(pairs, shown, counts, is_part, excluded, pairs_compared, weight, height)
         at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width, in_block[:m], takes[in_block[:m]])
         moments = WindowMoments(mean[:m], scale[:m])
         costs_at_height(at_height, moments, of_pairs, weights, evidence, total, codes[k])

@@ -417,12 +417,23 @@ def add_ratios(table, weight, greys, pair, n, rows, bins, total):
         total[j] += rows[ratio, j] if is_seen else none
 
 
-# PairWindows, WindowMoments, PairScratch, i8, (i,i) f4, EvidenceTable, (p,) f4 -> None
+# f4, (i,p) f4, ViewPair, i8, (p,) f4 -> None
 @kernel
-def add_evidence(views, moments, scratch, n, weights, evidence, total):
+def add_seen_weights(weight, greys, pair, n, seen):
+    """Add the weight of a pair of views where both see the cell, at the first n places."""
+    a, b, none = pair.a, pair.b, np.float32(0.0)
+    for j in range(np.uint64(n)):
+        is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
+        seen[j] += weight if is_seen else none
+
+
+# PairWindows, WindowMoments, PairScratch, i8, (i,i) f4, EvidenceTable, (p,) f4, (p,) f4 -> None
+@kernel
+def add_evidence(views, moments, scratch, n, weights, evidence, total, seen):
     """Add the weighted log-likelihood ratios of all pairs of views that see the cell, at the first n places.
 
-    weights : of the pairs of the block's views, see `PairsOfBlock`; pairs without weight are left out.
+    weights : of the pairs of the block's views, see `PairsOfBlock`; pairs without weight are left out; seen : (p,), the
+    weights of the same pairs are added to it, unless it has no elements.
     """
     describe_views(views, scratch, n)
     for a in range(views.planes.shape[0]):
@@ -432,6 +443,8 @@ def add_evidence(views, moments, scratch, n, weights, evidence, total):
                 pair = ViewPair(np.uint64(a), np.uint64(b))
                 write_pair_bins(views, pair, moments, scratch, evidence.noise_variance, n)
                 add_ratios(evidence.log_ratios, weight, views.greys, pair, n, scratch.rows, scratch.bins, total)
+                if seen.shape[0] > 0:
+                    add_seen_weights(weight, views.greys, pair, n, seen)
 
 
 # EvidenceTable, f4, i8 -> f4

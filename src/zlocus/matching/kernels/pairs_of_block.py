@@ -53,3 +53,37 @@ def pairs_of_block(worth, views):
                 weights[a, b] = value * np.float32(n_pairs) / total
                 weights[b, a] = weights[a, b]
     return PairsOfBlock(weights, total * total / squares)
+
+
+# FlatVisibility, (w,) i8, (i,i) f4, (p,) f4 -> None
+@kernel
+def weights_of_covering(flat, takes, weights, out):
+    """Write the weight of a pair of views that see the cell, where the pairs of the block's views have weights of their
+    own: 1 over the sum of the weights of those views that cover the cell at any height.
+
+    takes : numbers of the block's views; weights : see `PairsOfBlock`.
+    """
+    out[:] = 0.0
+    for a in range(takes.shape[0]):
+        for b in range(a + 1, takes.shape[0]):
+            first, second, weight = takes[a], takes[b], weights[a, b]
+            for j in range(out.shape[0]):
+                covers_first = flat.lowest_covered[first, j] <= flat.highest_covered[first, j]
+                covers_second = flat.lowest_covered[second, j] <= flat.highest_covered[second, j]
+                out[j] += weight if covers_first and covers_second else np.float32(0.0)
+    for j in range(out.shape[0]):
+        out[j] = np.float32(1.0) / max(out[j], np.float32(1.0))
+
+
+# (p,) f4, f4, i8, (p,) f4 -> None
+@kernel
+def weights_of_seeing(of_covering, excluded, n, out):
+    """Write the weight of a pair of views that see the cell, as `weights_with_occlusion`, for pairs with weights of
+    their own.
+
+    out : (p,), the sum of the weights of the pairs that see each cell, replaced by the result. Pairs that see a cell
+    say no more than one pair of mean weight where their sum is less.
+    """
+    one = np.float32(1.0)
+    for j in range(n):
+        out[j] = of_covering[j] + excluded * (one / max(out[j], one) - of_covering[j])
