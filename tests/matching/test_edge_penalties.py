@@ -28,8 +28,6 @@ from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE, SIDE_PX = 0.5, 0.5, 16, (40, 60), 301
 ORIGIN_M, N_STEPS = 40.0, 64
-# Directions of two blocks of a scene seen from far away differ by less, cells per height step.
-DIRECTION_CELLS = 1e-3
 
 
 def views_of(*angles, grey=None):

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+# Largest margin around the heights of a surface, as a share of their depth below the lowest camera.
+MAX_MARGIN_SHARE_OF_DEPTH = 0.15
+
 
 @runtime_checkable
 class SensorModel(Protocol):
@@ -66,6 +69,12 @@ def lowest_station(sensors: Iterable[SensorModel]) -> float | None:
             return None
         heights.append(sensor.station_height())
     return min(heights, default=None)
+
+
+def margin_below(station: float | None, height: float, margin_m: float) -> float:
+    """A margin (m) around a height (m), no more than `MAX_MARGIN_SHARE_OF_DEPTH` of the depth of that height below a
+    projection centre at height `station` (m): a drone flies higher than what it sees is tall. Unchanged without one."""
+    return margin_m if station is None else min(margin_m, MAX_MARGIN_SHARE_OF_DEPTH * max(station - height, 0.0))
 
 
 def capped(z_range: tuple[float, float], station: float | None, clearance: float) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.nearest_points import nearest_points
-from zlocus.core.sensor_model import lowest_station
+from zlocus.core.sensor_model import lowest_station, margin_below
 from zlocus.matching.level_records import PyramidLevel, SearchPrior
 from zlocus.matching.match_scene import MatchScene
 
@@ -25,8 +25,6 @@ SQUARE_CELLS = 8
 NEIGHBOURS, LEFT_OUT, MIN_NEAR = 16, 1, 8
 # Expected below the lowest and above the highest of them, m: single trees and roofs carry no tie points.
 BELOW_M, ABOVE_M = 2.0, 25.0
-# Above, at most this share of the depth below the lowest camera: a drone flies higher than what it sees is tall.
-MAX_SHARE_OF_DEPTH = 0.15
 # The ground may rise or fall by so much between a place and the nearest tie point, m per m. Ties so far away that they
 # could lie anywhere in the expected range are left out.
 MAX_SLOPE = 0.5
@@ -77,7 +75,7 @@ def _middles_of_squares(match_scene: MatchScene, level: PyramidLevel) -> NDArray
 def _above_m(match_scene: MatchScene, in_scene: tuple[float, float]) -> float:
     """How far above tie points the surface is expected, m."""
     station = lowest_station(view.sensor for view in match_scene.views)
-    return ABOVE_M if station is None else min(ABOVE_M, MAX_SHARE_OF_DEPTH * max(station - in_scene[0], 0.0))
+    return margin_below(station, in_scene[0], ABOVE_M)
 
 
 def _of_nearest(

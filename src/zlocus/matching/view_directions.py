@@ -13,6 +13,7 @@ from zlocus.matching.tile_views import TileViews
 # Directions may differ by so many cells per height step within a part of a tile.
 MAX_TURN_CELLS_PER_STEP = 0.2
 MAX_PARTS_PER_SIDE = 8
+ALL = slice(None)
 
 
 def parts_of_one_direction(tile_views: TileViews, view: int) -> list[tuple[slice, slice]]:
@@ -36,13 +37,19 @@ def _block_cells(tile_views: TileViews, b: int, d: int) -> tuple[slice, slice]:
     return slice(b * block, (b + 1) * block), slice(d * block, (d + 1) * block)
 
 
-def directions_of_blocks(tile_views: TileViews) -> NDArray[np.float64]:
-    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, of every view and block.
+def directions_of_blocks(
+    tile_views: TileViews, view: slice = ALL, block_rows: slice = ALL, block_cols: slice = ALL
+) -> NDArray[np.float64]:
+    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, of views and blocks.
 
-    (i, b, d, 2) float64; see `cells_per_step`. 0 where a view does not show a block.
+    (i, b, d, 2) float64, taken at height index 0, or as near to it as the polynomials of a block hold. 0 where a view
+    does not show a block. Without slices: of every view and block.
     """
-    nodes, (t_0, t_step) = tile_views.nodes, tile_views.t_of_index
-    low, high = np.moveaxis(t_0 + tile_views.index_range * t_step, -1, 0)
+    t_0, t_step = tile_views.t_of_index
+    rows, cols = (slice(span.start, None if span.stop is None else span.stop + 1) for span in (block_rows, block_cols))
+    blocks = (view, block_rows, block_cols)
+    nodes, index_range = tile_views.nodes[view, rows, cols], tile_views.index_range[blocks]
+    low, high = np.moveaxis(t_0 + index_range * t_step, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         powers = np.clip(0.0, low, high)[..., None] ** np.arange(nodes.shape[-1])
         here, right, below = (
@@ -55,7 +62,7 @@ def directions_of_blocks(tile_views: TileViews) -> NDArray[np.float64]:
         determinant = by_col[..., 0] * by_row[..., 1] - by_col[..., 1] * by_row[..., 0]
         col = (by_row[..., 0] * by_step[..., 1] - by_row[..., 1] * by_step[..., 0]) / determinant
         row = (by_col[..., 1] * by_step[..., 0] - by_col[..., 0] * by_step[..., 1]) / determinant
-    is_shown = (tile_views.is_projected & np.isfinite(col) & np.isfinite(row))[..., None]
+    is_shown = (tile_views.is_projected[blocks] & np.isfinite(col) & np.isfinite(row))[..., None]
     return np.where(is_shown, np.stack([col, row], axis=-1), 0.0)
 
 
@@ -74,14 +81,7 @@ def cells_per_step(tile_views: TileViews, view: int, part: tuple[slice, slice] |
         shown = np.argwhere(tile_views.is_projected[view])
         if not len(shown):
             return 0.0, 0.0
-        b, d = shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()]
-    # At height index 0, or as near to it as the polynomials of the block hold.
-    low, high = tile_views.t_of_index[0] + tile_views.index_range[view, b, d] * tile_views.t_of_index[1]
-    t = float(min(max(0.0, low), high))
-    powers = t ** np.arange(nodes.shape[-1])
-    slopes = np.arange(1, nodes.shape[-1]) * powers[:-1]
-    here, right, below = (nodes[at] @ powers for at in ((b, d), (b, d + 1), (b + 1, d)))
-    by_cell = np.column_stack([right - here, below - here]) / tile_views.block
-    by_step = nodes[b, d][:, 1:] @ slopes * tile_views.t_of_index[1]
-    col, row = -np.linalg.solve(by_cell, by_step)
+        b, d = (int(n) for n in shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()])
+    found = directions_of_blocks(tile_views, slice(view, view + 1), slice(b, b + 1), slice(d, d + 1))
+    col, row = found[0, 0, 0]
     return float(col), float(row)

@@ -11,14 +11,11 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.height_range import HeightRange
 from zlocus.core.nearest_points import nearest_points
 from zlocus.core.options import OrientationOptions
-from zlocus.core.sensor_model import FloatArray
+from zlocus.core.sensor_model import FloatArray, margin_below
 
 # Trusted ties that a range of heights needs, and the percentiles of their heights that it is taken from.
 MIN_TIES_FOR_RANGE = 20
 RANGE_PERCENT = (0.5, 99.5)
-# Largest margin above and below the ties, as a share of the depth below the lowest camera: a drone flies higher than
-# what it sees is tall.
-MAX_MARGIN_SHARE_OF_DEPTH = 0.15
 # A tie is trusted where so many of its nearest neighbours have a height that agrees with its own: up to this slope
 # between the two, and this many standard deviations of both.
 NEIGHBOURS = 8
@@ -42,7 +39,7 @@ def height_range_of_ties(
     The expected range is that of the 0.5 to 99.5 percentiles of the trusted ties, widened at both ends by
     `range_margin` times itself (peaks and valleys between ties), then by `range_up_m` above (roofs and trees carry few
     ties) and `range_down_m` below. What is searched goes on beyond it by `search_up_m` and `search_down_m`, for towers
-    and pits. Neither margin in metres is more than `MAX_MARGIN_SHARE_OF_DEPTH` of the depth below the station.
+    and pits. Both margins in metres are limited where the station is near, see `margin_below`.
 
     Raises
     ------
@@ -65,12 +62,7 @@ def height_range_of_ties(
 def _widened(heights: tuple[float, float], down_m: float, up_m: float, station: float | None) -> tuple[float, float]:
     """A height range with margins (m) below and above, no more than a share of the depth below the station."""
     low, high = heights
-    if station is not None:
-        down_m, up_m = (
-            min(margin, MAX_MARGIN_SHARE_OF_DEPTH * max(station - z, 0.0))
-            for margin, z in ((down_m, low), (up_m, high))
-        )
-    return low - down_m, high + up_m
+    return low - margin_below(station, low, down_m), high + margin_below(station, high, up_m)
 
 
 def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> NDArray[np.bool_]:
