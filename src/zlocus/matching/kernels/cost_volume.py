@@ -378,8 +378,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
         excluded, is_part = parameters.occluded_pairs_excluded, n_whole < n_views
         weights = PairWeights(pairs, shown, counts, is_part, excluded, pairs_compared, weight, height)
         at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width, in_block[:m], takes[in_block[:m]])
-        moments = WindowMoments(mean[:m], scale[:m])
-        costs_at_height(at_height, moments, of_pairs, weights, evidence, total, codes[k])
+        costs_at_height(at_height, WindowMoments(mean[:m], scale[:m]), of_pairs, weights, evidence, total, codes[k])
     heights_last(codes, width, out)
 
 
