@@ -41,10 +41,10 @@ ROUNDED = 1e-3
 
 
 @pytest.fixture
-def small_data(small_town, tmp_path) -> Path:
+def small_data(shared_data, small_town, tmp_path) -> Path:
     """A data folder whose only scene is the small town, by the name of the shared one, beside the shared judge."""
     if not judging.JUDGE.exists():
-        pytest.skip(f"{judging.JUDGE} is missing (ZLOCUS_TEST_DATA): no row of the acceptance table can be judged")
+        pytest.fail(f"{judging.JUDGE} is missing, beside {shared_data}: no row of the acceptance table can be judged")
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "rendered-city").symlink_to(small_town)
     (tmp_path / "tools").mkdir()
