@@ -71,7 +71,7 @@ def lowest_station(sensors: Iterable[SensorModel]) -> float | None:
     return min(heights, default=None)
 
 
-def margin_below(station: float | None, height: float, margin_m: float) -> float:
+def limited_margin(margin_m: float, height: float, station: float | None) -> float:
     """A margin (m) around a height (m), no more than `MAX_MARGIN_SHARE_OF_DEPTH` of the depth of that height below a
     projection centre at height `station` (m): a drone flies higher than what it sees is tall. Unchanged without one."""
     return margin_m if station is None else min(margin_m, MAX_MARGIN_SHARE_OF_DEPTH * max(station - height, 0.0))

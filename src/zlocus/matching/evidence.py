@@ -52,7 +52,8 @@ ROUGH_SHARE, FIRST_ROUGH_CONTRAST, FULL_ROUGH_CONTRAST = 0.4, 4, 9
 # share of the way to those that were counted; half as far where a bin of contrast has no more counts than the prior of
 # so many bins.
 ROUGH_DISTANCE, ROUGH_PRIOR_BINS = 0.8, 50
-LEAST_VARIANCE_OF_FEATURE, LEAST_SHARE = 1e-4, 1e-9
+# Bins of contrast that no window filled have this many counts in every bin, and features vary by no less than this.
+LEAST_COUNT, LEAST_VARIANCE_OF_FEATURE = 1e-9, 1e-4
 # Counts that every bin gets at right heights before the images are looked at, where all blocks of a tile are counted;
 # wrong heights get the same frequency. More counts make rare features, such as those of trees, say less.
 PRIOR_COUNTS = 40.0
@@ -196,7 +197,7 @@ def rough_ratios(
     grey = np.linspace(0.0, 1.0, TABLE_SHAPE[2])[:, None]
     n_right = of_right.sum(axis=of_features, keepdims=True)
     right, wrong = (
-        (counts + LEAST_SHARE) / (counts + LEAST_SHARE).sum(axis=of_features, keepdims=True)
+        (counts + LEAST_COUNT) / (counts + LEAST_COUNT).sum(axis=of_features, keepdims=True)
         for counts in (of_right, of_wrong)
     )
     distance = ROUGH_DISTANCE * n_right / (n_right + ROUGH_PRIOR_BINS * prior_counts)

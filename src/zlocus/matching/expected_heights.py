@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.nearest_points import nearest_points
-from zlocus.core.sensor_model import lowest_station, margin_below
+from zlocus.core.sensor_model import limited_margin, lowest_station
 from zlocus.matching.level_records import PyramidLevel, SearchPrior
 from zlocus.matching.match_scene import MatchScene
 
@@ -75,7 +75,7 @@ def _middles_of_squares(match_scene: MatchScene, level: PyramidLevel) -> NDArray
 def _above_m(match_scene: MatchScene, in_scene: tuple[float, float]) -> float:
     """How far above tie points the surface is expected, m."""
     station = lowest_station(view.sensor for view in match_scene.views)
-    return margin_below(station, in_scene[0], ABOVE_M)
+    return limited_margin(ABOVE_M, in_scene[0], station)
 
 
 def _of_nearest(

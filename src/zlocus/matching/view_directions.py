@@ -13,7 +13,6 @@ from zlocus.matching.tile_views import TileViews
 # Directions may differ by so many cells per height step within a part of a tile.
 MAX_TURN_CELLS_PER_STEP = 0.2
 MAX_PARTS_PER_SIDE = 8
-ALL = slice(None)
 
 
 def parts_of_one_direction(tile_views: TileViews, view: int) -> list[tuple[slice, slice]]:
@@ -37,18 +36,25 @@ def _block_cells(tile_views: TileViews, b: int, d: int) -> tuple[slice, slice]:
     return slice(b * block, (b + 1) * block), slice(d * block, (d + 1) * block)
 
 
-def directions_of_blocks(
-    tile_views: TileViews, view: slice = ALL, block_rows: slice = ALL, block_cols: slice = ALL
-) -> NDArray[np.float64]:
-    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, of views and blocks.
+def directions_of_blocks(tile_views: TileViews) -> NDArray[np.float64]:
+    """Cells (columns, rows) that the ground point seen by a fixed pixel moves per height step, of every view and block.
 
-    (i, b, d, 2) float64, taken at height index 0, or as near to it as the polynomials of a block hold. 0 where a view
-    does not show a block. Without slices: of every view and block.
+    (i, b, d, 2) float64; see `cells_per_step`. 0 where a view does not show a block.
+    """
+    found = _directions(tile_views, tile_views.nodes, tile_views.index_range)
+    is_shown = tile_views.is_projected & np.isfinite(found).all(axis=-1)
+    return np.where(is_shown[..., None], found, 0.0)
+
+
+def _directions(
+    tile_views: TileViews, nodes: NDArray[np.float64], index_range: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Directions (i, b, d, 2) of some views in some blocks, see `directions_of_blocks`, from the nodes at the blocks'
+    corners and the ranges of height indices over which these hold, as in `TileViews`.
+
+    Taken at height index 0, or as near to it as the polynomials of a block hold.
     """
     t_0, t_step = tile_views.t_of_index
-    rows, cols = (slice(span.start, None if span.stop is None else span.stop + 1) for span in (block_rows, block_cols))
-    blocks = (view, block_rows, block_cols)
-    nodes, index_range = tile_views.nodes[view, rows, cols], tile_views.index_range[blocks]
     low, high = np.moveaxis(t_0 + index_range * t_step, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         powers = np.clip(0.0, low, high)[..., None] ** np.arange(nodes.shape[-1])
@@ -62,8 +68,7 @@ def directions_of_blocks(
         determinant = by_col[..., 0] * by_row[..., 1] - by_col[..., 1] * by_row[..., 0]
         col = (by_row[..., 0] * by_step[..., 1] - by_row[..., 1] * by_step[..., 0]) / determinant
         row = (by_col[..., 1] * by_step[..., 0] - by_col[..., 0] * by_step[..., 1]) / determinant
-    is_shown = (tile_views.is_projected[blocks] & np.isfinite(col) & np.isfinite(row))[..., None]
-    return np.where(is_shown, np.stack([col, row], axis=-1), 0.0)
+    return np.stack([col, row], axis=-1)
 
 
 def cells_per_step(tile_views: TileViews, view: int, part: tuple[slice, slice] | None = None) -> tuple[float, float]:
@@ -82,6 +87,6 @@ def cells_per_step(tile_views: TileViews, view: int, part: tuple[slice, slice] |
         if not len(shown):
             return 0.0, 0.0
         b, d = (int(n) for n in shown[((shown - (b, d)) ** 2).sum(axis=1).argmin()])
-    found = directions_of_blocks(tile_views, slice(view, view + 1), slice(b, b + 1), slice(d, d + 1))
-    col, row = found[0, 0, 0]
+    of_block = nodes[None, b : b + 2, d : d + 2], tile_views.index_range[view : view + 1, b : b + 1, d : d + 1]
+    col, row = _directions(tile_views, *of_block)[0, 0, 0]
     return float(col), float(row)

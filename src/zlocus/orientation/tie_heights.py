@@ -11,7 +11,7 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.height_range import HeightRange
 from zlocus.core.nearest_points import nearest_points
 from zlocus.core.options import OrientationOptions
-from zlocus.core.sensor_model import FloatArray, margin_below
+from zlocus.core.sensor_model import FloatArray, limited_margin
 
 # Trusted ties that a range of heights needs, and the percentiles of their heights that it is taken from.
 MIN_TIES_FOR_RANGE = 20
@@ -39,7 +39,7 @@ def height_range_of_ties(
     The expected range is that of the 0.5 to 99.5 percentiles of the trusted ties, widened at both ends by
     `range_margin` times itself (peaks and valleys between ties), then by `range_up_m` above (roofs and trees carry few
     ties) and `range_down_m` below. What is searched goes on beyond it by `search_up_m` and `search_down_m`, for towers
-    and pits. Both margins in metres are limited where the station is near, see `margin_below`.
+    and pits. Both margins in metres are limited where the station is near, see `limited_margin`.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def height_range_of_ties(
 def _widened(heights: tuple[float, float], down_m: float, up_m: float, station: float | None) -> tuple[float, float]:
     """A height range with margins (m) below and above, no more than a share of the depth below the station."""
     low, high = heights
-    return low - margin_below(station, low, down_m), high + margin_below(station, high, up_m)
+    return low - limited_margin(down_m, low, station), high + limited_margin(up_m, high, station)
 
 
 def supported(xyz: FloatArray, sigma_z_m: FloatArray) -> NDArray[np.bool_]:

@@ -21,9 +21,10 @@ from zlocus.matching.kernels.evidence import (
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
 from zlocus.matching.kernels.pairs_of_block import (
     PairsOfBlock,
+    count_seeing_pairs,
     pairs_of_block,
     weights_of_covering,
-    weights_of_seeing,
+    weights_with_occlusion,
 )
 from zlocus.matching.kernels.resample import (
     block_grid,
@@ -227,23 +228,6 @@ def exclude_unseen(is_seen, n, scale, grey, grey_of_unseen):
         grey[j] = grey[j] if is_seen[j] > np.float32(0.0) else grey_of_unseen
 
 
-# (p,) f4, (2,p) f4, f4, i8, (p,) f4 -> None
-@kernel
-def weights_with_occlusion(pair_weight, counts, excluded, n, out):
-    """Write the weight of a pair of views that see the cell, where some pairs contain an occluded view.
-
-    counts : (2, p), views that cover and that see each cell; excluded : share of the pairs with an occluded view that
-    is left out of the mean. The other such pairs count as uncorrelated (NCC 0). If none was left out, the ground beside
-    a wall would rather be roof, which all views see; if all were, heights that few views see would be favoured, where
-    chance agreement is larger.
-    """
-    n_seeing, one = counts[1], np.float32(1.0)
-    for j in range(n):
-        m = n_seeing[j]
-        visible = np.float32(2.0) / max(m * (m - one), one)
-        out[j] = pair_weight[j] + excluded * (visible - pair_weight[j])
-
-
 # (p,) f4, (p,) f4, (p,) f4, f4, i8, i8, (p,) u1 -> None
 @kernel
 def rounded_costs(total, pair_weight, n_covering, grey_weight, n_sizes, n, out):
@@ -305,12 +289,13 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
         seen[:] = 0.0
         add_evidence(at_height, moments, scratch, n, weights.of_block.weights, evidence.table, total, seen)
         if weights.is_part:
-            weights_of_seeing(weights.of_covering, weights.excluded, n, seen)
+            weights_with_occlusion(weights.of_covering, weights.excluded, n, seen)
         scale = cost_of_unit(evidence.table, weights.of_block.n_effective, n_sizes)
         evidence_costs(total, of_pair, n_covering, evidence.table, scale, n, out)
     else:
         if weights.is_part:
-            weights_with_occlusion(weights.of_covering, weights.counts, weights.excluded, n, weights.of_seeing)
+            count_seeing_pairs(weights.counts[1], n, weights.of_seeing)
+            weights_with_occlusion(weights.of_covering, weights.excluded, n, weights.of_seeing)
         if weight > 0.0:
             add_closeness(at_height.greys, weight * np.float32(n_sizes), n, total)
         totals = total.reshape((1, 1, total.shape[0]))

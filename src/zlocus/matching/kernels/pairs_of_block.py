@@ -75,14 +75,26 @@ def weights_of_covering(flat, takes, weights, out):
         out[j] = np.float32(1.0) / max(out[j], np.float32(1.0))
 
 
+# (p,) f4, i8, (p,) f4 -> None
+@kernel
+def count_seeing_pairs(n_seeing, n, out):
+    """Write the number of pairs of the views that see each cell. n_seeing : (p,), number of these views."""
+    for j in range(n):
+        out[j] = np.float32(0.5) * n_seeing[j] * (n_seeing[j] - np.float32(1.0))
+
+
 # (p,) f4, f4, i8, (p,) f4 -> None
 @kernel
-def weights_of_seeing(of_covering, excluded, n, out):
-    """Write the weight of a pair of views that see the cell, as `weights_with_occlusion`, for pairs with weights of
-    their own.
+def weights_with_occlusion(of_covering, excluded, n, out):
+    """Write the weight of a pair of views that see the cell, where some pairs contain an occluded view.
 
-    out : (p,), the sum of the weights of the pairs that see each cell, replaced by the result. Pairs that see a cell
-    say no more than one pair of mean weight where their sum is less.
+    of_covering : (p,), the weight where all views that cover the cell see it; excluded : share of the pairs with an
+    occluded view that is left out of the mean; out : (p,), the number of the pairs that see each cell, or the sum of
+    their weights, replaced by the result. Less than one pair counts as one.
+
+    The other pairs with an occluded view count as uncorrelated, or as without evidence. If no pair was left out, the
+    ground beside a wall would rather be roof, which all views see; if all were, heights that few views see would be
+    favoured, where chance agreement is larger.
     """
     one = np.float32(1.0)
     for j in range(n):
