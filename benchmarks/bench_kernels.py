@@ -151,7 +151,8 @@ def some_evidence(n_views: int) -> TableAndCounts:
     ratios = rng.uniform(-2, 3, int(np.prod(TABLE_SHAPE)) + 1).astype(np.float32)
     worth = rng.uniform(0.5, 1.5, (n_views, n_views)).astype(np.float32)
     values = (np.float32(value) for value in (0.01, 14.0, 18.0, 3.0, 0.5, 0.3, 160.0))
-    return TableAndCounts(EvidenceTable(ratios, *values, worth), NO_COUNTS)
+    grey_unit = rng.uniform(0.5, 1.5, (n_views, n_views)).astype(np.float32)
+    return TableAndCounts(EvidenceTable(ratios, *values, grey_unit, worth), NO_COUNTS)
 
 
 def costs_case(

@@ -13,6 +13,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.matching import evidence
 from zlocus.matching.evidence import (
     MAX_LOG_RATIO,
+    grey_units,
     heights_to_learn_from,
     log_of_sampling,
     log_ratios,
@@ -105,6 +106,17 @@ def test_pairs_are_worth_what_their_likeness_tells():
     assert worth[1, 2] == pytest.approx(
         worth_of_pairs(*(c.sum(axis=(0, 1)) * np.ones((2, 2, 1), int) for c in (right, wrong)))[0, 1], rel=0.02
     )
+
+
+def test_the_usual_grey_difference_of_a_pair_is_its_unit():
+    """Pairs that were often counted have their own, and pairs that were never counted that of all pairs."""
+    n, roots = np.zeros((3, 3), int), np.zeros((3, 3))
+    n[0, 1], n[0, 2] = 10**6, 10**6
+    roots[0, 1], roots[0, 2] = 0.2 * 10**6, 0.6 * 10**6
+    unit = grey_units(roots, n)
+    np.testing.assert_array_equal(unit, unit.T)
+    np.testing.assert_allclose(unit[np.triu_indices(3, 1)], [0.5**2, 1.5**2, 1.0], rtol=0.01)
+    np.testing.assert_array_equal(grey_units(np.zeros((3, 3)), n), np.ones((3, 3)))
 
 
 def views_of(*images):

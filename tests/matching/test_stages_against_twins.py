@@ -236,10 +236,12 @@ def test_a_surface_occludes_what_marched_rays_meet(stages):
             found, expected = visible.lowest_unoccluded[i][part], lowest[part]
             free = expected < NEVER_OCCLUDED
             assert (found[free] == NEVER_OCCLUDED).all()
-            # The kernel rounds to whole steps, and interpolates a bound again at every cell, which lowers edges.
-            difference = np.abs(found[~free] - expected[~free])
-            assert np.quantile(difference, 0.95) <= 1.0
-            assert difference.max() <= 5.0
+            # The kernel rounds to whole steps, and interpolates a bound again at every cell: it lies between those of
+            # its neighbours, which differ much at the edges of roofs only.
+            assert np.quantile(np.abs(found[~free] - expected[~free]), 0.95) <= 1.0
+            around = np.ones((3, 3), np.uint8)
+            assert (found >= cv2.erode(lowest, around)[part] - 1.0)[~free].all()
+            assert (found <= cv2.dilate(lowest, around)[part] + 1.0)[~free].all()
             n_occluded += (expected > (occluder - slope_cells)[part]).sum()
     assert n_occluded > 0
 

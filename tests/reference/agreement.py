@@ -33,12 +33,11 @@ def over_pairs(total, visible, excluded):
     """Mean over all pairs of usable views of a sum over the visible pairs, (r, c).
 
     visible : (2, i, r, c) whether a view sees the cell at this height, and whether it covers it at any height (then its
-    pairs count); excluded : share of the pairs with an occluded view that is excluded from the mean; the others are 0.
+    pairs count); excluded : power of the number of pairs that see the cell in the number that is divided by, the rest
+    is that of all pairs.
     """
-    here, anywhere = (v.sum(axis=0) for v in visible)
-    every = np.where(anywhere > 1, total / np.maximum(anywhere * (anywhere - 1) / 2, 1), 0.0)
-    shown = np.where(here > 1, total / np.maximum(here * (here - 1) / 2, 1), 0.0)
-    return (1 - excluded) * every + excluded * shown
+    n_here, n_anywhere = (np.maximum(n * (n - 1) / 2, 1) for n in (v.sum(axis=0) for v in visible))
+    return total / (n_here**excluded * n_anywhere ** (1 - excluded))
 
 
 def mean_ncc(planes, visible, half, variance=0.0, excluded=0.0, group=(0, 1)):

@@ -67,8 +67,9 @@ def same_order(a, b, half):
     return (brighter[0] == brighter[1]).mean(axis=-1)
 
 
-def pair_bins(a, b, direction, halves, noise):
-    """Contrast, difference, grey and likeness bin (r, c) of two planes; the last with its fraction."""
+def pair_bins(a, b, direction, halves, noise, grey_unit):
+    """Contrast, difference, grey and likeness bin (r, c) of two planes; the last with its fraction. grey_unit : of the
+    grey differences."""
     half, correlation = max(halves), []
     for small in halves:
         trim = half - small
@@ -76,7 +77,7 @@ def pair_bins(a, b, direction, halves, noise):
         correlation.append(ncc(windows(inner[0], small), windows(inner[1], small)))
     contrasts = [contrast(plane, half, direction, noise) for plane in (a, b)]
     apart = np.abs(contrasts[0] - contrasts[1])
-    grey = np.abs(a - b)[half:-half, half:-half]
+    grey = np.abs(a - b)[half:-half, half:-half] / grey_unit
     likeness = 0.35 * np.mean(correlation, axis=0) + 0.65 * (2 * same_order(a, b, half) - 1)
     return (
         np.clip(contrasts[0] + contrasts[1] + 4, 0, N_CONTRAST - 1).astype(int),
@@ -86,10 +87,10 @@ def pair_bins(a, b, direction, halves, noise):
     )
 
 
-def bins_of_pair(planes, movement, a, b, halves, noise):
-    """Bins of the views a and b of a block."""
+def bins_of_pair(planes, movement, a, b, halves, noise, grey_unit):
+    """Bins of the views a and b of a block. grey_unit : (i, i)."""
     relative = movement[a] - movement[b]
-    return pair_bins(planes[a], planes[b], relative / np.linalg.norm(relative), halves, noise)
+    return pair_bins(planes[a], planes[b], relative / np.linalg.norm(relative), halves, noise, grey_unit[a, b])
 
 
 def from_table(table, bins):
@@ -100,32 +101,41 @@ def from_table(table, bins):
     return (1 - share) * table[contrast, difference, grey, lower] + share * table[contrast, difference, grey, lower + 1]
 
 
-def cell_evidence(planes, movement, halves, noise, table, visible, excluded, weights):
+def cell_evidence(planes, movement, halves, noise, grey_unit, table, visible, excluded, weights):
     """Weighted mean evidence over the pairs of views, (r, c).
 
     visible : (2, i, r, c), see `reference.agreement.over_pairs`; weights : (i, i), of the pairs, whose mean over the
-    pairs is 1. The mean is that over the pairs that see the cell, as far as the others are excluded, and else that over
-    the pairs that cover it; few pairs are as many as one of mean weight.
+    pairs is 1. The mean is the geometric one, by `excluded`, of that over the pairs that see the cell and that over the
+    pairs that cover it; few pairs are as many as one of mean weight.
     """
     here, covering = visible
     total, of_seeing, of_covering = np.zeros(here.shape[1:]), np.zeros(here.shape[1:]), np.zeros(here.shape[1:])
     for a, b in combinations(range(len(planes)), 2):
-        ratio = from_table(table, bins_of_pair(planes, movement, a, b, halves, noise))
+        ratio = from_table(table, bins_of_pair(planes, movement, a, b, halves, noise, grey_unit))
         total += weights[a, b] * np.where(here[a] & here[b], ratio, 0.0)
         of_seeing += weights[a, b] * (here[a] & here[b])
         of_covering += weights[a, b] * (covering[a] & covering[b])
-    return total * (excluded / np.maximum(of_seeing, 1) + (1 - excluded) / np.maximum(of_covering, 1))
+    return total / (np.maximum(of_seeing, 1) ** excluded * np.maximum(of_covering, 1) ** (1 - excluded))
 
 
-def counted(planes, movement, halves, noise, is_counted, here):
+def counted(planes, movement, halves, noise, grey_unit, is_counted, here):
     """Counts (14, 3, 14, 20) of the nearest bins of all pairs that see a cell, where `is_counted` (r, c)."""
     counts = np.zeros((N_CONTRAST, N_DIFFERENCE, N_GREY, N_LIKENESS), int)
     for a, b in combinations(range(len(planes)), 2):
-        contrast, difference, grey, place = bins_of_pair(planes, movement, a, b, halves, noise)
+        contrast, difference, grey, place = bins_of_pair(planes, movement, a, b, halves, noise, grey_unit)
         nearest = place.astype(int) + (place - place.astype(int) > 0.5)
         which = is_counted & here[a] & here[b]
         np.add.at(counts, (contrast[which], difference[which], grey[which], nearest[which]), 1)
     return counts
+
+
+def grey_roots(planes, half, is_counted, here):
+    """Sums (i, i) of the roots of the grey differences of all pairs that see a cell, where `is_counted` (r, c)."""
+    sums, inner = np.zeros((len(planes), len(planes))), [plane[half:-half, half:-half] for plane in planes]
+    for a, b in combinations(range(len(planes)), 2):
+        which = is_counted & here[a] & here[b]
+        sums[a, b] = np.sqrt(np.abs(inner[a] - inner[b]))[which].sum()
+    return sums
 
 
 def pair_weights(worth, views, pairs_per_view):

@@ -1,4 +1,4 @@
-"""One rendered ground and three kinds of sensor: exact cameras, and a surface from all that is as good as the best."""
+"""One rendered ground and three kinds of sensor: exact cameras, and a surface from all that is better than each alone."""
 
 from __future__ import annotations
 
@@ -26,11 +26,14 @@ EXACT_PX = 1e-3
 # Exact cameras need no correction; what is found is the noise of some hundred ties.
 SHIFT_PX = 0.05
 TWO_PIXELS_M = 0.42
+# All nine images together find at least so much more of the ground than the best three of one sensor.
+GAIN = 0.01
 
 
 @pytest.fixture(scope="module")
 def spec():
-    whole = demo_spec()
+    # Houses and trees enough for sensors to differ: with the seed of the demo every sensor finds .999 of this ground.
+    whole = replace(demo_spec(), seed=6)
     return replace(whole, size=240, hill_m=0.0, objects=replace(whole.objects, towers_per_ha=0.0))
 
 
@@ -55,7 +58,7 @@ def test_every_sensor_reads_back_as_its_exact_camera(spec, scenes):
             np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=EXACT_PX)
 
 
-def test_all_sensors_together_are_no_worse_than_the_best_alone(scenes, tmp_path):
+def test_all_sensors_together_are_better_than_the_best_alone(scenes, tmp_path):
     nmad, within = {}, {}
     for kind, scene in scenes.items():
         run_dsm(
@@ -65,7 +68,7 @@ def test_all_sensors_together_are_no_worse_than_the_best_alone(scenes, tmp_path)
         found = evaluate(tmp_path / kind / "dsm.tif", Comparison(truth, classes=classes, threshold_m=TWO_PIXELS_M))
         nmad[kind], within[kind] = found.class_statistics["ground"].nmad, found.statistics.within
     assert nmad["mixed"] <= min(nmad[kind] for kind in SENSORS)
-    assert within["mixed"] >= max(within[kind] for kind in SENSORS)
+    assert within["mixed"] >= max(within[kind] for kind in SENSORS) + GAIN
     views = json.loads((tmp_path / "mixed" / "run.json").read_text())["orientation"]["views"].values()
     assert max(np.abs(view["shift_px"]).max() for view in views) < SHIFT_PX
 

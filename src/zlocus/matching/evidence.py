@@ -27,6 +27,7 @@ from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE, EvidenceTa
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.local_contrast import rounded
+from zlocus.matching.occlusion import PAIR
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 
@@ -44,7 +45,7 @@ MAX_MIDDLE_COST = 160.0
 MAX_LOG_RATIO = 5.0
 # The part of the evidence that the grey difference adds to that of likeness and contrast counts by this: grey values
 # of neighbouring heights are alike, so that the two are not independent.
-GREY_SHARE = 0.8
+GREY_SHARE = 0.5
 # This share of the right heights is that of rough surfaces, such as trees, which are too seldom counted. It grows from
 # nothing in the first of these bins of contrast, that of noise, to the whole share in the second.
 ROUGH_SHARE, FIRST_ROUGH_CONTRAST, FULL_ROUGH_CONTRAST = 0.4, 4, 9
@@ -77,11 +78,15 @@ NOISE_SHARE, NOISE_WINDOW, LEAST_VARIANCE = 0.05, (5, 5), 1e-7
 LEAST_CELLS = 80_000
 # Of every 2^k blocks of a row the same one is counted as in the row above, shifted by the k-th of these.
 ROW_SHIFTS = (0, 1, 2, 3, 4)
+# Usual grey differences are counted first, in 2^k times fewer blocks. Each pair of views gets so many differences more
+# that are like those of all pairs.
+UNIT_LOG_EVERY, GREY_DIFFERENCES_OF_ALL_PAIRS = 2, 1000.0
 
 NO_TABLE = EvidenceTable(
     log_ratios=np.zeros(0, np.float32), noise_variance=np.float32(1.0), unit=np.float32(0.0),
     small_window_unit=np.float32(0.0), highest=np.float32(0.0), neutral=np.float32(0.0),
-    pair_exponent=np.float32(0.0), max_cost=np.float32(0.0), worth=np.zeros((0, 0), np.float32),
+    pair_exponent=np.float32(0.0), max_cost=np.float32(0.0), grey_unit=np.zeros((0, 0), np.float32),
+    worth=np.zeros((0, 0), np.float32),
 )  # fmt: skip
 NO_COUNTS = Learning(
     np.zeros((0, 0), np.float32),
@@ -89,6 +94,7 @@ NO_COUNTS = Learning(
     np.zeros(0, np.int64),
     np.zeros((0, 0, 0), np.int64),
     np.zeros((0, 0, 0), np.int64),
+    np.zeros((0, 0), np.float64),
 )
 NO_EVIDENCE = TableAndCounts(NO_TABLE, NO_COUNTS)
 
@@ -117,21 +123,23 @@ def learned_evidence(
 
     slope_views, slope_arrays, lattice, windows, visible, parameters : as for the costs, see `tile_costs`.
     """
-    size = int(np.prod(TABLE_SHAPE))
-    # One more bin, because a likeness is counted at the nearest bin.
-    right, wrong = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    log_every = log_of_sampling(taught_heights.height.size)
-    reference = sampled_blocks(taught_heights.height, lattice.block, log_every)
-    n_views = len(slope_views.layout)
-    right_of_pair, wrong_of_pair = (np.zeros((n_views, n_views, N_LIKENESS), np.int64) for _ in range(2))
-    learning = Learning(reference, right, wrong, right_of_pair, wrong_of_pair)
-    noise = noise_variance(slope_views)
-    counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise), learning)
-    volume = np.empty(lattice.size, np.uint8)
-    tile_costs(
-        slope_views.arrays, slope_arrays, lattice.layout, windows, visible, parameters, counting, volume
-    )  # fmt: skip
-    of_right, of_wrong = right[:-1].reshape(TABLE_SHAPE), wrong[:-1].reshape(TABLE_SHAPE)
+    n_views, log_every = len(slope_views.layout), log_of_sampling(taught_heights.height.size)
+    noise, grey_unit = noise_variance(slope_views), np.ones((n_views, n_views), np.float32)
+
+    def counted(log_every: int) -> Learning:
+        learning = nothing_counted(n_views, sampled_blocks(taught_heights.height, lattice.block, log_every))
+        counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise, grey_unit=grey_unit), learning)
+        volume = np.empty(lattice.size, np.uint8)
+        tile_costs(
+            slope_views.arrays, slope_arrays, lattice.layout, windows, visible, parameters, counting, volume
+        )  # fmt: skip
+        return learning
+
+    if n_views > PAIR:
+        of_few = counted(min(log_every + UNIT_LOG_EVERY, len(ROW_SHIFTS) - 1))
+        grey_unit = grey_units(of_few.grey_roots, of_few.right_of_pair.sum(axis=2))
+    learning = counted(log_every)
+    of_right, of_wrong = (counts[:-1].reshape(TABLE_SHAPE) for counts in (learning.right, learning.wrong))
     ratios, neutral = log_ratios(of_right, of_wrong, PRIOR_COUNTS / 2**log_every)
     table = np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32)
     factor = UNIT_FACTOR_PER_LEVEL**taught_heights.level
@@ -144,9 +152,35 @@ def learned_evidence(
         neutral=np.float32(neutral),
         pair_exponent=np.float32(PAIR_EXPONENT),
         max_cost=np.float32(MAX_MIDDLE_COST),
-        worth=worth_of_pairs(right_of_pair, wrong_of_pair),
+        grey_unit=grey_unit,
+        worth=worth_of_pairs(learning.right_of_pair, learning.wrong_of_pair),
     )
     return TableAndCounts(found, NO_COUNTS)
+
+
+def nothing_counted(n_views: int, reference: NDArray[np.float32]) -> Learning:
+    """Counts of 0, for heights (r, c) that count as right."""
+    # One more bin, because a likeness is counted at the nearest bin.
+    of_bins, of_pair = int(np.prod(TABLE_SHAPE)) + 1, (n_views, n_views)
+    right, wrong = np.zeros(of_bins, np.int64), np.zeros(of_bins, np.int64)
+    right_of_pair, wrong_of_pair = (np.zeros((*of_pair, N_LIKENESS), np.int64) for _ in range(2))
+    return Learning(reference, right, wrong, right_of_pair, wrong_of_pair, np.zeros(of_pair))
+
+
+def grey_units(grey_roots: NDArray[np.float64], n_differences: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Usual grey difference of each pair of views, as a multiple of that of all pairs, (i, i) float32.
+
+    grey_roots : (i, i), sums of the roots of the grey differences at right heights; n_differences : (i, i), how many
+    they are. Only views in ascending order are counted. Images of one pass differ less than those of different days:
+    in units of its own a difference says as much in each pair.
+    """
+    of_all = grey_roots.sum() / max(n_differences.sum(), 1)
+    if of_all == 0:
+        return np.ones(grey_roots.shape, np.float32)
+    more = GREY_DIFFERENCES_OF_ALL_PAIRS
+    unit = ((grey_roots + more * of_all) / (n_differences + more) / of_all) ** 2
+    upper = np.triu(unit, 1)
+    return np.asarray(upper + upper.T + np.eye(len(unit)), np.float32)
 
 
 def log_ratios(

@@ -88,12 +88,18 @@ def worth_of(n_views, seed=5):
     return worth + worth.T
 
 
+def grey_unit_of(n_views, seed=6):
+    """The unit of the grey differences of each pair of views, (i, i)."""
+    return worth_of(n_views, seed)
+
+
 def table_with(ratios, n_views=3):
     """A table whose costs neither reach 0 nor 255."""
     values = (NOISE, UNIT, SMALL_UNIT, float(ratios.max()), 0.5, 0.3, 160.0)
     return EvidenceTable(
         np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32),
         *(np.float32(v) for v in values),
+        grey_unit_of(n_views),
         worth_of(n_views),
     )
 
@@ -125,7 +131,9 @@ def test_costs_are_the_sums_of_the_table(n_views):
             scale = UNIT * n_effective**0.3
             highest = min(scale * ratios.max(), 160.0)
             planes, movement = planes_of(scene, b, d, rows, cols, index)
-            mean = twin.cell_evidence(planes, movement, HALVES, NOISE, ratios.astype(float), views, EXCLUDED, weights)
+            mean = twin.cell_evidence(
+                planes, movement, HALVES, NOISE, table.grey_unit, ratios.astype(float), views, EXCLUDED, weights
+            )
             cost = np.where(n_covering > 1, highest - scale * mean, highest - scale * 0.5)
             expected[rows, cols, index] = np.clip(cost, 0, 255)
     is_searched = np.isfinite(expected)
@@ -141,23 +149,26 @@ def test_counts_are_those_of_right_and_of_wrong_heights():
     reference[:, 20:] = np.nan
     size = int(np.prod(TABLE_SHAPE)) + 1
     by_table, by_pair = ([np.zeros(shape, np.int64) for _ in range(2)] for shape in (size, (3, 3, N_LIKENESS)))
-    learning = Learning(reference, *by_table, *by_pair)
-    _, lattice = run(scene, visible, TableAndCounts(NO_TABLE._replace(noise_variance=np.float32(NOISE)), learning))
-    right, wrong = np.zeros(TABLE_SHAPE, int), np.zeros(TABLE_SHAPE, int)
+    learning, grey_unit = Learning(reference, *by_table, *by_pair, np.zeros((3, 3))), grey_unit_of(3)
+    table = NO_TABLE._replace(noise_variance=np.float32(NOISE), grey_unit=grey_unit)
+    _, lattice = run(scene, visible, TableAndCounts(table, learning))
+    right, wrong, grey_roots = np.zeros(TABLE_SHAPE, int), np.zeros(TABLE_SHAPE, int), np.zeros((3, 3))
     for b, d, rows, cols in scene.blocks():
         known = np.isfinite(reference[rows, cols])
         for index in range(lattice.first[b, d], lattice.first[b, d] + lattice.count[b, d]):
             here = seen(visible, rows, cols, index)[0][0]
             (planes, movement), away = planes_of(scene, b, d, rows, cols, index), abs(index - 2.25)
             if away <= 3:
-                right += twin.counted(planes, movement, HALVES, NOISE, known, here)
+                right += twin.counted(planes, movement, HALVES, NOISE, grey_unit, known, here)
+                grey_roots += twin.grey_roots(planes, HALVES[-1], known, here)
             elif away > 5:
-                wrong += twin.counted(planes, movement, HALVES, NOISE, known, here)
+                wrong += twin.counted(planes, movement, HALVES, NOISE, grey_unit, known, here)
     assert right.sum() > 4000
     assert wrong.sum() > 2000
     for found, expected in ((learning.right, right), (learning.wrong, wrong)):
         assert found[:-1].sum() == expected.sum()
         assert np.abs(found[:-1].reshape(TABLE_SHAPE) - expected).sum() < FEW * expected.sum()
+    np.testing.assert_allclose(learning.grey_roots, grey_roots, rtol=1e-4)
     for of_pair, of_all in ((learning.right_of_pair, learning.right), (learning.wrong_of_pair, learning.wrong)):
         likeness = of_all[:-1].reshape(TABLE_SHAPE).sum(axis=(0, 1, 2))
         np.testing.assert_array_equal(of_pair.sum(axis=(0, 1)), likeness)
@@ -181,7 +192,8 @@ def test_the_order_of_the_views_does_not_matter(n_views):
     table = table_with(ratios, n_views)
     order = list(reversed(range(n_views)))
     turned = type(scene)(**(vars(scene) | {"layout": scene.layout[order].copy(), "nodes": scene.nodes[order].copy()}))
-    tables = (table, table._replace(worth=table.worth[np.ix_(order, order)].copy()))
+    of_turned = {name: getattr(table, name)[np.ix_(order, order)].copy() for name in ("grey_unit", "worth")}
+    tables = (table, table._replace(**of_turned))
     volumes = [
         run(s, s.all_visible(), TableAndCounts(t, NO_COUNTS))[0].astype(int)
         for s, t in zip((scene, turned), tables, strict=True)

@@ -42,8 +42,9 @@ class CostOptions(Checked):
         low=0.01, high=10.0,
     )  # fmt: skip
     occluded_pairs_excluded: float | None = option_by_method(
-        0.5, 1.0, "Share of the pairs with an occluded image that is excluded from the mean; the other such pairs "
-        "count as uncorrelated.",
+        0.5, 1.0, "How far pairs with an occluded image are excluded from the mean: with 1 the sum over the pairs "
+        "that see a cell is divided by their number, with 0 by that of all pairs, else by the geometric mean of both, "
+        "with this weight.",
         low=0.0, high=1.0,
     )  # fmt: skip
     occlusion_margin_steps: float | None = option_by_method(

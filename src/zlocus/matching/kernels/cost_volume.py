@@ -59,7 +59,7 @@ class CostParameters(NamedTuple):
     grey_weight: np.float32  # f4: weight of grey differences beside the correlation
     grey_weight_two_images: np.float32  # f4: the same in blocks that two of three or more views cover
     max_grey_difference: np.float32  # f4: grey difference at which two views do not agree at all
-    occluded_pairs_excluded: np.float32  # f4: share of the pairs with an occluded view that is excluded from the mean
+    occluded_pairs_excluded: np.float32  # f4: how far pairs with an occluded view are excluded from the mean
     max_images_for_large_window: int  # i8: blocks that more views cover take the smallest window only
 
 
@@ -77,7 +77,7 @@ class PairWeights(NamedTuple):
     of_seeing: np.ndarray  # (p,) f4: scratch; weight of a pair that sees the cell where others are occluded
     counts: np.ndarray  # (2,p) f4: how many views cover, and how many see, each cell at this height
     is_part: bool  # b1: whether a view is occluded in a cell, or does not cover it
-    excluded: np.float32  # f4: share of the pairs with an occluded view that is left out of the mean
+    excluded: np.float32  # f4: how far pairs with an occluded view are left out of the mean
     of_block: PairsOfBlock  # PairsOfBlock: the pairs of the views that cover the block
     grey_weight: np.float32  # f4: weight of grey differences
     height: np.int32  # i4: height index
@@ -420,7 +420,8 @@ def evidence_in(evidence, box):
     """The table, and the counts with the reference heights of the cells of a rectangle."""
     of_tile = evidence.learning
     reference = of_tile.reference[box.first_row : box.end_row, box.first_col : box.end_col]
-    learning = Learning(reference, of_tile.right, of_tile.wrong, of_tile.right_of_pair, of_tile.wrong_of_pair)
+    by_bin, by_pair = (of_tile.right, of_tile.wrong), (of_tile.right_of_pair, of_tile.wrong_of_pair)
+    learning = Learning(reference, *by_bin, *by_pair, of_tile.grey_roots)
     return TableAndCounts(evidence.table, learning)
 
 

@@ -64,6 +64,7 @@ class EvidenceTable(NamedTuple):
     neutral: np.float32  # f4: log ratio of no evidence
     pair_exponent: np.float32  # f4: the mean over n pairs that say equally much counts n ** pair_exponent times
     max_cost: np.float32  # f4: cost of a height without evidence for or against it, at most
+    grey_unit: np.ndarray  # (i,i) f4: usual grey difference of each pair of views, as a multiple of that of all pairs
     worth: np.ndarray  # (i,i) f4: what each pair of views is worth, see `zlocus.matching.evidence.worth_of_pairs`
 
 
@@ -75,6 +76,7 @@ class Learning(NamedTuple):
     wrong: np.ndarray  # (e,) i8: how often at wrong heights
     right_of_pair: np.ndarray  # (i,i,k) i8: how often each likeness occurs at right heights in each pair of views
     wrong_of_pair: np.ndarray  # (i,i,k) i8: how often at wrong heights
+    grey_roots: np.ndarray  # (i,i) f8: sum of the roots of the grey differences of each pair at right heights
 
 
 class TableAndCounts(NamedTuple):
@@ -308,12 +310,12 @@ def write_contrast_bins(bits, n, bins):
 
 # (i,p) f4, f4, ViewPair, i8, (p,) i4 -> None
 @kernel
-def add_grey_bins(greys, grey_factor, pair, n, bins):
-    """Make bins of contrast those of contrast and grey difference, at the first n places. grey_factor : of `greys`."""
-    to_grey, per_factor = np.float32(N_GREY) / LARGEST_GREY_ROOT, np.float32(1.0) / grey_factor
+def add_grey_bins(greys, unit, pair, n, bins):
+    """Make bins of contrast those of contrast and grey difference, at the first n places. unit : of the differences."""
+    to_grey, per_unit = np.float32(N_GREY) / LARGEST_GREY_ROOT, np.float32(1.0) / unit
     a, b, last = pair.a, pair.b, np.float32(N_GREY - 1)
     for j in range(np.uint64(n)):
-        grey = min(np.sqrt(abs(greys[a, j] - greys[b, j]) * per_factor) * to_grey, last)
+        grey = min(np.sqrt(abs(greys[a, j] - greys[b, j]) * per_unit) * to_grey, last)
         bins[j] = bins[j] * np.int32(N_GREY) + np.int32(grey)
 
 
@@ -345,9 +347,9 @@ def add_likeness_bins(census, pair, half, n_sizes, n, rows, bins):
         bins[j] = bins[j] * np.int32(N_LIKENESS) + lower
 
 
-# PairWindows, ViewPair, WindowMoments, PairScratch, f4, i8 -> None
+# PairWindows, ViewPair, WindowMoments, PairScratch, EvidenceTable, i8 -> None
 @kernel
-def write_pair_bins(views, pair, moments, scratch, noise_variance, n):
+def write_pair_bins(views, pair, moments, scratch, table, n):
     """Write the bin of a pair of views, and its position between two bins of likeness, at the first n places.
 
     Each feature has loops of its own, because a loop over the arrays of all features is not vectorised. Arrays are
@@ -355,9 +357,10 @@ def write_pair_bins(views, pair, moments, scratch, noise_variance, n):
     """
     windows, rows, bins = views.windows, scratch.rows, scratch.bins
     write_pair_correlation(views, pair, moments, rows, n)
-    write_contrasts(scratch.gradients, scratch.movement, pair, noise_variance, n, rows)
+    write_contrasts(scratch.gradients, scratch.movement, pair, table.noise_variance, n, rows)
     write_contrast_bins(scratch.bits, n, bins)
-    add_grey_bins(views.greys, views.grey_factor, pair, n, bins)
+    grey_unit = table.grey_unit[views.in_tile[pair.a], views.in_tile[pair.b]]
+    add_grey_bins(views.greys, views.grey_factor * grey_unit, pair, n, bins)
     add_likeness_bins(scratch.census, pair, windows[-1], windows.shape[0], n, rows, bins)
 
 
@@ -378,12 +381,12 @@ def count_bins(views, moments, scratch, n, height, evidence):
     learning = evidence.learning
     reference, right, wrong = learning.reference, learning.right, learning.wrong
     right_of_pair, wrong_of_pair = learning.right_of_pair, learning.wrong_of_pair
-    noise_variance, position, bins = evidence.table.noise_variance, scratch.rows[POSITION], scratch.bins
+    position, bins, per_factor = scratch.rows[POSITION], scratch.bins, np.float32(1.0) / views.grey_factor
     describe_views(views, scratch, n)
     rows, cols = reference.shape
     for a in range(views.planes.shape[0]):
         for b in range(a + 1, views.planes.shape[0]):
-            write_pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, noise_variance, n)
+            write_pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, evidence.table, n)
             first, second = views.in_tile[a], views.in_tile[b]
             for r in range(rows):
                 for c in range(cols):
@@ -398,6 +401,8 @@ def count_bins(views, moments, scratch, n, height, evidence):
                     if away <= RIGHT_STEPS:
                         right[nearest] += 1
                         right_of_pair[first, second, likeness] += 1
+                        difference = abs(views.greys[a, j] - views.greys[b, j]) * per_factor
+                        learning.grey_roots[first, second] += np.sqrt(difference)
                     elif away > FIRST_WRONG_STEP:
                         wrong[nearest] += 1
                         wrong_of_pair[first, second, likeness] += 1
@@ -441,7 +446,7 @@ def add_evidence(views, moments, scratch, n, weights, evidence, total, seen):
             weight = weights[views.in_block[a], views.in_block[b]]
             if weight > np.float32(0.0):
                 pair = ViewPair(np.uint64(a), np.uint64(b))
-                write_pair_bins(views, pair, moments, scratch, evidence.noise_variance, n)
+                write_pair_bins(views, pair, moments, scratch, evidence, n)
                 add_ratios(evidence.log_ratios, weight, views.greys, pair, n, scratch.rows, scratch.bins, total)
                 if seen.shape[0] > 0:
                     add_seen_weights(weight, views.greys, pair, n, seen)

@@ -88,14 +88,16 @@ def count_seeing_pairs(n_seeing, n, out):
 def weights_with_occlusion(of_covering, excluded, n, out):
     """Write the weight of a pair of views that see the cell, where some pairs contain an occluded view.
 
-    of_covering : (p,), the weight where all views that cover the cell see it; excluded : share of the pairs with an
-    occluded view that is left out of the mean; out : (p,), the number of the pairs that see each cell, or the sum of
-    their weights, replaced by the result. Less than one pair counts as one.
+    of_covering : (p,), the weight where all views that cover the cell see it; excluded : how far pairs with an occluded
+    view are left out of the mean; out : (p,), the number of the pairs that see each cell, or the sum of their weights,
+    replaced by the result. Less than one pair counts as one.
 
-    The other pairs with an occluded view count as uncorrelated, or as without evidence. If no pair was left out, the
-    ground beside a wall would rather be roof, which all views see; if all were, heights that few views see would be
-    favoured, where chance agreement is larger.
+    The weight is (1 / seeing pairs) ** excluded * of_covering ** (1 - excluded). If no pair was left out (0), the
+    ground beside a wall would rather be roof, which all views see; if all were (1), heights that few views see would be
+    favoured, where chance agreement is larger. Their mean is the geometric one because the evidence of n pairs does not
+    count n times that of one: where one pair of eighteen sees a cell, the arithmetic mean would have it count 9 times.
     """
     one = np.float32(1.0)
     for j in range(n):
-        out[j] = of_covering[j] + excluded * (one / max(out[j], one) - of_covering[j])
+        fewer = one / (of_covering[j] * max(out[j], one))
+        out[j] = of_covering[j] * fewer**excluded
