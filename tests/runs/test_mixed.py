@@ -1,4 +1,4 @@
-"""One rendered ground and three kinds of sensor: exact cameras, and a surface from all that is better than each alone."""
+"""One rendered ground and three kinds of sensor: exact cameras, and a surface from all, better than from each alone."""
 
 from __future__ import annotations
 
