@@ -58,19 +58,30 @@ def test_every_sensor_reads_back_as_its_exact_camera(spec, scenes):
             np.testing.assert_allclose(view.sensor.image_from_ground(xyz), xy, rtol=0, atol=EXACT_PX)
 
 
-def test_all_sensors_together_are_better_than_the_best_alone(scenes, tmp_path):
+def judged(scenes: dict[str, Path], out: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """NMAD of the ground, and share of all blocks within two pixels, of the surface of each sensor and of all."""
     nmad, within = {}, {}
     for kind, scene in scenes.items():
-        run_dsm(
-            DsmRequest(inputs=(scene,), out=tmp_path / kind, resolution=0.2), RunConfig(), progress_for(io.StringIO())
-        )
+        run_dsm(DsmRequest(inputs=(scene,), out=out / kind, resolution=0.2), RunConfig(), progress_for(io.StringIO()))
         truth, classes = (scene.parent / name for name in ("truth_dsm.tif", "truth_class.tif"))
-        found = evaluate(tmp_path / kind / "dsm.tif", Comparison(truth, classes=classes, threshold_m=TWO_PIXELS_M))
+        found = evaluate(out / kind / "dsm.tif", Comparison(truth, classes=classes, threshold_m=TWO_PIXELS_M))
         nmad[kind], within[kind] = found.class_statistics["ground"].nmad, found.statistics.within
+    return nmad, within
+
+
+def test_all_sensors_together_are_better_than_the_best_alone(scenes, tmp_path):
+    nmad, within = judged(scenes, tmp_path)
     assert nmad["mixed"] <= min(nmad[kind] for kind in SENSORS)
     assert within["mixed"] >= max(within[kind] for kind in SENSORS) + GAIN
     views = json.loads((tmp_path / "mixed" / "run.json").read_text())["orientation"]["views"].values()
     assert max(np.abs(view["shift_px"]).max() for view in views) < SHIFT_PX
+
+
+@pytest.mark.xfail(strict=True, reason="two of 3136 blocks are wrong at a roof's edge, one with the best sensor alone")
+def test_of_one_house_no_block_more_is_lost_than_by_the_best_alone(spec, tmp_path):
+    scenes = render_mixed_scene(replace(spec, seed=demo_spec().seed), tmp_path / "scene")
+    _, within = judged(scenes, tmp_path)
+    assert within["mixed"] >= max(within[kind] for kind in SENSORS)
 
 
 def test_the_command(tmp_path):
