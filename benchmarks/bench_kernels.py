@@ -41,6 +41,7 @@ from zlocus.matching.kernels.smooth import slopes, smooth_surface
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling, tile_ortho, tile_profile
 from zlocus.matching.kernels.winners import winner_takes_all, winners
+from zlocus.matching.local_planes import mean_of_planes
 from zlocus.matching.prior_costs import CANDIDATE_REACH, COST_OF_CANDIDATES
 from zlocus.matching.subpixel import smoothed
 from zlocus.products.hillshade import hillshade
@@ -267,6 +268,17 @@ def smooth_case(side: int = SIDE) -> Case:
     return Case(lambda: smooth_surface(surface, by_row, by_col, 2, np.float32(2.0), out), surface.size, "cell")
 
 
+def local_planes_case(side: int = SIDE) -> Case:
+    """Planes of windows of three sides around every cell, of a surface with noise and a few unknown cells."""
+    rng = np.random.default_rng(5)
+    height = rolling(side) + rng.normal(0, 0.3, (side, side)).astype(np.float32)
+    sigma, is_known = np.full(height.shape, 0.4, np.float32), rng.random(height.shape) < 0.98
+    return Case(
+        lambda: [mean_of_planes(height, sigma, is_known, of_window) for of_window in (5, 9, 17)],
+        3 * height.size, "cell and side of windows",
+    )  # fmt: skip
+
+
 def visibility_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) -> Case:
     """Occlusion of a surface in one view; by_col, by_row : parallax rate, which decides the direction of the sweep."""
     surface = rolling(side)
@@ -409,6 +421,10 @@ def test_profile(benchmark, side):
 def test_smooth(benchmark, side):
     surface = rolling(side or SIDE)
     timed(benchmark, Case(lambda: smoothed(surface, 2.0), surface.size, "cell"))
+
+
+def test_local_planes(benchmark, side):
+    timed(benchmark, local_planes_case(side or SIDE))
 
 
 def test_visibility(benchmark, side):

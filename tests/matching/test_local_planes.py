@@ -1,4 +1,4 @@
-"""Heights smoothed by local planes: analytic surfaces, a slow twin, and independence of the cut into tiles."""
+"""Heights smoothed by local planes: analytic surfaces, a slow twin, and independence of cells far away."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zlocus.matching import local_planes
+from zlocus.matching.kernels.local_planes import MAX_MISFIT, MIN_KNOWN_SHARE
 from zlocus.matching.local_planes import (
-    MAX_MISFIT,
     MAX_MOVE_SIGMAS,
-    MIN_KNOWN_SHARE,
     mean_of_planes,
-    planes_of_windows,
     remaining_error,
     smoothed_by_planes,
 )
@@ -95,12 +92,10 @@ def test_unknown_cells_count_for_nothing_and_stay():
     np.testing.assert_array_equal(smooth(height, sides=()), height)
 
 
-def test_heights_do_not_depend_on_the_strips_nor_on_cells_far_away(monkeypatch):
+def test_heights_do_not_depend_on_cells_far_away():
     height, sigma = slope((150, 60)) + noise((150, 60), 5), np.full((150, 60), SIGMA_STEPS, np.float32)
     is_known, reach = np.ones(height.shape, bool), 2 * (SIDES[-1] // 2)
     whole = smooth(height)
-    monkeypatch.setattr(local_planes, "STRIP_ROWS", 37)
-    np.testing.assert_allclose(smooth(height), whole, rtol=0, atol=ROUNDING_STEPS)
     part = smoothed_by_planes(height[30:120], sigma[30:120], is_known[30:120], WHOLE, SIDES).height
     np.testing.assert_allclose(part[reach:-reach], whole[30 + reach : 120 - reach], rtol=0, atol=ROUNDING_STEPS)
 
@@ -134,7 +129,7 @@ def test_planes_are_those_of_the_twin(seed):
     height[8:, 12:] += np.float32(rng.uniform(0, 6))
     sigma = rng.uniform(0.3, 1.2, height.shape).astype(np.float32)
     is_known = rng.random(height.shape) < 0.9
-    found = mean_of_planes(planes_of_windows(height, sigma, is_known, 5), 5)
+    found = mean_of_planes(height, sigma, is_known, 5)
     expected = twin_of_one_side(height, sigma, is_known, 5)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING_STEPS)
@@ -144,9 +139,7 @@ def test_planes_are_those_of_the_twin(seed):
 def test_no_plane_where_a_window_has_few_heights(side):
     is_known = np.zeros((40, 40), bool)
     is_known[:, ::2] = True
-    assert np.isnan(
-        mean_of_planes(planes_of_windows(slope((40, 40)), np.ones((40, 40), np.float32), is_known, side), side)
-    ).all()
+    assert np.isnan(mean_of_planes(slope((40, 40)), np.ones((40, 40), np.float32), is_known, side)).all()
 
 
 def test_each_height_tells_the_windows_that_it_came_from():

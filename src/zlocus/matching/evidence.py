@@ -72,10 +72,12 @@ MIN_TRUSTED_CELLS = 20_000
 # Tiles of fewer finest cells would learn at their finest level only, between coarser heights that were found without
 # evidence: of a town in 40 000 cells 2.05 % of the heights are then off by more than 10 m, and 1.86 % without evidence.
 MIN_CELLS_OF_TILE = 4 * MIN_TRUSTED_CELLS
-# The noise of an image is the variance that this share of its small windows is below.
-NOISE_SHARE, NOISE_WINDOW, LEAST_VARIANCE = 0.05, (5, 5), 1e-7
+# The noise of an image is the variance that this share of its small windows, so many pixels apart, is below.
+NOISE_SHARE, NOISE_WINDOW, NOISE_EVERY, LEAST_VARIANCE = 0.05, (5, 5), 2, 1e-7
 # Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain.
 LEAST_CELLS = 80_000
+# Wrong heights, of which there are many more than right ones, are counted at every fourth height index.
+WRONG_EVERY = 4
 # Of every 2^k blocks of a row the same one is counted as in the row above, shifted by the k-th of these.
 ROW_SHIFTS = (0, 1, 2, 3, 4)
 # Usual grey differences are counted first, in 2^k times fewer blocks. Each pair of views gets so many differences more
@@ -90,6 +92,7 @@ NO_TABLE = EvidenceTable(
 )  # fmt: skip
 NO_COUNTS = Learning(
     np.zeros((0, 0), np.float32),
+    np.int64(0),
     np.zeros(0, np.int64),
     np.zeros(0, np.int64),
     np.zeros((0, 0, 0), np.int64),
@@ -126,8 +129,9 @@ def learned_evidence(
     n_views, log_every = len(slope_views.layout), log_of_sampling(taught_heights.height.size)
     noise, grey_unit = noise_variance(slope_views), np.ones((n_views, n_views), np.float32)
 
-    def counted(log_every: int) -> Learning:
-        learning = nothing_counted(n_views, sampled_blocks(taught_heights.height, lattice.block, log_every))
+    def counted(log_every: int, wrong_every: int) -> Learning:
+        reference = sampled_blocks(taught_heights.height, lattice.block, log_every)
+        learning = nothing_counted(n_views, reference, wrong_every)
         counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise, grey_unit=grey_unit), learning)
         volume = np.empty(lattice.size, np.uint8)
         tile_costs(
@@ -136,9 +140,9 @@ def learned_evidence(
         return learning
 
     if n_views > PAIR:
-        of_few = counted(min(log_every + UNIT_LOG_EVERY, len(ROW_SHIFTS) - 1))
+        of_few = counted(min(log_every + UNIT_LOG_EVERY, len(ROW_SHIFTS) - 1), 0)
         grey_unit = grey_units(of_few.grey_roots, of_few.right_of_pair.sum(axis=2))
-    learning = counted(log_every)
+    learning = counted(log_every, WRONG_EVERY)
     of_right, of_wrong = (counts[:-1].reshape(TABLE_SHAPE) for counts in (learning.right, learning.wrong))
     ratios, neutral = log_ratios(of_right, of_wrong, PRIOR_COUNTS / 2**log_every)
     table = np.append(ratios.ravel(), np.float32(0.0)).astype(np.float32)
@@ -158,13 +162,13 @@ def learned_evidence(
     return TableAndCounts(found, NO_COUNTS)
 
 
-def nothing_counted(n_views: int, reference: NDArray[np.float32]) -> Learning:
-    """Counts of 0, for heights (r, c) that count as right."""
+def nothing_counted(n_views: int, reference: NDArray[np.float32], wrong_every: int) -> Learning:
+    """Counts of 0, for heights (r, c) that count as right, and wrong heights at one of so many indices (0: none)."""
     # One more bin, because a likeness is counted at the nearest bin.
     of_bins, of_pair = int(np.prod(TABLE_SHAPE)) + 1, (n_views, n_views)
     right, wrong = np.zeros(of_bins, np.int64), np.zeros(of_bins, np.int64)
     right_of_pair, wrong_of_pair = (np.zeros((*of_pair, N_LIKENESS), np.int64) for _ in range(2))
-    return Learning(reference, right, wrong, right_of_pair, wrong_of_pair, np.zeros(of_pair))
+    return Learning(reference, np.int64(wrong_every), right, wrong, right_of_pair, wrong_of_pair, np.zeros(of_pair))
 
 
 def grey_units(grey_roots: NDArray[np.float64], n_differences: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -281,7 +285,7 @@ def noise_variance(slope_views: TileViews) -> np.float32:
     for offset, rows, cols in slope_views.layout:
         grey = slope_views.arrays.pixels[offset : offset + rows * cols].reshape(rows, cols)
         mean, squares = cv2.blur(grey, NOISE_WINDOW), cv2.blur(grey * grey, NOISE_WINDOW)
-        variance = squares - mean * mean
+        variance = (squares - mean * mean)[::NOISE_EVERY, ::NOISE_EVERY]
         variance = variance[variance > LEAST_VARIANCE]
         if variance.size:
             found.append(float(np.quantile(variance, NOISE_SHARE)))

@@ -8,15 +8,13 @@ import pytest
 from kernel_scene import even_lattice, kernel_scene
 from reference import evidence as twin
 from reference.semiglobal import dense
-from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE, NO_TABLE
+from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE, NO_TABLE, nothing_counted
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
 from zlocus.matching.kernels.evidence import (
     CONTRAST_A,
     CONTRAST_B,
-    N_LIKENESS,
     TABLE_SHAPE,
     EvidenceTable,
-    Learning,
     TableAndCounts,
     bit_count,
     doublings,
@@ -141,15 +139,15 @@ def test_costs_are_the_sums_of_the_table(n_views):
     assert (np.abs(found - expected) > COST).mean() < FEW
 
 
-def test_counts_are_those_of_right_and_of_wrong_heights():
+@pytest.mark.parametrize("wrong_every", [1, 2])
+def test_counts_are_those_of_right_and_of_wrong_heights(wrong_every):
     """Cells without a reference, views that do not see a cell, and heights that are neither right nor wrong are not
-    counted."""
+    counted, and wrong heights only at every so many indices."""
     scene, visible = scene_and_visibility()
     reference = np.full(SHAPE, 2.25, np.float32)
     reference[:, 20:] = np.nan
-    size = int(np.prod(TABLE_SHAPE)) + 1
-    by_table, by_pair = ([np.zeros(shape, np.int64) for _ in range(2)] for shape in (size, (3, 3, N_LIKENESS)))
-    learning, grey_unit = Learning(reference, *by_table, *by_pair, np.zeros((3, 3))), grey_unit_of(3)
+    learning = nothing_counted(3, reference, wrong_every)
+    grey_unit = grey_unit_of(3)
     table = NO_TABLE._replace(noise_variance=np.float32(NOISE), grey_unit=grey_unit)
     _, lattice = run(scene, visible, TableAndCounts(table, learning))
     right, wrong, grey_roots = np.zeros(TABLE_SHAPE, int), np.zeros(TABLE_SHAPE, int), np.zeros((3, 3))
@@ -161,10 +159,10 @@ def test_counts_are_those_of_right_and_of_wrong_heights():
             if away <= 3:
                 right += twin.counted(planes, movement, HALVES, NOISE, grey_unit, known, here)
                 grey_roots += twin.grey_roots(planes, HALVES[-1], known, here)
-            elif away > 5:
+            elif away > 5 and index % wrong_every == 0:
                 wrong += twin.counted(planes, movement, HALVES, NOISE, grey_unit, known, here)
     assert right.sum() > 4000
-    assert wrong.sum() > 2000
+    assert wrong.sum() > 1000
     for found, expected in ((learning.right, right), (learning.wrong, wrong)):
         assert found[:-1].sum() == expected.sum()
         assert np.abs(found[:-1].reshape(TABLE_SHAPE) - expected).sum() < FEW * expected.sum()
@@ -175,6 +173,20 @@ def test_counts_are_those_of_right_and_of_wrong_heights():
         # View 1 covers half of the cells, so that its pairs are counted less often; none is counted twice.
         assert (of_pair.sum(axis=2)[[0, 1], [1, 2]] < of_pair[0, 2].sum()).all()
         assert not of_pair[np.tril_indices(3)].any()
+
+
+def test_right_heights_can_be_counted_alone():
+    scene, visible = scene_and_visibility()
+    reference, found = np.full(SHAPE, 2.25, np.float32), []
+    for wrong_every in (0, 1):
+        learning = nothing_counted(3, reference, wrong_every)
+        run(scene, visible, TableAndCounts(NO_TABLE._replace(grey_unit=grey_unit_of(3)), learning))
+        found.append(learning)
+    np.testing.assert_array_equal(found[0].right, found[1].right)
+    np.testing.assert_array_equal(found[0].grey_roots, found[1].grey_roots)
+    assert found[1].wrong.any()
+    assert not found[0].wrong.any()
+    assert not found[0].wrong_of_pair.any()
 
 
 def test_without_a_table_the_cost_is_that_of_correlation():

@@ -15,6 +15,7 @@ from zlocus.matching.kernels.evidence import (
     cost_of_unit,
     count_bins,
     evidence_costs,
+    is_height_counted,
     pair_scratch,
     put_movement,
 )
@@ -339,6 +340,8 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
+        if evidence.learning.right.shape[0] > 0 and not is_height_counted(evidence.learning, height):
+            continue
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole
         for i in range(n_views):
@@ -421,7 +424,7 @@ def evidence_in(evidence, box):
     of_tile = evidence.learning
     reference = of_tile.reference[box.first_row : box.end_row, box.first_col : box.end_col]
     by_bin, by_pair = (of_tile.right, of_tile.wrong), (of_tile.right_of_pair, of_tile.wrong_of_pair)
-    learning = Learning(reference, *by_bin, *by_pair, of_tile.grey_roots)
+    learning = Learning(reference, of_tile.wrong_every, *by_bin, *by_pair, of_tile.grey_roots)
     return TableAndCounts(evidence.table, learning)
 
 

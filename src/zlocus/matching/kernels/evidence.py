@@ -72,6 +72,7 @@ class Learning(NamedTuple):
     """Counts that a table is learned from. Without counts (no elements) nothing is counted."""
 
     reference: np.ndarray  # (r,c) f4: height index that counts as right in each cell, NaN where no cell is counted
+    wrong_every: np.int64  # i8: wrong heights are counted at one of so many height indices, at none where it is 0
     right: np.ndarray  # (e,) i8: how often each bin occurs at right heights
     wrong: np.ndarray  # (e,) i8: how often at wrong heights
     right_of_pair: np.ndarray  # (i,i,k) i8: how often each likeness occurs at right heights in each pair of views
@@ -374,6 +375,26 @@ def describe_views(views, scratch, n):
         write_census(views.planes, view, half, width, n, scratch.census)
 
 
+# Learning, i4 -> b1
+@kernel
+def counts_wrong_heights(learning, height):
+    """Whether wrong heights are counted at a height index."""
+    return learning.wrong_every > 0 and height % learning.wrong_every == 0
+
+
+# Learning, i4 -> b1
+@kernel
+def is_height_counted(learning, height):
+    """Whether a height index is right or wrong, and counted, in any cell of a block."""
+    counts_wrong = counts_wrong_heights(learning, height)
+    for r in range(learning.reference.shape[0]):
+        for c in range(learning.reference.shape[1]):
+            away = abs(np.float32(height) - learning.reference[r, c])
+            if away <= RIGHT_STEPS or (counts_wrong and FIRST_WRONG_STEP < away <= LAST_WRONG_STEP):
+                return True
+    return False
+
+
 # PairWindows, WindowMoments, PairScratch, i8, i4, TableAndCounts -> None
 @kernel
 def count_bins(views, moments, scratch, n, height, evidence):
@@ -382,6 +403,7 @@ def count_bins(views, moments, scratch, n, height, evidence):
     reference, right, wrong = learning.reference, learning.right, learning.wrong
     right_of_pair, wrong_of_pair = learning.right_of_pair, learning.wrong_of_pair
     position, bins, per_factor = scratch.rows[POSITION], scratch.bins, np.float32(1.0) / views.grey_factor
+    counts_wrong = counts_wrong_heights(learning, height)
     describe_views(views, scratch, n)
     rows, cols = reference.shape
     for a in range(views.planes.shape[0]):
@@ -403,7 +425,7 @@ def count_bins(views, moments, scratch, n, height, evidence):
                         right_of_pair[first, second, likeness] += 1
                         difference = abs(views.greys[a, j] - views.greys[b, j]) * per_factor
                         learning.grey_roots[first, second] += np.sqrt(difference)
-                    elif away > FIRST_WRONG_STEP:
+                    elif counts_wrong and away > FIRST_WRONG_STEP:
                         wrong[nearest] += 1
                         wrong_of_pair[first, second, likeness] += 1
 
