@@ -16,7 +16,14 @@ from zlocus.matching.kernels.prior_costs import (
     add_costs_of_candidates,
     write_misfit,
 )
-from zlocus.matching.prior_costs import HALVING_MISFIT, LEAST_PENALTY, penalties_after_misfit
+from zlocus.matching.prior_costs import (
+    FREE_SIDES,
+    FREE_STEPS,
+    HALVING_MISFIT,
+    LEAST_PENALTY,
+    cost_beyond,
+    penalties_after_misfit,
+)
 
 SHAPE, BLOCK = (13, 22), 8
 BY_DISTANCE = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
@@ -114,3 +121,15 @@ def test_a_worse_fit_never_makes_jumps_dearer(one, other, penalty):
     assert pytest.approx(penalty, abs=max(1, LEAST_PENALTY)) == int(
         penalties_after_misfit(penalties, np.zeros((3, 3), np.float32)).max()
     )
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.1, 10.0), st.integers(0, 3), st.floats(1.0, 5.0))
+def test_a_narrow_base_frees_no_more_metres_than_a_wide_one(step_cells, level, times):
+    """Heights that are so many times as far as the free steps cost the same with every base."""
+    found, wide = cost_beyond(3.0, 30.0, level, step_cells), cost_beyond(3.0, 30.0, level, 0.1)
+    assert found.free_steps * 2**level * step_cells <= FREE_SIDES * (1 + 1e-6)
+    assert found.free_steps * 2**level <= FREE_STEPS * (1 + 1e-6)
+    assert wide == DistanceCost(np.float32(FREE_STEPS / 2**level), np.float32(3.0), np.float32(30.0))
+    costs = [each.cost_per_step * (times - 1) * each.free_steps for each in (found, wide)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-5)

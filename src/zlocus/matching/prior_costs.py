@@ -42,9 +42,12 @@ COST_OF_CANDIDATES = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(3
 # The cost of heights far from what the tie points suggest, at the coarsest level.
 COST_BEYOND_EXPECTED = DistanceCost(np.float32(0.0), np.float32(5.0), np.float32(20.0))
 # Where jumps become cheaper, heights far from the surface of the first aggregation become more expensive: so many steps
-# of the finest level are free, below and above the heights of NEARBY_CELLS.
+# of the finest level are free, below and above the heights of NEARBY_CELLS. A tree is as high for images with a narrow
+# base, whose steps are large: no more than so many sides of a finest cell are free, and the cost of a step grows as the
+# free steps become fewer.
 NEARBY_CELLS = np.ones((5, 5), np.uint8)
-FREE_STEPS, COST_BEYOND, MAX_COST_BEYOND = 12.0, 3.0, 30.0
+FREE_STEPS, FREE_SIDES = 12.0, 21.0
+COST_BEYOND, MAX_COST_BEYOND = 3.0, 30.0
 # The same for patches that stand off their surroundings without evidence, and the heights of the surroundings.
 COST_OFF_SURROUNDINGS, MAX_COST_OFF_SURROUNDINGS = 6.0, 90.0
 # A height that no cell has.
@@ -118,17 +121,22 @@ def add_costs_far_from_surface(
     Where a patch of the surface stands off its surroundings without evidence, their heights take its place. step_cells
     : finest height step divided by the side of a finest cell.
     """
-    surface, free_steps = (
-        np.asarray(heights.vertex + slope_surface.cells, np.float32),
-        np.float32(FREE_STEPS / 2**level),
-    )
+    surface = np.asarray(heights.vertex + slope_surface.cells, np.float32)
     surroundings = heights_of_surroundings(cost, lattice, slope_surface, surface, level, step_cells)
     is_replaced = np.isfinite(surroundings)
     if is_replaced.any():
         surface = np.where(is_replaced, surroundings, surface)
-        off = DistanceCost(free_steps, np.float32(COST_OFF_SURROUNDINGS), np.float32(MAX_COST_OFF_SURROUNDINGS))
+        off = cost_beyond(COST_OFF_SURROUNDINGS, MAX_COST_OFF_SURROUNDINGS, level, step_cells)
         low, high = np.where(is_replaced, surface, -FAR), np.where(is_replaced, surface, FAR)
         add_costs_beyond(cost, lattice.layout, slope_surface.cells, low, high, off)
     low, high = cv2.erode(surface, NEARBY_CELLS), cv2.dilate(surface, NEARBY_CELLS)
-    by_distance = DistanceCost(free_steps, np.float32(COST_BEYOND), np.float32(MAX_COST_BEYOND))
+    by_distance = cost_beyond(COST_BEYOND, MAX_COST_BEYOND, level, step_cells)
     add_costs_beyond(cost, lattice.layout, slope_surface.cells, low, high, by_distance)
+
+
+def cost_beyond(cost_per_step: float, max_cost: float, level: int, step_cells: float) -> DistanceCost:
+    """Cost of the steps of a level beyond those that are free, see FREE_STEPS. step_cells : finest height step divided
+    by the side of a finest cell."""
+    free_steps = min(FREE_STEPS, FREE_SIDES / step_cells)
+    cost = cost_per_step * FREE_STEPS / free_steps
+    return DistanceCost(np.float32(free_steps / 2**level), np.float32(cost), np.float32(max_cost))
