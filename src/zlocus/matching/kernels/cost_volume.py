@@ -13,12 +13,11 @@ from zlocus.matching.kernels.evidence import (
     TableAndCounts,
     add_evidence,
     cost_of_unit,
-    count_bins,
     evidence_costs,
-    is_height_counted,
     pair_scratch,
     put_movement,
 )
+from zlocus.matching.kernels.evidence_counts import count_bins, is_height_counted
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
 from zlocus.matching.kernels.pairs_of_block import (
     PairsOfBlock,
@@ -311,9 +310,8 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     as much, weighted, for the grey differences of the same pairs; or, with a table of `evidence`, the costs that follow
     from it. Where a table is being learned, its bins are counted, and the costs have no meaning.
 
-    views : with the nodes of this block; relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; windows
-    : half widths, ascending, the last is `half`; visible : of this block; out : (r, c * count) uint8. Views that see
-    nothing of the block at a height are left out there.
+    views, visible : of this block; relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; windows : half
+    widths, ascending, the last is `half`; out : (r, c * count) uint8. A view that sees nothing of it is left out.
     """
     of_block = block_visibility(visible)
     takes = covering_views(of_block, span)
@@ -329,10 +327,9 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
     flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.empty((span.n_heights, n), np.uint8)
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    counts, scratch = np.empty((2, size), np.float32), resample_scratch(size)
-    work, centre = np.empty((4, size), np.float32), np.float32(0.0)
+    counts, work, scratch = np.empty((2, size), np.float32), np.empty((4, size), np.float32), resample_scratch(size)
     flat_visibility(visible, half, flat, pairs)
-    of_pairs, in_block = pair_scratch(n_views, half, size, work), np.empty(n_views, np.int64)
+    of_pairs, in_block, centre = pair_scratch(n_views, half, size, work), np.empty(n_views, np.int64), np.float32(0.0)
     pairs_compared = pairs_of_block(evidence.table.worth, takes)
     if evidence.table.log_ratios.shape[0] > 0:
         weights_of_covering(flat, takes, pairs_compared.weights, pairs)
@@ -340,7 +337,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
-        if evidence.learning.right.shape[0] > 0 and not is_height_counted(evidence.learning, height):
+        if not is_height_counted(evidence.learning, height):
             continue
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole
@@ -363,8 +360,8 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
                 exclude_unseen(shown, n, scale[m], grey, GREY_OF_UNSEEING_VIEW * np.float32(m + 1))
             in_block[m] = i
             m += 1
-        excluded, is_part = parameters.occluded_pairs_excluded, n_whole < n_views
-        weights = PairWeights(pairs, shown, counts, is_part, excluded, pairs_compared, weight, height)
+        excluded = parameters.occluded_pairs_excluded
+        weights = PairWeights(pairs, shown, counts, n_whole < n_views, excluded, pairs_compared, weight, height)
         at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width, in_block[:m], takes[in_block[:m]])
         costs_at_height(at_height, WindowMoments(mean[:m], scale[:m]), of_pairs, weights, evidence, total, codes[k])
     heights_last(codes, width, out)
