@@ -72,7 +72,8 @@ MIN_TRUSTED_CELLS = 20_000
 # Tiles of fewer finest cells would learn at their finest level only, between coarser heights that were found without
 # evidence: of a town in 40 000 cells 2.05 % of the heights are then off by more than 10 m, and 1.86 % without evidence.
 MIN_CELLS_OF_TILE = 4 * MIN_TRUSTED_CELLS
-# The noise of an image is the variance that this share of its small windows, so many pixels apart, is below.
+# The noise of an image is the variance that this share of its small windows is below. Windows are NOISE_EVERY pixels
+# apart.
 NOISE_SHARE, NOISE_WINDOW, NOISE_EVERY, LEAST_VARIANCE = 0.05, (5, 5), 2, 1e-7
 # Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain.
 LEAST_CELLS = 80_000
@@ -140,7 +141,7 @@ def learned_evidence(
         return learning
 
     if n_views > PAIR:
-        of_few = counted(min(log_every + UNIT_LOG_EVERY, len(ROW_SHIFTS) - 1), 0)
+        of_few = counted(min(log_every + UNIT_LOG_EVERY, len(ROW_SHIFTS) - 1), wrong_every=0)
         grey_unit = grey_units(of_few.grey_roots, of_few.right_of_pair.sum(axis=2))
     learning = counted(log_every, WRONG_EVERY)
     of_right, of_wrong = (counts[:-1].reshape(TABLE_SHAPE) for counts in (learning.right, learning.wrong))

@@ -17,7 +17,7 @@ from zlocus.matching.kernels.evidence import (
     pair_scratch,
     put_movement,
 )
-from zlocus.matching.kernels.evidence_counts import count_bins, is_height_counted
+from zlocus.matching.kernels.evidence_counts import count_bins, is_height_needed
 from zlocus.matching.kernels.ncc import SLACK, WindowMoments, add_closeness, add_pairs, window_moments
 from zlocus.matching.kernels.pairs_of_block import (
     PairsOfBlock,
@@ -311,7 +311,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     from it. Where a table is being learned, its bins are counted, and the costs have no meaning.
 
     views, visible : of this block; relief : (r + 2 half, c + 2 half) float32, steps, see `block_relief`; windows : half
-    widths, ascending, the last is `half`; out : (r, c * count) uint8. A view that sees nothing of it is left out.
+    widths, ascending, the last is `half`; out : (r, c * count) uint8. Views that see nothing at a height are left out.
     """
     of_block = block_visibility(visible)
     takes = covering_views(of_block, span)
@@ -337,7 +337,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
-        if not is_height_counted(evidence.learning, height):
+        if not is_height_needed(evidence.learning, height):
             continue
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole

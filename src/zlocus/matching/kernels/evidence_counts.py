@@ -22,8 +22,11 @@ def counts_wrong_heights(learning, height):
 
 # Learning, i4 -> b1
 @kernel
-def is_height_counted(learning, height):
-    """Whether a height index is right or wrong, and counted, in any cell of a block; always without counts."""
+def is_height_needed(learning, height):
+    """Whether costs or counts are made at a height index of a block.
+
+    Where bins are counted, only heights that are right, or counted as wrong, in any of its cells are needed.
+    """
     if learning.right.shape[0] == 0:
         return True
     counts_wrong = counts_wrong_heights(learning, height)

@@ -20,12 +20,12 @@ MIN_TOTAL_WEIGHT = 1e-9
 MIN_DETERMINANT = 1e-6
 # Sums of weights that are all zero may differ from it by rounding.
 MIN_WEIGHT_OF_PLANES = 0.25
-# Weighted sums of the cells of a column: of 1, row, row^2, height, row height, height^2, and the number of cells.
-N_COLUMN_SUMS = 7
-# The same of a window, and the weighted sums of column, row column, column^2 and column height.
-N_WINDOW_SUMS = 11
-# What is summed of the planes: weight, and weight times constant, rise by row and rise by column.
-N_PLANE_SUMS = 4
+# Weighted sums over the cells of a window, by what is summed; those before COL are sums over a column of cells, too.
+WEIGHT, ROW, ROW_ROW, HEIGHT, ROW_HEIGHT, HEIGHT_HEIGHT, N_KNOWN, COL, ROW_COL, COL_COL, COL_HEIGHT = range(11)
+N_COLUMN_SUMS, N_WINDOW_SUMS = COL, COL_HEIGHT + 1
+# What is summed of the planes: their weight, and by weight the constant, the rise by row and the rise by column.
+OF_WEIGHT, OF_CONSTANT, OF_ROW, OF_COL = range(4)
+N_PLANE_SUMS = OF_COL + 1
 
 
 # (c,) f4, (c,) f8, f8, f8, f8, (k,c) f8 -> None
@@ -35,67 +35,74 @@ def add_row_of_heights(height, weight, origin, row, sign, columns):
     for c in range(height.shape[0]):
         z = np.float64(height[c]) - origin if weight[c] > 0.0 else 0.0
         w = sign * weight[c]
-        columns[0, c] += w
-        columns[1, c] += w * row
-        columns[2, c] += w * row * row
-        columns[3, c] += w * z
-        columns[4, c] += w * row * z
-        columns[5, c] += w * z * z
-        columns[6, c] += sign if weight[c] > 0.0 else 0.0
+        columns[WEIGHT, c] += w
+        columns[ROW, c] += w * row
+        columns[ROW_ROW, c] += w * row * row
+        columns[HEIGHT, c] += w * z
+        columns[ROW_HEIGHT, c] += w * row * z
+        columns[HEIGHT_HEIGHT, c] += w * z * z
+        columns[N_KNOWN, c] += sign if weight[c] > 0.0 else 0.0
 
 
 # (k,c) f8, i8, (k,c) f8 -> None
 @kernel
 def window_sums(columns, side, windows):
     """Write the sums of the windows around the cells of a row. columns : with side // 2 + 1 zeros before the first
-    cell, and side // 2 behind the last; see N_WINDOW_SUMS."""
+    cell, and side // 2 behind the last; see WEIGHT."""
     half, before = side // 2, side // 2 + 1
-    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    weight, row, row_row, z, row_z, z_z, known = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    col, row_col, col_col, col_z = 0.0, 0.0, 0.0, 0.0
     for j in range(before, columns.shape[1]):
         i = max(j - side, 0)
-        come, go = np.float64(j - before), np.float64(j - before - side)
-        s0 += columns[0, j] - columns[0, i]
-        s1 += columns[1, j] - columns[1, i]
-        s2 += columns[2, j] - columns[2, i]
-        s3 += columns[3, j] - columns[3, i]
-        s4 += columns[4, j] - columns[4, i]
-        s5 += columns[5, j] - columns[5, i]
-        s6 += columns[6, j] - columns[6, i]
-        s7 += come * columns[0, j] - go * columns[0, i]
-        s8 += come * columns[1, j] - go * columns[1, i]
-        s9 += come * come * columns[0, j] - go * go * columns[0, i]
-        s10 += come * columns[3, j] - go * columns[3, i]
+        entering, leaving = np.float64(j - before), np.float64(j - before - side)
+        weight += columns[WEIGHT, j] - columns[WEIGHT, i]
+        row += columns[ROW, j] - columns[ROW, i]
+        row_row += columns[ROW_ROW, j] - columns[ROW_ROW, i]
+        z += columns[HEIGHT, j] - columns[HEIGHT, i]
+        row_z += columns[ROW_HEIGHT, j] - columns[ROW_HEIGHT, i]
+        z_z += columns[HEIGHT_HEIGHT, j] - columns[HEIGHT_HEIGHT, i]
+        known += columns[N_KNOWN, j] - columns[N_KNOWN, i]
+        col += entering * columns[WEIGHT, j] - leaving * columns[WEIGHT, i]
+        row_col += entering * columns[ROW, j] - leaving * columns[ROW, i]
+        col_col += entering * entering * columns[WEIGHT, j] - leaving * leaving * columns[WEIGHT, i]
+        col_z += entering * columns[HEIGHT, j] - leaving * columns[HEIGHT, i]
         c = j - before - half
         if c >= 0:
-            windows[0, c], windows[1, c], windows[2, c], windows[3, c] = s0, s1, s2, s3
-            windows[4, c], windows[5, c], windows[6, c], windows[7, c] = s4, s5, s6, s7
-            windows[8, c], windows[9, c], windows[10, c] = s8, s9, s10
+            windows[WEIGHT, c], windows[ROW, c], windows[ROW_ROW, c], windows[HEIGHT, c] = weight, row, row_row, z
+            windows[ROW_HEIGHT, c], windows[HEIGHT_HEIGHT, c], windows[N_KNOWN, c] = row_z, z_z, known
+            windows[COL, c], windows[ROW_COL, c], windows[COL_COL, c], windows[COL_HEIGHT, c] = (
+                col, row_col, col_col, col_z,
+            )  # fmt: skip
 
 
 # (k,c) f8, f8, i8, (k,c) f8 -> None
 @kernel
 def planes_of_sums(windows, origin, side, planes):
-    """Write the weight of the planes of a row of windows, and the weighted planes, see N_PLANE_SUMS; 0 where a plane is
+    """Write the weight of the planes of a row of windows, and the weighted planes, see OF_WEIGHT; 0 where a plane is
     not kept. Planes that fit well count more."""
     least_known = MIN_KNOWN_SHARE * side * side
     for c in range(planes.shape[1]):
-        total = max(windows[0, c], MIN_TOTAL_WEIGHT)
-        share, known = 1.0 / total, windows[6, c]
-        mean_row, mean_col, mean_z = windows[1, c] * share, windows[7, c] * share, windows[3, c] * share
-        row_row, col_col = windows[2, c] * share - mean_row * mean_row, windows[9, c] * share - mean_col * mean_col
-        row_col = windows[8, c] * share - mean_row * mean_col
-        row_z, col_z = windows[4, c] * share - mean_row * mean_z, windows[10, c] * share - mean_col * mean_z
-        z_z = windows[5, c] * share - mean_z * mean_z
+        total = max(windows[WEIGHT, c], MIN_TOTAL_WEIGHT)
+        share, known = 1.0 / total, windows[N_KNOWN, c]
+        mean_row, mean_col, mean_z = windows[ROW, c] * share, windows[COL, c] * share, windows[HEIGHT, c] * share
+        row_row = windows[ROW_ROW, c] * share - mean_row * mean_row
+        col_col = windows[COL_COL, c] * share - mean_col * mean_col
+        row_col = windows[ROW_COL, c] * share - mean_row * mean_col
+        row_z = windows[ROW_HEIGHT, c] * share - mean_row * mean_z
+        col_z = windows[COL_HEIGHT, c] * share - mean_col * mean_z
+        z_z = windows[HEIGHT_HEIGHT, c] * share - mean_z * mean_z
         of_determinant = 1.0 / max(row_row * col_col - row_col * row_col, MIN_DETERMINANT)
         by_row = (row_z * col_col - col_z * row_col) * of_determinant
         by_col = (col_z * row_row - row_z * row_col) * of_determinant
         misfit = max(z_z - by_row * row_z - by_col * col_z, 0.0) * total / max(known, 1.0)
         is_kept = misfit < MAX_MISFIT and known >= least_known
         # Sums go on from window to window, so that a plane of any size that is not kept must be left out of them.
-        planes[0, c] = 1.0 / (1.0 + misfit) if is_kept else 0.0
-        planes[1, c] = planes[0, c] * (origin + mean_z - by_row * mean_row - by_col * mean_col) if is_kept else 0.0
-        planes[2, c] = planes[0, c] * by_row if is_kept else 0.0
-        planes[3, c] = planes[0, c] * by_col if is_kept else 0.0
+        weight = 1.0 / (1.0 + misfit)
+        constant = origin + mean_z - by_row * mean_row - by_col * mean_col
+        planes[OF_WEIGHT, c] = weight if is_kept else 0.0
+        planes[OF_CONSTANT, c] = weight * constant if is_kept else 0.0
+        planes[OF_ROW, c] = weight * by_row if is_kept else 0.0
+        planes[OF_COL, c] = weight * by_col if is_kept else 0.0
 
 
 # (k,c) f8, f8, (k,c) f8 -> None
@@ -116,10 +123,10 @@ def heights_of_planes(columns, side, row, found):
     weight, constant, by_row, by_col = 0.0, 0.0, 0.0, 0.0
     for j in range(before, columns.shape[1]):
         i = max(j - side, 0)
-        weight += columns[0, j] - columns[0, i]
-        constant += columns[1, j] - columns[1, i]
-        by_row += columns[2, j] - columns[2, i]
-        by_col += columns[3, j] - columns[3, i]
+        weight += columns[OF_WEIGHT, j] - columns[OF_WEIGHT, i]
+        constant += columns[OF_CONSTANT, j] - columns[OF_CONSTANT, i]
+        by_row += columns[OF_ROW, j] - columns[OF_ROW, i]
+        by_col += columns[OF_COL, j] - columns[OF_COL, i]
         c = j - before - half
         if c >= 0:
             height = (constant + by_row * row + by_col * np.float64(c)) / max(weight, MIN_WEIGHT_OF_PLANES)
@@ -141,20 +148,20 @@ def mean_heights_of_planes(height, weight, origin, side, planes, found):
     windows = np.empty((N_WINDOW_SUMS, n_cols), np.float64)
     inner = columns[:, before : before + n_cols]
     for r in range(-half, n_rows):
-        come, go = r + half, r - half - 1
-        if come < n_rows:
-            add_row_of_heights(height[come], weight[come], origin, np.float64(come), 1.0, inner)
-        if go >= 0:
-            add_row_of_heights(height[go], weight[go], origin, np.float64(go), -1.0, inner)
+        entering, leaving = r + half, r - half - 1
+        if entering < n_rows:
+            add_row_of_heights(height[entering], weight[entering], origin, np.float64(entering), 1.0, inner)
+        if leaving >= 0:
+            add_row_of_heights(height[leaving], weight[leaving], origin, np.float64(leaving), -1.0, inner)
         if r >= 0:
             window_sums(columns, side, windows)
             planes_of_sums(windows, origin, side, planes[:, r])
     columns[:] = 0.0
     for r in range(-half, n_rows):
-        come, go = r + half, r - half - 1
-        if come < n_rows:
-            add_row_of_planes(planes[:, come], 1.0, inner)
-        if go >= 0:
-            add_row_of_planes(planes[:, go], -1.0, inner)
+        entering, leaving = r + half, r - half - 1
+        if entering < n_rows:
+            add_row_of_planes(planes[:, entering], 1.0, inner)
+        if leaving >= 0:
+            add_row_of_planes(planes[:, leaving], -1.0, inner)
         if r >= 0:
             heights_of_planes(columns[:N_PLANE_SUMS], side, np.float64(r), found[r])

@@ -100,4 +100,4 @@ def weights_with_occlusion(of_covering, excluded, n, out):
     one = np.float32(1.0)
     for j in range(n):
         fewer = one / (of_covering[j] * max(out[j], one))
-        out[j] = of_covering[j] * (fewer**excluded if fewer != one else one)
+        out[j] = of_covering[j] * fewer**excluded
