@@ -152,12 +152,11 @@ def check_tutorial(folder: Path) -> None:
     found = json.loads(done.stdout)
     told = " ".join((ROOT / "docs" / "tutorials" / "first_surface.md").read_text(encoding="utf-8").split())
     numbers = re.search(
-        r"truth ([\d.]+) % lie within 1 m .*: ([\d.]+) % of the ground and of the roofs, ([\d.]+) %", told
+        r"truth ([\d.]+) % lie within 1 m .*: ([\d.]+) % of the ground, ([\d.]+) % of the roofs, ([\d.]+) %", told
     )
     assert numbers
-    everything, ground, trees = (float(each) for each in numbers.groups())
-    for name, share in (("all", everything), ("ground", ground), ("building", ground), ("tree", trees)):
-        assert abs(100 * found[name]["within"] - share) < TOLD_TO, name
+    for name, share in zip(("all", "ground", "building", "tree"), numbers.groups(), strict=True):
+        assert abs(100 * found[name]["within"] - float(share)) < TOLD_TO, name
     coverage = json.loads((folder / "surface" / "run.json").read_text(encoding="utf-8"))["coverage"]
     assert f"says that {100 * coverage:.0f} % of the cells" in told
     # Another run of `zlocus dsm`, to which no products were added.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zlocus.core.options import CheckOptions
-from zlocus.matching.height_checks import judge
+from zlocus.matching.height_checks import judge, mean_around
 from zlocus.matching.quality import Quality
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.subpixel import RefinedHeights
@@ -29,7 +29,10 @@ def judged(**changed):
     }
     arrays = {name: np.full((7, 9), value) for name, value in values.items()}
     for name, value in changed.items():
-        arrays[name][AT] = value
+        if np.ndim(value):
+            arrays[name] = value
+        else:
+            arrays[name][AT] = value
     best = arrays["best"].astype(np.int32)
     heights = SemiGlobalHeights(best, best, arrays["uniqueness"].astype(np.uint16), best.astype(np.float32))
     height, nothing = arrays["height"].astype(np.float32), np.zeros((7, 9), np.float32)
@@ -59,7 +62,7 @@ def test_good_cells_have_no_reason():
         ({"best": 0}, Quality.RANGE_END),
         ({"best": 99}, Quality.RANGE_END),
         ({"best": 110}, Quality.RANGE_END),
-        ({"ncc": 0.19}, Quality.NO_MATCH | Quality.WEAK),
+        ({"ncc": 0.19}, Quality.WEAK),
         ({"ncc": 0.49}, Quality.WEAK),
         ({"group_distance": 1.01}, Quality.DISPUTED),
         ({"uniqueness": 63}, Quality.AMBIGUOUS),
@@ -76,6 +79,26 @@ def test_a_reason(changed, reason):
 @pytest.mark.parametrize("changed", [{"best": 1}, {"best": 98}, {"ncc": 0.51}, {"uniqueness": 64}, {"seeing": 2}])
 def test_just_good_enough(changed):
     assert (judged(**changed) == 0).all()
+
+
+def test_a_cell_whose_images_do_not_agree_has_no_height_next_to_a_jump_only():
+    quality = judged(ncc=0.19, height=53.3)
+    assert quality[AT] == Quality.NO_MATCH | Quality.WEAK | Quality.JUMP
+    assert (quality & Quality.NO_MATCH != 0).sum() == 1
+
+
+def test_cells_have_no_height_where_the_images_do_not_agree_in_the_mean_around_them():
+    agreement = np.tile(np.array([0.3, -0.2], np.float32), (7, 5))[:, :9]
+    assert (judged(ncc=agreement) & Quality.NO_MATCH != 0).all()
+    assert not (judged(ncc=agreement + 0.2) & Quality.NO_MATCH).any()
+
+
+def test_the_mean_around_a_cell_leaves_out_what_does_not_count():
+    values, is_counted = np.full((12, 20), 0.8, np.float32), np.ones((12, 20), bool)
+    values[:, 10:], is_counted[:, 10:] = -1.0, False
+    found = mean_around(values, is_counted)
+    np.testing.assert_allclose(found[:, :14], 0.8, atol=1e-6)
+    assert (found[:, 16:] == 0).all()
 
 
 def test_cells_next_to_a_jump():

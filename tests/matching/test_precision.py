@@ -10,12 +10,20 @@ from hypothesis import strategies as st
 from zlocus.matching import precision
 from zlocus.matching.kernels.precision import add_curve
 from zlocus.matching.match_curve import predicted_sigma
-from zlocus.matching.precision import MIN_ROUGHNESS_STEPS, is_split, sigma_steps, spread_around, uncertainty_predictors
+from zlocus.matching.precision import (
+    MIN_ROUGHNESS_STEPS,
+    distance_from_agreement,
+    height_errors,
+    is_split,
+    spread_around,
+    uncertainty_predictors,
+)
 from zlocus.matching.precision_calibration import PAIR, SPLIT
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.subpixel import RefinedHeights, peak_variance
 
 SHAPE, LOGARITHM = (24, 30), 1e-5
+MAX_DISTANCE = 32.0
 INNER = (slice(6, -6), slice(6, -6))
 
 
@@ -42,11 +50,12 @@ def semi_global(height) -> SemiGlobalHeights:
 
 def predictors(found: RefinedHeights, n_seeing=4, vertex=None, texture=0.3):
     heights = semi_global(found.height if vertex is None else vertex)
-    return uncertainty_predictors(heights, found, np.full(SHAPE, n_seeing), np.full(SHAPE, texture, np.float32))
+    texture_of_cells = np.full(SHAPE, texture, np.float32)
+    return uncertainty_predictors(heights, found, np.full(SHAPE, n_seeing), texture_of_cells, MAX_DISTANCE)
 
 
 def sigma(found: RefinedHeights, **kwargs) -> np.ndarray:
-    return sigma_steps(predictors(found, **kwargs), found)
+    return height_errors(predictors(found, **kwargs), found).total
 
 
 @given(
@@ -118,7 +127,7 @@ def test_each_cell_has_the_sigma_of_its_model(is_known):
     height = rng.normal(20, 1, SHAPE).astype(np.float32)
     found = refined(group_distance=group_distance, height=height, is_refined=rng.random(SHAPE) < 0.5)
     said, line_shift_steps = predictors(found), 0.2
-    split, sigmas = is_split(said), sigma_steps(said, found, line_shift_steps)
+    split, sigmas = is_split(said), height_errors(said, found, line_shift_steps).total
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         constant, not_refined, of_lines, curves = model
         expected = constant + np.where(found.is_refined, 0.0, not_refined)
@@ -130,7 +139,7 @@ def test_each_cell_has_the_sigma_of_its_model(is_known):
 
 def test_displaced_lines_are_an_error_of_their_own():
     found = refined()
-    without, with_lines = (sigma_steps(predictors(found), found, steps) for steps in (0.0, 0.5))
+    without, with_lines = (height_errors(predictors(found), found, steps).total for steps in (0.0, 0.5))
     of_lines = SPLIT[2]
     assert of_lines > 0.1
     np.testing.assert_allclose(with_lines, np.hypot(without, of_lines * 0.5), rtol=LOGARITHM)
@@ -138,8 +147,25 @@ def test_displaced_lines_are_an_error_of_their_own():
 
 def test_a_place_without_texture_is_less_precise():
     found = refined()
-    plain, textured = (sigma_steps(predictors(found, texture=texture), found) for texture in (0.0, 0.3))
+    plain, textured = (sigma(found, texture=texture) for texture in (0.0, 0.3))
     assert (plain > 1.1 * textured).all()
+
+
+def test_distance_is_that_from_the_nearest_agreement():
+    ncc = np.full((40, 60), 0.9, np.float32)
+    ncc[:, 20:] = 0.0
+    found = distance_from_agreement(ncc, MAX_DISTANCE)
+    assert (found[:, :20] == 0).all()
+    # The mean over nine cells is below the limit from this column on.
+    np.testing.assert_allclose(found[20, 20:], np.minimum(np.arange(1, 41), MAX_DISTANCE), atol=1e-5)
+    assert (distance_from_agreement(np.zeros((8, 9), np.float32), MAX_DISTANCE) == MAX_DISTANCE).all()
+
+
+def test_sigma_grows_with_the_distance_from_all_agreement():
+    ncc = np.full(SHAPE, 0.9, np.float32)
+    ncc[:, 5:] = 0.0
+    found = sigma(refined(ncc=ncc))
+    assert (found[:, 25] > 1.5 * found[:, 10]).all()
 
 
 def test_texture_is_that_of_the_views_that_cover_a_cell(monkeypatch):

@@ -11,9 +11,14 @@ from scipy.ndimage import gaussian_filter
 from kernel_scene import even_lattice
 from reference.semiglobal import BEHIND
 from zlocus.core.options import SemiGlobalOptions
-from zlocus.core.options.option_fields import value_of
 from zlocus.matching.local_contrast import edge_unit
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties, winner_takes_all_heights
+from zlocus.matching.semiglobal import (
+    SemiGlobalHeights,
+    aggregate,
+    jump_penalties,
+    penalty_of_one_step,
+    winner_takes_all_heights,
+)
 
 OPTIONS = SemiGlobalOptions(p1=20, p2=240, p2_edge=60, edge_contrast=2.0, penalty_factor_per_level=0.5)
 
@@ -42,16 +47,16 @@ def test_penalties_shrink_with_the_grey_difference_to_the_cell_behind():
 def test_penalties_of_all_cells(shape):
     """At the border too, where the image goes on as it ends; to a rounding of P2. An edge is worth what it is worth at
     both cells."""
-    rng, options = np.random.default_rng(3), replace(OPTIONS, edge_contrast_two_images=6.0)
+    rng = np.random.default_rng(3)
     ortho, has_two_views = rng.normal(size=shape).astype(np.float32), rng.random(shape) < 0.5
     ortho[rng.random(shape) < 0.1] = np.nan
     weight, unit = rng.random(shape).astype(np.float32), max(edge_unit(ortho), 1e-6)
-    found = jump_penalties(ortho, shape, 0, options, has_two_views, edge_weight=weight)
+    found = jump_penalties(ortho, shape, 0, OPTIONS, has_two_views, edge_weight=weight)
     for path, (dr, dc) in enumerate(BEHIND):
         for r, c in np.ndindex(shape):
             other = max(r + dr, 0), min(max(c + dc, 0), shape[1] - 1)
             away, worth = abs(ortho[r, c] - ortho[other]), min(weight[r, c], weight[other])
-            contrast = value_of(options, "edge_contrast_two_images" if has_two_views[r, c] else "edge_contrast")
+            contrast = 8.0 if has_two_views[r, c] else 2.0
             plain = 240 / (1 + (0 if np.isnan(away) else away) / (contrast * unit))
             assert abs(found[path, r, c] - (240 - worth * (240 - max(plain, 60)))) <= 1, (path, r, c)
 
@@ -71,10 +76,10 @@ def test_a_penalty_of_edges_above_p2_does_not_raise_it():
 
 def test_edges_count_less_where_two_views_see_a_cell():
     ortho = np.random.default_rng(0).normal(size=(9, 10)).astype(np.float32)
-    options, has_two_views = replace(OPTIONS, edge_contrast_two_images=6.0), np.zeros((9, 10), bool)
+    has_two_views = np.zeros((9, 10), bool)
     has_two_views[:, 5:] = True
-    p2 = jump_penalties(ortho, (9, 10), 0, options, has_two_views)
-    few, many = (jump_penalties(ortho, (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (6.0, 2.0))
+    p2 = jump_penalties(ortho, (9, 10), 0, OPTIONS, has_two_views)
+    few, many = (jump_penalties(ortho, (9, 10), 0, replace(OPTIONS, edge_contrast=c)) for c in (8.0, 2.0))
     np.testing.assert_array_equal(p2, np.where(has_two_views, few, many))
     assert (few[few > 60] > many[few > 60]).mean() > 0.9
 
@@ -160,14 +165,18 @@ def test_heights_above_a_base_surface():
 
 
 @pytest.mark.parametrize("predecessors", [1, 2])
-def test_a_pair_has_a_penalty_of_its_own(predecessors):
-    """Of two images, `p1_two_images` takes the place of `p1`."""
+def test_the_penalty_of_one_step_is_divided_by_the_images_less_one(predecessors):
     lattice, rng = even_lattice(6, (9, 11), 8), np.random.default_rng(4)
     cost = rng.integers(0, 129, lattice.size).astype(np.uint8)
     p2 = jump_penalties(None, (9, 11), 0, OPTIONS)
-    options = replace(OPTIONS, predecessors=predecessors, p1_two_images=90)
-    of_two, of_three = (aggregate(cost, lattice, p2, 1.0, options, is_pair).uniqueness for is_pair in (True, False))
-    for found, p1 in ((of_two, 90), (of_three, 20)):
+    options = replace(OPTIONS, predecessors=predecessors, p1=90)
+    found = {n: aggregate(cost, lattice, p2, 1.0, options, n).uniqueness for n in (2, 3, 4, 40)}
+    for n, p1 in ((2, 90), (3, 45), (4, 30), (40, 15)):
         expected = aggregate(cost, lattice, p2, 1.0, replace(options, p1=p1)).uniqueness
-        np.testing.assert_array_equal(found, expected)
-    assert (of_two != of_three).any()
+        np.testing.assert_array_equal(found[n], expected)
+    assert (found[2] != found[3]).any()
+
+
+@pytest.mark.parametrize(("p1", "n_images", "expected"), [(100, 1, 100), (100, 3.5, 40), (10, 9, 10), (0, 2, 0)])
+def test_the_penalty_of_one_step(p1, n_images, expected):
+    assert penalty_of_one_step(p1, n_images) == expected

@@ -77,7 +77,7 @@ def cell_costs(images, nodes, heights, index, block, halves, visible, parameters
     """
     half, p = max(halves), parameters
     low, high, free_from = visible
-    weight = float(p.grey_weight_two_images if (low <= high).any(axis=(1, 2)).sum() == 2 else p.grey_weight)
+    weight = float(p.grey_weight_of_one_pair if (low <= high).any(axis=(1, 2)).sum() == 2 else p.grey_weight)
     variance, max_difference, excluded = (
         float(v) for v in (p.window_variance, p.max_grey_difference, p.occluded_pairs_excluded)
     )

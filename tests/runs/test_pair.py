@@ -1,4 +1,4 @@
-"""Options for scenes of two views apply to these and not to others."""
+"""Scenes of two views are matched with all of the grey differences and with a penalty of one step of their own."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from rendered_scenes import PART, read, rendered, run
 from zlocus.core.options import CostOptions, RunConfig, SemiGlobalOptions
+from zlocus.matching import semiglobal
 
 
 @pytest.fixture(scope="module")
@@ -24,18 +25,18 @@ def heights(images, number: int, out, **options) -> np.ndarray:
 
 def test_a_pair_is_matched_with_the_penalty_of_pairs_and_all_grey_differences(images, tmp_path):
     plain = heights(images, 2, tmp_path / "plain")
-    other = heights(images, 2, tmp_path / "other", semiglobal=SemiGlobalOptions(p1_two_images=0))
-    lighter = heights(images, 2, tmp_path / "lighter", cost=CostOptions(grey_weight=0.3))
-    assert not np.array_equal(plain, other, equal_nan=True)
-    assert not np.array_equal(plain, lighter, equal_nan=True)
-    same = heights(images, 2, tmp_path / "same", semiglobal=SemiGlobalOptions(p1=1))
+    for name, options in (
+        ("other", {"semiglobal": SemiGlobalOptions(p1=0)}), ("lighter", {"cost": CostOptions(grey_weight=0.3)})
+    ):  # fmt: skip
+        assert not np.array_equal(plain, heights(images, 2, tmp_path / name, **options), equal_nan=True)
+    same = heights(images, 2, tmp_path / "same", semiglobal=SemiGlobalOptions(p1=100))
     np.testing.assert_array_equal(plain, same)
-    lone = heights(images, 2, tmp_path / "lone", cost=CostOptions(grey_weight_two_images=0.0))
-    np.testing.assert_array_equal(plain, lone)
 
 
-def test_options_for_two_views_do_not_change_three(images, tmp_path):
-    plain = heights(images, 3, tmp_path / "plain")
-    np.testing.assert_array_equal(
-        plain, heights(images, 3, tmp_path / "pairs", semiglobal=SemiGlobalOptions(p1_two_images=1000))
-    )
+def test_the_penalty_of_one_step_follows_the_images_that_see_the_ground(images, tmp_path, monkeypatch):
+    found, of_images = set(), semiglobal.penalty_of_one_step
+    monkeypatch.setattr(semiglobal, "penalty_of_one_step", lambda p1, n: found.add((p1, n)) or of_images(p1, n))
+    heights(images, 2, tmp_path / "two")
+    assert found == {(100, 2.0)}
+    heights(images, 3, tmp_path / "three")
+    assert (100, 3.0) in found

@@ -20,7 +20,7 @@ from zlocus.core.scene import ImageSource, Scene
 from zlocus.matching import true_ortho as ortho
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.match_scene import height_step, reference_first
-from zlocus.matching.occlusion import covered_heights
+from zlocus.matching.occlusion import PAIR, covered_heights
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties
 from zlocus.matching.slope_surface import SlopeSurface
@@ -215,12 +215,14 @@ def semiglobal(
     ortho: NDArray[np.float32] | None = None,
     options: SemiGlobalOptions | None = None,
     step_cells: float = 1.0,
+    n_images: int = PAIR,
 ) -> SemiGlobalHeights:
     """Heights by the semi-global constraint on a matching cost of one's own.
 
     cost : (r, c, h) in units of 1 - NCC: 0 where all images agree, NaN where it is unknown and taken as 1. The
     penalties are made for these units. ortho : (r, c) grey values, at whose edges heights may jump. step_cells : a
-    height step over the side of a cell. Heights come back as indices into h; `vertex` is the one between steps.
+    height step over the side of a cell. n_images : that the cost compares; the more they are, the smaller is P1.
+    Heights come back as indices into h; `vertex` is the one between steps.
 
     Raises
     ------
@@ -238,4 +240,4 @@ def semiglobal(
         0.0, 1.0, shape, max(shape), np.zeros((1, 1), np.int64), np.full((1, 1), cost.shape[2], np.int64)
     )
     p2 = jump_penalties(ortho, shape, 0, options)
-    return aggregate(np.ascontiguousarray(counted).ravel(), lattice, p2, step_cells, options)
+    return aggregate(np.ascontiguousarray(counted).ravel(), lattice, p2, step_cells, options, n_images)

@@ -14,6 +14,10 @@ from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 
+# Share of the weight of grey differences in blocks that only two of three or more images cover: the grey values of one
+# pair agree by chance at many heights.
+GREY_SHARE_OF_ONE_PAIR = 0.3
+
 
 def cost_volume(
     slope_views: TileViews,
@@ -21,13 +25,13 @@ def cost_volume(
     lattice: HeightLattice,
     visible: VisibleHeights,
     options: CostOptions,
-    is_pair: bool = False,
+    one_pair_share: float = GREY_SHARE_OF_ONE_PAIR,
     taught_heights: TaughtHeights | None = None,
 ) -> NDArray[np.uint8]:
     """Matching cost of every cell and height, (v,) uint8, in the order of `HeightLattice.layout`.
 
-    slope_views : projections of slope indices, see `SlopeSurface.along`; visible : in slope indices; is_pair : whether
-    the whole scene has two images only; taught_heights : heights from which the evidence of the images is learned.
+    slope_views : projections of slope indices, see `SlopeSurface.along`; visible : in slope indices; one_pair_share :
+    see `cost_parameters`; taught_heights : heights from which the evidence of the images is learned.
 
     With such heights the cost of a height is the evidence against it, see `zlocus.matching.evidence`. Without them
     it is 64 (1 - NCC) + 64 w d.
@@ -38,10 +42,10 @@ def cost_volume(
     mean, over the same pairs, of the grey difference of the two pixels, in units of `max_grey_difference` and at most
     1. It is added because NCC finds nothing on roofs of one grey value and blurs edges by the width of its window
     (AD-Census adds grey differences for the same reason: Mei et al. 2011, equation 3). w is `grey_weight`, and
-    `grey_weight_two_images` in blocks that only two of three or more views cover.
+    less in blocks that only two of three or more views cover.
     """
     windows = np.unique([options.small_window // 2, large_window_side(options) // 2])
-    volume, parameters = np.empty(lattice.size, np.uint8), cost_parameters(options, is_pair)
+    volume, parameters = np.empty(lattice.size, np.uint8), cost_parameters(options, one_pair_share)
     slope, evidence = SlopeArrays(slope_surface.padded(int(windows.max())), slope_surface.nodes), NO_EVIDENCE
     if taught_heights is not None:
         evidence = learned_evidence(slope_views, slope, lattice, windows, visible, parameters, taught_heights)
@@ -51,14 +55,15 @@ def cost_volume(
     return volume
 
 
-def cost_parameters(options: CostOptions, is_pair: bool) -> CostParameters:
-    """The options of the cost as the kernels take them. is_pair : whether the whole scene has two images only."""
+def cost_parameters(options: CostOptions, one_pair_share: float) -> CostParameters:
+    """The options of the cost as the kernels take them.
+
+    one_pair_share : share of the weight of grey differences in blocks that only two images cover.
+    """
     return CostParameters(
         window_variance=np.float32(options.noise_deviation**2),
         grey_weight=np.float32(options.grey_weight),
-        grey_weight_two_images=np.float32(
-            options.grey_weight if is_pair else value_of(options, "grey_weight_two_images")
-        ),
+        grey_weight_of_one_pair=np.float32(options.grey_weight * one_pair_share),
         max_grey_difference=np.float32(options.max_grey_difference),
         occluded_pairs_excluded=np.float32(value_of(options, "occluded_pairs_excluded")),
         max_images_for_large_window=options.max_images_for_large_window,

@@ -14,6 +14,11 @@ from zlocus.matching.subpixel import RefinedHeights
 # Height difference between neighbouring cells from which on both are marked as next to a jump.
 MAX_DIFFERENCE_WITHOUT_JUMP_STEPS = 3.0
 NEIGHBOURS = np.ones((3, 3), np.uint8)
+# The images do not agree where their mean correlation over a window of this side is too low. On plain ground the
+# correlation of one cell is noise, and says nothing against a height that the cells around it share.
+AROUND_CELLS = 9
+# Less than the share of one cell of such a window, so that nothing is divided by 0.
+LEAST_SHARE = np.float32(1e-3)
 
 
 def judge(
@@ -40,12 +45,25 @@ def judge(
     mark(n_covering < 2, Quality.UNSEEN)
     mark((n_covering >= 2) & (n_seeing < 2), Quality.OCCLUDED)
     is_seen = n_seeing >= 2
+    local_range = cv2.dilate(refined.height, NEIGHBOURS) - cv2.erode(refined.height, NEIGHBOURS)
+    is_at_jump = local_range > MAX_DIFFERENCE_WITHOUT_JUMP_STEPS
+    is_unlike = mean_around(refined.ncc, is_seen) < options.min_ncc
+    is_unlike |= is_at_jump & (refined.ncc < options.min_ncc)
     mark(is_seen & ((heights.best <= 0) | (heights.best >= last_index)), Quality.RANGE_END)
-    mark(is_seen & (refined.ncc < options.min_ncc), Quality.NO_MATCH)
+    mark(is_seen & is_unlike, Quality.NO_MATCH)
     mark(is_seen & (refined.ncc < options.weak_ncc), Quality.WEAK)
     mark(heights.uniqueness < options.min_uniqueness, Quality.AMBIGUOUS)
-    local_range = cv2.dilate(refined.height, NEIGHBOURS) - cv2.erode(refined.height, NEIGHBOURS)
-    mark(local_range > MAX_DIFFERENCE_WITHOUT_JUMP_STEPS, Quality.JUMP)
+    mark(is_at_jump, Quality.JUMP)
     mark(~refined.is_refined, Quality.UNREFINED)
     mark(is_seen & (group_distance > options.disputed_steps), Quality.DISPUTED)
     return quality
+
+
+def mean_around(values: NDArray[np.float32], is_counted: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Mean over the window around every cell, (r, c) float32, of the cells that count; 0 where none does.
+
+    values : (r, c); is_counted : (r, c) bool.
+    """
+    window, weight = (AROUND_CELLS, AROUND_CELLS), is_counted.astype(np.float32)
+    total = cv2.blur(np.where(is_counted, values, np.float32(0.0)), window)
+    return np.asarray(total / np.maximum(cv2.blur(weight, window), LEAST_SHARE), np.float32)

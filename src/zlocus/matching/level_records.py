@@ -48,11 +48,6 @@ class TileInputs:
     choose_images: bool = True
 
     @property
-    def is_pair(self) -> bool:
-        """Whether the whole scene has two images only."""
-        return len(self.match_scene.views) == PAIR
-
-    @property
     def handles_occlusion(self) -> bool:
         """Whether images can be excluded where a surface occludes them, which takes three images.
 

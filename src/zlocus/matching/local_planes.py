@@ -41,7 +41,9 @@ class SmoothedHeights(NamedTuple):
 
 
 def remaining_error(side: NDArray[np.uint8]) -> FloatGrid:
-    """Standard deviation of heights smoothed by planes of windows of a side, over what it was before, (r, c) float32.
+    """Standard deviation of the errors of cells after smoothing by planes of windows of a side, over that before.
+
+    side : (r, c); the result is (r, c) float32.
 
     Measured by `benchmarks/precision.py`.
     """

@@ -10,6 +10,8 @@ have a model of their own, because no second pair contradicts their false height
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -33,17 +35,38 @@ TEXTURE_WINDOW = (NEAR_CELLS, NEAR_CELLS)
 # uniqueness (path cost units).
 MIN_ROUGHNESS_STEPS, MIN_GROUP_DISTANCE_STEPS, MIN_RANGE_STEPS, MIN_REFINEMENT_STEPS = 0.03, 0.01, 0.1, 0.05
 MIN_UNIQUENESS, MAX_UNIQUENESS = 20, 2000.0
+# The images agree around a cell where their mean correlation over WIDE_CELLS is at least this.
+MIN_AGREEMENT = 0.4
 # The same for texture, in standard deviations of the grey values of an image.
 MIN_TEXTURE = 0.01
 
 
-def sigma_steps(predictors: dict[str, FloatGrid], refined: RefinedHeights, line_shift_steps: float = 0.0) -> FloatGrid:
-    """Standard deviation of the heights in steps, (r, c) float32.
+class HeightErrors(NamedTuple):
+    """Standard deviations (r, c) float32, in one unit, of the two kinds of errors that a height has.
+
+    of_cells : errors of the cell itself, which those of other cells average out; of_lines : errors of displaced lines,
+    which all cells around it share.
+    """
+
+    of_cells: FloatGrid
+    of_lines: FloatGrid
+
+    @property
+    def total(self) -> FloatGrid:
+        """Standard deviation of the sum of both, (r, c) float32."""
+        return np.asarray(np.hypot(self.of_cells, self.of_lines), np.float32)
+
+
+def height_errors(
+    predictors: dict[str, FloatGrid], refined: RefinedHeights, line_shift_steps: float = 0.0
+) -> HeightErrors:
+    """Standard deviations of the heights, in steps.
 
     predictors : see `uncertainty_predictors`; line_shift_steps : see `MatchScene`: displacements of lines along the
     parallax, which nothing shows, are as large as those across it, and their errors come on top of all others.
     """
-    sigma, split = np.empty(refined.height.shape, np.float32), is_split(predictors)
+    split = is_split(predictors)
+    errors = HeightErrors(*(np.empty(refined.height.shape, np.float32) for _ in range(2)))
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         if cells.any():
             constant, not_refined, of_lines, curves = model
@@ -54,9 +77,9 @@ def sigma_steps(predictors: dict[str, FloatGrid], refined: RefinedHeights, line_
             for name, (first, spacing, curve) in curves.items():
                 values = predictors[name][of_model].ravel()
                 add_curve(values, np.float32(first), np.float32(spacing), np.array(curve, np.float32), total)
-            of_cells = np.exp(total, out=total).reshape(is_refined.shape)
-            sigma[of_model] = np.hypot(of_cells, np.float32(of_lines * line_shift_steps))
-    return sigma
+            errors.of_cells[of_model] = np.exp(total, out=total).reshape(is_refined.shape)
+            errors.of_lines[of_model] = of_lines * line_shift_steps
+    return errors
 
 
 def spread_around(sigma: FloatGrid) -> FloatGrid:
@@ -77,7 +100,11 @@ def is_split(predictors: dict[str, FloatGrid]) -> NDArray[np.bool_]:
 
 
 def uncertainty_predictors(
-    heights: SemiGlobalHeights, refined: RefinedHeights, n_seeing: NDArray[np.integer], texture: FloatGrid
+    heights: SemiGlobalHeights,
+    refined: RefinedHeights,
+    n_seeing: NDArray[np.integer],
+    texture: FloatGrid,
+    max_distance: float,
 ) -> dict[str, FloatGrid]:
     """Predictors of the standard deviation of the heights, each (r, c) float32; logarithms but for `ncc` and `plane`.
 
@@ -88,7 +115,8 @@ def uncertainty_predictors(
     the cell; range_5, range_9 : highest minus lowest height within 5 and within 9 cells; uniqueness : by how much the
     path costs of the secondary minimum are larger; refinement : distance from the semi-global height; images : number
     of images that see the cell; plane : 1 for the height of a plane through a plain segment, else 0; texture : standard
-    deviation of the grey values around the cell, (r, c) in units of that of an image, see `texture_around`.
+    deviation of the grey values around the cell, (r, c) in units of that of an image, see `texture_around`; distance :
+    cells to the nearest place where the images agree, see `distance_from_agreement`.
     """
     height, n_images = refined.height, np.maximum(n_seeing, 1).astype(np.float32)
     plain = cv2.medianBlur(height, NEAR_CELLS)
@@ -112,8 +140,23 @@ def uncertainty_predictors(
         "images": np.log(n_images),
         "plane": refined.is_fixed,
         "texture": np.log(texture + np.float32(MIN_TEXTURE)),
+        "distance": np.log1p(distance_from_agreement(refined.ncc, max_distance)),
     }
     return {name: values.astype(np.float32, copy=False) for name, values in predictors.items()}
+
+
+def distance_from_agreement(ncc: FloatGrid, max_distance: float) -> FloatGrid:
+    """Distance of every cell from the nearest cell around which the images agree, (r, c) float32 cells.
+
+    Where they agree nowhere near, as on water or on plain ground, the height is that of a place so far away. ncc :
+    (r, c), correlation of the images at the heights found; max_distance : a larger distance counts as this, so that it
+    does not depend on how the ground is cut into tiles.
+    """
+    disagrees = (_mean(ncc, WIDE_CELLS) < np.float32(MIN_AGREEMENT)).astype(np.uint8)
+    if disagrees.all():
+        return np.full(ncc.shape, max_distance, np.float32)
+    found = cv2.distanceTransform(disagrees, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(np.minimum(found, np.float32(max_distance)), np.float32)
 
 
 def texture_around(tile_views: TileViews, height: FloatGrid, is_covered: NDArray[np.bool_]) -> FloatGrid:

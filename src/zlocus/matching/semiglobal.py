@@ -15,8 +15,13 @@ from zlocus.matching.kernels.penalties import PenaltyOptions, image_penalties
 from zlocus.matching.kernels.sgm import sweep
 from zlocus.matching.kernels.winners import winner_takes_all, winners
 from zlocus.matching.local_contrast import ALL, Part, edge_unit
+from zlocus.matching.occlusion import PAIR
 
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
+# P1 is divided by the number of images less one, but is not below this: many images err together.
+LEAST_P1 = 15
+# Cells that only two images cover ask for so many times the contrast of an edge that opens a jump.
+PAIR_CONTRAST = np.float32(4.0)
 
 
 @dataclass(frozen=True)
@@ -63,9 +68,9 @@ def jump_penalties(
     Both are lower at coarser levels: there the same roof has half as many cells to pay for its jumps, and a roof that
     is lost there stays lost.
 
-    ortho : (r, c), NaN where the grey value is not known; has_two_views : (r, c), cells that only two views cover, to
-    which `edge_contrast_two_images` applies; edge_weight : (r, c) from 0 to 1, how much of the decrease an edge at each
-    cell is worth, None for all of it.
+    ortho : (r, c), NaN where the grey value is not known; has_two_views : (r, c), cells that only two views cover,
+    where PAIR_CONTRAST times as much contrast is asked for; edge_weight : (r, c) from 0 to 1, how much of the decrease
+    an edge at each cell is worth, None for all of it.
     """
     factor = options.penalty_factor_per_level**level
     p2 = value_of(options, "p2") * factor
@@ -74,11 +79,10 @@ def jump_penalties(
         return np.full((PATHS, *shape), p2, np.uint16)
     penalties = np.empty((PATHS, *shape), np.uint16)
     unit = np.float32(max(edge_unit(ortho, core), 1e-6))
-    contrasts = [value_of(options, name) for name in ("edge_contrast", "edge_contrast_two_images")]
-    units = np.array(contrasts, np.float32) * unit
+    unit *= np.float32(value_of(options, "edge_contrast"))
     has_two_views = np.zeros(shape, np.bool_) if has_two_views is None else has_two_views
     edge_weight = np.ones(shape, np.float32) if edge_weight is None else edge_weight
-    constants = PenaltyOptions(np.float32(p2), np.float32(p2_edge), units[0], units[1])
+    constants = PenaltyOptions(np.float32(p2), np.float32(p2_edge), unit, PAIR_CONTRAST * unit)
     image_penalties(ortho, has_two_views, edge_weight, constants, penalties)
     return penalties
 
@@ -89,22 +93,31 @@ def aggregate(
     p2: NDArray[np.uint16],
     step_cells: float,
     options: SemiGlobalOptions,
-    is_pair: bool = False,
+    n_images: float = PAIR,
 ) -> SemiGlobalHeights:
     """Heights with the least sum of the path costs over 8 paths.
 
     cost : (v,) uint8, see `HeightLattice.layout`; p2 : see `jump_penalties`; step_cells : height step divided by the
-    side of a cell; is_pair : whether the scene has two images only, so that `p1_two_images` applies. Two predecessors
-    find more roofs and take up to twice the time; with a narrow base, where a step is as high as a storey, they find
-    few more.
+    side of a cell; n_images : that see a cell, see `penalty_of_one_step`. Two predecessors find more roofs and take up
+    to twice the time; with a narrow base, where a step is as high as a storey, they find few more.
     """
-    p1 = value_of(options, "p1_two_images" if is_pair else "p1")
+    p1 = penalty_of_one_step(value_of(options, "p1"), n_images)
     if (options.predecessors or (1 if step_cells > NARROW_BASE_STEP_CELLS else 2)) == 2:
         return heights_of_sums(more_global_path_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)
     for sign in (1, -1):
         sweep(cost, lattice.layout, p2, np.uint16(p1), sign, total)
     return heights_of_sums(total, lattice)
+
+
+def penalty_of_one_step(p1: int, n_images: float) -> int:
+    """P1 where so many images see a cell.
+
+    p1 : where two do. n images compare a height n - 1 times without repeating what was compared already, so that the
+    noise of their mean cost is smaller, and the constraint has to smooth less.
+    """
+    of_images = p1 / max(n_images - 1.0, 1.0)
+    return min(max(round(of_images), LEAST_P1), p1)
 
 
 def winner_takes_all_heights(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
-from zlocus.matching.cost_volume import cost_volume
+from zlocus.matching.cost_volume import GREY_SHARE_OF_ONE_PAIR, cost_volume
 from zlocus.matching.edge_penalties import penalties_at_edges
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
 from zlocus.matching.expected_heights import expected_of_searched
@@ -236,6 +236,13 @@ def _slope_of_heights(tile: TileInputs, result: LevelResult) -> SlopeSurface:
     return SlopeSurface.from_surface(smooth, tile.config.pyramid.block)
 
 
+def grey_share_of_one_pair(tile: TileInputs) -> float:
+    """Share of the weight of grey differences in blocks that only two images cover, see `cost_parameters`: all of it
+    where the scene has no more images, and in image space."""
+    is_usual = len(tile.match_scene.views) == PAIR or tile.method == "gc3-sgm"
+    return 1.0 if is_usual else GREY_SHARE_OF_ONE_PAIR
+
+
 def add_evaluations(result: LevelResult, earlier_result: LevelResult) -> LevelResult:
     """A level's result with the evaluations of an earlier pass over the same level added."""
     return replace(
@@ -326,7 +333,7 @@ def match_level(
         search.lattice,
         chosen.matched,
         config.cost,
-        tile.is_pair,
+        grey_share_of_one_pair(tile),
         taught_heights,
     )
     if tile.method != "mvll" and prior.coarser_result is None:
@@ -343,7 +350,9 @@ def match_level(
         penalties = penalties_at_edges(
             search.tile_views, search.smooth, covered, alike, level, config.semiglobal
         )  # fmt: skip
-        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, is_evidence)
+        # In image space P1 is that of close objects, however many images there are.
+        n_images = PAIR if tile.method == "gc3-sgm" else chosen.usual_number(level.core)
+        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, n_images, is_evidence)
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
 
@@ -420,16 +429,17 @@ def semiglobal_heights(
     cost: NDArray[np.uint8],
     penalties: NDArray[np.uint16],
     visible: VisibleHeights,
+    n_images: float,
     is_evidence: bool = False,
 ) -> SemiGlobalHeights:
     """Heights of a level under the semi-global constraint, slope indices; this changes `cost`.
 
     Where a surface was known before, the constraint is applied a second time. Heights that stand in free rays of sight
-    are more expensive then. is_evidence : whether jumps are cheaper then where the surface of the first time
-    contradicts the images, see `zlocus.matching.prior_costs`.
+    are more expensive then. n_images : that cells are matched with; is_evidence : whether jumps are cheaper the second
+    time where the surface of the first contradicts the images, see `zlocus.matching.prior_costs`.
     """
     options, step_cells = tile.config.semiglobal, tile.match_scene.step_cells
-    heights = aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
+    heights = aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
     if search.smooth is None:
         return heights
     has_rays = add_costs_of_rays(
@@ -441,7 +451,7 @@ def semiglobal_heights(
         add_costs_far_from_surface(cost, search.lattice, search.slope_surface, heights, level.number, step_cells)
     elif not has_rays:
         return heights
-    return aggregate(cost, search.lattice, penalties, step_cells, options, tile.is_pair)
+    return aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
 
 
 def _level_result(

@@ -23,6 +23,7 @@ from zlocus.core.scene import View
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import LevelResult, PyramidLevel
+from zlocus.matching.local_contrast import Part
 from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.match_scene import parallax_rate
@@ -69,6 +70,10 @@ class ChosenViews:
     matched: VisibleHeights
     helpful: VisibleHeights
     evaluations: int = 0
+
+    def usual_number(self, core: Part) -> float:
+        """Median number of views that the cells of the core of a tile are matched with."""
+        return float(np.median(covers(self.matched)[(slice(None), *core)].sum(axis=0)))
 
 
 def choose_views(

@@ -28,12 +28,8 @@ class CostOptions(Checked):
     )  # fmt: skip
     grey_weight: float = option(
         1.0, "Weight of the grey differences between images beside the correlation, which finds nothing on roofs "
-        "without texture.",
-        low=0.0, high=1.5,
-    )  # fmt: skip
-    grey_weight_two_images: float | None = option_by_method(
-        0.3, 1.0, "The same weight in blocks that only two of three or more images cover: the grey values of one "
-        "pair agree by chance at many heights.",
+        "without texture. Times 0.3 in blocks that only two of three or more images cover: the grey values of one pair "
+        "agree by chance at many heights.",
         low=0.0, high=1.5,
     )  # fmt: skip
     max_grey_difference: float = option(

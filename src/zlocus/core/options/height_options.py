@@ -77,8 +77,9 @@ class CheckOptions(Checked):
     """Limits beyond which a cell has no height, or is marked as doubtful."""
 
     min_ncc: float = option(
-        -0.2, "A cell has no height below this mean NCC. Roofs without texture have a higher one; below it noise "
-        "decides.",
+        -0.2, "A cell has no height where the mean NCC of the images over 9 x 9 cells is below this; next to a jump "
+        "in height, where its own is. Ground without texture has a higher one; below it the images contradict each "
+        "other.",
         low=-1.0, high=1.0,
     )  # fmt: skip
     weak_ncc: float = option(0.3, "A cell is marked as WEAK below this mean NCC.", low=-1.0, high=1.0)

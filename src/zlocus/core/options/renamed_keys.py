@@ -12,7 +12,6 @@ RENAMED_KEYS: dict[str, str] = {
     "measure.few_views": "cost.max_images_for_large_window",
     "measure.noise": "cost.noise_deviation",
     "measure.grey_weight": "cost.grey_weight",
-    "measure.grey_weight_two": "cost.grey_weight_two_images",
     "measure.grey_reach": "cost.max_grey_difference",
     "measure.hidden_excused": "cost.occluded_pairs_excluded",
     "measure.hidden_margin_steps": "cost.occlusion_margin_steps",
@@ -45,9 +44,7 @@ RENAMED_KEYS: dict[str, str] = {
     "checks.most_spread_steps": "checks.max_overlap_edge_sigma_steps",
     "checks.most_sigma_m": "checks.max_sigma_m",
     "refine.reach_steps": "refine.max_correction_steps",
-    "semiglobal.p1_two": "semiglobal.p1_two_images",
     "semiglobal.level_easing": "semiglobal.penalty_factor_per_level",
-    "semiglobal.edge_contrast_two": "semiglobal.edge_contrast_two_images",
     "orientation.joint": "orientation.bundle_adjustment",
     "orientation.joint.rpc": "orientation.bundle_adjustment.rpc_correction",
     "orientation.joint.drift_s": "orientation.bundle_adjustment.drift_knot_interval_s",
@@ -58,6 +55,12 @@ RENAMED_KEYS: dict[str, str] = {
 # Keys that are no longer options, because nobody had a reason to change their values, with the value that always
 # applies.
 REMOVED_KEYS: dict[str, str] = {
+    "measure.grey_weight_two": "0.3 times cost.grey_weight",
+    "cost.grey_weight_two_images": "0.3 times cost.grey_weight",
+    "semiglobal.p1_two": "semiglobal.p1",
+    "semiglobal.p1_two_images": "semiglobal.p1",
+    "semiglobal.edge_contrast_two": "4 times semiglobal.edge_contrast",
+    "semiglobal.edge_contrast_two_images": "4 times semiglobal.edge_contrast",
     "orientation.match_ratio": "0.8",
     "orientation.patch_px": "9 px",
     "products.ground_cell_m": "1 m",

@@ -16,11 +16,10 @@ class SemiGlobalOptions(Checked):
         "Unset: 1 where a height step is higher than two cells (narrow bases), else 2.", choices=(1, 2),
     )  # fmt: skip
     p1: int | None = option_by_method(
-        45, 20, "Penalty P1 of a height difference of one step between neighbours.", low=0, high=1000
-    )
-    p1_two_images: int | None = option_by_method(
-        110, 20, "Penalty P1 in scenes of two images: the match curves of a single pair are noisy.", low=0, high=1000
-    )
+        100, 20, "Penalty P1 of a height difference of one step between neighbours that two images see. Match curves "
+        "of n images are less noisy: there it is divided by n - 1, but not below 15.",
+        low=0, high=1000,
+    )  # fmt: skip
     p2: int | None = option_by_method(
         400, 240, "Penalty P2 of a larger height difference where the ortho-image has no edge.", low=1, high=4000
     )
@@ -33,10 +32,7 @@ class SemiGlobalOptions(Checked):
         low=0.1, high=1.0,
     )  # fmt: skip
     edge_contrast: float | None = option_by_method(
-        1.0, 2.0, "Grey difference in the ortho-image that halves P2. In units of the tile's median grey difference.",
-        low=0.01, high=1e3,
-    )  # fmt: skip
-    edge_contrast_two_images: float | None = option_by_method(
-        4.0, 2.0, "The same in cells that only two images cover: a single pair agrees by chance at many heights.",
+        1.0, 2.0, "Grey difference in the ortho-image that halves P2. In units of the tile's median grey difference. "
+        "Four times as much in cells that only two images cover: a single pair agrees by chance at many heights.",
         low=0.01, high=1e3,
     )  # fmt: skip

@@ -57,7 +57,7 @@ class CostParameters(NamedTuple):
 
     window_variance: np.float32  # f4: added to the variance of every window, grey values squared
     grey_weight: np.float32  # f4: weight of grey differences beside the correlation
-    grey_weight_two_images: np.float32  # f4: the same in blocks that two of three or more views cover
+    grey_weight_of_one_pair: np.float32  # f4: the same in blocks that only two views cover
     max_grey_difference: np.float32  # f4: grey difference at which two views do not agree at all
     occluded_pairs_excluded: np.float32  # f4: how far pairs with an occluded view are excluded from the mean
     max_images_for_large_window: int  # i8: blocks that more views cover take the smallest window only
@@ -315,7 +315,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     """
     of_block = block_visibility(visible)
     takes = covering_views(of_block, span)
-    weight = parameters.grey_weight_two_images if takes.shape[0] == 2 else parameters.grey_weight
+    weight = parameters.grey_weight_of_one_pair if takes.shape[0] == 2 else parameters.grey_weight
     if takes.shape[0] < 2:
         out[:] = np.uint8(UNCOVERED_COST * (np.float32(1.0) + weight))
         return

@@ -40,7 +40,7 @@ MEANINGS = {
 DESPITE_PEAK = {
     Quality.NO_MATCH: "the semi-global constraint puts the surface at a height that agrees with its neighbours, which "
     "need not be that of the peak. At that height, in windows that follow the slope, the mean correlation of all pairs "
-    "of images that see the cell is below {min_ncc:g} (checks.min_ncc)",
+    "of images that see the cell, or of the cells around it, is below {min_ncc:g} (checks.min_ncc)",
     Quality.RANGE_END: "the height that agrees best with the neighbours is the lowest or the highest candidate height "
     "({low:.1f} to {high:.1f} m)",
     Quality.OCCLUDED: "match curves do not include occlusions. At the height of the surface fewer than two images see "
