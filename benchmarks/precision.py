@@ -70,8 +70,8 @@ DIRECTION = {
 }  # fmt: skip
 ASKED = ((0.68, 0.0, 1.0), (0.94, float(np.log(2.0)), 2.0))
 # Planes leave more of the errors in some scenes than in others: of the shares that they leave in the runs, the one that
-# this part of them is below.
-CAUTION = 0.8
+# this part of them is below. 1: sigma becomes smaller only where that holds in every run.
+CAUTION = 1.0
 # No share that planes leave is smaller.
 LEAST_REMAINING = 0.2
 # Cells that were smoothed by windows of a side, from which a run counts.

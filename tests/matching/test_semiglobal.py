@@ -169,14 +169,16 @@ def test_the_penalty_of_one_step_is_divided_by_the_images_less_one(predecessors)
     lattice, rng = even_lattice(6, (9, 11), 8), np.random.default_rng(4)
     cost = rng.integers(0, 129, lattice.size).astype(np.uint8)
     p2 = jump_penalties(None, (9, 11), 0, OPTIONS)
-    options = replace(OPTIONS, predecessors=predecessors, p1=90)
+    options = replace(OPTIONS, predecessors=predecessors, p1=180)
     found = {n: aggregate(cost, lattice, p2, 1.0, options, n).uniqueness for n in (2, 3, 4, 40)}
-    for n, p1 in ((2, 90), (3, 45), (4, 30), (40, 15)):
+    for n, p1 in ((2, 180), (3, 90), (4, 60), (40, 45)):
         expected = aggregate(cost, lattice, p2, 1.0, replace(options, p1=p1)).uniqueness
         np.testing.assert_array_equal(found[n], expected)
     assert (found[2] != found[3]).any()
 
 
-@pytest.mark.parametrize(("p1", "n_images", "expected"), [(100, 1, 100), (100, 3.5, 40), (10, 9, 10), (0, 2, 0)])
+@pytest.mark.parametrize(
+    ("p1", "n_images", "expected"), [(100, 1, 100), (200, 3.5, 80), (100, 9, 45), (10, 9, 10), (0, 2, 0)]
+)
 def test_the_penalty_of_one_step(p1, n_images, expected):
     assert penalty_of_one_step(p1, n_images) == expected

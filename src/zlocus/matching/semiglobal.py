@@ -19,7 +19,7 @@ from zlocus.matching.occlusion import PAIR
 
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
 # P1 is divided by the number of images less one, but is not below this: many images err together.
-LEAST_P1 = 15
+LEAST_P1 = 45
 # Cells that only two images cover ask for so many times the contrast of an edge that opens a jump.
 PAIR_CONTRAST = np.float32(4.0)
 

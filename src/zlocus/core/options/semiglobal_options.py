@@ -17,7 +17,7 @@ class SemiGlobalOptions(Checked):
     )  # fmt: skip
     p1: int | None = option_by_method(
         100, 20, "Penalty P1 of a height difference of one step between neighbours that two images see. Match curves "
-        "of n images are less noisy: there it is divided by n - 1, but not below 15.",
+        "of n images are less noisy: there it is divided by n - 1, but not below 45.",
         low=0, high=1000,
     )  # fmt: skip
     p2: int | None = option_by_method(
