@@ -39,6 +39,8 @@ COLOURS = {
 }
 NAMES = {"opencv": "OpenCV", "libsgm": "libSGM", "pandora": "Pandora"}
 MARKS = "osD^v<>ph*XP"
+# Share of wrong or empty cells at which a surface without any is drawn.
+LEAST_WRONG_PERCENT = 0.01
 PLAIN = "{x:g}"
 PICTURES = ("peers_accuracy.png", "peers_cost.png")
 HEAD = """# Comparison with other programs
@@ -361,7 +363,10 @@ def draw_accuracy(found: dict[str, Any], path: Path) -> None:
 
 
 def draw_cost(found: dict[str, Any], path: Path) -> None:
-    """Plot CPU against the share of wrong or empty cells; low values of both are good."""
+    """Plot CPU against the share of wrong or empty cells; low values of both are good.
+
+    A surface without such cells is drawn at LEAST_WRONG_PERCENT, because the axis is logarithmic.
+    """
     metadata, found = picture_metadata(found), with_means_of_seeds(found)
     picture, axis = plt.subplots(figsize=(10, 5.5), layout="constrained")
     marks = dict(zip(judged(found), MARKS, strict=False))
@@ -369,7 +374,8 @@ def draw_cost(found: dict[str, Any], path: Path) -> None:
         for scene, mark in marks.items():
             row = succeeded(of_scene(found, scene)).get(program)
             if row is not None:
-                at = per_million(found, row), 100.0 * (1.0 - (figure(row, "all", "within") or 0.0))
+                wrong = 100.0 * (1.0 - (figure(row, "all", "within") or 0.0))
+                at = per_million(found, row), max(wrong, LEAST_WRONG_PERCENT)
                 axis.plot(*at, mark, color=COLOURS.get(program), markersize=9, alpha=0.85)
     axis.set(
         xscale="log", yscale="log", xlabel="CPU, s for a million cells", ylabel="cells more than 1 m off or empty, %"

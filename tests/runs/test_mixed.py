@@ -77,7 +77,6 @@ def test_all_sensors_together_are_better_than_the_best_alone(scenes, tmp_path):
     assert max(np.abs(view["shift_px"]).max() for view in views) < SHIFT_PX
 
 
-@pytest.mark.xfail(strict=True, reason="two of 3136 blocks are wrong at a roof's edge, one with the best sensor alone")
 def test_of_one_house_no_block_more_is_lost_than_by_the_best_alone(spec, tmp_path):
     scenes = render_mixed_scene(replace(spec, seed=demo_spec().seed), tmp_path / "scene")
     _, within = judged(scenes, tmp_path)
