@@ -1,18 +1,15 @@
 """Calibrates the standard deviations of `sigma.tif`, and judges them.
 
     python benchmarks/precision.py fit [FOLDER ...] [--views 6 3 2] [--calibration FILE] [--fewest N] [-o OUT]
-    python benchmarks/precision.py planes [FOLDER ...] [--views 6 3 2] [--calibration FILE] [-o OUT]
     python benchmarks/precision.py judge [FOLDER ...] [--views 6 3 2] [-o OUT]
 
 `fit` renders the scenes of TRAINING, or takes the FOLDERs given, runs `zlocus dsm` on them with six, three and two
-views, and writes src/zlocus/matching/precision_calibration.py, or FILE. Runs with fewer than N cells of a kind (seen by
-a pair, or by more images) do not count. Then it runs `planes`, which measures on the same scenes how much of the
-standard deviation remains where heights are smoothed by planes. `judge` runs `zlocus dsm` on folders with img_*.tif,
-truth_dsm.tif and truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for all cells,
-ground, roofs and trees, the share of true errors within one and two sigma (68 and 95 % of a normal distribution); the
-share within one
-sigma in each quintile of sigma; and how many of the errors above 1 m are gone once the tenth of the cells with the
-largest sigma is dropped. Draws calibration.png.
+views, without smoothing by planes, and writes src/zlocus/matching/precision_calibration.py, or FILE. Runs with fewer
+than N cells of a kind (seen by a pair, or by more images) do not count. `judge` runs `zlocus dsm` on folders with
+img_*.tif, truth_dsm.tif and truth_class.tif (default: the scenes of JUDGED, never used to calibrate) and prints, for
+all cells, ground, roofs and trees, the share of true errors within one and two sigma (68 and 95 % of a normal
+distribution); the share within one sigma in each quintile of sigma; and how many of the errors above 1 m are gone once
+the tenth of the cells with the largest sigma is dropped. Draws calibration.png.
 """
 
 from __future__ import annotations
@@ -41,7 +38,6 @@ from zlocus.evaluation.frame import Points
 from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import CLASS_NAMES, TruthBlocks, read_classes, truth_blocks
 from zlocus.matching import finest_level, tile
-from zlocus.matching.local_planes import SIDES
 from zlocus.matching.precision import is_split
 from zlocus.pipeline import tile_run
 from zlocus.synthetic.troubles import TROUBLES
@@ -69,14 +65,6 @@ DIRECTION = {
     "distance": 1, "curvature": -1, "ncc": -1, "uniqueness": -1, "texture": -1,
 }  # fmt: skip
 ASKED = ((0.68, 0.0, 1.0), (0.94, float(np.log(2.0)), 2.0))
-# Planes leave more of the errors in some scenes than in others: of the shares that they leave in the runs, the one that
-# this part of them is below. 1: sigma becomes smaller only where that holds in every run.
-CAUTION = 1.0
-# No share that planes leave is smaller.
-LEAST_REMAINING = 0.2
-# Cells that were smoothed by windows of a side, from which a run counts.
-MIN_SMOOTHED = 500
-REMAINING = "REMAINING_OF_PLANES: dict[int, float]"
 FEWEST, CELLS, CLASS_WEIGHT = 5000, 30000, {"ground": 1.0, "building": 0.4, "tree": 0.05}
 
 
@@ -105,24 +93,14 @@ class Judged:
 
 
 @contextmanager
-def watched(found: list[tuple[Any, ...]], is_model: bool):
-    """Add (window, core window, predictors, is_refined, match scene) of every tile that is matched to `found`.
-
-    is_model : whether the predictors are those of the model; see `sample`.
-    """
-    predict, refine, match = finest_level.height_errors, tile.refined_surface, tile_run.match_tile
-    smooth = finest_level.smoothed_by_planes
+def watched(found: list[tuple[Any, ...]]):
+    """Add (window, core window, predictors, is_refined, match scene) of every tile that is matched to `found`."""
+    predict, refine, match = finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile
     last: dict[str, Any] = {}
 
     def predicted(predictors, refined, line_shift_steps):
-        errors = predict(predictors, refined, line_shift_steps)
-        last.update(predictors=predictors, is_refined=refined.is_refined, of_smooth=errors._asdict())
-        return errors
-
-    def smoothed(height, sigma, *rest):
-        found = smooth(height, sigma, *rest)
-        last["of_smooth"]["side"] = found.side
-        return found
+        last.update(predictors=predictors, is_refined=refined.is_refined)
+        return predict(predictors, refined, line_shift_steps)
 
     def refined(tile_inputs, result, *rest):
         last["window"] = result.level.window
@@ -132,17 +110,14 @@ def watched(found: list[tuple[Any, ...]], is_model: bool):
         last.clear()
         result = match(match_scene, core_window, *rest)
         if "window" in last:
-            predictors = last["predictors"] if is_model else last["of_smooth"]
-            found.append((last["window"], core_window, predictors, last["is_refined"], match_scene))
+            found.append((last["window"], core_window, last["predictors"], last["is_refined"], match_scene))
         return result
 
-    finest_level.height_errors, tile.refined_surface, tile_run.match_tile = predicted, refined, matched
-    finest_level.smoothed_by_planes = smoothed
+    finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile = predicted, refined, matched
     try:
         yield
     finally:
-        finest_level.height_errors, tile.refined_surface, tile_run.match_tile = predict, refine, match
-        finest_level.smoothed_by_planes = smooth
+        finest_level.sigma_steps, tile.refined_surface, tile_run.match_tile = predict, refine, match
 
 
 def run(folder: Path, views: tuple[str, ...], out: Path, is_smoothed: bool = True) -> list[tuple[Any, ...]]:
@@ -156,7 +131,7 @@ def run(folder: Path, views: tuple[str, ...], out: Path, is_smoothed: bool = Tru
         bounds, crs, cell = file.bounds, file.crs.to_string(), 2 * file.res[0]
     found: list[tuple[Any, ...]] = []
     images = [str(path) for name in views if (path := folder / f"img_{name}.tif").exists()]
-    with watched(found, not is_smoothed):
+    with watched(found):
         run_here(["dsm", *images, "-o", str(out), "--crs", crs, "--resolution", str(cell), "--bounds",
                   *map(str, bounds), "--config", str(options), "--overwrite", "--workers", "1",
                   "--no-report"])  # fmt: skip
@@ -184,13 +159,9 @@ def kinds(truth: TruthBlocks) -> np.ndarray:
     return np.argmax([truth.members(name) for name in CLASS_NAMES], axis=0)
 
 
-def sample(folder: Path, views: tuple[str, ...], out: Path, is_smoothed: bool) -> Sample:
-    """The cells of a run whose errors are known.
-
-    is_smoothed : whether heights are smoothed by planes. The predictors are then the standard deviations before that,
-    `of_cells` and `of_lines`, in steps, and the `side` of the windows.
-    """
-    tiles = run(folder, views, out, is_smoothed)
+def sample(folder: Path, views: tuple[str, ...], out: Path) -> Sample:
+    """The cells of a run without smoothing whose errors are known."""
+    tiles = run(folder, views, out, is_smoothed=False)
     truth, xy, errors = errors_of(folder, out / "dsm.tif")
     kind = kinds(truth)
     parts = []
@@ -208,36 +179,6 @@ def sample(folder: Path, views: tuple[str, ...], out: Path, is_smoothed: bool) -
         *(np.concatenate([part[i] for part in parts]) for i in (1, 2, 3)),
         tiles[0][4].height_step, tiles[0][4].line_shift_steps,
     )  # fmt: skip
-
-
-def remaining_of_planes(samples: Sequence[Sample]) -> dict[int, float]:
-    """Share of the errors of cells that remains where heights were smoothed by planes of windows of a side.
-
-    The factor by which the errors within one and two sigma are as many as asked, which CAUTION of the runs stay below;
-    for a side that was never used, that of the next smaller one.
-    """
-    found: dict[int, float] = {}
-    for side in SIDES:
-        factors = []
-        for one in samples:
-            rows = (one.predictors["side"] == side) & (one.kind != list(CLASS_NAMES).index("tree"))
-            if rows.sum() >= MIN_SMOOTHED:
-                factors.append([remaining_share(one, rows, asked, np.exp(above)) for asked, above, _ in ASKED])
-        if factors:
-            found[side] = float(min(np.exp(np.log(np.quantile(factors, CAUTION, axis=0)).mean()), 1.0))
-        else:
-            found[side] = found.get(SIDES[max(SIDES.index(side) - 1, 0)], 1.0)
-    return found
-
-
-def remaining_share(one: Sample, rows: np.ndarray, asked: float, times: float) -> float:
-    """The share of the errors of cells with which a share `asked` of the errors is within so many sigma.
-
-    At least LEAST_REMAINING: the errors of lines alone may explain all. rows : (n,) bool.
-    """
-    of_cells, of_lines = (one.predictors[name][rows] * one.step_m for name in ("of_cells", "of_lines"))
-    beyond_lines = np.maximum((one.error_m[rows] / times) ** 2 - of_lines**2, 0.0)
-    return max(float(np.quantile(np.sqrt(beyond_lines) / of_cells, asked)), LEAST_REMAINING)
 
 
 def hats(values: np.ndarray, first: float, spacing: float) -> np.ndarray:
@@ -354,7 +295,7 @@ def fit_model(samples: list[Sample]) -> dict[str, Any]:
 
 
 def write(model: dict[str, Any], path: Path) -> None:
-    """The calibration as a module, without smoothing; see `write_remaining`."""
+    """Write the calibration as a module."""
     lines = [
         '"""Curves of the precision model, made by benchmarks/precision.py; not to be edited."""', "",
         "from __future__ import annotations", "",
@@ -363,8 +304,6 @@ def write(model: dict[str, Any], path: Path) -> None:
         "# lines leave, as a share of their displacement, whose square is added; and for each predictor the position",
         "# of the first knot, the spacing of the knots, and the logarithm of the factor at each knot.",
         "Model = tuple[float, float, float, dict[str, tuple[float, float, tuple[float, ...]]]]",
-        "# Where heights are smoothed by planes of windows of a side, cells: the share of sigma that remains.",
-        remaining_line(dict.fromkeys(SIDES, 1.0)),
     ]  # fmt: skip
     for kind, one in model.items():
         lines.append(f"{kind}: Model = ({one['constant']:.4f}, {one['not_refined']:.4f}, {one['of_lines']:.4f}, {{")
@@ -374,18 +313,6 @@ def write(model: dict[str, Any], path: Path) -> None:
             lines.append(f'    "{name}": ({first:.5g}, {spacing:.5g}, ({", ".join(f"{v:.4f}" for v in curve)})),')
         lines.append("})")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def remaining_line(shares: dict[int, float]) -> str:
-    """The line of the module that holds the shares of sigma that smoothing leaves."""
-    return f"{REMAINING} = {{{', '.join(f'{side}: {share:.3f}' for side, share in shares.items())}}}"
-
-
-def write_remaining(shares: dict[int, float], path: Path) -> None:
-    """Put the shares of sigma that smoothing leaves into a calibration."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    changed = [remaining_line(shares) if line.startswith(REMAINING) else line for line in lines]
-    path.write_text("\n".join(changed) + "\n", encoding="utf-8")
 
 
 def predicted_sigma(model: dict[str, Any], one: Sample) -> np.ndarray:
@@ -461,7 +388,7 @@ def with_views(folders: Sequence[Path], views: Sequence[int]) -> list[tuple[Path
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("action", choices=("fit", "planes", "judge"))
+    parser.add_argument("action", choices=("fit", "judge"))
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--views", nargs="+", type=int, choices=tuple(VIEWS), default=tuple(VIEWS))
     parser.add_argument("--calibration", type=Path, default=CALIBRATION, metavar="FILE", help="module that fit writes")
@@ -472,21 +399,11 @@ def main() -> None:
     scenes = JUDGED if args.action == "judge" else TRAINING
     folders = [*map(rendered_scene, args.folders)] or [rendered(kind, seed, args.out) for kind, seed in scenes]
     if args.action == "fit":
-        samples = {
-            (f.name, n): sample(f, VIEWS[n], args.out / "run", False) for f, n in with_views(folders, args.views)
-        }
+        samples = {(f.name, n): sample(f, VIEWS[n], args.out / "run") for f, n in with_views(folders, args.views)}
         model = fit(list(samples.values()), args.fewest)
         write(model, args.calibration)
         for (name, n), one in samples.items():
             print(f"{name}, {n} views:", judgement(Judged(one.error_m, predicted_sigma(model, one), one.kind)))
-        # In a process of its own, which imports what was just written.
-        again = [arg for arg in sys.argv[1:] if arg != "fit"]
-        subprocess.run([sys.executable, __file__, "planes", *again], check=True)
-        return
-    if args.action == "planes":
-        smooth = [sample(f, VIEWS[n], args.out / "run", True) for f, n in with_views(folders, args.views)]
-        write_remaining(shares := remaining_of_planes(smooth), args.calibration)
-        print("share of sigma that planes leave, by the side of their windows:", shares)
         return
     judged = {}
     for folder, n in with_views(folders, args.views):

@@ -13,8 +13,8 @@ from zlocus.matching.match_curve import predicted_sigma
 from zlocus.matching.precision import (
     MIN_ROUGHNESS_STEPS,
     distance_from_agreement,
-    height_errors,
     is_split,
+    sigma_steps,
     spread_around,
     uncertainty_predictors,
 )
@@ -55,7 +55,7 @@ def predictors(found: RefinedHeights, n_seeing=4, vertex=None, texture=0.3):
 
 
 def sigma(found: RefinedHeights, **kwargs) -> np.ndarray:
-    return height_errors(predictors(found, **kwargs), found).total
+    return sigma_steps(predictors(found, **kwargs), found)
 
 
 @given(
@@ -127,7 +127,7 @@ def test_each_cell_has_the_sigma_of_its_model(is_known):
     height = rng.normal(20, 1, SHAPE).astype(np.float32)
     found = refined(group_distance=group_distance, height=height, is_refined=rng.random(SHAPE) < 0.5)
     said, line_shift_steps = predictors(found), 0.2
-    split, sigmas = is_split(said), height_errors(said, found, line_shift_steps).total
+    split, sigmas = is_split(said), sigma_steps(said, found, line_shift_steps)
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         constant, not_refined, of_lines, curves = model
         expected = constant + np.where(found.is_refined, 0.0, not_refined)
@@ -139,7 +139,7 @@ def test_each_cell_has_the_sigma_of_its_model(is_known):
 
 def test_displaced_lines_are_an_error_of_their_own():
     found = refined()
-    without, with_lines = (height_errors(predictors(found), found, steps).total for steps in (0.0, 0.5))
+    without, with_lines = (sigma_steps(predictors(found), found, steps) for steps in (0.0, 0.5))
     of_lines = SPLIT[2]
     assert of_lines > 0.1
     np.testing.assert_allclose(with_lines, np.hypot(without, of_lines * 0.5), rtol=LOGARITHM)

@@ -14,17 +14,11 @@ from zlocus.matching.height_checks import judge
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.level_records import LevelResult, TileInputs
 from zlocus.matching.local_contrast import texture_unit
-from zlocus.matching.local_planes import SIDES, remaining_error, smoothed_by_planes
+from zlocus.matching.local_planes import SIDES, smoothed_by_planes
 from zlocus.matching.occlusion import covers, excluded_view_mask, n_seeing
 from zlocus.matching.overlap import OverlapGround, unsupported
 from zlocus.matching.plane_fitting import PlanarHeights, with_planes
-from zlocus.matching.precision import (
-    HeightErrors,
-    height_errors,
-    spread_around,
-    texture_around,
-    uncertainty_predictors,
-)
+from zlocus.matching.precision import sigma_steps, spread_around, texture_around, uncertainty_predictors
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.subpixel import refine
 from zlocus.matching.surface import Surface
@@ -81,18 +75,17 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     group_distance = np.exp(predictors["group_distance"])
     quality = judge(result.heights, refined, n_covering, n_views, group_distance, last_index, config.checks)
     _mark_overlap(quality, result, ground, refined.height)
-    errors = height_errors(predictors, refined, match_scene.line_shift_steps)
-    is_uneven = spread_around(errors.total) > config.checks.max_overlap_edge_sigma_steps
+    sigma = sigma_steps(predictors, refined, match_scene.line_shift_steps)
+    is_uneven = spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps
     is_noise = ground.is_at_edge_in(result.level.window) & is_uneven
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)
     lattice_index = refined.height
     if tile.method != "mvll":
         sides = [side for side in SIDES if side <= value_of(config.refine, "max_plane_side")]
-        smooth = smoothed_by_planes(lattice_index, errors.total, ~is_empty(quality), result.level.core, sides)
-        lattice_index = smooth.height
-        errors = HeightErrors(errors.of_cells * remaining_error(smooth.side), errors.of_lines)
+        # The standard deviations stay: in some scenes the errors reach farther than the planes.
+        lattice_index = smoothed_by_planes(lattice_index, sigma, ~is_empty(quality), result.level.core, sides).height
     height = result.lattice.metres(lattice_index)
-    sigma = errors.total * np.float32(match_scene.height_step)
+    sigma *= np.float32(match_scene.height_step)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
     n_images = np.where(np.isnan(height), 0, n_views).astype(np.uint8)

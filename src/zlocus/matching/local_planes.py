@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.matching.kernels.local_planes import N_PLANE_SUMS, mean_heights_of_planes
-from zlocus.matching.precision_calibration import REMAINING_OF_PLANES
 
 FloatGrid = NDArray[np.float32]
 # Sides of the windows, cells, from the smallest to the largest.
@@ -38,19 +37,6 @@ class SmoothedHeights(NamedTuple):
 
     height: FloatGrid
     side: NDArray[np.uint8]
-
-
-def remaining_error(side: NDArray[np.uint8]) -> FloatGrid:
-    """Standard deviation of the errors of cells after smoothing by planes of windows of a side, over that before.
-
-    side : (r, c); the result is (r, c) float32.
-
-    Measured by `benchmarks/precision.py`.
-    """
-    by_side = np.ones(max(SIDES) + 1, np.float32)
-    for each, share in REMAINING_OF_PLANES.items():
-        by_side[each] = share
-    return by_side[side]
 
 
 def smoothed_by_planes(

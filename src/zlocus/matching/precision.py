@@ -10,8 +10,6 @@ have a model of their own, because no second pair contradicts their false height
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -41,32 +39,13 @@ MIN_AGREEMENT = 0.4
 MIN_TEXTURE = 0.01
 
 
-class HeightErrors(NamedTuple):
-    """Standard deviations (r, c) float32, in one unit, of the two kinds of errors that a height has.
-
-    of_cells : errors of the cell itself, which those of other cells average out; of_lines : errors of displaced lines,
-    which all cells around it share.
-    """
-
-    of_cells: FloatGrid
-    of_lines: FloatGrid
-
-    @property
-    def total(self) -> FloatGrid:
-        """Standard deviation of the sum of both, (r, c) float32."""
-        return np.asarray(np.hypot(self.of_cells, self.of_lines), np.float32)
-
-
-def height_errors(
-    predictors: dict[str, FloatGrid], refined: RefinedHeights, line_shift_steps: float = 0.0
-) -> HeightErrors:
-    """Standard deviations of the heights, in steps.
+def sigma_steps(predictors: dict[str, FloatGrid], refined: RefinedHeights, line_shift_steps: float = 0.0) -> FloatGrid:
+    """Standard deviation of the heights in steps, (r, c) float32.
 
     predictors : see `uncertainty_predictors`; line_shift_steps : see `MatchScene`: displacements of lines along the
     parallax, which nothing shows, are as large as those across it, and their errors come on top of all others.
     """
-    split = is_split(predictors)
-    errors = HeightErrors(*(np.empty(refined.height.shape, np.float32) for _ in range(2)))
+    sigma, split = np.empty(refined.height.shape, np.float32), is_split(predictors)
     for model, cells in ((SPLIT, split), (PAIR, ~split)):
         if cells.any():
             constant, not_refined, of_lines, curves = model
@@ -77,9 +56,9 @@ def height_errors(
             for name, (first, spacing, curve) in curves.items():
                 values = predictors[name][of_model].ravel()
                 add_curve(values, np.float32(first), np.float32(spacing), np.array(curve, np.float32), total)
-            errors.of_cells[of_model] = np.exp(total, out=total).reshape(is_refined.shape)
-            errors.of_lines[of_model] = of_lines * line_shift_steps
-    return errors
+            of_cells = np.exp(total, out=total).reshape(is_refined.shape)
+            sigma[of_model] = np.hypot(of_cells, np.float32(of_lines * line_shift_steps))
+    return sigma
 
 
 def spread_around(sigma: FloatGrid) -> FloatGrid:

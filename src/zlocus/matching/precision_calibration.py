@@ -7,8 +7,6 @@ from __future__ import annotations
 # lines leave, as a share of their displacement, whose square is added; and for each predictor the position
 # of the first knot, the spacing of the knots, and the logarithm of the factor at each knot.
 Model = tuple[float, float, float, dict[str, tuple[float, float, tuple[float, ...]]]]
-# Where heights are smoothed by planes of windows of a side, cells: the share of sigma that remains.
-REMAINING_OF_PLANES: dict[int, float] = {5: 1.000, 9: 1.000, 17: 1.000, 33: 1.000}
 SPLIT: Model = (0.0634, 0.1634, 0.6895, {
     "noise": (-3.7014, 0.62978, (-0.1255, -0.0462, 0.0557, 0.1173, 0.1173, 0.1173, 0.1173, 0.1173, 0.1313)),
     "curvature": (-6.9078, 0.83466, (0.1341, 0.1341, 0.1341, 0.1341, 0.1341, 0.1175, 0.0389, -0.0550, -0.1343)),
