@@ -59,6 +59,7 @@ RUN_BY = {
     "peers/scenes.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
     "peers/sgm_speed.py": "test_peers_command.py::test_aggregation_is_timed_beside_other_programs",
     "precision.py": "test_surfaces.py::test_standard_deviations_are_calibrated",
+    "rows/standard_deviations.py": "test_surfaces.py::test_shares_within_sigma_by_recipe",
     "recording.py": "test_result_files.py::test_the_tables_that_a_script_prints_are_kept",
     "rectifying.py": "test_surfaces.py::test_the_benchmark_of_other_methods",
     "reprojection.py": "test_acceptance.py::test_images_left_out_confirm_a_surface",

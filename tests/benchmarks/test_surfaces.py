@@ -22,6 +22,7 @@ import spaces
 import terrain
 import terrain_features
 from benchmark_scripts import printed_table, run_script, share_of
+from rows import standard_deviations
 from workplace import CannotRun
 from zlocus.io.scene_file import open_scene
 from zlocus.matching import precision_calibration as calibration
@@ -164,6 +165,23 @@ def test_standard_deviations_are_judged(small_town, tmp_path, monkeypatch, capsy
     assert abs(one - ONE_SIGMA) < SIGMA_TOLERANCE
     assert abs(two - TWO_SIGMA) < SIGMA_TOLERANCE
     assert (tmp_path / "calibration.png").stat().st_size > 0
+
+
+def test_shares_within_sigma_by_recipe():
+    """Errors of 0.5, 1.5 and 2.5 sigma on 62, 30 and 8 of 100 cells; trees, all wrong by 5 sigma, do not count."""
+    planted = np.repeat([0.5, 1.5, 2.5, 5.0], (62, 30, 8, 100))
+    sigma = np.linspace(0.1, 0.5, 200)
+    judged = precision.Judged(planted * sigma, sigma, np.repeat([0, 1, 2], (50, 50, 100)))
+    one, two = standard_deviations.of_recipes({("hills", 3): [judged]})
+    assert (one.value, two.value) == (0.62, 0.92)
+    assert one.passes
+    assert two.passes
+    figures = {figure.what: figure.value for figure in standard_deviations.of_all_cells([judged])}
+    assert figures["within two sigma, most of the scenes"] == 0.46
+    # The tenth with the largest sigma is all trees, wrong by more than 1 m; so are all trees with sigma above 0.2 m.
+    is_large = np.abs(judged.error_m) > 1
+    expected = 20 / is_large.sum()
+    assert figures["errors above 1 m in the tenth with the largest sigma, least"] == expected < 1
 
 
 def terrain_rows(text: str) -> dict[str, list[float]]:
