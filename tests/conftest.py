@@ -31,6 +31,15 @@ def pytest_configure(config):
     config.addinivalue_line("markers", "slow: left out of `make test-fast`; set by the table in tests/conftest.py")
 
 
+def pytest_sessionstart(session):
+    """Compile the kernels once, before several processes would each compile the same ones at the same time."""
+    if session.config.getoption("numprocesses", None) and not hasattr(session.config, "workerinput"):
+        from zlocus.pipeline.execution.precompile import kernels_compiling
+
+        with kernels_compiling():
+            pass
+
+
 def pytest_collection_modifyitems(items):
     slow = [TESTS / name for name in SLOW]
     for item in items:
