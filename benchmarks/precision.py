@@ -326,17 +326,32 @@ def predicted_sigma(model: dict[str, Any], one: Sample) -> np.ndarray:
     return np.hypot(np.exp(total), left) * one.step_m
 
 
+def share_within(judged: Judged, times: float, classes: Sequence[str]) -> float:
+    """Share of the errors of some classes within so many standard deviations."""
+    rows = np.isin(judged.kind, [list(CLASS_NAMES).index(name) for name in classes])
+    return float((np.abs(judged.error_m) < times * judged.sigma_m)[rows].mean())
+
+
+def share_in_worst_tenth(judged: Judged) -> float:
+    """Share of the errors above LARGE_ERROR_M that lies in the tenth of the cells with the largest sigma."""
+    worst = np.argsort(-judged.sigma_m, kind="stable")[: len(judged.sigma_m) // 10]
+    is_large = np.abs(judged.error_m) > LARGE_ERROR_M
+    return float(is_large[worst].sum() / max(is_large.sum(), 1))
+
+
 def judgement(judged: Judged) -> str:
     """The figures of a run on one line."""
     size, sigma = np.abs(judged.error_m), judged.sigma_m
-    parts = []
-    for name, rows in (("all", np.ones(len(size), bool)), *((n, judged.kind == i) for i, n in enumerate(CLASS_NAMES))):
-        if rows.sum() > 100:
-            parts.append(f"{name} {(size < sigma)[rows].mean():.3f}/{(size < 2 * sigma)[rows].mean():.3f}")
+    of_class = {name: (judged.kind == i).sum() for i, name in enumerate(CLASS_NAMES)}
+    groups = {"all": list(CLASS_NAMES), **{name: [name] for name, n in of_class.items() if n > 100}}
+    parts = [
+        f"{name} {share_within(judged, 1, classes):.3f}/{share_within(judged, 2, classes):.3f}"
+        for name, classes in groups.items()
+    ]
     quintile = np.digitize(sigma, np.quantile(sigma, [0.2, 0.4, 0.6, 0.8]))
     parts.append("quintiles " + " ".join(f"{(size < sigma)[quintile == q].mean():.2f}" for q in range(5)))
-    worst, large = np.argsort(-sigma, kind="stable")[: len(size) // 10], size > LARGE_ERROR_M
-    parts.append(f"worst tenth holds {large[worst].sum() / max(large.sum(), 1):.2f} of {large.mean():.4f} > 1 m")
+    is_large = (size > LARGE_ERROR_M).mean()
+    parts.append(f"worst tenth holds {share_in_worst_tenth(judged):.2f} of {is_large:.4f} > 1 m")
     parts.append(f"median {np.median(sigma):.3f} m")
     return "; ".join(parts)
 

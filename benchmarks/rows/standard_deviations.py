@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
-from precision import JUDGED, LARGE_ERROR_M, VIEWS, Judged, judge, rendered, with_views
+from precision import (
+    JUDGED,
+    VIEWS,
+    Judged,
+    judge,
+    rendered,
+    share_in_worst_tenth,
+    share_within,
+    with_views,
+)
 from workplace import Figure, Workplace
 from zlocus.evaluation.truth import CLASS_NAMES
 
 # Of a normal distribution 68 and 95 % of the errors lie within one and two standard deviations, and a mean over the
 # scenes of one recipe may be so far from that.
 WITHIN = {"one": (1, 0.68, 0.07), "two": (2, 0.95, 0.04)}
-WORST_SHARE = 0.1
 
 
 def precision(workplace: Workplace) -> list[Figure]:
@@ -54,16 +62,3 @@ def of_all_cells(runs: Iterable[Judged]) -> list[Figure]:
     figures.append(Figure("errors above 1 m in the tenth with the largest sigma, least", min(shares)))
     figures.append(Figure("errors above 1 m in the tenth with the largest sigma, most", max(shares)))
     return figures
-
-
-def share_within(judged: Judged, times: float, classes: Sequence[str]) -> float:
-    """Share of the errors of some classes within so many standard deviations."""
-    rows = np.isin(judged.kind, [list(CLASS_NAMES).index(name) for name in classes])
-    return float((np.abs(judged.error_m) < times * judged.sigma_m)[rows].mean())
-
-
-def share_in_worst_tenth(judged: Judged) -> float:
-    """Share of the errors above LARGE_ERROR_M that lies in the tenth of the cells with the largest sigma."""
-    worst = np.argsort(-judged.sigma_m, kind="stable")[: round(WORST_SHARE * len(judged.sigma_m))]
-    is_large = np.abs(judged.error_m) > LARGE_ERROR_M
-    return float(is_large[worst].sum() / max(is_large.sum(), 1))

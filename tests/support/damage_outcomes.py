@@ -26,22 +26,7 @@ class Good:
 
 def outcome(good: Good, content: bytes) -> Leaves | str:
     """What a damaged file says, or what was said of it; in time and memory, without a warning."""
-    allowed = SECONDS if len(content) < d.LARGE // 2 else SECONDS_10_MB
     good.path.write_bytes(content)
-    try:
-        found, taken, taken_mb = reading(good)
-        if taken >= allowed:
-            # Other processes on the same core may have made it slow; a file that takes too long does so again.
-            found, taken, taken_mb = reading(good)
-    finally:
-        good.path.write_bytes(good.content)
-    assert taken < allowed
-    assert taken_mb < MEGABYTES
-    return found
-
-
-def reading(good: Good) -> tuple[Leaves | str, float, float]:
-    """What the file says now, or what was said of it, the CPU in seconds, and the memory in MB that this took."""
     before, started = reset_peak_mb(), time.process_time()
     try:
         with warnings.catch_warnings():
@@ -51,7 +36,12 @@ def reading(good: Good) -> tuple[Leaves | str, float, float]:
     except ZlocusError as error:
         found = str(error)
         check_sentence(found, good.path)
-    return found, time.process_time() - started, peak_mb() - before
+    finally:
+        taken, taken_mb = time.process_time() - started, peak_mb() - before
+        good.path.write_bytes(good.content)
+    assert taken < (SECONDS if len(content) < d.LARGE // 2 else SECONDS_10_MB)
+    assert taken_mb < MEGABYTES
+    return found
 
 
 def peak_mb() -> float:
