@@ -71,7 +71,7 @@ def read_json(path: Path, start: str | None = None, advice: str = EXPORT_AGAIN) 
 
 @contextmanager
 def _garbage_kept() -> Iterator[None]:
-    """Without the search for cyclic garbage. A parser makes none, but each of its many lists would bring the next search
+    """Without the search for cyclic garbage. A parser makes none, but each list that it makes brings the next search
     nearer: four fifths of the time that a document of two million lists takes.
     """
     searched = gc.isenabled()
