@@ -41,7 +41,7 @@ docs: $(STAMP)
 	$(BIN)/python -m sphinx -W --keep-going -E -q -b html -d build/doctrees docs build/docs
 
 test: lint
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # Tests of single modules, for use while editing: under two minutes on two cores. tests/conftest.py lists what is left out.
 test-fast: $(STAMP)
@@ -54,7 +54,7 @@ test-minimum: $(STAMP)
 	    extra = project["optional-dependencies"]; needed = project["dependencies"] + extra["cluster"] + extra["inspect"] + extra["xarray"]; \
 	    print(*(d.split(",")[0].replace(">=", "==") for d in needed), sep="\n")' > $(MINIMUM)/versions.txt
 	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[dev]'
-	$(MINIMUM)/bin/python -m pytest -n 2
+	$(MINIMUM)/bin/python -m pytest -n 2 --dist worksteal
 
 # Known vulnerabilities of what is installed, from the package registry.
 audit: $(STAMP)

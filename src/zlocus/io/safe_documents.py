@@ -6,7 +6,7 @@ import gc
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -167,32 +167,56 @@ class _YamlChecker:
 
     def check(self, text: str) -> None:
         """Raise `InputError` for anything that `read_yaml` refuses."""
+        # By the type itself, because a large document has a million events.
+        take: dict[type, Callable[[Any], None]] = {
+            yaml.MappingStartEvent: self._begin_mapping,
+            yaml.SequenceStartEvent: self._begin_sequence,
+            yaml.MappingEndEvent: self._end,
+            yaml.SequenceEndEvent: self._end,
+            yaml.ScalarEvent: self._scalar,
+            yaml.AliasEvent: self._alias,
+        }
         for event in yaml.parse(text, _Loader):
-            if isinstance(event, yaml.CollectionEndEvent):
-                anchor, before, _ = self.open.pop()
-                self.is_key.pop()
-                self._remember(anchor, self.n_values - before)
-            elif isinstance(event, yaml.AliasEvent):
-                self._key(event)
-                self._add(self._size(event.anchor or ""))
-            elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
-                if event.tag is not None:
-                    raise InputError(f"{self.path} holds the tag {quoted(event.tag)}, which is not read. Leave it out.")
-                self._key(event)
-                self._add(1)
-                self._begin(event)
+            taken = take.get(type(event))
+            if taken is not None:
+                taken(event)
 
-    def _begin(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
-        if isinstance(event, yaml.ScalarEvent):
-            self._remember(event.anchor, 1)
-            return
+    def _begin_mapping(self, event: yaml.MappingStartEvent) -> None:
+        self._begin(event, set())
+
+    def _begin_sequence(self, event: yaml.SequenceStartEvent) -> None:
+        self._begin(event, None)
+
+    def _begin(self, event: yaml.CollectionStartEvent, keys: set[str] | None) -> None:
+        self._value(event)
         if len(self.open) == MAX_YAML_DEPTH:
             raise InputError(TOO_DEEP.format(path=self.path))
-        self.sizes.pop(event.anchor or "", None)
-        self.open.append(
-            (event.anchor, self.n_values - 1, set() if isinstance(event, yaml.MappingStartEvent) else None)
-        )
+        if event.anchor is not None:
+            self.sizes.pop(event.anchor, None)
+        self.open.append((event.anchor, self.n_values - 1, keys))
         self.is_key.append(True)
+
+    def _end(self, _: yaml.CollectionEndEvent) -> None:
+        anchor, before, _keys = self.open.pop()
+        self.is_key.pop()
+        if anchor is not None:
+            self.sizes[anchor] = self.n_values - before
+
+    def _scalar(self, event: yaml.ScalarEvent) -> None:
+        self._value(event)
+        if event.anchor is not None:
+            self.sizes[event.anchor] = 1
+
+    def _alias(self, event: yaml.AliasEvent) -> None:
+        self._key(event)
+        self._add(self._size(event.anchor or ""))
+
+    def _value(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
+        """Check a scalar, or the beginning of a collection, which counts as one value."""
+        if event.tag is not None:
+            raise InputError(f"{self.path} holds the tag {quoted(event.tag)}, which is not read. Leave it out.")
+        self._key(event)
+        self._add(1)
 
     def _key(self, event: yaml.NodeEvent) -> None:
         """Check that keys are unique: in a mapping, every second value is a key."""
@@ -212,10 +236,6 @@ class _YamlChecker:
                 f"{self.path} refers to {quoted('*' + anchor)}, which is not complete there. Write it out."
             )
         return self.sizes[anchor]
-
-    def _remember(self, anchor: str | None, size: int) -> None:
-        if anchor is not None:
-            self.sizes[anchor] = size
 
     def _add(self, size: int) -> None:
         self.n_values += size
