@@ -153,7 +153,7 @@ def some_evidence(n_views: int) -> TableAndCounts:
     worth = rng.uniform(0.5, 1.5, (n_views, n_views)).astype(np.float32)
     values = (np.float32(value) for value in (0.01, 14.0, 18.0, 3.0, 0.5, 0.3, 160.0))
     grey_unit = rng.uniform(0.5, 1.5, (n_views, n_views)).astype(np.float32)
-    return TableAndCounts(EvidenceTable(ratios, *values, grey_unit, worth), NO_COUNTS)
+    return TableAndCounts(EvidenceTable(ratios, *values, grey_unit, worth, np.float32(0.7)), NO_COUNTS)
 
 
 def costs_case(

@@ -101,20 +101,29 @@ def from_table(table, bins):
     return (1 - share) * table[contrast, difference, grey, lower] + share * table[contrast, difference, grey, lower + 1]
 
 
-def cell_evidence(planes, movement, halves, noise, grey_unit, table, visible, excluded, weights):
-    """Weighted mean evidence over the pairs of views, (r, c).
+def mean_of_best(ratios, weights, share):
+    """Mean of the largest ratios (k,), until their weights (k,) are a share of all weights; 0 without any weight."""
+    order = np.argsort(-ratios)
+    taken = np.minimum(np.cumsum(weights[order]), share * weights.sum())
+    return float(np.diff(taken, prepend=0.0) @ ratios[order]) / max(share * weights.sum(), 1e-12)
+
+
+def cell_evidence(planes, movement, halves, noise, grey_unit, table, visible, excluded, weights, best_share):
+    """Weighted mean evidence over the best pairs of views, (r, c): see `mean_of_best`.
 
     visible : (2, i, r, c), see `reference.agreement.over_pairs`; weights : (i, i), of the pairs, whose mean over the
     pairs is 1. The mean is the geometric one, by `excluded`, of that over the pairs that see the cell and that over the
     pairs that cover it; few pairs are as many as one of mean weight.
     """
     here, covering = visible
-    total, of_seeing, of_covering = np.zeros(here.shape[1:]), np.zeros(here.shape[1:]), np.zeros(here.shape[1:])
-    for a, b in combinations(range(len(planes)), 2):
-        ratio = from_table(table, bins_of_pair(planes, movement, a, b, halves, noise, grey_unit))
-        total += weights[a, b] * np.where(here[a] & here[b], ratio, 0.0)
-        of_seeing += weights[a, b] * (here[a] & here[b])
-        of_covering += weights[a, b] * (covering[a] & covering[b])
+    pairs = list(combinations(range(len(planes)), 2))
+    of_pairs = np.array([weights[pair] for pair in pairs])[:, None, None]
+    of_seen = of_pairs * np.array([here[a] & here[b] for a, b in pairs])
+    of_seeing, of_covering = of_seen.sum(axis=0), sum(weights[a, b] * (covering[a] & covering[b]) for a, b in pairs)
+    ratios = [from_table(table, bins_of_pair(planes, movement, a, b, halves, noise, grey_unit)) for a, b in pairs]
+    total, ratios = np.zeros(here.shape[1:]), np.array(ratios)
+    for r, c in np.ndindex(total.shape):
+        total[r, c] = mean_of_best(ratios[:, r, c], of_seen[:, r, c], best_share) * of_seeing[r, c]
     return total / (np.maximum(of_seeing, 1) ** excluded * np.maximum(of_covering, 1) ** (1 - excluded))
 
 

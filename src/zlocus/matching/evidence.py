@@ -39,6 +39,9 @@ UNIT_COST, SMALL_WINDOW_UNIT_COST = 14.0, 18.0
 UNIT_FACTOR_PER_LEVEL = 1.25
 # The evidence of n pairs counts n ** PAIR_EXPONENT times their mean: pairs share images, so that they err together.
 PAIR_EXPONENT = 0.3
+# Of the pairs that see a height, the best count, by this share of their weight: a pair that does not show what the
+# others do, because of an occlusion or a change between two dates, speaks against the right height too.
+BEST_SHARE = 0.7
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
 # Evidence of one pair is at most this, natural units.
@@ -89,7 +92,7 @@ NO_TABLE = EvidenceTable(
     log_ratios=np.zeros(0, np.float32), noise_variance=np.float32(1.0), unit=np.float32(0.0),
     small_window_unit=np.float32(0.0), highest=np.float32(0.0), neutral=np.float32(0.0),
     pair_exponent=np.float32(0.0), max_cost=np.float32(0.0), grey_unit=np.zeros((0, 0), np.float32),
-    worth=np.zeros((0, 0), np.float32),
+    worth=np.zeros((0, 0), np.float32), best_share=np.float32(1.0),
 )  # fmt: skip
 NO_COUNTS = Learning(
     np.zeros((0, 0), np.float32),
@@ -159,6 +162,7 @@ def learned_evidence(
         max_cost=np.float32(MAX_MIDDLE_COST),
         grey_unit=grey_unit,
         worth=worth_of_pairs(learning.right_of_pair, learning.wrong_of_pair),
+        best_share=np.float32(BEST_SHARE),
     )
     return TableAndCounts(found, NO_COUNTS)
 

@@ -28,7 +28,7 @@ from zlocus.matching.kernels.pairs_of_block import PAIRS_PER_VIEW, pairs_of_bloc
 from zlocus.matching.kernels.shared_records import NEVER_COVERED
 
 HALVES = np.array([1, 2])
-EXCLUDED = 0.4
+EXCLUDED, BEST_SHARE = 0.4, 0.7
 PARAMETERS = CostParameters(*(np.float32(v) for v in (0.0, 1.0, 0.3, 0.3, EXCLUDED)), max_images_for_large_window=255)
 WORK = np.zeros((4, 0), np.float32)
 PAIR = ViewPair(np.uint64(0), np.uint64(1))
@@ -99,6 +99,7 @@ def table_with(ratios, n_views=3):
         *(np.float32(v) for v in values),
         grey_unit_of(n_views),
         worth_of(n_views),
+        np.float32(BEST_SHARE),
     )
 
 
@@ -130,8 +131,9 @@ def test_costs_are_the_sums_of_the_table(n_views):
             highest = min(scale * ratios.max(), 160.0)
             planes, movement = planes_of(scene, b, d, rows, cols, index)
             mean = twin.cell_evidence(
-                planes, movement, HALVES, NOISE, table.grey_unit, ratios.astype(float), views, EXCLUDED, weights
-            )
+                planes, movement, HALVES, NOISE, table.grey_unit, ratios.astype(float), views, EXCLUDED, weights,
+                BEST_SHARE,
+            )  # fmt: skip
             cost = np.where(n_covering > 1, highest - scale * mean, highest - scale * 0.5)
             expected[rows, cols, index] = np.clip(cost, 0, 255)
     is_searched = np.isfinite(expected)

@@ -285,11 +285,10 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
     if evidence.learning.right.shape[0] > 0:
         count_bins(at_height, moments, scratch, n, weights.height, evidence)
     elif evidence.table.log_ratios.shape[0] > 0:
-        seen = weights.of_seeing if weights.is_part else weights.of_seeing[:0]
-        seen[:] = 0.0
-        add_evidence(at_height, moments, scratch, n, weights.of_block.weights, evidence.table, total, seen)
+        add_evidence(at_height, moments, scratch, n, weights.of_block.weights, evidence.table, total)
         if weights.is_part:
-            weights_with_occlusion(weights.of_covering, weights.excluded, n, seen)
+            weights.of_seeing[:n] = scratch.ratios.seen[:n]
+            weights_with_occlusion(weights.of_covering, weights.excluded, n, weights.of_seeing)
         scale = cost_of_unit(evidence.table, weights.of_block.n_effective, n_sizes)
         evidence_costs(total, of_pair, n_covering, evidence.table, scale, n, out)
     else:

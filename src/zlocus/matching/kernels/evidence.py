@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zlocus.core.jit import kernel
+from zlocus.matching.kernels.best_pairs import RATIO_OF_UNSEEN, PairRatios, add_best_pairs, empty_pair_ratios
 from zlocus.matching.kernels.ncc import SLACK, ColumnSums, ViewPair, add_correlation, column_products
 
 # Bins of the four features of a pair: local contrast of both windows, difference of the two contrasts, grey
@@ -63,6 +64,7 @@ class EvidenceTable(NamedTuple):
     max_cost: np.float32  # f4: cost of a height without evidence for or against it, at most
     grey_unit: np.ndarray  # (i,i) f4: usual grey difference of each pair of views, as a multiple of that of all pairs
     worth: np.ndarray  # (i,i) f4: what each pair of views is worth, see `zlocus.matching.evidence.worth_of_pairs`
+    best_share: np.float32  # f4: of the pairs that see a height only the best count, by this share of their weight
 
 
 class Learning(NamedTuple):
@@ -94,6 +96,7 @@ class PairScratch(NamedTuple):
     rows: np.ndarray  # (5,p) f4: sums, contrasts and positions between two bins of likeness, see SUMS and others
     bits: np.ndarray  # (5,p) i4: the bits of `rows`
     bins: np.ndarray  # (p,) i4: index of the lower bin
+    ratios: PairRatios  # PairRatios: log ratios of the pairs
 
 
 class PairWindows(NamedTuple):
@@ -114,8 +117,8 @@ def pair_scratch(n_views, half, size, work):
     """Arrays for the pairs of views of a block on flat planes of a size, not filled. half : of the largest window."""
     gradients, movement = np.empty((n_views, 3, size), np.float32), np.empty((n_views, 2), np.float32)
     census, bins = np.empty((n_views, n_beside(half) // 8, size), np.uint8), np.empty(size, np.int32)
-    rows = np.empty((5, size), np.float32)
-    return PairScratch(work, gradients, census, movement, rows, rows.view(np.int32), bins)
+    rows, ratios = np.empty((5, size), np.float32), empty_pair_ratios(n_views * (n_views - 1) // 2, size)
+    return PairScratch(work, gradients, census, movement, rows, rows.view(np.int32), bins, ratios)
 
 
 # BlockGrid, PixelVelocity, (2,) f4 -> None
@@ -372,48 +375,52 @@ def describe_views(views, scratch, n):
         write_census(views.planes, view, half, width, n, scratch.census)
 
 
-# (e,) f4, f4, (i,p) f4, ViewPair, i8, (5,p) f4, (p,) i4, (p,) f4 -> None
+# (e,) f4, (i,p) f4, ViewPair, i8, (5,p) f4, (p,) i4, (p,) f4 -> None
 @kernel
-def add_ratios(table, weight, greys, pair, n, rows, bins, total):
-    """Add the weighted log-likelihood ratios of a pair of views where both see the cell, at the first n places."""
-    a, b, one, next_bin, none = pair.a, pair.b, np.float32(1.0), np.uint64(1), np.float32(0.0)
-    position, ratio = np.uint64(POSITION), np.uint64(SUMS)
+def write_ratios(table, greys, pair, n, rows, bins, out):
+    """Write the log-likelihood ratios of a pair of views, at the first n places."""
+    a, b, one, next_bin, position = pair.a, pair.b, np.float32(1.0), np.uint64(1), np.uint64(POSITION)
     for j in range(np.uint64(n)):
         at, share = np.uint64(bins[j]), rows[position, j]
-        rows[ratio, j] = weight * (table[at] * (one - share) + table[at + next_bin] * share)
+        out[j] = table[at] * (one - share) + table[at + next_bin] * share
     for j in range(np.uint64(n)):
         is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
-        total[j] += rows[ratio, j] if is_seen else none
+        out[j] = out[j] if is_seen else RATIO_OF_UNSEEN
 
 
-# f4, (i,p) f4, ViewPair, i8, (p,) f4 -> None
+# (p,) f4, f4, i8, (p,) f4 -> None
 @kernel
-def add_seen_weights(weight, greys, pair, n, seen):
-    """Add the weight of a pair of views where both see the cell, at the first n places."""
-    a, b, none = pair.a, pair.b, np.float32(0.0)
+def add_seen_weights(ratios, weight, n, seen):
+    """Add the weight of a pair of views where both see the cell, at the first n places. ratios : of the pair."""
+    none = np.float32(0.0)
     for j in range(np.uint64(n)):
-        is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
-        seen[j] += weight if is_seen else none
+        seen[j] += weight if ratios[j] > RATIO_OF_UNSEEN else none
 
 
-# PairWindows, WindowMoments, PairScratch, i8, (i,i) f4, EvidenceTable, (p,) f4, (p,) f4 -> None
+# PairWindows, WindowMoments, PairScratch, i8, (i,i) f4, EvidenceTable, (p,) f4 -> None
 @kernel
-def add_evidence(views, moments, scratch, n, weights, evidence, total, seen):
-    """Add the weighted log-likelihood ratios of all pairs of views that see the cell, at the first n places.
+def add_evidence(views, moments, scratch, n, weights, evidence, total):
+    """Add the log-likelihood ratios of the pairs of views that see the cell, at the first n places.
 
-    weights : of the pairs of the block's views, see `PairsOfBlock`; pairs without weight are left out; seen : (p,), the
-    weights of the same pairs are added to it, unless it has no elements.
+    They are added as the mean of the best of them, times the weights of all.
+
+    weights : of the pairs of the block's views, see `PairsOfBlock`; pairs without weight are left out. The weights of
+    the pairs that see each cell are in the scratch arrays afterwards.
     """
     describe_views(views, scratch, n)
+    ratios, k = scratch.ratios, np.uint64(0)
+    ratios.seen[:n] = np.float32(0.0)
     for a in range(views.planes.shape[0]):
         for b in range(a + 1, views.planes.shape[0]):
             weight = weights[views.in_block[a], views.in_block[b]]
             if weight > np.float32(0.0):
                 pair = ViewPair(np.uint64(a), np.uint64(b))
                 write_pair_bins(views, pair, moments, scratch, evidence, n)
-                add_ratios(evidence.log_ratios, weight, views.greys, pair, n, scratch.rows, scratch.bins, total)
-                if seen.shape[0] > 0:
-                    add_seen_weights(weight, views.greys, pair, n, seen)
+                write_ratios(evidence.log_ratios, views.greys, pair, n, scratch.rows, scratch.bins, ratios.of_pairs[k])
+                add_seen_weights(ratios.of_pairs[k], weight, n, ratios.seen)
+                ratios.weights[k] = weight
+                k += np.uint64(1)
+    add_best_pairs(ratios, k, evidence.best_share, evidence.highest, n, total)
 
 
 # EvidenceTable, f4, i8 -> f4
