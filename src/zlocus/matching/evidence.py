@@ -41,7 +41,9 @@ UNIT_FACTOR_PER_LEVEL = 1.25
 PAIR_EXPONENT = 0.3
 # Of the pairs that see a height, the best count, by this share of their weight: a pair that does not show what the
 # others do, because of an occlusion or a change between two dates, speaks against the right height too.
-BEST_SHARE = 0.7
+# Of tiles with many views all pairs count. There a false tower occludes the views that see the ground beside it, and
+# the best of the pairs that are left confirm it.
+BEST_SHARE, MAX_VIEWS_FOR_BEST_SHARE = 0.7, 8
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
 # Evidence of one pair is at most this, natural units.
@@ -162,7 +164,7 @@ def learned_evidence(
         max_cost=np.float32(MAX_MIDDLE_COST),
         grey_unit=grey_unit,
         worth=worth_of_pairs(learning.right_of_pair, learning.wrong_of_pair),
-        best_share=np.float32(BEST_SHARE),
+        best_share=np.float32(BEST_SHARE if n_views <= MAX_VIEWS_FOR_BEST_SHARE else 1.0),
     )
     return TableAndCounts(found, NO_COUNTS)
 

@@ -61,7 +61,6 @@ def write_limits(ratios, n_pairs, share, highest, n):
         span *= half
         for j in range(np.uint64(n)):
             limit[j] += span if ratios.above[j] > share * seen[j] else -span
-    # Where all pairs count, the limit is below all of them.
     largest[:n] = highest - np.float32(2.0) * HALF_SPAN
     for k in range(n_pairs):
         for j in range(np.uint64(n)):
@@ -84,6 +83,8 @@ def add_best_pairs(ratios, n_pairs, share, highest, n, total):
     limit, seen, zero = ratios.limit, ratios.seen, np.float32(0.0)
     if n_pairs == 1:
         limit[:n] = ratios.of_pairs[0, :n]
+    elif share == np.float32(1.0):
+        limit[:n] = highest - np.float32(2.0) * HALF_SPAN
     else:
         write_limits(ratios, n_pairs, share, highest, n)
     for j in range(np.uint64(n)):
