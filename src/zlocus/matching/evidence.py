@@ -43,7 +43,7 @@ PAIR_EXPONENT = 0.3
 # others do, because of an occlusion or a change between two dates, speaks against the right height too.
 # Of tiles with many views all pairs count. There a false tower occludes the views that see the ground beside it, and
 # the best of the pairs that are left confirm it.
-BEST_SHARE, MAX_VIEWS_FOR_BEST_SHARE = 0.7, 8
+BEST_SHARE, MAX_VIEWS_FOR_BEST_SHARE = 0.7, 12
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
 # Evidence of one pair is at most this, natural units.
