@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from zlocus.matching.evidence import NO_COUNTS, NO_EVIDENCE
+from zlocus.matching.evidence import BEST_SHARE, NO_COUNTS, NO_EVIDENCE
 from zlocus.matching.free_rays import pair_agreement
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
@@ -153,7 +153,7 @@ def some_evidence(n_views: int) -> TableAndCounts:
     worth = rng.uniform(0.5, 1.5, (n_views, n_views)).astype(np.float32)
     values = (np.float32(value) for value in (0.01, 14.0, 18.0, 3.0, 0.5, 0.3, 160.0))
     grey_unit = rng.uniform(0.5, 1.5, (n_views, n_views)).astype(np.float32)
-    return TableAndCounts(EvidenceTable(ratios, *values, grey_unit, worth, np.float32(0.7)), NO_COUNTS)
+    return TableAndCounts(EvidenceTable(ratios, *values, grey_unit, worth, np.float32(BEST_SHARE)), NO_COUNTS)
 
 
 def costs_case(

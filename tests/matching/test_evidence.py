@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from zlocus.core.grid import CellWindow
 from zlocus.matching import evidence
 from zlocus.matching.evidence import (
+    BEST_SHARE,
     MAX_LOG_RATIO,
+    MAX_VIEWS_FOR_BEST_SHARE,
+    best_share_of,
     grey_units,
     heights_to_learn_from,
     log_of_sampling,
@@ -183,3 +186,8 @@ def test_few_cells_teach_nothing():
     level = SimpleNamespace(number=1, window=CellWindow(0, 0, 140, 140), shape=(140, 140), core=np.s_[:, :])
     slope = SimpleNamespace(cells=np.zeros((140, 140), np.float32))
     assert heights_to_learn_from(result_with(np.zeros((140, 140))), level, slope) is None
+
+
+def test_of_many_views_all_pairs_count():
+    assert best_share_of(2) == best_share_of(MAX_VIEWS_FOR_BEST_SHARE) == BEST_SHARE
+    assert best_share_of(MAX_VIEWS_FOR_BEST_SHARE + 1) == 1

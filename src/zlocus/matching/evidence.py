@@ -39,10 +39,10 @@ UNIT_COST, SMALL_WINDOW_UNIT_COST = 14.0, 18.0
 UNIT_FACTOR_PER_LEVEL = 1.25
 # The evidence of n pairs counts n ** PAIR_EXPONENT times their mean: pairs share images, so that they err together.
 PAIR_EXPONENT = 0.3
-# Of the pairs that see a height, the best count, by this share of their weight: a pair that does not show what the
-# others do, because of an occlusion or a change between two dates, speaks against the right height too.
-# Of tiles with many views all pairs count. There a false tower occludes the views that see the ground beside it, and
-# the best of the pairs that are left confirm it.
+# Of the pairs that see a height, those count that speak most for it, until they are this share of the weight of all. A
+# pair that does not show what the others do, because of an occlusion or a change between two dates, speaks against the
+# right height too. In tiles of more views all pairs count: there a false tower occludes the views that see the ground
+# beside it, and the best of the pairs that are left would confirm it.
 BEST_SHARE, MAX_VIEWS_FOR_BEST_SHARE = 0.7, 12
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
@@ -164,9 +164,14 @@ def learned_evidence(
         max_cost=np.float32(MAX_MIDDLE_COST),
         grey_unit=grey_unit,
         worth=worth_of_pairs(learning.right_of_pair, learning.wrong_of_pair),
-        best_share=np.float32(BEST_SHARE if n_views <= MAX_VIEWS_FOR_BEST_SHARE else 1.0),
+        best_share=np.float32(best_share_of(n_views)),
     )
     return TableAndCounts(found, NO_COUNTS)
+
+
+def best_share_of(n_views: int) -> float:
+    """The share of the pairs that counts as evidence in a tile of so many views: see BEST_SHARE."""
+    return BEST_SHARE if n_views <= MAX_VIEWS_FOR_BEST_SHARE else 1.0
 
 
 def nothing_counted(n_views: int, reference: NDArray[np.float32], wrong_every: int) -> Learning:
