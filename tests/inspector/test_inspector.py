@@ -56,7 +56,7 @@ SHIFT_M = (2.0, -1.0, 0.5)
 @pytest.fixture(scope="module")
 def out(images, tmp_path_factory):
     """A run over all of the sine; not to be changed."""
-    return run(images("sine"), tmp_path_factory.mktemp("inspected") / "out", SMALL_TILES).out
+    return run(images("sine"), tmp_path_factory.mktemp("inspected") / "out", SMALL_TILES, report=True).out
 
 
 @pytest.fixture(scope="module")
@@ -341,7 +341,7 @@ def test_a_surface_above_a_geoid_is_looked_at_above_it(images, tmp_path):
     from zlocus.pipeline.dsm import run_dsm
 
     request = DsmRequest(images("sine").inputs, tmp_path / "out", crs="EPSG:32632", resolution=0.5,
-                         heights=(25 - UNDULATION_M, 80 - UNDULATION_M), vertical=str(geoid))  # fmt: skip
+                         heights=(25 - UNDULATION_M, 80 - UNDULATION_M), vertical=str(geoid), report=False)  # fmt: skip
     out = run_dsm(request, SMALL_TILES, SilentProgress()).out
     ellipsoidal = out / "ellipsoidal.tif"
     with rasterio.open(out / "dsm.tif") as file:

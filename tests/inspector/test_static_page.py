@@ -35,7 +35,7 @@ LEGEND_PX = 62
 @pytest.fixture(scope="module")
 def out(images, tmp_path_factory):
     """A run over all of the sine; not to be changed."""
-    return run(images("sine"), tmp_path_factory.mktemp("page") / "out", SMALL_TILES).out
+    return run(images("sine"), tmp_path_factory.mktemp("page") / "out", SMALL_TILES, report=True).out
 
 
 @pytest.fixture(scope="module")
@@ -446,7 +446,7 @@ def test_a_wrong_link_is_said(browser, inspected):
 
 
 def test_names_that_are_code_do_not_run(images, browser, tmp_path):
-    out = run(images("plane"), tmp_path / "out", SMALL_TILES).out
+    out = run(images("plane"), tmp_path / "out", SMALL_TILES, report=True).out
     record = json.loads((out / "run.json").read_text())
     bad = "<img src=x onerror=alert(1)>"
     record["orientation"]["views"] = {bad: {}, **record["orientation"]["views"]}

@@ -55,7 +55,8 @@ LEFT_PX = 0.1
 @pytest.fixture(scope="session")
 def whole(images, tmp_path_factory):
     """A run over all of the sine, in tiles of 64 cells."""
-    return run(images("sine"), tmp_path_factory.mktemp("whole") / "out", SMALL_TILES, products=ALL_MAPS).out
+    out = tmp_path_factory.mktemp("whole") / "out"
+    return run(images("sine"), out, SMALL_TILES, products=ALL_MAPS, report=True).out
 
 
 def spread(error):
@@ -236,7 +237,7 @@ def test_same_bytes_for_another_order_of_tiles(whole, images, tmp_path, monkeypa
 def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
     out = run(images("plane"), tmp_path / "out", bounds=PART, products=("dtm", "laz")).out
     assert {"dtm.tif", "surface.laz", "item.json"} <= {path.name for path in out.iterdir()}
-    run(images("plane"), out, bounds=PART, products=(), overwrite=True)
+    run(images("plane"), out, bounds=PART, products=(), overwrite=True, report=True)
     assert {path.name for path in out.iterdir()} == {
         *PRODUCTS,
         *REPORT_FILES,

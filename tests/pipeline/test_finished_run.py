@@ -51,7 +51,7 @@ def out(finished, tmp_path):
 
 
 def asked(images, out, config=SMALL_TILES, **more):
-    return run(images("sine"), out, config, **({"bounds": PART, "workers": 1} | more))
+    return run(images("sine"), out, config, **({"bounds": PART, "workers": 1, "report": True} | more))
 
 
 def forbid_matching(monkeypatch):

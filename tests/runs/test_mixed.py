@@ -62,7 +62,8 @@ def judged(scenes: dict[str, Path], out: Path) -> tuple[dict[str, float], dict[s
     """NMAD of the ground, and share of all blocks within two pixels, of the surface of each sensor and of all."""
     nmad, within = {}, {}
     for kind, scene in scenes.items():
-        run_dsm(DsmRequest(inputs=(scene,), out=out / kind, resolution=0.2), RunConfig(), progress_for(io.StringIO()))
+        request = DsmRequest(inputs=(scene,), out=out / kind, resolution=0.2, report=False)
+        run_dsm(request, RunConfig(), progress_for(io.StringIO()))
         truth, classes = (scene.parent / name for name in ("truth_dsm.tif", "truth_class.tif"))
         found = evaluate(out / kind / "dsm.tif", Comparison(truth, classes=classes, threshold_m=TWO_PIXELS_M))
         nmad[kind], within[kind] = found.class_statistics["ground"].nmad, found.statistics.within

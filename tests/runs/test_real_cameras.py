@@ -159,7 +159,7 @@ def test_a_surface_of_aerial_images_without_heights(shared_data, tmp_path):
     import_scene(ImportRequest("eo", folder, out, crs=LO25, camera=camera))
     x, y = -56_400, -3_729_500
     bounds = (x - 600, y - 900, x + 600, y + 900)
-    request = DsmRequest(inputs=(out,), out=tmp_path / "dsm", bounds=bounds, resolution=12.0)
+    request = DsmRequest(inputs=(out,), out=tmp_path / "dsm", bounds=bounds, resolution=12.0, report=False)
     result = run_dsm(request, RunConfig(), SilentProgress())
     assert result.coverage > MIN_COVERAGE
     with rasterio.open(tmp_path / "dsm" / "dsm.tif") as source:

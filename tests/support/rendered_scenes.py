@@ -99,9 +99,9 @@ def rendered_in_colours(folder: Path, dtype: str) -> tuple[Path, ...]:
 
 
 def run(images: RenderedImages | tuple[Path, ...], out: Path, config: RunConfig | None = None, **request) -> DsmResult:
-    """A surface of these images at 0.5 m in UTM, with the heights given unless the request says otherwise."""
+    """A surface of these images at 0.5 m in UTM, with the heights given and without a report, unless a request asks."""
     inputs = images.inputs if isinstance(images, RenderedImages) else images
-    asked = {"crs": "EPSG:32632", "resolution": GSD_M, "heights": HEIGHTS} | request
+    asked = {"crs": "EPSG:32632", "resolution": GSD_M, "heights": HEIGHTS, "report": False} | request
     if "like" in asked:
         asked["crs"] = asked["resolution"] = None
     return run_dsm(DsmRequest(inputs=inputs, out=out, **asked), config or RunConfig(), progress_for(io.StringIO()))

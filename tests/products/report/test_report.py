@@ -99,7 +99,7 @@ def zl(*arguments):
 @pytest.fixture(scope="module")
 def made(images, tmp_path_factory):
     """A run over all of the sine; not to be changed."""
-    return run(images("sine"), tmp_path_factory.mktemp("report") / "out", SMALL_TILES).out
+    return run(images("sine"), tmp_path_factory.mktemp("report") / "out", SMALL_TILES, report=True).out
 
 
 @pytest.fixture
@@ -212,7 +212,7 @@ def test_labels_that_cannot_be_sampled_fail_no_run(images, tmp_path, monkeypatch
         raise RuntimeError("no luck")
 
     monkeypatch.setattr(zlocus.pipeline.report_inputs, "rank_tile", broken)
-    out = run(images("sine"), tmp_path / "out", SMALL_TILES).out
+    out = run(images("sine"), tmp_path / "out", SMALL_TILES, report=True).out
     assert "There are no labels of pairs. The sample could not be made: RuntimeError: no luck." in page_of(out).text(
         "pairs"
     )
@@ -228,7 +228,7 @@ def test_samples_keep_to_their_time(images, tmp_path, monkeypatch):
     monkeypatch.setattr(
         zlocus.pipeline.report_inputs, "rank_tile", lambda *these: asked.append(these) or rank_tile(*these)
     )
-    run(images("sine"), tmp_path / "out", SMALL_TILES)
+    run(images("sine"), tmp_path / "out", SMALL_TILES, report=True)
     assert len(asked) == 1
 
 
@@ -385,7 +385,7 @@ def test_a_curve_that_fails_fails_no_run(images, tmp_path, monkeypatch):
         raise RuntimeError("no luck\nat all")
 
     monkeypatch.setattr(zlocus.pipeline.report_inputs, "curves_at", broken)
-    out = run(images("sine"), tmp_path / "out", SMALL_TILES).out
+    out = run(images("sine"), tmp_path / "out", SMALL_TILES, report=True).out
     assert "No curve could be made: RuntimeError: no luck at all." in page_of(out).text("curves")
 
 
