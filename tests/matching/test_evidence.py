@@ -13,8 +13,8 @@ from zlocus.core.grid import CellWindow
 from zlocus.matching import evidence
 from zlocus.matching.evidence import (
     BEST_SHARE,
+    BEST_SHARE_OF_MANY,
     MAX_LOG_RATIO,
-    MAX_VIEWS_FOR_BEST_SHARE,
     best_share_of,
     grey_units,
     heights_to_learn_from,
@@ -28,6 +28,7 @@ from zlocus.matching.evidence import (
     worth_of_pairs,
 )
 from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE
+from zlocus.matching.occlusion import MANY_VIEWS
 
 # Relative: a low quantile of variances of 25 values is below that of the noise, and is rounded.
 NOISE_SHARE = 0.6
@@ -144,10 +145,13 @@ def test_images_of_one_grey_value_have_the_least_noise():
     assert float(noise_variance(views_of(np.full((20, 20), 2.0)))) == pytest.approx(evidence.LEAST_VARIANCE)
 
 
-@pytest.mark.parametrize(("side", "share"), [(100, 1.0), (420, 0.5), (800, 0.125), (1600, 1 / 16), (4000, 1 / 16)])
-def test_a_part_of_the_blocks_of_large_levels_is_counted(side, share):
+@pytest.mark.parametrize(
+    ("side", "n_views", "share"),
+    [(100, 3, 1.0), (420, 2, 0.5), (800, 12, 0.125), (1600, 3, 1 / 16), (4000, 3, 1 / 16), (420, 24, 1 / 8)],
+)
+def test_a_part_of_the_blocks_of_large_levels_is_counted(side, n_views, share):
     reference = np.ones((side, side), np.float32)
-    taken = np.isfinite(sampled_blocks(reference, 8, log_of_sampling(reference.size)))
+    taken = np.isfinite(sampled_blocks(reference, 8, log_of_sampling(reference.size, n_views)))
     assert taken.mean() == pytest.approx(share, abs=0.01)
     for quarter in (taken[: side // 2], taken[:, : side // 2]):
         assert quarter.mean() == pytest.approx(share, abs=0.02)
@@ -188,6 +192,6 @@ def test_few_cells_teach_nothing():
     assert heights_to_learn_from(result_with(np.zeros((140, 140))), level, slope) is None
 
 
-def test_of_many_views_all_pairs_count():
-    assert best_share_of(2) == best_share_of(MAX_VIEWS_FOR_BEST_SHARE) == BEST_SHARE
-    assert best_share_of(MAX_VIEWS_FOR_BEST_SHARE + 1) == 1
+def test_of_many_views_a_smaller_share_of_the_pairs_counts():
+    assert best_share_of(2) == best_share_of(MANY_VIEWS - 1) == BEST_SHARE
+    assert best_share_of(MANY_VIEWS) == BEST_SHARE_OF_MANY < BEST_SHARE

@@ -10,7 +10,7 @@ from free_ray_scene import AIR, ANGLES_DEG, BLOCK, GROUND, N_STEPS, PATCH, SHAPE
 from kernel_scene import even_lattice, ragged_lattice
 from reference import free_rays as twin
 from zlocus.matching import free_rays as stage
-from zlocus.matching.free_rays import add_costs_of_rays, agreement_on, free_rays, pair_agreement
+from zlocus.matching.free_rays import PairAgreement, add_costs_of_rays, agreement_on, free_rays, pair_agreement
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.occlusion import covered_heights
 from zlocus.matching.slope_surface import SlopeSurface
@@ -73,6 +73,15 @@ def test_agreement_of_pairs_against_its_slow_twin():
     np.testing.assert_array_equal(found.untextured, untextured)
     assert (textured >= 2).any()
     assert (untextured >= 1).any()
+
+
+@pytest.mark.parametrize(("n_views", "needed"), [(2, 1), (3, 2), (6, 2), (9, 4), (19, 8)])
+def test_a_height_is_seen_where_a_share_of_the_images_agree(n_views, needed):
+    shape, covering = (n_views, 9, 9), np.full((9, 9), n_views)
+    for n_agreeing in range(n_views):
+        some, none = np.full(shape, n_agreeing, np.uint8), np.zeros(shape, np.uint8)
+        for agreement in (PairAgreement(some, none, covering), PairAgreement(none, some, covering)):
+            assert (agreement.height_is_seen == (n_agreeing >= needed)).all()
 
 
 def test_images_agree_on_the_ground_and_not_in_free_air():

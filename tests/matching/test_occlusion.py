@@ -17,6 +17,7 @@ from zlocus.matching.occlusion import (
     keep_enough_views,
     mark_occlusions,
     sees,
+    usual_number,
 )
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
@@ -127,6 +128,14 @@ def test_a_short_run_that_the_relief_moves_away_from_itself_is_kept():
     assert never.sum() > 50
     for found, expected in zip(rough, level, strict=True):
         np.testing.assert_array_equal(found[0, never], expected[0, never])
+
+
+def test_the_usual_number_of_views_is_that_of_some_cells():
+    covered = np.zeros((3, 2, 4), np.int32)
+    covered[2, :, :2] = 5
+    visible = VisibleHeights(covered, np.full((3, 2, 4), 4, np.int32), np.zeros((3, 2, 4), np.float32))
+    assert usual_number(visible, np.s_[:, :2]) == 2
+    assert usual_number(visible, np.arange(8).reshape(2, 4) > 5) == 3
 
 
 def test_windows_do_not_touch_nodata():

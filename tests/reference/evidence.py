@@ -147,12 +147,17 @@ def grey_roots(planes, half, is_counted, here):
     return sums
 
 
-def pair_weights(worth, views, pairs_per_view):
+def n_compared(n_views, per_view=2, n_first=12):
+    """Number of pairs that are compared: so many for each of the first views, one for each view more."""
+    return min(sum(per_view if k < n_first else 1 for k in range(n_views)), n_views * (n_views - 1) // 2)
+
+
+def pair_weights(worth, views):
     """Weights (i, i) of the pairs of some views by what they are worth, and the number of equally good pairs."""
     pairs = list(combinations(range(len(views)), 2))
     ranked = sorted(pairs, key=lambda pair: -worth[views[pair[0]], views[pair[1]]])
     weights = np.zeros((len(views), len(views)))
-    for a, b in ranked[: int(pairs_per_view * len(views))]:
+    for a, b in ranked[: n_compared(len(views))]:
         weights[a, b] = weights[b, a] = worth[views[a], views[b]]
     n_effective = weights.sum() ** 2 / (weights**2).sum() / 2
     return weights * (2 * len(pairs) / weights.sum()), n_effective

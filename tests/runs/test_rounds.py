@@ -49,6 +49,17 @@ def test_occlusions_are_found_without_a_choice_of_images_too(images, tmp_path, l
     assert [call for call in levels_matched if call[0] == 0] == [(0, True, 2), (0, True, 1)]
 
 
+def test_of_many_images_none_is_excluded_where_a_surface_occludes_it(images, tmp_path, monkeypatch):
+    calls, mark = [], tile.mark_occlusions
+    monkeypatch.setattr(tile, "mark_occlusions", lambda *given: calls.append(given) or mark(*given))
+    run(images("step"), tmp_path / "few")
+    assert calls
+    calls.clear()
+    monkeypatch.setattr(tile, "MANY_VIEWS", 3)
+    run(images("step"), tmp_path / "many")
+    assert calls == []
+
+
 def test_workers_change_nothing(images, tmp_path):
     one, two = (run(images("step"), tmp_path / str(n), SMALL_TWICE, workers=n) for n in (1, 2))
     np.testing.assert_array_equal(*(read(r.out / "dsm.tif")[0] for r in (one, two)))

@@ -130,6 +130,12 @@ def test_the_choice_saves_evaluations(guided):
     assert every["done"] == every["all_images"]
 
 
+def test_where_many_images_show_the_cells_none_is_left_out(town, tmp_path, blocks_used):
+    selection = replace(SMALL_BLOCKS.selection, max_images_for_choice=len(GOOD_VIEWS) - 1)
+    surface(town, tmp_path / "out", replace(SMALL_BLOCKS, selection=selection))
+    assert blocks_used == {}
+
+
 def test_no_cell_that_all_images_see_is_left_empty_by_the_choice(guided, town):
     (some, _), (every, _) = (read(out / "dsm.tif") for out in guided)
     n_views = read(guided[1] / "views.tif")[0]

@@ -27,7 +27,7 @@ from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE, EvidenceTa
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.local_contrast import rounded
-from zlocus.matching.occlusion import PAIR
+from zlocus.matching.occlusion import MANY_VIEWS, PAIR, usual_number
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 
@@ -41,9 +41,8 @@ UNIT_FACTOR_PER_LEVEL = 1.25
 PAIR_EXPONENT = 0.3
 # Of the pairs that see a height, those count that speak most for it, until they are this share of the weight of all. A
 # pair that does not show what the others do, because of an occlusion or a change between two dates, speaks against the
-# right height too. In tiles of more views all pairs count: there a false tower occludes the views that see the ground
-# beside it, and the best of the pairs that are left would confirm it.
-BEST_SHARE, MAX_VIEWS_FOR_BEST_SHARE = 0.7, 12
+# right height too. Of many views fewer pairs are needed, and occluded views are not excluded otherwise.
+BEST_SHARE, BEST_SHARE_OF_MANY = 0.7, 0.3
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
 # Evidence of one pair is at most this, natural units.
@@ -80,8 +79,9 @@ MIN_CELLS_OF_TILE = 4 * MIN_TRUSTED_CELLS
 # The noise of an image is the variance that this share of its small windows is below. Windows are NOISE_EVERY pixels
 # apart.
 NOISE_SHARE, NOISE_WINDOW, NOISE_EVERY, LEAST_VARIANCE = 0.05, (5, 5), 2, 1e-7
-# Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain.
-LEAST_CELLS = 80_000
+# Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain. All pairs are
+# counted in a cell, so that fewer cells are needed of more views than MAX_VIEWS_FOR_CELLS.
+LEAST_CELLS, MAX_VIEWS_FOR_CELLS = 80_000, 12
 # Wrong heights, of which there are many more than right ones, are counted at every fourth height index.
 WRONG_EVERY = 4
 # Of every 2^k blocks of a row the same one is counted as in the row above, shifted by the k-th of these.
@@ -132,7 +132,9 @@ def learned_evidence(
 
     slope_views, slope_arrays, lattice, windows, visible, parameters : as for the costs, see `tile_costs`.
     """
-    n_views, log_every = len(slope_views.layout), log_of_sampling(taught_heights.height.size)
+    n_views = len(slope_views.layout)
+    n_covering = usual_number(visible, np.isfinite(taught_heights.height))
+    log_every = log_of_sampling(taught_heights.height.size, n_covering)
     noise, grey_unit = noise_variance(slope_views), np.ones((n_views, n_views), np.float32)
 
     def counted(log_every: int, wrong_every: int) -> Learning:
@@ -164,14 +166,14 @@ def learned_evidence(
         max_cost=np.float32(MAX_MIDDLE_COST),
         grey_unit=grey_unit,
         worth=worth_of_pairs(learning.right_of_pair, learning.wrong_of_pair),
-        best_share=np.float32(best_share_of(n_views)),
+        best_share=np.float32(best_share_of(n_covering)),
     )
     return TableAndCounts(found, NO_COUNTS)
 
 
-def best_share_of(n_views: int) -> float:
-    """The share of the pairs that counts as evidence in a tile of so many views: see BEST_SHARE."""
-    return BEST_SHARE if n_views <= MAX_VIEWS_FOR_BEST_SHARE else 1.0
+def best_share_of(n_covering: float) -> float:
+    """The share of the pairs that counts as evidence where so many views cover the cells: see BEST_SHARE."""
+    return BEST_SHARE if n_covering < MANY_VIEWS else BEST_SHARE_OF_MANY
 
 
 def nothing_counted(n_views: int, reference: NDArray[np.float32], wrong_every: int) -> Learning:
@@ -304,9 +306,11 @@ def noise_variance(slope_views: TileViews) -> np.float32:
     return np.float32(rounded(float(np.mean(found)))) if found else np.float32(LEAST_VARIANCE)
 
 
-def log_of_sampling(n_cells: int) -> int:
-    """k, where one of 2^k blocks of a level of so many cells is counted."""
-    return max((k for k in range(len(ROW_SHIFTS)) if n_cells >> k >= LEAST_CELLS), default=0)
+def log_of_sampling(n_cells: int, n_covering: float) -> int:
+    """k, where one of 2^k blocks of a level of so many cells is counted, which so many views cover."""
+    n_of_most = MAX_VIEWS_FOR_CELLS * (MAX_VIEWS_FOR_CELLS - 1)
+    least_cells = LEAST_CELLS * min(1.0, n_of_most / max(n_covering * (n_covering - 1.0), 1.0))
+    return max((k for k in range(len(ROW_SHIFTS)) if n_cells >> k >= least_cells), default=0)
 
 
 def sampled_blocks(reference: NDArray[np.float32], block: int, log_every: int) -> NDArray[np.float32]:

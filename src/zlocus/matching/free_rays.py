@@ -38,8 +38,8 @@ MIN_VARIANCE = 1e-6
 MIN_AGREEING_TO_SEE = 2
 MIN_SEEN_SHAPE = np.ones((3, 3), np.uint8)
 # An image that agrees with so many others at a cell's own height has no ray that passes below it. With many images some
-# agree at any height.
-MIN_AGREEING_AT_HEIGHT, MIN_AGREEING_OF_MANY, MANY_VIEWS = 2, 4, 13
+# agree at any height, so that it takes this share of those that cover the cell.
+MIN_AGREEING_AT_HEIGHT, MIN_SHARE_AGREEING = 2, 0.4
 # Holes of this shape between such cells are closed where so many images take part.
 MIN_VIEWS_TO_CLOSE = 5
 CLOSED_SHAPE = np.ones((5, 5), np.uint8)
@@ -54,11 +54,12 @@ class PairAgreement:
     """Number of other images with which each image agrees on each cell of a surface.
 
     textured, untextured : (i, r, c) uint8, images that agree by correlation, and as ground without texture of the same
-    grey value.
+    grey value; n_covering : (r, c), images that cover the cell.
     """
 
     textured: NDArray[np.uint8]
     untextured: NDArray[np.uint8]
+    n_covering: NDArray[np.integer]
 
     @property
     def clearly_seen(self) -> NDArray[np.bool_]:
@@ -70,11 +71,12 @@ class PairAgreement:
     def height_is_seen(self) -> NDArray[np.bool_]:
         """(i, r, c), cells that an image sees at the height of the surface, so that none of its rays passes below."""
         n_views = len(self.textured)
-        need = min(MIN_AGREEING_AT_HEIGHT if n_views < MANY_VIEWS else MIN_AGREEING_OF_MANY, n_views - 1)
+        share = np.rint(np.float32(MIN_SHARE_AGREEING) * self.n_covering)
+        need = np.minimum(np.maximum(share, MIN_AGREEING_AT_HEIGHT), n_views - 1)
         is_seen = ((self.textured >= need) | (self.untextured >= need)).astype(np.uint8)
         if n_views >= MIN_VIEWS_TO_CLOSE:
             is_seen = np.stack([cv2.morphologyEx(mask, cv2.MORPH_CLOSE, CLOSED_SHAPE) for mask in is_seen])
-        return is_seen > 0
+        return np.asarray(is_seen > 0, np.bool_)
 
 
 def pair_agreement(grey: NDArray[np.float32], covering: NDArray[np.bool_]) -> PairAgreement:
@@ -97,7 +99,7 @@ def pair_agreement(grey: NDArray[np.float32], covering: NDArray[np.bool_]) -> Pa
         for view in (i, j):
             textured[view] += agree
             untextured[view] += both_plain
-    return PairAgreement(textured, untextured)
+    return PairAgreement(textured, untextured, covering.sum(axis=0))
 
 
 def agreement_on(tile_views: TileViews, surface: NDArray[np.float32], covering: NDArray[np.bool_]) -> PairAgreement:

@@ -32,6 +32,8 @@ MIN_LEVELS = 3
 MIN_STEPS = 4
 # Places along each side at which two views are compared: of the overlap of a pair, and of the ground of all views.
 PAIR_SAMPLES_PER_SIDE, GROUND_SAMPLES_PER_SIDE = 9, 65
+# Points along each side of a window of cells whose projections say which images, and which of their pixels, it needs.
+WINDOW_POINTS_PER_SIDE = 5
 # Parallax rates are differences over this height above and below a point: at the middle of an image, and elsewhere.
 IMAGE_HALF_HEIGHT_M, PLACE_HALF_HEIGHT_M = 5.0, 0.5
 # Views whose equivalent disparity grows more slowly than this, px per metre, show no heights.
@@ -113,6 +115,12 @@ class MatchScene:
     def transform(self, window: CellWindow, level: int) -> Affine:
         """From cell corners (column, row) of a window of a level to the ground."""
         return window_transform(window, self.anchor, self.cell_size * 2**level)
+
+    def points_of(self, window: CellWindow, level: int) -> NDArray[np.float64]:
+        """Ground points (n, 2) all over a window of a level, m."""
+        transform = self.transform(window, level)
+        across, down = (np.linspace(0, n, WINDOW_POINTS_PER_SIDE) for n in (window.cols, window.rows))
+        return np.array([transform * (c, r) for c in across for r in down])
 
     @property
     def overlap_bounds(self) -> tuple[float, float, float, float]:

@@ -20,6 +20,10 @@ from zlocus.matching.view_directions import cells_per_step, parts_of_one_directi
 EDGE_PX = 3.0
 # A height takes two views.
 PAIR = 2
+# Where so many views cover the cells of a tile, none is excluded where a surface occludes it: a tower that is too wide
+# would exclude just those that see the ground beside it. There the best of the pairs count, which are those without
+# occluded views anyway.
+MANY_VIEWS = 13
 # Where more views cover a cell, at least so many count as unoccluded.
 MIN_UNOCCLUDED = 3
 
@@ -119,6 +123,11 @@ def n_seeing(visible: VisibleHeights, height: NDArray[np.float32]) -> NDArray[np
 def covers(visible: VisibleHeights) -> NDArray[np.bool_]:
     """Which views cover the cells at any height, (..., r, c)."""
     return np.asarray(visible.lowest_covered <= visible.highest_covered)
+
+
+def usual_number(visible: VisibleHeights, cells: tuple[slice, slice] | NDArray[np.bool_]) -> float:
+    """Median number of views that cover some cells, given by their rows and columns or by a mask (r, c)."""
+    return float(np.median(covers(visible).sum(axis=0)[cells]))
 
 
 def in_level_indices(visible: VisibleHeights, slope_cells: NDArray[np.float32]) -> VisibleHeights:

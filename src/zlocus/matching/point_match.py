@@ -41,8 +41,6 @@ IntArray = NDArray[np.int64]
 NEAREST_TIES = 5
 # Tie points within this distance order the images of a cell where none is nearer.
 RANKED_WITHIN_CELLS = 2048
-# Points along each side of a window whose projections say which pixels it needs.
-GROUND_POINTS_PER_SIDE = 5
 
 
 @dataclass(frozen=True)
@@ -390,9 +388,7 @@ def views_around(
 ) -> tuple[list[int], TileViews]:
     """Numbers of the views to compare at a place, and their pixels and projections over a window of cells around it."""
     z_range = heights_around(match_scene, window, place, config.selection)
-    transform = match_scene.transform(window, 0)
-    across, down = (np.linspace(0, n, GROUND_POINTS_PER_SIDE) for n in (window.cols, window.rows))
-    ground_xy = np.array([transform * (c, r) for c in across for r in down])
+    transform, ground_xy = match_scene.transform(window, 0), match_scene.points_of(window, 0)
     candidates = [number for number, view in enumerate(match_scene.views) if shows(view, place.xyz)]
     if len(candidates) > config.selection.max_candidates + 1:
         showing = [match_scene.views[number] for number in candidates]

@@ -36,12 +36,14 @@ from zlocus.matching.level_records import (
 from zlocus.matching.local_contrast import agreement
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.occlusion import (
+    MANY_VIEWS,
     PAIR,
     covered_heights,
     covers,
     in_level_indices,
     keep_enough_views,
     mark_occlusions,
+    usual_number,
 )
 from zlocus.matching.overlap import CoarsestHeights, ExpectedBounds, OverlapGround, find_overlap_window, overlap_ground
 from zlocus.matching.pair_labels import PairLabels, TileLabels, label_pairs_at_ties
@@ -64,10 +66,7 @@ from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile_views import PixelWindow, TileGrid, TileViews, pixel_window, read_pixels, tile_views
-from zlocus.matching.view_selection import ChosenViews, choose_views, preselected
-
-# Points along each side of a tile whose projections say which images may see it.
-GROUND_POINTS_PER_SIDE = 5
+from zlocus.matching.view_selection import ChosenViews, choose_views, preselected, usual_number_showing
 
 
 @dataclass(frozen=True)
@@ -157,13 +156,21 @@ def read_tile(
     choose_images: bool = True,
 ) -> TileInputs:
     """Read the pixels of the views that may see a tile; of many views, if images are chosen, only the best
-    candidates."""
+    candidates.
+
+    Nothing is chosen for the blocks of a tile whose cells many views show.
+    """
     ground_xy, windows = windows_of(match_scene, core_window, config)
-    numbers = list(windows)
-    if choose_images and len(numbers) > config.selection.max_candidates + 1:
+    numbers, options = list(windows), config.selection
+    if choose_images and len(numbers) > options.max_candidates + 1:
         views = [match_scene.views[n] for n in numbers]
-        rows = preselected(views, ground_xy, match_scene.ground_height, config.selection)
+        rows = preselected(views, ground_xy, match_scene.ground_height, options)
         numbers = [numbers[row] for row in rows]
+    if choose_images and len(numbers) > options.max_images_for_choice:
+        views = [match_scene.views[n] for n in numbers]
+        core_xy = match_scene.points_of(core_window, 0)
+        n_showing = usual_number_showing(views, core_xy, match_scene.ground_height)
+        choose_images = n_showing <= options.max_images_for_choice
     view_pixels = [
         read_pixels(match_scene.views[n], windows[n], match_scene.levels, match_scene.grey_scales[n]) for n in numbers
     ]
@@ -181,10 +188,7 @@ def windows_of(
     coarsest, options = match_scene.levels - 1, config.pyramid
     limit_window = match_scene.overlap_window.at_level(coarsest, 0)
     window = level_window(core_window, coarsest, options.halo, options.block, limit_window)
-    transform = match_scene.transform(window, coarsest)
-    across, down = (np.linspace(0, n, GROUND_POINTS_PER_SIDE) for n in (window.cols, window.rows))
-    ground_xy = np.array([transform * (c, r) for c in across for r in down])
-    windows = {}
+    ground_xy, windows = match_scene.points_of(window, coarsest), {}
     for number in match_scene.views_near(ground_xy):
         view_window = pixel_window(match_scene.views[number], ground_xy, match_scene.z_range, 2**coarsest)
         if view_window is not None:
@@ -321,7 +325,7 @@ def match_level(
     """
     config = tile.config
     search = search_along_slope(tile, level, prior)
-    visible = visible_heights(tile, search, prior)
+    visible = visible_heights(tile, level, search, prior)
     chosen = _chosen_views(tile, level, search, visible, prior, pair_labels)
     taught_heights = None
     if earlier_result is not None and learns_evidence(tile):
@@ -382,13 +386,15 @@ def _project(tile: TileInputs, level: PyramidLevel, prior: SearchPrior) -> TileV
     )  # fmt: skip
 
 
-def visible_heights(tile: TileInputs, search: LevelSearch, prior: SearchPrior) -> VisibleHeights:
+def visible_heights(tile: TileInputs, level: PyramidLevel, search: LevelSearch, prior: SearchPrior) -> VisibleHeights:
     """Visible height ranges of all views, slope indices.
 
-    Where a surface is known and there are three views or more, heights at which it occludes a view are excluded.
+    Where a surface is known and there are three views or more, but not many, heights at which it occludes a view are
+    excluded.
     """
     visible = covered_heights(search.slope_views, search.slope_surface, search.lattice)
-    if prior.surface is not None and tile.handles_occlusion:
+    are_few = usual_number(visible, level.core) < MANY_VIEWS
+    if prior.surface is not None and tile.handles_occlusion and are_few:
         occluder = cv2.erode(prior.surface, prior.erosion)
         margin_steps = value_of(tile.config.cost, "occlusion_margin_steps")
         mark_occlusions(visible, search.tile_views, occluder, search.slope_surface.cells, margin_steps)

@@ -82,6 +82,10 @@ class SelectionOptions(Checked):
     min_images_for_choice: int = option(
         7, "A tile that fewer images see uses all of them.", low=3, high=255
     )  # fmt: skip
+    max_images_for_choice: int = option(
+        12, "A tile whose cells more images show uses all its candidates: the best of many pairs mislead less than a "
+        "few chosen images.", low=2, high=255,
+    )  # fmt: skip
     min_images: int = option(
         2, "Number of search images that a cell uses, whatever their labels are.", low=1, high=254
     )  # fmt: skip
@@ -90,7 +94,7 @@ class SelectionOptions(Checked):
         low=1, high=254,
     )  # fmt: skip
     max_candidates: int = option(
-        12, "Largest number of search images that are considered for a tile.", low=1, high=254
+        24, "Largest number of search images that are considered for a tile.", low=1, high=254
     )  # fmt: skip
     min_overlap: float = option(
         0.2, "Images that see a smaller share of a tile are considered last.", low=0.0, high=1.0

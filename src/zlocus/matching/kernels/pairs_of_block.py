@@ -8,9 +8,9 @@ import numpy as np
 
 from zlocus.core.jit import kernel
 
-# So many pairs for each view are compared, those that are worth most: the time grows like the number of views, and not
-# like its square.
-PAIRS_PER_VIEW = 2.0
+# So many pairs for each of the first views are compared, and one for each view more, those that are worth most: the
+# time grows like the number of views, and not like its square.
+PAIRS_PER_VIEW, N_FIRST_VIEWS = 2, 12
 
 
 class PairsOfBlock(NamedTuple):
@@ -39,7 +39,7 @@ def pairs_of_block(worth, views):
         for b in range(a + 1, n):
             of_pairs[k] = worth[views[a], views[b]]
             k += 1
-    n_compared = min(np.int64(PAIRS_PER_VIEW * n), n_pairs)
+    n_compared = min(n + (PAIRS_PER_VIEW - 1) * min(n, N_FIRST_VIEWS), n_pairs)
     least = np.sort(of_pairs)[n_pairs - n_compared]
     total, squares = np.float32(0.0), np.float32(0.0)
     for value in of_pairs:

@@ -266,6 +266,10 @@ function ofRun(found) {
     return `${used}With fewer than ${surface.min_images_for_choice} images the run uses all of them: order and stop ` +
       `are those that the rule gives for this single cell.${curves_text}`;
   }
+  if (surface.images.length > surface.max_images_for_choice) {
+    return `${used}The run chooses images where at most ${surface.max_images_for_choice} see a place, by the same rule, ` +
+      `for matching blocks. Where more see it, all its candidates are used.${curves_text}`;
+  }
   return `${used}It applies the same rule to matching blocks, on the next coarser pyramid level.${curves_text}`;
 }
 
