@@ -41,7 +41,8 @@ UNIT_FACTOR_PER_LEVEL = 1.25
 PAIR_EXPONENT = 0.3
 # Of the pairs that see a height, those count that speak most for it, until they are this share of the weight of all. A
 # pair that does not show what the others do, because of an occlusion or a change between two dates, speaks against the
-# right height too. Of many views fewer pairs are needed, and occluded views are not excluded otherwise.
+# right height too. Where many views cover the cells, half of them may be occluded, and none is excluded: there only a
+# smaller share of the pairs shows the surface.
 BEST_SHARE, BEST_SHARE_OF_MANY = 0.7, 0.3
 # Cost of a height without evidence is at most this, so that evidence against a height has room below 255.
 MAX_MIDDLE_COST = 160.0
@@ -79,9 +80,9 @@ MIN_CELLS_OF_TILE = 4 * MIN_TRUSTED_CELLS
 # The noise of an image is the variance that this share of its small windows is below. Windows are NOISE_EVERY pixels
 # apart.
 NOISE_SHARE, NOISE_WINDOW, NOISE_EVERY, LEAST_VARIANCE = 0.05, (5, 5), 2, 1e-7
-# Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain. All pairs are
-# counted in a cell, so that fewer cells are needed of more views than MAX_VIEWS_FOR_CELLS.
-LEAST_CELLS, MAX_VIEWS_FOR_CELLS = 80_000, 12
+# Only every second, fourth, eighth or sixteenth block of a level is counted where so many cells remain. A cell counts
+# once for each pair of views, so that where more than so many views cover the cells, fewer cells are enough.
+LEAST_CELLS, VIEWS_OF_LEAST_CELLS = 80_000, 12
 # Wrong heights, of which there are many more than right ones, are counted at every fourth height index.
 WRONG_EVERY = 4
 # Of every 2^k blocks of a row the same one is counted as in the row above, shifted by the k-th of these.
@@ -308,8 +309,8 @@ def noise_variance(slope_views: TileViews) -> np.float32:
 
 def log_of_sampling(n_cells: int, n_covering: float) -> int:
     """k, where one of 2^k blocks of a level of so many cells is counted, which so many views cover."""
-    n_of_most = MAX_VIEWS_FOR_CELLS * (MAX_VIEWS_FOR_CELLS - 1)
-    least_cells = LEAST_CELLS * min(1.0, n_of_most / max(n_covering * (n_covering - 1.0), 1.0))
+    n_pairs, n_enough = n_covering * (n_covering - 1.0), VIEWS_OF_LEAST_CELLS * (VIEWS_OF_LEAST_CELLS - 1)
+    least_cells = LEAST_CELLS * min(1.0, n_enough / max(n_pairs, 1.0))
     return max((k for k in range(len(ROW_SHIFTS)) if n_cells >> k >= least_cells), default=0)
 
 
