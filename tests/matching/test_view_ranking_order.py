@@ -271,10 +271,10 @@ def test_a_hundred_images():
     rng = np.random.default_rng(8)
     given_numbers = geometry(rng.uniform(0, 1, 100), rng.uniform(0, 80, 100), rng.uniform(0, 900, 100))
     chosen = candidate_images(given_numbers, SelectionOptions())
-    assert len(set(chosen.tolist())) == 12
+    assert len(set(chosen.tolist())) == 24
     assert (given_numbers.overlap[chosen] >= 0.2).all()
     assert ((given_numbers.angle_deg[chosen] >= 5) & (given_numbers.angle_deg[chosen] <= 45)).all()
-    assert chosen.tolist() == candidate_images(given_numbers, SelectionOptions(max_candidates=50)).tolist()[:12]
+    assert chosen.tolist() == candidate_images(given_numbers, SelectionOptions(max_candidates=50)).tolist()[:24]
 
 
 def test_angles_that_contradict_each_other_are_refused():
