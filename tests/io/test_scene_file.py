@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import datetime
 import os
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
 from pyproj import CRS
 
@@ -49,6 +51,17 @@ def test_scene_of_images_has_the_utm_zone_of_its_centre(pair):
     assert (scene.bounds, scene.heights) == (None, None)
     xyz = scene.views[0].sensor.ground_from_image(np.array([[200.0, 150.0]]), np.array([Z]))
     np.testing.assert_allclose(scene.views[1].sensor.image_from_ground(xyz), [[100, 150]], atol=1e-6)
+
+
+def test_the_date_of_a_view_is_that_of_the_scene_file_else_that_of_its_image(tmp_path, pair):
+    for path in pair:
+        with rasterio.open(path, "r+") as file:
+            file.update_tags(NITF_IDATIM="20141005160138")
+    given = document()
+    given["views"][1]["date"] = datetime.date(2016, 2, 3)
+    dates = [view.date for view in open_scene([write(tmp_path, given)]).views]
+    assert dates == [datetime.date(2014, 10, 5), datetime.date(2016, 2, 3)]
+    assert [view.date for view in open_scene(pair).views] == [datetime.date(2014, 10, 5)] * 2
 
 
 @pytest.mark.parametrize(("lon", "lat", "epsg"), [(5.5, -43.25, 32731), (179.99, 10.0, 32660), (-180.0, 10.0, 32601)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 import warnings
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import HeldPixels, ImageWindow
+from zlocus.io.image_dates import date_of_exposure
 from zlocus.io.open_raster import (
     UNCOMPRESSED_DRIVERS,
     cached_raster,
@@ -53,7 +55,7 @@ class RasterImage:
     bands : 1-based indices of the bands that are read; weights : their weights in the grey value; plateau : pixels of
     one value at the border, which are invalid, see `with_plateau`; held : the parts that a sparse file stores, see
     `SparseSource`; state : size and time of the file when it was opened, see `file_state`; sources : other files from
-    which pixels or mask are read.
+    which pixels or mask are read; date : of the exposure, None where the file does not say.
     """
 
     path: Path
@@ -67,6 +69,7 @@ class RasterImage:
     held: HeldPixels | None = field(default=None, compare=False, repr=False)
     state: tuple[int, ...] = field(default=(), compare=False, repr=False)
     sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
+    date: datetime.date | None = field(default=None, compare=False, repr=False)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """Read the window of rows x cols pixels that starts at (row, col) and lies inside the image.
@@ -166,7 +169,8 @@ def open_image(path: Path) -> RasterImage:
                 "its blocks was ever written. Copy it again from its source, or leave it out."
             )
         image._read(source, _last_block(source, bands[0]))
-        return replace(image, held=held, state=tuple(state), sources=_sources(source, path))
+        date = date_of_exposure(source)
+        return replace(image, held=held, state=tuple(state), sources=_sources(source, path), date=date)
 
 
 def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:

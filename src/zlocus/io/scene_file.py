@@ -89,7 +89,7 @@ class Area(StrictModel):
 
 
 class ViewEntry(StrictModel):
-    """An image and its camera. name : unique in the scene; date : of the exposure."""
+    """An image and its camera. name : unique in the scene; date : of the exposure, None for what the image says."""
 
     name: str = Field(min_length=1)
     image: str
@@ -299,7 +299,8 @@ class _OpenedView:
     def view(self, crs: CRS) -> View:
         """The view in the frame of the scene."""
         entry = self.entry
-        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, entry.date)
+        date = entry.date or self.image.date
+        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, date)
 
 
 def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[RefusedView] | None = None) -> _SceneInput:
