@@ -164,7 +164,7 @@ def costs_case(
     volume = np.empty(heights.size, np.uint8)
     visible, half = all_visible(n_views, side), np.array(windows, np.int64)
     values = (np.float32(value) for value in (0.0, weight, weight, 0.3, 0.5))
-    parameters, wide = CostParameters(*values, n_views), side + 2 * max(windows)
+    parameters, wide = CostParameters(*values, n_views, np.float32(0.0)), side + 2 * max(windows)
     slope = SlopeArrays(np.zeros((wide, wide), np.float32), np.zeros((side // BLOCK + 1, side // BLOCK + 1)))
     arrays, layout = ViewArrays(*views(n_views, side), BLOCK), heights.layout
 

@@ -58,6 +58,7 @@ CASES = {
     "cones, 3 views": Case("cones", (("im2.png", 0.0), ("im6.png", 1.0), ("im4.png", 0.5)), 63, CONES_TRUTH),
     "teddy, 2 views": Case("teddy", (("im2.png", 0.0), ("im6.png", 1.0)), 63, CONES_TRUTH),
     "tsukuba, 2 views": Case("tsukuba", TSUKUBA[:2], 15, TSUKUBA_TRUTH),
+    "tsukuba, 3 views": Case("tsukuba", (*TSUKUBA[:2], TSUKUBA[3]), 15, TSUKUBA_TRUTH),
     "tsukuba, 5 views": Case("tsukuba", TSUKUBA, 15, TSUKUBA_TRUTH),
 }
 

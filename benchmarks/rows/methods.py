@@ -123,10 +123,11 @@ def middlebury(workplace: Workplace) -> list[Figure]:
     for name, case in found.items():
         figures.append(Figure(f"{name}: OpenCV, bad > 1 px", case.opencv, "%", is_detail=True))
         figures.append(Figure(f"{name}: left empty before gaps are filled", case.unfilled, "%", is_detail=True))
-    for more, fewer in (("cones, 3 views", "cones, 2 views"), ("tsukuba, 5 views", "tsukuba, 2 views")):
+    for scene, more in (("cones", 3), ("tsukuba", 3), ("tsukuba", 5)):
+        of_more, of_two = f"{scene}, {more} views", f"{scene}, 2 views"
         figures.append(
             Figure(
-                f"{more} over {fewer}", share[more] / share[fewer], at_most=1,
+                f"{of_more} over {of_two}", share[of_more] / share[of_two], at_most=0.9,
                 fails_when="further images add false heights instead of removing them",
             )
         )  # fmt: skip

@@ -59,6 +59,8 @@ ROWS: dict[str, Row] = {
     "pairs-of-triplet": Row("rows.real_images:pairs_of_triplet", WITHOUT_TRUTH),
     "independent-surfaces": Row("rows.real_images:independent_surfaces", WITHOUT_TRUTH),
     "left-out-views": Row("rows.real_images:left_out_views", WITHOUT_TRUTH),
+    "many-images": Row("rows.many_images:many_images"),
+    "more-images": Row("rows.many_images:more_images", WITHOUT_TRUTH, is_slow=True),
     "middlebury": Row("rows.methods:middlebury"),
     "selection": Row("rows.methods:selection"),
     "city": Row("rows.rendered:city"),

@@ -30,7 +30,7 @@ from zlocus.core.options import (
 from zlocus.core.options.option_fields import value_of
 from zlocus.core.scene import Scene, View
 from zlocus.matching import subpixel
-from zlocus.matching.cost_volume import GREY_SHARE_OF_ONE_PAIR, cost_parameters, cost_volume
+from zlocus.matching.cost_volume import CountedPairs, cost_parameters, cost_volume
 from zlocus.matching.kernels.shared_records import NEVER_OCCLUDED, VisibleHeights
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.kernels.subpixel import CUBIC, ProfileSampling
@@ -250,7 +250,7 @@ def test_costs_are_those_of_windows_cut_out_one_by_one(stages):
     views, lattice, slope_surface = stages.views, stages.lattice, stages.search.slope_surface
     options = CONFIG.cost
     halves = sorted({options.small_window // 2, large_window_side(options) // 2})
-    parameters = cost_parameters(options, GREY_SHARE_OF_ONE_PAIR)
+    parameters = cost_parameters(options, CountedPairs())
     volume, lowest = stages.dense(stages.cost), int(lattice.first.min())
     padded = slope_surface.padded(max(halves))
     for b, d, rows, cols in stages.blocks():

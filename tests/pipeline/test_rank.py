@@ -58,11 +58,15 @@ def test_good_images_are_good_at_all_points(images, tmp_path):
 
 def test_a_covered_image_is_last(with_noise, tmp_path):
     said = rank(with_noise, tmp_path / "out")
-    assert said.splitlines()[-1].endswith(", aft.")
+    ranks, keep, direction = said.splitlines()[-3:]
+    assert ranks.endswith(", aft.")
+    assert keep.startswith("Keep ")
+    assert direction.startswith("No direction is missing: the rays of 3 images differ by up to ")
 
 
 def test_two_images_are_ranked_too(images, tmp_path):
-    rank(images("sine").inputs[:2], tmp_path / "out")
+    said = rank(images("sine").inputs[:2], tmp_path / "out")
+    assert said.splitlines()[-1].startswith("Buy a third image")
     assert len(json.loads((tmp_path / "out" / "ranking.json").read_text())["pairs"]) == 1
 
 

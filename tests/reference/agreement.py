@@ -69,6 +69,21 @@ def mean_closeness(greys, visible, max_difference, excluded=0.0):
     return over_pairs(total, visible, excluded)
 
 
+def best_of_reference(scores, is_seen, share):
+    """Mean (r, c) of the best share of the pairs of the first view that see the cell, 0 where none does.
+
+    scores : (k, r, c), of every pair; is_seen : (k, r, c) bool.
+    """
+    out = np.zeros(scores.shape[1:])
+    for cell in np.ndindex(out.shape):
+        left, total = share * is_seen[(slice(None), *cell)].sum(), 0.0
+        for score in sorted(scores[(is_seen[(slice(None), *cell)], *cell)], reverse=True):
+            total += min(1.0, left) * score
+            left = max(left - 1.0, 0.0)
+        out[cell] = total / max(share * is_seen[(slice(None), *cell)].sum(), 1e-9)
+    return out
+
+
 def cell_costs(images, nodes, heights, index, block, halves, visible, parameters, relief):
     """64 (1 - mean NCC + weight (1 - mean closeness)) of a block's cells at one height, (r, c), before rounding.
 
@@ -89,12 +104,23 @@ def cell_costs(images, nodes, heights, index, block, halves, visible, parameters
     ]
     covered = (low <= index) & (index <= high)
     usable = np.stack([covered & (free_from <= index), low <= high])
-    by_window = []
-    for small in halves:
-        trim = half - small
-        inner = [plane[trim : plane.shape[0] - trim, trim : plane.shape[1] - trim] for plane in planes]
-        by_window.append(mean_ncc(inner, usable, small, variance, excluded))
+    inner_planes = [
+        [plane[half - w : plane.shape[0] - half + w, half - w : plane.shape[1] - half + w] for plane in planes]
+        for w in halves
+    ]
     greys = [plane[half:-half, half:-half] for plane in planes]
+    # A view takes part in a block where some of its cells see the height from, and others below, what occludes them.
+    takes_part = (np.maximum(low, free_from).min(axis=(1, 2)) <= index) & (index <= high.max(axis=(1, 2)))
+    if p.best_share_of_reference > 0 and takes_part.sum() > 2 and takes_part[0]:
+        scores = [
+            np.mean([ncc(windows(inner[0], w), windows(inner[b], w), variance)
+                     for w, inner in zip(halves, inner_planes, strict=True)], axis=0)
+            + weight * np.maximum(0.0, 1.0 - np.abs(greys[0] - greys[b]) / max_difference)
+            for b in range(1, len(planes))
+        ]  # fmt: skip
+        best = best_of_reference(np.stack(scores), usable[0][:1] & usable[0][1:], float(p.best_share_of_reference))
+        return np.where(covered.sum(axis=0) > 1, 64.0 * (1.0 + weight - best), UNCOVERED_COST * (1.0 + weight))
+    by_window = [mean_ncc(inner, usable, w, variance, excluded) for w, inner in zip(halves, inner_planes, strict=True)]
     apart = 1.0 - np.mean(by_window, axis=0) + weight * (1.0 - mean_closeness(greys, usable, max_difference, excluded))
     return np.where(covered.sum(axis=0) > 1, 64.0 * apart, UNCOVERED_COST * (1.0 + weight))
 

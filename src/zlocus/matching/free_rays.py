@@ -46,7 +46,7 @@ CLOSED_SHAPE = np.ones((5, 5), np.uint8)
 # Height steps by which a height must stand above a ray to obstruct it, and the cost of doing so for each ray, at the
 # finest level and at coarser ones, where a step is higher and jumps are cheaper; and the largest cost.
 MARGIN_STEPS, COARSER_MARGIN_STEPS = 8.0, 4.0
-RAY_COST, COARSER_RAY_COST, MAX_RAY_COST = 12, 20, 80
+RAY_COST, COARSER_RAY_COST, MAX_RAY_COST = 20, 25, 160
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
-from zlocus.matching.cost_volume import GREY_SHARE_OF_ONE_PAIR, cost_volume
+from zlocus.matching.cost_volume import CountedPairs, cost_volume
 from zlocus.matching.edge_penalties import penalties_at_edges
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
 from zlocus.matching.expected_heights import expected_of_searched
@@ -240,13 +240,6 @@ def _slope_of_heights(tile: TileInputs, result: LevelResult) -> SlopeSurface:
     return SlopeSurface.from_surface(smooth, tile.config.pyramid.block)
 
 
-def grey_share_of_one_pair(tile: TileInputs) -> float:
-    """Share of the weight of grey differences in blocks that only two images cover, see `cost_parameters`: all of it
-    where the scene has no more images, and in image space."""
-    is_usual = len(tile.match_scene.views) == PAIR or tile.method == "gc3-sgm"
-    return 1.0 if is_usual else GREY_SHARE_OF_ONE_PAIR
-
-
 def add_evaluations(result: LevelResult, earlier_result: LevelResult) -> LevelResult:
     """A level's result with the evaluations of an earlier pass over the same level added."""
     return replace(
@@ -337,7 +330,7 @@ def match_level(
         search.lattice,
         chosen.matched,
         config.cost,
-        grey_share_of_one_pair(tile),
+        CountedPairs.of(tile),
         taught_heights,
     )
     if tile.method != "mvll" and prior.coarser_result is None:

@@ -14,12 +14,14 @@ from zlocus.core.progress import Progress
 from zlocus.core.requests import RankRequest, SetupRequest, check_output
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, result_record, write_record
+from zlocus.matching.match_scene import parallax_rate
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.tile import rank_tile
 from zlocus.pipeline.execution.plan import plan_tiles
 from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.orient import check_ties
 from zlocus.pipeline.output_folder import made_folder
+from zlocus.pipeline.rank_advice import SharedPoints, advice
 from zlocus.pipeline.setup import RunSetup, open_inputs, orient_views, set_up_run
 from zlocus.products.tie_layers import counted_pairs, label_counts, write_ranking, write_ties
 
@@ -27,7 +29,8 @@ from zlocus.products.tie_layers import counted_pairs, label_counts, write_rankin
 def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str:
     """Label every pair of images at the tie points, as `zlocus dsm` does to choose images.
 
-    Writes ranking.gpkg, ranking.json and ties.gpkg to `request.out`, and returns a table of the labels.
+    Writes ranking.gpkg, ranking.json and ties.gpkg to `request.out`. Returns a table of the labels, and sentences that
+    say which images to keep, to drop and to buy.
 
     Raises
     ------
@@ -55,7 +58,10 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
         counts = label_counts(labelled_ties, len(names))
         write_record(request.out / "ranking.json", ranking_record(counts, names))
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
-    return ranking_table(counts, names)
+    views = setup.match_scene.views
+    rates = np.array([parallax_rate(view, setup.match_scene.ground_height) for view in views])
+    said = advice(SharedPoints.of(labelled_ties, views), rates, names, config.selection)
+    return "\n".join([ranking_table(counts, names), *said])
 
 
 def rank_tiles(setup: RunSetup, workers: int, config: RunConfig, progress: Progress) -> list[LabelledTies]:

@@ -51,16 +51,21 @@ from zlocus.matching.kernels.shared_records import NEVER_COVERED, HeightSpan, Vi
 NCC = 2e-5
 # A cost is a whole number; where its plain value is near a half, rounding may fall either way.
 COST = 0.51
+# The limit between the best pairs and the others is found to 0.02 of the sum of the scores over the windows.
+BEST_COST = COST + 64 * 0.02
 HALVES = np.array([1, 2])
 
 
-def parameters(variance, grey_weight, two_images, max_grey_difference, excluded):
+def parameters(variance, grey_weight, two_images, max_grey_difference, excluded, best_share=0.0):
     """Parameters of the cost; the large window is used however many views cover a block."""
     values = [np.float32(v) for v in (variance, grey_weight, two_images, max_grey_difference, excluded)]
-    return CostParameters(*values, max_images_for_large_window=255)
+    return CostParameters(*values, max_images_for_large_window=255, best_share_of_reference=np.float32(best_share))
 
 
 PLAIN, GREYS = parameters(0.0, 0.0, 0.0, 1.0, 0.0), parameters(0.02, 0.8, 0.3, 1.5, 0.4)
+BEST_PLAIN, BEST_GREYS = (
+    values._replace(best_share_of_reference=np.float32(share)) for values, share in ((PLAIN, 0.5), (GREYS, 0.6))
+)
 
 
 def bases(scene, half, bumps=1.5, seed=0):
@@ -230,7 +235,9 @@ def test_a_window_without_texture_agrees_with_nothing(half):
         assert np.abs(found).max() <= 1.0 + 1e-3
 
 
-@pytest.mark.parametrize("options", [PLAIN, GREYS], ids=["plain", "greys"])
+@pytest.mark.parametrize(
+    "options", [PLAIN, GREYS, BEST_PLAIN, BEST_GREYS], ids=["plain", "greys", "best", "best-greys"]
+)
 @pytest.mark.parametrize(
     ("n_views", "shape", "block"), [(2, (37, 70), 32), (3, (37, 70), 16), (5, (9, 11), 32), (3, (33, 17), 16)]
 )
@@ -240,12 +247,22 @@ def test_costs_of_a_tile(n_views, shape, block, options):
     expected = twin_costs(scene, lattice, scene.all_visible(), options=options, bumps=1.5)
     searched = np.isfinite(expected)
     assert (np.isfinite(found) == searched).all()
-    assert np.abs(found[searched] - expected[searched]).max() < COST
+    apart = np.abs(found[searched] - expected[searched])
+    assert apart.max() < (BEST_COST if options.best_share_of_reference > 0 else COST)
+    assert (apart < COST).mean() > 0.99
 
 
 @pytest.mark.parametrize(
     ("halves", "options"),
-    [([1, 2], PLAIN), ([3], parameters(0.05, 0.0, 0.0, 1.0, 1.0)), ([2, 4], PLAIN), ([1, 2], GREYS), ([1], GREYS)],
+    [
+        ([1, 2], PLAIN),
+        ([3], parameters(0.05, 0.0, 0.0, 1.0, 1.0)),
+        ([2, 4], PLAIN),
+        ([1, 2], GREYS),
+        ([1], GREYS),
+        ([1], BEST_PLAIN),
+        ([1, 2], BEST_GREYS),
+    ],
 )
 def test_costs_with_occluded_views(halves, options):
     scene, lattice = kernel_scene(4, (20, 26), 16), ragged_lattice((20, 26), 16, seed=3)
@@ -253,10 +270,32 @@ def test_costs_with_occluded_views(halves, options):
     found = dense(costs(scene, lattice, visible, halves, options, 1.5), lattice, np.inf)
     expected = twin_costs(scene, lattice, visible, halves, options, 1.5)
     searched = np.isfinite(expected)
-    assert np.abs(found[searched] - expected[searched]).max() < COST
+    apart = np.abs(found[searched] - expected[searched])
+    assert apart.max() < (BEST_COST if options.best_share_of_reference > 0 else COST)
+    assert (apart < COST).mean() > 0.99
     alone = ((visible.lowest_covered <= visible.highest_covered).sum(axis=0) < 2)[..., None] & searched
     assert alone.any()
     assert (found[alone] == round(twin.UNCOVERED_COST * (1.0 + options.grey_weight))).all()
+
+
+def test_an_image_that_does_not_show_what_the_reference_does_is_not_counted():
+    """One of two further images is replaced by noise: the other alone gives the cost, whichever it is."""
+    scene, lattice = kernel_scene(3, (20, 26), 16), even_lattice(16, (20, 26), 16)
+    pair = kernel_scene(3, (20, 26), 16)
+    visible = pair.all_visible()
+    visible.lowest_covered[2], visible.highest_covered[2] = NEVER_COVERED, -1
+    rng, (start, rows, cols) = np.random.default_rng(6), (int(v) for v in scene.layout[2])
+    scene.pixels[start : start + rows * cols] = rng.normal(size=rows * cols).astype(np.float32)
+    alone = costs(pair, lattice, visible, options=GREYS._replace(grey_weight_of_one_pair=GREYS.grey_weight))
+    best, mean = (
+        costs(scene, lattice, scene.all_visible(), options=GREYS._replace(best_share_of_reference=np.float32(share)))
+        for share in (0.5, 0.0)
+    )
+    least_alone, least_best, least_mean = (
+        dense(volume, lattice, np.inf).min(axis=-1).mean() for volume in (alone, best, mean)
+    )
+    assert least_best <= least_alone + 1.0
+    assert least_mean > least_alone + 10.0
 
 
 def test_many_views_take_the_smallest_window_alone():

@@ -29,7 +29,7 @@ from zlocus.matching.kernels.shared_records import NEVER_COVERED
 
 HALVES = np.array([1, 2])
 EXCLUDED, BEST_SHARE = 0.4, 0.7
-PARAMETERS = CostParameters(*(np.float32(v) for v in (0.0, 1.0, 0.3, 0.3, EXCLUDED)), max_images_for_large_window=255)
+PARAMETERS = CostParameters(*(np.float32(v) for v in (0.0, 1.0, 0.3, 0.3, EXCLUDED)), 255, np.float32(0.0))
 WORK = np.zeros((4, 0), np.float32)
 PAIR = ViewPair(np.uint64(0), np.uint64(1))
 NOISE = 0.05

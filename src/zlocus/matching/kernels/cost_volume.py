@@ -26,6 +26,7 @@ from zlocus.matching.kernels.pairs_of_block import (
     weights_of_covering,
     weights_with_occlusion,
 )
+from zlocus.matching.kernels.reference_pairs import write_best_of_reference
 from zlocus.matching.kernels.resample import (
     block_grid,
     block_velocity,
@@ -61,6 +62,7 @@ class CostParameters(NamedTuple):
     max_grey_difference: np.float32  # f4: grey difference at which two views do not agree at all
     occluded_pairs_excluded: np.float32  # f4: how far pairs with an occluded view are excluded from the mean
     max_images_for_large_window: int  # i8: blocks that more views cover take the smallest window only
+    best_share_of_reference: np.float32  # f4: share of the pairs of the first view that count, 0: all pairs of views
 
 
 class SlopeArrays(NamedTuple):
@@ -80,6 +82,7 @@ class PairWeights(NamedTuple):
     excluded: np.float32  # f4: how far pairs with an occluded view are left out of the mean
     of_block: PairsOfBlock  # PairsOfBlock: the pairs of the views that cover the block
     grey_weight: np.float32  # f4: weight of grey differences
+    best_share_of_reference: np.float32  # f4: see `CostParameters`; 0 where the first view does not see the block
     height: np.int32  # i4: height index
 
 
@@ -291,6 +294,10 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
             weights_with_occlusion(weights.of_covering, weights.excluded, n, weights.of_seeing)
         scale = cost_of_unit(evidence.table, weights.of_block.n_effective, n_sizes)
         evidence_costs(total, of_pair, n_covering, evidence.table, scale, n, out)
+    elif weights.best_share_of_reference > np.float32(0.0):
+        write_best_of_reference(at_height, moments, scratch, weight, weights.best_share_of_reference, n, total)
+        weights.of_seeing[:n] = 1.0
+        rounded_costs(total, weights.of_seeing, n_covering, weight, n_sizes, n, out)
     else:
         if weights.is_part:
             count_seeing_pairs(weights.counts[1], n, weights.of_seeing)
@@ -300,6 +307,15 @@ def costs_at_height(at_height, moments, scratch, weights, evidence, total, out):
         totals = total.reshape((1, 1, total.shape[0]))
         add_pairs(at_height.planes, at_height.windows, moments, at_height.width, n, scratch.work, totals)
         rounded_costs(total, of_pair, n_covering, weight, n_sizes, n, out)
+
+
+# TableAndCounts, f4, f4 -> f4
+@kernel
+def factor_of_greys(evidence, weight, max_difference):
+    """By what grey values are multiplied before they are compared: 1 where bins are made of them, or where they have no
+    weight; else so that the grey difference at which two views do not agree at all becomes the weight."""
+    has_bins = evidence.table.log_ratios.shape[0] > 0 or evidence.learning.right.shape[0] > 0
+    return np.float32(1.0) if has_bins or weight == np.float32(0.0) else weight / max_difference
 
 
 # ViewArrays, (r,c) f4, HeightSpan, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (r,d) u1 -> None
@@ -332,8 +348,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     pairs_compared = pairs_of_block(evidence.table.worth, takes)
     if evidence.table.log_ratios.shape[0] > 0:
         weights_of_covering(flat, takes, pairs_compared.weights, pairs)
-    uses_bins = evidence.table.log_ratios.shape[0] > 0 or evidence.learning.right.shape[0] > 0
-    grey_factor = np.float32(1.0) if uses_bins else weight * np.float32(n_sizes) / parameters.max_grey_difference
+    grey_factor = factor_of_greys(evidence, weight * np.float32(n_sizes), parameters.max_grey_difference)
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
         if not is_height_needed(evidence.learning, height):
@@ -359,8 +374,9 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
                 exclude_unseen(shown, n, scale[m], grey, GREY_OF_UNSEEING_VIEW * np.float32(m + 1))
             in_block[m] = i
             m += 1
-        excluded = parameters.occluded_pairs_excluded
-        weights = PairWeights(pairs, shown, counts, n_whole < n_views, excluded, pairs_compared, weight, height)
+        share = parameters.best_share_of_reference if m > 2 and takes[in_block[0]] == 0 else np.float32(0.0)
+        excluded, is_part = parameters.occluded_pairs_excluded, n_whole < n_views
+        weights = PairWeights(pairs, shown, counts, is_part, excluded, pairs_compared, weight, share, height)
         at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width, in_block[:m], takes[in_block[:m]])
         costs_at_height(at_height, WindowMoments(mean[:m], scale[:m]), of_pairs, weights, evidence, total, codes[k])
     heights_last(codes, width, out)

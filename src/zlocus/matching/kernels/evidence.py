@@ -375,17 +375,25 @@ def describe_views(views, scratch, n):
         write_census(views.planes, view, half, width, n, scratch.census)
 
 
+# (i,p) f4, ViewPair, i8, (p,) f4 -> None
+@kernel
+def put_unseen(greys, pair, n, out):
+    """Write RATIO_OF_UNSEEN where one of a pair of views does not see the cell, at the first n places."""
+    a, b = pair.a, pair.b
+    for j in range(np.uint64(n)):
+        is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
+        out[j] = out[j] if is_seen else RATIO_OF_UNSEEN
+
+
 # (e,) f4, (i,p) f4, ViewPair, i8, (5,p) f4, (p,) i4, (p,) f4 -> None
 @kernel
 def write_ratios(table, greys, pair, n, rows, bins, out):
     """Write the log-likelihood ratios of a pair of views, at the first n places."""
-    a, b, one, next_bin, position = pair.a, pair.b, np.float32(1.0), np.uint64(1), np.uint64(POSITION)
+    one, next_bin, position = np.float32(1.0), np.uint64(1), np.uint64(POSITION)
     for j in range(np.uint64(n)):
         at, share = np.uint64(bins[j]), rows[position, j]
         out[j] = table[at] * (one - share) + table[at + next_bin] * share
-    for j in range(np.uint64(n)):
-        is_seen = abs(greys[a, j]) < GREY_LIMIT and abs(greys[b, j]) < GREY_LIMIT
-        out[j] = out[j] if is_seen else RATIO_OF_UNSEEN
+    put_unseen(greys, pair, n, out)
 
 
 # (p,) f4, f4, i8, (p,) f4 -> None

@@ -1,0 +1,38 @@
+"""Rows on stacks of images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+
+from rows.many_images import BUILDING, GROUND, n_false_on_ground, step_up
+
+
+def write(path, values):
+    profile = {"driver": "GTiff", "width": values.shape[1], "height": values.shape[0], "count": 1}
+    place = {"crs": "EPSG:32617", "transform": from_origin(0, 20, 0.5, 0.5)}
+    with rasterio.open(path, "w", dtype=values.dtype.name, **profile, **place) as file:
+        file.write(values, 1)
+    return path
+
+
+def test_false_heights_on_ground_away_from_buildings_are_counted(tmp_path):
+    """One false height counts. Not those beside a building, on it, on trees, too small, or without truth."""
+    truth, kind = np.zeros((30, 40), np.float32), np.full((30, 40), GROUND, np.uint8)
+    kind[:, :5], kind[20:] = BUILDING, 5
+    truth[10, 30] = np.nan
+    heights = truth + 3.0
+    heights[10, [2, 8, 20, 25, 30]] = 60.0, 60.0, 60.0, 20.0, 60.0
+    heights[25, 20] = 60.0
+    judged = {"shift_cells_row_col": [0.0, 0.0], "shift_m": 3.0}
+    paths = [write(tmp_path / f"{name}.tif", v) for name, v in (("dsm", heights), ("lidar", truth), ("kind", kind))]
+    assert n_false_on_ground(*paths, judged) == 1
+    assert n_false_on_ground(*paths, judged | {"shift_m": -40.0}) > 100
+    assert n_false_on_ground(*paths, judged | {"shift_cells_row_col": [0.0, -25.0]}) == 0
+
+
+def test_the_largest_step_up_of_an_error():
+    assert step_up({2: 4.0, 3: 2.0, 5: 2.5, 7: 2.4}) == pytest.approx(1.25)
+    assert step_up({2: 4.0, 3: 3.0}) == pytest.approx(0.75)
