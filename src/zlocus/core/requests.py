@@ -45,7 +45,8 @@ class DsmRequest:
     heights : (zmin, zmax), m, in the vertical datum `vertical`. dem : raster around whose heights is searched;
     dem_vertical : its vertical datum, None takes the one of its CRS.
     reference : name of the reference image; with gc3-sgm only the pixels of this image are matched.
-    vertical : vertical datum of all heights: `ellipsoid`, `egm96` or `egm2008` in upper or lower case, or the file of a geoid raster.
+    vertical : vertical datum of all heights: ellipsoid, egm96 or egm2008 in upper or lower case, or the file of a geoid
+    raster.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
     scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
     together, GB; None: 60 % of what is free. overwrite : whether another run in `out` is replaced. resume : whether

@@ -127,6 +127,20 @@ def image_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> I
     first = by_name[reference]
     other_views = [view for view in scene.views if view.name != reference]
     rays = depth_rays(first, other_views) if is_by_depth(scene) else height_rays(first, z_range)
+    return _along(rays, first, other_views)
+
+
+def height_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> ImageSpace:
+    """The scene in the frame of one of its images, with heights along its rays whatever the cameras are, as in GC3.
+
+    reference : name of one of its views; z_range : m, range of the heights of the ground.
+    """
+    (first,) = (view for view in scene.views if view.name == reference)
+    return _along(height_rays(first, z_range), first, [view for view in scene.views if view.name != reference])
+
+
+def _along(rays: Rays, first: View, other_views: list[View]) -> ImageSpace:
+    """The space of some rays of the view `first`."""
     moved = [replace(view, sensor=rays.to(view.sensor)) for view in other_views]
     return ImageSpace(first, rays, (replace(first, sensor=PixelModel()), *moved))
 
