@@ -27,7 +27,9 @@ DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
 # The record of a finished surface: everything that it depends on, and the checksums of its products.
 FINISHED = "finished.json"
 VIEWS = ("auto", "all")
-METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
+METHODS = ("mvll-sgm", "mvll", "gc3-sgm", "gc3")
+# How images are chosen for a cell, and the methods that go with it, the usual one first.
+METHODS_OF_SELECTION = {"default": ("mvll-sgm", "mvll", "gc3-sgm"), "paper": ("mvll", "gc3")}
 FILLS = ("none", "interpolate", "dem")
 PRODUCTS = ("hillshade", "contours", "dtm", "laz")
 # The hillshade is what everyone looks at first and takes a second per million cells; the others are made on request.
@@ -44,7 +46,8 @@ class DsmRequest:
     like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
     heights : (zmin, zmax), m, in the vertical datum `vertical`. dem : raster around whose heights is searched;
     dem_vertical : its vertical datum, None takes the one of its CRS.
-    reference : name of the reference image; with gc3-sgm only the pixels of this image are matched.
+    reference : name of the reference image; with gc3-sgm only the pixels of this image are matched. selection : key of
+    `METHODS_OF_SELECTION`: how images are chosen, `paper` for Ji et al. (2014) literally.
     vertical : vertical datum of all heights: ellipsoid, egm96 or egm2008 in upper or lower case, or the file of a geoid
     raster.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
@@ -76,6 +79,7 @@ class DsmRequest:
     reference: str | None = None
     views: str = "auto"
     method: str = "mvll-sgm"
+    selection: str = "default"
     vertical: str = "ellipsoid"
     fill: str = "none"
     partial: bool = False
@@ -94,20 +98,22 @@ class DsmRequest:
         check_heights(self.heights)
         if self.heights is not None and self.dem is not None:
             raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
-        if self.dem is not None and self.method == "gc3-sgm":
+        if self.dem is not None and self.is_in_image_space:
             raise ConfigError(
-                f"--method gc3-sgm searches one range of heights and cannot follow --dem {self.dem}. Give "
+                f"--method {self.method} searches one range of heights and cannot follow --dem {self.dem}. Give "
                 "--heights, or use mvll-sgm."
             )
         for name, value, choices in (
             ("views", self.views, VIEWS),
             ("method", self.method, METHODS),
+            ("selection", self.selection, tuple(METHODS_OF_SELECTION)),
             ("fill", self.fill, FILLS),
         ):
             check_choice(name, value, choices)
-        if self.scheduler is not None and self.method == "gc3-sgm":
+        self._check_selection()
+        if self.scheduler is not None and self.is_in_image_space:
             raise ConfigError(
-                "--method gc3-sgm matches whole images in one process. Leave --scheduler out, or use mvll-sgm."
+                f"--method {self.method} matches whole images in one process. Leave --scheduler out, or use mvll-sgm."
             )
         if self.fill == "dem" and self.dem is None:
             raise ConfigError("--fill dem needs the heights of a terrain model. Add --dem RASTER.")
@@ -115,6 +121,27 @@ class DsmRequest:
         check_vertical_of("dem", self.dem, self.dem_vertical)
         check_workers(self.workers)
         check_positive("--memory", self.memory_gb, "GB")
+
+    @property
+    def is_in_image_space(self) -> bool:
+        """Whether the pixels of reference images are matched, instead of the cells of the ground."""
+        return self.method.startswith("gc3")
+
+    def _check_selection(self) -> None:
+        methods = METHODS_OF_SELECTION[self.selection]
+        if self.method not in methods:
+            other = "--selection paper" if self.method == "gc3" else "--selection default"
+            raise ConfigError(
+                f"--method {self.method} does not go with --selection {self.selection}, which takes "
+                f"{' or '.join(methods)}. Give one of these, or {other}."
+            )
+        if self.selection == "paper":
+            for name, is_given in (("--views all", self.views == "all"), (f"--dem {self.dem}", self.dem is not None)):
+                if is_given:
+                    raise ConfigError(
+                        f"--selection paper chooses the images, and searches around the heights of feature points; "
+                        f"{name} contradicts that. Leave it out, or use --selection default."
+                    )
 
     def _check_grid(self) -> None:
         check_positive("--resolution", self.resolution, "m")

@@ -74,15 +74,17 @@ class SelectionArea:
     """A window of cells with everything that its points are matched from.
 
     window : finest cells; tile_views : their views, the reference image first; view_numbers : which views of the scene
-    they are; ties : the feature points of the whole scene; features : those in the window, with the labels (n, i) of
-    the search images; numbers : (n,) int64, which of `ties` these are; step_px : (i + 1,) float64, equivalent disparity
-    of a height step in each view against the reference image.
+    they are; ties : the feature points of the whole scene; initial : (r, c) float64 lattice indices, initial height of
+    every cell; features : the feature points in the window, with the labels (n, i) of the search images; numbers : (n,)
+    int64, which of `ties` these are; step_px : (i + 1,) float64, equivalent disparity of a height step in each view
+    against the reference image.
     """
 
     window: CellWindow
     tile_views: TileViews
     view_numbers: tuple[int, ...]
     ties: GridTies
+    initial: FloatArray
     features: FeaturePoints
     numbers: IntArray
     step_px: FloatArray
@@ -103,7 +105,7 @@ def selection_area(match_scene: MatchScene, window: CellWindow, config: RunConfi
     if not len(ties.xy) or not (window.rows and window.cols):
         return None
     half, reach = large_window_side(config.cost) // 2, config.selection.reach_steps + 1
-    initial = initial_heights(ties, cell_middles(all_cells(window), window))
+    initial = initial_heights(ties, cell_middles(all_cells(window), window)).reshape(window.rows, window.cols)
     low, high = float(initial.min()), float(initial.max())
     inside = np.flatnonzero(ties.inside(window))
     if len(inside):
@@ -125,7 +127,8 @@ def selection_area(match_scene: MatchScene, window: CellWindow, config: RunConfi
     views = tile_views(view_pixels, cells, z_range, half, z_range)
     step_px = np.append(0.0, steps_px(views, REFERENCE, np.arange(1, len(numbers))))
     labels = feature_labels(views, window, ties, inside, step_px, config)
-    return SelectionArea(window, views, numbers, ties, FeaturePoints(ties.xy[inside], labels), inside, step_px)
+    features = FeaturePoints(ties.xy[inside], labels)
+    return SelectionArea(window, views, numbers, ties, initial, features, inside, step_px)
 
 
 def feature_points(match_scene: MatchScene) -> GridTies:
@@ -232,7 +235,7 @@ def match_cells(area: SelectionArea, cells: IntArray, config: RunConfig) -> Sele
     """
     options = options_of_paper(config.selection)
     xy = cell_middles(cells, area.window)
-    initial = initial_heights(area.ties, xy)
+    initial = area.initial[cells[:, 0], cells[:, 1]]
     samples = samples_of(cells, initial, config)
     reference = samples.windows(area.tile_views, REFERENCE, slice(None))
 

@@ -43,7 +43,7 @@ def run_paper(request: PaperRequest, config: RunConfig, progress: Progress) -> s
         note_orientation(orientation, progress)
         setup = set_up_run(setup_request, opened_inputs, orientation, config, progress)
         with progress.stage("Match curves"):
-            space = paper_space(setup, orientation, request, config)
+            space = paper_space(setup, request, config)
             area, point = find_point(space, request, config)
             shown = paper_point(space, area, point, request, config)
         with progress.stage("Writing"):

@@ -14,7 +14,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.paper_request import PaperRequest
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
-from zlocus.matching.image_space import ImageSpace, build_image_match_scene, height_space, hypotheses_of_heights
+from zlocus.matching.image_space import ImageSpace
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import GridTies
 from zlocus.matching.point_match import PointCurves, cell_of
@@ -25,8 +25,8 @@ from zlocus.matching.stereo_selection import (
     point_curves_of_paper,
     selection_area,
 )
-from zlocus.orientation.orientation import Orientation
-from zlocus.pipeline.setup import RunSetup, supported_views
+from zlocus.pipeline.image_tiles import reference_scene
+from zlocus.pipeline.setup import RunSetup, reference_features, supported_views
 from zlocus.products.paper_figures import ComparedPoint, PaperPoint
 from zlocus.products.point_report import PointReport, loci_through
 
@@ -91,21 +91,16 @@ def _whole(value: float) -> int:
     return int(np.rint(value)) if np.isfinite(value) else -1
 
 
-def paper_space(setup: RunSetup, orientation: Orientation, request: PaperRequest, config: RunConfig) -> PaperSpace:
+def paper_space(setup: RunSetup, request: PaperRequest, config: RunConfig) -> PaperSpace:
     """The space that is asked for, with the feature points of the reference image.
-
-    The feature points are the tie points that SIFT found in the reference image and in another one, as far as they
-    agree with the cameras.
 
     Raises
     ------
     GeometryError
         The reference image has no feature points.
     """
-    name, scene = setup.match_scene.views[0].name, supported_views(setup.scene, orientation)
-    number = [view.name for view in setup.scene.views].index(name)
-    seen = np.unique(orientation.observations.point[orientation.observations.view == number])
-    features = orientation.xyz[seen]
+    name, scene = setup.match_scene.views[0].name, supported_views(setup.scene, setup.orientation)
+    features = reference_features(setup)
     if len(features) < N_FEATURES:
         raise GeometryError(
             f"{name} has {len(features)} feature points, and {N_FEATURES} are needed. Name another image with "
@@ -114,12 +109,9 @@ def paper_space(setup: RunSetup, orientation: Orientation, request: PaperRequest
     if request.space == "ground":
         match_scene = replace(setup.match_scene, ties=features)
         return PaperSpace(match_scene, match_scene.views, None, features, scene.crs)
-    space = height_space(scene, name, setup.height_range.expected)
-    z_range = hypotheses_of_heights(space, setup.height_range.expected)
-    assert z_range is not None, "hypotheses are heights"
-    match_scene = build_image_match_scene(space, z_range, space.frame_from_ground(features), config.pyramid)
-    by_name = {view.name: view for view in scene.views}
-    return PaperSpace(match_scene, tuple(by_name[v.name] for v in space.views), space, features, scene.crs)
+    image_scene, by_name = reference_scene(setup, config), {view.name: view for view in scene.views}
+    views = tuple(by_name[view.name] for view in image_scene.image_space.views)
+    return PaperSpace(image_scene.match_scene, views, image_scene.image_space, features, scene.crs)
 
 
 @dataclass(frozen=True)
@@ -135,8 +127,9 @@ def find_point(space: PaperSpace, request: PaperRequest, config: RunConfig) -> t
     """The requested point P0, or the first one that serves as an example, and the area around it.
 
     Where none is requested, points are tried on a grid of `CANDIDATE_SPACING` cells, from the middle of the reference
-    image (on the ground: of the overlap) outwards. The first one is taken whose match stops before the last search
-    image, but not at the first one, of which there is no mean.
+    image (on the ground: of the overlap) outwards. The first one is taken that is like the paper's: its match stops
+    before the last search image, but not at the first one, of which there is no mean; an image that is left out is poor
+    around it; and the peak of all search images is the same within a step, so that both means show one surface.
 
     Raises
     ------
@@ -150,8 +143,7 @@ def find_point(space: PaperSpace, request: PaperRequest, config: RunConfig) -> t
     else:
         return _example(space, request, config)
     area = area_around(space, cell, what, config)
-    initial = initial_heights(area.ties, np.array([cell[::-1]]) + 0.5)
-    found = match_point(area, cell, float(initial[0]), request, config)
+    found = match_point(area, cell, request, config)
     if isinstance(found, str):
         raise GeometryError(f"{what} cannot be shown: {found}")
     return area, found
@@ -181,10 +173,10 @@ def area_around(space: PaperSpace, cell: tuple[int, int], what: str, config: Run
 
 
 def match_point(
-    area: SelectionArea, cell: tuple[int, int], initial: float, request: PaperRequest, config: RunConfig
+    area: SelectionArea, cell: tuple[int, int], request: PaperRequest, config: RunConfig
 ) -> MatchedPoint | str:
     """The match of a point with the feature points that the request asks for, or why there is none, in a sentence."""
-    xy = np.array(cell[::-1]) + 0.5
+    xy, initial = np.array(cell[::-1]) + 0.5, float(area.initial[cell[0] - area.window.row, cell[1] - area.window.col])
     distance = np.sort(np.hypot(*(area.features.xy - xy).T))
     if len(distance) < N_FEATURES:
         return f"only {len(distance)} feature points lie around it, and {N_FEATURES} are needed. Give another point."
@@ -206,18 +198,26 @@ def _example(space: PaperSpace, request: PaperRequest, config: RunConfig) -> tup
     middle = (window.row + window.rows // 2, window.col + window.cols // 2)
     area = area_around(space, middle, "The middle of the images", config)
     for point in matched_points(area, candidates(area.window, CANDIDATE_SPACING, middle), request, config):
-        n_search = len(point.curves.order.search)
-        if is_stopped_early(point) and (point.curves.n_used > 1 or n_search <= 2):
+        curves = point.curves
+        peaks, n_search = curves.mean_curves.peaks.peak, len(curves.order.search)
+        is_one_surface = abs(int(peaks[curves.n_used - 1]) - int(peaks[-1])) <= 1
+        has_mean = curves.n_used > 1 or n_search == 2
+        if is_stopped_early(point) and leaves_out_poor(point) and is_one_surface and has_mean:
             return area, point
     raise GeometryError(
-        f"No point within {AREA_CELLS // 2} px of the middle stops after several search images, but before the last "
-        "one. Give a point with --pixel ROW COL or --at X Y."
+        f"No point within {AREA_CELLS // 2} px of the middle stops after several search images, leaves out a poor one, "
+        "and has the height that all of them show. Give a point with --pixel ROW COL or --at X Y."
     )
 
 
 def is_stopped_early(point: MatchedPoint) -> bool:
     """Whether the match of a point stops before the last search image."""
     return point.curves.is_stopped and point.curves.n_used < len(point.curves.order.search)
+
+
+def leaves_out_poor(point: MatchedPoint) -> bool:
+    """Whether an image that is not used has an accumulated label below 0: it is poor around the point."""
+    return bool((point.curves.order.accumulated[point.curves.n_used :] < 0).any())
 
 
 def candidates(window: CellWindow, spacing: int, middle: tuple[int, int]) -> list[tuple[int, int]]:
@@ -236,11 +236,8 @@ def matched_points(
     area: SelectionArea, cells: list[tuple[int, int]], request: PaperRequest, config: RunConfig
 ) -> Iterator[MatchedPoint]:
     """The matches of cells, one after the other, without those that cannot be matched."""
-    if not cells:
-        return
-    initial = initial_heights(area.ties, np.array(cells)[:, ::-1] + 0.5)
-    for cell, z in zip(cells, initial.tolist(), strict=True):
-        found = match_point(area, cell, z, request, config)
+    for cell in cells:
+        found = match_point(area, cell, request, config)
         if isinstance(found, MatchedPoint):
             yield found
 
@@ -301,7 +298,7 @@ def compared_points(
             peaks, n = point.curves.mean_curves.peaks, point.curves.n_used
             chosen, every = ((float(peaks.rho1[k]), float(peaks.rho2[k]), float(peaks.ratio[k])) for k in (n - 1, -1))
             x, y, z = space.points(point.cell, np.array([point.curves.peak_index]))[0].tolist()
-            found.append(ComparedPoint((x, y, z), n, chosen, every))
+            found.append(ComparedPoint((x, y, z), n, chosen, every, leaves_out_poor(point)))
     return tuple(found), n_matched
 
 

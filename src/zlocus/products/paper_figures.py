@@ -18,11 +18,12 @@ from zlocus.io.atomic_write import write_atomically
 from zlocus.matching.point_match import JudgedCurves
 from zlocus.products.match_curve_figures import DPI, loci_figure, match_curves_figure, mean_figure
 from zlocus.products.point_report import Locus, PointReport, decimal, signed, table
-from zlocus.products.printed_values import FIGURE_6, TABLE_3, TABLE_4
+from zlocus.products.printed_values import FIGURE_6, PRINTED_GROUPS, TABLE_3, TABLE_4
 
 # The figures of the three feature points.
 FIGURES_OF_FEATURES = {"figure3": 0, "figure4": 1, "figure5": 2}
 PRINTED = "The printed values are those of the paper's ADS40 images, which are not available."
+PRINTED_ORDER = f"Printed order: {'; '.join(', '.join(group) for group in PRINTED_GROUPS)}."
 Rows = list[tuple[str, ...]]
 
 
@@ -31,13 +32,15 @@ class ComparedPoint:
     """One point with its chosen images and with all of them.
 
     place : (3,) m, on the ground; n_chosen : search images after which the match stops; chosen, every : rho1, rho2 and
-    ratio of the mean curve of these, and of all search images.
+    ratio of the mean curve of these, and of all search images; leaves_out_poor : whether a search image that is not
+    used has an accumulated label below 0.
     """
 
     place: tuple[float, float, float]
     n_chosen: int
     chosen: tuple[float, float, float]
     every: tuple[float, float, float]
+    leaves_out_poor: bool
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,8 @@ def write_paper(folder: Path, what: str, paper_point: PaperPoint) -> str:
     if what in ("table3", "table4"):
         heads, rows = (table_3 if what == "table3" else table_4)(paper_point)
         _write_rows(folder / f"{what}.csv", heads, rows)
-        return _text(paper_point, [*table(heads, rows), "", PRINTED])
+        order = ["", PRINTED_ORDER] if what == "table4" else [""]
+        return _text(paper_point, [*table(heads, rows), *order, PRINTED])
     if what in FIGURES_OF_FEATURES:
         number = FIGURES_OF_FEATURES[what]
         feature = paper_point.features[number]
@@ -178,31 +182,39 @@ def mean_lines(report: PointReport, n_images: int) -> list[str]:
 
 def compared_rows(compared_points: Sequence[ComparedPoint]) -> tuple[tuple[str, ...], Rows]:
     """Heads and rows of the points at which the chosen images are compared with all of them."""
-    heads = ("easting_m", "northing_m", "height_m", "n_chosen", *(f"{name}_chosen" for name in JUDGED[:3]),
-             *(f"{name}_all" for name in JUDGED[:3]))  # fmt: skip
-    return heads, [
-        (*(f"{v:.2f}" for v in point.place), str(point.n_chosen), *_digits(point.chosen), *_digits(point.every))
-        for point in compared_points
-    ]
+    heads = ("easting_m", "northing_m", "height_m", "n_chosen", "leaves_out_poor",
+             *(f"{name}_chosen" for name in JUDGED[:3]), *(f"{name}_all" for name in JUDGED[:3]))  # fmt: skip
+    rows: Rows = []
+    for point in compared_points:
+        of_point = (*(f"{v:.2f}" for v in point.place), str(point.n_chosen), str(int(point.leaves_out_poor)))
+        rows.append((*of_point, *_digits(point.chosen), *_digits(point.every)))
+    return heads, rows
 
 
 def compared_lines(paper_point: PaperPoint) -> list[str]:
-    """What more images do to rho1 and the ratio, over all compared points, in sentences and a table."""
+    """What more images do to rho1 and the ratio, over all compared points and over those with a poor image left out."""
     compared_points, looked_at = paper_point.compared, paper_point.n_looked_at
-    n = len(compared_points)
-    first = f"Of {looked_at} points on a regular grid, {n} stop before the last search image."
-    if not n:
-        return [first]
-    chosen, every = (np.array([getattr(p, name) for p in compared_points]) for name in ("chosen", "every"))
-    falls = [100 * float((every[:, k] < chosen[:, k]).mean()) for k in (0, 2)]
+    first = f"Of {looked_at} points on a regular grid, {len(compared_points)} stop before the last search image."
+    heads = ("points", "n", "rho1 chosen", "rho1 all", "falls", "ratio chosen", "ratio all", "falls ")
+    poor = [point for point in compared_points if point.leaves_out_poor]
     rows: Rows = [
-        (name, *(decimal(float(np.median(values[:, k])), 4) for k in (0, 2)))
-        for name, values in (("the chosen images", chosen), ("all search images", every))
+        (name, str(len(points)), *_compared(points))
+        for name, points in (("that stop early", compared_points), ("with a poor image left out", poor))
     ]
-    return [
-        f"{first} The medians of their means:", *table(("mean of", "rho1", "ratio"), rows),
-        f"With all search images rho1 is lower at {falls[0]:.0f} % of the {n} points, the ratio at {falls[1]:.0f} %.",
-    ]  # fmt: skip
+    note = "The values are medians over the points; falls: share of the points at which the value of all is lower."
+    return [first, *table(heads, rows), note]
+
+
+def _compared(compared_points: Sequence[ComparedPoint]) -> tuple[str, ...]:
+    """Medians of rho1 and ratio of the chosen and of all images, and at which share of the points they fall."""
+    if not compared_points:
+        return ("none",) * 6
+    chosen, every = (np.array([getattr(p, name) for p in compared_points]) for name in ("chosen", "every"))
+    cells: list[str] = []
+    for k in (0, 2):
+        cells += [decimal(float(np.median(values[:, k])), 3) for values in (chosen, every)]
+        cells.append(f"{100 * float((every[:, k] < chosen[:, k]).mean()):.0f} %")
+    return tuple(cells)
 
 
 def _text(paper_point: PaperPoint, lines: list[str]) -> str:
