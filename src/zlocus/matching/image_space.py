@@ -139,10 +139,10 @@ def height_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> 
     return _along(height_rays(first, z_range), first, [view for view in scene.views if view.name != reference])
 
 
-def _along(rays: Rays, first: View, other_views: list[View]) -> ImageSpace:
-    """The space of some rays of the view `first`."""
-    moved = [replace(view, sensor=rays.to(view.sensor)) for view in other_views]
-    return ImageSpace(first, rays, (replace(first, sensor=PixelModel()), *moved))
+def _along(rays: Rays, view: View, other_views: list[View]) -> ImageSpace:
+    """The space of some rays of a view."""
+    moved = [replace(other, sensor=rays.to(other.sensor)) for other in other_views]
+    return ImageSpace(view, rays, (replace(view, sensor=PixelModel()), *moved))
 
 
 def height_rays(view: View, z_range: tuple[float, float]) -> HeightRays:

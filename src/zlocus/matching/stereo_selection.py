@@ -212,12 +212,12 @@ def feature_labels(
 class SelectedMatch:
     """Matched cells.
 
-    initial : (n,) float64, lattice indices in the middle of their curves; progress : their mean curves, labels and
-    numbers of images; peaks : of the mean curves.
+    initial : (n,) float64, lattice indices in the middle of their curves; progressive_match : their mean curves, labels
+    and numbers of images; peaks : of the mean curves.
     """
 
     initial: FloatArray
-    progress: ProgressiveMatch
+    progressive_match: ProgressiveMatch
     peaks: CurvePeaks
 
     def lattice_index(self, reach_steps: int) -> FloatArray:
@@ -249,11 +249,11 @@ def match_cells(area: SelectionArea, cells: IntArray, config: RunConfig) -> Sele
 
     order = order_images(area.features, xy, options).images + 1
     plan = SearchPlan.by_cell(order, np.ones((len(cells), len(area.view_numbers)), bool), area.step_px)
-    progress = match_progressively(correlate, samples.n_heights, plan, options)
+    progressive_match = match_progressively(correlate, samples.n_heights, plan, options)
     widest_px = np.maximum.accumulate(area.step_px[order], axis=1)
-    n_added = np.maximum(progress.n_added, 1)[:, None] - 1
+    n_added = np.maximum(progressive_match.n_added, 1)[:, None] - 1
     step_px = np.take_along_axis(widest_px, n_added, axis=1)[:, 0]
-    return SelectedMatch(initial, progress, curve_peaks(progress.mean_ncc, step_px, options))
+    return SelectedMatch(initial, progressive_match, curve_peaks(progressive_match.mean_ncc, step_px, options))
 
 
 def point_curves_of_paper(area: SelectionArea, cell: tuple[int, int], initial: float, config: RunConfig) -> PointCurves:

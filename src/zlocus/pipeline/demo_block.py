@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 DIGEST = "scene_sha256"
 
 
-def block_digest(spec: SceneSpec, flown: TrajectoryNoise) -> str:
+def block_digest(spec: SceneSpec, noise: TrajectoryNoise) -> str:
     """Digest of everything that a rendered block follows from: equal digests mean the same images."""
-    return hashlib.sha256(repr((spec, flown, versions_record())).encode()).hexdigest()
+    return hashlib.sha256(repr((spec, noise, versions_record())).encode()).hexdigest()
 
 
 def is_block_of(record: Path, digest: str) -> bool:

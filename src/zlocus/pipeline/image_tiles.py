@@ -318,7 +318,7 @@ def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, method:
         A fault of our own, with the tile in which it happened.
     """
     try:
-        result = method.match(image_scene.match_scene, tile.core_window, config)
+        result = method.match(image_scene.match_scene, tile, config)
     except ZlocusError:
         raise
     except Exception as error:

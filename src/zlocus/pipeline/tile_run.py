@@ -39,6 +39,8 @@ from zlocus.products.rasters import SurfaceRasters
 
 # Processes take about two seconds to start, and so are not worth it for less work than this, s.
 SHORT_S = 15.0
+# Time to match a cell by the selection of the paper, with six images.
+PAPER_CELL_S = 2e-4
 # A message names at most this many failed tiles.
 MAX_NAMED_TILES = 3
 
@@ -99,14 +101,22 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
             f"{own / 1e9:.2g} GB of the command itself. Allow more, or set a smaller pyramid.tile in --config."
         )
     n_worked = sum(1 for tile in tiles if tile.core_window.rows and tile.core_window.cols)
-    wanted = request.workers or (cores() if needs.seconds > SHORT_S else 1)
+    seconds = seconds_of_paper(tiles) if request.selection == "paper" else needs.seconds
+    wanted = request.workers or (cores() if seconds > SHORT_S else 1)
     there = needs.n_bytes + WORKER_BYTES
     slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
     processes = slots > 1 and not request.is_in_image_space
     each = there if processes or request.scheduler else here
-    # In image space the pixels of every image are matched before.
-    seconds = needs.seconds * (len(match_scene.views) if request.is_in_image_space else 1)
+    if request.method == "gc3-sgm":
+        # The pixels of every image are matched before.
+        seconds *= len(match_scene.views)
     return Plan(len(tiles), slots, processes, each, own, allowed, seconds, request.scheduler)
+
+
+def seconds_of_paper(tiles: Sequence[Tile]) -> float:
+    """Estimated time of one worker for the selection of the paper, which matches only the kept cells."""
+    kept = [tile.kept_window.within(tile.core_window) for tile in tiles]
+    return PAPER_CELL_S * sum(window.rows * window.cols for window in kept)
 
 
 @dataclass
@@ -432,14 +442,15 @@ class MatchMethod:
     choose_images: bool = True
     selection: str = "default"
 
-    def match(
-        self, match_scene: MatchScene, core_window: CellWindow, config: RunConfig, fill: str = "none"
-    ) -> TileResult:
+    def match(self, match_scene: MatchScene, tile: Tile, config: RunConfig, fill: str = "none") -> TileResult:
         """The result of a tile."""
         if self.selection == "default":
-            return match_tile(match_scene, core_window, config, self.name, self.choose_images, fill)
-        result = match_tile_of_paper(match_scene, core_window, config)
-        return replace(result, surface=filled(result.surface, config.pyramid.halo // 2)) if fill != "none" else result
+            return match_tile(match_scene, tile.core_window, config, self.name, self.choose_images, fill)
+        if fill == "none":
+            return match_tile_of_paper(match_scene, tile.core_window, tile.kept_window, config)
+        # The cells around those that are kept fill gaps at their border.
+        result = match_tile_of_paper(match_scene, tile.core_window, tile.core_window, config)
+        return replace(result, surface=filled(result.surface, config.pyramid.halo // 2))
 
 
 @dataclass(frozen=True)
@@ -459,7 +470,7 @@ class TileJob:
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        return self.product(tile, self.method.match(self.match_scene, tile.core_window, self.config, self.fill))
+        return self.product(tile, self.method.match(self.match_scene, tile, self.config, self.fill))
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:
         """The product of a matched tile: cut to the requested cells, with gaps filled from the terrain model."""

@@ -47,18 +47,18 @@ class ComparedPoint:
 class PaperPoint:
     """The point P0 with the feature points around it.
 
-    report : of P0; features : reports of the feature points, P1, P2, ..., the nearest first, whose search images stand
-    in the order of the scene; where : of P0, in words; line : what the heights follow, in words; loci : images of that
-    line, the reference image first; compared : many points for figure 7; n_looked_at : number of points that were
-    matched for them.
+    report : of P0; feature_reports : those of the feature points, P1, P2, ..., the nearest first, whose search images
+    stand in the order of the scene; where : of P0, in words; line : what the heights follow, in words; loci : images of
+    that line, the reference image first; compared_points : many points for figure 7; n_looked_at : number of points
+    that were matched for them.
     """
 
     report: PointReport
-    features: tuple[PointReport, ...]
+    feature_reports: tuple[PointReport, ...]
     where: str
     line: str
     loci: tuple[Locus, ...]
-    compared: tuple[ComparedPoint, ...] = ()
+    compared_points: tuple[ComparedPoint, ...] = ()
     n_looked_at: int = 0
 
 
@@ -80,7 +80,7 @@ def write_paper(folder: Path, what: str, paper_point: PaperPoint) -> str:
         return _text(paper_point, [*table(heads, rows), *order, PRINTED])
     if what in FIGURES_OF_FEATURES:
         number = FIGURES_OF_FEATURES[what]
-        feature = paper_point.features[number]
+        feature = paper_point.feature_reports[number]
         figure = match_curves_figure(feature, f"Feature point P{number + 1}: correlation with each search image")
         _write_rows(folder / f"{what}.csv", *curve_rows(feature, len(feature.search), has_means=False))
         lines = table(("image", *JUDGED), _judged_rows(feature.search, feature.curves.single_curves))
@@ -95,7 +95,7 @@ def write_paper(folder: Path, what: str, paper_point: PaperPoint) -> str:
         _write_rows(folder / f"{what}.csv", *curve_rows(report, n_images, has_means=True))
         lines = mean_lines(report, n_images)
         if paper_point.n_looked_at:
-            _write_rows(folder / "figure7_points.csv", *compared_rows(paper_point.compared))
+            _write_rows(folder / "figure7_points.csv", *compared_rows(paper_point.compared_points))
             lines += ["", *compared_lines(paper_point)]
     write_atomically(folder / f"{what}.png", partial(figure.savefig, format="png", dpi=DPI))
     return _text(paper_point, lines)
@@ -108,7 +108,7 @@ def table_3(paper_point: PaperPoint) -> tuple[tuple[str, ...], Rows]:
     """Heads and rows of table 3: the curve of every feature point with every search image, and the printed values."""
     heads = ("point", "image", *JUDGED, *(f"printed_{name}" for name in JUDGED))
     rows: Rows = []
-    for number, feature in enumerate(paper_point.features, 1):
+    for number, feature in enumerate(paper_point.feature_reports, 1):
         for j, name in enumerate(feature.search):
             printed = TABLE_3.get((f"P{number}", name.lower()))
             shown = ("", "", "", "")
@@ -193,7 +193,7 @@ def compared_rows(compared_points: Sequence[ComparedPoint]) -> tuple[tuple[str, 
 
 def compared_lines(paper_point: PaperPoint) -> list[str]:
     """What more images do to rho1 and the ratio, over all compared points and over those with a poor image left out."""
-    compared_points, looked_at = paper_point.compared, paper_point.n_looked_at
+    compared_points, looked_at = paper_point.compared_points, paper_point.n_looked_at
     first = f"Of {looked_at} points on a regular grid, {len(compared_points)} stop before the last search image."
     heads = ("points", "n", "rho1 chosen", "rho1 all", "falls", "ratio chosen", "ratio all", "falls ")
     poor = [point for point in compared_points if point.leaves_out_poor]
@@ -226,7 +226,7 @@ def _text(paper_point: PaperPoint, lines: list[str]) -> str:
         f"P0         {paper_point.where}",
         f"Reference  {report.reference}; search images {', '.join(report.search)}",
         f"Heights    {heights} along {paper_point.line[:1].lower()}{paper_point.line[1:]}: {steps}",
-        f"Around P0  {len(paper_point.features)} feature points, {_distances(paper_point)} away",
+        f"Around P0  {len(paper_point.feature_reports)} feature points, {_distances(paper_point)} away",
     ]
     return "\n".join([*head, "", *lines])
 

@@ -21,7 +21,7 @@ class PrintedCurve(NamedTuple):
 
 SEARCH_IMAGES = ("b1", "f1", "b2", "n2", "f2")
 # Table 3: match curves of three feature points against the search images.
-TABLE_3: dict[tuple[str, str], PrintedCurve] = {
+TABLE_3 = {
     ("P1", "b1"): PrintedCurve(0.9083, 0.7142, 1.2718, 1),
     ("P1", "f1"): PrintedCurve(0.7801, 0.7387, 1.0560, 0),
     ("P1", "b2"): PrintedCurve(0.7683, 0.4412, 1.7413, 1),
