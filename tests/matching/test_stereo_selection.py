@@ -17,12 +17,13 @@ from zlocus.core.options import PyramidOptions, RunConfig, SelectionOptions, lar
 from zlocus.io.scene_file import open_scene
 from zlocus.matching.image_space import ImageSpace, build_image_match_scene, height_space, hypotheses_of_heights
 from zlocus.matching.locus_windows import CurveSamples
-from zlocus.matching.match_curve import FAIR, GOOD
+from zlocus.matching.match_curve import GOOD, ProgressiveMatch, curve_labels, curve_peaks
 from zlocus.matching.match_scene import MatchScene, build_match_scene
 from zlocus.matching.pair_labels import GridTies
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.selected_surface import match_tile_of_paper, quality_of
 from zlocus.matching.stereo_selection import (
+    SelectedMatch,
     all_cells,
     cell_middles,
     feature_curves,
@@ -225,17 +226,37 @@ def test_a_kept_cell_does_not_depend_on_the_others(space):
     assert np.isnan(part.height[outside]).all()
 
 
-def test_flags_say_why_a_cell_has_no_height_or_a_doubtful_one(area):
-    match = match_cells(area, all_cells(area.window), CONFIG)
+def curve(*peaks: tuple[int, float], missing: tuple[int, ...] = ()) -> np.ndarray:
+    """A curve of 21 heights with one-sample peaks (sample, value) on a floor of -0.5."""
+    values = np.full(21, -0.5)
+    for at, value in peaks:
+        values[at] = value
+    values[list(missing)] = np.nan
+    return values
+
+
+FLAGGED = [
+    (curve((10, 0.95)), Quality(0)),
+    (curve((10, 0.95), (16, 0.93)), Quality.AMBIGUOUS),
+    (curve((10, 0.55)), Quality.WEAK),
+    (curve((10, 0.4)), Quality.NO_MATCH),
+    (curve((10, 0.55), (16, 0.53)), Quality.NO_MATCH),
+    (curve((0, 0.95)), Quality.RANGE_END | Quality.AMBIGUOUS),
+    (curve((20, 0.4)), Quality.RANGE_END | Quality.NO_MATCH),
+    (curve((10, 0.95), missing=(11,)), Quality.RANGE_END | Quality.AMBIGUOUS),
+    (curve(missing=tuple(range(21))), Quality.UNSEEN),
+]
+
+
+@pytest.mark.parametrize(("values", "flags"), FLAGGED)
+def test_flags_say_why_a_cell_has_no_height_or_a_doubtful_one(values, flags):
+    peaks, label = curve_peaks(values[None], 0.5, CONFIG.selection), curve_labels(values[None], 0.5, CONFIG.selection)
+    one = np.ones(1, np.int64)
+    match = SelectedMatch(np.zeros(1), ProgressiveMatch(values[None], one, label, label == GOOD, one, 1, 1), peaks)
     quality = quality_of(match, CONFIG.selection)
-    label, peaks = match.progressive_match.label, match.peaks
-    has = {flag: (quality & flag) != 0 for flag in (Quality.NO_MATCH, Quality.AMBIGUOUS, Quality.WEAK)}
-    assert np.array_equal(has[Quality.NO_MATCH], label == -1)
-    fair = label == FAIR
-    assert np.array_equal(has[Quality.AMBIGUOUS], fair & (peaks.rho1 > 0.65))
-    assert np.array_equal(has[Quality.WEAK], fair & (peaks.rho1 <= 0.65))
-    at_end = np.isin(peaks.peak, (0, match.progressive_match.mean_ncc.shape[1] - 1)) & np.isfinite(peaks.rho1)
-    assert ((quality & Quality.RANGE_END) != 0)[at_end].all()
+    assert Quality(int(quality[0])) == flags
+    has_height = flags in (Quality(0), Quality.AMBIGUOUS, Quality.WEAK)
+    assert is_empty(quality)[0] != has_height
 
 
 def test_nothing_of_ours_takes_part():
