@@ -193,6 +193,10 @@ def test_figure_8_is_a_point_in_the_reference_image_and_lines_in_the_others(town
                 if r["image"] == f"img_{name}" and r["point"] == "line"
             ])  # fmt: skip
             assert len(xy) == 2 * REACH + 1
+            (start,) = (r for r in rows if r["image"] == f"img_{name}" and r["point"] == "start")
+            heights = [float(r["height_m"]) for r in rows if r["image"] == f"img_{name}" and r["point"] == "line"]
+            assert float(start["height_m"]) == pytest.approx(heights[REACH], abs=1e-3)
+            np.testing.assert_allclose(xy[REACH], (float(start["column"]), float(start["row"])), atol=1e-2)
             length = np.hypot(*(xy[-1] - xy[0]))
             if name == "n1" and space == "image":
                 assert length < 1e-3

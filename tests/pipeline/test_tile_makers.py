@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rendered_scenes import PART, errors_of, read, run
+from zlocus.core.options import RunConfig
+from zlocus.core.requests import DsmRequest
 from zlocus.matching.quality import Quality, is_empty
+from zlocus.orientation.triangulate import Observations
+from zlocus.pipeline.tile_run import Polygons, tile_job
 
 KIND = "sine"
 # The height of a cell is that of a step, which is about 0.7 m here.
@@ -55,3 +62,26 @@ def test_a_part_has_the_heights_of_the_whole(images, surface, tmp_path):
     whole, of_whole = read(out / "dsm.tif")
     col, row = (round(v) for v in ~of_whole.transform * (of_part.bounds.left, of_part.bounds.top))
     np.testing.assert_array_equal(part, whole[row : row + part.shape[0], col : col + part.shape[1]])
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """As much of a match scene as a job looks at."""
+
+    views: tuple[SimpleNamespace, ...]
+    ties: np.ndarray
+
+
+@pytest.mark.parametrize(("selection", "points"), [("paper", [0, 1, 3]), ("default", [0, 1, 2, 3])])
+def test_the_feature_points_are_the_tie_points_of_the_reference_image(selection, points):
+    a, b, c = (SimpleNamespace(name=name) for name in "abc")
+    xyz = np.arange(12.0).reshape(4, 3)
+    observations = Observations(np.array([0, 1, 1, 0, 2, 1]), np.array([0, 0, 1, 2, 1, 3]), np.zeros((6, 2)))
+    setup = SimpleNamespace(
+        orientation=SimpleNamespace(xyz=xyz, observations=observations), scene=SimpleNamespace(views=(a, b, c)),
+        match_scene=Lattice((b, a, c), xyz), grid=None,
+    )  # fmt: skip
+    request = DsmRequest((Path("a.tif"), Path("b.tif")), Path("out"), method="mvll", selection=selection)
+    job = tile_job(request, setup, RunConfig(), Polygons())
+    assert job.match_scene.ties.tolist() == xyz[points].tolist()
+    assert job.method.selection == selection
