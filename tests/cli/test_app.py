@@ -77,7 +77,7 @@ def test_version(zl):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["demo"], ["dsm"], ["cloud"], ["curves"], ["doctor"], ["evaluate"], ["config"]]
+    "command", [[], ["demo"], ["dsm"], ["cloud"], ["curves"], ["paper"], ["doctor"], ["evaluate"], ["config"]]
 )
 def test_every_command_has_help(zl, command):
     result = zl(*command, "--help")
@@ -101,6 +101,17 @@ def test_dsm_options_reach_the_pipeline(zl, pipeline, tmp_path):
         overwrite=True,
     )  # fmt: skip
     assert "98.7 %" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "method"),
+    [([], "mvll-sgm"), (["--selection", "paper"], "mvll"), (["--selection", "paper", "--method", "gc3"], "gc3")],
+)
+def test_each_selection_has_its_own_method(zl, pipeline, tmp_path, arguments, method):
+    result = zl("dsm", "a.tif", "b.tif", "-o", tmp_path / "out", *arguments)
+    assert result.exit_code == 0, result.output
+    assert pipeline.request.method == method
+    assert pipeline.request.selection == ("paper" if arguments else "default")
 
 
 def test_like_and_dem_reach_the_pipeline(zl, pipeline, tmp_path):
@@ -135,6 +146,12 @@ def test_dsm_reads_its_configuration(zl, pipeline, tmp_path):
         (["a.tif", "b.tif", "--like", "l.tif", "--crs", "EPSG:32631"], "Leave out --crs"),
         (["a.tif", "b.tif", "--method", "magic"], "--method magic"),
         (["a.tif", "b.tif", "--views", "some"], "--views some"),
+        (["a.tif", "b.tif", "--selection", "some"], "--selection some is not known"),
+        (["a.tif", "b.tif", "--selection", "paper", "--method", "mvll-sgm"], "which takes mvll or gc3. Give one of"),
+        (["a.tif", "b.tif", "--selection", "paper", "--method", "gc3-sgm"], "--method gc3-sgm does not go with"),
+        (["a.tif", "b.tif", "--method", "gc3"], "--selection default, which takes mvll-sgm or mvll or gc3-sgm"),
+        (["a.tif", "b.tif", "--selection", "paper", "--views", "all"], "--views all contradicts that"),
+        (["a.tif", "b.tif", "--selection", "paper", "--dem", "d.tif"], "--dem d.tif contradicts that"),
         (["a.tif", "b.tif", "--fill", "dreams"], "--fill dreams"),
         (["a.tif", "b.tif", "--vertical", "moon"], "--vertical moon"),
         (["a.tif", "b.tif", "--workers", "0"], "--workers 0"),

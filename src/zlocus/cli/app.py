@@ -24,6 +24,7 @@ from zlocus.cli.exit_status import show_our_warnings
 from zlocus.cli.import_cameras import ImportOptions, import_cameras
 from zlocus.cli.inspect import InspectOptions, inspect
 from zlocus.cli.orient import OrientOptions, TiesOptions, orient, ties
+from zlocus.cli.paper import PaperOptions, paper
 from zlocus.cli.products import ProductsOptions, products
 from zlocus.cli.rank import RankOptions, rank
 from zlocus.cli.report import ReportOptions, report
@@ -37,6 +38,7 @@ COMMANDS: tuple[tuple[str, type[Any], Callable[[Any], None]], ...] = (
     ("products", ProductsOptions, products),
     ("cloud", CloudOptions, cloud),
     ("curves", CurvesOptions, curves),
+    ("paper", PaperOptions, paper),
     ("orient", OrientOptions, orient),
     ("ties", TiesOptions, ties),
     ("rank", RankOptions, rank),

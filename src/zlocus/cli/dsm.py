@@ -24,7 +24,14 @@ from zlocus.cli.shared_options import (
     Vertical,
 )
 from zlocus.core.progress import progress_for
-from zlocus.core.requests import DEFAULT_PRODUCTS, DsmRequest, check_output, product_names
+from zlocus.core.requests import (
+    DEFAULT_PRODUCTS,
+    METHODS,
+    METHODS_OF_SELECTION,
+    DsmRequest,
+    check_output,
+    product_names,
+)
 
 
 @dataclass(frozen=True)
@@ -61,12 +68,20 @@ class DsmOptions:
         str, typer.Option(help="Images used for a cell: chosen for it, or all that show it.", metavar="auto|all")
     ] = "auto"
     method: Annotated[
+        str | None,
+        typer.Option(
+            help="Matching: ground grid (mvll) or image space (gc3), with or without semi-global constraint. "
+            "Default: mvll-sgm; mvll with --selection paper.",
+            metavar="mvll-sgm|mvll|gc3-sgm|gc3",
+        ),
+    ] = None
+    selection: Annotated[
         str,
         typer.Option(
-            help="Matching: ground grid, with or without semi-global constraint, or image space.",
-            metavar="mvll-sgm|mvll|gc3-sgm",
+            help="How images are chosen: as usual, or literally as Ji et al. (2014) do for single cells.",
+            metavar="default|paper",
         ),
-    ] = "mvll-sgm"
+    ] = "default"
     vertical: Vertical = "ellipsoid"
     fill: Annotated[
         str,
@@ -94,13 +109,19 @@ class DsmOptions:
     config: ConfigFile = None
 
 
+def method_of(options: DsmOptions) -> str:
+    """The method that is asked for, or the usual one of the selection."""
+    return options.method or METHODS_OF_SELECTION.get(options.selection, METHODS)[0]
+
+
 def dsm(options: DsmOptions) -> None:
     """Make a digital surface model from images."""
     request = DsmRequest(
         inputs=tuple(options.inputs), out=options.out, resolution=options.resolution, crs=options.crs,
         bounds=options.bounds, like=options.like, area=options.area, mask=options.mask, heights=options.heights,
         dem=options.dem, dem_vertical=options.dem_vertical, reference=options.reference, views=options.views,
-        method=options.method, vertical=options.vertical, fill=options.fill, partial=options.partial,
+        method=method_of(options), selection=options.selection, vertical=options.vertical, fill=options.fill,
+        partial=options.partial,
         workers=options.workers, scheduler=options.scheduler, memory_gb=options.memory, overwrite=options.overwrite,
         resume=options.resume, products=product_names(options.maps), report=options.report,
     )  # fmt: skip

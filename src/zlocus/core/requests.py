@@ -8,18 +8,28 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from zlocus.core.errors import ConfigError, InputError, OutputError
+from zlocus.core.errors import ConfigError, OutputError
+from zlocus.core.request_checks import (
+    SCENE_SUFFIXES,
+    check_choice,
+    check_heights,
+    check_inputs,
+    check_positive,
+    check_vertical,
+    check_vertical_of,
+    check_workers,
+    is_scene_file,
+)
 
-SCENE_SUFFIXES = (".yaml", ".yml")
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
 # Files of a demo: the first marks its folder; the last holds the accuracy against the truth and ends the demo.
 DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
 # The record of a finished surface: everything that it depends on, and the checksums of its products.
 FINISHED = "finished.json"
 VIEWS = ("auto", "all")
-METHODS = ("mvll-sgm", "mvll", "gc3-sgm")
-# Names of vertical datums; the file of a geoid raster may be given instead.
-VERTICALS = ("ellipsoid", "egm96", "egm2008")
+METHODS = ("mvll-sgm", "mvll", "gc3-sgm", "gc3")
+# How images are chosen for a cell, and the methods that go with it, the usual one first.
+METHODS_OF_SELECTION = {"default": ("mvll-sgm", "mvll", "gc3-sgm"), "paper": ("mvll", "gc3")}
 FILLS = ("none", "interpolate", "dem")
 PRODUCTS = ("hillshade", "contours", "dtm", "laz")
 # The hillshade is what everyone looks at first and takes a second per million cells; the others are made on request.
@@ -36,8 +46,10 @@ class DsmRequest:
     like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
     heights : (zmin, zmax), m, in the vertical datum `vertical`. dem : raster around whose heights is searched;
     dem_vertical : its vertical datum, None takes the one of its CRS.
-    reference : name of the reference image; with gc3-sgm only the pixels of this image are matched.
-    vertical : vertical datum of all heights: one of `VERTICALS` in upper or lower case, or the file of a geoid raster.
+    reference : name of the reference image; with gc3-sgm only the pixels of this image are matched. selection : key of
+    `METHODS_OF_SELECTION`: how images are chosen, `paper` for Ji et al. (2014) literally.
+    vertical : vertical datum of all heights: ellipsoid, egm96 or egm2008 in upper or lower case, or the file of a geoid
+    raster.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
     scheduler : address of a Dask cluster that works on them instead. memory_gb : most memory the tiles may take
     together, GB; None: 60 % of what is free. overwrite : whether another run in `out` is replaced. resume : whether
@@ -67,6 +79,7 @@ class DsmRequest:
     reference: str | None = None
     views: str = "auto"
     method: str = "mvll-sgm"
+    selection: str = "default"
     vertical: str = "ellipsoid"
     fill: str = "none"
     partial: bool = False
@@ -79,36 +92,59 @@ class DsmRequest:
     report: bool = True
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
+        check_inputs(self.inputs)
         self._check_grid()
         _check_products(self.products)
-        _check_heights(self.heights)
+        check_heights(self.heights)
         if self.heights is not None and self.dem is not None:
             raise ConfigError(f"--heights and --dem {self.dem} exclude each other. Leave one out.")
-        if self.dem is not None and self.method == "gc3-sgm":
+        if self.dem is not None and self.is_in_image_space:
             raise ConfigError(
-                f"--method gc3-sgm searches one range of heights and cannot follow --dem {self.dem}. Give "
+                f"--method {self.method} searches one range of heights and cannot follow --dem {self.dem}. Give "
                 "--heights, or use mvll-sgm."
             )
         for name, value, choices in (
             ("views", self.views, VIEWS),
             ("method", self.method, METHODS),
+            ("selection", self.selection, tuple(METHODS_OF_SELECTION)),
             ("fill", self.fill, FILLS),
         ):
-            _check_choice(name, value, choices)
-        if self.scheduler is not None and self.method == "gc3-sgm":
+            check_choice(name, value, choices)
+        self._check_selection()
+        if self.scheduler is not None and self.is_in_image_space:
             raise ConfigError(
-                "--method gc3-sgm matches whole images in one process. Leave --scheduler out, or use mvll-sgm."
+                f"--method {self.method} matches whole images in one process. Leave --scheduler out, or use mvll-sgm."
             )
         if self.fill == "dem" and self.dem is None:
             raise ConfigError("--fill dem needs the heights of a terrain model. Add --dem RASTER.")
-        _check_vertical("vertical", self.vertical)
-        _check_vertical_of("dem", self.dem, self.dem_vertical)
-        _check_workers(self.workers)
-        _check_positive("--memory", self.memory_gb, "GB")
+        check_vertical("vertical", self.vertical)
+        check_vertical_of("dem", self.dem, self.dem_vertical)
+        check_workers(self.workers)
+        check_positive("--memory", self.memory_gb, "GB")
+
+    @property
+    def is_in_image_space(self) -> bool:
+        """Whether the pixels of reference images are matched, instead of the cells of the ground."""
+        return self.method.startswith("gc3")
+
+    def _check_selection(self) -> None:
+        methods = METHODS_OF_SELECTION[self.selection]
+        if self.method not in methods:
+            other = "--selection paper" if self.method == "gc3" else "--selection default"
+            raise ConfigError(
+                f"--method {self.method} does not go with --selection {self.selection}, which takes "
+                f"{' or '.join(methods)}. Give one of these, or {other}."
+            )
+        if self.selection == "paper":
+            for name, is_given in (("--views all", self.views == "all"), (f"--dem {self.dem}", self.dem is not None)):
+                if is_given:
+                    raise ConfigError(
+                        f"--selection paper chooses the images, and searches around the heights of feature points; "
+                        f"{name} contradicts that. Leave it out, or use --selection default."
+                    )
 
     def _check_grid(self) -> None:
-        _check_positive("--resolution", self.resolution, "m")
+        check_positive("--resolution", self.resolution, "m")
         given = {"--resolution": self.resolution, "--crs": self.crs, "--bounds": self.bounds}
         extra = [name for name, value in given.items() if value is not None]
         if self.like is not None and extra:
@@ -179,11 +215,11 @@ class CloudRequest:
     vertical: str = "ellipsoid"
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        _check_heights(self.heights)
-        _check_choice("fill", self.fill, FILLS[:2])
-        _check_vertical("vertical", self.vertical)
-        _check_workers(self.workers)
+        check_inputs(self.inputs)
+        check_heights(self.heights)
+        check_choice("fill", self.fill, FILLS[:2])
+        check_vertical("vertical", self.vertical)
+        check_workers(self.workers)
         for name in self.references:
             if self.references.count(name) > 1:
                 raise ConfigError(f"--reference {name} is given twice. Name each view once.")
@@ -216,9 +252,9 @@ class CurvesRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        _check_positive("--resolution", self.resolution, "m")
-        _check_heights(self.heights)
+        check_inputs(self.inputs)
+        check_positive("--resolution", self.resolution, "m")
+        check_heights(self.heights)
         if (self.at is None) == (self.pixel is None):
             given = "both are given" if self.at is not None else "none is given"
             raise ConfigError(f"The point is asked for by --at X Y or by --pixel VIEW ROW COL, and {given}. Give one.")
@@ -257,10 +293,10 @@ class OrientRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        _check_heights(self.heights)
-        _check_vertical_of("control", self.control, self.control_vertical)
-        _check_vertical_of("dem", self.dem, self.dem_vertical)
+        check_inputs(self.inputs)
+        check_heights(self.heights)
+        check_vertical_of("control", self.control, self.control_vertical)
+        check_vertical_of("dem", self.dem, self.dem_vertical)
 
 
 @dataclass(frozen=True)
@@ -286,10 +322,10 @@ class RankRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        _check_positive("--resolution", self.resolution, "m")
-        _check_heights(self.heights)
-        _check_workers(self.workers)
+        check_inputs(self.inputs)
+        check_positive("--resolution", self.resolution, "m")
+        check_heights(self.heights)
+        check_workers(self.workers)
 
 
 @dataclass(frozen=True)
@@ -315,11 +351,11 @@ class DoctorRequest:
     memory_gb: float | None = None
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        _check_positive("--resolution", self.resolution, "m")
-        _check_heights(self.heights)
-        _check_workers(self.workers)
-        _check_positive("--memory", self.memory_gb, "GB")
+        check_inputs(self.inputs)
+        check_positive("--resolution", self.resolution, "m")
+        check_heights(self.heights)
+        check_workers(self.workers)
+        check_positive("--memory", self.memory_gb, "GB")
 
 
 @dataclass(frozen=True)
@@ -351,11 +387,11 @@ class ImportRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if not _is_scene_file(self.out):
+        if not is_scene_file(self.out):
             raise ConfigError(f"-o {self.out} is no name of a scene file. Let it end in {' or '.join(SCENE_SUFFIXES)}.")
-        _check_positive("--focal", self.focal, "px")
+        check_positive("--focal", self.focal, "px")
         if self.earth is not None:
-            _check_choice("earth", self.earth, EARTHS)
+            check_choice("earth", self.earth, EARTHS)
         for name, axis in (("up", self.up), ("north", self.north)):
             if axis is not None and not (all(map(math.isfinite, axis)) and any(axis)):
                 raise ConfigError(
@@ -394,65 +430,6 @@ def _check_products(names: Iterable[str]) -> None:
             raise ConfigError(
                 f"--products {name} is not known; choose from {', '.join(PRODUCTS)} with commas between them, or none."
             )
-
-
-def _check_inputs(inputs: tuple[Path, ...]) -> None:
-    if len(inputs) == 1 and _is_scene_file(inputs[0]):
-        return
-    scene_files = [path for path in inputs if _is_scene_file(path)]
-    if scene_files:
-        raise InputError(f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs.")
-    if len(inputs) < 2:
-        given = f"only {inputs[0]} is given" if inputs else "none is given"
-        raise InputError(f"A surface needs two images or more, and {given}. Add images, or give one scene.yaml.")
-    seen = set()
-    for path in inputs:
-        if path.resolve() in seen:
-            raise InputError(f"{path} is given twice, and an image cannot be matched with itself. Name it once.")
-        seen.add(path.resolve())
-
-
-def _check_heights(heights: tuple[float, float] | None) -> None:
-    if heights is None:
-        return
-    zmin, zmax = heights
-    if not (math.isfinite(zmin) and math.isfinite(zmax)) or zmin >= zmax:
-        raise ConfigError(f"--heights {zmin:.12g} {zmax:.12g} is an empty range. Give ZMIN ZMAX, the lower first.")
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ConfigError(f"--{name} {value} is not known; choose from {', '.join(choices)}.")
-
-
-def _check_vertical(name: str, value: str) -> None:
-    if value.lower() not in VERTICALS and not Path(value).is_file():
-        raise ConfigError(
-            f"--{name} {value} is neither {', '.join(VERTICALS)} nor the file of a geoid. Check the name."
-        )
-
-
-def _check_vertical_of(name: str, of: Path | None, value: str | None) -> None:
-    """Check the vertical datum of a file, which needs the file itself."""
-    if value is None:
-        return
-    if of is None:
-        raise ConfigError(f"--{name}-vertical {value} is given without --{name}. Give both, or leave it out.")
-    _check_vertical(f"{name}-vertical", value)
-
-
-def _check_workers(workers: int | None) -> None:
-    if workers is not None and workers < 1:
-        raise ConfigError(f"--workers {workers} is too few; give 1 or more.")
-
-
-def _is_scene_file(path: Path) -> bool:
-    return path.suffix.lower() in SCENE_SUFFIXES
-
-
-def _check_positive(name: str, value: float | None, unit: str) -> None:
-    if value is not None and not (math.isfinite(value) and value > 0):
-        raise ConfigError(f"{name} {value:g} is not a size. Give a number of {unit} above 0.")
 
 
 def held_files(out: Path, files: Sequence[str] = RUN_FILES) -> list[str]:

@@ -127,8 +127,22 @@ def image_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> I
     first = by_name[reference]
     other_views = [view for view in scene.views if view.name != reference]
     rays = depth_rays(first, other_views) if is_by_depth(scene) else height_rays(first, z_range)
-    moved = [replace(view, sensor=rays.to(view.sensor)) for view in other_views]
-    return ImageSpace(first, rays, (replace(first, sensor=PixelModel()), *moved))
+    return _along(rays, first, other_views)
+
+
+def height_space(scene: Scene, reference: str, z_range: tuple[float, float]) -> ImageSpace:
+    """The scene in the frame of one of its images, with heights along its rays whatever the cameras are, as in GC3.
+
+    reference : name of one of its views; z_range : m, range of the heights of the ground.
+    """
+    (first,) = (view for view in scene.views if view.name == reference)
+    return _along(height_rays(first, z_range), first, [view for view in scene.views if view.name != reference])
+
+
+def _along(rays: Rays, view: View, other_views: list[View]) -> ImageSpace:
+    """The space of some rays of a view."""
+    moved = [replace(other, sensor=rays.to(other.sensor)) for other in other_views]
+    return ImageSpace(view, rays, (replace(view, sensor=PixelModel()), *moved))
 
 
 def height_rays(view: View, z_range: tuple[float, float]) -> HeightRays:

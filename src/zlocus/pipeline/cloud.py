@@ -36,6 +36,7 @@ from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.pixel_products import write_cloud, write_maps
 from zlocus.pipeline.required_space import check_room_for_pixels
 from zlocus.pipeline.setup import open_inputs
+from zlocus.pipeline.tile_run import MatchMethod
 from zlocus.products.point_cloud import file_names
 from zlocus.sensors.image_rays import DepthRays
 
@@ -83,7 +84,8 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         check_geoid(vertical, setup)
     with watch.stage("match"):
         spill_arrays = SpillArrays(request.out, DEFAULT_MEMORY_SHARE * free_bytes())
-        matched = match_images(image_scenes, ImageMatching(config, True, request.workers, spill_arrays), progress)
+        matching = ImageMatching(config, MatchMethod("gc3-sgm"), request.workers, spill_arrays)
+        matched = match_images(image_scenes, matching, progress)
     with watch.stage("cross-check"):
         matched = cross_checked_images(matched, progress, spill_arrays)
     checksums = inputs.record()

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zlocus.core.errors import InputError, OutputError
+from zlocus.core.errors import OutputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DEMO_ACCURACY, DEMO_BEGUN, FINISHED, DsmRequest, held_files
-from zlocus.io.run_record import read_record, versions_record, write_record
+from zlocus.io.run_record import write_record
+from zlocus.pipeline.demo_block import DIGEST, block_digest, is_block_of
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.pipeline.execution.checkpoint import FOLDER as TILES
 from zlocus.pipeline.execution.precompile import kernels_compiling
@@ -75,12 +74,12 @@ def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene
 
     # The trajectory files describe the flight exactly as it was rendered.
     flown = TrajectoryNoise()
-    made_of = hashlib.sha256(repr((spec, flown, versions_record())).encode()).hexdigest()
+    made_of = block_digest(spec, flown)
     folder, begun, finished = out / "scene", out / DEMO_BEGUN, out / DEMO_ACCURACY
     if folder.exists() and not finished.exists():
         if not begun.exists():
             raise OutputError(f"{folder} is there already, and not the scene of a demo. Choose another folder with -o.")
-        if _is_scene_of(begun, made_of):
+        if is_block_of(begun, made_of):
             progress.note(f"The scene in {folder} is that of a demo which was stopped: it is not rendered again.")
             return scene_files(spec, folder, is_linescan=True)
     with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
@@ -92,12 +91,5 @@ def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene
         for old in (folder, out / TILES):
             shutil.rmtree(old, ignore_errors=True)
         rendered = render_scene(spec, folder, lambda step: stage.advance(), flown)
-        write_record(begun, {"scene_sha256": made_of})
+        write_record(begun, {DIGEST: made_of})
     return rendered
-
-
-def _is_scene_of(begun: Path, made_of: str) -> bool:
-    """Whether an interrupted demo has rendered its scene, and with the same specification."""
-    with suppress(InputError):  # damaged
-        return bool(read_record(begun).get("scene_sha256") == made_of)
-    return False

@@ -27,7 +27,6 @@ from zlocus.pipeline.execution.plan import Tile, plan_tiles
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import write_finished
 from zlocus.pipeline.finished_run import Missing, make_missing, missing_products, whole_again
-from zlocus.pipeline.image_tiles import tile_maker
 from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.open_run import OpenRun, check_polygons, known_ties, may_have_terrain, open_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
@@ -43,6 +42,7 @@ from zlocus.pipeline.surface_products import (
     write_points,
     write_report_inputs,
 )
+from zlocus.pipeline.tile_makers import tile_maker
 from zlocus.pipeline.tile_run import Plan, Tally, TileRun, planned, tile_job, workers_for
 from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD

@@ -7,7 +7,7 @@ are removed), and for a surface `heights_for_grid` and `grid_tile` (the heights 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -21,7 +21,6 @@ from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig
 from zlocus.core.parallel import run_all
 from zlocus.core.progress import Progress
-from zlocus.core.requests import DsmRequest
 from zlocus.core.scene import Scene, View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.fill import filled
@@ -35,6 +34,7 @@ from zlocus.matching.image_space import (
     check_cross_consistency,
     depth_options,
     fitting_block,
+    height_space,
     hypotheses_of_heights,
     hypotheses_of_ties,
     image_space,
@@ -44,15 +44,15 @@ from zlocus.matching.image_space import (
 from zlocus.matching.match_scene import MIN_LEVELS, MatchScene
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
-from zlocus.matching.tile import TileResult, match_tile
+from zlocus.matching.tile import TileResult
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.plan import Tile, plan_tiles
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
 from zlocus.pipeline.height_range import possible_heights, range_from_ties
-from zlocus.pipeline.setup import RunSetup, orient_views, supported_views
-from zlocus.pipeline.tile_run import Plan, Tally, TileJob, TileProduct
+from zlocus.pipeline.setup import RunSetup, orient_views, reference_features, supported_views
+from zlocus.pipeline.tile_run import MatchMethod, TileProduct
 from zlocus.sensors.frame import FrameModel
 
 # Two images agree on a height where it moves the pixel by at most this much.
@@ -114,14 +114,14 @@ class ImageScene:
 class ImageMatching:
     """How reference images are matched.
 
-    config : options, with the blocks and levels that suit the images; choose_images : see `match_tile`; workers :
-    tiles at a time; spill_arrays : makes the arrays of all pixels; ground_area : tiles that cannot show it are left
+    config : options, with the blocks and levels that suit the images; method : how tiles are matched; workers : tiles
+    at a time; spill_arrays : makes the arrays of all pixels; ground_area : tiles that cannot show it are left
     out, None leaves none out; checkpoint : keeps finished tiles, and holds those of a run that is resumed, None keeps
     none.
     """
 
     config: RunConfig
-    choose_images: bool
+    method: MatchMethod
     workers: int
     spill_arrays: SpillArrays
     ground_area: GroundArea | None = None
@@ -255,6 +255,20 @@ def build_image_scene(setup: ImageSetup, reference: str, config: RunConfig) -> I
     return ImageScene(space, build_image_match_scene(space, span, ties[is_known], config.pyramid, measured))
 
 
+def reference_scene(setup: RunSetup, config: RunConfig) -> ImageScene:
+    """The pixels of the reference image of a run, with heights along its rays whatever its camera is (GC3).
+
+    Its tie points are the feature points of the reference image.
+    """
+    scene, z_range = supported_views(setup.scene, setup.orientation), setup.height_range.expected
+    space = height_space(scene, setup.match_scene.views[0].name, z_range)
+    span = hypotheses_of_heights(space, z_range)
+    assert span is not None, "hypotheses are heights"
+    ties = space.frame_from_ground(reference_features(setup))
+    ties = ties[np.isfinite(ties).all(axis=1)]
+    return ImageScene(space, build_image_match_scene(space, span, ties, config.pyramid))
+
+
 def match_images(
     image_scenes: Sequence[ImageScene], matching: ImageMatching, progress: Progress
 ) -> list[MatchedPixels]:
@@ -279,7 +293,7 @@ def match_images(
         arrays = None if matching.checkpoint is None else matching.checkpoint.load(tile_name(*task))
         if arrays is not None:
             return TileProduct.of(arrays), False
-        return matched_tile(image_scenes[task[0]], task[1], config, matching.choose_images), True
+        return matched_tile(image_scenes[task[0]], task[1], config, matching.method), True
 
     with progress.stage("Matching", len(tasks)) as stage, _interruption(matching.checkpoint, tasks, progress):
         for (number, tile), (product, is_new) in run_all(work, tasks, matching.workers):
@@ -295,7 +309,7 @@ def match_images(
     return [replace(m, evaluations=int(t[0]), all_images=int(t[1])) for m, t in zip(matched, tallies, strict=True)]
 
 
-def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, choose_images: bool) -> TileProduct:
+def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, method: MatchMethod) -> TileProduct:
     """One tile of a reference image.
 
     Raises
@@ -304,9 +318,7 @@ def matched_tile(image_scene: ImageScene, tile: Tile, config: RunConfig, choose_
         A fault of our own, with the tile in which it happened.
     """
     try:
-        result = match_tile(
-            image_scene.match_scene, tile.core_window, config, method="gc3-sgm", choose_images=choose_images
-        )
+        result = method.match(image_scene.match_scene, tile, config)
     except ZlocusError:
         raise
     except Exception as error:
@@ -418,47 +430,3 @@ def grid_tile(
     if fill == "interpolate":
         surface = filled(surface, halo // 2)
     return TileResult(surface.part(core_window, window))
-
-
-def tile_maker(
-    request: DsmRequest,
-    tile_job: TileJob,
-    checkpoint: TileCheckpoint,
-    setup: RunSetup,
-    plan: Plan,
-    tally: Tally,
-    progress: Progress,
-) -> Callable[[Tile], TileProduct]:
-    """The function that makes a tile of a surface.
-
-    On the ground grid it is the tile_job itself. In image space all images are matched and checked against each other
-    first; a tile is then made from their heights.
-    """
-    if request.method != "gc3-sgm":
-        return tile_job
-    orientation, grid, match_scene = setup.orientation, tile_job.grid, setup.match_scene
-    used = supported_views(setup.scene, orientation)
-    is_supported = supported(orientation.xyz, orientation.sigma_z_m)
-    image_setup = ImageSetup(used, orientation, orientation.xyz, is_supported, setup.height_range.searched)
-    references = [view.name for view in match_scene.views if request.reference in (None, view.name)]
-    box, margin = grid.geobox.extent.boundingbox, tile_job.config.pyramid.halo * grid.cell_m
-    bounds = (box.left - margin, box.bottom - margin, box.right + margin, box.top + margin)
-    spill_arrays = SpillArrays(request.out, plan.allowed_bytes - plan.n_bytes)
-    area = GroundArea(bounds, setup.height_range.searched)
-    matching = ImageMatching(tile_job.config, tile_job.choose_images, plan.slots, spill_arrays, area, checkpoint)
-    grid_images = heights_for_grid(image_setup, references, matching, progress)
-    tally.evaluations, tally.all_images = grid_images.evaluations, grid_images.all_images
-    if spill_arrays.file_bytes:
-        progress.note(
-            f"Memory has no room for the heights of all pixels: {spill_arrays.file_bytes / 1e9:.2g} GB of them lie on "
-            "disk."
-        )
-
-    def make(tile: Tile) -> TileProduct:
-        product = tile_job.product(
-            tile, grid_tile(grid_images, match_scene, tile.core_window, tile_job.config, tile_job.fill)
-        )
-        spill_arrays.rest()
-        return product
-
-    return make

@@ -78,7 +78,7 @@ def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
 
 def _check_room_first(request: DsmRequest, opened_inputs: OpenedInputs, checkpoint: TileCheckpoint) -> None:
     """Refuse, before images are read, a run that memory or the disk has no room for."""
-    if request.method == "gc3-sgm":
+    if request.is_in_image_space:
         check_room_for_pixels(request.out, opened_inputs.scene, [view.name for view in opened_inputs.scene.views])
     if not checkpoint.finished:
         like = None if opened_inputs.like is None else opened_inputs.like.shape.yx

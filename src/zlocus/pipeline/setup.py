@@ -33,6 +33,7 @@ from zlocus.core.progress import Progress
 from zlocus.core.requests import SetupRequest
 from zlocus.core.resources import cores
 from zlocus.core.scene import Scene, is_local
+from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import checked_crs
 from zlocus.io.grid_inputs import dem_datum, read_dem, read_geobox
 from zlocus.io.input_files import files_of
@@ -224,6 +225,16 @@ def supported_views(scene: Scene, orientation: Orientation) -> Scene:
         "nothing was matched. Check that they show the same ground and that each camera belongs to its image; where "
         "cameras may be far off, set a larger orientation.max_pointing_px in --config."
     )
+
+
+def reference_features(setup: RunSetup) -> FloatArray:
+    """Ground points (n, 3) m of the tie points in the reference image, which are the feature points of the paper.
+
+    SIFT has found them in the reference image and in another one, and the cameras confirm them.
+    """
+    observations, name = setup.orientation.observations, setup.match_scene.views[0].name
+    number = [view.name for view in setup.scene.views].index(name)
+    return np.asarray(setup.orientation.xyz[np.unique(observations.point[observations.view == number])])
 
 
 def doubts_from_dem(

@@ -34,8 +34,8 @@ SUFFICIENT_COVERAGE = 0.5
 
 
 def has_colours(request: DsmRequest, setup: RunSetup) -> bool:
-    """Whether the ortho-image of the surface has colours; that of image space is grey."""
-    return setup.match_scene.has_colours and request.method != "gc3-sgm"
+    """Whether the ortho-image has colours; that of image space, and with the selection of the paper, is grey."""
+    return setup.match_scene.has_colours and not request.is_in_image_space and request.selection == "default"
 
 
 def surface_rasters(request: DsmRequest, setup: RunSetup, vertical_datum: VerticalDatum) -> SurfaceRasters:

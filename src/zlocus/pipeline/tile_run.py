@@ -21,10 +21,11 @@ from zlocus.core.resources import DEFAULT_MEMORY_SHARE, TILE_CODE_BYTES, WORKER_
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
 from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
-from zlocus.matching.fill import filled_from
+from zlocus.matching.fill import filled, filled_from
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.quality import Quality
+from zlocus.matching.selected_surface import match_tile_of_paper
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
@@ -33,11 +34,13 @@ from zlocus.pipeline.execution.event_log import NAME, EventLog
 from zlocus.pipeline.execution.plan import Tile, tile_needs
 from zlocus.pipeline.execution.processes import Processes
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
-from zlocus.pipeline.setup import RunSetup
+from zlocus.pipeline.setup import RunSetup, reference_features
 from zlocus.products.rasters import SurfaceRasters
 
 # Processes take about two seconds to start, and so are not worth it for less work than this, s.
 SHORT_S = 15.0
+# Time to match a cell by the selection of the paper, with six images.
+PAPER_CELL_S = 2e-4
 # A message names at most this many failed tiles.
 MAX_NAMED_TILES = 3
 
@@ -98,14 +101,22 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
             f"{own / 1e9:.2g} GB of the command itself. Allow more, or set a smaller pyramid.tile in --config."
         )
     n_worked = sum(1 for tile in tiles if tile.core_window.rows and tile.core_window.cols)
-    wanted = request.workers or (cores() if needs.seconds > SHORT_S else 1)
+    seconds = seconds_of_paper(tiles) if request.selection == "paper" else needs.seconds
+    wanted = request.workers or (cores() if seconds > SHORT_S else 1)
     there = needs.n_bytes + WORKER_BYTES
     slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
-    processes = slots > 1 and request.method != "gc3-sgm"
+    processes = slots > 1 and not request.is_in_image_space
     each = there if processes or request.scheduler else here
-    # In image space the pixels of every image are matched before.
-    seconds = needs.seconds * (len(match_scene.views) if request.method == "gc3-sgm" else 1)
+    if request.method == "gc3-sgm":
+        # The pixels of every image are matched before.
+        seconds *= len(match_scene.views)
     return Plan(len(tiles), slots, processes, each, own, allowed, seconds, request.scheduler)
+
+
+def seconds_of_paper(tiles: Sequence[Tile]) -> float:
+    """Estimated time of one worker for the selection of the paper, which matches only the kept cells."""
+    kept = [tile.kept_window.within(tile.core_window) for tile in tiles]
+    return PAPER_CELL_S * sum(window.rows * window.cols for window in kept)
 
 
 @dataclass
@@ -310,7 +321,11 @@ def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: 
         assert request.dem is not None, "a request that fills from a terrain model names it"
         terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
     choose_images, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
-    return TileJob(setup.match_scene, setup.grid, config, request.method, choose_images, fill, polygons, terrain)
+    match_scene = setup.match_scene
+    if request.selection == "paper":
+        match_scene = replace(match_scene, ties=reference_features(setup))
+    method = MatchMethod(request.method, choose_images, request.selection)
+    return TileJob(match_scene, setup.grid, config, method, fill, polygons, terrain)
 
 
 def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress) -> AbstractContextManager[Workers]:
@@ -420,25 +435,42 @@ class TileProduct:
 
 
 @dataclass(frozen=True)
+class MatchMethod:
+    """How tiles are matched. name, choose_images : see `match_tile`; selection : see `DsmRequest`."""
+
+    name: str
+    choose_images: bool = True
+    selection: str = "default"
+
+    def match(self, match_scene: MatchScene, tile: Tile, config: RunConfig, fill: str = "none") -> TileResult:
+        """The result of a tile."""
+        if self.selection == "default":
+            return match_tile(match_scene, tile.core_window, config, self.name, self.choose_images, fill)
+        if fill == "none":
+            return match_tile_of_paper(match_scene, tile.core_window, tile.kept_window, config)
+        # The cells around those that are kept fill gaps at their border.
+        result = match_tile_of_paper(match_scene, tile.core_window, tile.core_window, config)
+        return replace(result, surface=filled(result.surface, config.pyramid.halo // 2))
+
+
+@dataclass(frozen=True)
 class TileJob:
     """Makes the tiles of a match scene; it is sent to each worker once.
 
-    method, choose_images, fill : see `match_tile`; terrain : fills cells that are still empty, None fills none.
+    fill : see `match_tile`; terrain : fills cells that are still empty, None fills none.
     """
 
     match_scene: MatchScene
     grid: Grid
     config: RunConfig
-    method: str
-    choose_images: bool
+    method: MatchMethod
     fill: str
     area: Polygons = Polygons()
     terrain: Terrain | None = None
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        result = match_tile(self.match_scene, tile.core_window, self.config, self.method, self.choose_images, self.fill)
-        return self.product(tile, result)
+        return self.product(tile, self.method.match(self.match_scene, tile, self.config, self.fill))
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:
         """The product of a matched tile: cut to the requested cells, with gaps filled from the terrain model."""

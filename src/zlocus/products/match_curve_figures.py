@@ -62,7 +62,7 @@ def write_point(folder: Path, report: PointReport, loci: Sequence[Locus], option
     write_record(folder / "point.json", point_record(report, options))
 
 
-def match_curves_figure(report: PointReport) -> Figure:
+def match_curves_figure(report: PointReport, title: str = "Correlation with each search image") -> Figure:
     """NCC with each search image in a panel of its own, in their order, with peak and secondary peak marked."""
     curves, n = report.curves.single_curves, len(report.search)
     figure, panels = _panels(n, (4.2, 2.5), share=True)
@@ -77,7 +77,7 @@ def match_curves_figure(report: PointReport) -> Figure:
         axes.set_title(as_written(f"{j + 1}. {report.reference} – {name}"), fontsize=9, loc="left")
         rho = f"{signed(label)} {LABELS[label]}   ρ1 {decimal(peaks.rho1[j], 2)}   ratio {decimal(peaks.ratio[j], 2)}"
         axes.text(0.02, 0.03, rho, transform=axes.transAxes, fontsize=8, color=LABEL_COLOURS[label])
-    _labelled(figure, "Correlation with each search image (x: peak, dotted: secondary peak ρ2)")
+    _labelled(figure, f"{title} (x: peak, dotted: secondary peak ρ2)")
     return figure
 
 
@@ -134,8 +134,8 @@ def svg_of(figure: Figure) -> str:
     return text[text.index("<svg") :]  # without the document type, which holds an address
 
 
-def loci_figure(loci: Sequence[Locus]) -> Figure:
-    """The vertical line over a crop of every image, the reference image first."""
+def loci_figure(loci: Sequence[Locus], line: str = "The vertical line") -> Figure:
+    """A line over a crop of every image, the reference image first. line : what it is, for the title."""
     figure, panels = _panels(len(loci), (3.1, 3.3))
     for j, (axes, locus) in enumerate(zip(panels, loci, strict=True)):
         row, col = locus.first
@@ -153,7 +153,7 @@ def loci_figure(loci: Sequence[Locus]) -> Figure:
         axes.tick_params(labelsize=7)
         title = f"{locus.name} (reference)" if j == 0 else f"{j}. {locus.name}"
         axes.set_title(as_written(title), fontsize=9, loc="left")
-    figure.suptitle("The vertical line in the images, column and row (+: height at the start, x: peak)", fontsize=10)
+    figure.suptitle(f"{line} in the images, column and row (+: height at the start, x: peak)", fontsize=10)
     return figure
 
 

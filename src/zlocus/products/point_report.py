@@ -96,15 +96,24 @@ def loci(views: Sequence[View], report: PointReport) -> list[Locus]:
 
     views : that were compared.
     """
-    order, lines = report.curves.order, []
+    order = report.curves.order
     peak_m = report.peak_m if math.isfinite(report.peak_m) else float(report.xyz[2])
     heights = np.concatenate([report.heights_m, [report.xyz[2], peak_m]])
     xyz = np.column_stack([np.broadcast_to(report.middle, (len(heights), 2)), heights])
-    for i in (order.reference, *order.search.tolist()):
-        xy = views[i].sensor.image_from_ground(xyz)
-        row, col, pixels, valid = crop(views[i], xy[np.isfinite(xy).all(axis=1)])
+    return loci_through([views[i] for i in (order.reference, *order.search.tolist())], xyz)
+
+
+def loci_through(views: Sequence[View], xyz: FloatArray) -> list[Locus]:
+    """The images of a line of ground points, for each view.
+
+    xyz : (h + 2, 3) m, the points of the line, then that at the start and that at the peak.
+    """
+    lines = []
+    for view in views:
+        xy = view.sensor.image_from_ground(xyz)
+        row, col, pixels, valid = crop(view, xy[np.isfinite(xy).all(axis=1)])
         grey = np.where(valid, pixels, np.float32(np.nan))
-        lines.append(Locus(views[i].name, (row, col), grey, xy[:-2], xy[-2], xy[-1]))
+        lines.append(Locus(view.name, (row, col), grey, xy[:-2], xy[-2], xy[-1]))
     return lines
 
 
