@@ -70,6 +70,7 @@ RUN_BY = {
     "rows/drone_block.py": "test_drone_block_row.py::test_the_row_renders_matches_and_judges",
     "rows/demo.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/fresh.py": "test_seeds.py::test_the_figures_of_a_seed_are_those_of_its_surface",
+    "rows/choice_of_images.py": "test_many_images.py::test_the_default_is_compared_with_the_best_of_the_others",
     "rows/many_images.py": "test_many_images.py::test_false_heights_on_ground_away_from_buildings_are_counted",
     "rows/methods.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/photographs.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",

@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
+from rows.choice_of_images import STEPS, Judged, behind_the_best
 from rows.many_images import BUILDING, GROUND, n_false_on_ground, step_up
 
 
@@ -36,3 +37,18 @@ def test_false_heights_on_ground_away_from_buildings_are_counted(tmp_path):
 def test_the_largest_step_up_of_an_error():
     assert step_up({2: 4.0, 3: 2.0, 5: 2.5, 7: 2.4}) == pytest.approx(1.25)
     assert step_up({2: 4.0, 3: 3.0}) == pytest.approx(0.75)
+
+
+def test_the_default_is_compared_with_the_best_of_the_others():
+    """By the least error of any, and by the largest share of any, which need not be of the same one."""
+    found = {step: Judged(2.0, 0.7, 20.0) for step in STEPS}
+    found |= {
+        "the paper": Judged(1.0, 0.6, 99.0),
+        "all images": Judged(1.5, 0.8, 10.0),
+        "default": Judged(1.1, 0.79, 5.0),
+    }
+    figures = {figure.what: figure for figure in behind_the_best("town", found)}
+    assert figures["town: error over the best"].value == pytest.approx(1.1)
+    assert figures["town: within 1 m below the best"].value == pytest.approx(0.01)
+    assert figures["town: CPU over that of all images"].value == pytest.approx(0.5)
+    assert len(behind_the_best("facade", {step: Judged(1.0, None, 1.0) for step in STEPS})) == 2
