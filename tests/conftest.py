@@ -36,10 +36,15 @@ def pytest_configure(config):
 def pytest_sessionstart(session):
     """Compile the kernels once, before several processes would each compile the same ones at the same time."""
     if session.config.getoption("numprocesses", None) and not hasattr(session.config, "workerinput"):
-        from zlocus.pipeline.execution.precompile import kernels_compiling
+        from dataclasses import replace
+        from tempfile import TemporaryDirectory
 
-        with kernels_compiling():
-            pass
+        from zlocus.pipeline.execution.precompile import kernels_compiling
+        from zlocus.synthetic.files import render_scene
+        from zlocus.synthetic.scenes import city_spec
+
+        with kernels_compiling(), TemporaryDirectory() as folder:
+            render_scene(replace(city_spec(16), size=32), Path(folder) / "scene")
 
 
 def pytest_collection_modifyitems(items):
@@ -47,6 +52,22 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if any(item.path.is_relative_to(place) for place in slow):
             item.add_marker(pytest.mark.slow)
+    items[:] = in_halves(items)
+
+
+def in_halves(items):
+    """The tests in two halves, which the two processes of `make test` begin with: every other slow file first, with all
+    its tests, then half of the other tests. A process that has nothing left takes tests from the end of the other's,
+    and short ones let both end at the same time."""
+    files = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    slow = [tests for tests in files.values() if tests[0].get_closest_marker("slow")]
+    quick = [item for tests in files.values() if not tests[0].get_closest_marker("slow") for item in tests]
+    first, second = ([item for tests in slow[at::2] for item in tests] for at in (0, 1))
+    # So that the halves have equal numbers of tests, as pytest-xdist deals them out.
+    n = min(max(len(items) // 2 - len(first), 0), len(quick))
+    return [*first, *quick[:n], *second, *quick[n:]]
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -10,7 +11,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from functools import cache
+from glob import glob
 from pathlib import Path
 
 import httpx
@@ -64,16 +67,52 @@ def check_make(text: str) -> None:
     assert re.search(rf"^{text.split()[1]}:", makefile, re.MULTILINE), text
 
 
+# Starts scripts, each in a process of its own that has loaded already what most of them import, and keeps what they say
+# of themselves in files that are numbered as the scripts are. A script that does not end after `--help` has failed.
+HELP = """
+import gc, os, runpy, sys
+from pathlib import Path
+import cv2
+import zlocus.evaluation.evaluate, zlocus.pipeline.dsm, zlocus.synthetic.files
+
+folder, *scripts = sys.argv[1:]
+gc.freeze()
+for number, script in enumerate(scripts):
+    if not (process := os.fork()):
+        said = os.open(f"{folder}/{number}", os.O_CREAT | os.O_WRONLY)
+        os.dup2(said, 1)
+        sys.argv, sys.path[0] = [script, "--help"], script if Path(script).is_dir() else str(Path(script).parent)
+        try:
+            runpy.run_path(script, run_name="__main__")
+        except SystemExit as end:
+            sys.stdout.flush()
+            os._exit(end.code or 0)
+        os._exit(3)
+    if status := os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]):
+        sys.exit(f"{script} --help ends with exit status {status}")
+"""
+
+
 @cache
-def help_of(script: str) -> str:
-    """What a script says of itself."""
-    asked = [sys.executable, script, "--help"]
-    return subprocess.run(asked, capture_output=True, text=True, cwd=ROOT, check=True).stdout
+def help_of_scripts() -> dict[str, str]:
+    """What the scripts of benchmarks/ that pages name say of themselves."""
+    scripts = sorted(
+        {
+            shlex.split(step.text)[1]
+            for page in PAGES_WITH_COMMANDS
+            for step in steps_of(page)
+            if step.text.startswith("python benchmarks/")
+        }
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run([sys.executable, "-c", HELP, folder, *scripts], capture_output=True, text=True, cwd=ROOT)
+        assert done.returncode == 0, done.stderr
+        return {script: (Path(folder) / str(i)).read_text(encoding="utf-8") for i, script in enumerate(scripts)}
 
 
 def check_benchmark(text: str) -> None:
     """The script starts, and has the options."""
-    assert options_of(text) <= options_of(help_of(shlex.split(text)[1])), text
+    assert options_of(text) <= options_of(help_of_scripts()[shlex.split(text)[1]]), text
 
 
 def check_pytest(text: str) -> None:
@@ -97,6 +136,29 @@ def runnable(text: str) -> str:
     return re.sub(r"\s*\[-[^]]*\]", "", text).replace("INPUT...", INPUTS)
 
 
+# Signs by which a line asks more of the shell than words and `*`.
+SHELL = re.compile(r"[|&;<>$`\\~?\[{(]")
+
+
+def is_run_here(step: Step, folder: Path) -> bool:
+    """Whether a step is a command of zlocus that this process can run as one of its own would: imports and kernels are
+    loaded already. `inspect` ends by a signal, and PROJ looks for a user's grids when a process starts."""
+    words = [] if step.is_python else step.text.split()
+    if words[:1] != ["zlocus"] or words[1] == "inspect" or (folder / PROJ_GRIDS).exists():
+        return False
+    return SHELL.search(runnable(step.text)) is None
+
+
+def run_here(words: list[str], folder: Path) -> None:
+    """Runs a command of zlocus in this process, in a folder; `*` in its words stands for the files of the folder."""
+    found = [
+        sorted(name for name in glob(word, root_dir=folder)) or [word] if "*" in word else [word] for word in words
+    ]
+    with contextlib.chdir(folder):
+        done = CliRunner().invoke(app, [name for names in found for name in names][1:], catch_exceptions=False)
+    assert done.exit_code == 0, f"{' '.join(words)}\n{done.output}"
+
+
 def run(step: Step, folder: Path) -> None:
     """Runs one step in a folder as a reader would; commands that are alternatives to others begin anew."""
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
@@ -108,6 +170,9 @@ def run(step: Step, folder: Path) -> None:
         shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
     if words[:2] == ["zlocus", "inspect"]:
         check_page(words, folder, environment)
+        return
+    if is_run_here(step, folder):
+        run_here(words, folder)
         return
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{step.text}\n{done.stdout}\n{done.stderr}"

@@ -12,6 +12,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Set
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,7 +77,13 @@ def annotated_names(folder: Path) -> list[AnnotatedName]:
 def modules(folder: Path) -> Iterator[tuple[str, ast.Module]]:
     """Path below the folder and syntax tree of every module."""
     for module in sorted(folder.rglob("*.py")):
-        yield module.relative_to(folder).as_posix(), ast.parse(module.read_text(encoding="utf-8"))
+        yield module.relative_to(folder).as_posix(), tree_of(module.read_text(encoding="utf-8"))
+
+
+@cache
+def tree_of(text: str) -> ast.Module:
+    """Syntax tree of a module's text, which nobody changes."""
+    return ast.parse(text)
 
 
 def annotations(tree: ast.AST, own_class: str = "") -> Iterator[tuple[int, str, ast.expr, str]]:

@@ -49,6 +49,11 @@ class Areas:
         down, across = ((np.arange(n) + 0.5) / n - 0.5 for n in self.shape)
         return np.column_stack([np.tile(across, len(down)), np.repeat(down, len(across))])
 
+    def offsets(self, part: slice) -> FloatArray:
+        """Offsets (n, k, 2) of the places from some of the points, in x and y; (k, 2) where all areas are alike."""
+        steps, (across, down) = self.steps if self.steps.ndim == 2 else self.steps[part], self.places.T[..., None]
+        return np.asarray(steps[..., None, :, 0] * across + steps[..., None, :, 1] * down)
+
 
 @dataclass(frozen=True)
 class Points:
@@ -73,13 +78,12 @@ class Points:
         xy = self.xy if shift is None else self.moved(shift)
         if self.areas is None:
             return sample(xy)
-        places, steps = self.areas.places, np.broadcast_to(self.areas.steps, (len(xy), 2, 2))
+        areas, places = self.areas, self.areas.places
         means = np.full(len(xy), np.nan)
         n_at_a_time = max(1, PLACES_AT_A_TIME // len(places))
         for first in range(0, len(xy), n_at_a_time):
             part = slice(first, first + n_at_a_time)
-            offsets = np.einsum("nij,kj->nki", steps[part], places)
-            z = sample((xy[part, None] + offsets).reshape(-1, 2)).reshape(-1, len(places))
+            z = sample((xy[part, None] + areas.offsets(part)).reshape(-1, 2)).reshape(-1, len(places))
             n_known = np.isfinite(z).sum(axis=1)
             enough = 2 * n_known >= len(places)
             means[part][enough] = np.nansum(z[enough], axis=1) / n_known[enough]

@@ -27,7 +27,7 @@ from zlocus.matching.tile import rank_tile
 from zlocus.orientation.parameter_groups import kind_of
 from zlocus.pipeline.setup import RunSetup
 from zlocus.products.footprints import write_footprints
-from zlocus.products.match_curve_figures import mean_figure, svg_of
+from zlocus.products.match_curve_drawing import mean_svg
 from zlocus.products.point_report import PointReport, point_record
 from zlocus.products.report.example_cells import FAILED, RULE, ChosenCell, chosen_cells
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, REPORT
@@ -240,8 +240,8 @@ def curves_of(
     report = PointReport.of(asked, looked, match_scene, run.scene.crs)
     # Where no height was found, all images are shown.
     n_images = len(report.search) if chosen_cell.kind == FAILED else report.curves.n_used
-    figure = mean_figure(report, n_images, is_small=True)
-    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": svg_of(figure)}
+    drawing = mean_svg(report, n_images)
+    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": drawing}
 
 
 def place_of_cell(xy: FloatArray, height_m: float, run: ReportedRun) -> Place:

@@ -34,10 +34,11 @@ if TYPE_CHECKING:
 
 COLUMNS = 3
 DPI = 110
-SMALL_INCHES = (3.7, 3.5)
 # The colours of Okabe and Ito, which colour-blind readers can distinguish. The mean is black.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195")
 DASHES = ("-", "--", ":")
+# The same for SVG.
+SMALL_DASHES = ("", "4 2", "1.5 2")
 LABEL_COLOURS = {1: "#00704F", 0: "#8A6100", -1: "#B03A00"}
 STRETCH_PERCENT = (1.0, 99.0)
 
@@ -81,12 +82,20 @@ def match_curves_figure(report: PointReport, title: str = "Correlation with each
     return figure
 
 
-def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> Figure:
+def shown_means(report: PointReport, n_images: int) -> list[tuple[int, float]]:
+    """The means that are drawn beside that of `n_images`: the number of images of each, and its grey, 0 for black."""
+    # The mean of one image is that image's own curve.
+    used = report.curves.n_used
+    steps = [used] if n_images > used else list(range(2, n_images))
+    return [(m, 0.8 - 0.5 * k / len(steps)) for k, m in enumerate(steps, 1)]  # the later, the darker
+
+
+def mean_figure(report: PointReport, n_images: int) -> Figure:
     """NCC of the first images as thin lines, their mean as a thick one, and the means before it as dashed ones.
 
-    n_images : number of images in the mean; is_small : as wide as a telephone, without a title.
+    n_images : number of images in the mean.
     """
-    figure, (axes,) = _panels(1, SMALL_INCHES if is_small else (7.6, 4.4))
+    figure, (axes,) = _panels(1, (7.6, 4.4))
     _frame(axes, report)
     curves = report.curves
     for j, name in enumerate(report.search[:n_images]):
@@ -94,12 +103,9 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
         colour, dashes = COLOURS[j % len(COLOURS)], DASHES[j // len(COLOURS) % len(DASHES)]
         axes.plot(report.heights_m, values, color=colour, linestyle=dashes, linewidth=0.9, label=as_written(name))
     mean, j = curves.mean_curves, n_images - 1
-    # The mean of one image is that image's own curve.
-    steps = [curves.n_used] if n_images > curves.n_used else list(range(2, n_images))
-    for k, m in enumerate(steps, 1):
-        grey = f"{0.8 - 0.5 * k / len(steps):.2f}"  # the later, the darker
+    for m, grey in shown_means(report, n_images):
         name = f"mean of the first {m}"
-        axes.plot(report.heights_m, mean.values[m - 1], color=grey, linewidth=1.6, linestyle="--", label=name)
+        axes.plot(report.heights_m, mean.values[m - 1], color=f"{grey:.2f}", linewidth=1.6, linestyle="--", label=name)
     axes.plot(report.heights_m, mean.values[j], color="black", linewidth=2.2, label=f"mean of {n_images}")
     peak = mean.peaks.peak[j]
     axes.plot(report.heights_m[peak], mean.peaks.rho1[j], "x", color="black", markersize=9, markeredgewidth=2)
@@ -107,11 +113,6 @@ def mean_figure(report: PointReport, n_images: int, is_small: bool = False) -> F
     figures = f"ρ1 {decimal(mean.peaks.rho1[j], 3)}, ratio {decimal(mean.peaks.ratio[j], 2)}, peak {height:.2f} m"
     which = "all search images" if n_images == len(report.search) else f"{n_images} of {len(report.search)} images"
     title = f"{report.reference} with {which}: {signed(label)} {LABELS[label]}, {figures}"
-    if is_small:
-        figure.legend(loc="outside lower center", fontsize=8, frameon=False, ncols=2)
-        axes.set_xlabel("height, m", fontsize=9)  # the figure's own would be under the legend
-        axes.set_ylabel("correlation", fontsize=9)
-        return figure
     axes.set_title(as_written(title), fontsize=9, loc="left")
     figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     _labelled(figure, None)

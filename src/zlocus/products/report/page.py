@@ -19,6 +19,7 @@ from zlocus.evaluation.comparison import Comparison
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality
+from zlocus.products.match_curve_drawing import SVG_PX
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
 from zlocus.products.report.comparison import comparison_part
@@ -35,8 +36,6 @@ DRAWING_SIDE = 1000.0
 NUMBER_BOX, PLACES_PER_SIDE = np.array([56.0, 44.0]), 8
 # Colours of outlines and their numbers, which colour-blind readers can distinguish on white.
 OUTLINE_COLOURS = ("#0072b2", "#b03a00", "#00704f", "#8f3f71", "#8a6100", "#5b4bb5", "#8b3a2b", "#444444")
-# Width and height of a small figure of match curves.
-SVG_PX = (355, 336)
 # The only script of the page opens folded tables before printing.
 SCRIPT = 'addEventListener("beforeprint",()=>document.querySelectorAll("details").forEach(d=>{d.open=true}));'
 
