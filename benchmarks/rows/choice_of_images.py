@@ -31,7 +31,7 @@ RULE_OF_PAPER = (
 )
 STEPS = {
     "the paper": ("", ["--selection", "paper"]),
-    "its rule, with semi-global constraint": (RULE_OF_PAPER, []),
+    "its rule with the semi-global constraint": (RULE_OF_PAPER, []),
     "geometry alone": (BY_GEOMETRY, []),
     "all images": ("", ["--views", "all"]),
     "default": ("", []),
