@@ -302,7 +302,7 @@ def test_image_space_resumes_with_the_tiles_of_its_images(images, tmp_path, monk
     """Tiles that are kept and undamaged are not matched again."""
     asked = {"method": "gc3-sgm", "report": False, "workers": 1}
     straight = run(images("sine"), tmp_path / "straight", SMALL_TILES, **asked).out
-    match, matched = zlocus.pipeline.image_tiles.match_tile, []
+    match, matched = zlocus.pipeline.tile_run.match_tile, []
 
     def until_stopped(scene, core, *rest, **given):
         matched.append((core.row, core.col))
@@ -311,7 +311,7 @@ def test_image_space_resumes_with_the_tiles_of_its_images(images, tmp_path, monk
         return match(scene, core, *rest, **given)
 
     said = io.StringIO()
-    monkeypatch.setattr("zlocus.pipeline.image_tiles.match_tile", until_stopped)
+    monkeypatch.setattr("zlocus.pipeline.tile_run.match_tile", until_stopped)
     monkeypatch.setattr("rendered_scenes.progress_for", lambda _: progress_for(said))
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
@@ -336,7 +336,7 @@ def list_of_tiles(images, tmp_path, asked):
             found.append(core)
             return match(scene, core, *rest, **given)
 
-        patch.setattr("zlocus.pipeline.image_tiles.match_tile", counted)
+        patch.setattr("zlocus.pipeline.tile_run.match_tile", counted)
         run(images("sine"), tmp_path / "counted", SMALL_TILES, **asked)
     return found
 
