@@ -263,6 +263,19 @@ def middlebury(results: AllResults) -> str:
     return markdown(["scene", "zlocus", "OpenCV", "left empty before gaps are filled"], lines)
 
 
+@table("more-images")
+def more_images(results: AllResults) -> str:
+    """Errors with a growing number of images: a line for each scene."""
+    errors: dict[str, dict[int, str]] = {}
+    for figure in of_row(results, "more-images").figures:
+        scene, _, what = figure.what.rpartition(": ")
+        if what.endswith(" images"):
+            errors.setdefault(scene, {})[int(what.split()[0])] = f"{figure.value:.3g}"
+    counts = sorted({n for of_scene in errors.values() for n in of_scene})
+    lines = [[scene, *(of_scene.get(n, "") for n in counts)] for scene, of_scene in errors.items()]
+    return markdown(["scene, error", *(f"{n} images" for n in counts)], lines)
+
+
 @table("kernels")
 def kernels(results: AllResults) -> str:
     """Time of a unit of work of every benchmark of a kernel."""
