@@ -129,3 +129,11 @@ def test_two_images_have_free_rays_too():
     assert add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0)
     assert (cost > 50).any()
     assert cost.max() <= 50 + 2 * stage.RAY_COST
+
+
+def test_rays_cost_more_where_many_views_cover_the_cells():
+    """There no view is excluded by the coarser surface; at coarser levels jumps are cheaper."""
+    assert stage.costs_of_ray(0, 12.0) == (stage.RAY_COST, stage.MAX_RAY_COST)
+    assert stage.costs_of_ray(1, 2.0) == (stage.COARSER_RAY_COST, stage.MAX_RAY_COST)
+    assert stage.costs_of_ray(0, 13.0) == (stage.RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)
+    assert stage.costs_of_ray(2, 19.0) == (stage.COARSER_RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.shared_records import VisibleHeights
-from zlocus.matching.occlusion import covers_at
+from zlocus.matching.local_contrast import ALL
+from zlocus.matching.occlusion import MANY_VIEWS, covers_at, usual_number
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.true_ortho import ortho_image
@@ -44,9 +45,11 @@ MIN_AGREEING_AT_HEIGHT, MIN_SHARE_AGREEING = 2, 0.4
 MIN_VIEWS_TO_CLOSE = 5
 CLOSED_SHAPE = np.ones((5, 5), np.uint8)
 # Height steps by which a height must stand above a ray to obstruct it, and the cost of doing so for each ray, at the
-# finest level and at coarser ones, where a step is higher and jumps are cheaper; and the largest cost.
+# finest level and at coarser ones, where a step is higher and jumps are cheaper; and the largest cost. Where many views
+# cover the cells, no view is excluded by the coarser surface, and the rays alone tell that a tower is too wide.
 MARGIN_STEPS, COARSER_MARGIN_STEPS = 8.0, 4.0
-RAY_COST, COARSER_RAY_COST, MAX_RAY_COST = 20, 25, 160
+RAY_COST, COARSER_RAY_COST, MAX_RAY_COST = 12, 20, 80
+RAY_COST_OF_MANY, COARSER_RAY_COST_OF_MANY, MAX_RAY_COST_OF_MANY = 20, 25, 160
 
 
 @dataclass(frozen=True)
@@ -173,10 +176,17 @@ def add_costs_of_rays(
     rays = free_rays(tile_views, height + slope_surface.cells, covers_at(visible, height), highest)
     if not np.isfinite(rays).any():
         return False
-    margin, ray_cost = (COARSER_MARGIN_STEPS, COARSER_RAY_COST) if level else (MARGIN_STEPS, RAY_COST)
-    rays += np.float32(margin)
-    add_ray_costs(rays, slope_surface.cells, lattice.layout, ray_cost, MAX_RAY_COST, cost)
+    rays += np.float32(COARSER_MARGIN_STEPS if level else MARGIN_STEPS)
+    ray_cost, max_cost = costs_of_ray(level, usual_number(visible, ALL))
+    add_ray_costs(rays, slope_surface.cells, lattice.layout, ray_cost, max_cost, cost)
     return True
+
+
+def costs_of_ray(level: int, n_covering: float) -> tuple[int, int]:
+    """Cost of a height for each ray that it obstructs, and the largest cost, where so many views cover the cells."""
+    if n_covering < MANY_VIEWS:
+        return (COARSER_RAY_COST if level else RAY_COST), MAX_RAY_COST
+    return (COARSER_RAY_COST_OF_MANY if level else RAY_COST_OF_MANY), MAX_RAY_COST_OF_MANY
 
 
 def _mean(image: NDArray[np.float32]) -> NDArray[np.float32]:
