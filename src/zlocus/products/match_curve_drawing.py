@@ -12,9 +12,11 @@ from html import escape
 import numpy as np
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.products.match_curve_figures import COLOURS, SMALL_DASHES, shown_means
+from zlocus.products.match_curve_figures import COLOURS, shown_means
 from zlocus.products.point_report import PointReport
 
+# Of further images, after as many as there are colours.
+DASHES = ("", "4 2", "1.5 2")
 # Of a drawing with few curves.
 SVG_PX = WIDTH_PX, HEIGHT_PX = 355, 336
 # Space for labels left of, right of, above and below the axes; the legend comes below that.
@@ -89,7 +91,7 @@ def mean_svg(report: PointReport, n_images: int) -> str:
 def _curves(report: PointReport, n_images: int) -> list[DrawnCurve]:
     single, mean = report.curves.single_curves.values, report.curves.mean_curves.values
     curves = [
-        DrawnCurve(single[j], name, COLOURS[j % len(COLOURS)], 1.2, SMALL_DASHES[j // len(COLOURS) % len(SMALL_DASHES)])
+        DrawnCurve(single[j], name, COLOURS[j % len(COLOURS)], 1.2, DASHES[j // len(COLOURS) % len(DASHES)])
         for j, name in enumerate(report.search[:n_images])
     ]
     for m, grey in shown_means(report, n_images):
@@ -129,13 +131,13 @@ def _frame(axes: Axes, start_m: float) -> list[str]:
     for height in ticks(axes.low, axes.high):
         x = axes.x(height)
         parts.append(f"<path d='M{x:.1f} {axes.bottom:.1f}v4' stroke='#000000'/>")
-        parts.append(f"<text x='{x:.1f}' y='{axes.bottom + 15:.1f}' text-anchor='middle'>{signed(height, 'g')}</text>")
-    for correlation in np.linspace(-1.0, 1.0, 5).tolist():
-        y = axes.y(correlation)
-        parts.append(f"<path d='M{LEFT_PX} {y:.1f}h-4' stroke='#000000'/>")
         parts.append(
-            f"<text x='{LEFT_PX - 7:.1f}' y='{y + 4:.1f}' text-anchor='end'>{signed(correlation, '.1f')}</text>"
+            f"<text x='{x:.1f}' y='{axes.bottom + 15:.1f}' text-anchor='middle'>{with_minus_sign(height, 'g')}</text>"
         )
+    for correlation in np.linspace(-1.0, 1.0, 5).tolist():
+        y, label = axes.y(correlation), with_minus_sign(correlation, ".1f")
+        parts.append(f"<path d='M{LEFT_PX} {y:.1f}h-4' stroke='#000000'/>")
+        parts.append(f"<text x='{LEFT_PX - 7:.1f}' y='{y + 4:.1f}' text-anchor='end'>{label}</text>")
     return [
         *parts,
         f"<rect x='{LEFT_PX}' y='{TOP_PX}' width='{right - LEFT_PX}' height='{axes.bottom - TOP_PX:.1f}' "
@@ -146,8 +148,8 @@ def _frame(axes: Axes, start_m: float) -> list[str]:
     ]
 
 
-def signed(value: float, digits: str) -> str:
-    """A number as text, with the sign that is as wide as a digit."""
+def with_minus_sign(value: float, digits: str) -> str:
+    """A number as text, with a minus sign in place of a hyphen."""
     return f"{value:{digits}}".replace("-", "\N{MINUS SIGN}")
 
 

@@ -37,8 +37,6 @@ DPI = 110
 # The colours of Okabe and Ito, which colour-blind readers can distinguish. The mean is black.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195")
 DASHES = ("-", "--", ":")
-# The same for SVG.
-SMALL_DASHES = ("", "4 2", "1.5 2")
 LABEL_COLOURS = {1: "#00704F", 0: "#8A6100", -1: "#B03A00"}
 STRETCH_PERCENT = (1.0, 99.0)
 
