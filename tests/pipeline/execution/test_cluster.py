@@ -23,6 +23,7 @@ from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.tasks import Cause, run_tasks
 
 pytestmark = pytest.mark.filterwarnings("ignore::Warning:distributed", "ignore::ResourceWarning")
+BUSY_S = 2.0
 RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
 
 
@@ -158,6 +159,21 @@ def test_where_nothing_answers(images, tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(ConfigError, match=r"--method gc3-sgm matches whole images in one process\. Leave --scheduler"):
         run(images("sine"), tmp_path / "out", SMALL_TILES, scheduler="tcp://127.0.0.1:9", method="gc3-sgm")
+
+
+def test_a_signal_as_a_call_begins(tmp_path, caplog):
+    """Results are waited for where no signal interrupts `distributed`, which would print a traceback."""
+    with cluster(tmp_path, n_workers=1) as found, Cluster(Planted(tmp_path), found.address) as workers:
+        workers.submit(1)
+        loop = workers._client.loop
+        loop.add_callback(time.sleep, BUSY_S)  # so that the next call waits for its turn
+        threading.Timer(BUSY_S / 4, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            workers.wait()
+        handled = threading.Event()
+        loop.add_callback(handled.set)
+        assert handled.wait(60)
+    assert not caplog.records
 
 
 def test_a_signal_ends_the_command_and_not_the_cluster(images, straight, tmp_path):

@@ -6,16 +6,18 @@ import pickle
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from types import TracebackType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from zlocus.core.errors import ConfigError, StoppedError
 from zlocus.core.startup import allow_import
 from zlocus.pipeline.execution.processes import one_thread
 from zlocus.pipeline.execution.tasks import Cause, Failure, Outcome, attempted, failure_of
 
+P = ParamSpec("P")
+R = TypeVar("R")
 CONNECT_S, WORKERS_S = 10.0, 120.0
 CHECK_INTERVAL_S = 5.0  # between two checks whether the cluster has workers
 # Tasks queued at each worker, so that it does not wait while results are sent.
@@ -71,9 +73,10 @@ class Cluster:
                 "the Dask scheduler prints, such as tcp://10.0.0.1:8786."
             ) from error
         self._futures: dict[Any, Any] = {}
+        self._calls = ThreadPoolExecutor(1, "calls to the cluster")
         try:
-            self._client.wait_for_workers(1, timeout=WORKERS_S)
-            self._client.register_plugin(_plugin(self._name, pickle.dumps(function)), self._name)
+            self._call(self._client.wait_for_workers, 1, WORKERS_S)
+            self._call(self._client.register_plugin, _plugin(self._name, pickle.dumps(function)), self._name)
         except TimeoutError as error:
             self.close()
             raise ConfigError(
@@ -98,7 +101,7 @@ class Cluster:
     def slots(self) -> int:
         """See `Workers`; the number follows the size of the cluster."""
         with self._reached():
-            threads = [int(n) for n in self._client.nthreads().values()]
+            threads = [int(n) for n in self._call(self._client.nthreads).values()]
         return max(sum(threads) + QUEUED_TASKS * len(threads), 1)
 
     def submit(self, task: Any) -> None:
@@ -115,16 +118,15 @@ class Cluster:
         StoppedError
             The scheduler has gone, or the cluster has had no workers for some time.
         """
-        from distributed import wait
-
         without_workers_s = 0.0
         while True:
             with self._reached():
                 try:
-                    done = wait(list(self._futures), timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done
-                    return [self._outcome(future, self._futures.pop(future)) for future in done]
+                    finished = self._call(_finished, list(self._futures))
+                    return [_outcome(self._futures.pop(future), end) for future, end in finished]
                 except TimeoutError:
-                    without_workers_s = 0.0 if self._client.nthreads() else without_workers_s + CHECK_INTERVAL_S
+                    has_workers = bool(self._call(self._client.nthreads))
+                    without_workers_s = 0.0 if has_workers else without_workers_s + CHECK_INTERVAL_S
             if without_workers_s >= WORKERS_S:
                 raise StoppedError(
                     f"The cluster at {self._address} has had no workers for {WORKERS_S:.0f} s. Finished tiles are "
@@ -143,17 +145,10 @@ class Cluster:
                 "when it is back, or without --scheduler."
             ) from error
 
-    def _outcome(self, future: Any, task: Any) -> Outcome:
-        error = future.exception()
-        if error is None:
-            outcome: Outcome = future.result()
-        elif type(error).__name__ == "KilledWorker":
-            said = "workers that had it were lost, one after another"
-            outcome = Outcome(task, failure=Failure(Cause.LOST, said, is_given_up=True))
-        else:
-            outcome = Outcome(task, failure=failure_of(error))
-        future.release()
-        return outcome
+    def _call(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call a function of `distributed` in a thread, where no signal interrupts it: when it is interrupted as it
+        begins, `distributed` prints a traceback."""
+        return self._calls.submit(function, *args, **kwargs).result()
 
     def close(self) -> None:
         """Remove the remaining tasks of the run from the cluster."""
@@ -162,6 +157,7 @@ class Cluster:
             self._client.unregister_worker_plugin(self._name)
         with suppress(Exception):
             self._client.close(timeout=CONNECT_S)
+        self._calls.shutdown(wait=False, cancel_futures=True)
 
     def __enter__(self) -> Cluster:
         return self
@@ -170,6 +166,32 @@ class Cluster:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _finished(futures: list[Any]) -> list[tuple[Any, Outcome | Exception]]:
+    """The futures that have ended, each with its result or its error; at least one.
+
+    Raises
+    ------
+    TimeoutError
+        None has ended within `CHECK_INTERVAL_S`.
+    """
+    from distributed import wait
+
+    done = wait(futures, timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done
+    finished = [(future, future.exception() or future.result()) for future in done]
+    for future in done:
+        future.release()
+    return finished
+
+
+def _outcome(task: Any, end: Outcome | Exception) -> Outcome:
+    if isinstance(end, Outcome):
+        return end
+    if type(end).__name__ == "KilledWorker":
+        said = "workers that had it were lost, one after another"
+        return Outcome(task, failure=Failure(Cause.LOST, said, is_given_up=True))
+    return Outcome(task, failure=failure_of(end))
 
 
 def _plugin(name: str, function: bytes) -> Any:
