@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -73,4 +74,5 @@ def test_an_image_is_kept_that_goes_well_with_one_other():
     ],
 )
 def test_the_image_that_is_missing(degrees, said):
-    assert missing_image(rates(*degrees), OPTIONS).startswith(said)
+    angles = [abs(a - b) for a, b in combinations(degrees, 2)]
+    assert missing_image(len(degrees), np.array(angles), OPTIONS).startswith(said)

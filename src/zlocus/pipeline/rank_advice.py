@@ -81,27 +81,30 @@ def advice(
             f"Nothing can be said of {', '.join(names[i] for i in unknown)}: no tie point lies in it and in another "
             "image."
         )
-    return [*sentences, missing_image(rates[kept], options)]
+    apart = np.linalg.norm(rates[kept][:, None] - rates[kept][None], axis=-1)
+    angles_deg = np.degrees(np.arctan(apart[np.triu_indices(len(kept), 1)]))
+    return [*sentences, missing_image(len(kept), angles_deg, options)]
 
 
-def missing_image(rates: NDArray[np.float64], options: SelectionOptions) -> str:
-    """One sentence: from where an image would help that is not there. rates : (i, 2), see `advice`, of the images that
-    are kept."""
+def missing_image(n_images: int, angles_deg: NDArray[np.float64], options: SelectionOptions) -> str:
+    """One sentence: from where an image would help that is not there.
+
+    n_images : how many are kept; angles_deg : (p,) between the rays of each two of them, finite; p is at least 1 where
+    two or more are kept.
+    """
     low, best, high = options.min_angle_deg, options.best_angle_deg, options.max_angle_deg
-    if len(rates) < 2:
+    if n_images < 2:
         return f"Buy images that match: two or more, whose rays differ by {low:g} to {high:g} degrees."
-    apart = np.linalg.norm(rates[:, None] - rates[None], axis=-1)
-    angle = np.degrees(np.arctan(apart[np.triu_indices(len(rates), 1)]))
-    if angle.max() < low:
+    if angles_deg.max() < low:
         return (
-            f"Buy an image that looks from about {best:g} degrees away: the rays of these differ by {angle.max():.1f} "
-            "degrees at most, so that their heights are imprecise."
+            f"Buy an image that looks from about {best:g} degrees away: the rays of these differ by "
+            f"{angles_deg.max():.1f} degrees at most, so that their heights are imprecise."
         )
-    if angle.min() > high:
+    if angles_deg.min() > high:
         return (
-            f"Buy an image between these: their rays differ by {angle.min():.1f} degrees and more, and beyond "
+            f"Buy an image between these: their rays differ by {angles_deg.min():.1f} degrees and more, and beyond "
             f"{high:g} degrees walls and crowns look too different."
         )
-    if len(rates) < WANTED_IMAGES:
+    if n_images < WANTED_IMAGES:
         return "Buy a third image from the other side of one of these: it shows what the other one does not see."
-    return f"No direction is missing: the rays of {len(rates)} images differ by up to {angle.max():.1f} degrees."
+    return f"No direction is missing: the rays of {n_images} images differ by up to {angles_deg.max():.1f} degrees."

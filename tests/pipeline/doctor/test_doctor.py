@@ -91,6 +91,10 @@ def test_nothing_is_wrong_with_good_images(healthy):
         assert view["residual_after_px"]["median"] < 0.1
         assert view["ground_px_m"] == pytest.approx(GSD_M, rel=0.1)
         assert view["closing_px"] < 1e-3
+    keep, buy = report["advice"]
+    assert keep == "Keep aft, fore, nadir."
+    assert buy.startswith("No direction is missing: the rays of 3 images differ by up to 3")
+    assert f"- {keep}\n- {buy}\n" in text
 
 
 def test_base_to_height_is_that_of_the_cameras(healthy):
@@ -299,6 +303,7 @@ def test_a_narrow_base(tmp_path):
     assert status == 0
     (pair,) = report["pairs"]
     assert pair["base_to_height"] == pytest.approx(base, rel=0.15)  # the Earth is round below a satellite
+    assert report["advice"][1].startswith("Buy an image that looks from about 20 degrees away")
     assert any("nearly the same line" in s and "0.2 px makes a height off by" in s for s in sentences(report, "poor"))
 
 
@@ -315,6 +320,10 @@ def test_an_image_of_another_ground_has_no_ties(good, tmp_path):
     _, _, report = doctor(tmp_path / "out", good["nadir"], good["fore"], other)
     assert report["views"]["other"]["n_ties"] == 0
     assert any(s.startswith("other: it takes no part: no tie point") for s in sentences(report, "poor"))
+    keep, drop, buy = report["advice"]
+    assert keep == "Keep fore, nadir."
+    assert drop.startswith("Drop other: ")
+    assert buy.startswith("Buy a third image")
 
 
 def bare(path, folder):

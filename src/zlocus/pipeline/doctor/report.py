@@ -27,7 +27,8 @@ class Diagnosis:
     """Result of the doctor, as far as the inputs could be examined.
 
     views, quality : of the same length, None for an image that cannot be read; geometry : as long as views, or empty;
-    pairs : of views that share ground; refused : views that could not be opened.
+    pairs : of views that share ground; refused : views that could not be opened; advice : sentences on which images to
+    keep, drop and buy, none without tie points.
     """
 
     views: tuple[View, ...]
@@ -37,6 +38,7 @@ class Diagnosis:
     ties: QuickTies | None
     plan: RunPlan | None
     refused: tuple[RefusedView, ...]
+    advice: tuple[str, ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -56,9 +58,13 @@ class Diagnosis:
             "" if self.ties is None or not self.ties.is_quick else "Ties are of a quick pass: a run finds more of them."
         )
         parts = [_table("Images", _view_rows(self)), _table("Pairs", _pair_rows(self)), quick, *_plan_lines(self)]
-        for level, heading in HEADINGS.items():
-            told = [f"- {finding.sentence}" for finding in self.findings if finding.level == level]
-            parts.append("\n".join([heading, *told]) if told else "")
+        sections = {
+            heading: tuple(finding.sentence for finding in self.findings if finding.level == level)
+            for level, heading in HEADINGS.items()
+        }
+        sections["Which images"] = self.advice
+        for heading, told in sections.items():
+            parts.append("\n".join([heading, *(f"- {sentence}" for sentence in told)]) if told else "")
         return "\n\n".join([part for part in parts if part] + [VERDICTS[worst(self.findings)]])
 
     def as_dict(self) -> dict[str, Any]:
@@ -73,6 +79,7 @@ class Diagnosis:
             "refused": {each.name: {"path": str(each.path), "reason": each.reason} for each in self.refused},
             "pairs": [self.pair_record(pair) for pair in self.pairs],
             "quick_ties": None if self.ties is None else self.ties.is_quick,
+            "advice": list(self.advice),
             "plan": None if self.plan is None else _plan_record(self.plan),
         }
 

@@ -23,6 +23,7 @@ from zlocus.core.requests import DoctorRequest
 from zlocus.core.scene import Scene
 from zlocus.io.run_record import write_record
 from zlocus.io.scene_file import UsableViews, open_usable_views
+from zlocus.pipeline.doctor.advice import image_advice
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
 from zlocus.pipeline.doctor.geometry import geometry_findings
 from zlocus.pipeline.doctor.plan import plan_findings, run_plan
@@ -87,7 +88,7 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
     findings.entries += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
     scene = usable.scene
     if scene is None:
-        diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, tuple(findings.entries))
+        diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, (), tuple(findings.entries))
     else:
         scene = sorted_views(scene)
         diagnosis = examined(request, config, scene, usable, findings, progress)
@@ -116,6 +117,7 @@ def examined(
     geometry: tuple[ViewGeometry, ...] = ()
     pairs: tuple[PairGeometry, ...] = ()
     ties = plan = None
+    advice: list[str] = []
     if len(names) < 2:
         findings.entries.append(Finding(STOPS, f"Only {names[0]} can be used, and a surface needs two images or more."))
         levels = None
@@ -134,6 +136,7 @@ def examined(
         findings.entries += geometry_findings(names, geometry, pairs)
         if ties is not None:
             findings.entries += tie_findings(names, ties.orientation, pairs, config.orientation)
+            advice = image_advice(names, ties.orientation, pairs, config.selection)
             findings.entries += plane_findings(corrected, request.inputs, ties.orientation)
             plan = planned(request, config, corrected, ties, geometry, findings)
     return Diagnosis(
@@ -144,6 +147,7 @@ def examined(
         ties,
         plan,
         usable_views.refused,
+        tuple(advice),
         tuple(dict.fromkeys(findings.entries)),
     )
 
