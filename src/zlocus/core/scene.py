@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from datetime import date as Date
 from functools import cached_property
@@ -129,10 +130,26 @@ class ColourSource(ImageSource, Protocol):
 
 
 @dataclass(frozen=True)
+class SunDirection:
+    """Where the sun stood. azimuth_deg : clockwise from north, 0 to 360; altitude_deg : above the horizon."""
+
+    azimuth_deg: float
+    altitude_deg: float
+
+    def angle_deg(self, other: SunDirection) -> float:
+        """Angle between this direction and another one, 0 to 180 degrees."""
+        low, high = math.radians(self.altitude_deg), math.radians(other.altitude_deg)
+        turned = math.radians(self.azimuth_deg - other.azimuth_deg)
+        cosine = math.sin(low) * math.sin(high) + math.cos(low) * math.cos(high) * math.cos(turned)
+        return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+
+
+@dataclass(frozen=True)
 class View:
     """One image with its sensor model in the frame of the scene.
 
-    camera_files : files beside the image from which the sensor model was read; date : of the exposure, where known.
+    camera_files : files beside the image from which the sensor model was read; date, sun : of the exposure, where
+    known.
     """
 
     name: str
@@ -141,6 +158,7 @@ class View:
     sensor: SensorModel
     camera_files: tuple[Path, ...] = ()
     date: Date | None = None
+    sun: SunDirection | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:

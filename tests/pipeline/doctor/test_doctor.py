@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -598,3 +600,19 @@ def test_what_takes_no_part_and_what_is_doubtful_is_told():
 def test_more_memory_than_the_machine_has(machine, level):
     plan = RunPlan(0.5, (9, 9), (0.0, 1.0), 0.1, 10, 8, 2 * 10**9, 4, machine, 1.0, 1.0)
     assert [finding.level for finding in plan_findings(plan, None)] == level
+
+
+def test_suns_that_are_far_apart_are_told(good, tmp_path):
+    """The farthest two of the images whose sun is known; without one nothing is told."""
+    suns = {"nadir": (150.0, 50.0), "fore": (152.0, 51.0), "aft": (230.0, 30.0)}
+    paths = {name: Path(shutil.copy(path, tmp_path)) for name, path in good.items()}
+    for name, (azimuth, altitude) in suns.items():
+        with rasterio.open(paths[name], "r+") as file:
+            file.update_tags(NITF_USE00A_SUN_AZ=str(azimuth), NITF_USE00A_SUN_EL=str(altitude))
+    _, _, report = doctor(tmp_path / "out", *paths.values())
+    (told,) = sentences(report, "note")
+    assert re.match(r"The sun stood up to 61 degrees apart \(aft and nadir\): shadows", told)
+    assert report["verdict"] == "good"
+    assert report["views"]["aft"]["sun_deg"] == [230.0, 30.0]
+    _, _, report = doctor(tmp_path / "out", paths["nadir"], paths["fore"])
+    assert not sentences(report, "note")

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
 from zlocus.core.footprints import PairGeometry, ViewGeometry
-from zlocus.pipeline.doctor.findings import POOR, Finding, poor
+from zlocus.core.scene import View
+from zlocus.pipeline.doctor.findings import NOTE, POOR, Finding, poor
 
 # Limits beyond which a finding is made.
 CLOSING_PX = 0.05
 NARROW, WIDE = 0.1, 1.2
 PIXEL_SHARE = 0.2  # by which an ordinary match is off
 FINER = 3.0
+SHADOWS_DEG = 20.0
 
 
 def geometry_findings(
@@ -41,6 +44,19 @@ def geometry_findings(
             )
         )
     return told + base_findings(names, views, pairs)
+
+
+def shadow_findings(views: Sequence[View]) -> list[Finding]:
+    """A finding about the two images whose suns are farthest apart, where shadows lie elsewhere in them."""
+    apart = [(a.sun.angle_deg(b.sun), a.name, b.name) for a, b in combinations(views, 2) if a.sun and b.sun]
+    angle_deg, *names = max(apart, default=(0.0, "", ""))
+    if angle_deg <= SHADOWS_DEG:
+        return []
+    sentence = (
+        f"The sun stood up to {angle_deg:.0f} degrees apart ({names[0]} and {names[1]}): shadows lie elsewhere, and "
+        "count for little where they differ. Images of one hour and season match better."
+    )
+    return [Finding(NOTE, sentence, tuple(names))]
 
 
 def base_findings(names: Sequence[str], views: Sequence[ViewGeometry], pairs: Sequence[PairGeometry]) -> list[Finding]:

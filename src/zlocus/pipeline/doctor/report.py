@@ -90,6 +90,8 @@ class Diagnosis:
             "path": str(view.path),
             "sensor": kind_of(view.sensor),
             "shape": list(view.image.shape),
+            "date": None if view.date is None else view.date.isoformat(),
+            "sun_deg": None if view.sun is None else [view.sun.azimuth_deg, view.sun.altitude_deg],
         }
         if quality is not None:
             record |= {

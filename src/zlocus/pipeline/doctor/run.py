@@ -25,7 +25,7 @@ from zlocus.io.run_record import write_record
 from zlocus.io.scene_file import UsableViews, open_usable_views
 from zlocus.pipeline.doctor.advice import image_advice
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
-from zlocus.pipeline.doctor.geometry import geometry_findings
+from zlocus.pipeline.doctor.geometry import geometry_findings, shadow_findings
 from zlocus.pipeline.doctor.plan import plan_findings, run_plan
 from zlocus.pipeline.doctor.plane import plane_findings
 from zlocus.pipeline.doctor.quality import image_quality, quality_findings
@@ -133,7 +133,7 @@ def examined(
         z = ground_height(ties, levels)
         geometry = tuple(view_geometry(view, z) for view in corrected.views)
         pairs = tuple(pair_geometries(corrected.views, [each.outline for each in geometry], z))
-        findings.entries += geometry_findings(names, geometry, pairs)
+        findings.entries += geometry_findings(names, geometry, pairs) + shadow_findings(scene.views)
         if ties is not None:
             findings.entries += tie_findings(names, ties.orientation, pairs, config.orientation)
             advice = image_advice(names, ties.orientation, pairs, config.selection)
