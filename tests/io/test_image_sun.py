@@ -6,7 +6,7 @@ import rasterio
 
 from rpc_fixtures import write_image
 from zlocus.core.scene import SunDirection
-from zlocus.io.image_sun import sun_of_exposure
+from zlocus.io.image_sun import sun_direction_at_exposure
 from zlocus.io.images import open_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -38,7 +38,7 @@ def tagged(path, **tags):
 
 def sun_of(path):
     with rasterio.open(path) as source:
-        return sun_of_exposure(source)
+        return sun_direction_at_exposure(source)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_metadata_of_the_vendor_beside_the_image(tmp_path, image, beside):
     write_image(tmp_path / image, GREY)
     for name, text in beside.items():
         (tmp_path / name).write_text(text, encoding="ascii")
-    assert open_image(tmp_path / image).sun == OCTOBER
+    assert open_image(tmp_path / image).sun_direction == OCTOBER
 
 
 def test_the_header_of_a_nitf_file(tmp_path):

@@ -148,8 +148,8 @@ class SunDirection:
 class View:
     """One image with its sensor model in the frame of the scene.
 
-    camera_files : files beside the image from which the sensor model was read; date, sun : of the exposure, where
-    known.
+    camera_files : files beside the image from which the sensor model was read; date, sun_direction : of the exposure,
+    where known.
     """
 
     name: str
@@ -158,7 +158,7 @@ class View:
     sensor: SensorModel
     camera_files: tuple[Path, ...] = ()
     date: Date | None = None
-    sun: SunDirection | None = None
+    sun_direction: SunDirection | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -15,7 +15,7 @@ AZIMUTH_NAMES = ("meansunaz", "sunaz", "sun_azimuth", "nitf_use00a_sun_az")
 ALTITUDE_NAMES = ("meansunel", "sunel", "sun_elevation", "nitf_use00a_sun_el")
 
 
-def sun_of_exposure(source: rasterio.DatasetReader) -> SunDirection | None:
+def sun_direction_at_exposure(source: rasterio.DatasetReader) -> SunDirection | None:
     """The direction to the sun as an opened image was taken; None where the file does not say, or says what cannot
     be. Where a file says it of several places of the image, the first one counts."""
     tags = source.tags(ns=VENDOR_DOMAIN) | source.tags()

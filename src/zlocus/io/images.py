@@ -18,7 +18,7 @@ from rasterio.windows import Window
 from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import HeldPixels, ImageWindow, SunDirection
 from zlocus.io.image_dates import date_of_exposure
-from zlocus.io.image_sun import sun_of_exposure
+from zlocus.io.image_sun import sun_direction_at_exposure
 from zlocus.io.open_raster import (
     UNCOMPRESSED_DRIVERS,
     cached_raster,
@@ -71,7 +71,7 @@ class RasterImage:
     state: tuple[int, ...] = field(default=(), compare=False, repr=False)
     sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
     date: datetime.date | None = field(default=None, compare=False, repr=False)
-    sun: SunDirection | None = field(default=None, compare=False, repr=False)
+    sun_direction: SunDirection | None = field(default=None, compare=False, repr=False)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """Read the window of rows x cols pixels that starts at (row, col) and lies inside the image.
@@ -172,7 +172,7 @@ def open_image(path: Path) -> RasterImage:
             )
         image._read(source, _last_block(source, bands[0]))
         image = replace(image, held=held, state=tuple(state), sources=_sources(source, path))
-        return replace(image, date=date_of_exposure(source), sun=sun_of_exposure(source))
+        return replace(image, date=date_of_exposure(source), sun_direction=sun_direction_at_exposure(source))
 
 
 def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:

@@ -299,8 +299,8 @@ class _OpenedView:
     def view(self, crs: CRS) -> View:
         """The view in the frame of the scene."""
         entry = self.entry
-        date, sun = entry.date or self.image.date, self.image.sun
-        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, date, sun)
+        date, sun_direction = entry.date or self.image.date, self.image.sun_direction
+        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, date, sun_direction)
 
 
 def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[RefusedView] | None = None) -> _SceneInput:

@@ -48,7 +48,11 @@ def geometry_findings(
 
 def shadow_findings(views: Sequence[View]) -> list[Finding]:
     """A finding about the two images whose suns are farthest apart, where shadows lie elsewhere in them."""
-    apart = [(a.sun.angle_deg(b.sun), a.name, b.name) for a, b in combinations(views, 2) if a.sun and b.sun]
+    apart = [
+        (a.sun_direction.angle_deg(b.sun_direction), a.name, b.name)
+        for a, b in combinations(views, 2)
+        if a.sun_direction and b.sun_direction
+    ]
     angle_deg, *names = max(apart, default=(0.0, "", ""))
     if angle_deg <= SHADOWS_DEG:
         return []

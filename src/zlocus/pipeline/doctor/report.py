@@ -86,12 +86,13 @@ class Diagnosis:
     def view_record(self, number: int) -> dict[str, Any]:
         """The record of a view."""
         view, quality = self.views[number], self.quality[number]
+        sun = view.sun_direction
         record: dict[str, Any] = {
             "path": str(view.path),
             "sensor": kind_of(view.sensor),
             "shape": list(view.image.shape),
             "date": None if view.date is None else view.date.isoformat(),
-            "sun_deg": None if view.sun is None else [view.sun.azimuth_deg, view.sun.altitude_deg],
+            "sun_deg": None if sun is None else [sun.azimuth_deg, sun.altitude_deg],
         }
         if quality is not None:
             record |= {
