@@ -122,8 +122,7 @@ class Cluster:
         while True:
             with self._reached():
                 try:
-                    finished = self._call(_finished, list(self._futures))
-                    return [_outcome(self._futures.pop(future), end) for future, end in finished]
+                    return self._call(_finished, self._futures)
                 except TimeoutError:
                     has_workers = bool(self._call(self._client.nthreads))
                     without_workers_s = 0.0 if has_workers else without_workers_s + CHECK_INTERVAL_S
@@ -168,8 +167,10 @@ class Cluster:
         self.close()
 
 
-def _finished(futures: list[Any]) -> list[tuple[Any, Outcome | Exception]]:
-    """The futures that have ended, each with its result or its error; at least one.
+def _finished(futures: dict[Any, Any]) -> list[Outcome]:
+    """The outcomes of futures that have ended, which are removed from those that are waited for; at least one.
+
+    futures : the task of each.
 
     Raises
     ------
@@ -178,20 +179,19 @@ def _finished(futures: list[Any]) -> list[tuple[Any, Outcome | Exception]]:
     """
     from distributed import wait
 
-    done = wait(futures, timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done
-    finished = [(future, future.exception() or future.result()) for future in done]
-    for future in done:
+    outcomes = []
+    for future in wait(list(futures), timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done:
+        error, task = future.exception(), futures.pop(future)
+        outcomes.append(future.result() if error is None else _failed(task, error))
         future.release()
-    return finished
+    return outcomes
 
 
-def _outcome(task: Any, end: Outcome | Exception) -> Outcome:
-    if isinstance(end, Outcome):
-        return end
-    if type(end).__name__ == "KilledWorker":
+def _failed(task: Any, error: Exception) -> Outcome:
+    if type(error).__name__ == "KilledWorker":
         said = "workers that had it were lost, one after another"
         return Outcome(task, failure=Failure(Cause.LOST, said, is_given_up=True))
-    return Outcome(task, failure=failure_of(end))
+    return Outcome(task, failure=failure_of(error))
 
 
 def _plugin(name: str, function: bytes) -> Any:
