@@ -183,7 +183,7 @@ def test_record(whole, images):
     assert record["evaluations"]["done"] > 1e6
     assert record["image_dates"] == [None] * 3
     assert abs((datetime.now(UTC) - datetime.fromisoformat(record["created"])).total_seconds()) < 3600
-    assert record["config"]["options"]["pyramid"]["tile"] == 64
+    assert record["config"]["options"]["pyramid"]["tile"] == SMALL_TILES.pyramid.tile
     assert record["config"]["request"]["heights"] == list(HEIGHTS)
     height, quality = read(whole / "dsm.tif")[0], read(whole / "quality.tif")[0]
     seen = (quality & (Quality.UNSEEN | Quality.OUTSIDE)) == 0

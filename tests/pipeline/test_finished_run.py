@@ -189,7 +189,7 @@ def test_another_run_is_refused_and_what_differs_is_said(images, out, no_matchin
     before = state(out)
     for more, says in (
         ({"heights": (20.0, 80.0)}, r"request\.heights was \[25\.0, 80\.0\] there and is \[20\.0, 80\.0\] now"),
-        ({"config": RunConfig()}, r"options\.pyramid\.tile was 64 there and is"),
+        ({"config": RunConfig()}, r"options\.pyramid\.tile was 80 there and is"),
         (
             {"config": replace(SMALL_TILES, products=ProductOptions(sun_azimuth_deg=90.0))},
             "options.products.sun_azimuth",

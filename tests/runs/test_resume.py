@@ -39,7 +39,7 @@ from interrupted_runs import (
     wait_for_tiles,
     wait_until,
 )
-from rendered_scenes import CENTRE, HEIGHTS, SMALL_TILES, read, run
+from rendered_scenes import CENTRE, HEIGHTS, N_SMALL_TILES, SMALL_TILES, read, run
 from zlocus.core.errors import GeometryError, InputError, OutputError, StoppedError
 from zlocus.core.progress import progress_for
 from zlocus.core.resources import held_bytes
@@ -54,7 +54,7 @@ SEED = 20261122
 
 @pytest.fixture(scope="module")
 def straight(images, tmp_path_factory):
-    """The surface of a run without interruption, in tiles of 64 cells."""
+    """The surface of a run without interruption, in small tiles."""
     return run(images("sine"), tmp_path_factory.mktemp("straight") / "out", SMALL_TILES, workers=1, report=False).out
 
 
@@ -179,7 +179,7 @@ def test_a_run_that_is_stopped_after_the_matching_keeps_its_tiles(images, straig
     asked = {"workers": 1, "report": step.endswith("write_report_inputs")}
     with pytest.raises(KeyboardInterrupt):
         run(images("sine"), out, SMALL_TILES, **asked)
-    assert "9 of 9 tiles are finished and kept: the same command resumes from there.\n" in said.getvalue()
+    assert "4 of 4 tiles are finished and kept: the same command resumes from there.\n" in said.getvalue()
     found = {path.name for path in out.iterdir() if path.is_file()}
     assert complete | {"events.jsonl"} <= found
     assert {f"{name}.tif" for name in RASTERS} <= found if complete else found == {"events.jsonl"}
@@ -231,18 +231,18 @@ def failing(monkeypatch, error, where=CENTRE):
 def test_a_tile_that_fails_costs_no_other(images, straight, tmp_path, monkeypatch, error, says, attempts):
     out = tmp_path / "out"
     failing(monkeypatch, error)
-    with pytest.raises(StoppedError, match="1 of 9 tiles failed: E 461990 to 462022 m, N 5246984 to 5247016 m") as stop:
+    with pytest.raises(StoppedError, match="1 of 4 tiles failed: E 461958 to 462006 m, N 5246954 to 5247000 m") as stop:
         run(images("sine"), out, SMALL_TILES, workers=1, report=False)
     assert says in str(stop.value)
     assert stop.value.exit_status == 3
     assert not (out / "dsm.tif").exists()
-    assert n_finished(out) == 8
+    assert n_finished(out) == N_SMALL_TILES - 1
     # The surface without the failed tile.
     with pytest.raises(StoppedError, match=r"They are empty in the surface \(FAILED in quality\.tif\)"):
         run(images("sine"), out, SMALL_TILES, workers=1, report=False, partial=True)
     quality, whole = read(out / "quality.tif")[0], read(straight / "quality.tif")[0]
     lost = quality == int(Quality.FAILED)
-    assert 1000 < lost.sum() <= 64 * 64
+    assert 1000 < lost.sum() <= SMALL_TILES.pyramid.tile**2 * 1.5
     np.testing.assert_array_equal(quality[~lost], whole[~lost])
     assert np.isnan(read(out / "dsm.tif")[0][lost]).all()
     failed = [
@@ -271,7 +271,7 @@ def test_if_all_tiles_fail_the_log_says_why(images, tmp_path, monkeypatch):
         raise IndexError("index 7 is out of bounds")
 
     monkeypatch.setattr(zlocus.pipeline.tile_run, "match_tile", fail)
-    with pytest.raises(StoppedError, match=r"9 of 9 tiles failed: .*; and 6 more\. Nothing was made\."):
+    with pytest.raises(StoppedError, match=r"4 of 4 tiles failed: .*; and 1 more\. Nothing was made\."):
         run(images("sine"), tmp_path / "out", SMALL_TILES, partial=True)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["events.jsonl"]
     assert all("in fail" in e["trace"] for e in events_of(tmp_path / "out") if e["event"] == "tile failed")
@@ -370,9 +370,9 @@ def test_what_was_changed_meanwhile_is_said(images, tmp_path, monkeypatch):
         run(copied, tmp_path / "out", SMALL_TILES, report=False)
     monkeypatch.undo()
     n = n_finished(tmp_path / "out")
-    with pytest.raises(OutputError, match=r"holds 8 finished tiles of another run: request\.heights was"):
+    with pytest.raises(OutputError, match=r"holds 3 finished tiles of another run: request\.heights was"):
         run(copied, tmp_path / "out", SMALL_TILES, heights=(20.0, 80.0))
-    with pytest.raises(OutputError, match=r"options\.pyramid\.tile was 64 there and is"):
+    with pytest.raises(OutputError, match=r"options\.pyramid\.tile was 80 there and is"):
         run(copied, tmp_path / "out")
     os.utime(copied[1])
     with pytest.raises(OutputError, match=rf"{copied[1].name} has changed since"):
@@ -384,20 +384,20 @@ def test_what_was_changed_meanwhile_is_said(images, tmp_path, monkeypatch):
 
 
 def test_an_image_that_disappears(images, tmp_path, monkeypatch):
-    """After the third tile: all others need it, and are named; what is done is kept."""
+    """After the first tile: all others need it, and are named; what is done is kept."""
     copied = tuple(Path(shutil.copy(path, tmp_path)) for path in images("sine").inputs)
     match, made = zlocus.pipeline.tile_run.match_tile, []
 
     def robbed(*given):
         made.append(given)
-        if len(made) == 4:
+        if len(made) == 2:
             copied[0].rename(tmp_path / "elsewhere")
         return match(*given)
 
     monkeypatch.setattr(zlocus.pipeline.tile_run, "match_tile", robbed)
-    with pytest.raises(StoppedError, match=rf"6 of 9 tiles failed: .*There is no image .*{copied[0].name}"):
+    with pytest.raises(StoppedError, match=rf"3 of 4 tiles failed: .*There is no image .*{copied[0].name}"):
         run(copied, tmp_path / "out", SMALL_TILES, report=False)
-    assert n_finished(tmp_path / "out") == 3
+    assert n_finished(tmp_path / "out") == 1
     (tmp_path / "elsewhere").rename(copied[0])
     run(copied, tmp_path / "out", SMALL_TILES, report=False)
     assert same(tmp_path / "out", run(copied, tmp_path / "straight", SMALL_TILES, report=False).out)
@@ -447,15 +447,15 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
     def until_full(path, content):
         if path.suffix == ".npz" and path.name != BEFORE:
             written.append(path)
-            if len(written) > 4:
+            if len(written) > 2:
                 with Path("/dev/full").open("wb", buffering=0) as full:
                     full.write(content)
         write(path, content)
 
     monkeypatch.setattr(store, "write_atomically", until_full)
-    with pytest.raises(StoppedError, match=r"No space left on device\. 4 finished tiles are kept; make room"):
+    with pytest.raises(StoppedError, match=r"No space left on device\. 2 finished tiles are kept; make room"):
         run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
-    assert n_finished(tmp_path / "out") == 4
+    assert n_finished(tmp_path / "out") == 2
     monkeypatch.undo()
     run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
     assert same(tmp_path / "out", straight)
@@ -510,7 +510,7 @@ import zlocus
 from zlocus.core.options import PyramidOptions, RunConfig
 print("once")
 zlocus.match(*{names}, out={str(tmp_path / "out")!r}, workers=2, crs="EPSG:32632", resolution=0.5,
-             heights={HEIGHTS}, report=False, config=RunConfig(pyramid=PyramidOptions(tile=64)))
+             heights={HEIGHTS}, report=False, config=RunConfig(pyramid=PyramidOptions(tile=80)))
 """
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)

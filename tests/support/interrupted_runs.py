@@ -16,7 +16,7 @@ from zlocus.pipeline.execution.checkpoint import DONE, FOLDER
 def command(images, out, folder, *more):
     """The command line of `zlocus dsm` on images, in tiles of 64 cells."""
     options = folder / "options.toml"
-    options.write_text("[pyramid]\ntile = 64\n")
+    options.write_text("[pyramid]\ntile = 80\n")
     asked = ["--crs", "EPSG:32632", "--resolution", "0.5", "--heights", *map(str, HEIGHTS), "--no-report"]
     words = ["dsm", *map(str, images.inputs), "-o", str(out), *asked, "--config", str(options), *more]
     return [sys.executable, "-m", "zlocus", *words]

@@ -33,7 +33,9 @@ FIELD = (640, 640)
 # Forward and across view angles, degrees.
 LOOKS = {"nadir": (1.0, -3.0), "fore": (18.0, 2.0), "aft": (-17.0, 4.0)}
 QUIET = Optics(noise=0.003, noise_floor=1.0)
-SMALL_TILES = RunConfig(pyramid=PyramidOptions(tile=64))
+# Four tiles of the area that the rendered images see.
+SMALL_TILES = RunConfig(pyramid=PyramidOptions(tile=80))
+N_SMALL_TILES = 4
 # A part of the area that all images see.
 PART = (CENTRE[0] - 12.0, CENTRE[1] - 10.0, CENTRE[0] + 14.0, CENTRE[1] + 9.0)
 # An error that counts as a wrong match.

@@ -16,7 +16,7 @@ import pytest
 
 from interrupted_runs import check_end, command, n_finished, started, wait_for_tiles
 from places import SUPPORT
-from rendered_scenes import SMALL_TILES, run
+from rendered_scenes import N_SMALL_TILES, SMALL_TILES, run
 from worker_tasks import Planted
 from zlocus.core.errors import ConfigError, StoppedError
 from zlocus.pipeline.execution.cluster import Cluster
@@ -112,7 +112,7 @@ def test_a_worker_that_is_lost_costs_its_tiles_only(images, straight, tmp_path):
         tiles = [
             json.loads(line)["tile"] for line in (out / "events.jsonl").read_text().splitlines() if '"tile"' in line
         ]
-        assert len(tiles) == len(set(tiles)) == 9
+        assert len(tiles) == len(set(tiles)) == N_SMALL_TILES
 
 
 def test_a_scheduler_that_goes_keeps_what_is_done(images, straight, tmp_path):
