@@ -10,14 +10,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import rasterio
+from numpy.typing import NDArray
 
 import judging
 from peers.realistic import judged_realistic
 from reprojection import Surface, reprojected
 from rows.many_images import CLASSES, FACADE, JUDGE, LIDAR
-from rows.real_images import reduced_facade, without
-from workplace import COVERAGE_SHORT, ZLOCUS, Figure, Workplace, rendered_images, run
+from rows.photographs import import_tuniu
+from rows.real_images import judged, orient, reduced_facade, without
+from seeds import fresh_seeds
+from workplace import COVERAGE_SHORT, ZLOCUS, Figure, Workplace, render, rendered_images, run
 from zlocus.io.scene_file import open_scene
 
 WORSE = "the choice of images loses to another one, or to no choice at all"
@@ -36,6 +40,9 @@ STEPS = {
     "all images": ("", ["--views", "all"]),
     "default": ("", []),
 }
+# Six images of one date, one of another date and a hazy one.
+TOWN_CELLS, TOWN_VIEWS = 300, 8
+DRONE_JUDGE = "100_0005_0136"
 # The error of the default may be so much larger than the best of the others, and its share within 1 m so much smaller.
 ERROR_MARGIN, SHARE_MARGIN = 1.02, 0.002
 
@@ -43,12 +50,13 @@ ERROR_MARGIN, SHARE_MARGIN = 1.02, 0.002
 @dataclass(frozen=True)
 class Judged:
     """error : mean absolute error (rendered scenes: root mean square error), m, or 1 less the median correlation of an
-    image left out; within : share of the
-    cells within 1 m, None where no heights are known; cpu_s : of the whole run."""
+    image left out; within : share of the cells within 1 m, None where no heights are known; cpu_s : of the whole run;
+    spread : standard deviation of the error over the seeds, None without seeds."""
 
     error: float
     within: float | None
     cpu_s: float
+    spread: float | None = None
 
 
 def choice_of_images(workplace: Workplace) -> list[Figure]:
@@ -61,6 +69,8 @@ def choice_of_images(workplace: Workplace) -> list[Figure]:
             figures.append(Figure(f"{scene}, {step}: CPU", one.cpu_s, "s", is_detail=True))
             if one.within is not None:
                 figures.append(Figure(f"{scene}, {step}: within 1 m", one.within, is_detail=True))
+            if one.spread is not None:
+                figures.append(Figure(f"{scene}, {step}: spread of the error", one.spread, "m", is_detail=True))
         figures += behind_the_best(scene, found)
     return figures
 
@@ -100,10 +110,26 @@ def surface(inputs: Sequence[Path], out: Path, step: str, *options: object) -> f
 
 def spoiled_town(workplace: Workplace, out: Path, step: str) -> Judged:
     """Eight images of the rendered town, one of another date and one hazy."""
-    scene = workplace.scene("rendered-city")
+    return town(workplace.scene("rendered-city"), out, step)
+
+
+def town(scene: Path, out: Path, step: str) -> Judged:
+    """All images of a rendered town against its truth."""
     cpu_s = surface(sorted(scene.glob("img_*.tif")), out, step, "--resolution", 0.5)
     found = judging.judged(out / "dsm.tif", scene / "truth_dsm.tif", scene / "truth_class.tif")["all"]
     return Judged(found["rmse"], found["within"], cpu_s)
+
+
+def spoiled_towns(workplace: Workplace, out: Path, step: str) -> Judged:
+    """Means over the rendered towns of ten seeds, each seen by eight images of which two are spoiled."""
+    found = []
+    for seed in fresh_seeds():
+        scene = workplace.out / f"town-{seed}"
+        if not (scene / "truth_dsm.tif").exists():
+            render(scene, "city", TOWN_CELLS, "--seed", seed, "--views", TOWN_VIEWS)
+        found.append(town(scene, out / str(seed), step))
+    errors, within, cpu_s = ([getattr(one, name) for one in found] for name in ("error", "within", "cpu_s"))
+    return Judged(statistics.fmean(errors), statistics.fmean(within), sum(cpu_s), statistics.stdev(errors))
 
 
 def realistic_scene(workplace: Workplace, out: Path, step: str) -> Judged:
@@ -136,6 +162,32 @@ def all_of_jacksonville(workplace: Workplace, out: Path, step: str) -> Judged:
     return jacksonville(workplace, out, step, 19)
 
 
+def triplet(workplace: Workplace, out: Path, step: str) -> Judged:
+    """Three Pleiades images against the surface that S2P made of them, which has errors of its own."""
+    scene = workplace.scene("pleiades_triplet_calanques")
+    reference = scene / "reference" / "s2p_dsm_0.5m_utm31n.tif"
+    cpu_s = surface(sorted(scene.glob("img_0*.tif")), out, step, "--like", reference)
+    expected, difference = heights_of(reference), heights_of(out / "dsm.tif") - heights_of(reference)
+    apart = np.abs(difference - np.nanmedian(difference))
+    within = (apart[np.isfinite(expected)] < 1.0).mean()  # False for cells without a height
+    return Judged(float(np.nanmean(apart)), float(within), cpu_s)
+
+
+def heights_of(path: Path) -> NDArray[np.float32]:
+    """Heights of a raster, (r, c) m, NaN where it has none."""
+    with rasterio.open(path) as file:
+        return np.asarray(file.read(1, masked=True).filled(np.nan), np.float32)
+
+
+def drone(workplace: Workplace, out: Path, step: str) -> Judged:
+    """Three oblique images of a drone; the fourth judges."""
+    oriented = orient([import_tuniu(workplace, workplace.out / "tuniu")], workplace.out / "tuniu" / "oriented")
+    rest = without(oriented, [DRONE_JUDGE], oriented.with_name("three.yaml"))
+    cpu_s = surface([rest], out, step)
+    found = judged(Surface.read(out / "dsm.tif"), open_scene([oriented]).views, DRONE_JUDGE)
+    return Judged(1 - found.median, None, cpu_s)
+
+
 def facade(workplace: Workplace, out: Path, step: str) -> Judged:
     """Seven photographs of a facade; the eighth judges."""
     scene = reduced_facade(workplace)
@@ -148,8 +200,11 @@ def facade(workplace: Workplace, out: Path, step: str) -> Judged:
 
 SCENES = {
     "town, two of eight spoiled": spoiled_town,
+    "towns of ten seeds, two of eight spoiled": spoiled_towns,
     "realistic scene a, six": realistic_scene,
     "Jacksonville, seven": seven_of_jacksonville,
     "Jacksonville, nineteen": all_of_jacksonville,
+    "triplet": triplet,
+    "tuniu, three": drone,
     "Herz-Jesu, seven": facade,
 }

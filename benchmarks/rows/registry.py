@@ -61,7 +61,7 @@ ROWS: dict[str, Row] = {
     "left-out-views": Row("rows.real_images:left_out_views", WITHOUT_TRUTH),
     "many-images": Row("rows.many_images:many_images"),
     "more-images": Row("rows.many_images:more_images", WITHOUT_TRUTH, is_slow=True),
-    "choice-of-images": Row("rows.choice_of_images:choice_of_images", WITHOUT_TRUTH, is_slow=True),
+    "choice-of-images": Row("rows.choice_of_images:choice_of_images", (*WITHOUT_TRUTH, RENDERER), is_slow=True),
     "middlebury": Row("rows.methods:middlebury"),
     "selection": Row("rows.methods:selection"),
     "city": Row("rows.rendered:city"),
