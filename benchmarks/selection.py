@@ -5,11 +5,10 @@
 SCENE_FOLDER holds img_*.tif with RPC, truth_dsm.tif and truth_class.tif. The default is the rendered town, where two of
 the eight views are bad: d1 (another date) and d2 (haze, blur, clouds). Each choice is one run of `zlocus dsm`:
 
-- all images: `--views all`, which knows nothing of hidden views either;
-- all images, hidden ones masked: what the choices below are to be compared with;
+- all images: the default, what the choices below are to be compared with;
 - six good images: without the bad ones (names that begin with d);
 - k best by geometry: the most nadir view and k - 1 others by `candidate_images` (angles and overlap alone);
-- guided: `--views auto`, ranked at tie points, added until match curves are distinct and precise;
+- guided: `--selection guided`, ranked at tie points, added until match curves are distinct and precise;
 - guided, rule of the paper: adding stops when the label of 95 % of the cells is good; no view is excluded for its
   labels.
 
@@ -49,7 +48,6 @@ from zlocus.matching.view_ranking import SearchGeometry, candidate_images
 
 SPOILED = "d"
 CURVES = 2000
-KEEP_ALL = RunConfig(selection=SelectionOptions(min_images=254, max_images=254))
 OF_THE_PAPER = RunConfig(
     selection=SelectionOptions(
         max_sigma_steps=1000.0,
@@ -63,10 +61,10 @@ OF_THE_PAPER = RunConfig(
 
 @dataclass(frozen=True)
 class Choice:
-    """One run. images : names of its images; views : value of `--views`."""
+    """One run. images : names of its images; selection : value of `--selection`."""
 
     images: tuple[str, ...]
-    views: str
+    selection: str
     config: RunConfig
 
 
@@ -74,14 +72,13 @@ def choices(names: list[str], by_geometry: list[str]) -> dict[str, Choice]:
     """The runs, by their names in the table."""
     good = tuple(name for name in names if not name.startswith(SPOILED))
     every = tuple(names)
-    best = {f"{k} best by geometry": Choice(tuple(by_geometry[:k]), "auto", KEEP_ALL) for k in (3, 4, 5, 6)}
+    best = {f"{k} best by geometry": Choice(tuple(by_geometry[:k]), "default", RunConfig()) for k in (3, 4, 5, 6)}
     return {
-        "all images": Choice(every, "all", KEEP_ALL),
-        "all images, hidden ones masked": Choice(every, "auto", KEEP_ALL),
-        "six good images": Choice(good, "auto", KEEP_ALL),
+        "all images": Choice(every, "default", RunConfig()),
+        "six good images": Choice(good, "default", RunConfig()),
         **best,
-        "guided": Choice(every, "auto", RunConfig()),
-        "guided, rule of the paper": Choice(every, "auto", OF_THE_PAPER),
+        "guided": Choice(every, "guided", RunConfig()),
+        "guided, rule of the paper": Choice(every, "guided", OF_THE_PAPER),
     }
 
 
@@ -170,7 +167,7 @@ def run(name: str, choice: Choice, folder: Path, out: Path, curves: int = CURVES
     with watched(tiles):
         work = matched(
             images, place, choice.config,
-            ["--crs", crs, "--resolution", str(cell), "--views", choice.views, "--bounds", *map(str, bounds),
+            ["--crs", crs, "--resolution", str(cell), "--selection", choice.selection, "--bounds", *map(str, bounds),
              # The run takes place in this process, so that `watched` can record the tiles.
              "--workers", "1"],
         )  # fmt: skip

@@ -10,26 +10,28 @@ from middlebury import CASES, judge
 from workplace import COVERAGE_SHORT, ZLOCUS, Figure, Workplace, rendered_images, run
 
 BEHIND_OPENCV = "matching costs or penalties are worse than those of OpenCV"
+# Values of --selection: all images, and some of them.
+CHOICES = ("default", "guided")
 NO_GAIN = "penalties are too high or too low, so that smoothing costs more than it gains"
 
 
 def selection(workplace: Workplace) -> list[Figure]:
-    """Eight views of the rendered town, one of another date and one hazy: the chosen ones against all of them."""
+    """Eight views of the rendered town, one of another date and one hazy: `--selection guided` against all of them."""
     scene = workplace.scene("rendered-city")
     all_images = sorted(scene.glob("img_*.tif"))
     figures, shares, cpu = [], {}, {}
-    for name, images, views in (
-        ("all", all_images, "all"),
-        ("good", rendered_images(scene), "auto"),
-        ("auto", all_images, "auto"),
+    for name, images, choice in (
+        ("all", all_images, "default"),
+        ("good", rendered_images(scene), "default"),
+        ("guided", all_images, "guided"),
     ):
         out = workplace.out / name
-        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--views", views, "--overwrite"])
+        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--selection", choice, "--overwrite"])
         found, record = workplace.judge(out / "dsm.tif", scene), json.loads((out / "run.json").read_text())
         shares[name] = {surface: found[surface]["within"] for surface in ("all", "building")}
         cpu[name] = sum(stage["cpu_s"] for stage in record["stages"])
     for surface in ("all", "building"):
-        gain, loss = (shares["auto"][surface] - shares[other][surface] for other in ("all", "good"))
+        gain, loss = (shares["guided"][surface] - shares[other][surface] for other in ("all", "good"))
         figures.append(
             Figure(
                 f"{surface}: over all images", gain, at_least=0.005,
@@ -50,7 +52,7 @@ def selection(workplace: Workplace) -> list[Figure]:
             fails_when="match curves do not stop, or more heights are searched",
         ),
         Figure(
-            "CPU over that of all images", cpu["auto"] / cpu["all"], at_most=1,
+            "CPU over that of all images", cpu["guided"] / cpu["all"], at_most=1,
             fails_when="ranking the images takes more time than it saves",
         ),
         *no_worse_on_hills(workplace),
@@ -62,13 +64,13 @@ def no_worse_on_hills(workplace: Workplace) -> list[Figure]:
     """NMAD of the aligned ground of eight views of the hills: chosen images over all images."""
     scene = workplace.scene("rendered-hills-biased")
     images, nmad = sorted(scene.glob("img_*.tif")), {}
-    for views in ("all", "auto"):
-        out = workplace.out / f"hills-{views}"
-        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--views", views, "--overwrite"])
-        nmad[views] = workplace.judge(out / "dsm.tif", scene, "--align")["ground"]["nmad"]
+    for choice in CHOICES:
+        out = workplace.out / f"hills-{choice}"
+        run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--selection", choice, "--overwrite"])
+        nmad[choice] = workplace.judge(out / "dsm.tif", scene, "--align")["ground"]["nmad"]
     return [
         Figure(
-            "hills: NMAD over that of all images", nmad["auto"] / nmad["all"], at_most=1.02,
+            "hills: NMAD over that of all images", nmad["guided"] / nmad["default"], at_most=1.02,
             fails_when="images that look at slopes obliquely are preferred",
         )
     ]  # fmt: skip
@@ -82,21 +84,21 @@ def no_worse_on_worldview(workplace: Workplace) -> list[Figure]:
     scene = workplace.scene("worldview3_jax068")
     images, within = sorted(scene.glob("*_RGB.tif")), {}
     lidar, classes = (scene / "reference" / name for name in ("lidar_dsm_half_utm17n.tif", "classes_half_utm17n.tif"))
-    for views in ("all", "auto"):
-        out = workplace.out / f"worldview-{views}"
+    for choice in CHOICES:
+        out = workplace.out / f"worldview-{choice}"
         run(
-            [ZLOCUS, "dsm", *images, "-o", out, "--like", lidar, "--views", views, "--overwrite", "--no-report"],
+            [ZLOCUS, "dsm", *images, "-o", out, "--like", lidar, "--selection", choice, "--overwrite", "--no-report"],
             accept=(0, COVERAGE_SHORT),
         )
-        within[views] = workplace.judge_registered(out / "dsm.tif", lidar, classes)
+        within[choice] = workplace.judge_registered(out / "dsm.tif", lidar, classes)
     return [
         *(
-            Figure(f"WorldView-3, {views}, aligned, within 1 m: all", within[views]["all"]["within1"])
-            for views in ("all", "auto")
+            Figure(f"WorldView-3, {choice}, aligned, within 1 m: all", within[choice]["all"]["within1"])
+            for choice in CHOICES
         ),
         Figure(
             "WorldView-3, within 1 m over that of all images",
-            within["auto"]["all"]["within1"] / within["all"]["all"]["within1"],
+            within["guided"]["all"]["within1"] / within["default"]["all"]["within1"],
             at_least=1.0,
             fails_when="images of other seasons are chosen, or too few images",
         ),

@@ -24,7 +24,6 @@ from zlocus.core.options import (
     CostOptions,
     PyramidOptions,
     RunConfig,
-    SelectionOptions,
     large_window_side,
 )
 from zlocus.core.options.option_fields import value_of
@@ -57,7 +56,6 @@ HEIGHTS_M = (45.0, 72.0)
 CONFIG = RunConfig(
     pyramid=PyramidOptions(block=16, halo=8, max_levels=2),
     cost=CostOptions(large_window=5),
-    selection=SelectionOptions(min_images_for_choice=254),
 )
 # Projection tables promise this; positions of the largest image differ by less.
 TABLE_PX = 0.02

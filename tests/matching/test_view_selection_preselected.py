@@ -12,7 +12,7 @@ import pytest
 from rendered_scenes import CENTRE
 from zlocus.core.options import SelectionOptions
 from zlocus.core.scene import View
-from zlocus.matching.view_selection import preselected, usual_number_showing
+from zlocus.matching.view_selection import preselected
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
 
@@ -46,15 +46,6 @@ def test_a_hundred_images_leave_a_reference_and_its_candidates():
     assert names[0] == "v0"
     angles = [0.4 * int(name[1:]) for name in names[1:]]
     assert np.abs(np.array(angles) - 20.0).max() < 2.0
-
-
-@pytest.mark.parametrize(("east", "number"), [(0.0, 3.0), (300.0, 2.0)])
-def test_the_number_of_images_that_show_most_of_a_patch(east, number):
-    views = [view("nadir"), view("beside", 10.0), view("moved", 20.0, east=east)]
-    assert usual_number_showing(views, corners(), Z) == number
-    # Points that one image shows, or none, do not count.
-    assert usual_number_showing(views, np.concatenate([corners(), corners() + 1000.0, corners() + 2000.0]), Z) == number
-    assert usual_number_showing(views[:1], corners(), Z) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -38,10 +38,10 @@ SPEC = SceneSpec(
     objects=Objects(35.0, 22.0, 0.0, 10.0, plain_roofs=1.0),
 )  # fmt: skip
 # Small blocks, so that the small town has several.
-SMALL_BLOCKS = RunConfig(pyramid=PyramidOptions(block=16), selection=SelectionOptions(min_images_for_choice=3))
+SMALL_BLOCKS = RunConfig(pyramid=PyramidOptions(block=16))
 USE_ALL = replace(SMALL_BLOCKS, selection=SelectionOptions(min_images=254, max_images=254))
 # Almost no block has a tie point within this radius.
-FAR_FROM_TIES = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, max_radii=1.0, min_images_for_choice=3))
+FAR_FROM_TIES = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, max_radii=1.0))
 WITHIN_M, ROAD, BUILDING = 1.0, 1, 2
 # Largest share of cells that the choice of images may leave empty.
 COVERAGE = 0.005
@@ -70,9 +70,10 @@ def town(tmp_path_factory):
 
 
 def surface(town, out, config=SMALL_BLOCKS, names=(*GOOD_VIEWS, BAD), **request):
-    """Run over the town on its cells. The bad image takes part, although no tie point supports it."""
+    """Run over the town on its cells, with a choice of the images unless a request asks otherwise. The bad image takes
+    part, although no tie point supports it."""
     inputs = tuple(town.scene.images[name] for name in names)
-    asked = {"bounds": town.bounds, "heights": (425.0, 470.0)} | request
+    asked = {"bounds": town.bounds, "heights": (425.0, 470.0), "selection": "guided"} | request
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(zlocus.pipeline.setup, "supported_views", lambda scene, orientation: scene)
         return run(inputs, out, config, **asked).out
@@ -130,10 +131,10 @@ def test_the_choice_saves_evaluations(guided):
     assert every["done"] == every["all_images"]
 
 
-def test_where_many_images_show_the_cells_none_is_left_out(town, tmp_path, blocks_used):
-    selection = replace(SMALL_BLOCKS.selection, max_images_for_choice=len(GOOD_VIEWS) - 1)
-    surface(town, tmp_path / "out", replace(SMALL_BLOCKS, selection=selection))
+def test_by_default_no_image_is_left_out(town, tmp_path, blocks_used):
+    out = surface(town, tmp_path / "out", selection="default")
     assert blocks_used == {}
+    assert evaluations(out)["done"] == evaluations(out)["all_images"]
 
 
 def test_no_cell_that_all_images_see_is_left_empty_by_the_choice(guided, town):

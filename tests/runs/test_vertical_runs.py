@@ -44,7 +44,7 @@ from zlocus.synthetic.terrain import analytic_height
 AT_CENTRE_M, EAST_SLOPE, NORTH_SLOPE = 48.0, 8e-3, -4e-3
 POST_M = 100.0
 # Three images are ranked too.
-RANKED = replace(SMALL_TILES, selection=replace(SMALL_TILES.selection, min_images_for_choice=3, min_images=1))
+RANKED = replace(SMALL_TILES, selection=replace(SMALL_TILES.selection, min_images=1))
 EXACT_M = 1e-9
 # float32 heights, of which an undulation is taken.
 FLOAT_M = 2e-5
@@ -112,7 +112,9 @@ def test_run_json_says_what_heights_are_above(both, geoid):
 def test_points_are_above_the_same(images, geoid, tmp_path, name):
     asked = {"heights": None, "bounds": PART}
     above = {"plain": "ellipsoid", "above": str(geoid)}
-    folders = [run(images("sine"), tmp_path / f, RANKED, vertical=v, **asked).out for f, v in above.items()]
+    folders = [
+        run(images("sine"), tmp_path / f, RANKED, vertical=v, selection="guided", **asked).out for f, v in above.items()
+    ]
     (plain, plain_crs), (above, crs) = (points_in(out / f"{name}.gpkg") for out in folders)
     assert len(plain) > 20
     np.testing.assert_array_equal(above[:, :2], plain[:, :2])

@@ -65,7 +65,10 @@ class DsmOptions:
         ),
     ] = None
     views: Annotated[
-        str, typer.Option(help="Images used for a cell: chosen for it, or all that show it.", metavar="auto|all")
+        str,
+        typer.Option(
+            help="Images considered for a cell: the best candidates that show its tile, or all.", metavar="auto|all"
+        ),
     ] = "auto"
     method: Annotated[
         str | None,
@@ -78,8 +81,9 @@ class DsmOptions:
     selection: Annotated[
         str,
         typer.Option(
-            help="How images are chosen: as usual, or literally as Ji et al. (2014) do for single cells.",
-            metavar="default|paper",
+            help="Images used for a cell: all that are considered; a few, chosen by match curves at tie points; or "
+            "those of Ji et al. (2014).",
+            metavar="default|guided|paper",
         ),
     ] = "default"
     vertical: Vertical = "ellipsoid"

@@ -29,7 +29,9 @@ FINISHED = "finished.json"
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm", "gc3")
 # How images are chosen for a cell, and the methods that go with it, the usual one first.
-METHODS_OF_SELECTION = {"default": ("mvll-sgm", "mvll", "gc3-sgm"), "paper": ("mvll", "gc3")}
+METHODS_OF_SELECTION = {
+    "default": ("mvll-sgm", "mvll", "gc3-sgm"), "guided": ("mvll-sgm", "mvll"), "paper": ("mvll", "gc3"),
+}  # fmt: skip
 FILLS = ("none", "interpolate", "dem")
 PRODUCTS = ("hillshade", "contours", "dtm", "laz")
 # The hillshade is what everyone looks at first and takes a second per million cells; the others are made on request.
@@ -47,7 +49,8 @@ class DsmRequest:
     heights : (zmin, zmax), m, in the vertical datum `vertical`. dem : raster around whose heights is searched;
     dem_vertical : its vertical datum, None takes the one of its CRS.
     reference : name of the reference image; with gc3-sgm only the pixels of this image are matched. selection : key of
-    `METHODS_OF_SELECTION`: how images are chosen, `paper` for Ji et al. (2014) literally.
+    `METHODS_OF_SELECTION`: which images are used for a cell, `default` for all, `guided` for a few that labels choose,
+    `paper` for those of Ji et al. (2014).
     vertical : vertical datum of all heights: ellipsoid, egm96 or egm2008 in upper or lower case, or the file of a geoid
     raster.
     workers : tiles worked on at a time, in processes; None: as many as there are cores, memory and work for.
@@ -135,13 +138,16 @@ class DsmRequest:
                 f"--method {self.method} does not go with --selection {self.selection}, which takes "
                 f"{' or '.join(methods)}. Give one of these, or {other}."
             )
-        if self.selection == "paper":
-            for name, is_given in (("--views all", self.views == "all"), (f"--dem {self.dem}", self.dem is not None)):
-                if is_given:
-                    raise ConfigError(
-                        f"--selection paper chooses the images, and searches around the heights of feature points; "
-                        f"{name} contradicts that. Leave it out, or use --selection default."
-                    )
+        if self.selection != "default" and self.views == "all":
+            raise ConfigError(
+                f"--selection {self.selection} chooses the images, and --views all contradicts that. Leave it out, or "
+                "use --selection default."
+            )
+        if self.selection == "paper" and self.dem is not None:
+            raise ConfigError(
+                f"--selection paper searches around the heights of feature points, and --dem {self.dem} contradicts "
+                "that. Leave it out, or use --selection default."
+            )
 
     def _check_grid(self) -> None:
         check_positive("--resolution", self.resolution, "m")

@@ -39,7 +39,7 @@ NOT_THE_SAME = (
 NOT_KNOWN = "The run did not record its fingerprint, so it is not known whether the cameras are the same as in the run."
 MADE_AGAIN = "The surface was made again, or removed, after this page was opened. Start `zlocus inspect` again."
 # Options that have no effect on a single cell.
-OPTIONS_OF_RUNS = ("stopped_share", "min_images_for_choice", "max_images_for_choice")
+OPTIONS_OF_RUNS = ("stopped_share",)
 
 
 @dataclass
@@ -220,8 +220,7 @@ class Inspection:
             "images": list(run["orientation"]["views"]), "method": run["config"]["request"]["method"],
             "small_window": config.cost.small_window,
             "max_images_for_large_window": config.cost.max_images_for_large_window,
-            "min_images_for_choice": config.selection.min_images_for_choice,
-            "max_images_for_choice": config.selection.max_images_for_choice, "views": run["config"]["request"]["views"],
+            "selection": run["config"]["request"]["selection"],
             "options": options_record(config.selection),
             "window": {"value": large_window_side(config.cost), "choices": list(WINDOWS)},
             "cells": self._cells(),

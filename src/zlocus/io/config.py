@@ -127,10 +127,7 @@ def _check_renamed(key: str, value: Any, where: str) -> None:
         if old in RENAMED_KEYS:
             raise ConfigError(f"{where}: {old} is now called {RENAMED_KEYS[old]}. Rename it in the file.")
         if old in REMOVED_KEYS:
-            raise ConfigError(
-                f"{where}: {old} is no longer an option; its value is always {REMOVED_KEYS[old]}. Remove it from the "
-                "file."
-            )
+            raise ConfigError(f"{where}: {old} is no longer an option; {REMOVED_KEYS[old]}. Remove it from the file.")
 
 
 def _unknown(name: str, known: list[str], where: str, prefix: str) -> str:

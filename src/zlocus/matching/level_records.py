@@ -45,7 +45,7 @@ class TileInputs:
     view_pixels: Sequence[ViewPixels]
     view_numbers: Sequence[int]
     method: str = "mvll-sgm"
-    choose_images: bool = True
+    choose_images: bool = False
 
     @property
     def handles_occlusion(self) -> bool:

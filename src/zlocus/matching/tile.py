@@ -66,7 +66,7 @@ from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile_views import PixelWindow, TileGrid, TileViews, pixel_window, read_pixels, tile_views
-from zlocus.matching.view_selection import ChosenViews, choose_views, preselected, usual_number_showing
+from zlocus.matching.view_selection import ChosenViews, choose_views, preselected
 
 
 @dataclass(frozen=True)
@@ -99,19 +99,20 @@ def match_tile(
     core_window: CellWindow,
     config: RunConfig,
     method: str = "mvll-sgm",
-    choose_images: bool = True,
+    choose_images: bool = False,
     fill: str = "none",
+    preselect: bool = True,
 ) -> TileResult:
     """Match one tile.
 
     core_window : finest cells whose surface is wanted; every level adds a halo around them. method : mvll-sgm, mvll
-    without the semi-global constraint, or gc3-sgm in image space. choose_images : match each block with a choice of the
-    images; False: with all. fill : none, or interpolate to fill gaps that images cover. Occlusions are found wherever
-    three images or more see the tile.
+    without the semi-global constraint, or gc3-sgm in image space. choose_images : match each block with a few
+    images, chosen by labels; False: with all. fill : none, or interpolate to fill gaps that images cover. preselect :
+    see `read_tile`. Occlusions are found wherever three images or more see the tile.
     """
     if not (core_window.rows and core_window.cols):
         return TileResult(Surface.nothing(core_window))
-    tile = read_tile(match_scene, core_window, config, method, choose_images)
+    tile = read_tile(match_scene, core_window, config, method, choose_images, preselect)
     if len(tile.view_pixels) < PAIR:
         return TileResult(Surface.nothing(core_window))
     coarsest_match = match_coarsest_level(tile)
@@ -153,24 +154,16 @@ def read_tile(
     core_window: CellWindow,
     config: RunConfig,
     method: str = "mvll-sgm",
-    choose_images: bool = True,
+    choose_images: bool = False,
+    preselect: bool = True,
 ) -> TileInputs:
-    """Read the pixels of the views that may see a tile; of many views, if images are chosen, only the best
-    candidates.
-
-    Nothing is chosen for the blocks of a tile whose cells many views show.
-    """
+    """Read the pixels of the views that may see a tile; with `preselect`, of many views only the best candidates."""
     ground_xy, windows = windows_of(match_scene, core_window, config)
     numbers, options = list(windows), config.selection
-    if choose_images and len(numbers) > options.max_candidates + 1:
+    if preselect and len(numbers) > options.max_candidates + 1:
         views = [match_scene.views[n] for n in numbers]
         rows = preselected(views, ground_xy, match_scene.ground_height, options)
         numbers = [numbers[row] for row in rows]
-    if choose_images and len(numbers) > options.max_images_for_choice:
-        views = [match_scene.views[n] for n in numbers]
-        core_xy = match_scene.points_of(core_window, 0)
-        n_showing = usual_number_showing(views, core_xy, match_scene.ground_height)
-        choose_images = n_showing <= options.max_images_for_choice
     view_pixels = [
         read_pixels(match_scene.views[n], windows[n], match_scene.levels, match_scene.grey_scales[n]) for n in numbers
     ]
@@ -251,8 +244,7 @@ def add_evaluations(result: LevelResult, earlier_result: LevelResult) -> LevelRe
 
 def pair_labels_for_choice(tile: TileInputs, coarsest_result: LevelResult | None) -> PairLabels | None:
     """Labels by which images are chosen; None where no choice is wanted, or too few images see the tile for one."""
-    n_views, options = len(tile.view_pixels), tile.config.selection
-    if not tile.choose_images or n_views < options.min_images_for_choice or n_views - 1 <= options.min_images:
+    if not tile.choose_images or len(tile.view_pixels) - 1 <= tile.config.selection.min_images:
         return None
     return label_pairs_at_ties(tile, coarsest_result)
 

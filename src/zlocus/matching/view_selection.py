@@ -27,7 +27,7 @@ from zlocus.matching.local_contrast import Part
 from zlocus.matching.locus_windows import CurveSamples
 from zlocus.matching.match_curve import ProgressiveMatch, SearchPlan, match_progressively
 from zlocus.matching.match_scene import parallax_rate
-from zlocus.matching.occlusion import PAIR, covers, exclude, sees, usual_number
+from zlocus.matching.occlusion import covers, exclude, sees, usual_number
 from zlocus.matching.pair_labels import PairLabels
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.tile_views import TileViews
@@ -152,16 +152,6 @@ def _parallax_rate_at(view: View, xyz: FloatArray, z: float) -> FloatArray:
     return parallax_rate(
         view, z, view.sensor.image_from_ground(xyz.mean(axis=0, keepdims=True))[0] if len(xyz) else None
     )
-
-
-def usual_number_showing(views: Sequence[View], ground_xy: FloatArray, z: float) -> float:
-    """Median number of views that show a point of a patch of ground, of the points that two or more show.
-
-    ground_xy : (n, 2) m; z : m.
-    """
-    xyz = np.column_stack([ground_xy, np.full(len(ground_xy), z)])
-    n_showing = np.sum([_inside(view, xyz) for view in views], axis=0)
-    return float(np.median(n_showing[n_showing >= PAIR])) if (n_showing >= PAIR).any() else 0.0
 
 
 def _inside(view: View, xyz: FloatArray) -> NDArray[np.bool_]:

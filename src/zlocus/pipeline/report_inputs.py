@@ -158,8 +158,8 @@ def tried_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str
 def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[str, Any]:
     """Labels of every pair of images at the tie points in and around a few places, each point once.
 
-    As where images are chosen (`rank_tile`), which takes `selection.min_images_for_choice`: with fewer images nothing
-    else says how well each pair of them matches. No place is begun after `most_s`.
+    As where images are chosen (`rank_tile`): without a choice nothing else says how well each pair of them matches. No
+    place is begun after `most_s`.
     """
     match_scene, start = run.match_scene, time.perf_counter()
     is_new, parts = np.ones(len(match_scene.ties), bool), list[LabelledTies]()

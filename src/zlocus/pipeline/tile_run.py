@@ -320,11 +320,11 @@ def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: 
     if request.fill == "dem":
         assert request.dem is not None, "a request that fills from a terrain model names it"
         terrain = Terrain(request.dem, dem_datum(request.dem, request.dem_vertical))
-    choose_images, fill = request.views == "auto", "none" if request.fill == "dem" else request.fill
+    fill = "none" if request.fill == "dem" else request.fill
     match_scene = setup.match_scene
     if request.selection == "paper":
         match_scene = replace(match_scene, ties=reference_features(setup))
-    method = MatchMethod(request.method, choose_images, request.selection)
+    method = MatchMethod(request.method, request.selection, request.views == "auto")
     return TileJob(match_scene, setup.grid, config, method, fill, polygons, terrain)
 
 
@@ -436,16 +436,17 @@ class TileProduct:
 
 @dataclass(frozen=True)
 class MatchMethod:
-    """How tiles are matched. name, choose_images : see `match_tile`; selection : see `DsmRequest`."""
+    """How tiles are matched. name : see `match_tile`; selection : see `DsmRequest`; preselect : see `match_tile`."""
 
     name: str
-    choose_images: bool = True
     selection: str = "default"
+    preselect: bool = True
 
     def match(self, match_scene: MatchScene, tile: Tile, config: RunConfig, fill: str = "none") -> TileResult:
         """The result of a tile."""
-        if self.selection == "default":
-            return match_tile(match_scene, tile.core_window, config, self.name, self.choose_images, fill)
+        if self.selection != "paper":
+            is_guided = self.selection == "guided"
+            return match_tile(match_scene, tile.core_window, config, self.name, is_guided, fill, self.preselect)
         if fill == "none":
             return match_tile_of_paper(match_scene, tile.core_window, tile.kept_window, config)
         # The cells around those that are kept fill gaps at their border.

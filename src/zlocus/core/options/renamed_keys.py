@@ -21,7 +21,6 @@ RENAMED_KEYS: dict[str, str] = {
     "selection.widest": "selection.max_radii",
     "selection.sigma_steps": "selection.max_sigma_steps",
     "selection.least_worth": "selection.min_label_share",
-    "selection.fewest_views": "selection.min_images_for_choice",
     "selection.least_images": "selection.min_images",
     "selection.most_images": "selection.max_images",
     "selection.candidates": "selection.max_candidates",
@@ -52,17 +51,19 @@ RENAMED_KEYS: dict[str, str] = {
     "orientation.prior_px": "orientation.sigma_shift_px",
 }
 
-# Keys that are no longer options, because nobody had a reason to change their values, with the value that always
-# applies.
+# Keys that are no longer options, because nobody had a reason to change their values, and what applies instead.
 REMOVED_KEYS: dict[str, str] = {
-    "measure.grey_weight_two": "0.3 times cost.grey_weight",
-    "cost.grey_weight_two_images": "0.3 times cost.grey_weight",
-    "semiglobal.p1_two": "semiglobal.p1",
-    "semiglobal.p1_two_images": "semiglobal.p1",
-    "semiglobal.edge_contrast_two": "4 times semiglobal.edge_contrast",
-    "semiglobal.edge_contrast_two_images": "4 times semiglobal.edge_contrast",
-    "orientation.match_ratio": "0.8",
-    "orientation.patch_px": "9 px",
-    "products.ground_cell_m": "1 m",
-    "products.ground_scaling": "1.25 m",
+    "measure.grey_weight_two": "its value is always 0.3 times cost.grey_weight",
+    "cost.grey_weight_two_images": "its value is always 0.3 times cost.grey_weight",
+    "semiglobal.p1_two": "its value is always semiglobal.p1",
+    "semiglobal.p1_two_images": "its value is always semiglobal.p1",
+    "semiglobal.edge_contrast_two": "its value is always 4 times semiglobal.edge_contrast",
+    "semiglobal.edge_contrast_two_images": "its value is always 4 times semiglobal.edge_contrast",
+    "selection.fewest_views": "images are chosen with --selection guided only",
+    "selection.min_images_for_choice": "images are chosen with --selection guided only",
+    "selection.max_images_for_choice": "images are chosen with --selection guided only",
+    "orientation.match_ratio": "its value is always 0.8",
+    "orientation.patch_px": "its value is always 9 px",
+    "products.ground_cell_m": "its value is always 1 m",
+    "products.ground_scaling": "its value is always 1.25 m",
 }

@@ -79,13 +79,6 @@ class SelectionOptions(Checked):
         "angle", "Which of the helpful images comes first: the one whose angle to the reference image is nearest to "
         "`best_angle_deg`, or the one with the highest accumulated label.", choices=("angle", "labels"),
     )  # fmt: skip
-    min_images_for_choice: int = option(
-        7, "A tile that fewer images see uses all of them.", low=3, high=255
-    )  # fmt: skip
-    max_images_for_choice: int = option(
-        12, "A tile whose cells more images show uses all its candidates: the best of many pairs mislead less than a "
-        "few chosen images.", low=2, high=255,
-    )  # fmt: skip
     min_images: int = option(
         2, "Number of search images that a cell uses, whatever their labels are.", low=1, high=254
     )  # fmt: skip

@@ -261,14 +261,9 @@ function ofRun(found) {
   const used = shown.height_m === null ? "" : `In the run ${shown.n_images} of ${surface.images.length} images, including the reference image, were used for the final height. Images in which the cell is occluded were not used. `;
   const curves_text = ` These curves use correlation windows of ${window} cells. The run also uses smaller windows and grey values` +
     (surface.method === "mvll" ? "." : ", and the semi-global constraint, so that its height need not lie at this peak.");
-  if (surface.views === "all") return `${used}The run used every image in every cell (--views all).${curves_text}`;
-  if (surface.images.length < surface.min_images_for_choice) {
-    return `${used}With fewer than ${surface.min_images_for_choice} images the run uses all of them: order and stop ` +
-      `are those that the rule gives for this single cell.${curves_text}`;
-  }
-  if (surface.images.length > surface.max_images_for_choice) {
-    return `${used}The run chooses images where at most ${surface.max_images_for_choice} see a place, by the same rule, ` +
-      `for matching blocks. Where more see it, all its candidates are used.${curves_text}`;
+  if (surface.selection !== "guided") {
+    return `${used}The run leaves out none for its match curve: order and stop are those that the rule of ` +
+      `--selection guided gives for this single cell.${curves_text}`;
   }
   return `${used}It applies the same rule to matching blocks, on the next coarser pyramid level.${curves_text}`;
 }
