@@ -1,6 +1,7 @@
-"""Figures of the method page: `python docs/figures.py [FOLDER]` renders a scene, matches it and draws them.
+"""Figures of the pages on the method: `python docs/figures.py [FOLDER]` renders a scene, matches it and draws them.
 
-Everything comes from one rendered town with exact truth; the same code gives the same figures.
+All but one come from one rendered town with exact truth; the same code gives the same figures. The errors with a
+growing number of images are those of the results file of that row.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ from zlocus.synthetic.files import RenderedScene, render_scene
 from zlocus.synthetic.scenes import city_spec
 
 HERE = Path(__file__).parent
+RESULTS = HERE.parent / "benchmarks" / "results"
+MARKERS = "os^vD"
 SEED, SIZE_PX, CELL_M = 6, 200, 0.5
 THREE, SIX = ("n1", "f1", "b1"), ("n1", "f1", "b1", "n2", "f2", "b2")
 # A place of the scene, on open ground beside a road.
@@ -235,6 +238,26 @@ def precision(town: Town, found: dict[str, FloatArray]) -> Figure:
     return figure
 
 
+def more_images(results: Path) -> Figure:
+    """Figure of the errors with a growing number of images over those with two, for every scene of a results file."""
+    errors: dict[str, dict[int, float]] = {}
+    for one in json.loads(results.read_text(encoding="utf-8"))["figures"]:
+        scene, _, what = one["what"].rpartition(": ")
+        if what.endswith(" images"):
+            errors.setdefault(scene.partition(",")[0], {})[int(what.split()[0])] = one["value"]
+    figure, ax = plt.subplots(figsize=(4.6, 3.6), layout="constrained")
+    for (scene, of_scene), marker in zip(errors.items(), MARKERS, strict=False):
+        counts = sorted(of_scene)
+        ax.plot(counts, [of_scene[n] / of_scene[counts[0]] for n in counts], f"{marker}-", ms=4, lw=1.0, label=scene)
+    ticks = sorted({n for of_scene in errors.values() for n in of_scene})
+    ax.axhline(1.0, color=PALE, lw=0.8, ls=":")
+    ax.set(xscale="log", xlabel="images", ylabel="error over that of two images")
+    ax.set_xticks(ticks, [str(n) for n in ticks])
+    ax.minorticks_off()
+    ax.legend(frameon=False)
+    return figure
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG with 128 colours, which takes a third of the space."""
     drawn = BytesIO()
@@ -256,6 +279,7 @@ def make_figures(folder: Path) -> list[Path]:
             "means": means(town, point),
             "semiglobal": semiglobal(town, found["mvll"]["dsm"], found["mvll-sgm"]["dsm"]),
             "precision": precision(town, found["mvll-sgm"]),
+            "more_images": more_images(RESULTS / "more-images.json"),
         }
         for name, figure in figures.items():
             save(figure, folder / f"{name}.png")

@@ -152,6 +152,8 @@ def test_dsm_reads_its_configuration(zl, pipeline, tmp_path):
         (["a.tif", "b.tif", "--method", "gc3"], "--selection default, which takes mvll-sgm or mvll or gc3-sgm"),
         (["a.tif", "b.tif", "--selection", "paper", "--views", "all"], "--views all contradicts that"),
         (["a.tif", "b.tif", "--selection", "paper", "--dem", "d.tif"], "--dem d.tif contradicts that"),
+        (["a.tif", "b.tif", "--selection", "guided", "--views", "all"], "--views all contradicts that"),
+        (["a.tif", "b.tif", "--selection", "guided", "--method", "gc3-sgm"], "does not go with --selection guided"),
         (["a.tif", "b.tif", "--fill", "dreams"], "--fill dreams"),
         (["a.tif", "b.tif", "--vertical", "moon"], "--vertical moon"),
         (["a.tif", "b.tif", "--workers", "0"], "--workers 0"),

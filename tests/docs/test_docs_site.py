@@ -185,11 +185,12 @@ def test_a_mistake_in_a_page_is_a_failure(tmp_path):
 
 
 def test_the_figures_are_those_of_the_code(tmp_path):
-    """`python docs/figures.py` makes what is committed, and the method shows all of it."""
+    """`python docs/figures.py` makes what is committed, and pages show all of it."""
     subprocess.run([sys.executable, DOCS / "figures.py", tmp_path], check=True, capture_output=True)
     committed = {path.name: path for path in DOCS.glob("figures/*.png")}
     assert {path.name for path in tmp_path.glob("*.png")} == set(committed)
-    shown = re.findall(r"figures/([a-z]+\.png)\)", (DOCS / "explanation" / "method.md").read_text(encoding="utf-8"))
+    pages = [page.read_text(encoding="utf-8") for page in DOCS.glob("explanation/*.md")]
+    shown = re.findall(r"figures/([a-z_]+\.png)\)", "".join(pages))
     assert sorted(shown) == sorted(committed)
     for name, path in committed.items():
         made, kept = (cv2.imread(str(each), cv2.IMREAD_GRAYSCALE) for each in (tmp_path / name, path))

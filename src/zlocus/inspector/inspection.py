@@ -220,7 +220,7 @@ class Inspection:
             "images": list(run["orientation"]["views"]), "method": run["config"]["request"]["method"],
             "small_window": config.cost.small_window,
             "max_images_for_large_window": config.cost.max_images_for_large_window,
-            "selection": run["config"]["request"]["selection"],
+            "selection": run["config"]["request"].get("selection", "default"),
             "options": options_record(config.selection),
             "window": {"value": large_window_side(config.cost), "choices": list(WINDOWS)},
             "cells": self._cells(),
