@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from rows.choice_of_images import STEPS, Judged, behind_the_best
+from rows.choice_of_images import DEFAULT, GUIDED, STEPS, Judged, behind_the_best
 from rows.many_images import BUILDING, GROUND, n_false_on_ground, step_up
 
 
@@ -44,11 +44,11 @@ def test_the_default_is_compared_with_the_best_of_the_others():
     found = {step: Judged(2.0, 0.7, 20.0) for step in STEPS}
     found |= {
         "the paper": Judged(1.0, 0.6, 99.0),
-        "all images": Judged(1.5, 0.8, 10.0),
-        "default": Judged(1.1, 0.79, 5.0),
+        GUIDED: Judged(1.5, 0.8, 10.0),
+        DEFAULT: Judged(1.1, 0.79, 5.0),
     }
     figures = {figure.what: figure for figure in behind_the_best("town", found)}
     assert figures["town: error over the best"].value == pytest.approx(1.1)
     assert figures["town: within 1 m below the best"].value == pytest.approx(0.01)
-    assert figures["town: CPU over that of all images"].value == pytest.approx(0.5)
+    assert figures["town: CPU over that of the choice by labels"].value == pytest.approx(0.5)
     assert len(behind_the_best("facade", {step: Judged(1.0, None, 1.0) for step in STEPS})) == 2
