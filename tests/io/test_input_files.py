@@ -127,7 +127,7 @@ def test_a_run_stops_when_an_image_changes_after_the_last_tile(copied, elsewhere
 
     monkeypatch.setattr(TileRun, "check", changing)
     said = "was replaced or written to" if change == "replaced" else "disappeared"
-    with pytest.raises(StoppedError, match=rf"{copied[1].name} {said} .* 9 finished tiles are kept"):
+    with pytest.raises(StoppedError, match=rf"{copied[1].name} {said} .* 4 finished tiles are kept"):
         asked(copied, out)
     assert names(out) == ["events.jsonl", FOLDER]
     monkeypatch.undo()

@@ -41,6 +41,7 @@ from interrupted_runs import (
 )
 from rendered_scenes import CENTRE, HEIGHTS, N_SMALL_TILES, SMALL_TILES, read, run
 from zlocus.core.errors import GeometryError, InputError, OutputError, StoppedError
+from zlocus.core.options import PyramidOptions, RunConfig
 from zlocus.core.progress import progress_for
 from zlocus.core.resources import held_bytes
 from zlocus.matching.quality import Quality
@@ -50,12 +51,21 @@ from zlocus.pipeline.execution.tasks import MAX_ATTEMPTS
 # Number of signals at random moments; benchmarks/acceptance.py sends more.
 SIGNALS = int(os.environ.get("ZLOCUS_SIGNALS", "8"))
 SEED = 20261122
+# Side of nine tiles of the area, cells: enough for a worker that takes the place of another one.
+SIDE_OF_NINE = 64
 
 
 @pytest.fixture(scope="module")
 def straight(images, tmp_path_factory):
     """The surface of a run without interruption, in small tiles."""
     return run(images("sine"), tmp_path_factory.mktemp("straight") / "out", SMALL_TILES, workers=1, report=False).out
+
+
+@pytest.fixture(scope="module")
+def straight_in_nine(images, tmp_path_factory):
+    """The same in nine tiles."""
+    nine = RunConfig(pyramid=PyramidOptions(tile=SIDE_OF_NINE))
+    return run(images("sine"), tmp_path_factory.mktemp("nine") / "out", nine, workers=1, report=False).out
 
 
 def test_signals_at_random_moments(images, straight, tmp_path):
@@ -126,10 +136,10 @@ def test_a_signal_stops_the_run_within_seconds_and_the_run_is_resumed(
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, number):
+def test_a_worker_that_is_killed_costs_no_tile(images, straight_in_nine, tmp_path, number):
     """As by a system that is short of memory: another worker takes its place and makes its tile again."""
     out = tmp_path / "out"
-    process = started(command(images("sine"), out, tmp_path, "--workers", "2"))
+    process = started(command(images("sine"), out, tmp_path, "--workers", "2", tile=SIDE_OF_NINE))
     killed = []
 
     def is_one_killed():
@@ -144,7 +154,7 @@ def test_a_worker_that_is_killed_costs_no_tile(images, straight, tmp_path, numbe
     _, stderr = process.communicate(timeout=12 * STOPS_WITHIN_S)
     assert killed
     assert process.returncode == 0, stderr
-    assert same(out, straight)
+    assert same(out, straight_in_nine)
     workers = {event["worker"] for event in events_of(out) if event["event"].startswith("tile")}
     assert "worker 3" in workers
     assert all(event["again"] for event in events_of(out) if event["event"] == "tile failed")

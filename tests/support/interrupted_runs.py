@@ -9,14 +9,14 @@ import time
 
 import psutil
 
-from rendered_scenes import HEIGHTS
+from rendered_scenes import HEIGHTS, SMALL_TILES
 from zlocus.pipeline.execution.checkpoint import DONE, FOLDER
 
 
-def command(images, out, folder, *more):
-    """The command line of `zlocus dsm` on images, in tiles of 64 cells."""
+def command(images, out, folder, *more, tile=SMALL_TILES.pyramid.tile):
+    """The command line of `zlocus dsm` on images, in small tiles."""
     options = folder / "options.toml"
-    options.write_text("[pyramid]\ntile = 80\n")
+    options.write_text(f"[pyramid]\ntile = {tile}\n")
     asked = ["--crs", "EPSG:32632", "--resolution", "0.5", "--heights", *map(str, HEIGHTS), "--no-report"]
     words = ["dsm", *map(str, images.inputs), "-o", str(out), *asked, "--config", str(options), *more]
     return [sys.executable, "-m", "zlocus", *words]

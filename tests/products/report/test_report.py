@@ -156,7 +156,7 @@ def test_its_figures_are_those_of_the_record(made):
         assert words.seconds(stage["wall_s"]) in parsed.text("time")
     assert f"{max(stage['peak_mb'] for stage in record['stages']):.0f} MB" in parsed.text("time")
     options = parsed.text("options")
-    assert "pyramid.tile 64 1024" in options  # the value and the default that it is not
+    assert "pyramid.tile 80 1024" in options  # the value and the default that it is not
     assert "heights 25.0 80.0" in options
     assert all(each["sha256"] in parsed.text("inputs") for each in record["inputs"])
 
