@@ -13,7 +13,7 @@ from zlocus.core.options.option_fields import value_of
 from zlocus.matching.height_checks import judge
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.level_records import LevelResult, TileInputs
-from zlocus.matching.local_contrast import texture_unit
+from zlocus.matching.local_contrast import agreeing_views, texture_unit
 from zlocus.matching.local_planes import SIDES, smoothed_by_planes
 from zlocus.matching.occlusion import covers, excluded_view_mask, n_seeing
 from zlocus.matching.overlap import OverlapGround, unsupported
@@ -43,16 +43,18 @@ class RefinedSurface:
 def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResult:
     """The finest level with planes in place of the heights of segments without texture, such as roofs.
 
-    The segments are found in the first `MAX_VIEWS_FOR_PLANES` views that are sharp.
+    The segments are found in the first `MAX_VIEWS_FOR_PLANES` views that agree with the others and are sharp.
     """
     heights, core = result.heights, result.level.core
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
     n_views = len(result.tile_views.layout)
     orthos = [ortho_image(result.tile_views, planar.height, view) for view in range(n_views)]
+    agrees = np.ones(n_views, np.bool_) if result.agreement is None else agreeing_views(result.agreement)
     texture = [texture_unit(ortho, core) for ortho in orthos]
     second_sharpest = sorted(texture)[-2]
-    sharp_views = [view for view, t in enumerate(texture) if t * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest]
-    for number, view in enumerate(sharp_views[:MAX_VIEWS_FOR_PLANES]):
+    is_sharp = [t * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest for t in texture]
+    views_to_look_in = [view for view in range(n_views) if agrees[view] and is_sharp[view]]
+    for number, view in enumerate(views_to_look_in[:MAX_VIEWS_FOR_PLANES]):
         ortho = orthos[view] if number == 0 else ortho_image(result.tile_views, planar.height, view)
         planar = with_planes(result.tile_views, ortho, planar, result.visible, config.planes, core)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)

@@ -44,8 +44,8 @@ def deviation(grey: NDArray[np.float32], window: tuple[int, int]) -> NDArray[np.
     return np.asarray(np.sqrt(np.maximum(squares - mean * mean, 0)), np.float32)
 
 
-# The image that gives the edges must agree with the other views by at least this share of the best agreement: noise,
-# clouds and the shadows of another hour have edges where no object stands.
+# The images that give edges and plain segments must agree with the other views by at least this share of the best
+# agreement: noise, clouds and the shadows of another hour have edges where no object stands, and haze hides a ridge.
 MIN_AGREEMENT_SHARE = 0.8
 # Cells that two views must share for their agreement to mean anything.
 MIN_SHARED_CELLS = 64
@@ -75,6 +75,15 @@ def agreement(
     return of_view
 
 
+def agreeing_views(agrees: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Views that agree with the others well enough to show what is on the ground, (i,); all where nothing is known.
+
+    agrees : (i,), see `agreement`.
+    """
+    best = np.nanmax(agrees, initial=0.0)
+    return ~(agrees < MIN_AGREEMENT_SHARE * best) if best > 0 else np.ones(len(agrees), np.bool_)
+
+
 def edge_image(
     tile_views: TileViews,
     surface: NDArray[np.float32],
@@ -87,8 +96,7 @@ def edge_image(
     It is that of the first view that agrees with the others and covers at least half as much of the core as any view
     that agrees. covering : see `agreement`, which gives `agrees` (i,).
     """
-    best = np.nanmax(agrees, initial=0.0)
-    trusted = ~(agrees < MIN_AGREEMENT_SHARE * best) if best > 0 else np.ones(len(agrees), np.bool_)
+    trusted = agreeing_views(agrees)
     shown = covering[:, *core].sum(axis=(1, 2))
     view = int(np.flatnonzero(trusted & (shown >= shown[trusted].max() / 2))[0])
     return np.where(covering[view], ortho_image(tile_views, surface, view), np.float32(np.nan))

@@ -30,8 +30,14 @@ from zlocus.matching.tile_views import TileViews
 # Window in which the grey deviation of a cell is measured; rim around the plain cells, and what is eroded for the inner
 # cells.
 TEXTURE_WINDOW, RIM, INNER = (3, 3), np.ones((3, 3), np.uint8), np.ones((3, 3), np.uint8)
-# How much worse the views may agree on a plane than on the matched heights, as a share of `max_cost`.
-MAX_COST_INCREASE_SHARE = 0.25
+# How much worse the views may agree on a plane than on the matched heights, as a share of `max_cost`: one plane through
+# a roof of two pitches is only a little worse.
+MAX_COST_INCREASE_SHARE = 0.1
+# A roof stands above its surroundings: of the cells whose distance from the segment, in cells, is in this range, this
+# share lies so many steps below its plane. On roads and on the ground planes are worse than the matched heights: with
+# them 1 of 25 cells of such segments is no longer within 1 m, in towns of two to eight images, and 1 of 50 cells of
+# roofs comes within it.
+SURROUNDINGS, MIN_SHARE_BELOW, LEAST_STEPS_ABOVE = (3, 4), 0.5, 3.0
 # Where the views agree better on a plane than on the matched heights, this share of the cells near it is enough.
 MIN_NEAR_SHARE_OF_BETTER_PLANE = 0.5
 
@@ -92,9 +98,9 @@ def with_planes(
     cells that are planar already keep theirs; visible : see `occlusion`; core : the cells whose texture is
     the unit.
 
-    A plane is accepted where most matched heights are near it, or the views agree better on it. In both cases the views
-    have to agree on its core to within the noise, and not much worse than on the matched heights; the rim need not
-    agree.
+    A plane is accepted where the segment stands above its surroundings, and where most matched heights are near the
+    plane, or the views agree better on it. In both cases the views have to agree on its core to within the noise, and
+    not much worse than on the matched heights; the rim need not agree.
     """
     height, is_known = known.height, np.isfinite(ortho)
     grey = np.where(is_known, ortho, np.float32(0.0))
@@ -109,6 +115,7 @@ def with_planes(
     fitted = _fitted_planes(tile_views, segments, before, is_visible, PlaneLimits(float(noise), options.max_cost))
     is_near = np.abs(fitted.heights - before) < options.near_steps
     is_accepted = accepted_planes(segments, fitted, is_near, options)
+    is_accepted[is_accepted] = share_below(segments, fitted.planes, height, is_accepted) > MIN_SHARE_BELOW
     kept = is_accepted[segments.of_cell] & (segments.is_inner | is_near) & (is_visible.sum(axis=0) >= 2)
     result = PlanarHeights(height.copy(), known.is_planar.copy())
     result.height[row[kept], col[kept]] = fitted.heights[kept]
@@ -148,6 +155,32 @@ def accepted_planes(
     slope = np.hypot(fitted.planes[:, 1], fitted.planes[:, 2])
     is_accepted &= slope < options.max_slope_steps * SLOPE_SPAN_CELLS
     return np.asarray(is_accepted)
+
+
+def share_below(
+    segments: PlainSegments, planes: NDArray[np.float64], height: NDArray[np.float32], wanted: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Share of the surroundings of each wanted segment that lies below its plane, (number of wanted segments,).
+
+    planes : see `FittedPlanes`; height : (r, c) height indices of all cells; wanted : (s,). See SURROUNDINGS.
+    """
+    nearest, farthest = SURROUNDINGS
+    inside, outside = (np.ones((2 * distance + 1,) * 2, np.uint8) for distance in (nearest - 1, farthest))
+    shares = []
+    for number in np.flatnonzero(wanted):
+        of_segment = slice(*segments.start[number : number + 2])
+        row, col = segments.row[of_segment], segments.col[of_segment]
+        top, left = max(row.min() - farthest, 0), max(col.min() - farthest, 0)
+        around = height[top : row.max() + farthest + 1, left : col.max() + farthest + 1]
+        shape = np.zeros(around.shape, np.uint8)
+        shape[row - top, col - left] = 1
+        is_beside = (cv2.dilate(shape, outside) > 0) & (cv2.dilate(shape, inside) == 0)
+        beside_row, beside_col = np.nonzero(is_beside)
+        level, by_row, by_col = planes[number] / (1.0, SLOPE_SPAN_CELLS, SLOPE_SPAN_CELLS)
+        plane = level + by_row * (beside_row + top - row.mean()) + by_col * (beside_col + left - col.mean())
+        is_below = around[is_beside] < plane - LEAST_STEPS_ABOVE
+        shares.append(is_below.mean() if is_below.size else 0.0)
+    return np.array(shares)
 
 
 def plain_segments(is_plain: NDArray[np.bool_], options: PlaneOptions) -> PlainSegments:

@@ -20,6 +20,9 @@ SLOPE_SPAN_CELLS = 10.0
 START_ROUNDS, MATCHING_ROUNDS = 8, 6
 # Noise of the heights: in the robust plane all cells nearer than this weigh the same.
 HEIGHT_NOISE_STEPS = 0.3
+# The core of a segment has to be plain in this share of the views that see it. Two of eight views may be hazy, or of a
+# day when a shadow crossed the roof. Were two thirds enough, planes would replace better heights where six views match.
+MIN_SHARE_OF_PLAIN_VIEWS = 0.75
 # Share of the mean diagonal that is added to the normal equations, and the largest change of a parameter in a round.
 DAMPING, MAX_CHANGE_STEPS = 1e-2, 1.0
 
@@ -250,7 +253,7 @@ def level_greys(grey, visible, is_core):
 def exclude_views(visible, cost, max_cost):
     """Exclude the views in which the core of a segment is not plain (a view of another day, for example).
 
-    Returns how many views are left, 0 where they are fewer than four in five.
+    Returns how many views are left, 0 where they are fewer than MIN_SHARE_OF_PLAIN_VIEWS.
     """
     left, seeing = 0, 0
     for i in range(visible.shape[0]):
@@ -261,7 +264,7 @@ def exclude_views(visible, cost, max_cost):
             left += 1
         else:
             visible[i] = False
-    return left if 5 * left >= 4 * seeing else 0
+    return left if left >= MIN_SHARE_OF_PLAIN_VIEWS * seeing else 0
 
 
 # (i,2) f8, i8 -> f8
