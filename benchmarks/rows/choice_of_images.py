@@ -104,7 +104,7 @@ def surface(inputs: Sequence[Path], out: Path, step: str, *options: object) -> f
     if config:
         file = out.with_name(f"{out.name}.toml")
         file.write_text(config, encoding="utf-8")
-        more = ["--config", file]
+        more = [*more, "--config", file]
     plain = ["--products", "none", "--no-report", "--overwrite"]
     return run([ZLOCUS, "dsm", *inputs, "-o", out, *plain, *options, *more], accept=(0, COVERAGE_SHORT)).cpu_s
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from rows.choice_of_images import DEFAULT, GUIDED, STEPS, Judged, behind_the_best
+from rows import choice_of_images
+from rows.choice_of_images import DEFAULT, GUIDED, STEPS, Judged, behind_the_best, surface
 from rows.many_images import BUILDING, GROUND, n_false_on_ground, step_up
+from workplace import Usage
 
 
 def write(path, values):
@@ -37,6 +41,27 @@ def test_false_heights_on_ground_away_from_buildings_are_counted(tmp_path):
 def test_the_largest_step_up_of_an_error():
     assert step_up({2: 4.0, 3: 2.0, 5: 2.5, 7: 2.4}) == pytest.approx(1.25)
     assert step_up({2: 4.0, 3: 3.0}) == pytest.approx(0.75)
+
+
+def test_a_step_of_the_choice_takes_its_options_and_its_configuration(monkeypatch, tmp_path):
+    """The rule of the paper is a configuration of the choice by labels."""
+    commands = []
+
+    def ran(command, accept):
+        commands.append(command)
+        return Usage(7.0, 1.0, 0)
+
+    monkeypatch.setattr(choice_of_images, "run", ran)
+    for step in ("its rule with the semi-global constraint", GUIDED, "geometry alone"):
+        assert surface([tmp_path / "scene.yaml"], tmp_path / "out" / "run", step, "--resolution", 0.5) == 7.0
+    with_rule, guided, geometry = (list(map(str, command)) for command in commands)
+    for command in (with_rule, guided):
+        assert command[command.index("--selection") + 1] == "guided"
+    file = Path(with_rule[with_rule.index("--config") + 1])
+    assert file.parent == tmp_path / "out"
+    assert "--config" not in guided
+    assert "--config" in geometry
+    assert "--selection" not in geometry
 
 
 def test_the_default_is_compared_with_the_best_of_the_others():
