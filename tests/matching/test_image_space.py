@@ -164,6 +164,7 @@ def test_options_that_were_changed_stay():
         24,
     )
     assert (plain.semiglobal.predecessors, plain.semiglobal.p1, plain.semiglobal.p2) == (1, 20, 240)
+    assert (plain.planes.min_share_below, plain.planes.max_cost_increase) == (0.0, 0.05)
     for value in (0.25, value_of(CostOptions(), "occluded_pairs_excluded")):
         mine = RunConfig(cost=CostOptions(occluded_pairs_excluded=value))
         assert depth_options(mine).cost.occluded_pairs_excluded == value

@@ -210,6 +210,8 @@ def test_no_plane_where_the_views_agree_better_on_what_was_matched(bow, is_flat)
     found = fitted(seen_by, height, replace(OPTIONS, texture=0.8))
     middle = np.s_[ROOF.start + 3 : ROOF.stop - 3, ROOF.start + 3 : ROOF.stop - 3]
     assert found.is_planar[middle].mean() > 0.9 if is_flat else not found.is_planar[middle].any()
+    any_cost = replace(OPTIONS, texture=0.8, max_cost_increase=10.0)
+    assert fitted(seen_by, height, any_cost).is_planar[middle].any()
 
 
 @pytest.mark.parametrize(("around", "is_roof"), [(2.0, True), (EAVES - 1.0, False), (2 * EAVES, False)])
@@ -220,6 +222,7 @@ def test_no_plane_where_a_segment_does_not_stand_above_its_surroundings(around, 
     is_beside[ROOF, ROOF] = False
     height[is_beside] = around
     assert fitted(views(), height).is_planar.any() == is_roof
+    assert fitted(views(), height, replace(OPTIONS, min_share_below=0.0)).is_planar.any()
 
 
 def test_share_of_the_surroundings_that_lie_below_a_plane():

@@ -225,7 +225,8 @@ def depth_options(config: RunConfig) -> RunConfig:
     # With one predecessor per path: jumps are sharp, and the second one costs time.
     semiglobal = with_depth_values(config.semiglobal)
     semiglobal = replace(semiglobal, predecessors=semiglobal.predecessors or 1)
-    return replace(config, cost=with_depth_values(config.cost), semiglobal=semiglobal)
+    planes = with_depth_values(config.planes)
+    return replace(config, cost=with_depth_values(config.cost), semiglobal=semiglobal, planes=planes)
 
 
 def hypotheses_of_heights(image_space: ImageSpace, z_range: tuple[float, float]) -> tuple[float, float] | None:

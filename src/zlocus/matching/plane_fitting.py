@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.options import PlaneOptions
+from zlocus.core.options.option_fields import value_of
 from zlocus.matching.kernels.plane_fitting import (
     SLOPE_SPAN_CELLS,
     FittedPlanes,
@@ -30,14 +31,11 @@ from zlocus.matching.tile_views import TileViews
 # Window in which the grey deviation of a cell is measured; rim around the plain cells, and what is eroded for the inner
 # cells.
 TEXTURE_WINDOW, RIM, INNER = (3, 3), np.ones((3, 3), np.uint8), np.ones((3, 3), np.uint8)
-# How much worse the views may agree on a plane than on the matched heights, as a share of `max_cost`: one plane through
-# a roof of two pitches is only a little worse.
-MAX_COST_INCREASE_SHARE = 0.1
-# A roof stands above its surroundings: of the cells whose distance from the segment, in cells, is in this range, this
-# share lies so many steps below its plane. On roads and on the ground planes are worse than the matched heights: with
-# them 1 of 25 cells of such segments is no longer within 1 m, in towns of two to eight images, and 1 of 50 cells of
-# roofs comes within it.
-SURROUNDINGS, MIN_SHARE_BELOW, LEAST_STEPS_ABOVE = (3, 4), 0.5, 3.0
+# The surroundings of a segment are the cells whose distance from it, in cells, is in this range. Those below its plane
+# are so many steps below it. On roads and on the ground planes are worse than the matched heights: with them 1 of 25
+# cells of such segments is no longer within 1 m, in towns of two to eight images, and 1 of 50 cells of roofs comes
+# within it.
+SURROUNDINGS, LEAST_STEPS_ABOVE = (3, 4), 3.0
 # Where the views agree better on a plane than on the matched heights, this share of the cells near it is enough.
 MIN_NEAR_SHARE_OF_BETTER_PLANE = 0.5
 
@@ -98,9 +96,9 @@ def with_planes(
     cells that are planar already keep theirs; visible : see `occlusion`; core : the cells whose texture is
     the unit.
 
-    A plane is accepted where the segment stands above its surroundings, and where most matched heights are near the
-    plane, or the views agree better on it. In both cases the views have to agree on its core to within the noise, and
-    not much worse than on the matched heights; the rim need not agree.
+    A plane is accepted where the segment stands above its surroundings (`min_share_below`), and where most matched
+    heights are near the plane, or the views agree better on it. In both cases the views have to agree on its core to
+    within the noise, and not much worse than on the matched heights; the rim need not agree.
     """
     height, is_known = known.height, np.isfinite(ortho)
     grey = np.where(is_known, ortho, np.float32(0.0))
@@ -115,7 +113,8 @@ def with_planes(
     fitted = _fitted_planes(tile_views, segments, before, is_visible, PlaneLimits(float(noise), options.max_cost))
     is_near = np.abs(fitted.heights - before) < options.near_steps
     is_accepted = accepted_planes(segments, fitted, is_near, options)
-    is_accepted[is_accepted] = share_below(segments, fitted.planes, height, is_accepted) > MIN_SHARE_BELOW
+    below = share_below(segments, fitted.planes, height, is_accepted)
+    is_accepted[is_accepted] = below >= value_of(options, "min_share_below")
     kept = is_accepted[segments.of_cell] & (segments.is_inner | is_near) & (is_visible.sum(axis=0) >= 2)
     result = PlanarHeights(height.copy(), known.is_planar.copy())
     result.height[row[kept], col[kept]] = fitted.heights[kept]
@@ -151,7 +150,7 @@ def accepted_planes(
     near_share = np.bincount(of_cell, is_near & segments.is_core, n_segments) / n_core
     min_share = np.where(all_after < all_before, MIN_NEAR_SHARE_OF_BETTER_PLANE, options.min_near_share)
     is_accepted = fitted.is_plain & (core_after < options.max_cost) & (near_share > min_share)
-    is_accepted &= core_after - core_before < MAX_COST_INCREASE_SHARE * options.max_cost
+    is_accepted &= core_after - core_before < value_of(options, "max_cost_increase")
     slope = np.hypot(fitted.planes[:, 1], fitted.planes[:, 2])
     is_accepted &= slope < options.max_slope_steps * SLOPE_SPAN_CELLS
     return np.asarray(is_accepted)

@@ -59,6 +59,11 @@ class PlaneOptions(Checked):
         "In units of the noise squared.",
         low=0.0, high=10.0,
     )  # fmt: skip
+    max_cost_increase: float | None = option_by_method(
+        0.02, 0.05, "By how much worse the images may agree on a plane than on the matched heights: one plane through "
+        "a roof of two pitches is only a little worse. In units of the noise squared.",
+        low=0.0, high=10.0,
+    )  # fmt: skip
     near_steps: float = option(
         3.0, "A matched height supports a plane that is closer than this.", low=0.1, high=100.0, unit="steps"
     )
@@ -66,6 +71,12 @@ class PlaneOptions(Checked):
         0.8, "Smallest share of the cells that have to support a plane. Half of the cells are enough where the images "
         "agree better on the plane than on the matched heights.",
         low=0.5, high=1.0,
+    )  # fmt: skip
+    min_share_below: float | None = option_by_method(
+        0.5, 0.0, "Smallest share of the cells around a segment that lies 3 steps or more below its plane. Roofs stand "
+        "above their surroundings; on roads and on the ground a plane is worse than the matched heights. 0: planes "
+        "replace the heights of plain segments everywhere.",
+        low=0.0, high=1.0,
     )  # fmt: skip
     max_slope_steps: float = option(
         0.8, "Largest slope of a plane, in height steps per cell.", low=0.0, high=100.0, unit="steps per cell"
