@@ -51,10 +51,10 @@ def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResu
     orthos = [ortho_image(result.tile_views, planar.height, view) for view in range(n_views)]
     agrees = np.ones(n_views, np.bool_) if result.agreement is None else agreeing_views(result.agreement)
     texture = [texture_unit(ortho, core) for ortho in orthos]
-    second_sharpest = sorted(texture)[-2]
-    is_sharp = [t * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest for t in texture]
-    views_to_look_in = [view for view in range(n_views) if agrees[view] and is_sharp[view]]
-    for number, view in enumerate(views_to_look_in[:MAX_VIEWS_FOR_PLANES]):
+    agreeing = [view for view in range(n_views) if agrees[view]]
+    second_sharpest = sorted(texture[view] for view in agreeing)[-2:][0]
+    sharp_views = [view for view in agreeing if texture[view] * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest]
+    for number, view in enumerate(sharp_views[:MAX_VIEWS_FOR_PLANES]):
         ortho = orthos[view] if number == 0 else ortho_image(result.tile_views, planar.height, view)
         planar = with_planes(result.tile_views, ortho, planar, result.visible, config.planes, core)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
