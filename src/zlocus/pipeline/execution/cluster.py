@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import pickle
 import time
 import uuid
@@ -68,10 +69,17 @@ class Cluster:
         try:
             self._client = Client(address, timeout=CONNECT_S)
         except (OSError, ValueError) as error:  # timeouts are among the first
+            said = str(error) or type(error).__name__
+        else:
+            said = ""
+        if said:
+            # The client that failed closes itself when it is collected. Were it collected while another one starts,
+            # both would wait for one lock of `distributed` without end.
+            gc.collect()
             raise ConfigError(
-                f"--scheduler {address} does not answer: {str(error) or type(error).__name__}. Give the address that "
-                "the Dask scheduler prints, such as tcp://10.0.0.1:8786."
-            ) from error
+                f"--scheduler {address} does not answer: {said}. Give the address that the Dask scheduler prints, such "
+                "as tcp://10.0.0.1:8786."
+            )
         self._futures: dict[Any, Any] = {}
         self._calls = ThreadPoolExecutor(1, "calls to the cluster")
         try:
