@@ -52,7 +52,7 @@ def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResu
     agrees = np.ones(n_views, np.bool_) if result.agreement is None else agreeing_views(result.agreement)
     texture = [texture_unit(ortho, core) for ortho in orthos]
     agreeing = [view for view in range(n_views) if agrees[view]]
-    second_sharpest = sorted(texture[view] for view in agreeing)[-2:][0]
+    second_sharpest = sorted(texture[view] for view in agreeing)[-2:][0]  # of a single view its own
     sharp_views = [view for view in agreeing if texture[view] * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest]
     for number, view in enumerate(sharp_views[:MAX_VIEWS_FOR_PLANES]):
         ortho = orthos[view] if number == 0 else ortho_image(result.tile_views, planar.height, view)

@@ -22,6 +22,7 @@ from zlocus.matching.kernels.plane_fitting import (
     PlaneCells,
     PlaneLimits,
     fit_segments,
+    plane_heights,
 )
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.local_contrast import ALL, Part, deviation, texture_unit
@@ -174,9 +175,10 @@ def share_below(
         shape = np.zeros(around.shape, np.uint8)
         shape[row - top, col - left] = 1
         is_beside = (cv2.dilate(shape, outside) > 0) & (cv2.dilate(shape, inside) == 0)
-        beside_row, beside_col = np.nonzero(is_beside)
-        level, by_row, by_col = planes[number] / (1.0, SLOPE_SPAN_CELLS, SLOPE_SPAN_CELLS)
-        plane = level + by_row * (beside_row + top - row.mean()) + by_col * (beside_col + left - col.mean())
+        beside_row, beside_col = np.divmod(np.flatnonzero(is_beside), is_beside.shape[1])
+        plane = np.empty(len(beside_row))
+        middle = np.array([row.mean() - top, col.mean() - left])
+        plane_heights(beside_row, beside_col, middle, planes[number], plane)
         is_below = around[is_beside] < plane - LEAST_STEPS_ABOVE
         shares.append(is_below.mean() if is_below.size else 0.0)
     return np.array(shares)

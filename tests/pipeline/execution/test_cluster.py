@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import distributed
 import pytest
 
 from interrupted_runs import check_end, command, n_finished, started, wait_for_tiles
@@ -159,6 +161,19 @@ def test_where_nothing_answers(images, tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(ConfigError, match=r"--method gc3-sgm matches whole images in one process\. Leave --scheduler"):
         run(images("sine"), tmp_path / "out", SMALL_TILES, scheduler="tcp://127.0.0.1:9", method="gc3-sgm")
+
+
+def test_a_client_that_found_nobody_is_collected_at_once(tmp_path):
+    """It closes itself then. While another client starts, both would wait for one lock of `distributed` without end."""
+
+    def clients():
+        return [kept for kept in gc.get_objects() if isinstance(kept, distributed.Client)]
+
+    gc.collect()
+    before = len(clients())
+    with pytest.raises(ConfigError, match="does not answer"):
+        Cluster(Planted(tmp_path), "tcp://127.0.0.1:9")
+    assert len(clients()) == before
 
 
 def test_a_signal_as_a_call_begins(tmp_path, caplog):

@@ -58,28 +58,8 @@ class Cluster:
     """
 
     def __init__(self, function: Callable[[Any], Any], address: str) -> None:
-        allow_import("dask")
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise ConfigError(
-                "--scheduler needs distributed, which is not installed: pip install '.[cluster]'."
-            ) from error
         self._address, self._name = address, f"zlocus-{uuid.uuid4().hex}"
-        try:
-            self._client = Client(address, timeout=CONNECT_S)
-        except (OSError, ValueError) as error:  # timeouts are among the first
-            said = str(error) or type(error).__name__
-        else:
-            said = ""
-        if said:
-            # The client that failed closes itself when it is collected. Were it collected while another one starts,
-            # both would wait for one lock of `distributed` without end.
-            gc.collect()
-            raise ConfigError(
-                f"--scheduler {address} does not answer: {said}. Give the address that the Dask scheduler prints, such "
-                "as tcp://10.0.0.1:8786."
-            )
+        self._client = _client(address)
         self._futures: dict[Any, Any] = {}
         self._calls = ThreadPoolExecutor(1, "calls to the cluster")
         try:
@@ -173,6 +153,32 @@ class Cluster:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _client(address: str) -> Any:
+    """A client of the scheduler that listens at an address.
+
+    Raises
+    ------
+    ConfigError
+        `distributed` is not installed, or nothing answers.
+    """
+    allow_import("dask")
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigError("--scheduler needs distributed, which is not installed: pip install '.[cluster]'.") from error
+    try:
+        return Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:  # timeouts are among the first
+        said = str(error) or type(error).__name__
+    # A client that found nobody closes itself when it is collected. Were it collected while another one starts, both
+    # would wait for one lock of `distributed` without end. The error would keep it: it is not chained.
+    gc.collect()
+    raise ConfigError(
+        f"--scheduler {address} does not answer: {said}. Give the address that the Dask scheduler prints, such as "
+        "tcp://10.0.0.1:8786."
+    )
 
 
 def _finished(futures: dict[Any, Any]) -> list[Outcome]:
