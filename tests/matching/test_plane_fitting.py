@@ -368,9 +368,13 @@ def test_disagreement_equals_its_slow_twin():
     assert np.isinf(cost[3]).all()
 
 
-@pytest.mark.parametrize(("costs", "left"), [((0.1,) * 5, 5), ((0.1,) * 4 + (9.0,), 4), ((0.1,) * 3 + (9.0,) * 2, 0),
-                                             ((0.1, 0.1, 9.0), 0), ((0.1,) * 4 + (9.0, np.inf), 4),
-                                             ((0.1,) * 3 + (9.0, np.inf), 3), ((0.1,) * 4 + (9.0,) * 2, 0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("costs", "left"),
+    [
+        ((0.1,) * 5, 5), ((0.1,) * 4 + (9.0,), 4), ((0.1,) * 3 + (9.0,) * 2, 0), ((0.1, 0.1, 9.0), 0),
+        ((0.1,) * 4 + (9.0, np.inf), 4), ((0.1,) * 3 + (9.0, np.inf), 3), ((0.1,) * 4 + (9.0,) * 2, 0),
+    ],
+)  # fmt: skip
 def test_one_view_in_four_may_be_excluded(costs, left):
     visible = np.ones((len(costs), 4), bool)
     assert exclude_views(visible, np.repeat(np.array(costs)[:, None], 2, axis=1), 0.2) == left
