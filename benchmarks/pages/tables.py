@@ -276,6 +276,30 @@ def more_images(results: AllResults) -> str:
     return markdown(["scene, error", *(f"{n} images" for n in counts)], lines)
 
 
+@table("choice-of-images")
+def choice_of_images(results: AllResults) -> str:
+    """Error, share within 1 m and CPU time of every choice of images: a line for each scene."""
+    scenes: dict[str, dict[str, dict[str, float]]] = {}
+    for figure in of_row(results, "choice-of-images").figures:
+        place, _, quantity = figure.what.rpartition(": ")
+        scene, _, choice = place.rpartition(", ")
+        if quantity in ("error", "spread of the error", "within 1 m", "CPU"):
+            scenes.setdefault(scene, {}).setdefault(choice, {})[quantity] = figure.value
+    choices = list(dict.fromkeys(choice for of_scene in scenes.values() for choice in of_scene))
+    lines = [
+        [scene, *(of_choice(of_scene[choice]) if choice in of_scene else "" for choice in choices)]
+        for scene, of_scene in scenes.items()
+    ]
+    return markdown(["scene", *choices], lines)
+
+
+def of_choice(values: Mapping[str, float]) -> str:
+    """What a choice of images gave on a scene: error (with its spread over seeds), share within 1 m, CPU time."""
+    spread = f" ± {values['spread of the error']:.2g}" if "spread of the error" in values else ""
+    within = [f"{values['within 1 m']:.3f}"] if "within 1 m" in values else []
+    return ", ".join([f"{values['error']:.3g}{spread}", *within, f"{values['CPU']:.0f} s"])
+
+
 @table("kernels")
 def kernels(results: AllResults) -> str:
     """Time of a unit of work of every benchmark of a kernel."""

@@ -225,10 +225,11 @@ def coloured(tmp_path_factory, request) -> tuple[Path, ...]:
     return rendered_in_colours(tmp_path_factory.mktemp("coloured"), request.param)
 
 
+@pytest.mark.parametrize("selection", ["default", "guided"])
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_an_ortho_image_has_the_colours_of_the_images(coloured, tmp_path):
+def test_an_ortho_image_has_the_colours_of_the_images(coloured, tmp_path, selection):
     assert open_image(coloured[0]).has_colours
-    out = run(coloured, tmp_path / "out", SMALL_TILES, bounds=PART, heights=HEIGHTS).out
+    out = run(coloured, tmp_path / "out", SMALL_TILES, bounds=PART, heights=HEIGHTS, selection=selection).out
     with rasterio.open(out / "ortho.tif") as source:
         bands, valid, meanings = source.read().astype(float), source.dataset_mask() > 0, source.colorinterp
         assert source.descriptions == ("red", "green", "blue")

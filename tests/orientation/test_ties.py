@@ -16,6 +16,7 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.options import OrientationOptions
 from zlocus.orientation import sift as features_module
 from zlocus.orientation.epipolar import EpipolarCurves, Sightlines
+from zlocus.orientation.kernels.descriptors import DESCRIPTOR_LENGTH_UNITS
 from zlocus.orientation.sift import Features, detect, part_grid, reduction
 from zlocus.orientation.ties import PairMatches, find_ties, join_tracks, match_along_curves, widest_range
 from zlocus.sensors.correction import ShiftedModel
@@ -184,9 +185,9 @@ def test_the_heights_looked_at_come_from_the_hint_or_the_models():
 
 
 def unit(*numbers):
-    vectors = np.zeros((len(numbers), 128), np.float32)
+    vectors = np.zeros((len(numbers), 128), np.int16)
     for row, number in enumerate(numbers):
-        vectors[row, number] = 1.0
+        vectors[row, number] = DESCRIPTOR_LENGTH_UNITS
     return vectors
 
 
@@ -203,12 +204,11 @@ def test_matches_are_mutual_unambiguous_and_near_their_locus():
     assert second.tolist() == [0, 4]
     wider, _ = match_along_curves(loci, in_a, in_b, 12.0, 0.8)
     assert wider.tolist() == [0, 1, 3]
-    twins = Features(low[[0, 0]] + np.array([[0.0, 0.0], [0.0, 4.0]]), unit(0, 0) + np.float32(0.1) * unit(9, 0))
-    lengths = np.linalg.norm(twins.descriptors, axis=1, keepdims=True)
+    twins = Features(low[[0, 0]] + np.array([[0.0, 0.0], [0.0, 4.0]]), unit(0, 0))
+    twins.descriptors[0, 9] = DESCRIPTOR_LENGTH_UNITS // 10
+    twins.descriptors[0, 0] = DESCRIPTOR_LENGTH_UNITS * np.sqrt(0.99)
     pair = EpipolarCurves(twins.xy, twins.xy + np.array([80.0, 0.0]), 0.0, 100.0)
-    first, _ = match_along_curves(
-        pair, Features(twins.xy, twins.descriptors / lengths), in_b.only(np.array([0])), 5.0, 0.8
-    )
+    first, _ = match_along_curves(pair, twins, in_b.only(np.array([0])), 5.0, 0.8)
     assert first.tolist() == [1]  # the one whose descriptor is nearer takes the point
 
 
@@ -217,7 +217,7 @@ def pair_of(views, first, second, z):
 
 
 def test_matches_of_all_pairs_join_into_points():
-    views = [Features(np.arange(10.0).reshape(5, 2) * 10.0, np.zeros((5, 128), np.float32)) for _ in range(3)]
+    views = [Features(np.arange(10.0).reshape(5, 2) * 10.0, np.zeros((5, 128), np.int16)) for _ in range(3)]
     pairs = (
         pair_of((0, 1), [0, 1], [3, 1], [10.0, 20.0]),
         pair_of((1, 2), [3, 2], [4, 2], [14.0, 30.0]),
@@ -231,7 +231,7 @@ def test_matches_of_all_pairs_join_into_points():
 
 
 def test_a_point_seen_twice_by_one_image_is_dropped():
-    views = [Features(np.arange(10.0).reshape(5, 2) * 10.0, np.zeros((5, 128), np.float32)) for _ in range(3)]
+    views = [Features(np.arange(10.0).reshape(5, 2) * 10.0, np.zeros((5, 128), np.int16)) for _ in range(3)]
     pairs = (
         pair_of((0, 1), [0, 1], [0, 1], [10.0, 20.0]),
         pair_of((0, 2), [2], [2], [10.0]),
@@ -244,7 +244,7 @@ def test_a_point_seen_twice_by_one_image_is_dropped():
 
 def test_orientations_of_one_place_are_one_feature():
     xy = np.array([[5.0, 5.0], [5.0, 5.0], [9.0, 9.0]])
-    views = [Features(xy, np.zeros((3, 128), np.float32)) for _ in range(2)]
+    views = [Features(xy, np.zeros((3, 128), np.int16)) for _ in range(2)]
     ties = join_tracks(views, (pair_of((0, 1), [0, 1], [0, 1], [10.0, 10.0]),), (0.0, 100.0))
     assert len(ties.z) == 1
     assert len(ties.observations) == 2

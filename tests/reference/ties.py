@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-SAME_PLACE_PX, UNRELATED_DISTANCE = 2.0, 0.9
+SAME_PLACE_PX, UNRELATED_DISTANCE, DESCRIPTOR_LENGTH_UNITS = 2.0, 0.9, 2**14
 
 
 def distance_to_segment(low, high, point):
@@ -27,7 +27,7 @@ def nearest_descriptors(low, high, in_a, xy, in_b, max_px, ratio):
             if np.isfinite(low[i]).all() and np.isfinite(high[i]).all():
                 along, across = distance_to_segment(low[i], high[i], xy[j])
                 if along <= max_px and across <= max_px:
-                    distance[i, j] = np.linalg.norm(in_a[i].astype(float) - in_b[j])
+                    distance[i, j] = np.linalg.norm(in_a[i].astype(float) - in_b[j]) / DESCRIPTOR_LENGTH_UNITS
     best_a, best_b = np.full(len(low), -1), np.full(len(xy), -1)
     for j in range(len(xy)):
         if np.isfinite(distance[:, j]).any():

@@ -21,6 +21,8 @@ PLACES_PER_SIDE, MIN_PLATEAU_WIDTH_PX = 24, 8
 # pixels.
 MIN_PLATEAU_SHARE, MIN_SHARE_OF_VALUE = 1e-3, 0.5
 BAND_ROWS = 256  # rows read at a time
+# Images of so many pixels or fewer are read once, which takes less time than many small windows.
+MAX_PX_READ_WHOLE = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +97,19 @@ def _value_at_border(image: ImageSource) -> float | None:
         (int(row), col, 1, depth) for row in np.linspace(0, rows - 1, PLACES_PER_SIDE) for col in (0, cols - depth)
     ]
     down = [(row, int(col), depth, 1) for col in np.linspace(0, cols - 1, PLACES_PER_SIDE) for row in (0, rows - depth)]
+    whole = image.read(0, 0, rows, cols) if rows * cols <= MAX_PX_READ_WHOLE else None
     for place in (*across, *down):
-        window = image.read(*place)
+        window = image.read(*place) if whole is None else part_of(whole, *place)
         first = float(window.pixels.flat[0])
         if window.valid.all() and (window.pixels == first).all():
             votes[first] = votes.get(first, 0) + 1
     return max(votes, key=lambda value: votes[value]) if votes else None
+
+
+def part_of(window: ImageWindow, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+    """The window of rows x cols pixels that starts at (row, col) of another window."""
+    at = slice(row, row + rows), slice(col, col + cols)
+    return ImageWindow(window.pixels[at], window.valid[at])
 
 
 @dataclass(frozen=True)

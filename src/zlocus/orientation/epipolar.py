@@ -13,6 +13,8 @@ MIN_CURVE_LENGTH_PX = 1.0
 # Heights at which rays are computed, in half ranges of height from the middle of the range, and the largest distance
 # from the middle at which the cubic through these is used.
 NODES, MAX_CUBIC_T = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0]), 1.25
+# The coefficients of the cubic through values at the nodes, of the highest power first, are this times the values.
+COEFFICIENTS_OF_NODES = np.linalg.inv(np.vander(NODES))
 
 
 @dataclass(frozen=True)
@@ -20,32 +22,32 @@ class Sightlines:
     """Rays of an image's points, as cubics through the ground points that they meet at four heights.
 
     Rays are straight, except for the curvature of the Earth and the approximation of an RPC. xy : (n, 2) px; z_range :
-    lowest and highest height, m; ground : (4, n, 3) m at the heights `NODES` of the range, NaN where a ray does not
-    reach that height.
+    lowest and highest height, m; coefficients : (4, n, 3) m, of the cubics in half ranges of height from the middle of
+    the range, of the highest power first; NaN where a ray does not reach one of the heights.
     """
 
     sensor: SensorModel
     xy: FloatArray
     z_range: tuple[float, float]
-    ground: FloatArray
+    coefficients: FloatArray
 
     @classmethod
     def of(cls, sensor: SensorModel, xy: FloatArray, z_range: tuple[float, float]) -> Sightlines:
         """Rays of the points xy (n, 2) px over a range of heights (m)."""
         heights = sum(z_range) / 2 + NODES * (z_range[1] - z_range[0]) / 2
-        return cls(sensor, xy, z_range, np.stack([sensor.ground_from_image(xy, np.full(len(xy), z)) for z in heights]))
+        ground = np.stack([sensor.ground_from_image(xy, np.full(len(xy), z)) for z in heights])
+        return cls(sensor, xy, z_range, np.einsum("km,mnj->knj", COEFFICIENTS_OF_NODES, ground))
 
     def only(self, rows: NDArray[np.int64]) -> Sightlines:
         """The rays of some points, rows (k,)."""
-        return Sightlines(self.sensor, self.xy[rows], self.z_range, self.ground[:, rows])
+        return Sightlines(self.sensor, self.xy[rows], self.z_range, self.coefficients[:, rows])
 
     def at(self, z: FloatArray) -> FloatArray:
         """Ground points (n, 3) m at heights z (n,) m: by the cubic near the range, by the sensor model beyond."""
         t = (z - sum(self.z_range) / 2) / max((self.z_range[1] - self.z_range[0]) / 2, 1e-9)
-        xyz = np.zeros((len(z), 3))
-        for k, ground in enumerate(self.ground):
-            others = np.delete(NODES, k)
-            xyz += np.prod((t[:, None] - others) / (NODES[k] - others), axis=1)[:, None] * ground
+        cubed, squared, linear, constant = self.coefficients
+        along_ray = t[:, None]
+        xyz: FloatArray = ((cubed * along_ray + squared) * along_ray + linear) * along_ray + constant
         xyz[:, 2] = z
         beyond = np.flatnonzero((np.abs(t) > MAX_CUBIC_T) | np.isnan(xyz).any(axis=1))
         xyz[beyond] = self.sensor.ground_from_image(self.xy[beyond], z[beyond])

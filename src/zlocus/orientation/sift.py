@@ -15,13 +15,14 @@ from zlocus.core.parallel import run_all
 from zlocus.core.scene import ImageSource, ImageWindow, held_pixels, held_window
 from zlocus.core.sensor_model import FloatArray
 from zlocus.core.unnamed_files import on_disk
+from zlocus.orientation.kernels.descriptors import DESCRIPTOR_LENGTH_UNITS
 
 PART_PX = 1024
 # Pixels of the reduced image that are read around each part.
 HALO_PX = 16
 STRETCH_PERCENT = (0.5, 99.5)
 CONTRAST_THRESHOLD = 0.02
-DESCRIPTOR_LENGTH = 128
+N_DESCRIPTOR_VALUES = 128
 # Descriptors of all images together that are kept in memory; further ones are written to files.
 HELD_BYTES = 500e6
 MIN_VALID_SHARE = 0.999  # of the area of a reduced pixel
@@ -29,10 +30,11 @@ MIN_VALID_SHARE = 0.999  # of the area of a reduced pixel
 
 @dataclass(frozen=True)
 class Features:
-    """SIFT features of one image. xy : (n, 2) px; descriptors : (n, 128) float32 of unit length."""
+    """SIFT features of one image. xy : (n, 2) px; descriptors : (n, 128) int16, RootSIFT descriptors, all of the length
+    `DESCRIPTOR_LENGTH_UNITS`."""
 
     xy: FloatArray
-    descriptors: NDArray[np.float32]
+    descriptors: NDArray[np.int16]
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -42,7 +44,7 @@ class Features:
         return Features(self.xy[rows], self.descriptors[rows])
 
 
-NOTHING = Features(np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), np.float32))
+NOTHING = Features(np.empty((0, 2)), np.empty((0, N_DESCRIPTOR_VALUES), np.int16))
 
 
 def detect(image: ImageSource, wanted: NDArray[np.bool_], options: OrientationOptions) -> Features:
@@ -153,7 +155,7 @@ def parts(image: ImageSource) -> Iterator[tuple[tuple[int, int], tuple[int, int,
         yield (part[0], part[1]), (core[0], core[1], core[2], core[3])
 
 
-def detect_window(image_window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.float32]]:
+def detect_window(image_window: ImageWindow, limit: int, factor: float) -> tuple[FloatArray, NDArray[np.int16]]:
     """SIFT positions (n, 2) px in a window and RootSIFT descriptors (n, 128), at most `limit`, the strongest first.
 
     factor : by which the window is reduced first, see `reduction`.
@@ -169,14 +171,15 @@ def detect_window(image_window: ImageWindow, limit: int, factor: float) -> tuple
     sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True)
     keypoints, found = sift.detectAndCompute(pixels, None)
     if not keypoints:
-        return np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), np.float32)
+        return np.empty((0, 2)), np.empty((0, N_DESCRIPTOR_VALUES), np.int16)
     strongest = np.argsort([-k.response for k in keypoints], kind="stable")
     keypoints, found = [keypoints[k] for k in strongest], found[strongest]
     xy = np.array([k.pt for k in keypoints])
     size_px = np.array([k.size for k in keypoints])
     keep = far_from_nodata(xy, size_px, valid)
     descriptors = np.sqrt(found[keep] / np.maximum(found[keep].sum(axis=1, keepdims=True), 1e-12))
-    return (xy[keep] + 0.5) * (full / size) - 0.5, descriptors.astype(np.float32)
+    whole = np.rint(descriptors * DESCRIPTOR_LENGTH_UNITS).astype(np.int16)
+    return (xy[keep] + 0.5) * (full / size) - 0.5, whole
 
 
 def reduced(image_window: ImageWindow, size: NDArray[np.int64]) -> ImageWindow:

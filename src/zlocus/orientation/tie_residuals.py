@@ -101,19 +101,23 @@ def pair_orientations(
     """
     observations, found = adjustment.observations, []
     of_view = rows_of_views(observations, len(scene.views))
-    for a, b in linked_pairs(observations, len(scene.views), len(adjustment.ground_points.xyz)):
-        _, in_a, in_b = np.intersect1d(
-            observations.point[of_view[a]], observations.point[of_view[b]], assume_unique=True, return_indices=True
-        )
-        few = slice(None, None, max(len(in_a) // TIES_FOR_MEDIAN, 1))
-        xy_a, xy_b = observations.xy[of_view[a][in_a[few]]], observations.xy[of_view[b][in_b[few]]]
-        sightlines = Sightlines.of(scene.views[a].sensor, xy_a, z_range)
-        before = epipolar_offsets(sightlines, scene.views[b].sensor, xy_b, z_range).distance_px
-        sightlines = Sightlines.of(corrected_sensors[a], xy_a - adjustment.shift_px[a], z_range)
-        shifted_b = xy_b - adjustment.shift_px[b]
-        after = epipolar_offsets(sightlines, corrected_sensors[b], shifted_b, z_range).distance_px
-        names = (scene.views[a].name, scene.views[b].name)
-        found.append(PairOrientation(names, len(in_a), median_distance(before), median_distance(after)))
+    pairs = linked_pairs(observations, len(scene.views), len(adjustment.ground_points.xyz))
+    for a in np.unique(pairs[:, 0]):
+        xy = observations.xy[of_view[a]]
+        lines_before = Sightlines.of(scene.views[a].sensor, xy, z_range)
+        lines_after = Sightlines.of(corrected_sensors[a], xy - adjustment.shift_px[a], z_range)
+        for b in pairs[pairs[:, 0] == a, 1]:
+            _, in_a, in_b = np.intersect1d(
+                observations.point[of_view[a]], observations.point[of_view[b]], assume_unique=True, return_indices=True
+            )
+            few = slice(None, None, max(len(in_a) // TIES_FOR_MEDIAN, 1))
+            before_b = observations.xy[of_view[b][in_b[few]]]
+            after_b = before_b - adjustment.shift_px[b]
+            before = epipolar_offsets(lines_before.only(in_a[few]), scene.views[b].sensor, before_b, z_range)
+            after = epipolar_offsets(lines_after.only(in_a[few]), corrected_sensors[b], after_b, z_range)
+            names = (scene.views[a].name, scene.views[b].name)
+            medians = (median_distance(of_pair.distance_px) for of_pair in (before, after))
+            found.append(PairOrientation(names, len(in_a), *medians))
     return tuple(found)
 
 

@@ -35,7 +35,7 @@ SUFFICIENT_COVERAGE = 0.5
 
 def has_colours(request: DsmRequest, setup: RunSetup) -> bool:
     """Whether the ortho-image has colours; that of image space, and with the selection of the paper, is grey."""
-    return setup.match_scene.has_colours and not request.is_in_image_space and request.selection == "default"
+    return setup.match_scene.has_colours and not request.is_in_image_space and request.selection != "paper"
 
 
 def surface_rasters(request: DsmRequest, setup: RunSetup, vertical_datum: VerticalDatum) -> SurfaceRasters:

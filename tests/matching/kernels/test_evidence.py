@@ -215,6 +215,18 @@ def test_the_order_of_the_views_does_not_matter(n_views):
     assert (np.abs(volumes[0] - volumes[1]) > 1).mean() < FEW
 
 
+def test_heights_far_from_all_candidates_are_not_compared():
+    """They cost the most; the others cost as much as where all heights are compared."""
+    scene, visible = scene_and_visibility()
+    table = table_with(np.random.default_rng(4).uniform(-1.0, 1.0, TABLE_SHAPE).astype(np.float32))
+    every, lattice = run(scene, visible, TableAndCounts(table, NO_COUNTS))
+    is_near = np.random.default_rng(5).random((*lattice.count.shape, N_HEIGHTS)) < 0.6
+    found, _ = run(scene, visible, TableAndCounts(table, NO_COUNTS, is_near))
+    every, found = dense(every, lattice, np.inf), dense(found, lattice, np.inf)
+    of_cells = is_near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[: SHAPE[0], : SHAPE[1]]
+    np.testing.assert_array_equal(found, np.where(of_cells, every, 255))
+
+
 def test_evidence_of_small_windows_is_worth_more():
     """The unit of a block where all views are compared in the smallest window only."""
     scene, _ = scene_and_visibility()

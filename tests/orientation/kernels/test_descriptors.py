@@ -8,10 +8,12 @@ import pytest
 from reference import ties as plain
 from zlocus.orientation.kernels.descriptors import (
     CELL_PX,
+    DESCRIPTOR_LENGTH_UNITS,
     SAME_PLACE_PX,
     UNRELATED_DISTANCE,
     CurveSegments,
     SecondFeatures,
+    descriptor_distance,
     dot,
     is_clear,
     is_near,
@@ -21,12 +23,14 @@ from zlocus.orientation.kernels.descriptors import (
 )
 
 RNG = np.random.default_rng(7)
-FLOAT32 = 1e-5
+# Of a squared distance, in squared lengths of the descriptors, whose values are rounded to 1 / 2^14 of it.
+SQUARES_TOLERANCE = 3e-4
 
 
-def unit_rows(n, length=128):
-    vectors = RNG.random((n, length)).astype(np.float32)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+def whole_rows(vectors):
+    """Descriptors (n, d) of the directions of some vectors."""
+    unit = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.rint(unit * DESCRIPTOR_LENGTH_UNITS).astype(np.int16)
 
 
 def random_scene(n=60, k=300, length_px=300.0):
@@ -35,12 +39,12 @@ def random_scene(n=60, k=300, length_px=300.0):
     angle = RNG.uniform(0, 2 * np.pi, n)
     high = low + RNG.uniform(0, length_px, n)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     xy = RNG.uniform(-50, 750, (k, 2))
-    in_a, in_b = unit_rows(n), unit_rows(k)
+    in_a, in_b = whole_rows(RNG.random((n, 128))), whole_rows(RNG.random((k, 128)))
     for i in range(n):
         at = low[i] + RNG.uniform(0, 1) * (high[i] - low[i])
         xy[2 * i], xy[2 * i + 1] = at + RNG.uniform(-3, 3, 2), at + RNG.uniform(-3, 3, 2)
-        noisy = in_a[i] + RNG.normal(size=128) * RNG.choice([0.01, 0.05])
-        in_b[2 * i] = noisy / np.linalg.norm(noisy)
+        noise = RNG.normal(size=128) * RNG.choice([0.01, 0.05])
+        in_b[2 * i] = whole_rows(in_a[i] / DESCRIPTOR_LENGTH_UNITS + noise)
     low[3], high[5, 0] = np.nan, np.inf
     high[7] = low[7]
     return low, high, in_a, xy, in_b
@@ -61,15 +65,27 @@ def test_nearest_descriptors_are_those_of_all_pairs(max_px):
 def test_nothing_to_compare_is_no_match():
     low, high, in_a, _, _ = random_scene(8, 16)
     best_a, best_b = np.empty(8, np.int64), np.empty(0, np.int64)
-    nothing = SecondFeatures(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    nothing = SecondFeatures(np.empty((0, 2)), np.empty((0, 128), np.int16))
     nearest_descriptors(CurveSegments(low, high, in_a), nothing, 30.0, 0.8, best_a, best_b)
     assert (best_a == -1).all()
 
 
-@pytest.mark.parametrize("n", [1, 4, 7, 128])
-def test_dot(n):
-    a, b = RNG.random((2, n)).astype(np.float32)
-    assert dot(a, b) == pytest.approx(float(np.dot(a.astype(float), b)), rel=FLOAT32)
+@pytest.mark.parametrize("n", [1, 7, 128])
+def test_descriptor_distance(n):
+    a, b = RNG.random((2, n))
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    whole_a, whole_b = whole_rows(a), whole_rows(b)
+    assert dot(whole_a, whole_b) == np.dot(whole_a.astype(np.int64), whole_b)
+    for other, whole in ((b, whole_b), (a, whole_a)):
+        squares = ((a - other) ** 2).sum()
+        assert descriptor_distance(whole_a, whole) ** 2 == pytest.approx(squares, abs=SQUARES_TOLERANCE)
+
+
+def test_no_dot_product_overflows():
+    """Of descriptors with one value only, of the same and of opposite signs."""
+    one = whole_rows(np.eye(128)[0])
+    assert dot(one, one) == DESCRIPTOR_LENGTH_UNITS**2
+    assert descriptor_distance(one, -one) == 2.0
 
 
 def test_cells_hold_their_points():

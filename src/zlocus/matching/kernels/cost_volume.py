@@ -46,6 +46,8 @@ from zlocus.matching.kernels.shared_records import (
 COST_SCALE = np.float32(64.0)
 # Cost of a height that fewer than two images cover: less than chance agreement costs, and more than a match.
 UNCOVERED_COST = np.float32(40.0)
+# Cost of a height that is not compared: the largest.
+COST_OF_UNCOMPARED = np.uint8(255)
 # Grey value of a view where it does not see the cell, times its number: far from every grey value, and from that of
 # another view.
 GREY_OF_UNSEEING_VIEW = np.float32(1e6)
@@ -353,6 +355,9 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
         height, m = np.int32(span.first + k), 0
         if not is_height_needed(evidence.learning, height):
             continue
+        if evidence.is_near.shape[0] > 0 and not evidence.is_near[0, 0, k]:
+            codes[k] = COST_OF_UNCOMPARED
+            continue
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole
         for i in range(n_views):
@@ -429,15 +434,15 @@ def cells_of_block(block_row, block_col, block, n_rows, n_cols):
     )  # fmt: skip
 
 
-# as TableAndCounts, sliced: TableAndCounts, CellBox -> TableAndCounts
+# as TableAndCounts, sliced: TableAndCounts, CellBox, i8 -> TableAndCounts
 @kernel
-def evidence_in(evidence, box):
-    """The table, and the counts with the reference heights of the cells of a rectangle."""
-    of_tile = evidence.learning
+def evidence_in(evidence, box, block):
+    """The table, and the counts with the reference heights of the cells of a block. block : cells along its side."""
+    of_tile, b, d = evidence.learning, box.first_row // block, box.first_col // block
     reference = of_tile.reference[box.first_row : box.end_row, box.first_col : box.end_col]
     by_bin, by_pair = (of_tile.right, of_tile.wrong), (of_tile.right_of_pair, of_tile.wrong_of_pair)
     learning = Learning(reference, of_tile.wrong_every, *by_bin, *by_pair, of_tile.grey_roots)
-    return TableAndCounts(evidence.table, learning)
+    return TableAndCounts(evidence.table, learning, evidence.is_near[b : b + 1, d : d + 1])
 
 
 # ViewArrays, SlopeArrays, VolumeLayout, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (v,) u1 -> None
@@ -455,7 +460,7 @@ def tile_costs(views, slope, layout, windows, visible, parameters, evidence, vol
             box = cells_of_block(br, bc, block, n_rows, n_cols)
             span = HeightSpan(layout.first[br, bc], layout.n_heights[br, bc])
             r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
-            evidence_of_block = evidence_in(evidence, box)
+            evidence_of_block = evidence_in(evidence, box, block)
             if evidence.learning.right.shape[0] > 0 and np.isnan(evidence_of_block.learning.reference).all():
                 continue
             first, length = layout.block_row_start[br, 0], layout.row_length[br, 0]

@@ -79,11 +79,16 @@ class Learning(NamedTuple):
     grey_roots: np.ndarray  # (i,i) f8: sum of the roots of the grey differences of each pair at right heights
 
 
+# Heights that are compared, where all of them are.
+ALL_HEIGHTS = np.zeros((0, 0, 0), np.bool_)
+
+
 class TableAndCounts(NamedTuple):
     """The table of a tile, and the counts of one that is being learned; at most one of the two is in use."""
 
     table: EvidenceTable  # EvidenceTable: the table
     learning: Learning  # Learning: the counts
+    is_near: np.ndarray = ALL_HEIGHTS  # (b,d,h) b1: heights of each block that are compared; no elements: all
 
 
 class PairScratch(NamedTuple):

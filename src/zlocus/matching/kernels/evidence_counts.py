@@ -38,36 +38,59 @@ def is_height_needed(learning, height):
     return False
 
 
+# (r,c) f4, i4, f4, f4, i8, (k,) i4 -> i8
+@kernel
+def put_cells_away(reference, height, above, at_most, width, cells):
+    """Write the places of the cells whose reference height lies so many steps from a height index, and return how many
+    they are. above, at_most : limits, steps; width : floats from a row of the flat planes to the next."""
+    n = 0
+    for r in range(reference.shape[0]):
+        for c in range(reference.shape[1]):
+            away = abs(np.float32(height) - reference[r, c])
+            if above < away <= at_most:
+                cells[n] = r * width + c
+                n += 1
+    return n
+
+
+# PairWindows, ViewPair, PairScratch, (k,) i4, (e,) i8, (i,i,k) i8 -> f8
+@kernel
+def count_pair_bins(views, pair, scratch, cells, by_bin, by_likeness):
+    """Count the bins of a pair of views in some cells, and return the sum of the roots of its grey differences there.
+
+    by_bin, by_likeness : counts, added to.
+    """
+    position, bins, per_factor, roots = scratch.rows[POSITION], scratch.bins, np.float32(1.0) / views.grey_factor, 0.0
+    of_a, of_b = views.greys[pair.a], views.greys[pair.b]
+    of_pair = by_likeness[views.in_tile[pair.a], views.in_tile[pair.b]]
+    for j in cells:
+        if abs(of_a[j]) > GREY_LIMIT or abs(of_b[j]) > GREY_LIMIT:
+            continue
+        nearest = bins[j] + np.int32(position[j] > np.float32(0.5))
+        by_bin[nearest] += 1
+        of_pair[nearest % np.int32(N_LIKENESS)] += 1
+        roots += np.sqrt(abs(of_a[j] - of_b[j]) * per_factor)
+    return roots
+
+
 # PairWindows, WindowMoments, PairScratch, i8, i4, TableAndCounts -> None
 @kernel
 def count_bins(views, moments, scratch, n, height, evidence):
     """Count the bins of all pairs of views at one height, at right and at wrong heights of the cells of a block."""
-    learning = evidence.learning
-    reference, right, wrong = learning.reference, learning.right, learning.wrong
-    right_of_pair, wrong_of_pair = learning.right_of_pair, learning.wrong_of_pair
-    position, bins, per_factor = scratch.rows[POSITION], scratch.bins, np.float32(1.0) / views.grey_factor
-    counts_wrong = counts_wrong_heights(learning, height)
+    learning, width = evidence.learning, views.width
+    right_cells, wrong_cells = np.empty(n, np.int32), np.empty(n, np.int32)
+    n_right = put_cells_away(learning.reference, height, np.float32(-1.0), RIGHT_STEPS, width, right_cells)
+    n_wrong = 0
+    if counts_wrong_heights(learning, height):
+        first, last = FIRST_WRONG_STEP, LAST_WRONG_STEP
+        n_wrong = put_cells_away(learning.reference, height, first, last, width, wrong_cells)
+    right_cells, wrong_cells = right_cells[:n_right], wrong_cells[:n_wrong]
     describe_views(views, scratch, n)
-    rows, cols = reference.shape
     for a in range(views.planes.shape[0]):
         for b in range(a + 1, views.planes.shape[0]):
-            write_pair_bins(views, ViewPair(np.uint64(a), np.uint64(b)), moments, scratch, evidence.table, n)
+            pair = ViewPair(np.uint64(a), np.uint64(b))
+            write_pair_bins(views, pair, moments, scratch, evidence.table, n)
             first, second = views.in_tile[a], views.in_tile[b]
-            for r in range(rows):
-                for c in range(cols):
-                    j = r * views.width + c
-                    away = abs(np.float32(height) - reference[r, c])
-                    if not away <= LAST_WRONG_STEP:
-                        continue
-                    if abs(views.greys[a, j]) > GREY_LIMIT or abs(views.greys[b, j]) > GREY_LIMIT:
-                        continue
-                    nearest = bins[j] + np.int32(position[j] > np.float32(0.5))
-                    likeness = nearest % np.int32(N_LIKENESS)
-                    if away <= RIGHT_STEPS:
-                        right[nearest] += 1
-                        right_of_pair[first, second, likeness] += 1
-                        difference = abs(views.greys[a, j] - views.greys[b, j]) * per_factor
-                        learning.grey_roots[first, second] += np.sqrt(difference)
-                    elif counts_wrong and away > FIRST_WRONG_STEP:
-                        wrong[nearest] += 1
-                        wrong_of_pair[first, second, likeness] += 1
+            roots = count_pair_bins(views, pair, scratch, right_cells, learning.right, learning.right_of_pair)
+            learning.grey_roots[first, second] += roots
+            count_pair_bins(views, pair, scratch, wrong_cells, learning.wrong, learning.wrong_of_pair)

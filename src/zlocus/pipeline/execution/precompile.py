@@ -106,14 +106,14 @@ def tiny_scene() -> MatchScene:
 def warm_orientation(match_scene: MatchScene) -> None:
     """Run the kernels of the orientation once."""
     from zlocus.orientation.epipolar import Sightlines, epipolar_curves
-    from zlocus.orientation.sift import DESCRIPTOR_LENGTH, Features
+    from zlocus.orientation.sift import N_DESCRIPTOR_VALUES, Features
     from zlocus.orientation.tie_refinement import refine_ties
     from zlocus.orientation.ties import MAX_DESCRIPTOR_RATIO, match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
 
     sensors, options = [view.sensor for view in match_scene.views], RunConfig().orientation
     xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
-    features = Features(xy, np.zeros((4, DESCRIPTOR_LENGTH), np.float32))
+    features = Features(xy, np.zeros((4, N_DESCRIPTOR_VALUES), np.int16))
     curves = epipolar_curves(Sightlines.of(sensors[0], xy, (0.0, 1.0)), sensors[1], (0.0, 1.0))
     for moved in (curves, curves.moved(np.zeros(2))):
         match_along_curves(moved, features.only(point), features, options.inlier_px, MAX_DESCRIPTOR_RATIO)
