@@ -23,7 +23,8 @@ def all_kernels():
     found = {}
     packages = (zlocus.matching.kernels, zlocus.orientation.kernels)
     names = [f"{package.__name__}.{m.name}" for package in packages for m in pkgutil.iter_modules(package.__path__)]
-    for name_of_module in [*names, "zlocus.products.shade_kernel", "zlocus.sensors.straighten_kernel"]:
+    single = ["products.shade_kernel", "sensors.rpc_kernel", "sensors.straighten_kernel"]
+    for name_of_module in [*names, *(f"zlocus.{name}" for name in single)]:
         loaded = importlib.import_module(name_of_module)
         source = inspect.getsource(loaded)
         for comment, name in re.findall(r"# (.*)\n@(?:parallel_)?kernel\ndef (\w+)\(", source):
@@ -35,8 +36,8 @@ def all_kernels():
 KERNELS = all_kernels()
 
 
-DTYPES = {"f4": types.float32, "f8": types.float64, "i4": types.int32, "i8": types.int64, "u1": types.uint8,
-          "u2": types.uint16, "u4": types.uint32, "u8": types.uint64, "c8": types.complex64,
+DTYPES = {"f4": types.float32, "f8": types.float64, "i2": types.int16, "i4": types.int32, "i8": types.int64,
+          "u1": types.uint8, "u2": types.uint16, "u4": types.uint32, "u8": types.uint64, "c8": types.complex64,
           "b1": types.boolean}  # fmt: skip
 
 

@@ -58,7 +58,7 @@ def kernels(workplace: Workplace, side: int | None = None) -> list[Figure]:
 
 
 def kernel_figures(name: str, found: dict[str, Any]) -> list[Figure]:
-    """Time of a unit of work of one benchmark of `bench_kernels.py` or `bench_linescan.py`; labels name both."""
+    """Time of a unit of work of one benchmark of a `bench_*.py`; labels name both."""
     times = [key for key in found if key.startswith("ns per ")]
     return [Figure(f"{name}, per {key.removeprefix('ns per ')}", found[key], "ns", is_detail=True) for key in times]
 

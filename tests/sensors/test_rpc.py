@@ -10,14 +10,18 @@ from hypothesis import strategies as st
 from pyproj import CRS
 from rasterio.transform import RPCTransformer
 
+from reference import rpc as plain
 from rpc_fixtures import gdal_rpc, satellite_rpc
 from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.rpc import read_rpc
-from zlocus.sensors.rpc import RpcModel, rpc_terms
+from zlocus.sensors.rpc import TOLERANCE_PX, RpcModel, rpc_terms
+from zlocus.sensors.rpc_kernel import ground_positions, positions
 
 UTM31 = CRS.from_epsg(32631)
 ROUND_TRIP_PX = 1e-6
 GDAL_PX = 1e-3
+# Of normalised coordinates: the order of sums; and two Newton steps that both reach TOLERANCE_PX.
+NORMALISED, GROUND = 1e-10, 1e-9
 METRES_PER_DEGREE = 111_000.0
 CROPS = ("pleiades_triplet_calanques/img_01.tif", "pleiades_pair_ventoux/img_02.tif", "rendered-city/img_f1.tif")
 
@@ -42,6 +46,34 @@ def test_slopes_are_the_derivatives_of_the_polynomials():
     by_lon = rpc.matrix @ (rpc_terms(lon + d, lat, height) - rpc_terms(lon - d, lat, height)) / (2 * d)
     by_lat = rpc.matrix @ (rpc_terms(lon, lat + d, height) - rpc_terms(lon, lat - d, height)) / (2 * d)
     np.testing.assert_allclose(found, [by_lon, by_lat], rtol=0, atol=1e-7)
+
+
+def any_rpc(seed, relief):
+    """An RPC whose polynomials differ from those of a satellite by random terms."""
+    rng, rpc = np.random.default_rng(seed), satellite_rpc()
+    names = ("line_num", "line_den", "samp_num", "samp_den")
+    near = {name: np.array(getattr(rpc, name)) + np.r_[0.0, rng.uniform(-relief, relief, 19)] for name in names}
+    return replace(rpc, **{name: tuple(values) for name, values in near.items()})
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.02, 0.3]))
+def test_kernels_are_their_plain_twins(seed, relief):
+    """Also where polynomials have poles, and where no ground shows at a pixel."""
+    rpc, rng = any_rpc(seed, relief), np.random.default_rng(seed + 1)
+    lon, lat, height = rng.uniform(-1.5, 1.5, (3, 40))
+    height[0] = np.nan
+    found, expected = np.empty((40, 2)), plain.positions(rpc, lon, lat, height)
+    positions(rpc.by_term, lon, lat, height, found)
+    np.testing.assert_allclose(found, expected, rtol=NORMALISED, atol=NORMALISED)
+    target = rng.uniform(-1.2, 1.2, (40, 2))
+    ground, expected = np.empty((40, 2)), plain.ground_positions(rpc, target, height)
+    tolerance = TOLERANCE_PX / np.array([rpc.samp_scale, rpc.line_scale])
+    ground_positions(rpc.by_term, rpc.slopes_by_term, target, height, tolerance, ground)
+    # Where a path passes a pole, a rounding decides whether and where it ends.
+    apart = ~np.isclose(ground, expected, rtol=0, atol=GROUND, equal_nan=True).all(axis=1)
+    assert apart.sum() <= (0 if relief < 0.1 else 4)
+    assert np.isnan(ground[0]).all()
+    assert np.isfinite(ground[1:]).all() or relief > 0
 
 
 def test_is_a_sensor_model_that_travels_between_processes(model: RpcModel):

@@ -106,10 +106,10 @@ def _value_at_border(image: ImageSource) -> float | None:
     return max(votes, key=lambda value: votes[value]) if votes else None
 
 
-def part_of(window: ImageWindow, row: int, col: int, rows: int, cols: int) -> ImageWindow:
+def part_of(image_window: ImageWindow, row: int, col: int, rows: int, cols: int) -> ImageWindow:
     """The window of rows x cols pixels that starts at (row, col) of another window."""
     at = slice(row, row + rows), slice(col, col + cols)
-    return ImageWindow(window.pixels[at], window.valid[at])
+    return ImageWindow(image_window.pixels[at], image_window.valid[at])
 
 
 @dataclass(frozen=True)

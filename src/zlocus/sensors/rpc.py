@@ -9,12 +9,10 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from zlocus.core.sensor_model import FloatArray
+from zlocus.sensors.rpc_kernel import ground_positions, positions
 
 GEOGRAPHIC = CRS.from_epsg(4979)
-MAX_ITERATIONS = 30
 TOLERANCE_PX = 1e-7
-# Largest Newton step, in half sizes of the RPC's box.
-MAX_STEP = 0.5
 # The cubic terms (see `rpc_terms`) as products of a quadratic and a linear one.
 CUBICS = (
     (10, 6, 1), (11, 7, 1), (12, 8, 1), (13, 9, 1), (14, 7, 2), (15, 8, 2), (16, 9, 2), (17, 7, 3), (18, 8, 3),
@@ -66,6 +64,16 @@ class RpcCoefficients:
             for term, factor, quadratic in rules:
                 slopes[axis, :, quadratic] = factor * self.matrix[:, term]
         return slopes.reshape(8, 10)
+
+    @cached_property
+    def by_term(self) -> FloatArray:
+        """Coefficients (20, 4) of the four polynomials, those of each term side by side."""
+        return np.ascontiguousarray(self.matrix.T)
+
+    @cached_property
+    def slopes_by_term(self) -> FloatArray:
+        """Coefficients (2, 10, 4) of their derivatives by longitude and by latitude, see `slopes`."""
+        return np.ascontiguousarray(np.moveaxis(self.slopes.reshape(2, 4, 10), 1, 2))
 
     def moved(self, column: float, row: float) -> RpcCoefficients:
         """The RPC with its image positions increased by `column` and `row` pixels."""
@@ -124,9 +132,8 @@ class RpcModel:
         NaN beyond a pole of the rational function (far outside the RPC's box), where its value means nothing.
         """
         rpc = self.rpc
-        with np.errstate(all="ignore"):
-            values = rpc.matrix @ rpc_terms(*self._normalised(lon, lat, height))
-        xy = np.ascontiguousarray(self._ratios(values).T)
+        xy = np.empty((len(lon), 2))
+        positions(rpc.by_term, *self._normalised(lon, lat, height), xy)
         xy *= [rpc.samp_scale, rpc.line_scale]
         xy += [rpc.samp_off, rpc.line_off]
         return xy
@@ -138,29 +145,12 @@ class RpcModel:
         so that crops far from the centre of a large box converge too. NaN where it does not reach `TOLERANCE_PX`.
         """
         rpc = self.rpc
-        scale = np.array([[rpc.samp_scale], [rpc.line_scale]])
-        target = (xy.T - np.array([[rpc.samp_off], [rpc.line_off]])) / scale
-        height = (z - rpc.height_off) / rpc.height_scale
-        lon, lat = np.zeros(len(xy)), np.zeros(len(xy))
-        done = np.zeros(len(xy), bool)
-        active = np.arange(len(xy))
-        for _ in range(MAX_ITERATIONS):
-            with np.errstate(all="ignore"):
-                terms = rpc_terms(lon[active], lat[active], height[active])
-                values = rpc.matrix @ terms
-            residual = target[:, active] - self._ratios(values)
-            reached = (np.abs(residual * scale) < TOLERANCE_PX).all(axis=0)
-            going = np.isfinite(residual).all(axis=0) & ~reached
-            done[active[reached]] = True
-            if not going.any():
-                break
-            active = active[going]
-            step_lon, step_lat = self._newton_step(terms[:10, going], values[:, going], residual[:, going])
-            lon[active] += step_lon
-            lat[active] += step_lat
-        lon_deg = np.remainder(lon * rpc.lon_scale + rpc.lon_off + 180.0, 360.0) - 180.0
-        lat_deg = lat * rpc.lat_scale + rpc.lat_off
-        return np.where(done, lon_deg, np.nan), np.where(done, lat_deg, np.nan)
+        scale = np.array([rpc.samp_scale, rpc.line_scale])
+        target = np.ascontiguousarray((xy - [rpc.samp_off, rpc.line_off]) / scale)
+        height, found = (z - rpc.height_off) / rpc.height_scale, np.empty((len(xy), 2))
+        ground_positions(rpc.by_term, rpc.slopes_by_term, target, height, TOLERANCE_PX / np.abs(scale), found)
+        lon_deg = np.remainder(found[:, 0] * rpc.lon_scale + rpc.lon_off + 180.0, 360.0) - 180.0
+        return lon_deg, found[:, 1] * rpc.lat_scale + rpc.lat_off
 
     def _normalised(
         self, lon: FloatArray, lat: FloatArray, height: FloatArray
@@ -175,34 +165,3 @@ class RpcModel:
                 (lat - rpc.lat_off) / rpc.lat_scale,
                 (height - rpc.height_off) / rpc.height_scale,
             )
-
-    def _ratios(self, values: FloatArray) -> FloatArray:
-        """Normalised (sample, line) (2, n) of the four polynomials (4, n), in the order of `RpcCoefficients.matrix`."""
-        line_num, line_den, samp_num, samp_den = values
-        with np.errstate(all="ignore"):
-            ratios = np.stack([samp_num / samp_den, line_num / line_den])
-            # The constant term is the denominator at the centre of the box: another sign means a pole in between.
-            usable = (line_den * self.rpc.line_den[0] > 0) & (samp_den * self.rpc.samp_den[0] > 0)
-        ratios[:, ~(usable & np.isfinite(ratios).all(axis=0))] = np.nan
-        return ratios
-
-    def _newton_step(self, terms: FloatArray, values: FloatArray, residual: FloatArray) -> FloatArray:
-        """Normalised step (longitude, latitude) (2, n) that removes a residual (2, n), limited to `MAX_STEP`.
-
-        terms : (10, n), the quadratic ones; values : (4, n), the polynomials there.
-        """
-        line_num, line_den, samp_num, samp_den = values
-        with np.errstate(all="ignore"):
-            sample, line, slopes = samp_num / samp_den, line_num / line_den, []
-            for d_line_num, d_line_den, d_samp_num, d_samp_den in (self.rpc.slopes @ terms).reshape(2, 4, -1):
-                by_sample, by_line = d_samp_num - sample * d_samp_den, d_line_num - line * d_line_den
-                slopes.append((by_sample / samp_den, by_line / line_den))
-            (samp_lon, line_lon), (samp_lat, line_lat) = slopes
-            determinant = samp_lon * line_lat - line_lon * samp_lat
-            step = np.stack(
-                [
-                    (residual[0] * line_lat - residual[1] * samp_lat) / determinant,
-                    (samp_lon * residual[1] - line_lon * residual[0]) / determinant,
-                ]
-            )
-        return np.asarray(np.clip(np.nan_to_num(step, nan=np.inf), -MAX_STEP, MAX_STEP))

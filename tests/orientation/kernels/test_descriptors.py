@@ -14,7 +14,7 @@ from zlocus.orientation.kernels.descriptors import (
     CurveSegments,
     SecondFeatures,
     descriptor_distance,
-    dot,
+    direction,
     is_clear,
     is_near,
     nearest_descriptors,
@@ -70,22 +70,25 @@ def test_nothing_to_compare_is_no_match():
     assert (best_a == -1).all()
 
 
+def distance_of(a, b):
+    """Distance of two descriptors (d,)."""
+    return descriptor_distance(a[None], np.uint64(0), b[None], np.uint64(0))
+
+
 @pytest.mark.parametrize("n", [1, 7, 128])
 def test_descriptor_distance(n):
     a, b = RNG.random((2, n))
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    whole_a, whole_b = whole_rows(a), whole_rows(b)
-    assert dot(whole_a, whole_b) == np.dot(whole_a.astype(np.int64), whole_b)
-    for other, whole in ((b, whole_b), (a, whole_a)):
+    for other in (a, b):
         squares = ((a - other) ** 2).sum()
-        assert descriptor_distance(whole_a, whole) ** 2 == pytest.approx(squares, abs=SQUARES_TOLERANCE)
+        assert distance_of(whole_rows(a), whole_rows(other)) ** 2 == pytest.approx(squares, abs=SQUARES_TOLERANCE)
 
 
-def test_no_dot_product_overflows():
+def test_no_distance_overflows():
     """Of descriptors with one value only, of the same and of opposite signs."""
     one = whole_rows(np.eye(128)[0])
-    assert dot(one, one) == DESCRIPTOR_LENGTH_UNITS**2
-    assert descriptor_distance(one, -one) == 2.0
+    assert distance_of(one, one) == 0.0
+    assert distance_of(one, -one) == 2.0
 
 
 def test_cells_hold_their_points():
@@ -104,8 +107,9 @@ def test_a_row_of_cells_is_searched_where_the_segment_may_be():
         low, high = RNG.uniform(0, 300, (2, 2))
         point = low + RNG.uniform(0, 1) * (high - low) + RNG.uniform(-9, 9, 2)
         along, across = plain.distance_to_segment(low, high, point)
-        assert is_near(low, high, point, 7.0) == (along <= 7.0 and across <= 7.0)
-        if is_near(low, high, point, 7.0):
+        is_here = is_near(*(point - low), direction(low, high), 7.0)
+        assert is_here == (along <= 7.0 and across <= 7.0)
+        if is_here:
             left, right = span_in_row(low, high, np.floor(point[1] / CELL_PX) * CELL_PX, 7.0)
             assert left <= point[0] <= right
 

@@ -46,8 +46,8 @@ from zlocus.matching.kernels.shared_records import (
 COST_SCALE = np.float32(64.0)
 # Cost of a height that fewer than two images cover: less than chance agreement costs, and more than a match.
 UNCOVERED_COST = np.float32(40.0)
-# Cost of a height that is not compared: the largest.
-COST_OF_UNCOMPARED = np.uint8(255)
+# Cost of a height far from all candidates of a block, at which the images are not compared: the largest.
+COST_IF_FAR = np.uint8(255)
 # Grey value of a view where it does not see the cell, times its number: far from every grey value, and from that of
 # another view.
 GREY_OF_UNSEEING_VIEW = np.float32(1e6)
@@ -342,7 +342,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     size, cells = steps.shape[0] + SLACK, flat_cells(relief.shape[0], width)
     planes, greys = np.zeros((n_views, size), np.float32), np.zeros((n_views, size), np.float32)
     mean, scale = np.empty((n_views, n_sizes, size), np.float32), np.empty((n_views, n_sizes, size), np.float32)
-    flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.empty((span.n_heights, n), np.uint8)
+    flat, codes = empty_visibility(visible.lowest_covered.shape[0], size), np.full((span.n_heights, n), COST_IF_FAR)
     pairs, shown, total = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     counts, work, scratch = np.empty((2, size), np.float32), np.empty((4, size), np.float32), resample_scratch(size)
     flat_visibility(visible, half, flat, pairs)
@@ -353,10 +353,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     grey_factor = factor_of_greys(evidence, weight * np.float32(n_sizes), parameters.max_grey_difference)
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
-        if not is_height_needed(evidence.learning, height):
-            continue
-        if evidence.is_near.shape[0] > 0 and not evidence.is_near[0, 0, k]:
-            codes[k] = COST_OF_UNCOMPARED
+        if not is_height_needed(evidence, height, k):
             continue
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole

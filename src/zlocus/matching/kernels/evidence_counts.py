@@ -20,15 +20,16 @@ def counts_wrong_heights(learning, height):
     return learning.wrong_every > 0 and height % learning.wrong_every == 0
 
 
-# Learning, i4 -> b1
+# TableAndCounts, i4, i8 -> b1
 @kernel
-def is_height_needed(learning, height):
-    """Whether costs or counts are made at a height index of a block.
+def is_height_needed(evidence, height, block_step):
+    """Whether costs or counts are made at a height of a block. block_step : number of the height in its search range.
 
     Where bins are counted, only heights that are right, or counted as wrong, in any of its cells are needed.
     """
+    learning = evidence.learning
     if learning.right.shape[0] == 0:
-        return True
+        return evidence.is_near.shape[0] == 0 or evidence.is_near[0, 0, block_step]
     counts_wrong = counts_wrong_heights(learning, height)
     for r in range(learning.reference.shape[0]):
         for c in range(learning.reference.shape[1]):

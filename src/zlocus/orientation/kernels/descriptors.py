@@ -18,8 +18,8 @@ CORNER_FACTOR = 1.5
 SAME_PLACE_PX = 2.0
 # Distance of RootSIFT descriptors of different ground. Random pairs have 0.9 to 1.2.
 UNRELATED_DISTANCE = 0.9
-# Descriptors are whole numbers of this part of their length: sums of whole numbers do not depend on their order, so
-# that they are added many at a time, in a seventh of the time. No dot product is larger than a 32-bit number.
+# Descriptors are whole numbers, of this length: sums of whole numbers do not depend on their order, so that they are
+# added many at a time, in a seventh of the time. No product of two descriptors exceeds a number of 32 bits.
 DESCRIPTOR_LENGTH_UNITS = 2**14
 
 
@@ -38,22 +38,22 @@ class SecondFeatures(NamedTuple):
     descriptors: NDArray[np.int16]  # (k,d) i2: of a length of DESCRIPTOR_LENGTH_UNITS
 
 
-# (d) i2, (d) i2 -> i4
-@kernel
-def dot(a, b):
-    """Dot product of two descriptors."""
-    total = np.int32(0)
-    for k in range(len(a)):
-        total = np.int32(total + np.int32(np.int32(a[k]) * np.int32(b[k])))
-    return total
+class Direction(NamedTuple):
+    """Unit vector along a segment, and its length. A segment without length is taken as horizontal."""
+
+    by_x: float  # f8: component along the columns
+    by_y: float  # f8: component along the rows
+    length: float  # f8: px
 
 
-# (d) i2, (d) i2 -> f4
+# (n,d) i2, u8, (k,d) i2, u8 -> f4
 @kernel
-def descriptor_distance(a, b):
-    """Distance of two descriptors, as a share of their length."""
-    per_square = np.float32(2.0 / DESCRIPTOR_LENGTH_UNITS**2)
-    return np.sqrt(max(np.float32(2.0) - per_square * np.float32(dot(a, b)), np.float32(0.0)))
+def descriptor_distance(in_a, i, in_b, j):
+    """Distance of two descriptors, rows i and j, as a share of their length."""
+    product, per_square = np.int32(0), np.float32(2.0 / DESCRIPTOR_LENGTH_UNITS**2)
+    for k in range(np.uint64(in_a.shape[1])):
+        product = np.int32(product + np.int32(np.int32(in_a[i, k]) * np.int32(in_b[j, k])))
+    return np.sqrt(max(np.float32(2.0) - per_square * np.float32(product), np.float32(0.0)))
 
 
 # (k,2) f8, (2) f8, i8, i8, (c) i8, (k) i8 -> None
@@ -78,19 +78,25 @@ def sort_into_cells(xy, corner, rows, cols, start, order):
         filled[cell[k]] += 1
 
 
-# (2) f8, (2) f8, (2) f8, f8 -> b1
+# (2) f8, (2) f8 -> Direction
 @kernel
-def is_near(low, high, point, max_px):
-    """Whether a point lies within `max_px` of a segment, both along it beyond its ends and across it.
-
-    A segment without length is taken as horizontal.
-    """
+def direction(low, high):
+    """Direction of the segment between two points, px."""
     by_x, by_y = high[0] - low[0], high[1] - low[1]
     length = np.sqrt(by_x * by_x + by_y * by_y)
-    by_x, by_y = (by_x / length, by_y / length) if length > 1e-9 else (1.0, 0.0)
-    x, y = point[0] - low[0], point[1] - low[1]
-    along = x * by_x + y * by_y
-    return abs(x * by_y - y * by_x) <= max_px and -max_px <= along <= length + max_px
+    return Direction(by_x / length, by_y / length, length) if length > 1e-9 else Direction(1.0, 0.0, length)
+
+
+# f8, f8, Direction, f8 -> b1
+@kernel
+def is_near(x, y, along_segment, max_px):
+    """Whether a point lies within `max_px` of a segment, both along it beyond its ends and across it.
+
+    x, y : from the first end of the segment; along_segment : of it.
+    """
+    along = x * along_segment.by_x + y * along_segment.by_y
+    across = abs(x * along_segment.by_y - y * along_segment.by_x)
+    return across <= max_px and -max_px <= along <= along_segment.length + max_px
 
 
 # (2) f8, (2) f8, f8, f8 -> (2) f8
@@ -142,7 +148,7 @@ def nearest_descriptors(segments, features, max_px, ratio, best_a, best_b):
     cols, rows = int((xy[:, 0].max() - corner[0]) / CELL_PX) + 1, int((xy[:, 1].max() - corner[1]) / CELL_PX) + 1
     start, order = np.empty(rows * cols + 1, np.int64), np.empty(len(xy), np.int64)
     sort_into_cells(xy, corner, rows, cols, start, order)
-    closest = np.full(len(xy), np.inf, np.float32)
+    closest, sorted_xy = np.full(len(xy), np.inf, np.float32), xy[order]
     near, distance = np.empty(len(xy), np.int64), np.empty(len(xy), np.float32)
     for i in range(len(low)):
         if not (np.isfinite(low[i]).all() and np.isfinite(high[i]).all()):
@@ -150,17 +156,17 @@ def nearest_descriptors(segments, features, max_px, ratio, best_a, best_b):
         top = min(low[i, 1], high[i, 1]) - CORNER_FACTOR * max_px
         bottom = max(low[i, 1], high[i, 1]) + CORNER_FACTOR * max_px
         first, last = int(np.floor((top - corner[1]) / CELL_PX)), int(np.floor((bottom - corner[1]) / CELL_PX))
-        n_near = 0
+        n_near, x, y, along_segment = 0, low[i, 0], low[i, 1], direction(low[i], high[i])
         for row in range(max(first, 0), min(last, rows - 1) + 1):
             left, right = span_in_row(low[i], high[i], corner[1] + row * CELL_PX, max_px)
             c0, c1 = int(np.floor((left - corner[0]) / CELL_PX)), int(np.floor((right - corner[0]) / CELL_PX))
             if c1 < 0 or c0 >= cols:
                 continue
             for at in range(start[row * cols + max(c0, 0)], start[row * cols + min(c1, cols - 1) + 1]):
-                j = order[at]
-                if not is_near(low[i], high[i], xy[j], max_px):
+                if not is_near(sorted_xy[at, 0] - x, sorted_xy[at, 1] - y, along_segment, max_px):
                     continue
-                apart = descriptor_distance(in_a[i], in_b[j])
+                j = order[at]
+                apart = descriptor_distance(in_a, np.uint64(i), in_b, np.uint64(j))
                 near[n_near], distance[n_near] = j, apart
                 n_near += 1
                 if apart < closest[j]:
