@@ -110,6 +110,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     from zlocus.orientation.tie_refinement import refine_ties
     from zlocus.orientation.ties import MAX_DESCRIPTOR_RATIO, match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
+    from zlocus.sensors.rpc_kernel import ground_positions, positions
 
     sensors, options = [view.sensor for view in match_scene.views], RunConfig().orientation
     xy, point = np.full((4, 2), SIDE / 2.0), np.arange(4)
@@ -120,6 +121,9 @@ def warm_orientation(match_scene: MatchScene) -> None:
     seen = Observations(np.repeat([0, 1], 4), np.tile(point, 2), np.tile(xy, (2, 1)))
     ground = sensors[0].ground_from_image(xy, np.zeros(4))
     refine_ties(match_scene.views, seen, ground_jacobian(sensors, seen, ground), options)
+    coefficients, one, found = np.ones((20, 4)), np.zeros(1), np.empty((1, 2))
+    positions(coefficients, one, one, one, found)
+    ground_positions(coefficients, np.ones((2, 10, 4)), found, one, np.ones(2), found)
 
 
 def warm(group: str) -> None:
