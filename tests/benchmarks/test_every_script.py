@@ -18,6 +18,7 @@ RUN_BY = {
     "before_after.py": "test_real_images.py::test_figures_before_and_after_a_change_stand_side_by_side",
     "bench_kernels.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "bench_linescan.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "bench_orientation.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "rows/other_programs.py": "test_acceptance.py::test_the_rows_of_other_programs_are_those_of_their_last_run",
     "conftest.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "coregistration.py": "test_acceptance.py::test_planted_shifts_are_found",
