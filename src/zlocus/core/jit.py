@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -19,6 +19,8 @@ from zlocus.core.errors import ZlocusWarning
 F = TypeVar("F", bound=Callable[..., Any])
 # A disk with less room than this takes no new folder of compiled kernels; all kernels together take 12 MB.
 MIN_FREE_BYTES = 50_000_000
+# Empty file in the folder of kernels that were all compiled in advance.
+COMPLETE = "complete"
 # Files of the package whose content compiled kernels depend on: Numba looks at a kernel's own file alone, but a kernel
 # contains the code of the kernels that it calls and the values of the constants that it uses.
 KERNEL_FILES = ("core/jit.py", "*/kernels/*.py", "products/shade_kernel.py", "sensors/*_kernel.py", "synthetic/*.py")
@@ -95,6 +97,17 @@ class KernelCache:
             ZlocusWarning,
             stacklevel=2,
         )
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all kernels of the package were compiled in advance and kept."""
+        return self.folder is not None and (self.folder / COMPLETE).exists()
+
+    def mark_complete(self) -> None:
+        """Remember that all kernels were compiled in advance and kept; without a folder nothing is remembered."""
+        if self.folder is not None:
+            with suppress(OSError):
+                (self.folder / COMPLETE).touch()
 
     def remove_temporary(self) -> None:
         """Remove the temporary folder, for a process that ends without its usual clean-up."""

@@ -20,6 +20,7 @@ from zlocus.io.run_record import Stopwatch, result_record, write_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.image_space import depth_options, is_by_depth
 from zlocus.matching.quality import Quality
+from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
 from zlocus.pipeline.image_tiles import (
     ImageMatching,
@@ -75,7 +76,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         check_room_for_pixels(request.out, scene, references)
         inputs = InputFiles.of(opened_inputs.files, scene, before)
     config = depth_options(config) if is_by_depth(scene) else config
-    with watch.stage("orient"):
+    with watch.stage("orient"), kernels_compiling(progress):
         setup = set_up_images(scene, config, progress)
         note_orientation(setup.orientation, progress)
         references = supported_references(references, setup)

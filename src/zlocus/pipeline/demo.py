@@ -82,7 +82,7 @@ def _demo_scene(spec: SceneSpec, out: Path, progress: Progress) -> RenderedScene
         if is_block_of(begun, made_of):
             progress.note(f"The scene in {folder} is that of a demo which was stopped: it is not rendered again.")
             return scene_files(spec, folder, is_linescan=True)
-    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling():
+    with made_folder(out), progress.stage("Rendering the scene", len(spec.views)) as stage, kernels_compiling(progress):
         # From here on the folder belongs to a demo whose scene is not complete.
         write_record(begun, {})
         finished.unlink(missing_ok=True)

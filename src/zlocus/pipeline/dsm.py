@@ -24,6 +24,7 @@ from zlocus.io.rasters import compression_threads
 from zlocus.io.run_record import Stopwatch, read_record
 from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, plan_tiles
+from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import write_finished
 from zlocus.pipeline.finished_run import Missing, make_missing, missing_products, whole_again
@@ -106,7 +107,7 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
             return _already_finished(request, config, run, missing, progress)
         request = whole_again(request, run.finished, missing, progress)
     opened_inputs, inputs, checkpoint, out, tally = run.opened_inputs, run.inputs, run.checkpoint, request.out, Tally()
-    with watch.stage("orient"):
+    with watch.stage("orient"), kernels_compiling(progress):
         ties = known_ties(checkpoint, opened_inputs.scene, progress)
         orientation = orient_views(
             opened_inputs.scene, config.orientation, progress, threads=request.workers, known_ties=ties

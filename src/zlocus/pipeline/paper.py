@@ -70,7 +70,7 @@ def demo_block(out: Path, progress: Progress) -> tuple[Path, ...]:
         if is_block_of(record, digest):
             return scene_files(spec, folder, is_linescan=True).inputs
         shutil.rmtree(folder)
-    with progress.stage("Rendering the demo's block", len(spec.views)) as stage, kernels_compiling():
+    with progress.stage("Rendering the demo's block", len(spec.views)) as stage, kernels_compiling(progress):
         rendered = render_scene(spec, folder, lambda step: stage.advance(), flown)
         write_record(record, {DIGEST: digest})
     return rendered.inputs

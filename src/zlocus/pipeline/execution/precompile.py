@@ -21,7 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
+from zlocus.core.jit import CACHE
 from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress, SilentProgress, duration
+from zlocus.core.resources import cores
 from zlocus.core.scene import ImageWindow, View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.match_scene import MatchScene
@@ -33,15 +36,29 @@ FOR_ANOTHER = (
     "import sys; from zlocus.pipeline.execution.precompile import warm_for_another; warm_for_another(sys.argv[1])"
 )
 SIDE = 96
+# Time to compile all kernels on one core of 2024.
+COMPILING_CPU_S = 150.0
 # Of Python's collector of unused objects. Compiling makes millions of objects and keeps most: with the default, a sixth
 # of the time is spent looking through them.
 GC_THRESHOLDS = (20_000, 10, 10)
 
 
 @contextmanager
-def kernels_compiling() -> Iterator[None]:
-    """Compile the kernels while the block runs; at its end they are ready."""
-    running = []
+def kernels_compiling(progress: Progress | None = None) -> Iterator[None]:
+    """Compile the kernels while the block runs; at its end they are ready.
+
+    Nothing is done where they are ready already, or where none can be kept. progress : is told why the run takes longer
+    than usual, and for how long.
+    """
+    if CACHE.is_complete or CACHE.folder is None:
+        yield
+        return
+    progress, running = progress or SilentProgress(), []
+    seconds = COMPILING_CPU_S / min(cores(), len(GROUPS))
+    progress.note(
+        f"Kernels are being compiled, once after an installation or an update. This takes about {duration(seconds)} of "
+        f"this run. They are kept in {CACHE.folder}."
+    )
     try:
         for group in GROUPS:
             command = [sys.executable, "-c", FOR_ANOTHER, group]
@@ -52,8 +69,12 @@ def kernels_compiling() -> Iterator[None]:
             )  # fmt: skip
             running.append(process)
         yield
-        for process in running:
-            process.wait()
+        with progress.stage("Compiling kernels", len(running)) as stage:
+            for process in running:
+                process.wait()
+                stage.advance()
+        if not any(process.returncode for process in running):
+            CACHE.mark_complete()
     finally:
         for process in running:
             process.kill()
@@ -177,9 +198,13 @@ def _leave_after_input() -> None:
 
 
 def warm_for_another(group: str) -> None:
-    """Run a group of kernels once, unless the starting process ends first."""
+    """Run a group of kernels once, unless the starting process ends first, and end this process.
+
+    An ordinary end would wait for the thread that reads the input, and fail.
+    """
     threading.Thread(target=_leave_after_input, daemon=True).start()
     warm(group)
+    os._exit(0)
 
 
 if __name__ == "__main__":
