@@ -161,7 +161,7 @@ def costs_case(
 ) -> Case:
     """Costs of a tile: half widths of its windows, weight of grey differences."""
     heights = lattice(side, 32)
-    volume = np.empty(heights.size, np.uint8)
+    volume = np.zeros(heights.size, np.uint8)
     visible, half = all_visible(n_views, side), np.array(windows, np.int64)
     values = (np.float32(value) for value in (0.0, weight, weight, 0.3, 0.5))
     parameters, wide = CostParameters(*values, n_views, np.float32(0.0)), side + 2 * max(windows)

@@ -14,7 +14,6 @@ from zlocus.matching.kernels.prior_costs import (
     DistanceCost,
     add_costs_beyond,
     add_costs_of_candidates,
-    mark_heights_near_candidates,
     write_misfit,
 )
 from zlocus.matching.prior_costs import (
@@ -68,23 +67,6 @@ def test_heights_far_from_all_candidates_cost_more(seed):
             added = np.floor(np.minimum(5.0 * np.maximum(away - 3.0, 0), 30.0) + 0.5)
             expected = np.minimum(before[r, c, first[r, c] + k] + added, 255)
             np.testing.assert_array_equal(found[r, c, first[r, c] + k], expected)
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10_000))
-def test_heights_of_a_block_are_near_where_they_do_not_cost_the_most_in_all_its_cells(seed):
-    _, lattice, slope = volume(seed)
-    candidates = np.random.default_rng(seed + 1).integers(0, 10, (2, SHAPE[0] // 2 + 2, SHAPE[1] // 2 + 2))
-    cells, by_distance = CoarserCells(1, 2, 1), DistanceCost(np.float32(0.0), np.float32(5.0), np.float32(10.0))
-    arguments = lattice.layout, slope, candidates.astype(np.int32), cells, by_distance
-    added = np.zeros(lattice.size, np.uint8)
-    add_costs_of_candidates(added, *arguments)
-    found = np.ones((*lattice.count.shape, int(lattice.count.max())), np.bool_)
-    mark_heights_near_candidates(*arguments, found)
-    added, (first, count) = dense(added, lattice, np.inf), (lattice.first, lattice.count)
-    for b, d in np.ndindex(*count.shape):
-        of_block = added[b * BLOCK : (b + 1) * BLOCK, d * BLOCK : (d + 1) * BLOCK, first[b, d] :][..., : count[b, d]]
-        np.testing.assert_array_equal(found[b, d, : count[b, d]], (of_block < 10).any(axis=(0, 1)))
 
 
 def test_heights_beyond_the_surface_cost_more():

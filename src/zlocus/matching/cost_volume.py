@@ -15,6 +15,7 @@ from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, til
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import TileInputs
 from zlocus.matching.occlusion import PAIR
+from zlocus.matching.prior_costs import COST_OF_CANDIDATES
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 
@@ -55,12 +56,16 @@ def cost_volume(
     options: CostOptions,
     counted_pairs: CountedPairs | None = None,
     taught_heights: TaughtHeights | None = None,
+    known_costs: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """Matching cost of every cell and height, (v,) uint8, in the order of `HeightLattice.layout`.
 
     slope_views : projections of slope indices, see `SlopeSurface.along`; visible : in slope indices; counted_pairs :
     None for those of a scene of many images on the ground; taught_heights : heights from which the evidence of the
-    images is learned.
+    images is learned; known_costs : (v,) uint8, those of `costs_of_coarser`, to which the others are added.
+
+    Where a height has the largest of the known costs in all cells of a block, the images are not compared: in a block
+    with a tower and a street most heights lie between the two. This halves the time of the comparison in a town.
 
     With such heights the cost of a height is the evidence against it, see `zlocus.matching.evidence`. Without them
     it is 64 (1 - NCC) + 64 w d.
@@ -75,10 +80,13 @@ def cost_volume(
     reference image, see `CountedPairs`.
     """
     windows = np.unique([options.small_window // 2, large_window_side(options) // 2])
-    volume, parameters = np.empty(lattice.size, np.uint8), cost_parameters(options, counted_pairs or CountedPairs())
+    volume = np.zeros(lattice.size, np.uint8) if known_costs is None else known_costs
+    parameters = cost_parameters(options, counted_pairs or CountedPairs())
     slope, evidence = SlopeArrays(slope_surface.padded(int(windows.max())), slope_surface.nodes), NO_EVIDENCE
     if taught_heights is not None:
         evidence = learned_evidence(slope_views, slope, lattice, windows, visible, parameters, taught_heights)
+    if known_costs is not None:
+        evidence = evidence._replace(far_cost=np.uint8(COST_OF_CANDIDATES.max_cost))
     tile_costs(
         slope_views.arrays, slope, lattice.layout, windows, visible, parameters, evidence, volume
     )  # fmt: skip

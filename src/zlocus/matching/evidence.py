@@ -14,7 +14,7 @@ to be those of rough surfaces, see `rough_ratios`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -23,14 +23,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import on_cells
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.cost_volume import CostParameters, SlopeArrays, tile_costs
-from zlocus.matching.kernels.evidence import (
-    ALL_HEIGHTS,
-    N_LIKENESS,
-    TABLE_SHAPE,
-    EvidenceTable,
-    Learning,
-    TableAndCounts,
-)
+from zlocus.matching.kernels.evidence import N_LIKENESS, TABLE_SHAPE, EvidenceTable, Learning, TableAndCounts
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.local_contrast import rounded
@@ -120,13 +113,11 @@ NO_EVIDENCE = TableAndCounts(NO_TABLE, NO_COUNTS)
 class TaughtHeights:
     """Heights that the evidence of a level is learned from.
 
-    height : (r, c) float32, slope indices, NaN where none is trusted; level : number of the level, 0 is the finest;
-    is_near : (b, d, h) bool, heights of each block at which images are compared afterwards, without elements all.
+    height : (r, c) float32, slope indices, NaN where none is trusted; level : number of the level, 0 is the finest.
     """
 
     height: NDArray[np.float32]
     level: int
-    is_near: NDArray[np.bool_] = field(default_factory=lambda: ALL_HEIGHTS)
 
 
 def learned_evidence(
@@ -151,7 +142,7 @@ def learned_evidence(
         reference = sampled_blocks(taught_heights.height, lattice.block, log_every)
         learning = nothing_counted(n_views, reference, wrong_every)
         counting = TableAndCounts(NO_TABLE._replace(noise_variance=noise, grey_unit=grey_unit), learning)
-        volume = np.empty(lattice.size, np.uint8)
+        volume = np.zeros(lattice.size, np.uint8)
         tile_costs(
             slope_views.arrays, slope_arrays, lattice.layout, windows, visible, parameters, counting, volume
         )  # fmt: skip
@@ -178,7 +169,7 @@ def learned_evidence(
         worth=worth_of_pairs(learning.right_of_pair, learning.wrong_of_pair),
         best_share=np.float32(best_share_of(n_covering)),
     )
-    return TableAndCounts(found, NO_COUNTS, taught_heights.is_near)
+    return TableAndCounts(found, NO_COUNTS)
 
 
 def best_share_of(n_covering: float) -> float:

@@ -15,8 +15,6 @@ Misfit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,6 @@ from zlocus.matching.kernels.prior_costs import (
     DistanceCost,
     add_costs_beyond,
     add_costs_of_candidates,
-    mark_heights_near_candidates,
     write_misfit,
 )
 from zlocus.matching.level_records import LevelResult, PyramidLevel
@@ -61,40 +58,20 @@ MISFIT_WINDOW, HALVING_MISFIT, MISFIT_POWER, MAX_MISFIT = (9, 9), 15.0, 3, 40.0
 LEAST_PENALTY = 10
 
 
-@dataclass(frozen=True)
-class CoarserCandidates:
-    """What the coarser level considers for the cells of a level.
-
-    heights : (m, e, f) int32, level indices of the coarser level; cells : where the cells of the level lie in it.
-    """
-
-    heights: NDArray[np.int32]
-    cells: CoarserCells
-
-    @classmethod
-    def of(cls, level: PyramidLevel, coarser_result: LevelResult, options: PyramidOptions) -> CoarserCandidates:
-        """The candidates of the coarser level for a level."""
-        window, coarser_window = level.window, coarser_result.level.window
-        cells = CoarserCells(window.row - 2 * coarser_window.row, window.col - 2 * coarser_window.col, CANDIDATE_REACH)
-        return cls(np.ascontiguousarray(candidates(coarser_result, options), np.int32), cells)
-
-    def add_costs(self, cost: NDArray[np.uint8], lattice: HeightLattice, slope_surface: SlopeSurface) -> None:
-        """Add the costs of heights far from the candidates; changes `cost`, (v,) uint8."""
-        add_costs_of_candidates(
-            cost, lattice.layout, slope_surface.cells, self.heights, self.cells, COST_OF_CANDIDATES
-        )  # fmt: skip
-
-    def heights_nearby(self, lattice: HeightLattice, slope_surface: SlopeSurface) -> NDArray[np.bool_]:
-        """Which heights of each block are near a candidate for one of its cells, (b, d, h) bool.
-
-        The images are compared at no others: in a block with a tower and a street most heights lie between the two, and
-        cost the most already. This halves the time of the comparison in a town.
-        """
-        is_near = np.empty((*lattice.count.shape, int(lattice.count.max())), np.bool_)
-        mark_heights_near_candidates(
-            lattice.layout, slope_surface.cells, self.heights, self.cells, COST_OF_CANDIDATES, is_near
-        )  # fmt: skip
-        return is_near
+def costs_of_coarser(
+    lattice: HeightLattice,
+    slope_surface: SlopeSurface,
+    level: PyramidLevel,
+    coarser_result: LevelResult,
+    options: PyramidOptions,
+) -> NDArray[np.uint8]:
+    """The costs of heights far from the candidates of the coarser level, (v,) uint8, see `HeightLattice.layout`."""
+    window, coarser_window = level.window, coarser_result.level.window
+    cells = CoarserCells(window.row - 2 * coarser_window.row, window.col - 2 * coarser_window.col, CANDIDATE_REACH)
+    found = np.ascontiguousarray(candidates(coarser_result, options), np.int32)
+    cost = np.zeros(lattice.size, np.uint8)
+    add_costs_of_candidates(cost, lattice.layout, slope_surface.cells, found, cells, COST_OF_CANDIDATES)
+    return cost
 
 
 def add_costs_beyond_expected(

@@ -48,9 +48,9 @@ from zlocus.matching.occlusion import (
 from zlocus.matching.overlap import CoarsestHeights, ExpectedBounds, OverlapGround, find_overlap_window, overlap_ground
 from zlocus.matching.pair_labels import PairLabels, TileLabels, label_pairs_at_ties
 from zlocus.matching.prior_costs import (
-    CoarserCandidates,
     add_costs_beyond_expected,
     add_costs_far_from_surface,
+    costs_of_coarser,
     misfit,
     penalties_after_misfit,
 )
@@ -312,13 +312,13 @@ def match_level(
     search = search_along_slope(tile, level, prior)
     visible = visible_heights(tile, level, search, prior)
     chosen = _chosen_views(tile, level, search, visible, prior, pair_labels)
-    taught_heights, of_coarser = None, None
+    taught_heights, known_costs = None, None
     if earlier_result is not None and learns_evidence(tile):
         taught_heights = heights_to_learn_from(earlier_result, level, search.slope_surface)
     if taught_heights is not None and prior.coarser_result is not None:
-        of_coarser = CoarserCandidates.of(level, prior.coarser_result, config.pyramid)
-        nearby = of_coarser.heights_nearby(search.lattice, search.slope_surface)
-        taught_heights = replace(taught_heights, is_near=nearby)
+        known_costs = costs_of_coarser(
+            search.lattice, search.slope_surface, level, prior.coarser_result, config.pyramid
+        )  # fmt: skip
     cost = cost_volume(
         search.slope_views,
         search.slope_surface,
@@ -327,6 +327,7 @@ def match_level(
         config.cost,
         CountedPairs.of(tile),
         taught_heights,
+        known_costs,
     )
     if tile.method != "mvll" and prior.coarser_result is None:
         add_costs_beyond_expected(cost, search.lattice, search.slope_surface, tile.match_scene, level)
@@ -335,14 +336,12 @@ def match_level(
     if tile.method == "mvll":
         heights = winner_takes_all_heights(cost, search.lattice)
     else:
-        if of_coarser is not None:
-            of_coarser.add_costs(cost, search.lattice, search.slope_surface)
         penalties = penalties_at_edges(
             search.tile_views, search.smooth, covered, alike, level, config.semiglobal
         )  # fmt: skip
         # In image space P1 is that of close objects, however many images there are.
         n_images = PAIR if tile.method == "gc3-sgm" else chosen.usual_number(level.core)
-        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, n_images, of_coarser is not None)
+        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, n_images, known_costs is not None)
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
 

@@ -215,16 +215,24 @@ def test_the_order_of_the_views_does_not_matter(n_views):
     assert (np.abs(volumes[0] - volumes[1]) > 1).mean() < FEW
 
 
-def test_heights_far_from_all_candidates_are_not_compared():
-    """They cost the most; the others cost as much as where all heights are compared."""
+def test_heights_that_cost_the_most_before_in_all_cells_of_a_block_are_not_compared():
+    """They cost the most afterwards too; at the others the evidence is added to the costs that were known."""
     scene, visible = scene_and_visibility()
     table = table_with(np.random.default_rng(4).uniform(-1.0, 1.0, TABLE_SHAPE).astype(np.float32))
-    every, lattice = run(scene, visible, TableAndCounts(table, NO_COUNTS))
-    is_near = np.random.default_rng(5).random((*lattice.count.shape, N_HEIGHTS)) < 0.6
-    found, _ = run(scene, visible, TableAndCounts(table, NO_COUNTS, is_near))
-    every, found = dense(every, lattice, np.inf), dense(found, lattice, np.inf)
-    of_cells = is_near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[: SHAPE[0], : SHAPE[1]]
-    np.testing.assert_array_equal(found, np.where(of_cells, every, 255))
+    alone, lattice = run(scene, visible, TableAndCounts(table, NO_COUNTS))
+    rng, far = np.random.default_rng(5), 30
+    is_far = (rng.random((*lattice.count.shape, N_HEIGHTS)) < 0.4).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
+    known = np.where(is_far[: SHAPE[0], : SHAPE[1]], far, rng.integers(0, far + 1, (*SHAPE, N_HEIGHTS)))
+    # Every cell of an even lattice has all heights, and blocks of a row of blocks follow each other, row by row.
+    volume = np.concatenate(
+        [known[r, c : c + BLOCK].ravel() for r in range(SHAPE[0]) for c in range(0, SHAPE[1], BLOCK)]
+    ).astype(np.uint8)
+    np.testing.assert_array_equal(dense(volume, lattice, np.inf), known)
+    evidence = TableAndCounts(table, NO_COUNTS, np.uint8(far))
+    tile_costs(scene.arrays, flat_slope(scene), lattice.layout, HALVES, visible, PARAMETERS, evidence, volume)
+    compared = np.minimum(dense(alone, lattice, np.inf) + known, 255)
+    expected = np.where(is_far[: SHAPE[0], : SHAPE[1]], 255, compared)
+    np.testing.assert_array_equal(dense(volume, lattice, np.inf), expected)
 
 
 def test_evidence_of_small_windows_is_worth_more():

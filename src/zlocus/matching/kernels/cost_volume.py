@@ -253,13 +253,14 @@ def rounded_costs(total, pair_weight, n_covering, grey_weight, n_sizes, n, out):
 
 # (h,p) u1, i8, (r,d) u1 -> None
 @kernel
-def heights_last(codes, width, out):
-    """Write costs that are one flat plane per height as rows of cells, each cell with all its heights."""
+def add_heights_last(codes, width, out):
+    """Add costs that are one flat plane per height to rows of cells, each cell with all its heights."""
     count = codes.shape[0]
     for r in range(out.shape[0]):
         for c in range(out.shape[1] // count):
             for k in range(count):
-                out[r, c * count + k] = codes[k, r * width + c]
+                at = c * count + k
+                out[r, at] = np.uint8(min(np.int32(out[r, at]) + np.int32(codes[k, r * width + c]), np.int32(255)))
 
 
 # (p,) f4, i8, f4, i8, f4, i8, (p,) f4 -> None
@@ -323,7 +324,7 @@ def factor_of_greys(evidence, weight, max_difference):
 # ViewArrays, (r,c) f4, HeightSpan, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (r,d) u1 -> None
 @kernel
 def block_costs(views, relief, span, windows, visible, parameters, evidence, out):
-    """Write the costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and
+    """Add the costs of one block: 64 (1 - mean NCC over all pairs of usable views, averaged over window sizes), and
     as much, weighted, for the grey differences of the same pairs; or, with a table of `evidence`, the costs that follow
     from it. Where a table is being learned, its bins are counted, and the costs have no meaning.
 
@@ -334,7 +335,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     takes = covering_views(of_block, span)
     weight = parameters.grey_weight_of_one_pair if takes.shape[0] == 2 else parameters.grey_weight
     if takes.shape[0] < 2:
-        out[:] = np.uint8(UNCOVERED_COST * (np.float32(1.0) + weight))
+        out += np.uint8(UNCOVERED_COST * (np.float32(1.0) + weight))
         return
     nodes, heights, block, variance = views.nodes, views.heights, views.block, parameters.window_variance
     n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
@@ -353,7 +354,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     grey_factor = factor_of_greys(evidence, weight * np.float32(n_sizes), parameters.max_grey_difference)
     for k in range(span.n_heights):
         height, m = np.int32(span.first + k), 0
-        if not is_height_needed(evidence, height, k):
+        if not is_height_needed(evidence, span, k, out):
             continue
         t, n_whole = heights[0] + height * heights[1], count_whole_views(of_block, takes, height)
         total[:n], counts[:, :n] = 0.0, n_whole
@@ -381,7 +382,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
         weights = PairWeights(pairs, shown, counts, is_part, excluded, pairs_compared, weight, share, height)
         at_height = PairWindows(planes[:m], windows, greys[:m], grey_factor, width, in_block[:m], takes[in_block[:m]])
         costs_at_height(at_height, WindowMoments(mean[:m], scale[:m]), of_pairs, weights, evidence, total, codes[k])
-    heights_last(codes, width, out)
+    add_heights_last(codes, width, out)
 
 
 # i8, i8 -> FlatVisibility
@@ -431,24 +432,25 @@ def cells_of_block(block_row, block_col, block, n_rows, n_cols):
     )  # fmt: skip
 
 
-# as TableAndCounts, sliced: TableAndCounts, CellBox, i8 -> TableAndCounts
+# as TableAndCounts, sliced: TableAndCounts, CellBox -> TableAndCounts
 @kernel
-def evidence_in(evidence, box, block):
-    """The table, and the counts with the reference heights of the cells of a block. block : cells along its side."""
-    of_tile, b, d = evidence.learning, box.first_row // block, box.first_col // block
+def evidence_in(evidence, box):
+    """The table, and the counts with the reference heights of the cells of a rectangle."""
+    of_tile = evidence.learning
     reference = of_tile.reference[box.first_row : box.end_row, box.first_col : box.end_col]
     by_bin, by_pair = (of_tile.right, of_tile.wrong), (of_tile.right_of_pair, of_tile.wrong_of_pair)
     learning = Learning(reference, of_tile.wrong_every, *by_bin, *by_pair, of_tile.grey_roots)
-    return TableAndCounts(evidence.table, learning, evidence.is_near[b : b + 1, d : d + 1])
+    return TableAndCounts(evidence.table, learning, evidence.far_cost)
 
 
 # ViewArrays, SlopeArrays, VolumeLayout, (w,) i8, VisibleHeights, CostParameters, TableAndCounts, (v,) u1 -> None
 @kernel
 def tile_costs(views, slope, layout, windows, visible, parameters, evidence, volume):
-    """Write `block_costs` of every block of a tile. A table is learned from blocks with reference heights.
+    """Add `block_costs` of every block of a tile. A table is learned from blocks with reference heights.
 
     views : whose nodes follow the slanted support surface; slope : with as many cells around the tile as the half width
-    of the largest window; windows : half widths, ascending; volume : (v,) uint8, laid out as `layout` says.
+    of the largest window; windows : half widths, ascending; volume : (v,) uint8, laid out as `layout` says, with
+    the costs that are known before the images are compared.
     """
     n_rows, n_cols = visible.lowest_covered.shape[1], visible.lowest_covered.shape[2]
     block = views.block
@@ -457,7 +459,7 @@ def tile_costs(views, slope, layout, windows, visible, parameters, evidence, vol
             box = cells_of_block(br, bc, block, n_rows, n_cols)
             span = HeightSpan(layout.first[br, bc], layout.n_heights[br, bc])
             r0, r1, c0, c1 = box.first_row, box.end_row, box.first_col, box.end_col
-            evidence_of_block = evidence_in(evidence, box, block)
+            evidence_of_block = evidence_in(evidence, box)
             if evidence.learning.right.shape[0] > 0 and np.isnan(evidence_of_block.learning.reference).all():
                 continue
             first, length = layout.block_row_start[br, 0], layout.row_length[br, 0]

@@ -79,8 +79,8 @@ class Learning(NamedTuple):
     grey_roots: np.ndarray  # (i,i) f8: sum of the roots of the grey differences of each pair at right heights
 
 
-# Heights that are compared, where all of them are.
-ALL_HEIGHTS = np.zeros((0, 0, 0), np.bool_)
+# No height costs so much that it would not be compared.
+NO_COST_IS_FAR = np.uint8(255)
 
 
 class TableAndCounts(NamedTuple):
@@ -88,7 +88,7 @@ class TableAndCounts(NamedTuple):
 
     table: EvidenceTable  # EvidenceTable: the table
     learning: Learning  # Learning: the counts
-    is_near: np.ndarray = ALL_HEIGHTS  # (b,d,h) b1: heights of each block that are compared; no elements: all
+    far_cost: np.uint8 = NO_COST_IS_FAR  # u1: heights that cost as much already in all cells are not compared
 
 
 class PairScratch(NamedTuple):

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from zlocus.core.jit import kernel
-from zlocus.matching.kernels.evidence import GREY_LIMIT, N_LIKENESS, POSITION, describe_views, write_pair_bins
+from zlocus.matching.kernels.evidence import (
+    GREY_LIMIT,
+    N_LIKENESS,
+    NO_COST_IS_FAR,
+    POSITION,
+    describe_views,
+    write_pair_bins,
+)
 from zlocus.matching.kernels.ncc import ViewPair
 
 # Heights so many steps from the reference are wrong, nearer ones may be right.
@@ -20,16 +27,29 @@ def counts_wrong_heights(learning, height):
     return learning.wrong_every > 0 and height % learning.wrong_every == 0
 
 
-# TableAndCounts, i4, i8 -> b1
+# (r,d) u1, i8, i8, u1 -> b1
 @kernel
-def is_height_needed(evidence, height, block_step):
-    """Whether costs or counts are made at a height of a block. block_step : number of the height in its search range.
+def any_costs_less(costs, n_heights, block_step, far_cost):
+    """Whether a height costs less than `far_cost` in any cell of a block, whose costs (r, c * n_heights) are given."""
+    for r in range(costs.shape[0]):
+        for at in range(block_step, costs.shape[1], n_heights):
+            if costs[r, at] < far_cost:
+                return True
+    return False
+
+
+# TableAndCounts, HeightSpan, i8, (r,d) u1 -> b1
+@kernel
+def is_height_needed(evidence, span, block_step, costs):
+    """Whether costs or counts are made at a height of a block. block_step : number of the height in its search range;
+    costs : known before the images are compared.
 
     Where bins are counted, only heights that are right, or counted as wrong, in any of its cells are needed.
     """
-    learning = evidence.learning
+    learning, height = evidence.learning, np.int32(span.first + block_step)
     if learning.right.shape[0] == 0:
-        return evidence.is_near.shape[0] == 0 or evidence.is_near[0, 0, block_step]
+        is_wanted = evidence.far_cost == NO_COST_IS_FAR
+        return is_wanted or any_costs_less(costs, span.n_heights, block_step, evidence.far_cost)
     counts_wrong = counts_wrong_heights(learning, height)
     for r in range(learning.reference.shape[0]):
         for c in range(learning.reference.shape[1]):

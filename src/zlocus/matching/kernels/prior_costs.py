@@ -98,40 +98,6 @@ def costs_around(candidates, row, col, reach, span, by_distance, distance, out):
         out[k] = np.int32(cost_of_distance(np.float32(distance[k]), by_distance) + np.float32(0.5))
 
 
-# CoarserCells, i8, i8, i8, i8 -> CellBox
-@kernel
-def cells_of_coarser(coarser, row, col, rows, cols):
-    """The cells of a level of rows x cols cells in one cell of the next coarser level."""
-    return CellBox(
-        max(2 * row - coarser.row, 0), min(2 * row + 2 - coarser.row, rows),
-        max(2 * col - coarser.col, 0), min(2 * col + 2 - coarser.col, cols),
-    )  # fmt: skip
-
-
-# VolumeLayout, (r,c) f4, (m,e,f) i4, CoarserCells, DistanceCost, (b,d,h) b1 -> None
-@kernel
-def mark_heights_near_candidates(layout, slope_cells, candidates, coarser, by_distance, is_near):
-    """Mark the heights of each block that are near a candidate for any of its cells.
-
-    Near are heights that cost less than the largest cost, see `add_costs_of_candidates`, whose arguments these are.
-    """
-    (rows, cols), reach, block = slope_cells.shape, coarser.reach, layout.block
-    of_tile = span_of_cells(layout, slope_cells, CellBox(0, rows, 0, cols))
-    distance, added = np.empty(of_tile.n_heights, np.int32), np.empty(of_tile.n_heights, np.int32)
-    is_near[:] = False
-    for row in range(coarser.row // 2, (coarser.row + rows - 1) // 2 + 1):
-        for col in range(coarser.col // 2, (coarser.col + cols - 1) // 2 + 1):
-            box = cells_of_coarser(coarser, row, col, rows, cols)
-            span = span_of_cells(layout, slope_cells, box)
-            costs_around(candidates, row, col, reach, span, by_distance, distance, added)
-            for r in range(box.first_row, box.end_row):
-                for c in range(box.first_col, box.end_col):
-                    b, d = r // block, c // block
-                    first = np.uint64(lowest_height(layout, r, c, slope_cells[r, c]) - span.first)
-                    for k in range(np.uint64(layout.n_heights[b, d])):
-                        is_near[b, d, k] |= np.float32(added[first + k]) < by_distance.max_cost
-
-
 # (v,) u1, VolumeLayout, (r,c) f4, (m,e,f) i4, CoarserCells, DistanceCost -> None
 @kernel
 def add_costs_of_candidates(cost, layout, slope_cells, candidates, coarser, by_distance):
@@ -145,7 +111,10 @@ def add_costs_of_candidates(cost, layout, slope_cells, candidates, coarser, by_d
     distance, added = np.empty(of_tile.n_heights, np.int32), np.empty(of_tile.n_heights, np.int32)
     for row in range(coarser.row // 2, (coarser.row + rows - 1) // 2 + 1):
         for col in range(coarser.col // 2, (coarser.col + cols - 1) // 2 + 1):
-            box = cells_of_coarser(coarser, row, col, rows, cols)
+            box = CellBox(
+                max(2 * row - coarser.row, 0), min(2 * row + 2 - coarser.row, rows),
+                max(2 * col - coarser.col, 0), min(2 * col + 2 - coarser.col, cols),
+            )  # fmt: skip
             span = span_of_cells(layout, slope_cells, box)
             costs_around(candidates, row, col, reach, span, by_distance, distance, added)
             for r in range(box.first_row, box.end_row):
