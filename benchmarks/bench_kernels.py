@@ -87,7 +87,8 @@ def timed(benchmark, case: Case) -> float:
 
 
 def views(n_views: int, side: int = SIDE):
-    """Pixels, layout, nodes and heights of synthetic views; neighbouring heights are half a pixel apart."""
+    """Pixels, layout, nodes, bends (none) and heights of synthetic views; neighbouring heights are half a pixel
+    apart."""
     rng = np.random.default_rng(7)
     px = side + 96
     corners = np.mgrid[: side // BLOCK + 1, : side // BLOCK + 1] * BLOCK
@@ -99,7 +100,8 @@ def views(n_views: int, side: int = SIDE):
         nodes[i, ..., 1, 1] = 3.0 * i
     pixels = rng.normal(size=n_views * px * px).astype(np.float32)
     layout = np.array([(i * px * px, px, px) for i in range(n_views)], np.int64)
-    return pixels, layout, nodes, np.array([-1.0, 2.0 / 64.0])
+    bends = np.empty((n_views, *np.subtract(nodes.shape[1:3], 1), 2, 2, 0))
+    return pixels, layout, nodes, bends, np.array([-1.0, 2.0 / 64.0])
 
 
 def all_visible(n_views: int, side: int = SIDE) -> VisibleHeights:
@@ -134,7 +136,7 @@ def rolling(side: int = SIDE) -> np.ndarray:
 def resample_case() -> Case:
     """Bilinear samples of one view on the plane of a block and its margin."""
     image, side = image_of(ViewArrays(*views(1), BLOCK), 0), BLOCK + 6
-    grid = BlockGrid(AxisGrid(60.3, 0.99, -0.02, 0.0), AxisGrid(60.7, 0.01, 1.01, 0.0))
+    grid = BlockGrid(AxisGrid(60.3, 0.99, -0.02, 0.0, 0.0, 0.0), AxisGrid(60.7, 0.01, 1.01, 0.0, 0.0, 0.0))
     cells, scratch = flat_cells(side, side), resample_scratch(side * side)
     relief, out = np.zeros(side * side, np.float32), np.empty(side * side, np.float32)
     velocity = PixelVelocity(np.float32(0.5), np.float32(0.1))
@@ -318,12 +320,12 @@ def agreement_case(n_views: int = 6, side: int = SIDE) -> Case:
 
 def reach_case() -> Case:
     """Visible height range of a block that the borders of three images cross at each of 64 heights (the slow case)."""
-    pixels, layout, nodes, heights = views(3)
+    pixels, layout, nodes, bends, heights = views(3)
     layout[:, 2] = 48 + BLOCK // 2
     span, low, high = HeightSpan(0, 64), np.full(3, -1), np.full(3, 64)
     lowest, highest = np.empty((3, BLOCK, BLOCK), np.int32), np.empty((3, BLOCK, BLOCK), np.int32)
     masks = ViewMasks(np.zeros(pixels.shape, bool), np.zeros(3, bool))
-    arrays = ViewArrays(pixels, layout, np.ascontiguousarray(nodes[:, :2, :2]), heights, BLOCK)
+    arrays = ViewArrays(pixels, layout, np.ascontiguousarray(nodes[:, :2, :2]), bends[:, :1, :1], heights, BLOCK)
 
     def call():
         for _ in range(50):

@@ -47,7 +47,6 @@ def drone_block(workplace: Workplace, spec: DroneBlockSpec | None = None, area_m
     bounds = _area(scene / "truth_dsm.tif", spec, area_m)
     resolution = TRUTH_CELLS * spec.step_m
     command = [ZLOCUS, "dsm", scene / "scene.yaml", "-o", out, "--resolution", resolution, "--bounds", *bounds]
-    # A tile of 20 frames takes 9 GB, so one is matched at a time.
     run([*command, "--workers", 1, "--no-report", "--overwrite"], accept=(0, COVERAGE_SHORT))
     record = json.loads((out / "run.json").read_text())
     judged = workplace.out / "judged"

@@ -22,8 +22,9 @@ from zlocus.matching.edge_penalties import (
 )
 from zlocus.matching.level_records import PyramidLevel
 from zlocus.matching.semiglobal import jump_penalties
-from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
 from zlocus.matching.view_directions import cells_per_step, directions_of_blocks
+from zlocus.matching.view_pixels import ViewPixels
 from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE, SIDE_PX = 0.5, 0.5, 16, (40, 60), 301
@@ -34,9 +35,9 @@ def views_of(*angles, grey=None):
     """Views from satellites with angles (along, across) in degrees, all of one image (301, 301)."""
     transform = Affine(CELL_M, 0, CENTRE[0] - 15.0, 0, -CELL_M, CENTRE[1] + 10.0)
     image = np.zeros((SIDE_PX, SIDE_PX), np.float32) if grey is None else grey.astype(np.float32)
-    mask = (np.ones((SIDE_PX, SIDE_PX), bool),)
+    mask = np.ones((SIDE_PX, SIDE_PX), bool)
     pixels = [
-        ViewPixels(SatelliteCamera((*CENTRE, 50.0), (150.0, 150.0), CELL_M, *each), (0, 0), 0.0, 1.0, (image,), mask)
+        ViewPixels(SatelliteCamera((*CENTRE, 50.0), (150.0, 150.0), CELL_M, *each), (0, 0), image, mask)
         for each in angles
     ]
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)

@@ -8,8 +8,9 @@ from affine import Affine
 
 from rendered_scenes import CENTRE
 from zlocus.matching.local_contrast import MIN_AGREEMENT_SHARE, MIN_SHARED_CELLS, agreement, edge_image
-from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
 from zlocus.matching.true_ortho import ortho_image
+from zlocus.matching.view_pixels import ViewPixels
 from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE, SIDE_PX = 0.5, 0.5, 16, (40, 60), 201
@@ -24,8 +25,8 @@ def views_of(*greys):
     """Views straight from above that show the given images (201, 201)."""
     transform = Affine(CELL_M, 0, CENTRE[0] - 15.0, 0, -CELL_M, CENTRE[1] + 10.0)
     sensor = SatelliteCamera((*CENTRE, 50.0), (100.0, 100.0), CELL_M, 0.0, 0.0)
-    mask = (np.ones((SIDE_PX, SIDE_PX), bool),)
-    pixels = [ViewPixels(sensor, (0, 0), 0.0, 1.0, (np.asarray(grey, np.float32),), mask) for grey in greys]
+    mask = np.ones((SIDE_PX, SIDE_PX), bool)
+    pixels = [ViewPixels(sensor, (0, 0), np.asarray(grey, np.float32), mask) for grey in greys]
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
     return tile_views(pixels, TileGrid(0, transform, SHAPE, BLOCK, ORIGIN_M, STEP_M), z, 2)
 

@@ -20,8 +20,9 @@ from zlocus.matching.occlusion import (
     usual_number,
 )
 from zlocus.matching.slope_surface import SlopeSurface
-from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
 from zlocus.matching.view_directions import cells_per_step, parts_of_one_direction
+from zlocus.matching.view_pixels import ViewPixels
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
 
@@ -37,9 +38,9 @@ def sensor(along=0.0, across=0.0):
 def tile(sensors, valid=None):
     """A tile around the scene's centre and its lattice of heights."""
     transform = Affine(CELL_M, 0, CENTRE[0] - 12.5, 0, -CELL_M, CENTRE[1] + 7.5)
-    pixels = (np.zeros((101, 121), np.float32),)
-    mask = (np.ones((101, 121), bool) if valid is None else valid,)
-    windows = [ViewPixels(s, (0, 0), 0.0, 1.0, pixels, mask) for s in sensors]
+    pixels = np.zeros((101, 121), np.float32)
+    mask = np.ones((101, 121), bool) if valid is None else valid
+    windows = [ViewPixels(s, (0, 0), pixels, mask) for s in sensors]
     blocks = (-(-SHAPE[0] // BLOCK), -(-SHAPE[1] // BLOCK))
     lattice = HeightLattice(
         ORIGIN_M, STEP_M, SHAPE, BLOCK, np.zeros(blocks, np.int64), np.full(blocks, N_STEPS, np.int64)
@@ -257,7 +258,7 @@ def test_a_wide_lens_sees_behind_a_tower_from_its_own_side():
     turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
     camera = FrameModel((*CENTRE, 150.0), turn, 100.0, (200.0, 100.0))
     pixels = np.zeros((201, 401), np.float32)
-    window = ViewPixels(camera, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    window = ViewPixels(camera, (0, 0), pixels, np.ones(pixels.shape, bool))
     views = tile_views([window], TileGrid(0, transform, shape, block, 0.0, 1.0), (0.0, 40.0), 2)
     surface = np.zeros(shape, np.float32)
     surface[24:40, 40:46] = surface[24:40, 210:216] = 30.0

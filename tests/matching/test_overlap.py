@@ -175,7 +175,7 @@ def test_where_most_cells_are_at_the_edge_none_is(edge, monkeypatch):
     lattice = HeightLattice(0.0, 1.0, (ROWS, COLS), 4, np.zeros((3, 15), np.int64), np.full((3, 15), LAST, np.int64))
     window = CellWindow(0, 0, ROWS, COLS)
     coarsest = CoarsestHeights(None, lattice, matched, window, 0, ground(), expected)
-    found = overlap_ground([], coarsest, LAST, CELL_STEPS)
+    found = overlap_ground(coarsest, LAST, CELL_STEPS)
     assert found.is_at_edge.any() == (edge > EDGE)
     assert found.is_outside.any() == (edge > EDGE)
     assert np.isinf(found.max_ground).all() == (edge < EDGE)

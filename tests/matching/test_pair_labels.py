@@ -37,7 +37,7 @@ def test_labels_of_a_kernel_scene_are_symmetric_and_poor_with_itself():
     scene = kernel_scene()
     holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
     views = TileViews(scene.pixels, np.zeros(len(scene.pixels), bool), np.zeros(3, bool), scene.layout, scene.nodes,
-                      holds, ~holds, scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
+                      scene.bends, holds, ~holds, scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
     rng = np.random.default_rng(2)
     xy = rng.uniform((0, 0), (scene.shape[1], scene.shape[0]), (50, 2))
     window = CellWindow(0, 0, *scene.shape)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from kernel_scene import at_all_heights
+from kernel_scene import at_all_heights, kernel_scene
 from rendered_scenes import PART, rendered, run
 from zlocus.core.options import PlaneOptions
 from zlocus.matching import finest_level, tile
@@ -23,6 +23,7 @@ from zlocus.matching.kernels.plane_fitting import (
     segment_loci,
     solve_damped,
 )
+from zlocus.matching.kernels.resample import block_grid, coordinate
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.local_contrast import deviation
 from zlocus.matching.plane_fitting import PlanarHeights, plain_segments, share_below, with_planes
@@ -81,8 +82,8 @@ def views(parallax=PARALLAX, roof_texture=0.0, bow=0.0) -> TileViews:
     pixels = np.concatenate([image.ravel() for image in images])
     held = np.ones((len(parallax), n_nodes - 1, n_nodes - 1), bool)
     return TileViews(
-        pixels, np.zeros(len(pixels), bool), np.zeros(len(parallax), bool), layout, nodes, held, ~held,
-        np.array([0.0, 1.0]), at_all_heights(held), BLOCK,
+        pixels, np.zeros(len(pixels), bool), np.zeros(len(parallax), bool), layout, nodes,
+        np.empty((*held.shape, 2, 2, 0)), held, ~held, np.array([0.0, 1.0]), at_all_heights(held), BLOCK,
     )  # fmt: skip
 
 
@@ -313,7 +314,7 @@ def test_greys_and_their_slopes():
     row, col = rng.integers(0, SIDE, (2, n))
     start, asked = rng.uniform(0, 20, (2, n))
     locus = np.empty((len(PARALLAX), n, 4))
-    segment_loci(seen_by.nodes, seen_by.t_of_index, BLOCK, row, col, start, locus)
+    segment_loci(seen_by.arrays, row, col, start, locus)
     np.testing.assert_allclose(locus[1, :, 0], col + MARGIN_PX + 0.5 * start)
     np.testing.assert_allclose(locus[2, :, 1:], np.column_stack([row + MARGIN_PX, np.full(n, -0.5), np.zeros(n)]))
     grey, slope, near, _ = np.empty((4, len(PARALLAX), n))
@@ -324,6 +325,23 @@ def test_greys_and_their_slopes():
     )
     np.testing.assert_allclose(np.where(crosses, 0, (near - grey) / 1e-4 - slope), 0, rtol=0, atol=1e-3)
     np.testing.assert_allclose(grey[0], seen_by.pixels[(row + MARGIN_PX) * seen_by.layout[0, 2] + col + MARGIN_PX])
+
+
+def test_loci_of_bent_blocks_are_those_of_their_grids():
+    scene = kernel_scene(is_bent=True)
+    rng = np.random.default_rng(5)
+    row, col = (rng.integers(0, side, 60) for side in scene.shape)
+    start, step = rng.uniform(0, 20, 60), 1e-4
+    locus = np.empty((scene.n_views, 60, 4))
+    segment_loci(scene.arrays, row, col, start, locus)
+    for view, n in np.ndindex(scene.n_views, 60):
+        b, d = row[n] // scene.block, col[n] // scene.block
+        places = []
+        for height in (start[n], start[n] + step):
+            grid = block_grid(scene.of_block(b, d), view, scene.heights[0] + height * scene.heights[1], 0)
+            places.append([coordinate(axis, row[n] - b * scene.block, col[n] - d * scene.block) for axis in grid])
+        np.testing.assert_allclose(locus[view, n, :2], places[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(locus[view, n, 2:], np.diff(places, axis=0)[0] / step, rtol=0, atol=1e-4)
 
 
 def slow_disagreement(grey, slope, visible, is_core, noise):

@@ -21,7 +21,7 @@ from zlocus.matching.radiometry import (
     grey_scales,
     image_grey,
 )
-from zlocus.matching.tile_views import read_pixels
+from zlocus.matching.view_pixels import PixelWindow, read_pixels
 
 SIZE_PX, GROUND_PX = 160, 400
 # Grey value of an albedo of 0 in each view, and by how much it grows per unit of albedo.
@@ -157,11 +157,11 @@ def test_what_one_side_of_an_image_has_more_is_taken_off():
     left, before = [], []
     for view, scale in zip(views, scales, strict=True):
         assert scale.trend is not None
-        read = read_pixels(view, (0, 0, SIZE_PX, SIZE_PX), 1, scale)
+        read = read_pixels(view, PixelWindow(0, 0, SIZE_PX, SIZE_PX), scale)
         np.testing.assert_array_equal(read.trend, scale.trend.window(0, 0, SIZE_PX, SIZE_PX))
-        part = read_pixels(view, (20, 30, 40, 50), 1, scale)
-        np.testing.assert_allclose(part.pixels[0], read.pixels[0][20:60, 30:80], rtol=0, atol=1e-4)
-        for found, pixels in ((left, read.pixels[0]), (before, (view.image.pixels - scale.mean) / scale.contrast)):
+        part = read_pixels(view, PixelWindow(20, 30, 40, 50), scale)
+        np.testing.assert_allclose(part.pixels, read.pixels[20:60, 30:80], rtol=0, atol=1e-4)
+        for found, pixels in ((left, read.pixels), (before, (view.image.pixels - scale.mean) / scale.contrast)):
             found.append(grey_at(replace(view, image=image_of(pixels)), at))
     left, before = (np.nanstd(np.array(found) - np.nanmean(found, axis=0)) for found in (left, before))
     assert before > 0.2

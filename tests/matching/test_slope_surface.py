@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from kernel_scene import at_all_heights, kernel_scene
+from reference.projection import position
+from zlocus.matching.kernels.cost_volume import views_of_block
 from zlocus.matching.kernels.resample import block_grid, coordinate
 from zlocus.matching.slope_surface import DAMPING, PATCH, ROUNDS, CoarserSlope, SlopeSurface, patch_medians, relaxed
 from zlocus.matching.tile_views import TileViews
@@ -17,6 +19,8 @@ SHAPE = (75, 104)
 STEPS, FLOAT32_STEPS = 1e-9, 1e-3
 # Positions of nodes, px, whose cubics are shifted in float64.
 POSITION_PX = 1e-9
+# In the middle of a block the product of the twists of the slope and of the projection remains.
+SLOPED_MIDDLE_PX = 1e-3
 # By how much corners that lie whole steps high may miss the rise of a plane over a patch.
 WHOLE_STEPS = 1.0
 # Share of the rise of a plane over a block that float32 slopes and their medians cost.
@@ -31,8 +35,25 @@ def plane(by_row, by_col, shape=SHAPE):
 def views_of(scene):
     none = np.zeros(len(scene.pixels), bool)
     holds = np.ones((scene.n_views, *np.subtract(scene.nodes.shape[1:3], 1)), bool)
-    return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, holds, ~holds,
-                      scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
+    return TileViews(scene.pixels, none, np.zeros(scene.n_views, bool), scene.layout, scene.nodes, scene.bends,
+                      holds, ~holds, scene.heights, at_all_heights(holds), scene.block)  # fmt: skip
+
+
+def test_bent_blocks_stay_bent_along_the_slope():
+    """In the middle of a block that rises evenly, slope index k is level index k + the mean of its corners."""
+    scene = kernel_scene(is_bent=True)
+    up = np.random.default_rng(4).uniform(-3, 3, scene.nodes.shape[1:3])
+    views = views_of(scene)
+    slope_views = SlopeSurface(up, scene.block, scene.shape, scene.block).along(views)
+    start, step = scene.heights
+    for view in range(scene.n_views):
+        for b, d in np.ndindex(scene.nodes.shape[1] - 1, scene.nodes.shape[2] - 1):
+            t = start + (7 + up[b : b + 2, d : d + 2].mean()) * step
+            node, bend = scene.of_one_block(view, b, d)
+            expected = position(node, np.float64(t), scene.block / 2, scene.block / 2, scene.block, bend)
+            grid = block_grid(views_of_block(slope_views.arrays, b, d), view, start + 7 * step, 0)
+            found = [coordinate(axis, scene.block / 2, scene.block / 2) for axis in grid]
+            np.testing.assert_allclose(found, expected, rtol=0, atol=SLOPED_MIDDLE_PX)
 
 
 def test_views_along_the_slope_take_slope_indices():
@@ -46,15 +67,12 @@ def test_views_along_the_slope_take_slope_indices():
     for view in range(scene.n_views):
         for b, d in np.ndindex(scene.nodes.shape[1] - 1, scene.nodes.shape[2] - 1):
             for k in (-7, 0, 19.25):
-                corner = slope_views.nodes[:, b : b + 2, d : d + 2]
-                grid = block_grid(corner, view, start + k * step, scene.block, 0)
+                grid = block_grid(views_of_block(slope_views.arrays, b, d), view, start + k * step, 0)
                 for i, j in np.ndindex(2, 2):
                     t = start + (k + up[b + i, d + j]) * step
-                    alone = np.broadcast_to(scene.nodes[view, b + i, d + j], (1, 2, 2, 2, 4))
-                    plain = block_grid(np.ascontiguousarray(alone), 0, t, scene.block, 0)
                     r, c = i * scene.block, j * scene.block
                     found = coordinate(grid.x, r, c), coordinate(grid.y, r, c)
-                    expected = plain.x.origin, plain.y.origin
+                    expected = scene.nodes[view, b + i, d + j] @ t ** np.arange(4)
                     np.testing.assert_allclose(found, expected, rtol=0, atol=POSITION_PX)
 
 

@@ -40,7 +40,7 @@ from zlocus.matching.occlusion import EDGE_PX, covered_heights, covers, in_level
 from zlocus.matching.search_range import prior_from_coarser
 from zlocus.matching.semiglobal import aggregate, jump_penalties, winner_takes_all_indices
 from zlocus.matching.subpixel import parabola_peaks, profiles_around, smoothed
-from zlocus.matching.tile import LevelSearch, match_coarsest_level, read_tile, search_along_slope
+from zlocus.matching.tile import LevelSearch, match_coarsest_level, search_along_slope, tile_inputs
 from zlocus.matching.true_ortho import ortho_image
 from zlocus.matching.view_directions import cells_per_step, parts_of_one_direction
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -134,8 +134,8 @@ def stages():
     heights = HeightRange.limited_to(HEIGHTS_M)
     match_scene = build_match_scene(scene(), GSD_M, (0.0, 0.0), heights, ties, None, CONFIG.pyramid)
     first = round(-CENTRE[1] / GSD_M) - SHAPE[0] // 2, round(CENTRE[0] / GSD_M) - SHAPE[1] // 2
-    tile = read_tile(match_scene, CellWindow(*first, *SHAPE), CONFIG)
-    assert len(tile.view_pixels) == 3
+    tile = tile_inputs(match_scene, CellWindow(*first, *SHAPE), CONFIG)
+    assert len(tile.view_numbers) == 3
     coarsest = match_coarsest_level(tile).result
     level = tile.level(0)
     prior = prior_from_coarser(tile, level, coarsest)
@@ -160,7 +160,7 @@ def test_the_scene_is_worth_comparing(stages):
 
 def test_projection_tables_give_the_positions_of_the_cameras(stages):
     views, level = stages.search.tile_views, stages.level
-    for i, view_pixels in enumerate(stages.tile.view_pixels):
+    for i, view_pixels in enumerate(views.view_pixels):
         for b, d, rows, cols in stages.blocks():
             row, col = np.mgrid[rows, cols]
             x, y = level.transform * (col + 0.5, row + 0.5)

@@ -22,7 +22,8 @@ from zlocus.matching.subpixel import (
     refine,
     smoothed,
 )
-from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
+from zlocus.matching.view_pixels import ViewPixels
 from zlocus.synthetic.render import Sun, render
 from zlocus.synthetic.terrain import analytic_ground
 
@@ -195,9 +196,7 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
     shape, block = (48, 50), 16
     origin = 50.0 - (20 + fraction) * STEP_M
     transform = Affine(GSD_M, 0, CENTRE[0] - 12.5, 0, -GSD_M, CENTRE[1] + 12.0)
-    windows = [
-        ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane
-    ]
+    windows = [ViewPixels(sensor, (0, 0), pixels, np.ones(pixels.shape, bool)) for sensor, pixels in plane]
     z = (origin, origin + 50 * STEP_M)
     views = tile_views(windows, TileGrid(0, transform, shape, block, origin, STEP_M), z, 2)
     visible = VisibleHeights(*(np.full((len(LOOKS), *shape), index, np.int32) for index in (0, 50, 0)))
@@ -215,9 +214,7 @@ def test_a_planted_fraction_of_a_step(plane, fraction):
 def test_what_is_too_far_keeps_the_coarse_height(plane):
     shape, origin = (32, 32), 50.0 - 20 * STEP_M
     transform = Affine(GSD_M, 0, CENTRE[0] - 8, 0, -GSD_M, CENTRE[1] + 8)
-    windows = [
-        ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),)) for sensor, pixels in plane
-    ]
+    windows = [ViewPixels(sensor, (0, 0), pixels, np.ones(pixels.shape, bool)) for sensor, pixels in plane]
     views = tile_views(windows, TileGrid(0, transform, shape, 16, origin, STEP_M), (40.0, 70.0), 2)
     visible = VisibleHeights(*(np.full((len(LOOKS), *shape), index, np.int32) for index in (0, 50, 0)))
     coarse = np.full(shape, 32.0, np.float32)

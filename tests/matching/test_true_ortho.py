@@ -22,7 +22,7 @@ from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.occlusion import covered_heights, mark_occlusions
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.slope_surface import SlopeSurface
-from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
 from zlocus.matching.true_ortho import (
     CoarserHeights,
     Surroundings,
@@ -32,6 +32,7 @@ from zlocus.matching.true_ortho import (
     surroundings_of_tile,
     true_ortho,
 )
+from zlocus.matching.view_pixels import ViewPixels
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -58,9 +59,9 @@ def tile(sensors, greys=None, contrast=1.0, mean=0.0, shape=SHAPE, col=0):
     """Views of a grid around the scene's centre, each of one grey value, and what they cover. col : where it begins."""
     transform = Affine(CELL_M, 0, CENTRE[0] - 15.0 + col * CELL_M, 0, -CELL_M, CENTRE[1] + 10.0)
     greys = range(len(sensors)) if greys is None else greys
-    mask = (np.ones((201, 201), bool),)
+    mask, scale = np.ones((201, 201), bool), GreyScale(mean, contrast)
     pixels = [
-        ViewPixels(s, (0, 0), mean, contrast, (np.full((201, 201), g, np.float32),), mask)
+        ViewPixels(s, (0, 0), np.full((201, 201), g, np.float32), mask, scale)
         for s, g in zip(sensors, greys, strict=True)
     ]
     blocks = (-(-shape[0] // BLOCK), -(-shape[1] // BLOCK))
@@ -69,7 +70,7 @@ def tile(sensors, greys=None, contrast=1.0, mean=0.0, shape=SHAPE, col=0):
     )
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
     views = tile_views(pixels, TileGrid(0, transform, shape, BLOCK, ORIGIN_M, STEP_M), z, 2)
-    return pixels, views, covered_heights(views, SlopeSurface.flat(shape, BLOCK), lattice)
+    return views, covered_heights(views, SlopeSurface.flat(shape, BLOCK), lattice)
 
 
 def tower() -> np.ndarray:
@@ -88,7 +89,7 @@ def test_pixels_of_a_cell():
         FrameModel(tuple(centre), tuple(map(tuple, axes)), 2000.0, (100.0, 100.0))
         for axes, centre in ((rotation, above), (rotation @ aside.T, beside))
     ]
-    _, views, _ = tile([sensor(), sensor(gsd=1.0), *looks])
+    views, _ = tile([sensor(), sensor(gsd=1.0), *looks])
     size = pixels_per_cell(views)
     for found, expected in zip(size, (1.0, 0.25, 1.0, np.cos(o) ** 3), strict=True):
         np.testing.assert_allclose(found, expected, rtol=0.05, atol=0)
@@ -98,7 +99,7 @@ def test_pixels_of_a_cell():
 def test_cells_that_a_tower_occludes_are_shown_by_another_view(across, behind):
     """12 m high, seen 30 degrees from one side: 7 m, or 13 cells, of the ground behind it."""
     slanted, opposite = sensor(across=across), sensor(across=-across)
-    _, views, visible = tile([slanted, opposite])
+    views, visible = tile([slanted, opposite])
     best = best_view(views, visible, tower())
     hidden = best == 1
     assert hidden[behind].all()
@@ -120,8 +121,8 @@ def beside_the_tile(across):
     sensors = [sensor(across=across), sensor(across=-across)]
     surface = np.full(WIDE, LOW, np.float32)
     surface[BESIDE] = HIGH
-    _, views, visible = tile(sensors, shape=WIDE, col=-40)
-    _, part, of_part = tile(sensors, col=FIRST - 40)
+    views, visible = tile(sensors, shape=WIDE, col=-40)
+    part, of_part = tile(sensors, col=FIRST - 40)
     return surface, best_view(views, visible, surface), part, of_part
 
 
@@ -163,9 +164,9 @@ def test_coarser_levels_are_used_as_far_as_they_can_occlude():
 
 
 def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
-    _, views, visible = tile([sensor(across=30.0), sensor(across=-30.0)])
+    views, visible = tile([sensor(across=30.0), sensor(across=-30.0)])
     best = best_view(views, visible, tower())
-    _, views, visible = tile([sensor(across=-30.0), sensor(across=30.0)])
+    views, visible = tile([sensor(across=-30.0), sensor(across=30.0)])
     other = best_view(views, visible, tower())
     # Where the first of the two is hidden, the second is shown, and it is the first elsewhere.
     assert not ((best == 1) & (other == 1)).any()
@@ -174,12 +175,12 @@ def test_both_sides_are_hidden_from_the_views_that_look_over_the_other():
 
 
 def test_cells_that_no_view_sees():
-    pixels, views, visible = tile([sensor(across=30.0), sensor(across=31.0)])
+    views, visible = tile([sensor(across=30.0), sensor(across=31.0)])
     # Where a view that was matched counts as seeing it, that is shown all the same.
     assert (best_view(views, visible, tower()) >= 0).all()
     mark_occlusions(visible, views, tower(), np.zeros(SHAPE, np.float32), 1.0)
     best = best_view(views, visible, tower())
-    ortho = true_ortho(pixels, views, visible, tower())
+    ortho = true_ortho(views, visible, tower())
     assert (best < 0).sum() > 80
     np.testing.assert_array_equal(np.isnan(ortho), best < 0)
 
@@ -187,37 +188,43 @@ def test_cells_that_no_view_sees():
 def test_the_finer_view_is_shown_where_it_is_clearly_finer():
     flat = np.full(SHAPE, LOW, np.float32)
     for gsds, expected in (((0.5, 0.48), 0), ((0.5, 0.25), 1), ((0.25, 0.5), 0)):
-        _, views, visible = tile([sensor(gsd=gsd) for gsd in gsds])
+        views, visible = tile([sensor(gsd=gsd) for gsd in gsds])
         assert (best_view(views, visible, flat) == expected).all()
 
 
 def test_grey_values_are_those_of_the_image():
     """Scaled back from what is matched."""
-    pixels, views, visible = tile([sensor(), sensor(along=20.0)], greys=(0.25, -3.0), contrast=40.0, mean=500.0)
+    views, visible = tile([sensor(), sensor(along=20.0)], greys=(0.25, -3.0), contrast=40.0, mean=500.0)
     flat = np.full(SHAPE, LOW, np.float32)
-    np.testing.assert_allclose(true_ortho(pixels, views, visible, flat), 510.0, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(true_ortho(views, visible, flat), 510.0, rtol=0, atol=1e-3)
     np.testing.assert_allclose(ortho_image(views, flat, 1), -3.0, rtol=0, atol=1e-6)
 
 
 def test_grey_values_are_levelled_to_those_of_one_image():
     """0.25 of 40 above 500 is 0.25 of 8 above 100; a trend is taken off."""
     flat = np.full(SHAPE, LOW, np.float32)
-    pixels, views, visible = tile([sensor()], greys=(0.25,), contrast=40.0, mean=500.0)
-    fallen = [replace(view, trend=np.full((201, 201), 7.0, np.float32)) for view in pixels]
+    views, visible = tile([sensor()], greys=(0.25,), contrast=40.0, mean=500.0)
+
+    class Seven:
+        def window(self, row, col, rows, cols):
+            return np.full((rows, cols), 7.0, np.float32)
+
+    (view,) = views.view_pixels
+    fallen = replace(views, view_pixels=(replace(view, scale=replace(view.scale, trend=Seven())),))
     for held, scale, expected in (
-        (pixels, None, 510.0), (fallen, None, 517.0),
-        (pixels, GreyScale(100.0, 8.0), 102.0), (fallen, GreyScale(100.0, 8.0), 102.0),
+        (views, None, 510.0), (fallen, None, 517.0),
+        (views, GreyScale(100.0, 8.0), 102.0), (fallen, GreyScale(100.0, 8.0), 102.0),
     ):  # fmt: skip
-        np.testing.assert_allclose(true_ortho(held, views, visible, flat, scale=scale), expected, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(true_ortho(held, visible, flat, scale=scale), expected, rtol=0, atol=1e-3)
     red, green, blue = (np.full((201, 201), v, np.float32) for v in (517.0, 497.0, 547.0))
 
     class Coloured:
         def colours(self, row, col, rows, cols):
             return np.stack([red, green, blue])[:, row : row + rows, col : col + cols]
 
-    found = true_ortho(fallen, views, visible, flat, [Coloured()], scale=GreyScale(100.0, 8.0))
+    found = true_ortho(fallen, visible, flat, [Coloured()], scale=GreyScale(100.0, 8.0))
     np.testing.assert_allclose(found[5, 5], [102.0, 98.0, 108.0], rtol=0, atol=1e-3)
-    np.testing.assert_allclose(true_ortho(fallen, views, visible, flat, [Coloured()])[5, 5], [517, 497, 547], atol=1e-3)
+    np.testing.assert_allclose(true_ortho(fallen, visible, flat, [Coloured()])[5, 5], [517, 497, 547], atol=1e-3)
 
 
 @pytest.fixture(scope="module", params=["uint8", "uint16"])

@@ -125,7 +125,7 @@ def cell_costs(images, nodes, heights, index, block, halves, visible, parameters
     return np.where(covered.sum(axis=0) > 1, 64.0 * apart, UNCOVERED_COST * (1.0 + weight))
 
 
-def profile(images, nodes, heights, surface, offset, block, half, visible, variance=0.0, group=(0, 1)):
+def profile(images, nodes, heights, surface, offset, block, half, visible, variance=0.0, group=(0, 1), bends=None):
     """Mean NCC, (r, c), in windows of a block that follow a surface (r + 2 half, c + 2 half), plus `offset`.
 
     Or the part of it that comes from a group of pairs, see `mean_ncc`.
@@ -133,7 +133,11 @@ def profile(images, nodes, heights, surface, offset, block, half, visible, varia
     low, high, free_from = visible
     shape = low.shape[1:]
     t = heights[0] + (surface + offset) * heights[1]
-    planes = [cubic(image, positions(node, t, shape, block, half)) for image, node in zip(images, nodes, strict=True)]
+    bends = [None] * len(images) if bends is None else bends
+    planes = [
+        cubic(image, positions(node, t, shape, block, half, bend))
+        for image, node, bend in zip(images, nodes, bends, strict=True)
+    ]
     centre = surface[half : half + shape[0], half : half + shape[1]]
     is_seen = (low <= centre) & (centre <= high) & (free_from <= centre)
     return mean_ncc(planes, np.stack([is_seen, is_seen]), half, variance, group=group)

@@ -6,26 +6,31 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 
-def position(node, t, row, col, block):
+def position(node, t, row, col, block, bend=None):
     """(x, y) px of the cell (row, col) of a block at height t: bilinear between four corners, cubic in height.
 
     node : (2, 2, 2, 4) corner row, corner column, axis, coefficients. t, row, col : numbers, or arrays of one shape.
+    bend : (2, 2, 4) along rows and along columns, axis, coefficients: what is added times r (r - block), c (c - block).
     """
     powers = np.stack([np.ones_like(t), t, t**2, t**3], axis=-1)
     a, b = np.asarray(row / block)[..., None], np.asarray(col / block)[..., None]
     corners = [[powers @ node[i, j].T for j in (0, 1)] for i in (0, 1)]
     top = (1 - b) * corners[0][0] + b * corners[0][1]
     low = (1 - b) * corners[1][0] + b * corners[1][1]
-    return (1 - a) * top + a * low
+    straight = (1 - a) * top + a * low
+    if bend is None or not bend.shape[-1]:
+        return straight
+    along_rows, along_cols = (powers @ coefficients.T for coefficients in bend)
+    return straight + block**2 * (a * (a - 1) * along_rows + b * (b - 1) * along_cols)
 
 
-def positions(node, t, shape, block, border=0):
+def positions(node, t, shape, block, border=0, bend=None):
     """(r, c, 2) px of the first `shape` cells of a block and of `border` cells around them.
 
     t : height, a number or (r, c).
     """
     row, col = np.indices((shape[0] + 2 * border, shape[1] + 2 * border)) - float(border)
-    return position(node, np.broadcast_to(np.asarray(t, float), row.shape), row, col, block)
+    return position(node, np.broadcast_to(np.asarray(t, float), row.shape), row, col, block, bend)
 
 
 def derivative(node):
@@ -33,14 +38,14 @@ def derivative(node):
     return np.concatenate([node[..., 1:] * [1.0, 2.0, 3.0], np.zeros_like(node[..., :1])], axis=-1)
 
 
-def along_slope(node, t, relief, per_index, shape, block, border=0):
+def along_slope(node, t, relief, per_index, shape, block, border=0, bend=None):
     """(r, c, 2) px of the cells of a block, `relief` steps above t, moving as fast as the block's middle does at t.
 
     relief : (r + 2 border, c + 2 border) steps; per_index : t per step. `positions` of the cells' own heights, but for
     the change of speed within a block and over the relief.
     """
     speed = position(derivative(node), np.float64(t), block / 2, block / 2, block) * per_index
-    return positions(node, t, shape, block, border) + relief[..., None] * speed
+    return positions(node, t, shape, block, border, bend) + relief[..., None] * speed
 
 
 def slope_relief(surface, corners, rows, cols, block, border):

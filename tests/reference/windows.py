@@ -14,7 +14,7 @@ def normalised(window):
     return apart / norm if norm > 1e-4 else np.zeros_like(apart)
 
 
-def window_places(node, t, cell, block, half, relief, per_index):
+def window_places(node, t, cell, block, half, relief, per_index, bend=None):
     """(k, 2) px of a window's cells, row by row, each `relief` (k,) steps above its middle.
 
     node : (2, 2, 2, 4), corners of the cell's block; cell : row and column in the block; a step moves a cell as it does
@@ -22,12 +22,12 @@ def window_places(node, t, cell, block, half, relief, per_index):
     """
     row, col = (v.ravel() + start for v, start in zip(np.indices((2 * half + 1,) * 2) - half, cell, strict=True))
     speed = position(derivative(node), np.float64(t), block / 2, block / 2, block) * per_index
-    return position(node, np.full(row.shape, t), row, col, block) + np.asarray(relief, float)[:, None] * speed
+    return position(node, np.full(row.shape, t), row, col, block, bend) + np.asarray(relief, float)[:, None] * speed
 
 
-def line_window(image, blocked, node, t, cell, block, half, relief, per_index):
+def line_window(image, blocked, node, t, cell, block, half, relief, per_index, bend=None):
     """(k,) normalised values of a window; NaN where it leaves the image, or its middle is on a blocked pixel."""
-    xy = window_places(node, t, cell, block, half, relief, per_index)
+    xy = window_places(node, t, cell, block, half, relief, per_index, bend)
     last = np.array([image.shape[1] - 1, image.shape[0] - 1])
     if (xy < 0).any() or (xy >= last).any():
         return np.full(len(xy), np.nan)

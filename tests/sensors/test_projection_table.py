@@ -21,13 +21,13 @@ from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import (
     FINEST_BENT_PX,
+    FINEST_TABLE_PX,
+    LARGEST_BENT_BLOCK,
     MAX_EXCLUDED_SHARE_AT_LAST,
     TileGrid,
-    ViewPixels,
-    halved,
-    read_pixels,
     tile_views,
 )
+from zlocus.matching.view_pixels import PixelWindow, ViewPixels, halved, read_pixels
 from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.linescan import RectifiedModel
@@ -154,7 +154,7 @@ def test_what_a_lens_cannot_see_is_not_seen():
 def test_coverage_leaves_out_what_does_not_hold():
     shape, sensor = (600, 600), drone()
     pixels = np.zeros((912, 1368), np.float32)
-    window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    window = ViewPixels(sensor, (0, 0), pixels, np.ones(pixels.shape, bool))
     views = tile_views(
         [window, window], TileGrid(0, grid(0.15, shape), shape, 32, 45.0, 0.5), (40.0, 60.0), 4, (45.0, 55.0)
     )
@@ -184,7 +184,7 @@ def test_coverage_leaves_out_what_does_not_hold():
 def test_tables_hold_over_heights_that_reach_close_to_the_camera():
     """From 170 to 55 m below a tilted wide lens, no block that shows the ground is left out."""
     shape, pixels = (400, 400), np.zeros((912, 1368), np.float32)
-    window = ViewPixels(drone(), (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    window = ViewPixels(drone(), (0, 0), pixels, np.ones(pixels.shape, bool))
     views = tile_views([window], TileGrid(0, grid(0.15, shape), shape, 32, -15.0, 0.5), (-15.0, 100.0), 4)
     assert not views.is_excluded.any()
     assert views.is_projected.mean() > 0.3
@@ -205,6 +205,9 @@ def shown_errors(table, sensor, transform, shape, block, window):
         fr, fc = (row % block / block)[:, None], (col % block / block)[:, None]
         at = [[table.nodes[b + i, d + j] @ t ** np.arange(table.nodes.shape[-1]) for j in (0, 1)] for i in (0, 1)]
         xy = (1 - fr) * ((1 - fc) * at[0][0] + fc * at[0][1]) + fr * ((1 - fc) * at[1][0] + fc * at[1][1])
+        if table.bends.shape[-1]:
+            bends = table.bends[b, d] @ t ** np.arange(table.bends.shape[-1])
+            xy += block**2 * (fr * (fr - 1) * bends[:, 0] + fc * (fc - 1) * bends[:, 1])
         held = table.holds[b, d] & (table.ends[b, d, 0] <= t) & (t <= table.ends[b, d, 1])
         errors.append(np.hypot(*(xy - exact)[shown & held].T))
         left_out, n_shown = left_out + (shown & ~held).sum(), n_shown + shown.sum()
@@ -230,6 +233,24 @@ def test_each_block_is_tabulated_over_the_heights_at_which_it_is_shown(omega):
         sensor, replace(request, z_range=(25.0, 90.0)), IMAGE, MAX_EXCLUDED_SHARE_AT_LAST, may_drop_heights=True
     )
     assert shown_errors(low, sensor, transform, shape, block, IMAGE)[1] < 0.02
+
+
+@pytest.mark.parametrize("omega", [0.0, 30.0])
+def test_blocks_that_may_bend_are_exact_where_straight_ones_are_not(omega):
+    """A lens bends rows of sixteen cells by more than the tolerance of the finest level."""
+    shape, block, sensor = (500, 500), 16, drone(omega=omega)
+    transform = grid(0.15, shape)
+    straight = TableRequest(transform, shape, block, (25.0, 70.0), FINEST_TABLE_PX, HIGHEST_DEGREE)
+    with pytest.raises(GeometryError):
+        projection_table_where_shown(sensor, straight, IMAGE, 0.01, may_drop_heights=False)
+    bent = replace(straight, is_bent=True)
+    table = projection_table_where_shown(sensor, bent, IMAGE, 0.01, may_drop_heights=False)
+    errors, left_out = shown_errors(table, sensor, transform, shape, block, IMAGE)
+    assert len(errors) > 300
+    assert errors.max() < 1.5 * FINEST_TABLE_PX
+    assert left_out < 0.02
+    everywhere = projection_table(sensor, replace(bent, z_range=(25.0, 35.0)), IMAGE)
+    assert shown_errors(everywhere, sensor, transform, shape, block, IMAGE)[0].max() < 1.5 * FINEST_TABLE_PX
 
 
 def test_what_is_too_bent_is_refused_unless_it_may_be_left_out():
@@ -277,7 +298,7 @@ def test_raw_lines_of_an_unsteady_flight_need_a_high_degree(unsteady):
     with pytest.raises(GeometryError, match="px from the exact model"):
         projection_table(raw, TableRequest(around, shape, 4, z, FINEST_BENT_PX, HIGHEST_DEGREE))
     pixels = np.zeros((300, 300), np.float32)
-    window = ViewPixels(raw, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    window = ViewPixels(raw, (0, 0), pixels, np.ones(pixels.shape, bool))
     views = tile_views([window], TileGrid(0, around, shape, 32, 430.0, 0.5), z, 4)
     assert views.nodes.shape[-1] == UNSTEADY_DEGREE + 1
     assert views.is_projected.any()
@@ -292,7 +313,7 @@ def test_flights_too_unsteady_for_raw_images_are_told_so(unsteady):
     # 3 cm from line to line. More takes the exact model a minute to solve, and says the same.
     jitter = np.random.default_rng(1).normal(0.0, 0.03, raw.trajectory.centres.shape)
     shaken = replace(raw.trajectory, centres=raw.trajectory.centres + jitter)
-    window = ViewPixels(replace(raw, trajectory=shaken), (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    window = ViewPixels(replace(raw, trajectory=shaken), (0, 0), pixels, np.ones(pixels.shape, bool))
     with pytest.raises(GeometryError, match=r"too unsteady for its raw images.*level 1"):
         tile_views([window], TileGrid(0, around, shape, 32, 430.0, 0.5), (430.0, 500.0), 4)
 
@@ -301,7 +322,7 @@ def test_blocks_from_which_a_view_is_left_out_are_named():
     """A camera in the midst of the heights searched cannot be tabulated; what it may show is lost, not unseen."""
     shape, pixels = (64, 64), np.zeros((912, 1368), np.float32)
     sensor = replace(drone(), centre=(*CENTRE, 130.0))
-    window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+    window = ViewPixels(sensor, (0, 0), pixels, np.ones(pixels.shape, bool))
     table = projection_table(sensor, TableRequest(grid(0.5, shape), shape, 8, (15.0, 128.0), 0.01, 3), IMAGE, 1.0)
     assert table.lost.any()
     # Ground 80 m ahead is in the image from 100 m above it, and beyond the fold of the distortion from 3 m.
@@ -322,18 +343,18 @@ def test_blocks_from_which_a_view_is_left_out_are_named():
 
 
 def test_perspective_shrinks_blocks_and_raises_the_degree_only_where_needed():
-    """A camera that looks straight down from 2 km keeps its blocks; one that is tilted, and close, does not."""
+    """A camera that looks straight down from 2 km keeps its blocks; those of one that is tilted, and close, bend."""
     pixels = np.zeros((912, 1368), np.float32)
 
     def fitted(sensor):
-        window = ViewPixels(sensor, (0, 0), 0.0, 1.0, (pixels,), (np.ones(pixels.shape, bool),))
+        window = ViewPixels(sensor, (0, 0), pixels, np.ones(pixels.shape, bool))
         return tile_views([window], TileGrid(0, grid(0.15, (256, 256)), (256, 256), 32, 45.0, 0.5), (40.0, 60.0), 4)
 
     far = FrameModel((*CENTRE, 2050.0), rotation_from_angles(0.0, 0.0, 10.0), 13_000.0, (683.5, 455.5))
-    assert (fitted(far).block, fitted(far).nodes.shape[-1]) == (32, 4)
+    assert (fitted(far).block, fitted(far).nodes.shape[-1], fitted(far).bends.shape[-1]) == (32, 4, 0)
     near = fitted(drone(None))
-    assert near.block < 32
-    assert near.nodes.shape[-1] == HIGHEST_DEGREE + 1
+    assert near.block == LARGEST_BENT_BLOCK
+    assert near.bends.shape[-1] == near.nodes.shape[-1] > 4
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -341,16 +362,15 @@ def test_pixels_of_a_level(level):
     """A cell at (x, y) px of the image is at (x + 0.5) / 2^level - 0.5 px of the level, less the window's origin."""
     sensor, shape, block = camera("fore"), (40, 50), 16
     transform = grid(0.5 * 2**level, shape)
-    origin = (8, 20)
-    pixels = tuple(np.zeros((96 // 2**k, 112 // 2**k), np.float32) for k in range(3))
-    window = ViewPixels(sensor, origin, 0.0, 1.0, pixels, tuple(np.ones(p.shape, bool) for p in pixels))
+    origin, pixels = (3, 5), np.zeros((96 // 2**level, 112 // 2**level), np.float32)
+    window = ViewPixels(sensor, origin, pixels, np.ones(pixels.shape, bool), level=level)
     lattice = (30.0, 1.5)
     views = tile_views([window], TileGrid(level, transform, shape, block, *lattice), HEIGHTS, 2)
     for row, col, k in ((0, 0, 0), (16, 32, 7), (32, 48, 30)):
         t = views.t_of_index[0] + k * views.t_of_index[1]
         x, y = views.nodes[0, row // block, col // block] @ t ** np.arange(4)
         ground = np.array([[*(transform * (col + 0.5, row + 0.5)), lattice[0] + k * lattice[1]]])
-        exact = (sensor.image_from_ground(ground)[0] + 0.5) / 2**level - 0.5 - np.array(origin[::-1]) / 2**level
+        exact = (sensor.image_from_ground(ground)[0] + 0.5) / 2**level - 0.5 - np.array(origin[::-1])
         np.testing.assert_allclose((x, y), exact, rtol=0, atol=TOLERANCE_PX)
 
 
@@ -358,13 +378,14 @@ def test_pixels_of_a_window_are_on_the_scale_of_all_views():
     """The view's own zero and one, at every level, wherever the window starts."""
     pixels = 500.0 + 40.0 * np.random.default_rng(0).normal(size=(40, 60))
     view = View("v", Path("v.tif"), image_of(pixels), camera("fore"))
-    read = read_pixels(view, (4, 8, 24, 32), 3, GreyScale(480.0, 25.0))
-    assert (read.origin, read.mean, read.contrast) == ((4, 8), 480.0, 25.0)
-    plain = (pixels[4:28, 8:40] - 480.0) / 25.0
-    for level, found in enumerate(read.pixels):
+    plain, scale = (pixels[4:28, 8:40] - 480.0) / 25.0, GreyScale(480.0, 25.0)
+    for level in range(3):
         side = 2**level
+        window = PixelWindow(4 // side, 8 // side, 24 // side, 32 // side)
+        read = read_pixels(view, window, scale, level)
+        assert (read.origin, read.scale, read.window) == ((4 // side, 8 // side), scale, window)
         means = plain.reshape(24 // side, side, 32 // side, side).mean(axis=(1, 3))
-        np.testing.assert_allclose(found, means, rtol=0, atol=FLOAT32_CONTRASTS)
+        np.testing.assert_allclose(read.pixels, means, rtol=0, atol=FLOAT32_CONTRASTS)
 
 
 def test_halved_pixels_lie_between_four():

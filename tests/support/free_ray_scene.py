@@ -8,7 +8,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from rendered_scenes import CENTRE
 from zlocus.matching.height_lattice import HeightLattice
-from zlocus.matching.tile_views import TileGrid, ViewPixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
+from zlocus.matching.view_pixels import ViewPixels
 from zlocus.synthetic.cameras import SatelliteCamera
 
 CELL_M, STEP_M, BLOCK, SHAPE = 0.5, 0.5, 16, (60, 80)
@@ -32,7 +33,7 @@ def level_ground(angles=ANGLES_DEG):
         xyz = sensor.ground_from_image(xy, np.full(len(xy), ORIGIN_M + GROUND * STEP_M))
         at = np.stack([200 - (xyz[:, 1] - CENTRE[1]) / CELL_M, 200 + (xyz[:, 0] - CENTRE[0]) / CELL_M])
         image = map_coordinates(texture, at, order=1).reshape(IMAGE).astype(np.float32)
-        pixels.append(ViewPixels(sensor, (0, 0), 0.0, 1.0, (image,), (np.ones(IMAGE, bool),)))
+        pixels.append(ViewPixels(sensor, (0, 0), image, np.ones(IMAGE, bool)))
     transform = Affine(CELL_M, 0, CENTRE[0] - 20.0, 0, -CELL_M, CENTRE[1] + 15.0)
     blocks = (-(-SHAPE[0] // BLOCK), -(-SHAPE[1] // BLOCK))
     lattice = HeightLattice(

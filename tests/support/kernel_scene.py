@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.kernels.cost_volume import views_of_block
 from zlocus.matching.kernels.shared_records import ViewArrays, VisibleHeights
 
 IMAGE_SHAPE = (61, 97)
@@ -15,12 +16,14 @@ IMAGE_SHAPE = (61, 97)
 
 @dataclass(frozen=True)
 class KernelScene:
-    """images : one (r, c) float32 each; nodes : (i, b + 1, d + 1, 2, 4); the others as in `TileViews`."""
+    """images : one (r, c) float32 each; nodes : (i, b + 1, d + 1, 2, 4); bends : (i, b, d, 2, 2, 4), or n = 0; the
+    others as in `TileViews`."""
 
     images: list[np.ndarray]
     pixels: np.ndarray
     layout: np.ndarray
     nodes: np.ndarray
+    bends: np.ndarray
     heights: np.ndarray
     shape: tuple[int, int]
     block: int
@@ -32,7 +35,15 @@ class KernelScene:
     @property
     def arrays(self):
         """The record that kernels take."""
-        return ViewArrays(self.pixels, self.layout, self.nodes, self.heights, self.block)
+        return ViewArrays(self.pixels, self.layout, self.nodes, self.bends, self.heights, self.block)
+
+    def of_block(self, b, d):
+        """The record that kernels take of one block."""
+        return views_of_block(self.arrays, b, d)
+
+    def of_one_block(self, view, b, d):
+        """Corners (2, 2, 2, 4) and bends (2, 2, n) of one view."""
+        return self.nodes[view, b : b + 2, d : d + 2], self.bends[view, b, d]
 
     def blocks(self):
         """Block row and column, and the rows and columns of its cells."""
@@ -48,8 +59,11 @@ class KernelScene:
         return VisibleHeights(np.zeros(shape, np.int32), np.full(shape, 1000, np.int32), np.zeros(shape, np.int32))
 
 
-def kernel_scene(n_views=3, shape=(37, 70), block=16, seed=0):
-    """Views turned, scaled and curved a little; image sizes differ; some cells near the edges project outside."""
+def kernel_scene(n_views=3, shape=(37, 70), block=16, seed=0, is_bent=False):
+    """Views turned, scaled and curved a little; image sizes differ; some cells near the edges project outside.
+
+    is_bent : rows and columns of the blocks bend by up to a pixel, a little more or less with the height.
+    """
     rng = np.random.default_rng(seed)
     corners = (-(-shape[0] // block) + 1, -(-shape[1] // block) + 1)
     row, col = np.meshgrid(np.arange(corners[0]) * block, np.arange(corners[1]) * block, indexing="ij")
@@ -68,7 +82,10 @@ def kernel_scene(n_views=3, shape=(37, 70), block=16, seed=0):
         nodes.append(node)
     pixels = np.concatenate([image.ravel() for image in images])
     heights = np.array([-0.9, 0.06])
-    return KernelScene(images, pixels, np.array(layout, np.int64), np.stack(nodes), heights, shape, block)
+    bends = np.zeros((n_views, corners[0] - 1, corners[1] - 1, 2, 2, 4 if is_bent else 0))
+    if is_bent:
+        bends[..., :2] = rng.uniform(-1.0, 1.0, (*bends.shape[:-1], 2)) * (4.0 / block**2, 0.4 / block**2)
+    return KernelScene(images, pixels, np.array(layout, np.int64), np.stack(nodes), bends, heights, shape, block)
 
 
 def ragged_lattice(shape=(37, 70), block=16, seed=0, counts=(16, 32)):

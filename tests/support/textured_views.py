@@ -48,7 +48,7 @@ def textured(slope=(0.0, 0.0), spoiled=(), noise=0.0, speeds=SPEEDS):
     holds = np.ones((len(images), corners[0] - 1, corners[1] - 1), bool)
     return TileViews(
         pixels, np.zeros(len(pixels), bool), np.zeros(len(images), bool), np.array(layout, np.int64), np.stack(nodes),
-        holds, ~holds, heights, at_all_heights(holds), BLOCK,
+        np.empty((*holds.shape, 2, 2, 0)), holds, ~holds, heights, at_all_heights(holds), BLOCK,
     )  # fmt: skip
 
 

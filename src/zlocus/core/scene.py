@@ -104,6 +104,16 @@ class SparseSource(Protocol):
         ...
 
 
+@runtime_checkable
+class DecodedSource(Protocol):
+    """An image whose file may have to be decoded as a whole."""
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Memory of its decoded pixels; 0 where windows of it can be read alone."""
+        ...
+
+
 def held_pixels(image: ImageSource) -> HeldPixels | None:
     """The cells of an image of which its file holds pixels; None where it holds all of them, as far as is known."""
     return image.held if isinstance(image, SparseSource) else None

@@ -17,6 +17,7 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import HeldPixels, ImageWindow, SunDirection
+from zlocus.io.decoded_images import DECODED, whole_bytes
 from zlocus.io.image_dates import date_of_exposure
 from zlocus.io.image_sun import sun_direction_at_exposure
 from zlocus.io.open_raster import (
@@ -56,7 +57,8 @@ class RasterImage:
     bands : 1-based indices of the bands that are read; weights : their weights in the grey value; plateau : pixels of
     one value at the border, which are invalid, see `with_plateau`; held : the parts that a sparse file stores, see
     `SparseSource`; state : size and time of the file when it was opened, see `file_state`; sources : other files from
-    which pixels or mask are read; date : of the exposure, None where the file does not say.
+    which pixels or mask are read; decoded_bytes : see `DecodedSource`; date : of the exposure, None where the file does
+    not say.
     """
 
     path: Path
@@ -70,6 +72,7 @@ class RasterImage:
     held: HeldPixels | None = field(default=None, compare=False, repr=False)
     state: tuple[int, ...] = field(default=(), compare=False, repr=False)
     sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
+    decoded_bytes: int = field(default=0, compare=False, repr=False)
     date: datetime.date | None = field(default=None, compare=False, repr=False)
     sun_direction: SunDirection | None = field(default=None, compare=False, repr=False)
 
@@ -107,20 +110,25 @@ class RasterImage:
         """
         assert self.has_colours, f"{self.path.name} is grey"
         with cached_raster(self.path) as source:
-            values = source.read(list(self.bands), window=Window(col, row, cols, rows), out_dtype=np.float32)
-        return np.nan_to_num(np.asarray(values, np.float32), copy=False, posinf=0.0, neginf=0.0)
+            window = Window(col, row, cols, rows)
+            stored = [DECODED.window(source, self.path, band, window) for band in self.bands]
+        values = np.stack(stored, dtype=np.float32)
+        if np.issubdtype(stored[0].dtype, np.floating):
+            np.nan_to_num(values, copy=False, posinf=0.0, neginf=0.0)
+        return values
 
     def _read(self, source: rasterio.DatasetReader, window: Window) -> ImageWindow:
-        pixels = np.zeros((int(window.height), int(window.width)), np.float32)
-        valid = np.ones(pixels.shape, bool)
+        pixels, valid = None, np.ones((int(window.height), int(window.width)), bool)
         for band, weight in zip(self.bands, self.weights, strict=True):
-            stored = source.read(band, window=window)
-            values = stored.astype(np.float32)
+            stored = DECODED.window(source, self.path, band, window)
+            values = np.multiply(stored, np.float32(weight), dtype=np.float32, casting="unsafe")
             if may_hold_too_large_values(stored.dtype):
-                is_grey = np.abs(values) <= MAX_GREY_VALUE  # False for NaN and infinities too
+                with np.errstate(invalid="ignore"):
+                    is_grey = np.abs(values) <= weight * MAX_GREY_VALUE  # False for NaN and infinities too
                 valid &= is_grey
                 values[~is_grey] = 0.0
-            pixels += values if weight == 1.0 else np.float32(weight) * values
+            pixels = values if pixels is None else np.add(pixels, values, out=pixels)
+        assert pixels is not None, "there is a band"
         plain = len(self.bands) == 1 and stored.dtype.kind in "iu"
         if plain and source.mask_flag_enums[self.bands[0] - 1] == [MaskFlags.nodata]:
             valid = stored != source.nodata  # GDAL's mask, without reading the band again
@@ -172,6 +180,7 @@ def open_image(path: Path) -> RasterImage:
             )
         image._read(source, _last_block(source, bands[0]))
         image = replace(image, held=held, state=tuple(state), sources=_sources(source, path))
+        image = replace(image, decoded_bytes=whole_bytes(source, path))
         return replace(image, date=date_of_exposure(source), sun_direction=sun_direction_at_exposure(source))
 
 

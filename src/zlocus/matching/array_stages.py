@@ -24,7 +24,8 @@ from zlocus.matching.occlusion import PAIR, covered_heights
 from zlocus.matching.radiometry import GreyScale
 from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties
 from zlocus.matching.slope_surface import SlopeSurface
-from zlocus.matching.tile_views import TileGrid, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, tile_views
+from zlocus.matching.view_pixels import read_pixels, window_showing
 
 # Cost of 1 - NCC = 1 in the integer units of the kernels, and the largest cost that these hold.
 COST_UNIT, MAX_COST = 64.0, 255.0
@@ -193,8 +194,8 @@ def true_ortho(
     transform = Affine(cell_m, 0, x[0] - cell_m / 2, 0, -cell_m, y[0] + cell_m / 2)
     across, down = np.linspace(0, shape[1], 5), np.linspace(0, shape[0], 5)
     corners = np.array([transform * (c, r) for c in across for r in down])
-    parts = [(view, pixel_window(view, corners, z_range, 1)) for view in views]
-    pixels = [read_pixels(view, part, 1, GreyScale(0.0, 1.0)) for view, part in parts if part is not None]
+    parts = [(view, window_showing(view, corners, z_range)) for view in views]
+    pixels = [read_pixels(view, part, GreyScale(0.0, 1.0)) for view, part in parts if part is not None]
     if not pixels:
         return np.full(shape, np.nan, np.float32)
     projected = tile_views(pixels, TileGrid(0, transform, shape, options.block, origin_m, step_m), z_range, 0)
@@ -204,7 +205,7 @@ def true_ortho(
     )
     index = ((np.where(np.isfinite(height), height, lowest) - origin_m) / step_m).astype(np.float32)
     visible = covered_heights(projected, SlopeSurface.flat(shape, projected.block), lattice)
-    shown = ortho.true_ortho(pixels, projected, visible, index)
+    shown = ortho.true_ortho(projected, visible, index)
     shown[~np.isfinite(height)] = np.nan
     return shown
 

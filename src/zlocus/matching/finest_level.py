@@ -63,7 +63,9 @@ def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResu
 def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> RefinedSurface:
     """Refine the heights of the finest level, halo included, check them, and estimate their precision."""
     match_scene, config = tile.match_scene, tile.config
-    splines = np.concatenate([spline_coefficients(view.pixels[0]).ravel() for view in tile.view_pixels])
+    splines, layout = np.empty_like(result.tile_views.pixels), result.tile_views.layout
+    for view, (first, rows, cols) in zip(result.tile_views.view_pixels, layout, strict=True):
+        splines[first : first + rows * cols] = spline_coefficients(view.pixels).ravel()
     refined = refine(
         result.tile_views, splines, result.heights.vertex, result.visible, match_scene.step_cells, config.refine,
         result.is_planar,
@@ -126,8 +128,6 @@ def ortho_of_surface(
     surroundings = surroundings_of_tile(coarser, finest.tile_views, window, lattice_index, halo)
     scale = tile.match_scene.grey_scales[0] if config.products.ortho_levels == "common" else None
     coloured = tile.match_scene.coloured(tile.view_numbers)
-    ortho = true_ortho(
-        tile.view_pixels, finest.tile_views, finest.visible, lattice_index, coloured, surroundings, scale
-    )
+    ortho = true_ortho(finest.tile_views, finest.visible, lattice_index, coloured, surroundings, scale)
     ortho[np.isnan(surface.height)] = np.nan
     return ortho

@@ -21,8 +21,11 @@ from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.occlusion import PAIR
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.slope_surface import CoarserSlope, SlopeSurface
-from zlocus.matching.tile_views import TileViews, ViewPixels
+from zlocus.matching.tile_views import TileViews
+from zlocus.matching.view_pixels import ViewPixels, read_pixels, unseen, window_showing
 
+# Points along each side of a window of cells whose projections say which pixels are read.
+READ_POINTS_PER_SIDE = 9
 # Before a surface is used as an occluder it is eroded, because matching widens roofs: by about two cells where the
 # surface comes from the coarser level, by one cell where it comes from an earlier round of the same level.
 ERODE_COARSER_SURFACE = np.ones((5, 5), np.uint8)
@@ -33,16 +36,15 @@ ERODE_OWN_SURFACE = np.ones((3, 3), np.uint8)
 class TileInputs:
     """Everything that a tile is matched from.
 
-    match_scene : the scene; core_window : finest cells whose surface is wanted, without halo; view_pixels : the views
-    that take part, the reference image first; view_numbers : which views of the scene they are; method : mvll-sgm,
-    mvll without the semi-global constraint, or gc3-sgm in image space; choose_images : whether each block is matched
-    with a choice of the images, else with all of them.
+    match_scene : the scene; core_window : finest cells whose surface is wanted, without halo; view_numbers : the views
+    of the scene that take part, the reference image first; method : mvll-sgm, mvll without the semi-global constraint,
+    or gc3-sgm in image space; choose_images : whether each block is matched with a choice of the images, else with all
+    of them.
     """
 
     match_scene: MatchScene
     core_window: CellWindow
     config: RunConfig
-    view_pixels: Sequence[ViewPixels]
     view_numbers: Sequence[int]
     method: str = "mvll-sgm"
     choose_images: bool = False
@@ -54,7 +56,17 @@ class TileInputs:
         A height that is wrong occludes as much as one that is right. If one of two images were excluded for it, no
         comparison would be left to correct the error.
         """
-        return len(self.view_pixels) > PAIR
+        return len(self.view_numbers) > PAIR
+
+    def read(self, window: CellWindow, level: int, z_range: tuple[float, float]) -> list[ViewPixels]:
+        """Pixels of a level of all views, as far as they show a window of its cells between two heights (m)."""
+        match_scene, ground = self.match_scene, self.match_scene.points_of(window, level, READ_POINTS_PER_SIDE)
+        found = []
+        for number in self.view_numbers:
+            view, scale = match_scene.views[number], match_scene.grey_scales[number]
+            part = window_showing(view, ground, z_range, level)
+            found.append(unseen(view, scale, level) if part is None else read_pixels(view, part, scale, level))
+        return found
 
     def level(self, number: int, limit_window: CellWindow | None = None) -> PyramidLevel:
         """A pyramid level of this tile with its halo. limit_window : cells of that level beyond which nothing is

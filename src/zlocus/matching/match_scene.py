@@ -24,7 +24,7 @@ from zlocus.core.scene import ColourSource, Scene, View, held_window
 from zlocus.core.sensor_model import Scanning, bare
 from zlocus.matching.ground_pixels import with_common_pixel
 from zlocus.matching.radiometry import GreyScale, grey_scales
-from zlocus.matching.tile_views import MARGIN_PX
+from zlocus.matching.view_pixels import MARGIN_PX
 
 # The visibility and the penalties of the finest level rest on two coarser ones.
 MIN_LEVELS = 3
@@ -116,10 +116,10 @@ class MatchScene:
         """From cell corners (column, row) of a window of a level to the ground."""
         return window_transform(window, self.anchor, self.cell_size * 2**level)
 
-    def points_of(self, window: CellWindow, level: int) -> NDArray[np.float64]:
-        """Ground points (n, 2) all over a window of a level, m."""
+    def points_of(self, window: CellWindow, level: int, per_side: int = WINDOW_POINTS_PER_SIDE) -> NDArray[np.float64]:
+        """Ground points (n, 2) all over a window of a level, m; per_side : along each of its sides."""
         transform = self.transform(window, level)
-        across, down = (np.linspace(0, n, WINDOW_POINTS_PER_SIDE) for n in (window.cols, window.rows))
+        across, down = (np.linspace(0, n, per_side) for n in (window.cols, window.rows))
         return np.array([transform * (c, r) for c in across for r in down])
 
     @property

@@ -7,7 +7,6 @@ an object that stands off that ground must be seen alike by more images than agr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.occlusion import PAIR, covered_heights, covers, covers_at, n_seeing
 from zlocus.matching.slope_surface import SlopeSurface
-from zlocus.matching.tile_views import TileViews, ViewPixels
+from zlocus.matching.tile_views import TileViews
 
 NEIGHBOURS = np.ones((3, 3), np.uint8)
 # Cells around the overlap that are matched too.
@@ -99,15 +98,13 @@ class OverlapGround:
         return np.asarray(on_cells(self.is_outside, self.window, window, self.level) & (height > max_ground))
 
 
-def overlap_ground(
-    view_pixels: Sequence[ViewPixels], coarsest: CoarsestHeights, n_steps: int, cell_size: float
-) -> OverlapGround:
+def overlap_ground(coarsest: CoarsestHeights, n_steps: int, cell_size: float) -> OverlapGround:
     """Estimate the ground at the edge of the overlap from the coarsest level.
 
     n_steps : heights of the level's lattice; cell_size : side of a cell of the level.
     """
     cell_steps = cell_size / coarsest.lattice.height_step
-    covering = heights_shown(view_pixels, coarsest, n_steps)
+    covering = heights_shown(coarsest, n_steps)
     covered = covered_ground(covering, coarsest.visible, coarsest.surface, coarsest.expected, cell_steps)
     known = compared_at_all_heights(coarsest.visible, coarsest.expected)
     window, level = coarsest.window, coarsest.level
@@ -175,14 +172,14 @@ def ground_nearby(
     return NearbyGround(of_label[nearest], max_rise)
 
 
-def heights_shown(view_pixels: Sequence[ViewPixels], coarsest: CoarsestHeights, n_steps: int) -> VisibleHeights:
+def heights_shown(coarsest: CoarsestHeights, n_steps: int) -> VisibleHeights:
     """Heights at which each image shows each cell, up to its last pixel.
 
     This covers more than `covered_heights`: windows of a coarse level need many pixels around a cell, those of the
     finest level, for which this is computed, a few. n_steps : of the lattice, all of which count.
     """
     tile_views, lattice = coarsest.tile_views, coarsest.lattice
-    unusable = [~view.valid[coarsest.level].ravel() for view in view_pixels]
+    unusable = [~view.valid.ravel() for view in tile_views.view_pixels]
     plain_views = replace(
         tile_views, blocked=np.concatenate(unusable), has_blocked=np.array([bool(mask.any()) for mask in unusable])
     )

@@ -123,7 +123,8 @@ def _views_around_ties(tile: TileInputs, window: CellWindow, ties: GridTies) -> 
         0, match_scene.transform(window, 0), (window.rows, window.cols), config.pyramid.block,
         match_scene.height_origin, match_scene.height_step,
     )  # fmt: skip
-    return tile_views(tile.view_pixels, cells, z_range, large_window_side(config.cost) // 2, z_reachable)
+    view_pixels = tile.read(window, 0, z_reachable or z_range)
+    return tile_views(view_pixels, cells, z_range, large_window_side(config.cost) // 2, z_reachable)
 
 
 def label_pairs(

@@ -30,8 +30,9 @@ from zlocus.matching.match_curve import (
 )
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import GridTies, PairLabels, label_pairs
-from zlocus.matching.tile_views import TileGrid, TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
 from zlocus.matching.view_directions import cells_per_step
+from zlocus.matching.view_pixels import read_pixels, window_showing
 from zlocus.matching.view_ranking import FeaturePoints, NeighbourSearch, OrderSource, order_images
 from zlocus.matching.view_selection import order_views, preselected
 
@@ -396,10 +397,10 @@ def views_around(
         candidates = [candidates[row] for row in rows]
     numbers, view_pixels = [], []
     for number in candidates:
-        view_window = pixel_window(match_scene.views[number], ground_xy, z_range, 1)
+        view_window = window_showing(match_scene.views[number], ground_xy, z_range)
         if view_window is not None:
             numbers.append(number)
-            view_pixels.append(read_pixels(match_scene.views[number], view_window, 1, match_scene.grey_scales[number]))
+            view_pixels.append(read_pixels(match_scene.views[number], view_window, match_scene.grey_scales[number]))
     shape, lattice = (window.rows, window.cols), (match_scene.height_origin, match_scene.height_step)
     half = large_window_side(config.cost) // 2
     cells = TileGrid(0, transform, shape, config.pyramid.block, *lattice)

@@ -52,7 +52,11 @@ class GreyTrend:
         """Grey values (rows, cols) float32 in a window of the image that starts at (row, col)."""
         u, v = unit_position(self.shape, np.arange(col, col + cols), np.arange(row, row + rows))
         a, b, c, d, e = self.terms
-        return np.asarray((a + c * u) * u + (b + e * v)[:, None] * v[:, None] + d * v[:, None] * u, np.float32)
+        of_col, of_row = np.asarray((a + c * u) * u, np.float32), np.asarray((b + e * v) * v, np.float32)
+        trend = np.asarray(d * v, np.float32)[:, None] * np.asarray(u, np.float32)
+        trend += of_col
+        trend += of_row[:, None]
+        return trend
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.matching.kernels.polynomials import shift_bends, shift_nodes
 from zlocus.matching.kernels.smooth import slopes
 from zlocus.matching.median import median
 from zlocus.matching.tile_views import TileViews
@@ -160,20 +160,14 @@ class SlopeSurface:
         return bool(max(np.abs(np.diff(nodes, axis=axis)).max(initial=0.0) for axis in (0, 1)) > STEEP_STEPS)
 
     def along(self, tile_views: TileViews) -> TileViews:
-        """The views with projections that take slope indices instead of level indices.
-
-        A polynomial in t at a node, evaluated at t + delta, is another polynomial in t:
-        c'_j = sum_i C(i, j) c_i delta^(i - j).
-        """
-        delta = self.nodes * tile_views.t_of_index[1]
-        moved = np.zeros_like(tile_views.nodes)
-        n = moved.shape[-1]
-        for j in range(n):
-            for i in range(j, n):
-                moved[..., j] += comb(i, j) * tile_views.nodes[..., i] * (delta ** (i - j))[None, :, :, None]
+        """The views with projections that take slope indices instead of level indices."""
+        delta, nodes, bends = self.nodes * tile_views.t_of_index[1], tile_views.nodes.copy(), tile_views.bends.copy()
+        if bends.shape[-1]:
+            shift_bends(nodes, delta, tile_views.block, bends)
+        shift_nodes(nodes, delta)
         corners = np.stack([self.nodes[i:n, j:m] for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None))])
         index_range = tile_views.index_range - np.stack([corners.min(axis=0), corners.max(axis=0)], axis=-1)
-        return replace(tile_views, nodes=moved, index_range=index_range)
+        return replace(tile_views, nodes=nodes, bends=bends, index_range=index_range)
 
 
 def divided(corners: NDArray[np.float64], times: int) -> NDArray[np.float64]:

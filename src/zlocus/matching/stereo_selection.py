@@ -45,7 +45,8 @@ from zlocus.matching.match_curve import (
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import GridTies
 from zlocus.matching.point_match import PointCurves, PointOrder, cell_windows, point_curves, steps_px
-from zlocus.matching.tile_views import TileGrid, TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
+from zlocus.matching.view_pixels import read_pixels, window_showing
 from zlocus.matching.view_ranking import FeaturePoints, NeighbourSearch, OrderSource, order_images, triangulated
 
 # Number of the reference image among the views of a match scene, and of `SelectionArea`.
@@ -113,12 +114,12 @@ def selection_area(match_scene: MatchScene, window: CellWindow, config: RunConfi
     step, origin = match_scene.height_step, match_scene.height_origin
     z_range = (origin + (low - reach) * step, origin + (high + reach) * step)
     ground_xy = match_scene.points_of(window.at_level(0, half), 0)
-    windows = {n: pixel_window(view, ground_xy, z_range, 1) for n, view in enumerate(match_scene.views)}
+    windows = {n: window_showing(view, ground_xy, z_range) for n, view in enumerate(match_scene.views)}
     numbers = tuple(number for number, view_window in windows.items() if view_window is not None)
     if REFERENCE not in numbers or len(numbers) < 2:
         return None
     view_pixels = [
-        read_pixels(match_scene.views[n], view_window, 1, match_scene.grey_scales[n])
+        read_pixels(match_scene.views[n], view_window, match_scene.grey_scales[n])
         for n, view_window in windows.items()
         if view_window is not None
     ]

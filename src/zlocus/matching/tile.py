@@ -65,7 +65,8 @@ from zlocus.matching.semiglobal import (
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.surface import Surface
-from zlocus.matching.tile_views import PixelWindow, TileGrid, TileViews, pixel_window, read_pixels, tile_views
+from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
+from zlocus.matching.view_pixels import PixelWindow, window_showing
 from zlocus.matching.view_selection import ChosenViews, choose_views, preselected
 
 
@@ -108,12 +109,12 @@ def match_tile(
     core_window : finest cells whose surface is wanted; every level adds a halo around them. method : mvll-sgm, mvll
     without the semi-global constraint, or gc3-sgm in image space. choose_images : match each block with a few
     images, chosen by labels; False: with all. fill : none, or interpolate to fill gaps that images cover. preselect :
-    see `read_tile`. Occlusions are found wherever three images or more see the tile.
+    see `tile_inputs`. Occlusions are found wherever three images or more see the tile.
     """
     if not (core_window.rows and core_window.cols):
         return TileResult(Surface.nothing(core_window))
-    tile = read_tile(match_scene, core_window, config, method, choose_images, preselect)
-    if len(tile.view_pixels) < PAIR:
+    tile = tile_inputs(match_scene, core_window, config, method, choose_images, preselect)
+    if len(tile.view_numbers) < PAIR:
         return TileResult(Surface.nothing(core_window))
     coarsest_match = match_coarsest_level(tile)
     ground = ground_of_overlap(tile, coarsest_match)
@@ -149,7 +150,7 @@ def _tile_result(
     )
 
 
-def read_tile(
+def tile_inputs(
     match_scene: MatchScene,
     core_window: CellWindow,
     config: RunConfig,
@@ -157,17 +158,14 @@ def read_tile(
     choose_images: bool = False,
     preselect: bool = True,
 ) -> TileInputs:
-    """Read the pixels of the views that may see a tile; with `preselect`, of many views only the best candidates."""
+    """The views that may see a tile; with `preselect`, of many views only the best candidates."""
     ground_xy, windows = windows_of(match_scene, core_window, config)
     numbers, options = list(windows), config.selection
     if preselect and len(numbers) > options.max_candidates + 1:
         views = [match_scene.views[n] for n in numbers]
         rows = preselected(views, ground_xy, match_scene.ground_height, options)
         numbers = [numbers[row] for row in rows]
-    view_pixels = [
-        read_pixels(match_scene.views[n], windows[n], match_scene.levels, match_scene.grey_scales[n]) for n in numbers
-    ]
-    return TileInputs(match_scene, core_window, config, view_pixels, numbers, method, choose_images)
+    return TileInputs(match_scene, core_window, config, numbers, method, choose_images)
 
 
 def windows_of(
@@ -183,7 +181,7 @@ def windows_of(
     window = level_window(core_window, coarsest, options.halo, options.block, limit_window)
     ground_xy, windows = match_scene.points_of(window, coarsest), {}
     for number in match_scene.views_near(ground_xy):
-        view_window = pixel_window(match_scene.views[number], ground_xy, match_scene.z_range, 2**coarsest)
+        view_window = window_showing(match_scene.views[number], ground_xy, match_scene.z_range, coarsest)
         if view_window is not None:
             windows[number] = view_window
     return ground_xy, windows
@@ -196,8 +194,8 @@ def rank_tile(match_scene: MatchScene, core_window: CellWindow, config: RunConfi
     """
     if not (core_window.rows and core_window.cols):
         return None
-    tile = read_tile(match_scene, core_window, config)
-    if len(tile.view_pixels) < PAIR:
+    tile = tile_inputs(match_scene, core_window, config)
+    if len(tile.view_numbers) < PAIR:
         return None
     return TileLabels(label_pairs_at_ties(tile, None), tile.view_numbers)
 
@@ -244,7 +242,7 @@ def add_evaluations(result: LevelResult, earlier_result: LevelResult) -> LevelRe
 
 def pair_labels_for_choice(tile: TileInputs, coarsest_result: LevelResult | None) -> PairLabels | None:
     """Labels by which images are chosen; None where no choice is wanted, or too few images see the tile for one."""
-    if not tile.choose_images or len(tile.view_pixels) - 1 <= tile.config.selection.min_images:
+    if not tile.choose_images or len(tile.view_numbers) - 1 <= tile.config.selection.min_images:
         return None
     return label_pairs_at_ties(tile, coarsest_result)
 
@@ -256,7 +254,7 @@ def ground_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> Overla
         result.tile_views, result.lattice, result.visible, level.window, level.number, result.heights.vertex,
         ExpectedBounds(*expected_of_searched(tile.match_scene, level, prior)),
     )  # fmt: skip
-    return overlap_ground(tile.view_pixels, heights, level.n_steps, level.cell_size)
+    return overlap_ground(heights, level.n_steps, level.cell_size)
 
 
 def match_finer_levels(
@@ -365,10 +363,9 @@ def _project(tile: TileInputs, level: PyramidLevel, prior: SearchPrior) -> TileV
     cells = TileGrid(
         level.number, level.transform, level.shape, config.pyramid.block, level.height_origin, level.height_step
     )
-    return tile_views(
-        tile.view_pixels, cells, table_range(level), large_window_side(config.cost) // 2,
-        reachable_range(level, prior, config),
-    )  # fmt: skip
+    z_needed = reachable_range(level, prior, config)
+    view_pixels = tile.read(level.window, level.number, z_needed)
+    return tile_views(view_pixels, cells, table_range(level), large_window_side(config.cost) // 2, z_needed)
 
 
 def visible_heights(tile: TileInputs, level: PyramidLevel, search: LevelSearch, prior: SearchPrior) -> VisibleHeights:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,10 +11,9 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError
-from zlocus.core.scene import View
-from zlocus.core.sensor_model import Scanning, SensorModel, bare, capped, lowest_station
+from zlocus.core.sensor_model import Scanning, bare, capped, lowest_station
 from zlocus.matching.kernels.shared_records import ViewArrays
-from zlocus.matching.radiometry import GreyScale
+from zlocus.matching.view_pixels import FloatImage, ViewPixels
 from zlocus.sensors.projection_table import (
     DEGREE,
     HIGHER_DEGREE,
@@ -27,9 +25,7 @@ from zlocus.sensors.projection_table import (
     projection_table_where_shown,
 )
 
-FloatImage = NDArray[np.float32]
 NO_INDEX = 2**29  # every height index is smaller
-MARGIN_PX = 4  # pixels of a level around the part of an image that shows the tile
 # Largest error of the projection table, in pixels of the level. It may be larger at coarser levels, which only give the
 # search range of the next, and whose blocks span so much ground that the unsteady flight of an aircraft bends them
 # (0.011 px over the 102 m of the demo).
@@ -42,49 +38,27 @@ MAX_EXCLUDED_SHARE, MAX_EXCLUDED_SHARE_AT_LAST = 0.01, 0.5
 # Cells along the side of the smallest blocks. The cells around a block make small ones slow: those of four cells are
 # twice as slow per cell as those of eight.
 SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
+# Blocks whose positions are bent are at most so large: over more cells the speed with which points move with height
+# changes too much for one relief (see `pixel_positions`).
+LARGEST_BENT_BLOCK = 16
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
-
-
-@dataclass(frozen=True)
-class ViewPixels:
-    """A window of one view at every level.
-
-    origin : (row, col) of the window's first pixel in the image, a multiple of 2^(levels - 1), so that the pyramid
-    does not depend on the window. mean, contrast : grey value of the image that becomes 0, and number of grey values
-    that become 1, so that views taken with different exposures can be compared. pixels, valid : per level, (r, c)
-    float32 and bool; level l has half as many rows and columns as level l - 1. trend : (r, c) float32 grey values that
-    were subtracted at the finest level, None if nothing was (see `GreyTrend`).
-    """
-
-    sensor: SensorModel
-    origin: tuple[int, int]
-    mean: float
-    contrast: float
-    pixels: tuple[FloatImage, ...]
-    valid: tuple[NDArray[np.bool_], ...]
-    trend: FloatImage | None = None
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns at the finest level."""
-        rows, cols = self.pixels[0].shape
-        return rows, cols
 
 
 @dataclass(frozen=True)
 class TileViews:
     """All views of a tile at one level, as the kernels take them.
 
-    pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels that no window may touch; has_blocked :
-    (i,) bool, whether a view has any; layout : (i, 3) int64, offset, rows and columns of each view in `pixels`; nodes :
-    (i, b + 1, d + 1, 2, n) float64, polynomials at the corners of the blocks, see `ProjectionTable`, in pixels of the
-    window; is_projected : (i, b, d) bool, blocks that a view can show; is_excluded : (i, b, d) bool, other blocks that
-    it may show, from which it is excluded because its projection table is not accurate there; t_of_index : (2,)
-    float64, parameter t of the polynomials at height index 0, and its change per index; index_range : (i, b, d, 2)
-    float64, lowest and highest height index over which the polynomials of a block hold; block : cells along the side of
-    a block. Height indices are level indices, or slope indices where the nodes follow a slanted support surface (see
-    `height_lattice`).
+    pixels : (p,) float32, one view after the other; blocked : (p,) bool, pixels that no window may touch;
+    has_blocked : (i,) bool, whether a view has any; layout : (i, 3) int64, offset, rows and columns of each view in
+    `pixels`; nodes : (i, b + 1, d + 1, 2, n) float64, polynomials at the corners of the blocks, in pixels of the
+    window, and bends : (i, b, d, 2, 2, n) float64, see `ProjectionTable`; is_projected : (i, b, d) bool, blocks
+    that a view can show; is_excluded : (i, b, d) bool, other blocks that it may show, from which it is excluded
+    because its projection table is not accurate there; t_of_index : (2,) float64, parameter t of the polynomials at
+    height index 0, and its change per index; index_range : (i, b, d, 2) float64, lowest and highest height index
+    over which the polynomials of a block hold; block : cells along the side of a block. Height indices are level
+    indices, or slope indices where the nodes follow a slanted support surface (see `height_lattice`). view_pixels : of
+    the views, whose pixels are parts of `pixels`.
     """
 
     pixels: FloatImage
@@ -92,16 +66,18 @@ class TileViews:
     has_blocked: NDArray[np.bool_]
     layout: NDArray[np.int64]
     nodes: NDArray[np.float64]
+    bends: NDArray[np.float64]
     is_projected: NDArray[np.bool_]
     is_excluded: NDArray[np.bool_]
     t_of_index: NDArray[np.float64]
     index_range: NDArray[np.float64]
     block: int
+    view_pixels: tuple[ViewPixels, ...] = ()
 
     @property
     def arrays(self) -> ViewArrays:
         """The arrays that the kernels read."""
-        return ViewArrays(self.pixels, self.layout, self.nodes, self.t_of_index, self.block)
+        return ViewArrays(self.pixels, self.layout, self.nodes, self.bends, self.t_of_index, self.block)
 
     @property
     def index_limits(self) -> NDArray[np.int64]:
@@ -130,75 +106,6 @@ class TileGrid:
     height_step: float
 
 
-class PixelWindow(NamedTuple):
-    """A window of an image: its first row and column, and its size in pixels."""
-
-    row: int
-    col: int
-    rows: int
-    cols: int
-
-
-def pixel_window(
-    view: View, corners: NDArray[np.float64], z_range: tuple[float, float], step: int
-) -> PixelWindow | None:
-    """The window of an image that shows a patch of ground; None where the image does not show it.
-
-    corners : (n, 2) m, outline of the patch; z_range : m, heights of the ground; step : row and column of the window
-    are multiples of it, px.
-    """
-    xyz = np.concatenate([np.column_stack([corners, np.full(len(corners), z)]) for z in z_range])
-    xy = view.sensor.image_from_ground(xyz)
-    known = np.isfinite(xy).all(axis=1)
-    rows, cols = view.image.shape
-    if not known.any():
-        return None
-    if not known.all():
-        # The ground between a point that the image shows and one that it does not may be anywhere in the image.
-        xy = np.concatenate([xy[known], [(0.0, 0.0), (cols - 1.0, rows - 1.0)]])
-    margin = MARGIN_PX * step
-    col0, row0 = np.floor(xy.min(axis=0)).astype(int) - margin
-    col1, row1 = np.ceil(xy.max(axis=0)).astype(int) + margin + 1
-    row0, col0 = max(row0 // step * step, 0), max(col0 // step * step, 0)
-    row1, col1 = min(row1, rows), min(col1, cols)
-    if row1 - row0 < 2 * step or col1 - col0 < 2 * step:
-        return None
-    return PixelWindow(row0, col0, row1 - row0, col1 - col0)
-
-
-def read_pixels(view: View, window: tuple[int, int, int, int], levels: int, scale: GreyScale) -> ViewPixels:
-    """Read a window of an image, and build its pyramid from means of 2 x 2 valid pixels.
-
-    window : row, col, rows, cols; scale : grey scale of the whole image, the same for every window of it.
-    """
-    row, col, rows, cols = window
-    read = view.image.read(row, col, rows, cols)
-    trend = None if scale.trend is None else scale.trend.window(row, col, rows, cols)
-    grey = read.pixels if trend is None else read.pixels - trend
-    pixels, valid = [(grey - np.float32(scale.mean)) * np.float32(1.0 / scale.contrast)], [read.valid]
-    for _ in range(levels - 1):
-        coarse, kept = halved(pixels[-1], valid[-1])
-        pixels.append(coarse)
-        valid.append(kept)
-    return ViewPixels(view.sensor, (row, col), scale.mean, scale.contrast, tuple(pixels), tuple(valid), trend)
-
-
-def halved(pixels: FloatImage, valid: NDArray[np.bool_]) -> tuple[FloatImage, NDArray[np.bool_]]:
-    """Pixels and validity at half the size: means over 2 x 2 valid pixels, valid where at least three of the four are.
-
-    An odd last row or column is dropped.
-    """
-    rows, cols = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
-    blocks = pixels[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
-    if valid.all():
-        mean = (blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]) * np.float32(0.25)
-        return np.ascontiguousarray(mean, np.float32), np.ones(mean.shape, bool)
-    kept = valid[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
-    count = kept.sum(axis=(1, 3))
-    total = np.where(kept, blocks, np.float32(0.0)).sum(axis=(1, 3))
-    return (total / np.maximum(count, 1)).astype(np.float32), np.asarray(count >= 3)
-
-
 def tile_views(
     view_pixels: Sequence[ViewPixels],
     tile_grid: TileGrid,
@@ -216,41 +123,48 @@ def tile_views(
     GeometryError
         Projections are too curved even for the smallest block.
     """
-    layout, nodes, blocked, offset, level = [], [], [], 0, tile_grid.level
+    layout, nodes, bends, unusable, offset, level = [], [], [], [], 0, tile_grid.level
     scale = 2.0**level
     station = lowest_station(view.sensor for view in view_pixels)
     z_ranges = capped(z_range, station, CLEARANCE), capped(z_needed or z_range, station, CLEARANCE)
     tables, block = _fitting_tables(view_pixels, tile_grid, z_ranges)
     for view, table in zip(view_pixels, tables, strict=True):
-        shape_px = view.pixels[level].shape
-        layout.append((offset, *shape_px))
-        offset += view.pixels[level].size
+        assert view.level == level, "the pixels are those of the level"
+        layout.append((offset, *view.pixels.shape))
+        offset += view.pixels.size
         scaled = table.nodes / scale
-        scaled[..., 0, 0] += 0.5 / scale - 0.5 - view.origin[1] / scale
-        scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0] / scale
+        scaled[..., 0, 0] += 0.5 / scale - 0.5 - view.origin[1]
+        scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0]
         nodes.append(scaled)
-        blocked.append(_grown(~view.valid[level], half))
+        bends.append(table.bends / scale)
+        unusable.append(None if view.valid.all() else _grown(~view.valid, half))
     t_of_index = np.array(
         [(tile_grid.height_origin - tables[0].z_mid) / tables[0].z_half, tile_grid.height_step / tables[0].z_half]
     )
+    pixels = np.concatenate([view.pixels.ravel() for view in view_pixels])
+    parts = [pixels[first : first + rows * cols].reshape(rows, cols) for first, rows, cols in layout]
+    blocked = np.zeros(offset, np.bool_)
+    for (first, rows, cols), mask in zip(layout, unusable, strict=True):
+        if mask is not None:
+            blocked[first : first + rows * cols] = mask.ravel()
     return TileViews(
-        pixels=np.concatenate([view.pixels[level].ravel() for view in view_pixels]),
-        blocked=np.concatenate([mask.ravel() for mask in blocked]),
-        has_blocked=np.array([bool(mask.any()) for mask in blocked]),
+        pixels=pixels,
+        blocked=blocked,
+        has_blocked=np.array([mask is not None for mask in unusable]),
         layout=np.array(layout, np.int64),
         nodes=np.ascontiguousarray(np.stack(nodes)),
+        bends=np.ascontiguousarray(np.stack(bends)),
         is_projected=np.stack([table.holds for table in tables]),
         is_excluded=np.stack([table.lost for table in tables]),
         t_of_index=t_of_index,
         index_range=(np.stack([table.ends for table in tables]) - t_of_index[0]) / t_of_index[1],
         block=block,
+        view_pixels=tuple(replace(view, pixels=part) for view, part in zip(view_pixels, parts, strict=True)),
     )
 
 
 def _grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
     """Pixels (r, c) that no middle of a window of half width `half` may be on."""
-    if not unusable.any():
-        return unusable
     side = 2 * (half + 2) + 1
     grown = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8))
     return np.asarray(grown, np.bool_)
@@ -261,18 +175,22 @@ class TableAttempt:
     """How projection tables are made.
 
     block : cells along the side of a block; tolerance_px : largest error, pixels of the level; degree : of the
-    polynomials in height; max_excluded : share of what a view shows from which it may be excluded.
+    polynomials in height; is_bent : see `TableRequest`; max_excluded : share of what a view shows from which it may be
+    excluded.
     """
 
     block: int
     tolerance_px: float
     degree: int
+    is_bent: bool = False
     max_excluded: float = 0.0
 
     def request(self, tile_grid: TileGrid, z_range: tuple[float, float]) -> TableRequest:
         """The table of a view over some heights (m)."""
         tolerance_px = self.tolerance_px * 2.0**tile_grid.level
-        return TableRequest(tile_grid.transform, tile_grid.shape, self.block, z_range, tolerance_px, self.degree)
+        return TableRequest(
+            tile_grid.transform, tile_grid.shape, self.block, z_range, tolerance_px, self.degree, self.is_bent
+        )
 
 
 def _attempts(block: int, level: int, is_scanning: bool) -> tuple[list[TableAttempt], list[TableAttempt]]:
@@ -283,15 +201,16 @@ def _attempts(block: int, level: int, is_scanning: bool) -> tuple[list[TableAtte
     while blocks[-1] >= 2 * SMALL_BLOCK:
         blocks.append(blocks[-1] // 2)
     large = [b for b in blocks if b > SMALL_BLOCK]
-    everywhere = [TableAttempt(b, near, HIGHER_DEGREE) for b in large]
-    shown = [TableAttempt(b, near, HIGHEST_DEGREE) for b in large]
-    shown += [TableAttempt(b, far, HIGHEST_DEGREE) for b in large[-1:]]
-    shown += [TableAttempt(SMALL_BLOCK, px, HIGHEST_DEGREE) for px in (near, far)]
+    bent = [b for b in large if b <= LARGEST_BENT_BLOCK]
+    everywhere = [TableAttempt(b, near, HIGHER_DEGREE) for b in large if b not in bent]
+    everywhere += [TableAttempt(b, near, HIGHER_DEGREE, is_bent=True) for b in bent]
+    shown = [TableAttempt(b, px, HIGHEST_DEGREE, is_bent=True) for px in (near, far) for b in bent]
+    shown += [TableAttempt(SMALL_BLOCK, px, HIGHEST_DEGREE, is_bent=True) for px in (near, far)]
     shown += [TableAttempt(SMALL_BLOCK, far, UNSTEADY_DEGREE)] * is_scanning
     shown += [
-        TableAttempt(SMALL_BLOCK, far, HIGHEST_DEGREE, MAX_EXCLUDED_SHARE),
+        TableAttempt(SMALL_BLOCK, far, HIGHEST_DEGREE, max_excluded=MAX_EXCLUDED_SHARE),
         TableAttempt(SMALLEST_BLOCK, far, HIGHEST_DEGREE),
-        TableAttempt(SMALLEST_BLOCK, far, HIGHEST_DEGREE, MAX_EXCLUDED_SHARE_AT_LAST),
+        TableAttempt(SMALLEST_BLOCK, far, HIGHEST_DEGREE, max_excluded=MAX_EXCLUDED_SHARE_AT_LAST),
     ]
     return everywhere, shown
 
@@ -322,12 +241,13 @@ def _fitting_tables(
         try:
             return [
                 projection_table_where_shown(
-                    view.sensor, request, (*view.origin, *view.shape), share, attempt.max_excluded > 0.0
+                    view.sensor, request, view.window.at_finest(view.level), share, attempt.max_excluded > 0.0
                 )
                 for view in view_pixels
             ], attempt.block
         except GeometryError as error:
-            bent = error
+            # Its traceback would keep this frame, and the arrays of the tile, until the next garbage collection.
+            bent = error.with_traceback(None)
     if not is_scanning:
         raise bent
     raise GeometryError(
@@ -339,9 +259,8 @@ def _tables_over_all_heights(view_pixels: Sequence[ViewPixels], request: TableRe
     """A projection table per view; None where one is not accurate enough, or not wherever its window shows the tile."""
     tables = []
     for view in view_pixels:
-        window = (*view.origin, *view.shape)
         try:
-            table = projection_table(view.sensor, request, window)
+            table = projection_table(view.sensor, request, view.window.at_finest(view.level))
         except GeometryError:
             return None
         if table.lost.any():

@@ -16,7 +16,7 @@ from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.kernels.subpixel import tile_ortho
 from zlocus.matching.occlusion import mark_occlusions
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.tile_views import TileViews, ViewPixels
+from zlocus.matching.tile_views import TileViews
 from zlocus.matching.view_directions import cells_per_step
 
 # Steps by which a surface must stand above a ray to occlude the cells behind it: less is noise of the surface.
@@ -104,36 +104,38 @@ def surroundings_of_tile(
 
 
 def true_ortho(
-    view_pixels: Sequence[ViewPixels], tile_views: TileViews, visible: VisibleHeights, surface: NDArray[np.float32],
+    tile_views: TileViews, visible: VisibleHeights, surface: NDArray[np.float32],
     coloured: Sequence[ColourSource] = (), surroundings: Surroundings | None = None, scale: GreyScale | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Grey values (r, c), or colours (r, c, 3), of the best view that sees each cell of a surface, float32.
 
     NaN where no view sees the cell. surface : (r, c) float32 height indices without NaN, which also decides which cells
-    are occluded; view_pixels, tile_views, visible : of the finest level; coloured : the images, where all have colours;
+    are occluded; tile_views, visible : of the finest level; coloured : the images, where all have colours;
     surroundings : surface around the tile that may occlude cells, None where nothing there is tall enough; scale : of
     the image to whose grey values all are adjusted, without trends; None: each keeps its own grey values.
     """
     best = best_view(tile_views, visible, surface, surroundings)
     out = np.full(surface.shape + ((3,) if coloured else ()), np.nan, np.float32)
-    for i, view in enumerate(view_pixels):
+    for i, view in enumerate(tile_views.view_pixels):
         shown = best == i
         if not shown.any():
             continue
         gain, offset = 1.0, 0.0
         if scale is not None:
-            gain = scale.contrast / view.contrast
-            offset = scale.mean - gain * view.mean
+            gain = scale.contrast / view.scale.contrast
+            offset = scale.mean - gain * view.scale.mean
         if coloured:
-            (row, col), (rows, cols) = view.origin, view.shape
-            for k, channel in enumerate(coloured[i].colours(row, col, rows, cols)):
-                plain = channel if scale is None or view.trend is None else channel - view.trend
+            trend = None if scale is None else view.trend
+            for k, channel in enumerate(coloured[i].colours(*view.window)):
+                plain = channel if trend is None else channel - trend
                 values = _ortho_of(tile_views, i, plain, surface)[shown]
                 out[shown, k] = values * np.float32(gain) + np.float32(offset)
             continue
-        grey = ortho_image(tile_views, surface, i)[shown] * np.float32(view.contrast) + np.float32(view.mean)
-        if scale is None and view.trend is not None:
-            grey += _ortho_of(tile_views, i, view.trend, surface)[shown]
+        own = view.scale
+        grey = ortho_image(tile_views, surface, i)[shown] * np.float32(own.contrast) + np.float32(own.mean)
+        trend = view.trend if scale is None else None
+        if trend is not None:
+            grey += _ortho_of(tile_views, i, trend, surface)[shown]
         out[shown] = grey if scale is None else grey * np.float32(gain) + np.float32(offset)
     return out
 

@@ -31,7 +31,7 @@ from zlocus.matching.tile import TileResult, match_tile
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.event_log import NAME, EventLog
-from zlocus.pipeline.execution.plan import Tile, tile_needs
+from zlocus.pipeline.execution.plan import Tile, kept_bytes, tile_needs
 from zlocus.pipeline.execution.processes import Processes
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
 from zlocus.pipeline.setup import RunSetup, reference_features
@@ -94,7 +94,8 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
     """
     needs, own, memory_gb = tile_needs(match_scene, tiles, config), held_bytes(), request.memory_gb
     allowed = own + DEFAULT_MEMORY_SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
-    here = needs.n_bytes + TILE_CODE_BYTES
+    kept = kept_bytes(match_scene)
+    here = needs.n_bytes + kept + TILE_CODE_BYTES
     if memory_gb is not None and own + here > allowed:
         raise ConfigError(
             f"--memory {memory_gb:g} GB is too little for one tile, which needs about {here / 1e9:.2g} GB beside the "
@@ -103,7 +104,7 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
     n_worked = sum(1 for tile in tiles if tile.core_window.rows and tile.core_window.cols)
     seconds = seconds_of_paper(tiles) if request.selection == "paper" else needs.seconds
     wanted = request.workers or (cores() if seconds > SHORT_S else 1)
-    there = needs.n_bytes + WORKER_BYTES
+    there = needs.n_bytes + kept + WORKER_BYTES
     slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
     processes = slots > 1 and not request.is_in_image_space
     each = there if processes or request.scheduler else here

@@ -3,12 +3,14 @@
 Exact sensor models are never evaluated per cell. A table evaluates them at the corners of blocks of cells and at a few
 heights; kernels interpolate between these. `projection_table` tabulates each block over all heights.
 `projection_table_where_shown` tabulates each block over the heights at which the image shows it, for cameras so close
-to the ground that a block leaves the image from one height to the next.
+to the ground that a block leaves the image from one height to the next. Close cameras and lenses with distortion also
+bend the rows and columns of a block; a table of bent blocks holds for blocks many times larger.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from affine import Affine
@@ -21,6 +23,8 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 BoolArray = NDArray[np.bool_]
 # A part of an image: first row, first column, number of rows, number of columns, px.
 ImagePart = tuple[int, int, int, int]
+# Rows and columns of one node of all blocks, for each node of a block.
+NodeSlices = tuple[tuple[slice, slice], ...]
 
 TOLERANCE_PX = 0.01
 DEGREE = 3
@@ -39,8 +43,9 @@ N_SAMPLED_HEIGHTS = 33
 # Chebyshev coefficients below this share of the tolerance are set to zero: as polynomials over a short part of the
 # heights they would be large numbers that cancel.
 NEGLIGIBLE_SHARE = 0.02
-# The four corners of all blocks, as slices of an array of corners.
-CORNERS = tuple((slice(i, n), slice(j, m)) for i, n in ((0, -1), (1, None)) for j, m in ((0, -1), (1, None)))
+# Places within a block, as shares of its sides, at which a table is compared with the exact model: bilinear positions
+# are worst in the middle, those that are bent through the middle between it and the corners, and at the edges.
+CHECKED_PLACES, CHECKED_PLACES_IF_BENT = ((0.5, 0.5),), ((0.25, 0.25), (0.75, 0.75), (0.0, 0.5), (0.5, 1.0))
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class TableRequest:
 
     transform : of the ground grid, from (column, row) of cell corners to x and y; shape : rows and columns of cells;
     block : cells along the side of a block; z_range : lowest and highest height, m; tolerance_px : largest distance
-    from the exact model; degree : of the polynomials in height.
+    from the exact model; degree : of the polynomials in height; is_bent : whether rows and columns of a block may bend.
     """
 
     transform: Affine
@@ -58,16 +63,36 @@ class TableRequest:
     z_range: tuple[float, float]
     tolerance_px: float = TOLERANCE_PX
     degree: int = DEGREE
+    is_bent: bool = False
 
     @property
-    def corner_rows(self) -> FloatArray:
-        """(b + 1,) rows of the cells at the corners of blocks."""
-        return self.block * np.arange(-(-self.shape[0] // self.block) + 1, dtype=np.float64)
+    def per_side(self) -> int:
+        """Distances between nodes along the side of a block: nodes are its corners, and if it is bent the middles."""
+        return 2 if self.is_bent else 1
 
     @property
-    def corner_cols(self) -> FloatArray:
-        """(d + 1,) columns of the cells at the corners of blocks."""
-        return self.block * np.arange(-(-self.shape[1] // self.block) + 1, dtype=np.float64)
+    def node_rows(self) -> FloatArray:
+        """(p,) rows of the cells at the nodes of all blocks."""
+        return self._nodes(self.shape[0])
+
+    @property
+    def node_cols(self) -> FloatArray:
+        """(q,) columns of the cells at the nodes of all blocks."""
+        return self._nodes(self.shape[1])
+
+    def _nodes(self, n_cells: int) -> FloatArray:
+        return self.block / self.per_side * np.arange(-(-n_cells // self.block) * self.per_side + 1, dtype=np.float64)
+
+    @property
+    def nodes_of_blocks(self) -> NodeSlices:
+        """Each of the nodes of all blocks, as slices of an array of nodes."""
+        along = [slice(i, i - self.per_side or None, self.per_side) for i in range(self.per_side + 1)]
+        return tuple(product(along, along))
+
+    @property
+    def checked_places(self) -> tuple[tuple[float, float], ...]:
+        """Shares of the sides of a block at which the table is compared with the exact model."""
+        return CHECKED_PLACES_IF_BENT if self.is_bent else CHECKED_PLACES
 
     @property
     def z_mid(self) -> float:
@@ -94,13 +119,16 @@ class ProjectionTable:
 
     nodes : (b + 1, d + 1, 2, n) float64, px: corner row, corner column, (x, y), coefficients of 1, t, t^2, ... with
     t = (z - z_mid) / z_half. The corner (b, d) is the centre of cell (b block, d block); between corners positions are
-    bilinear. holds : (b, d) bool, blocks in which these positions are exact to the tolerance; the other blocks are not
+    bilinear. bends : (b, d, 2, 2, n) float64, px by squares of cells: what is added to them is r (r - block) times the
+    first and c (c - block) times the second, r and c the row and the column within the block; n = 0 where nothing is.
+    holds : (b, d) bool, blocks in which these positions are exact to the tolerance; the other blocks are not
     in the image, or the sensor cannot map all of them, and they count as not visible. lost : (b, d) bool, blocks that
     the image may show, at some of the heights, although the table does not hold there. ends : (b, d, 2), lowest and
     highest t at which the polynomials of a block hold.
     """
 
     nodes: FloatArray
+    bends: FloatArray
     z_mid: float
     z_half: float
     holds: BoolArray
@@ -122,8 +150,8 @@ def projection_table(
         The table is further than the tolerance from the exact model, at the centres of more blocks that the window
         shows than `max_lost_share` allows. A smaller block or a shorter range of heights is needed.
     """
-    rows, cols, z_mid, z_half = request.corner_rows, request.corner_cols, request.z_mid, request.z_half
-    degree = request.degree
+    rows, cols, z_mid, z_half = request.node_rows, request.node_cols, request.z_mid, request.z_half
+    degree, nodes_of_blocks = request.degree, request.nodes_of_blocks
     t = np.cos((np.arange(degree + 1) + 0.5) * np.pi / (degree + 1))
     fit = np.linalg.inv(np.vander(t, increasing=True))
     positions = _project_at_heights(sensor, request.transform, rows, cols, np.array([z_mid + z_half * v for v in t]))
@@ -131,15 +159,15 @@ def projection_table(
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
-    whole = np.logical_and.reduce([known[corner] for corner in CORNERS])
-    shows = np.logical_or.reduce([shown[corner] for corner in CORNERS])
+    whole = np.logical_and.reduce([known[node] for node in nodes_of_blocks])
+    shows = np.logical_or.reduce([shown[node] for node in nodes_of_blocks])
     ends = np.broadcast_to((-np.inf, np.inf), (*whole.shape, 2))
-    table = ProjectionTable(nodes, z_mid, z_half, whole, ~whole & shows, ends)
-    gaps = _gaps_over_all_heights(table, sensor, request)
+    table = ProjectionTable(*_corners_and_bends(nodes, request), z_mid, z_half, whole, ~whole & shows, ends)
+    gaps = _gaps_at_heights(table.nodes, table.bends, sensor, request, np.array(CHECKED_T)).max(axis=-1)
     unmapped = (~whole | np.isnan(gaps)) & shows
     bad = table.holds & (gaps > request.tolerance_px)
     if bad.any() and window is not None:
-        bad &= _may_show(table, gaps, window)
+        bad &= _may_show(table, gaps, window, request.block)
     if bad.sum() > max_lost_share * bad.size:
         raise request.error(float(gaps[bad].max()))
     return replace(table, holds=table.holds & (gaps <= request.tolerance_px), lost=bad | unmapped)
@@ -159,14 +187,16 @@ def projection_table_where_shown(
     GeometryError
         More is dropped than `max_lost_share` or `may_drop_heights` allow.
     """
-    rows, cols, z_mid, z_half = request.corner_rows, request.corner_cols, request.z_mid, request.z_half
-    t = np.linspace(-1.0, 1.0, N_SAMPLED_HEIGHTS)
-    shown = shown_blocks(_project_at_heights(sensor, request.transform, rows, cols, z_mid + z_half * t), window)
-    first, last = _corner_runs(shown)
+    rows, cols, z_mid, z_half = request.node_rows, request.node_cols, request.z_mid, request.z_half
+    nodes_of_blocks, t = request.nodes_of_blocks, np.linspace(-1.0, 1.0, N_SAMPLED_HEIGHTS)
+    positions = _project_at_heights(sensor, request.transform, rows, cols, z_mid + z_half * t)
+    shown = shown_blocks(positions, window, nodes_of_blocks)
+    first, last = _node_runs(shown, nodes_of_blocks)
     nodes = _fitted_nodes(sensor, request, np.stack([t[first], t[last]], axis=-1))
     fine = np.linspace(-1.0, 1.0, 2 * N_SAMPLED_HEIGHTS - 1)
-    gaps = _gaps_at_heights(nodes, sensor, request, fine)
-    begins, stops = (2 * f([k[corner] for corner in CORNERS], axis=0) for f, k in ((np.max, first), (np.min, last)))
+    corners, bends = _corners_and_bends(nodes, request)
+    gaps = _gaps_at_heights(corners, bends, sensor, request, fine)
+    begins, stops = (2 * f([k[node] for node in nodes_of_blocks], axis=0) for f, k in ((np.max, first), (np.min, last)))
     at = np.arange(len(fine))
     holds = _with_midpoints(shown.around) & (at >= begins[..., None]) & (at <= stops[..., None])
     holds &= gaps <= request.tolerance_px
@@ -181,7 +211,7 @@ def projection_table_where_shown(
     low_t, high_t = np.where(low == 0, -np.inf, fine[low]), np.where(high == at[-1], np.inf, fine[high])
     ends = np.stack([np.where(some, low_t, np.inf), np.where(some, high_t, -np.inf)], axis=-1)
     lost = np.asarray((shown.missed | bent).any(axis=-1))
-    return ProjectionTable(nodes, z_mid, z_half, some, lost, ends)
+    return ProjectionTable(corners, bends, z_mid, z_half, some, lost, ends)
 
 
 def project_cells(sensor: SensorModel, transform: Affine, rows: FloatArray, cols: FloatArray, z: float) -> FloatArray:
@@ -199,27 +229,45 @@ def _project_at_heights(
     return np.stack([project_cells(sensor, transform, rows, cols, float(z)) for z in heights], axis=-1)
 
 
-def _gaps_over_all_heights(table: ProjectionTable, sensor: SensorModel, request: TableRequest) -> FloatArray:
-    """Largest distance (b, d) px of a table from the exact model at block centres, over the heights `CHECKED_T`; NaN
-    where the sensor cannot map a centre."""
-    n_b, n_d = table.holds.shape
-    rows = request.block * (np.arange(n_b, dtype=np.float64) + 0.5)
-    cols = request.block * (np.arange(n_d, dtype=np.float64) + 0.5)
-    centre = 0.25 * (table.nodes[:-1, :-1] + table.nodes[1:, :-1] + table.nodes[:-1, 1:] + table.nodes[1:, 1:])
-    worst = np.zeros((n_b, n_d))
-    for t in CHECKED_T:
-        exact = project_cells(sensor, request.transform, rows, cols, table.z_mid + t * table.z_half)
-        worst = np.maximum(worst, np.linalg.norm(centre @ t ** np.arange(centre.shape[-1]) - exact, axis=-1))
+def _corners_and_bends(nodes: FloatArray, request: TableRequest) -> tuple[FloatArray, FloatArray]:
+    """`ProjectionTable.nodes` and `bends` of polynomials (p, q, 2, n) at the nodes of all blocks."""
+    if not request.is_bent:
+        n_b, n_d = np.subtract(nodes.shape[:2], 1)
+        return nodes, np.empty((n_b, n_d, 2, 2, 0))
+    middle = nodes[1::2, 1::2]
+    beside = (nodes[:-1:2, 1::2], nodes[2::2, 1::2]), (nodes[1::2, :-1:2], nodes[1::2, 2::2])
+    bends = [(middle - 0.5 * (before + after)) * (-4.0 / request.block**2) for before, after in beside]
+    known = nodes[..., 0, 0] > NOWHERE_PX
+    is_whole = np.logical_and.reduce([known[node] for node in request.nodes_of_blocks])
+    return nodes[::2, ::2], np.where(is_whole[..., None, None, None], np.stack(bends, axis=2), 0.0)
+
+
+def polynomials_at(nodes: FloatArray, bends: FloatArray, block: int, place: tuple[float, float]) -> FloatArray:
+    """Polynomials (b, d, 2, n) px of a table at a place within each block, as shares of the block's sides."""
+    u, v = place
+    top = (1 - v) * nodes[:-1, :-1] + v * nodes[:-1, 1:]
+    low = (1 - v) * nodes[1:, :-1] + v * nodes[1:, 1:]
+    straight = (1 - u) * top + u * low
+    if not bends.shape[-1]:
+        return np.asarray(straight)
+    return np.asarray(straight + block**2 * (u * (u - 1) * bends[:, :, 0] + v * (v - 1) * bends[:, :, 1]))
+
+
+def _gaps_at_heights(
+    nodes: FloatArray, bends: FloatArray, sensor: SensorModel, request: TableRequest, t: FloatArray
+) -> FloatArray:
+    """Largest distance (b, d, s) px of a table from the exact model, over places within blocks, at heights t (s,); NaN
+    where the sensor cannot map one."""
+    powers, heights = np.vander(t, request.degree + 1, increasing=True).T, request.z_mid + request.z_half * t
+    rows, cols = request.node_rows[: -1 : request.per_side], request.node_cols[: -1 : request.per_side]
+    worst = np.zeros((len(rows), len(cols), len(t)))
+    for u, v in request.checked_places:
+        exact = _project_at_heights(
+            sensor, request.transform, rows + u * request.block, cols + v * request.block, heights
+        )  # fmt: skip
+        found = polynomials_at(nodes, bends, request.block, (u, v)) @ powers
+        worst = np.maximum(worst, np.linalg.norm(found - exact, axis=2))
     return worst
-
-
-def _gaps_at_heights(nodes: FloatArray, sensor: SensorModel, request: TableRequest, t: FloatArray) -> FloatArray:
-    """Distance (b, d, s) px of polynomials from the exact model at block centres and heights t (s,); NaN where the
-    sensor cannot map a centre."""
-    rows, cols = request.corner_rows[:-1] + request.block / 2, request.corner_cols[:-1] + request.block / 2
-    middle = np.mean([nodes[corner] for corner in CORNERS], axis=0)
-    exact = _project_at_heights(sensor, request.transform, rows, cols, request.z_mid + request.z_half * t)
-    return np.asarray(np.linalg.norm(middle @ np.vander(t, request.degree + 1, increasing=True).T - exact, axis=2))
 
 
 def _shows_any(positions: FloatArray, window: ImagePart) -> BoolArray:
@@ -230,13 +278,15 @@ def _shows_any(positions: FloatArray, window: ImagePart) -> BoolArray:
     return np.asarray(inside.any(axis=-1))
 
 
-def _may_show(table: ProjectionTable, gaps: FloatArray, window: ImagePart) -> BoolArray:
-    """Blocks (b, d) that a window may show: the box around their corners at all heights, widened by the gaps (b, d) px,
-    meets the window."""
-    at = np.stack([table.nodes @ t ** np.arange(table.nodes.shape[-1]) for t in CHECKED_T])
-    low, high = at.min(axis=0), at.max(axis=0)
-    low = np.min([low[corner] for corner in CORNERS], axis=0) - gaps[..., None]
-    high = np.max([high[corner] for corner in CORNERS], axis=0) + gaps[..., None]
+def _may_show(table: ProjectionTable, gaps: FloatArray, window: ImagePart, block: int) -> BoolArray:
+    """Blocks (b, d) that a window may show: the box around their corners and middles at all heights, widened by the
+    gaps (b, d) px, meets the window."""
+    places = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0), (0.5, 0.5))
+    at = np.stack([
+        polynomials_at(table.nodes, table.bends, block, place) @ t ** np.arange(table.nodes.shape[-1])
+        for t in CHECKED_T for place in places
+    ])  # fmt: skip
+    low, high = at.min(axis=0) - gaps[..., None], at.max(axis=0) + gaps[..., None]
     row, col, n_rows, n_cols = window
     return np.asarray(((high >= (col, row)) & (low <= (col + n_cols - 1, row + n_rows - 1))).all(axis=-1))
 
@@ -245,9 +295,9 @@ def _may_show(table: ProjectionTable, gaps: FloatArray, window: ImagePart) -> Bo
 class ShownBlocks:
     """Which blocks an image shows at s heights, (b, d, s) bool each.
 
-    near : blocks that may be in the image and whose four corners the sensor maps; around : these, and the same blocks
+    near : blocks that may be in the image and whose nodes the sensor maps; around : these, and the same blocks
     at the heights before and after, between which a block enters or leaves the image; missed : blocks that may be in
-    the image although the sensor does not map one of their corners.
+    the image although the sensor does not map one of their nodes.
     """
 
     near: BoolArray
@@ -255,19 +305,19 @@ class ShownBlocks:
     missed: BoolArray
 
 
-def shown_blocks(positions: FloatArray, window: ImagePart) -> ShownBlocks:
-    """Which blocks a window shows: those whose box around the known corners meets the window.
+def shown_blocks(positions: FloatArray, window: ImagePart, nodes_of_blocks: NodeSlices) -> ShownBlocks:
+    """Which blocks a window shows: those whose box around the known nodes meets the window.
 
-    positions : (b + 1, d + 1, 2, s) px, of the corners at s heights, NaN where unknown.
+    positions : (p, q, 2, s) px, of the nodes at s heights, NaN where unknown; nodes_of_blocks : see `TableRequest`.
     """
     row, col, n_rows, n_cols = window
     known = np.asarray(np.isfinite(positions).all(axis=2))
     here = known[:, :, None]
-    low = np.min([np.where(here, positions, np.inf)[corner] for corner in CORNERS], axis=0)
-    high = np.max([np.where(here, positions, -np.inf)[corner] for corner in CORNERS], axis=0)
+    low = np.min([np.where(here, positions, np.inf)[node] for node in nodes_of_blocks], axis=0)
+    high = np.max([np.where(here, positions, -np.inf)[node] for node in nodes_of_blocks], axis=0)
     first, last = np.array([col, row])[:, None], np.array([col + n_cols - 1, row + n_rows - 1])[:, None]
     meets = ((high >= first) & (low <= last)).all(axis=2)
-    whole = np.logical_and.reduce([known[corner] for corner in CORNERS])
+    whole = np.logical_and.reduce([known[node] for node in nodes_of_blocks])
     near = meets & whole
     around = near.copy()
     around[..., 1:] |= near[..., :-1]
@@ -282,13 +332,16 @@ def _with_midpoints(flags: BoolArray) -> BoolArray:
     return out
 
 
-def _corner_runs(shown_blocks: ShownBlocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last height index (b + 1, d + 1) of the longest run of heights at which a block around each corner is
-    shown. Where there is none, the first index is the larger one."""
+def _node_runs(shown_blocks: ShownBlocks, nodes_of_blocks: NodeSlices) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last height index (p, q) of the longest run of heights at which a block around each node is shown.
+
+    Where there is none, the first index is the larger one.
+    """
     n_b, n_d, n = shown_blocks.around.shape
-    around = np.zeros((n_b + 1, n_d + 1, n), bool)
-    for corner in CORNERS:
-        around[corner] |= shown_blocks.around
+    per_side = max(rows.start for rows, _ in nodes_of_blocks)
+    around = np.zeros((per_side * n_b + 1, per_side * n_d + 1, n), bool)
+    for node in nodes_of_blocks:
+        around[node] |= shown_blocks.around
     first, last = longest_run(around)
     some = around.any(axis=-1)
     return np.where(some, first, n - 1), np.where(some, last, 0)
@@ -306,12 +359,12 @@ def longest_run(flags: BoolArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def _fitted_nodes(sensor: SensorModel, request: TableRequest, ends: FloatArray) -> FloatArray:
-    """Polynomials in t (b + 1, d + 1, 2, n) px through Chebyshev nodes between the ends of each corner.
+    """Polynomials in t (p, q, 2, n) px through Chebyshev nodes between the ends of each node of the blocks.
 
-    ends : (b + 1, d + 1, 2), lowest and highest t of each corner; where the lowest is larger, the corner has none and
-    its polynomial is the constant NOWHERE_PX.
+    ends : (p, q, 2), lowest and highest t of each node; where the lowest is larger, the node has none and its
+    polynomial is the constant NOWHERE_PX.
     """
-    rows, cols, transform, degree = request.corner_rows, request.corner_cols, request.transform, request.degree
+    rows, cols, transform, degree = request.node_rows, request.node_cols, request.transform, request.degree
     nodes = np.zeros((len(rows), len(cols), 2, degree + 1))
     nodes[..., 0] = NOWHERE_PX
     at = ends[..., 0] <= ends[..., 1]

@@ -38,8 +38,9 @@ def covered(scene, lattice, blocked=None, relief=None, limits=None):
 
 @pytest.mark.parametrize(("n_views", "shape", "block"), [(3, (37, 70), 16), (2, (45, 90), 32), (2, (5, 7), 8)])
 @pytest.mark.parametrize("with_holes", [False, True])
-def test_covered_heights(n_views, shape, block, with_holes):
-    scene, lattice = kernel_scene(n_views, shape, block), even_lattice(32, shape, block, first=3)
+@pytest.mark.parametrize("is_bent", [False, True])
+def test_covered_heights(n_views, shape, block, with_holes, is_bent):
+    scene, lattice = kernel_scene(n_views, shape, block, is_bent=is_bent), even_lattice(32, shape, block, first=3)
     blocked = np.zeros(len(scene.pixels), bool)
     if with_holes:
         for offset, rows, cols in scene.layout[:2]:
@@ -48,8 +49,8 @@ def test_covered_heights(n_views, shape, block, with_holes):
     ends = 0
     for b, d, rows, cols in scene.blocks():
         for i in range(n_views):
-            node, cells = scene.nodes[i, b : b + 2, d : d + 2], (rows.stop - rows.start, cols.stop - cols.start)
-            good = np.stack([covers(scene, i, node, cells, k, blocked) for k in range(3, 35)], axis=-1)
+            place, cells = (i, b, d), (rows.stop - rows.start, cols.stop - cols.start)
+            good = np.stack([covers(scene, place, cells, k, blocked) for k in range(3, 35)], axis=-1)
             for r, c in np.ndindex(cells):
                 run = surfaces.longest_run(good[r, c])
                 expected = (NEVER_COVERED, -1) if run is None else (run[0] + 3, run[1] + 3)
@@ -81,8 +82,8 @@ def test_covered_heights_end_where_tables_do():
     for number, (b, d, rows, cols) in enumerate(scene.blocks()):
         for i in range(scene.n_views):
             low, high = limits[:, i, *np.unravel_index(number, limits.shape[2:])]
-            node, cells = scene.nodes[i, b : b + 2, d : d + 2], (rows.stop - rows.start, cols.stop - cols.start)
-            inside = [covers(scene, i, node, cells, k, np.zeros(len(scene.pixels), bool)) for k in range(3, 35)]
+            place, cells = (i, b, d), (rows.stop - rows.start, cols.stop - cols.start)
+            inside = [covers(scene, place, cells, k, np.zeros(len(scene.pixels), bool)) for k in range(3, 35)]
             good = np.stack([at & (low <= k <= high) for k, at in zip(range(3, 35), inside, strict=True)], axis=-1)
             for r, c in np.ndindex(cells):
                 run = surfaces.longest_run(good[r, c])
@@ -106,10 +107,15 @@ def test_ends_of_covered_heights_follow_the_relief():
     np.testing.assert_array_equal(moved, [low, high])
 
 
-def covers(scene, i, node, cells, k, blocked):
-    """Whether the cells of a block fall on a usable pixel at height index k, three from the border."""
-    x, y = np.moveaxis(positions(node, scene.heights[0] + k * scene.heights[1], cells, scene.block), -1, 0)
-    offset, rows, cols = scene.layout[i]
+def covers(scene, place, cells, k, blocked):
+    """Whether the cells of a block fall on a usable pixel at height index k, three from the border.
+
+    place : view, row and column of blocks.
+    """
+    node, bend = scene.of_one_block(*place)
+    t = scene.heights[0] + k * scene.heights[1]
+    x, y = np.moveaxis(positions(node, t, cells, scene.block, bend=bend), -1, 0)
+    offset, rows, cols = scene.layout[place[0]]
     inside = (x >= 3) & (x <= cols - 4) & (y >= 3) & (y <= rows - 4)
     hole = blocked[offset : offset + rows * cols].reshape(rows, cols)
     at = (np.clip((y + 0.5).astype(int), 0, rows - 1), np.clip((x + 0.5).astype(int), 0, cols - 1))
@@ -120,14 +126,14 @@ def test_covered_heights_of_one_block_and_its_shortcut():
     scene = kernel_scene(2, (8, 8), 8)
     blocked = np.zeros(len(scene.pixels), bool)
     plain, some = (mask_of(scene.arrays, ViewMasks(blocked, np.full(2, has)), 0) for has in (False, True))
-    assert surely_covered(scene.nodes, 0, -0.5, 0.5, 8, 3.0, plain)
-    assert surely_covered(scene.nodes, 0, -0.5, 0.5, 8, 3.0, some)
-    assert not surely_covered(scene.nodes, 0, -9.0, 0.5, 8, 3.0, plain)
+    assert surely_covered(scene.arrays, 0, -0.5, 0.5, 3.0, plain)
+    assert surely_covered(scene.arrays, 0, -0.5, 0.5, 3.0, some)
+    assert not surely_covered(scene.arrays, 0, -9.0, 0.5, 3.0, plain)
     for t in (-0.5, 0.0, 0.5):
         at = positions(scene.nodes[0, :2, :2], t, (8, 8), 8)[4, 4].astype(int)
         blocked[:] = False
         blocked[at[1] * scene.layout[0, 2] + at[0]] = True
-        assert not surely_covered(scene.nodes, 0, -0.5, 0.5, 8, 3.0, some)
+        assert not surely_covered(scene.arrays, 0, -0.5, 0.5, 3.0, some)
     lowest, highest = np.empty((2, 2, 8, 8), np.int32)
     masks = ViewMasks(np.zeros(len(scene.pixels), bool), np.zeros(2, bool))
     limits = EVERYWHERE[:, None].repeat(2, axis=1)

@@ -45,11 +45,11 @@ def twin_windows(scene, view, cells, first=FIRST, relief=None, blocked=None):
     mask = np.zeros(image.shape, bool) if blocked is None else blocked[offset : offset + rows * cols].reshape(rows, -1)
     for n, (r, c) in enumerate(cells):
         b, d = r // block, c // block
-        node = scene.nodes[view, b : b + 2, d : d + 2]
+        node, bend = scene.of_one_block(view, b, d)
         for k in range(N_HEIGHTS):
             t = scene.heights[0] + (first[n] + k) * scene.heights[1]
             at = (r - b * block, c - d * block)
-            out[n, k] = twin.line_window(image, mask, node, t, at, block, HALF, relief[n], scene.heights[1])
+            out[n, k] = twin.line_window(image, mask, node, t, at, block, HALF, relief[n], scene.heights[1], bend)
     return out
 
 
@@ -64,6 +64,15 @@ def scene():
 @pytest.fixture(scope="module")
 def cells(scene):
     return cells_of(scene)
+
+
+def test_windows_of_bent_blocks_are_those_of_the_twin():
+    made = kernel_scene(is_bent=True)
+    cells = cells_of(made)
+    for view in range(made.n_views):
+        found, plain = windows_of(made, view, cells), twin_windows(made, view, cells)
+        np.testing.assert_array_equal(np.isnan(found), np.isnan(plain))
+        np.testing.assert_allclose(found, plain, rtol=0, atol=VALUE)
 
 
 @pytest.mark.parametrize("view", [0, 1, 2])
@@ -177,7 +186,7 @@ def test_a_window_is_normalised_whatever_its_gain_and_offset():
 def test_a_sample_outside_ends_the_window():
     pixels = np.arange(12 * 9, dtype=np.float32)
     image, velocity = ViewImage(pixels, 9, 12), PixelVelocity(np.float32(0.5), np.float32(0.0))
-    grid = BlockGrid(AxisGrid(0.0, 1.0, 0.0, 0.0), AxisGrid(0.0, 0.0, 1.0, 0.0))
+    grid = BlockGrid(AxisGrid(0.0, 1.0, 0.0, 0.0, 0.0, 0.0), AxisGrid(0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
     relief, out = np.zeros(9, np.float32), np.empty(9, np.float32)
 
     def is_sampled(row, col):

@@ -27,9 +27,8 @@ BENT = 6e-3
 
 
 def resampled(scene, view, b, d, t, relief, half, run=100):
-    nodes, cells = scene.nodes[:, b : b + 2, d : d + 2], flat_cells(*relief.shape)
-    grid = block_grid(nodes, view, t, scene.block, half)
-    velocity = block_velocity(nodes, view, t, scene.heights[1])
+    views, cells = scene.of_block(b, d), flat_cells(*relief.shape)
+    grid, velocity = block_grid(views, view, t, half), block_velocity(views, view, t)
     out, scratch = np.empty(relief.size, np.float32), resample_scratch(run)
     resample_plane(image_of(scene.arrays, view), grid, velocity, cells, relief.ravel(), scratch, out)
     return out.reshape(relief.shape)
@@ -38,16 +37,17 @@ def resampled(scene, view, b, d, t, relief, half, run=100):
 @pytest.mark.parametrize("bumps", [0.0, 1.5])
 @pytest.mark.parametrize("half", [0, 2])
 @pytest.mark.parametrize("t", [-1.0, 0.37, 1.4])
-def test_resampled_planes(half, t, bumps):
+@pytest.mark.parametrize("is_bent", [False, True])
+def test_resampled_planes(half, t, bumps, is_bent):
     """Also of cells that project outside the image: they get the values of its edge."""
-    scene = kernel_scene()
+    scene = kernel_scene(is_bent=is_bent)
     rng = np.random.default_rng(8)
     for view in range(scene.n_views):
         for b, d, rows, cols in scene.blocks():
             cells = (rows.stop - rows.start, cols.stop - cols.start)
             relief = rng.uniform(-bumps, bumps, (cells[0] + 2 * half, cells[1] + 2 * half)).astype(np.float32)
-            node = scene.nodes[view, b : b + 2, d : d + 2]
-            xy = along_slope(node, t, relief, scene.heights[1], cells, scene.block, half)
+            node, bend = scene.of_one_block(view, b, d)
+            xy = along_slope(node, t, relief, scene.heights[1], cells, scene.block, half, bend)
             found = resampled(scene, view, b, d, t, relief, half)
             np.testing.assert_allclose(found, bilinear(scene.images[view], xy), rtol=0, atol=GREY)
 
@@ -73,7 +73,7 @@ def test_velocity_is_the_speed_at_the_middle_of_a_block():
     scene, h = kernel_scene(), 1e-5
     for view in range(scene.n_views):
         node, middle = scene.nodes[view, 1:3, 2:4], scene.block / 2
-        velocity = block_velocity(scene.nodes[:, 1:3, 2:4], view, 0.4, scene.heights[1])
+        velocity = block_velocity(scene.of_block(1, 2), view, 0.4)
         ends = [position(node, np.float64(0.4 + s * h), middle, middle, scene.block) for s in (-1, 1)]
         by_index = (ends[1] - ends[0]) / (2 * h) * scene.heights[1]
         np.testing.assert_allclose(velocity, by_index, rtol=1e-5)
@@ -81,12 +81,13 @@ def test_velocity_is_the_speed_at_the_middle_of_a_block():
         np.testing.assert_allclose(velocity, exact * scene.heights[1], rtol=1e-6)
 
 
-def test_grid_of_a_block_is_its_projection():
-    scene, half = kernel_scene(), 3
-    grid = block_grid(scene.nodes[:, 1:3, 2:4], 1, 0.4, scene.block, half)
+@pytest.mark.parametrize("is_bent", [False, True])
+def test_grid_of_a_block_is_its_projection(is_bent):
+    scene, half = kernel_scene(is_bent=is_bent), 3
+    grid, (node, bend) = block_grid(scene.of_block(1, 2), 1, 0.4, half), scene.of_one_block(1, 1, 2)
     for r, c in ((0, 0), (0, 20), (21, 0), (17, 9)):
         xy = coordinate(grid.x, r, c), coordinate(grid.y, r, c)
-        exact = position(scene.nodes[1, 1:3, 2:4], np.float64(0.4), r - half, c - half, scene.block)
+        exact = position(node, np.float64(0.4), r - half, c - half, scene.block, bend)
         np.testing.assert_allclose(xy, exact, rtol=0, atol=1e-9)
 
 

@@ -53,9 +53,9 @@ def test_values_on_a_surface(degree):
     np.testing.assert_allclose(out.reshape(shape), expected, rtol=0, atol=GREY)
 
 
-@pytest.mark.parametrize(("n_views", "half"), [(2, 2), (4, 3)])
-def test_profiles(n_views, half):
-    scene = kernel_scene(n_views, (20, 26), 16)
+@pytest.mark.parametrize(("n_views", "half", "is_bent"), [(2, 2, False), (4, 3, False), (3, 2, True)])
+def test_profiles(n_views, half, is_bent):
+    scene = kernel_scene(n_views, (20, 26), 16, is_bent=is_bent)
     shape = (20 + 2 * half, 26 + 2 * half)
     surface = (15 + 4 * gaussian_filter(np.random.default_rng(1).normal(size=shape), 3)).astype(np.float32)
     offsets = np.array([-1.5, 0.0, 0.7], np.float32)
@@ -71,23 +71,17 @@ def test_profiles(n_views, half):
         around = surface[
             rows.start + trim : rows.stop + half + window, cols.start + trim : cols.stop + half + window
         ].astype(float)
-        nodes = scene.nodes[:, b : b + 2, d : d + 2]
+        nodes, bends = scene.nodes[:, b : b + 2, d : d + 2], scene.bends[:, b, d]
         for j, offset in enumerate(offsets):
             expected = agreement.profile(
-                scene.images,
-                nodes,
-                scene.heights,
-                around,
-                offset,
-                scene.block,
-                window,
-                visible.at(np.s_[:, rows, cols]),
-            )
+                scene.images, nodes, scene.heights, around, offset, scene.block, window,
+                visible.at(np.s_[:, rows, cols]), bends=bends,
+            )  # fmt: skip
             np.testing.assert_allclose(out[w, j, rows, cols], expected, rtol=0, atol=NCC)
             for group in range(2):
                 expected = agreement.profile(
                     scene.images, nodes, scene.heights, around, offset, scene.block, window,
-                    visible.at(np.s_[:, rows, cols]), group=(group, 2),
+                    visible.at(np.s_[:, rows, cols]), group=(group, 2), bends=bends,
                 )  # fmt: skip
                 np.testing.assert_allclose(groups[w, group, j, rows, cols], expected, rtol=0, atol=NCC)
     if n_views == 2:

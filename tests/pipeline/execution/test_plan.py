@@ -90,7 +90,7 @@ def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
     assert needs_of(scene_of(4), candidates=2).n_bytes == plain
     assert needs_of(scene_of(6), candidates=2).n_bytes < 0.9 * needs_of(scene_of(6)).n_bytes
     # Coarse cells hold many pixels.
-    fine, coarse = scene_of(4), scene_of(4, cell_m=2.0)
+    fine, coarse = scene_of(4), scene_of(4, cell_m=3.0)
     per_cell = [
         needs_of(scene).n_bytes / (scene.overlap_window.rows * scene.overlap_window.cols) for scene in (fine, coarse)
     ]
@@ -100,7 +100,8 @@ def test_memory_is_that_of_cells_heights_and_the_views_of_a_tile():
 def test_time_is_that_of_cells_and_views():
     plain = needs_of(scene_of(4))
     cells = scene_of(4).overlap_window.rows * scene_of(4).overlap_window.cols
-    assert plain.seconds == pytest.approx(cells * (CELL_S + 3 * VIEW_CELL_S))
+    # At their borders views show less than the tile.
+    assert cells * (CELL_S + 2.5 * VIEW_CELL_S) < plain.seconds <= cells * (CELL_S + 3 * VIEW_CELL_S)
     assert needs_of(scene_of(4), tile=64).seconds == pytest.approx(plain.seconds, rel=0.05)
     assert needs_of(scene_of(6)).seconds > 1.3 * plain.seconds
 

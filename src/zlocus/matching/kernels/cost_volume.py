@@ -337,7 +337,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
     if takes.shape[0] < 2:
         out += np.uint8(UNCOVERED_COST * (np.float32(1.0) + weight))
         return
-    nodes, heights, block, variance = views.nodes, views.heights, views.block, parameters.window_variance
+    heights, variance = views.heights, parameters.window_variance
     n_views, n_sizes, half, width = takes.shape[0], windows.shape[0], windows[-1], relief.shape[1]
     n, start, steps = visible.lowest_covered.shape[1] * width, half * (width + 1), relief.ravel()
     size, cells = steps.shape[0] + SLACK, flat_cells(relief.shape[0], width)
@@ -365,7 +365,7 @@ def block_costs(views, relief, span, windows, visible, parameters, evidence, out
                 mark_seen_cells(flat, view, height, n, shown, counts)
             if extent == NOTHING and i > 0:
                 continue
-            grid, velocity = block_grid(nodes, view, t, block, half), block_velocity(nodes, view, t, heights[1])
+            grid, velocity = block_grid(views, view, t, half), block_velocity(views, view, t)
             put_movement(grid, velocity, of_pairs.movement[m])
             resample_plane(image_of(views, view), grid, velocity, cells, steps, scratch, plane)
             centre = plane[start] if i == 0 else centre
@@ -417,9 +417,10 @@ def visible_in(visible, box):
 # as ViewArrays with sliced nodes: ViewArrays, i8, i8 -> ViewArrays
 @kernel
 def views_of_block(views, block_row, block_col):
-    """The arrays of the views with the nodes at the corners of one block."""
+    """The arrays of the views with the projections of one block."""
     nodes = views.nodes[:, block_row : block_row + 2, block_col : block_col + 2]
-    return ViewArrays(views.pixels, views.layout, nodes, views.heights, views.block)
+    bends = views.bends[:, block_row : block_row + 1, block_col : block_col + 1]
+    return ViewArrays(views.pixels, views.layout, nodes, bends, views.heights, views.block)
 
 
 # i8, i8, i8, i8, i8 -> CellBox

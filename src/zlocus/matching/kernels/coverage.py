@@ -8,7 +8,7 @@ import numpy as np
 
 from zlocus.core.jit import kernel
 from zlocus.matching.kernels.cost_volume import cells_of_block, views_of_block
-from zlocus.matching.kernels.resample import block_grid, coordinate
+from zlocus.matching.kernels.resample import block_grid, coordinate, largest_bend
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, HeightSpan
 
 # Positions this close to a bound (px) are judged cell by cell.
@@ -71,7 +71,10 @@ def mask_of(views, masks, view):
 # BlockGrid, i8, i8 -> PixelBox
 @kernel
 def corner_box(grid, n_rows, n_cols):
-    """Extent of the positions of a block of cells. Positions are bilinear, so their extremes are at its corners."""
+    """Extent of the positions of a block of cells, or a little more where they are bent.
+
+    Bilinear positions have their extremes at the corners of the block.
+    """
     x_low, y_low = np.inf, np.inf
     x_high, y_high = -np.inf, -np.inf
     for corner in range(4):
@@ -79,7 +82,8 @@ def corner_box(grid, n_rows, n_cols):
         x, y = coordinate(grid.x, r, c), coordinate(grid.y, r, c)
         x_low, x_high = min(x_low, x), max(x_high, x)
         y_low, y_high = min(y_low, y), max(y_high, y)
-    return PixelBox(x_low, x_high, y_low, y_high)
+    x_more, y_more = largest_bend(grid.x, max(n_rows, n_cols)), largest_bend(grid.y, max(n_rows, n_cols))
+    return PixelBox(x_low - x_more, x_high + x_more, y_low - y_more, y_high + y_more)
 
 
 # ViewMask, PixelBox -> i8
@@ -98,25 +102,24 @@ def count_blocked(mask, box):
     return np.int64(-1) if n_blocked == width * height else n_blocked
 
 
-# (i,2,2,2,4) f8, i8, f8, f8, i8, f8, ViewMask -> b1
+# ViewArrays, i8, f8, f8, f8, ViewMask -> b1
 @kernel
-def surely_covered(nodes, view, t_low, t_high, block, margin, mask):
+def surely_covered(views, view, t_low, t_high, margin, mask):
     """Whether a view covers a whole block at all heights between two, as far as the two heights tell.
 
-    The block must project inside the image by `margin` px, on usable pixels. The paths of points are nearly straight;
-    unusable pixels are looked for `MAX_BEND_PX` around.
+    views : of the block. It must project inside the image by `margin` px, on usable pixels. The paths of points are
+    nearly straight; unusable pixels are looked for `MAX_BEND_PX` around.
     """
     x_low, y_low = np.inf, np.inf
     x_high, y_high = -np.inf, -np.inf
     for end in range(2):
-        grid = block_grid(nodes, view, t_low if end == 0 else t_high, block, 0)
-        for corner in range(4):
-            r, c = (corner // 2) * block, (corner % 2) * block
-            x, y = coordinate(grid.x, r, c), coordinate(grid.y, r, c)
-            if not (margin <= x <= mask.n_cols - 1 - margin and margin <= y <= mask.n_rows - 1 - margin):
-                return False
-            x_low, x_high = min(x_low, x), max(x_high, x)
-            y_low, y_high = min(y_low, y), max(y_high, y)
+        box = corner_box(block_grid(views, view, t_low if end == 0 else t_high, 0), views.block + 1, views.block + 1)
+        x_low, x_high = min(x_low, box.x_low), max(x_high, box.x_high)
+        y_low, y_high = min(y_low, box.y_low), max(y_high, box.y_high)
+    if not (margin <= x_low and x_high <= mask.n_cols - 1 - margin):
+        return False
+    if not (margin <= y_low and y_high <= mask.n_rows - 1 - margin):
+        return False
     if not mask.has_blocked:
         return True
     around = PixelBox(x_low - MAX_BEND_PX, x_high + MAX_BEND_PX, y_low - MAX_BEND_PX, y_high + MAX_BEND_PX)
@@ -169,17 +172,18 @@ def step_cells(grid, margin, mask, length):
     x_last, y_last = mask.n_cols - 1 - margin, mask.n_rows - 1 - margin
     gx, gy, offset, n_cols, blocked = grid.x, grid.y, mask.offset, mask.n_cols, mask.blocked
     for r in range(length.shape[0]):
-        x0, y0 = gx.origin + r * gx.by_row, gy.origin + r * gy.by_row
+        x0, y0 = gx.origin + r * (gx.by_row + r * gx.bend_row), gy.origin + r * (gy.by_row + r * gy.bend_row)
         dx, dy = gx.by_col + r * gx.mixed, gy.by_col + r * gy.mixed
         row = length[r]
         for c in range(row.shape[0]):
-            x, y = x0 + c * dx, y0 + c * dy
+            x, y = x0 + c * (dx + c * gx.bend_col), y0 + c * (dy + c * gy.bend_col)
             inside = (margin <= x) & (x <= x_last) & (margin <= y) & (y <= y_last)
             row[c] = np.int32(row[c] + np.int32(1)) if inside else np.int32(0)
         if mask.has_blocked:
             for c in range(row.shape[0]):
                 if row[c] > 0:
-                    p = offset + int(y0 + c * dy + 0.5) * n_cols + int(x0 + c * dx + 0.5)
+                    x, y = x0 + c * (dx + c * gx.bend_col), y0 + c * (dy + c * gy.bend_col)
+                    p = offset + int(y + 0.5) * n_cols + int(x + 0.5)
                     row[c] = 0 if blocked[p] else row[c]
 
 
@@ -194,7 +198,7 @@ def find_longest_runs(views, view, mask, span, margin, run):
     run.lowest[:], run.highest[:], run.length[:], run.longest[:] = NEVER_COVERED, -1, 0, 0
     end = span.first + span.n_heights
     for k in range(span.first, end):
-        grid = block_grid(views.nodes, view, heights[0] + k * heights[1], views.block, 0)
+        grid = block_grid(views, view, heights[0] + k * heights[1], 0)
         cover = plane_cover(grid, n_rows, n_cols, margin, mask)
         if cover > 0:
             covered += 1
@@ -226,7 +230,7 @@ def block_coverage(views, masks, span, limit_low, limit_high, margin, lowest, hi
         first, end = max(span.first, limit_low[i]), min(span.first + span.n_heights, limit_high[i] + 1)
         t_low, t_high = heights[0] + first * heights[1], heights[0] + (end - 1) * heights[1]
         mask = mask_of(views, masks, i)
-        if first < end and surely_covered(views.nodes, i, t_low, t_high, views.block, margin, mask):
+        if first < end and surely_covered(views, i, t_low, t_high, margin, mask):
             lowest[i] = first
             highest[i] = end - 1
             continue

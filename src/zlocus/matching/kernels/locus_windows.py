@@ -24,11 +24,12 @@ def sample_window(image, grid, velocity, row, col, half, relief, out):
     at = 0
     for i in range(-half, half + 1):
         r = row + i
-        x0, y0 = gx.origin + r * gx.by_row, gy.origin + r * gy.by_row
+        x0, y0 = gx.origin + r * (gx.by_row + r * gx.bend_row), gy.origin + r * (gy.by_row + r * gy.bend_row)
         dx, dy = gx.by_col + r * gx.mixed, gy.by_col + r * gy.mixed
         for j in range(-half, half + 1):
-            x = x0 + (col + j) * dx + relief[at] * velocity.x
-            y = y0 + (col + j) * dy + relief[at] * velocity.y
+            c = col + j
+            x = x0 + c * (dx + c * gx.bend_col) + relief[at] * velocity.x
+            y = y0 + c * (dy + c * gy.bend_col) + relief[at] * velocity.y
             if not (0.0 <= x < n_cols - 1 and 0.0 <= y < n_rows - 1):
                 return False
             left, top = int(x), int(y)
@@ -76,11 +77,10 @@ def line_windows(views, blocked, view, cells, first, half, relief, out):
     for n in range(out.shape[0]):
         b, d = cells[n, 0] // block, cells[n, 1] // block
         row, col = float(cells[n, 0] - b * block), float(cells[n, 1] - d * block)
-        corners = views_of_block(views, b, d).nodes
+        of_block = views_of_block(views, b, d)
         for k in range(out.shape[1]):
             t = heights[0] + (first[n] + k) * heights[1]
-            grid = block_grid(corners, view, t, block, 0)
-            velocity = block_velocity(corners, view, t, heights[1])
+            grid, velocity = block_grid(of_block, view, t, 0), block_velocity(of_block, view, t)
             window = out[n, k]
             is_shown = sample_window(image, grid, velocity, row, col, half, relief[n], window)
             if is_shown:

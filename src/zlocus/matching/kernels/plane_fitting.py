@@ -122,14 +122,16 @@ def plane_through(row, col, middle, height, weight, value, plane):
             weight[p] = 1.0 / max(abs(height[p] - at[p]), HEIGHT_NOISE_STEPS)
 
 
-# (i,b,d,2,k) f8, (2,) f8, i8, (n,) i8, (n,) i8, (n,) f8, (i,n,4) f8 -> None
+# ViewArrays, (n,) i8, (n,) i8, (n,) f8, (i,n,4) f8 -> None
 @kernel
-def segment_loci(nodes, heights, block, row, col, height, locus):
+def segment_loci(views, row, col, height, locus):
     """Write to `locus` where each view shows the cells of a segment, px, and by how much that moves per height step."""
+    nodes, bends, heights, block = views.nodes, views.bends, views.heights, views.block
     for p in range(row.shape[0]):
         b, d = row[p] // block, col[p] // block
         fr, fc = (row[p] - b * block) / block, (col[p] - d * block) / block
         w0, w1, w2, w3 = (1 - fr) * (1 - fc), (1 - fr) * fc, fr * (1 - fc), fr * fc
+        bend_row, bend_col = block * block * fr * (fr - 1), block * block * fc * (fc - 1)
         t = heights[0] + height[p] * heights[1]
         for i in range(nodes.shape[0]):
             for axis in range(2):
@@ -140,8 +142,12 @@ def segment_loci(nodes, heights, block, row, col, height, locus):
                         w0 * nodes[i, b, d, axis, k] + w1 * nodes[i, b, d + 1, axis, k]
                         + w2 * nodes[i, b + 1, d, axis, k] + w3 * nodes[i, b + 1, d + 1, axis, k]
                     )  # fmt: skip
-                locus[i, p, axis] = place
-                locus[i, p, 2 + axis] = moves * heights[1]
+                bent = bends_more = 0.0
+                for k in range(bends.shape[5] - 1, -1, -1):
+                    bends_more = bends_more * t + bent
+                    bent = bent * t + bend_row * bends[i, b, d, 0, axis, k] + bend_col * bends[i, b, d, 1, axis, k]
+                locus[i, p, axis] = place + bent
+                locus[i, p, 2 + axis] = (moves + bends_more) * heights[1]
 
 
 # (p,) f4, (i,3) i8, (i,n,4) f8, (n,) f8, (n,) f8, (i,n) f8, (i,n) f8 -> None
@@ -294,7 +300,7 @@ def fit_segment(cells, views, limits, plane, costs, out):
     locus, grey, slope = np.empty((n_views, n, 4)), np.empty((n_views, n)), np.empty((n_views, n))
     weight, value, cost, moved = np.empty(n), np.empty(n), np.empty((n_views, 2)), np.empty(3)
     normal, right = np.empty((3, 3)), np.empty(3)
-    segment_loci(views.nodes, views.heights, views.block, row, col, height, locus)
+    segment_loci(views, row, col, height, locus)
     segment_greys(pixels, layout, locus, height, height, grey, slope)
     level_greys(grey, visible, is_core)
     disagreement(grey, slope, visible, is_core, noise, weight, value, cost)

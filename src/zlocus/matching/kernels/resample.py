@@ -40,36 +40,49 @@ def polynomial(coefficients, t):
     return value
 
 
-# (2,2,2,4) f8, i8, f8, i8, i8 -> AxisGrid
+# (2,2,2,4) f8, (2,2,4) f8, i8, f8, i8, i8 -> AxisGrid
 @kernel
-def axis_grid(corners, axis, t, block, half):
+def axis_grid(corners, bends, axis, t, block, half):
     """One image coordinate of the cells of a block and of `half` cells around it. See `block_grid`."""
     origin, right = polynomial(corners[0, 0, axis], t), polynomial(corners[0, 1, axis], t)
     below, diagonal = polynomial(corners[1, 0, axis], t), polynomial(corners[1, 1, axis], t)
     by_col = (right - origin) / block
     by_row = (below - origin) / block
     mixed = (diagonal - below - right + origin) / (block * block)
-    origin = origin - half * by_col - half * by_row + half * half * mixed
-    return AxisGrid(origin, by_col - half * mixed, by_row - half * mixed, mixed)
+    bend_row, bend_col = polynomial(bends[0, axis], t), polynomial(bends[1, axis], t)
+    # A bend is zero at both ends of the block.
+    by_row -= block * bend_row
+    by_col -= block * bend_col
+    origin += half * (half * (mixed + bend_row + bend_col) - by_col - by_row)
+    by_row -= half * (mixed + 2.0 * bend_row)
+    by_col -= half * (mixed + 2.0 * bend_col)
+    return AxisGrid(origin, by_col, by_row, mixed, bend_row, bend_col)
 
 
-# (i,2,2,2,4) f8, i8, f8, i8, i8 -> BlockGrid
+# ViewArrays, i8, f8, i8 -> BlockGrid
 @kernel
-def block_grid(nodes, view, t, block, half):
+def block_grid(views, view, t, half):
     """Image positions, in one view, of the cells of a block and of `half` cells around it at one height.
 
-    nodes : (i, 2, 2, 2, n) float64: view, corner row, corner column, image coordinate (x, y), polynomial in t;
-    t : height in the normalised unit of the projection table; block : cells between the corners.
+    views : of one block, see `views_of_block`; t : height in the normalised unit of the projection table.
     """
-    corners = nodes[view]
-    return BlockGrid(axis_grid(corners, 0, t, block, half), axis_grid(corners, 1, t, block, half))
+    corners, bends, block = views.nodes[view], views.bends[view, 0, 0], views.block
+    return BlockGrid(axis_grid(corners, bends, 0, t, block, half), axis_grid(corners, bends, 1, t, block, half))
 
 
 # AxisGrid, f8, f8 -> f8
 @kernel
 def coordinate(grid, row, col):
     """Image coordinate (px) of the cell at (row, col)."""
-    return grid.origin + row * grid.by_row + col * (grid.by_col + row * grid.mixed)
+    by_col = grid.by_col + row * grid.mixed + col * grid.bend_col
+    return grid.origin + row * (grid.by_row + row * grid.bend_row) + col * by_col
+
+
+# AxisGrid, i8 -> f8
+@kernel
+def largest_bend(grid, block):
+    """By how much, at most, the positions within a block deviate from the bilinear ones between its corners, px."""
+    return 0.25 * block * block * (abs(grid.bend_row) + abs(grid.bend_col))
 
 
 # (2,2,2,4) f8, i8, f8 -> f8
@@ -86,11 +99,11 @@ def axis_velocity(corners, axis, t):
     return 0.25 * total
 
 
-# (i,2,2,2,4) f8, i8, f8, f8 -> PixelVelocity
+# ViewArrays, i8, f8 -> PixelVelocity
 @kernel
-def block_velocity(nodes, view, t, t_per_index):
-    """Pixels that the middle of a block moves per height index. nodes : see `block_grid`."""
-    corners = nodes[view]
+def block_velocity(views, view, t):
+    """Pixels that the middle of a block moves per height index. views, t : see `block_grid`."""
+    corners, t_per_index = views.nodes[view], views.heights[1]
     x, y = axis_velocity(corners, 0, t) * t_per_index, axis_velocity(corners, 1, t) * t_per_index
     return PixelVelocity(np.float32(x), np.float32(y))
 
@@ -132,13 +145,17 @@ def pixel_positions(image, grid, velocity, cells, relief, first, end, scratch):
     x_col, y_col = np.float32(grid.x.by_col), np.float32(grid.y.by_col)
     x_row, y_row = np.float32(grid.x.by_row), np.float32(grid.y.by_row)
     x_mixed, y_mixed = np.float32(grid.x.mixed), np.float32(grid.y.mixed)
+    x_bend_row, y_bend_row = np.float32(grid.x.bend_row), np.float32(grid.y.bend_row)
+    x_bend_col, y_bend_col = np.float32(grid.x.bend_col), np.float32(grid.y.bend_col)
     vx, vy = velocity.x, velocity.y
     rows, cols, steps = cells.rows[first:end], cells.cols[first:end], relief[first:end]
     index, fx, fy = scratch.pixel_index, scratch.fraction[0], scratch.fraction[1]
     for j in range(end - first):
         r, c, z = rows[j], cols[j], steps[j]
-        x = min(max(x0 + c * (x_col + r * x_mixed) + r * x_row + z * vx, x_low), x_high)
-        y = min(max(y0 + c * (y_col + r * y_mixed) + r * y_row + z * vy, y_low), y_high)
+        x_of_col, x_of_row = c * (x_col + r * x_mixed + c * x_bend_col), r * (x_row + r * x_bend_row)
+        y_of_col, y_of_row = c * (y_col + r * y_mixed + c * y_bend_col), r * (y_row + r * y_bend_row)
+        x = min(max(x0 + x_of_col + x_of_row + z * vx, x_low), x_high)
+        y = min(max(y0 + y_of_col + y_of_row + z * vy, y_low), y_high)
         left, top = np.floor(x), np.floor(y)
         fx[j] = x - left
         fy[j] = y - top

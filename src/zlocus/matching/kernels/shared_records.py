@@ -16,6 +16,7 @@ class ViewArrays(NamedTuple):
     pixels: np.ndarray  # (p,) f4: grey values (or spline coefficients) of one view after the other
     layout: np.ndarray  # (i,k) i8: offset of a view in `pixels`, its rows and its columns
     nodes: np.ndarray  # (i,b,d,a,n) f8: polynomial of each image coordinate (column, row) at the corners of the blocks
+    bends: np.ndarray  # (i,b,d,e,a,n) f8: polynomials of the bends (along rows, along columns), see `AxisGrid`
     heights: np.ndarray  # (k,) f8: argument of the polynomials at height index 0, and its change per index
     block: int  # i8: cells along the side of a block
 
@@ -80,13 +81,18 @@ class ViewImage(NamedTuple):
 
 
 class AxisGrid(NamedTuple):
-    """One image coordinate (px) of the cells of a block, bilinear in the row r and the column c of the cell:
-    origin + c by_col + r by_row + r c mixed."""
+    """One image coordinate (px) of the cells of a block, as a function of the row r and the column c of the cell:
+    origin + c by_col + r by_row + r c mixed + r^2 bend_row + c^2 bend_col.
+
+    It is bilinear between the corners of the block where the bends are 0. The bends are those of close cameras.
+    """
 
     origin: float  # f8: at the first cell
     by_col: float  # f8: change per column of cells
     by_row: float  # f8: change per row of cells
     mixed: float  # f8: change per row and column of cells
+    bend_row: float  # f8: factor of the square of the row
+    bend_col: float  # f8: factor of the square of the column
 
 
 class BlockGrid(NamedTuple):

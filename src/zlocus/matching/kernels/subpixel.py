@@ -16,6 +16,8 @@ from zlocus.matching.kernels.resample import RUN, block_grid, flat_cells, gather
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, BlockGrid, CellBox, VisibleHeights
 
 LINEAR, CUBIC = 1, 3
+# Least half range of the heights of a block, normalised: a flat block has none.
+MIN_SPAN = 1e-9
 
 
 class ProfileSampling(NamedTuple):
@@ -40,38 +42,41 @@ class LevelGrids(NamedTuple):
 def level_grids(views, view, middle, span, half):
     """Image positions of the cells of a block, and of `half` cells around it, at t = middle - span, middle and middle +
     span."""
-    nodes, block = views.nodes, views.block
     return LevelGrids(
-        block_grid(nodes, view, middle - span, block, half), block_grid(nodes, view, middle, block, half),
-        block_grid(nodes, view, middle + span, block, half),
+        block_grid(views, view, middle - span, half), block_grid(views, view, middle, half),
+        block_grid(views, view, middle + span, half),
     )  # fmt: skip
 
 
-# AxisGrid, AxisGrid, AxisGrid, i8, i8, (14,) f4 -> i8
+# AxisGrid, AxisGrid, AxisGrid, i8, i8, (20,) f4 -> i8
 @kernel
 def axis_path(low, middle, high, n, degree, path):
     """Write the path of one axis, see `surface_path`; returns the whole pixel. n : size of the image along the axis."""
     before, after = (1, 3.01) if degree == CUBIC else (0, 1.01)
     origin = min(max(int(middle.origin), before), n - int(after) - 1)
     path[0], path[1], path[2], path[3] = middle.origin - origin, middle.by_col, middle.by_row, middle.mixed
-    path[4], path[5] = 0.5 * (high.origin - low.origin), 0.5 * (high.by_col - low.by_col)
-    path[6], path[7] = 0.5 * (high.by_row - low.by_row), 0.5 * (high.mixed - low.mixed)
-    path[8] = 0.5 * (high.origin + low.origin) - middle.origin
-    path[9] = 0.5 * (high.by_col + low.by_col) - middle.by_col
-    path[10] = 0.5 * (high.by_row + low.by_row) - middle.by_row
-    path[11] = 0.5 * (high.mixed + low.mixed) - middle.mixed
-    path[12], path[13] = before - origin, n - after - origin
+    path[4], path[5] = middle.bend_row, middle.bend_col
+    path[6], path[7] = 0.5 * (high.origin - low.origin), 0.5 * (high.by_col - low.by_col)
+    path[8], path[9] = 0.5 * (high.by_row - low.by_row), 0.5 * (high.mixed - low.mixed)
+    path[10], path[11] = 0.5 * (high.bend_row - low.bend_row), 0.5 * (high.bend_col - low.bend_col)
+    path[12] = 0.5 * (high.origin + low.origin) - middle.origin
+    path[13] = 0.5 * (high.by_col + low.by_col) - middle.by_col
+    path[14] = 0.5 * (high.by_row + low.by_row) - middle.by_row
+    path[15] = 0.5 * (high.mixed + low.mixed) - middle.mixed
+    path[16] = 0.5 * (high.bend_row + low.bend_row) - middle.bend_row
+    path[17] = 0.5 * (high.bend_col + low.bend_col) - middle.bend_col
+    path[18], path[19] = before - origin, n - after - origin
     return origin
 
 
-# LevelGrids, ViewImage, i8, (2,14) f4 -> (2,) i8
+# LevelGrids, ViewImage, i8, (2,20) f4 -> (2,) i8
 @kernel
 def surface_path(grids, image, degree, path):
     """Write where one view shows a block of cells, as polynomials in the height u.
 
-    path : (2, 14), written, for x and y: the bilinear coefficients (1, column, row, both) of 1, u and u^2, then the
-    lowest and the highest position. Positions are px from a whole pixel (column, row), which is returned. degree : of
-    the interpolation, whose pixels have to lie inside the image.
+    path : (2, 20), written, for x and y: the coefficients (1, column, row, both, squares of row and column) of 1, u and
+    u^2, then the lowest and the highest position. Positions are px from a whole pixel (column, row), which is returned.
+    degree : of the interpolation, whose pixels have to lie inside the image.
     """
     low, middle, high, origin = grids.low, grids.middle, grids.high, np.empty(2, np.int64)
     origin[0] = axis_path(low.x, middle.x, high.x, image.n_cols, degree, path[0])
@@ -79,20 +84,20 @@ def surface_path(grids, image, degree, path):
     return origin
 
 
-# (14,) f4, FlatCells, (p,) f4, i8, i8, (n,) f4 -> None
+# (20,) f4, FlatCells, (p,) f4, i8, i8, (n,) f4 -> None
 @kernel
 def positions_along(path, cells, level, first, end, out):
     """Write the positions of a run of cells on one axis. path : see `surface_path`; level : heights u."""
-    a, b, c, d = path[0], path[1], path[2], path[3]
-    by_a, by_b, by_c, by_d = path[4], path[5], path[6], path[7]
-    bend_a, bend_b, bend_c, bend_d = path[8], path[9], path[10], path[11]
-    low, high = path[12], path[13]
+    a, b, c, d, e, f = path[0], path[1], path[2], path[3], path[4], path[5]
+    by_a, by_b, by_c, by_d, by_e, by_f = path[6], path[7], path[8], path[9], path[10], path[11]
+    bend_a, bend_b, bend_c, bend_d, bend_e, bend_f = path[12], path[13], path[14], path[15], path[16], path[17]
+    low, high = path[18], path[19]
     rows, cols, levels = cells.rows[first:end], cells.cols[first:end], level[first:end]
     for j in range(end - first):
         row, col, u = rows[j], cols[j], levels[j]
-        at = (a + row * c) + col * (b + row * d)
-        by_level = (by_a + row * by_c) + col * (by_b + row * by_d)
-        bend = (bend_a + row * bend_c) + col * (bend_b + row * bend_d)
+        at = (a + row * (c + row * e)) + col * (b + row * d + col * f)
+        by_level = (by_a + row * (by_c + row * by_e)) + col * (by_b + row * by_d + col * by_f)
+        bend = (bend_a + row * (bend_c + row * bend_e)) + col * (bend_b + row * bend_d + col * bend_f)
         out[j] = min(max(at + u * (by_level + u * bend), low), high)
 
 
@@ -161,7 +166,7 @@ def resample_surface(image, grids, cells, level, degree, out):
     degree : LINEAR or CUBIC; out : (p,) or longer. Positions are float32, counted from a whole pixel near the grid;
     those outside the image are moved to its edge.
     """
-    path, n_cols, pixels = np.empty((2, 14), np.float32), image.n_cols, image.pixels
+    path, n_cols, pixels = np.empty((2, 20), np.float32), image.n_cols, image.pixels
     origin = surface_path(grids, image, degree, path)
     before = 1 if degree == CUBIC else 0
     start = np.int32((origin[1] - before) * n_cols + origin[0] - before)
@@ -226,11 +231,7 @@ def block_profile(views, surface, sampling, visible, out):
         for i in range(n_views):
             if flat.lowest_covered[i].min() == NEVER_COVERED:
                 continue
-            grids = LevelGrids(
-                block_grid(views.nodes, i, heights[0] + (centre - span) * heights[1], views.block, half),
-                block_grid(views.nodes, i, heights[0] + centre * heights[1], views.block, half),
-                block_grid(views.nodes, i, heights[0] + (centre + span) * heights[1], views.block, half),
-            )
+            grids = level_grids(views, i, heights[0] + centre * heights[1], span * heights[1], half)
             resample_surface(image_of(views, i), grids, cells, level, degree, planes[i])
             planes[i] -= planes[i, half * width + half]
             window_moments(planes[i], windows, width, n, variance, work, mean[i], scale[i])
@@ -267,21 +268,22 @@ def tile_profile(views, surface, sampling, visible, out):
 def tile_ortho(views, surface, view, out):
     """Write the image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c)."""
     (n_rows, n_cols), heights, block, image = surface.shape, views.heights, views.block, image_of(views, view)
-    low, high = heights[0] + surface.min() * heights[1], heights[0] + surface.max() * heights[1]
-    middle, span = 0.5 * (low + high), max(0.5 * abs(high - low), 1e-9)
     level, grey = np.empty(block * block, np.float32), np.empty(block * block, np.float32)
     cells, last_width = flat_cells(block, block), block
     for br in range((n_rows + block - 1) // block):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
+            of_block = surface[r0:r1, c0:c1]
+            low, high = heights[0] + of_block.min() * heights[1], heights[0] + of_block.max() * heights[1]
+            middle, span = 0.5 * (low + high), max(0.5 * abs(high - low), MIN_SPAN)
             grids = level_grids(views_of_block(views, br, bc), view, middle, span, 0)
             width, n = c1 - c0, (r1 - r0) * (c1 - c0)
             if cells.rows.shape[0] != n or last_width != width:
                 cells, last_width = flat_cells(r1 - r0, width), width
             for r in range(r0, r1):
                 for c in range(width):
-                    index = heights[0] + surface[r, c0 + c] * heights[1]
+                    index = heights[0] + of_block[r - r0, c] * heights[1]
                     level[(r - r0) * width + c] = (index - middle) / span
             resample_surface(image, grids, cells, level[:n], LINEAR, grey[:n])
             out[r0:r1, c0:c1] = grey[:n].reshape((r1 - r0, width))

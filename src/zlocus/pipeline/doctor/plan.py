@@ -17,7 +17,7 @@ from zlocus.core.resources import WORKER_BYTES
 from zlocus.core.scene import Scene
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
 from zlocus.pipeline.doctor.ties import QuickTies
-from zlocus.pipeline.execution.plan import plan_tiles, tile_needs
+from zlocus.pipeline.execution.plan import kept_bytes, plan_tiles, tile_needs
 from zlocus.pipeline.required_space import check_room
 from zlocus.pipeline.setup import grid_of_run, match_scene_of_run
 
@@ -66,7 +66,7 @@ def run_plan(
     check_room(request.out or Path(), grid, match_scene, match_scene.has_colours)
     tiles = plan_tiles(grid.window, match_scene.overlap_window, config.pyramid)
     needs = tile_needs(match_scene, tiles, config)
-    tile_bytes = int(needs.n_bytes + WORKER_BYTES)
+    tile_bytes = int(needs.n_bytes + kept_bytes(match_scene) + WORKER_BYTES)
     fit = request.workers if request.memory_gb is None else int(request.memory_gb * 1e9 / tile_bytes)
     workers = max(min(request.workers, fit, len(tiles)), 1)
     area = box(*grid.geobox.boundingbox.bbox)

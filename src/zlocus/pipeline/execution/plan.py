@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
+
+from zlocus.core.footprints import ground_sample_distance
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions, RunConfig
+from zlocus.core.scene import DecodedSource
+from zlocus.io.decoded_images import DECODED_BYTES
+from zlocus.matching.level_records import READ_POINTS_PER_SIDE, level_window
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.tile import windows_of
+from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, window_showing
 
-# Time to match a cell of a core, and in addition for each view that is compared
-# (docs/development/experiments/growth.md).
-CELL_S, VIEW_CELL_S = 1.5e-6, 0.45e-6
+# Time to match a cell of a core, and in addition for each view that may show it
+# (docs/development/experiments/growth.md, docs/development/experiments/close_cameras.md).
+CELL_S, VIEW_CELL_S = 2e-6, 3e-6
 # Peak memory of a tile: for each cell; for each cell and height step; for each cell and view that is compared; for each
-# pixel of the windows of those views.
-CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 170, 3, 42, 22
+# pixel that those views show of the cells.
+CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 170, 3, 42, 10
 STEPS_PER_CELL = 48
+# Memory of the reduced parts of an image for each of its pixels: five bytes for each pixel of a level.
+REDUCED_BYTES = 5 / 4**FIRST_KEPT_LEVEL * 4 / 3
 # The needs of a run are estimated from at most this many tiles, spread over all.
 MAX_SAMPLED_TILES = 64
 
@@ -73,14 +84,45 @@ def tile_needs(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig
     """Estimate what tiles need, from the cells, views and pixels of a sample of them."""
     worked = [tile for tile in tiles if tile.core_window.rows and tile.core_window.cols]
     most, seconds, looked = 0, 0.0, worked[:: -(-len(worked) // MAX_SAMPLED_TILES) or 1]
+    steps = min(STEPS_PER_CELL, match_scene.n_steps + 16)
     for tile in looked:
-        fine = tile.core_window.at_level(0, config.pyramid.halo).within(match_scene.overlap_window)
-        cells, steps = fine.rows * fine.cols, min(STEPS_PER_CELL, match_scene.n_steps + 16)
-        pixels = sorted(
-            rows * cols for _, _, rows, cols in windows_of(match_scene, tile.core_window, config)[1].values()
-        )
-        pixels = pixels[-config.selection.max_candidates - 1 :]
-        per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * len(pixels)
-        most = max(most, cells * per_cell + sum(pixels) * PIXEL_BYTES)
-        seconds += tile.core_window.rows * tile.core_window.cols * (CELL_S + VIEW_CELL_S * len(pixels))
+        fine = level_window(
+            tile.core_window, 0, config.pyramid.halo, config.pyramid.block, match_scene.overlap_window
+        )  # fmt: skip
+        cells, shown = fine.rows * fine.cols, _shown_pixels(match_scene, tile.core_window, fine, config)
+        per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * len(shown.pixels)
+        most = max(most, cells * per_cell + sum(shown.pixels) * PIXEL_BYTES)
+        seconds += tile.core_window.rows * tile.core_window.cols * (CELL_S + VIEW_CELL_S * shown.views_of_cell)
     return TileNeeds(most, seconds * len(worked) / max(len(looked), 1))
+
+
+def kept_bytes(match_scene: MatchScene) -> int:
+    """Memory of the images that a process keeps from tile to tile: decoded ones, and reduced parts of all of them."""
+    decoded = sum(view.image.decoded_bytes for view in match_scene.views if isinstance(view.image, DecodedSource))
+    n_pixels = sum(math.prod(view.image.shape) for view in match_scene.views)
+    return min(decoded, DECODED_BYTES) + min(int(n_pixels * REDUCED_BYTES), PYRAMID_BYTES)
+
+
+class ShownPixels(NamedTuple):
+    """What views show of a tile. pixels : number for each view; views_of_cell : number of views that show a cell."""
+
+    pixels: list[int]
+    views_of_cell: float
+
+
+def _shown_pixels(
+    match_scene: MatchScene, core_window: CellWindow, fine_window: CellWindow, config: RunConfig
+) -> ShownPixels:
+    """Pixels of the finest level that the views of a tile show of it, those that show most of it first."""
+    ground, z_range = match_scene.points_of(fine_window, 0, READ_POINTS_PER_SIDE), match_scene.expected_range
+    pixels, cells = [], []
+    for number in windows_of(match_scene, core_window, config)[1]:
+        view = match_scene.views[number]
+        part = window_showing(view, ground, z_range or match_scene.z_range)
+        if part is not None:
+            pixel_cells = ground_sample_distance(view, match_scene.ground_height) / match_scene.cell_size
+            pixels.append(part.rows * part.cols)
+            cells.append(pixels[-1] * pixel_cells**2)
+    most = np.argsort(pixels)[::-1][: config.selection.max_candidates + 1]
+    shares = np.minimum(np.array(cells)[most] / (fine_window.rows * fine_window.cols), 1.0)
+    return ShownPixels([pixels[k] for k in most], float(np.nansum(shares)))

@@ -158,7 +158,8 @@ def warm(group: str) -> None:
     from zlocus.matching.kernels.spline import spline_coefficients
     from zlocus.matching.locus_windows import CurveSamples
     from zlocus.matching.subpixel import refine
-    from zlocus.matching.tile_views import TileGrid, read_pixels, tile_views
+    from zlocus.matching.tile_views import TileGrid, tile_views
+    from zlocus.matching.view_pixels import PixelWindow, read_pixels
 
     gc.set_threshold(*GC_THRESHOLDS)
     scene, config = tiny_scene(), RunConfig()
@@ -169,12 +170,12 @@ def warm(group: str) -> None:
         without = replace(config, refine=replace(config.refine, rounds=0))
         tile.match_tile(scene, scene.overlap_window, without)
         return
-    pixels = [read_pixels(view, (0, 0, SIDE, SIDE), 1, scene.grey_scales[0]) for view in scene.views]
+    pixels = [read_pixels(view, PixelWindow(0, 0, SIDE, SIDE), scene.grey_scales[0]) for view in scene.views]
     shape, block = (SIDE, SIDE), config.pyramid.block
     cells = TileGrid(0, scene.transform(scene.overlap_window, 0), shape, block, 0.0, 1.0)
     views = tile_views(pixels, cells, (0.0, 16.0), 2)
     for view in pixels:
-        spline_coefficients(view.pixels[0])
+        spline_coefficients(view.pixels)
     CurveSamples(np.full((1, 2), SIDE // 2), np.zeros(1), 2, np.zeros((1, 25), np.float32)).windows(
         views, 0, slice(None)
     )
