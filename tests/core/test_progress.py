@@ -39,10 +39,10 @@ def test_lines_tell_the_share_done_and_the_time_left(clock):
     log = io.StringIO()
     run(LineProgress(log), clock, steps=5, seconds=30)
     assert log.getvalue().splitlines() == [
-        "Matching: 1 of 5, 20 %, 2 min 0 s left",
-        "Matching: 2 of 5, 40 %, 1 min 30 s left",
-        "Matching: 3 of 5, 60 %, 1 min 0 s left",
-        "Matching: 4 of 5, 80 %, 30.0 s left",
+        "Matching: 1 of 5, 20 %, time left 2 min 0 s",
+        "Matching: 2 of 5, 40 %, time left 1 min 30 s",
+        "Matching: 3 of 5, 60 %, time left 1 min 0 s",
+        "Matching: 4 of 5, 80 %, time left 30.0 s",
         "Matching: done in 2 min 30 s",
     ]
 
@@ -53,7 +53,7 @@ def test_what_is_told_stands_beside_the_steps(clock):
         stage.tell("1.5 GB")
         clock.now += 20
         stage.advance()
-    assert log.getvalue().splitlines()[0] == "Matching: 1 of 2, 50 %, 20.0 s left, 1.5 GB"
+    assert log.getvalue().splitlines()[0] == "Matching: 1 of 2, 50 %, time left 20.0 s, 1.5 GB"
 
 
 def test_lines_are_at_least_ten_seconds_apart(clock):

@@ -16,7 +16,7 @@ from zlocus.io.decoded_images import DecodedImages
 from zlocus.io.images import open_image
 from zlocus.io.open_raster import cached_raster
 
-SHAPE = (60, 80)
+SHAPE, WINDOW = (60, 80), Window(0, 0, 5, 5)
 
 
 class Counted:
@@ -65,11 +65,7 @@ def test_formats_with_random_access_and_images_that_do_not_fit_are_read_by_windo
 
 
 def test_the_least_recently_used_image_is_forgotten(tmp_path):
-    paths, decoded, window = (
-        [write(tmp_path / f"{k}.jpg", k) for k in range(3)],
-        DecodedImages(30_000),
-        Window(0, 0, 5, 5),
-    )
+    paths, decoded, window = [write(tmp_path / f"{k}.jpg", k) for k in range(3)], DecodedImages(30_000), WINDOW
     n_reads = []
     for number in (0, 1, 0, 2, 0, 1):
         with cached_raster(paths[number]) as source:
@@ -77,6 +73,26 @@ def test_the_least_recently_used_image_is_forgotten(tmp_path):
             decoded.window(counted, paths[number], 1, window)
             n_reads.append(counted.n_reads)
     assert n_reads == [1, 1, 0, 1, 0, 1]
+
+
+def test_a_smaller_limit_forgets_images_at_once(tmp_path):
+    paths, decoded, window = (
+        [write(tmp_path / f"{k}.jpg", k) for k in range(3)],
+        DecodedImages(1 << 20),
+        Window(0, 0, 5, 5),
+    )
+    for path in paths:
+        with cached_raster(path) as source:
+            decoded.window(source, path, 1, window)
+    one = 3 * SHAPE[0] * SHAPE[1]
+    assert decoded.held_bytes == 3 * one
+    decoded.limit(2 * one)
+    assert decoded.held_bytes == 2 * one
+    decoded.limit(one - 1)
+    assert decoded.held_bytes == 0
+    with cached_raster(paths[0]) as source:
+        np.testing.assert_array_equal(decoded.window(source, paths[0], 1, window), source.read(1)[:5, :5])
+    assert decoded.held_bytes == 0
 
 
 def test_a_file_that_has_changed_is_decoded_again(tmp_path, monkeypatch):

@@ -106,6 +106,18 @@ def test_coarse_levels_are_read_once_and_the_oldest_parts_are_forgotten(view, im
     assert len(image.read_windows) == 3 * n
 
 
+def test_a_smaller_limit_forgets_parts_at_once(image):
+    pyramids, window = Pyramids(64 << 20), PixelWindow(0, 0, SHAPE[0] >> 2, SHAPE[1] >> 2)
+    before = pyramids.read(image, window, SCALE, 2)
+    assert 2e6 < pyramids.held_bytes < 4e6
+    pyramids.limit(1_000_000)
+    assert 0 < pyramids.held_bytes <= 1_000_000
+    pyramids.limit(0)
+    assert pyramids.held_bytes == 0
+    np.testing.assert_array_equal(pyramids.read(image, window, SCALE, 2).pixels, before.pixels)
+    assert pyramids.held_bytes == 0
+
+
 def test_other_scales_and_images_have_parts_of_their_own(view, image):
     window = PixelWindow(0, 0, 20, 20)
     first, other = (read_pixels(view, window, GreyScale(mean, 1.0), 3).pixels for mean in (0.0, 50.0))

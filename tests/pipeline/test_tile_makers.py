@@ -15,7 +15,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.requests import DsmRequest
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.orientation.triangulate import Observations
-from zlocus.pipeline.tile_run import Polygons, tile_job
+from zlocus.pipeline.tile_run import Plan, Polygons, tile_job
 
 KIND = "sine"
 # The height of a cell is that of a step, which is about 0.7 m here.
@@ -82,6 +82,8 @@ def test_the_feature_points_are_the_tie_points_of_the_reference_image(selection,
         match_scene=Lattice((b, a, c), xyz), grid=None,
     )  # fmt: skip
     request = DsmRequest((Path("a.tif"), Path("b.tif")), Path("out"), method="mvll", selection=selection)
-    job = tile_job(request, setup, RunConfig(), Polygons())
+    plan = Plan(1, 1, False, 1e9, 1e8, 2e9, 12_000_000, 5.0)
+    job = tile_job(request, setup, RunConfig(), Polygons(), plan)
     assert job.match_scene.ties.tolist() == xyz[points].tolist()
     assert job.method.selection == selection
+    assert job.kept_bytes == plan.kept_bytes

@@ -104,7 +104,7 @@ class _LineStage:
         left = (now - self.start) * (self.total - self.done) / self.done
         told = f", {self.told}" if self.told else ""
         steps = f"{self.done:.0f} of {self.total:.0f}, {100 * self.done / self.total:.0f} %"
-        self.progress.note(f"{self.name}: {steps}, {duration(left)} left{told}")
+        self.progress.note(f"{self.name}: {steps}, time left {duration(left)}{told}")
 
 
 @dataclass
@@ -167,7 +167,7 @@ def _new_bars() -> RichBars:
 
     columns = (
         TextColumn("{task.description:<14}"), BarColumn(), TaskProgressColumn(), MofNCompleteColumn(),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[told]}"),
+        TimeElapsedColumn(), TextColumn("time left"), TimeRemainingColumn(), TextColumn("{task.fields[told]}"),
     )  # fmt: skip
     return RichBars(*columns, console=Console(stderr=True))
 

@@ -41,6 +41,22 @@ class DecodedImages:
         row, col = int(window.row_off), int(window.col_off)
         return pixels[band - 1, row : row + int(window.height), col : col + int(window.width)]
 
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the images that are kept now."""
+        with self._lock:
+            return sum(pixels.nbytes for _, pixels in self._images.values())
+
+    def limit(self, n_bytes: int) -> None:
+        """Keep no more than so many bytes from now on."""
+        with self._lock:
+            self.n_bytes = n_bytes
+            self._forget_oldest()
+
+    def _forget_oldest(self) -> None:
+        while sum(pixels.nbytes for _, pixels in self._images.values()) > self.n_bytes:
+            self._images.popitem(last=False)
+
     def _decoded(self, source: rasterio.DatasetReader, path: Path) -> NDArray[Any]:
         """All bands (b, r, c) of an image. A file that has changed is decoded again."""
         state = file_state(path)
@@ -56,8 +72,7 @@ class DecodedImages:
             with self._lock:
                 self._images[path] = (state, pixels)
                 self._images.move_to_end(path)
-                while sum(image.nbytes for _, image in self._images.values()) > self.n_bytes:
-                    self._images.popitem(last=False)
+                self._forget_oldest()
         return pixels
 
 

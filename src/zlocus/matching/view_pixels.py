@@ -184,8 +184,14 @@ class Pyramids:
     def __init__(self, n_bytes: int) -> None:
         self.n_bytes = n_bytes
         self._parts: OrderedDict[PartKey, ReducedPart] = OrderedDict()
-        self._held_bytes = 0
+        self.held_bytes = 0
         self._lock = threading.Lock()
+
+    def limit(self, n_bytes: int) -> None:
+        """Keep no more than so many bytes from now on."""
+        with self._lock:
+            self.n_bytes = n_bytes
+            self._forget_oldest()
 
     def read(self, image: ImageSource, pixel_window: PixelWindow, scale: GreyScale, level: int) -> LevelPixels:
         """A window of a level, `FIRST_KEPT_LEVEL` or coarser."""
@@ -221,14 +227,17 @@ class Pyramids:
         with self._lock:
             self._forget(part_key)
             self._parts[part_key] = made = ReducedPart(image, level_pixels)
-            self._held_bytes += made.n_bytes
-            while self._held_bytes > self.n_bytes and len(self._parts) > 1:
-                self._forget(next(iter(self._parts)))
+            self.held_bytes += made.n_bytes
+            self._forget_oldest()
         return level_pixels[level - FIRST_KEPT_LEVEL]
 
     def _forget(self, part_key: PartKey) -> None:
         part = self._parts.pop(part_key, None)
-        self._held_bytes -= 0 if part is None else part.n_bytes
+        self.held_bytes -= 0 if part is None else part.n_bytes
+
+    def _forget_oldest(self) -> None:
+        while self.held_bytes > self.n_bytes and self._parts:
+            self._forget(next(iter(self._parts)))
 
 
 # One for each process: its threads share the parts.

@@ -118,7 +118,7 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
         progress.note(str(plan))
-    job, digest = tile_job(request, setup, config, run.polygons), digest_of(setup.match_scene, orientation)
+    job, digest = tile_job(request, setup, config, run.polygons, plan), digest_of(setup.match_scene, orientation)
     tile_run = TileRun(job, tiles, checkpoint, EventLog(out))
     with (
         made_folder(out),

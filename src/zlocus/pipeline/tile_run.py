@@ -18,6 +18,7 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress, Stage, duration
 from zlocus.core.requests import DsmRequest
 from zlocus.core.resources import DEFAULT_MEMORY_SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
+from zlocus.io.decoded_images import DECODED
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
 from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
@@ -28,10 +29,11 @@ from zlocus.matching.quality import Quality
 from zlocus.matching.selected_surface import match_tile_of_paper
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
+from zlocus.matching.view_pixels import PYRAMIDS
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.event_log import NAME, EventLog
-from zlocus.pipeline.execution.plan import Tile, kept_bytes, tile_needs
+from zlocus.pipeline.execution.plan import Tile, keep_at_most, kept_bytes, tile_needs
 from zlocus.pipeline.execution.processes import Processes
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
 from zlocus.pipeline.setup import RunSetup, reference_features
@@ -51,6 +53,7 @@ class Plan:
 
     slots : tiles at a time; processes : whether each runs in a process of its own; tile_bytes : memory of the largest
     tile, with its process; own_bytes : memory of the command itself; allowed_bytes : memory that all may take together;
+    kept_bytes : memory of the images that a process may keep from tile to tile, a part of `tile_bytes`;
     seconds : estimated time of one worker for all tiles; scheduler : address of the cluster that does the work instead.
     """
 
@@ -60,6 +63,7 @@ class Plan:
     tile_bytes: float
     own_bytes: float
     allowed_bytes: float
+    kept_bytes: int
     seconds: float
     scheduler: str | None = None
 
@@ -95,7 +99,10 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
     needs, own, memory_gb = tile_needs(match_scene, tiles, config), held_bytes(), request.memory_gb
     allowed = own + DEFAULT_MEMORY_SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
     kept = kept_bytes(match_scene)
-    here = needs.n_bytes + kept + TILE_CODE_BYTES
+    if memory_gb is not None:
+        # Where memory is scarce, images are decoded and reduced again instead of being kept.
+        kept = min(kept, max(int(allowed - own - needs.n_bytes - WORKER_BYTES), 0))
+    here = needs.n_bytes + max(kept - DECODED.held_bytes - PYRAMIDS.held_bytes, 0) + TILE_CODE_BYTES
     if memory_gb is not None and own + here > allowed:
         raise ConfigError(
             f"--memory {memory_gb:g} GB is too little for one tile, which needs about {here / 1e9:.2g} GB beside the "
@@ -111,7 +118,7 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
     if request.method == "gc3-sgm":
         # The pixels of every image are matched before.
         seconds *= len(match_scene.views)
-    return Plan(len(tiles), slots, processes, each, own, allowed, seconds, request.scheduler)
+    return Plan(len(tiles), slots, processes, each, own, allowed, kept, seconds, request.scheduler)
 
 
 def seconds_of_paper(tiles: Sequence[Tile]) -> float:
@@ -315,7 +322,7 @@ class TileRun:
         return self.tile_job.product(tile, TileResult(empty.part(tile.core_window, tile.kept_window)))
 
 
-def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: Polygons) -> TileJob:
+def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: Polygons, plan: Plan) -> TileJob:
     """What makes the tiles of a request."""
     terrain = None
     if request.fill == "dem":
@@ -326,7 +333,7 @@ def tile_job(request: DsmRequest, setup: RunSetup, config: RunConfig, polygons: 
     if request.selection == "paper":
         match_scene = replace(match_scene, ties=reference_features(setup))
     method = MatchMethod(request.method, request.selection, request.views == "auto")
-    return TileJob(match_scene, setup.grid, config, method, fill, polygons, terrain)
+    return TileJob(match_scene, setup.grid, config, method, fill, plan.kept_bytes, polygons, terrain)
 
 
 def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progress) -> AbstractContextManager[Workers]:
@@ -342,6 +349,7 @@ def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progr
         progress.note(f"Dask cluster at {plan.scheduler}; what it does is shown at {cluster.dashboard}")
         return cluster
     if plan.processes:
+        keep_at_most(0)  # the workers read the images from here on
         return Processes(make, plan.slots)
     return nullcontext(Here(make))
 
@@ -459,7 +467,7 @@ class MatchMethod:
 class TileJob:
     """Makes the tiles of a match scene; it is sent to each worker once.
 
-    fill : see `match_tile`; terrain : fills cells that are still empty, None fills none.
+    fill : see `match_tile`; kept_bytes : see `Plan`; terrain : fills cells that are still empty, None fills none.
     """
 
     match_scene: MatchScene
@@ -467,11 +475,13 @@ class TileJob:
     config: RunConfig
     method: MatchMethod
     fill: str
+    kept_bytes: int
     area: Polygons = Polygons()
     terrain: Terrain | None = None
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
+        keep_at_most(self.kept_bytes)
         return self.product(tile, self.method.match(self.match_scene, tile, self.config, self.fill))
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,19 @@ from orientation_scenes import hill_scene
 from zlocus.core.grid import CellWindow
 from zlocus.core.height_range import HeightRange
 from zlocus.core.options import PyramidOptions, RunConfig
+from zlocus.io.decoded_images import DECODED, DECODED_BYTES
 from zlocus.matching.match_scene import build_match_scene
-from zlocus.pipeline.execution.plan import CELL_S, VIEW_CELL_S, TileNeeds, core_size, plan_tiles, tile_needs
+from zlocus.matching.view_pixels import PYRAMID_BYTES, PYRAMIDS
+from zlocus.pipeline.execution.plan import (
+    CELL_S,
+    VIEW_CELL_S,
+    TileNeeds,
+    core_size,
+    keep_at_most,
+    kept_bytes,
+    plan_tiles,
+    tile_needs,
+)
 from zlocus.sensors.correction import ShiftedModel
 
 OPTIONS = PyramidOptions(tile=64, halo=8)
@@ -104,6 +116,25 @@ def test_time_is_that_of_cells_and_views():
     assert cells * (CELL_S + 2.5 * VIEW_CELL_S) < plain.seconds <= cells * (CELL_S + 3 * VIEW_CELL_S)
     assert needs_of(scene_of(4), tile=64).seconds == pytest.approx(plain.seconds, rel=0.05)
     assert needs_of(scene_of(6)).seconds > 1.3 * plain.seconds
+
+
+def test_images_that_are_kept_take_no_more_than_is_allowed():
+    scene = scene_of(4)
+    n_pixels = 4 * 280**2
+    assert kept_bytes(scene) == int(n_pixels * 5 / 16 * 4 / 3)
+    jpegs = [SimpleNamespace(shape=(3000, 4000), decoded_bytes=36_000_000) for _ in scene.views]
+    drone = replace(scene, views=tuple(replace(v, image=jpeg) for v, jpeg in zip(scene.views, jpegs, strict=True)))
+    assert kept_bytes(drone) == 4 * 36_000_000 + int(4 * 12e6 * 5 / 16 * 4 / 3)
+    large = [SimpleNamespace(shape=(30000, 40000), decoded_bytes=3_600_000_000) for _ in scene.views]
+    large = replace(scene, views=tuple(replace(v, image=one) for v, one in zip(scene.views, large, strict=True)))
+    assert kept_bytes(large) == DECODED_BYTES + PYRAMID_BYTES
+    try:
+        for n_bytes in (0, 1_000_000, 10**12):
+            keep_at_most(n_bytes)
+            assert DECODED.n_bytes + PYRAMIDS.n_bytes == min(n_bytes, DECODED_BYTES + PYRAMID_BYTES)
+    finally:
+        keep_at_most(DECODED_BYTES + PYRAMID_BYTES)
+    assert (DECODED.n_bytes, PYRAMIDS.n_bytes) == (DECODED_BYTES, PYRAMID_BYTES)
 
 
 def test_needs_of_no_tile():

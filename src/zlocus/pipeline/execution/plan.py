@@ -13,11 +13,11 @@ from zlocus.core.footprints import ground_sample_distance
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions, RunConfig
 from zlocus.core.scene import DecodedSource
-from zlocus.io.decoded_images import DECODED_BYTES
+from zlocus.io.decoded_images import DECODED, DECODED_BYTES
 from zlocus.matching.level_records import READ_POINTS_PER_SIDE, level_window
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.tile import windows_of
-from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, window_showing
+from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, PYRAMIDS, window_showing
 
 # Time to match a cell of a core, and in addition for each view that may show it
 # (docs/development/experiments/growth.md, docs/development/experiments/close_cameras.md).
@@ -101,6 +101,13 @@ def kept_bytes(match_scene: MatchScene) -> int:
     decoded = sum(view.image.decoded_bytes for view in match_scene.views if isinstance(view.image, DecodedSource))
     n_pixels = sum(math.prod(view.image.shape) for view in match_scene.views)
     return min(decoded, DECODED_BYTES) + min(int(n_pixels * REDUCED_BYTES), PYRAMID_BYTES)
+
+
+def keep_at_most(n_bytes: int) -> None:
+    """Limit the memory of the images that this process keeps from tile to tile, see `kept_bytes`."""
+    reduced = min(n_bytes // 4, PYRAMID_BYTES)
+    PYRAMIDS.limit(reduced)
+    DECODED.limit(min(n_bytes - reduced, DECODED_BYTES))
 
 
 class ShownPixels(NamedTuple):
