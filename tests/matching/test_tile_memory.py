@@ -58,7 +58,7 @@ def test_nine_tiles_of_frame_cameras_leave_nothing_behind(match_scene):
             result = match_tile(match_scene, window, RunConfig())
             assert np.isfinite(result.surface.height).mean() > 0.9
             del result
-            assert not [one for one in gc.get_objects() if isinstance(one, TileViews)]
+            assert not [one for one in gc.get_objects() if type(one) is TileViews]
             held.append(process.memory_info().rss)
     finally:
         gc.enable()

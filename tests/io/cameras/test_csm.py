@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -164,3 +165,13 @@ def test_the_test_orbit_is_level():
     assert height[0] > 4e5
     down = east_north_up(*np.deg2rad([lon, lat]))[0].T @ (look / np.linalg.norm(look))
     assert abs(down[2]) > 0.99
+
+
+@pytest.mark.parametrize("step", [2.6475717016343294e-70, 1e-310])
+def test_samples_of_no_length_give_numbers_without_a_warning(step):
+    """A damaged state: its samples end long before the first line, which is said later."""
+    values = np.arange(30.0).reshape(10, 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = lagrange_interpolated(values, -1.0, step, np.array([6e-5]), 8)
+    assert np.isfinite(found).all()

@@ -25,6 +25,8 @@ from zlocus.sensors.earth_frame import MAJOR_M, MINOR_M
 from zlocus.sensors.linescan import FocalLine, LineTimes
 from zlocus.sensors.trajectory import Trajectory
 
+# Times farther from the samples of a state than so many samples count as this far: such a state is refused later.
+FARTHEST_SAMPLE = 1e6
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 RADIAL = 0
 MAX_AXIS_DIFFERENCE_M = 100.0
@@ -271,7 +273,8 @@ def lagrange_interpolated(values: FloatArray, start: float, step: float, times: 
     A polynomial passes through the `order` nearest samples, through fewer near the ends (6, 4, 2), as in lagrangeInterp
     of usgscsm.
     """
-    at = (times - start) / step
+    with np.errstate(over="ignore"):
+        at = np.clip((times - start) / step, -FARTHEST_SAMPLE, FARTHEST_SAMPLE)
     index = np.clip(at.astype(int), 0, len(values) - 2)
     room = np.minimum(np.minimum(2 * (index + 1), 2 * (len(values) - 1 - index)), order)
     out = np.empty((len(times), values.shape[1]))
