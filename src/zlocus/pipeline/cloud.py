@@ -20,6 +20,7 @@ from zlocus.io.run_record import Stopwatch, result_record, write_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.image_space import depth_options, is_by_depth
 from zlocus.matching.quality import Quality
+from zlocus.pipeline.execution.plan import keep_at_most
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
 from zlocus.pipeline.image_tiles import (
@@ -68,6 +69,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         At the end, with all products kept, where fewer than half of the pixels seen by two images have a height.
     """
     check_output(request.out, request.overwrite)
+    keep_at_most()  # an earlier run of this process may have kept less
     watch, before = Stopwatch(), InputFiles.of(request.inputs)
     with watch.stage("open"), progress.stage("Opening images"):
         opened_inputs = open_inputs(SetupRequest.of(request), progress, "later")

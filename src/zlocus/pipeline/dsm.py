@@ -23,7 +23,7 @@ from zlocus.core.resources import cores
 from zlocus.io.rasters import compression_threads
 from zlocus.io.run_record import Stopwatch, read_record
 from zlocus.pipeline.execution.event_log import EventLog
-from zlocus.pipeline.execution.plan import Tile, plan_tiles
+from zlocus.pipeline.execution.plan import Tile, keep_at_most, plan_tiles
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import write_finished
@@ -78,6 +78,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         cameras are in grave doubt.
     """
     check_output(request.out, request.overwrite, may_be_same=True)
+    keep_at_most()  # an earlier run of this process may have kept less
     tile_runs: list[TileRun] = []
     try:
         with compression_threads(request.workers or cores()):

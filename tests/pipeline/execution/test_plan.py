@@ -133,7 +133,7 @@ def test_images_that_are_kept_take_no_more_than_is_allowed():
             keep_at_most(n_bytes)
             assert DECODED.n_bytes + PYRAMIDS.n_bytes == min(n_bytes, DECODED_BYTES + PYRAMID_BYTES)
     finally:
-        keep_at_most(DECODED_BYTES + PYRAMID_BYTES)
+        keep_at_most()
     assert (DECODED.n_bytes, PYRAMIDS.n_bytes) == (DECODED_BYTES, PYRAMID_BYTES)
 
 

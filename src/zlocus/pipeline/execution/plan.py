@@ -103,8 +103,11 @@ def kept_bytes(match_scene: MatchScene) -> int:
     return min(decoded, DECODED_BYTES) + min(int(n_pixels * REDUCED_BYTES), PYRAMID_BYTES)
 
 
-def keep_at_most(n_bytes: int) -> None:
-    """Limit the memory of the images that this process keeps from tile to tile, see `kept_bytes`."""
+def keep_at_most(n_bytes: int = DECODED_BYTES + PYRAMID_BYTES) -> None:
+    """Limit the memory of the images that this process keeps from tile to tile, see `kept_bytes`.
+
+    n_bytes : by default as much as any scene may take.
+    """
     reduced = min(n_bytes // 4, PYRAMID_BYTES)
     PYRAMIDS.limit(reduced)
     DECODED.limit(min(n_bytes - reduced, DECODED_BYTES))
