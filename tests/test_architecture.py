@@ -246,8 +246,6 @@ SECOND_NAMES: dict[tuple[str, str], str] = {
     ("Restored", "_scene"): "says its part in inspector/inspection.py",
     ("Scene", "corrected"): "says its part in pipeline/doctor/run.py",
     ("ExpectedBounds", "expected"): "says its part in matching/overlap.py",
-    ("Tile", "task"): "says its part in pipeline/image_tiles.py",
-    ("Tile", "tasks"): "says its part in pipeline/image_tiles.py",
     ("VerticalDatum", "vertical"): "says its part in products/rasters.py",
     ("ViewSpec", "view"): "says its part in synthetic/linescan.py, synthetic/scenes.py",
     ("ViewSpec", "views"): "says its part in synthetic/scenes.py",

@@ -21,7 +21,7 @@ from zlocus.matching.kernels.rasterise import SurfaceLimits, agreed_heights, dra
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.surface import Surface
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
-from zlocus.pipeline.image_tiles import GroundArea
+from zlocus.pipeline.image_scenes import GroundArea
 from zlocus.sensors.distortion import FisheyeDistortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.image_rays import HeightRays

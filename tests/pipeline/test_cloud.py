@@ -24,8 +24,8 @@ from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import CloudRequest
 from zlocus.io.open_raster import open_raster
 from zlocus.matching.quality import Quality, is_empty
-from zlocus.pipeline import cloud, pixel_products
-from zlocus.pipeline import image_tiles as per_image
+from zlocus.pipeline import cloud, image_scenes, pixel_products
+from zlocus.pipeline.checked_tiles import CheckedTiles
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.render import Sun, expose, render, visible_ground_points
 from zlocus.synthetic.terrain import analytic_ground
@@ -96,6 +96,13 @@ def rig(tmp_path_factory):
     return folder / "scene.yaml", cameras
 
 
+def read_points(path: Path) -> laspy.LasData:
+    """The points of a cloud image by image, and tile by tile as they were written within an image."""
+    points = laspy.read(path)
+    points.points = points.points[np.argsort(points.point_source_id, kind="stable")]
+    return points
+
+
 def open_rgb(path, shape, dtype):
     return rasterio.open(path, "w", driver="GTiff", height=shape[0], width=shape[1], count=3, dtype=dtype,
                          photometric="RGB", transform=rasterio.Affine.translation(0.5, 0.5), nodata=0)  # fmt: skip
@@ -124,7 +131,7 @@ def test_quality_says_why_a_pixel_is_empty(of_step):
 
 
 def test_the_cloud_holds_every_height_once(of_step):
-    points = laspy.read(of_step.out / "cloud.laz")
+    points = read_points(of_step.out / "cloud.laz")
     heights = [read(of_step.out / f"{name}_height.tif") for name in sorted(LOOKS)]
     counts = [int(np.isfinite(h).sum()) for h in heights]
     assert of_step.n_points == len(points) == sum(counts)
@@ -144,7 +151,7 @@ def spread(points, errors):
 
 def test_points_say_how_precise_they_are_and_how_many_images_saw_them(of_step):
     check_laz(of_step.out / "cloud.laz")
-    points = laspy.read(of_step.out / "cloud.laz")
+    points = read_points(of_step.out / "cloud.laz")
     names = sorted(LOOKS)
     true = [true_height("step", camera(name), (150 - 3 * list(LOOKS).index(name), 150)) for name in names]
     found = [np.isfinite(read(of_step.out / f"{name}_height.tif")) for name in names]
@@ -162,7 +169,7 @@ def test_points_say_how_precise_they_are_and_how_many_images_saw_them(of_step):
 
 
 def test_points_are_seen_where_their_pixel_is(of_step):
-    points = laspy.read(of_step.out / "cloud.laz")
+    points = read_points(of_step.out / "cloud.laz")
     first = sorted(LOOKS).index("nadir") + 1
     xy = camera("nadir").image_from_ground(np.asarray(points.xyz)[points.point_source_id == first])
     height = read(of_step.out / "nadir_height.tif")
@@ -175,7 +182,7 @@ def test_run_json_holds_what_was_done(of_step):
     record = json.loads((of_step.out / "run.json").read_text())
     assert record["points"] == of_step.n_points
     assert set(record["images"]) == set(LOOKS)
-    assert [s["name"] for s in record["stages"]] == ["open", "orient", "setup", "match", "cross-check", "write"]
+    assert [s["name"] for s in record["stages"]] == ["open", "orient", "setup", "match", "write"]
     assert len(record["inputs"]) == 3
     assert sum(v["points"] for v in record["images"].values()) == of_step.n_points
 
@@ -198,7 +205,7 @@ def test_frame_cameras_without_heights_given(rig, of_rig):
         np.testing.assert_allclose((model.centre[2] + depth * ray)[own], height[own], atol=0.3)
         assert (quality & Quality.FILLED).any()
         np.testing.assert_array_equal(is_empty(quality), np.isnan(height))
-    points = laspy.read(of_rig.out / "cloud.laz")
+    points = read_points(of_rig.out / "cloud.laz")
     assert points.header.parse_crs() is None
     assert len(points) == of_rig.n_points == n_own
     assert np.median(points.green / points.red) == pytest.approx(0.5, abs=0.02)
@@ -210,15 +217,15 @@ def test_frame_cameras_without_heights_given(rig, of_rig):
 
 def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypatch):
     patch = (slice(60, 90), slice(60, 90))
-    whole = per_image.matched_pixels
+    put = CheckedTiles._put
 
-    def planted(image_scene, surface):
-        matched = whole(image_scene, surface)
-        if image_scene.image_space.reference_view.name == "nadir":
+    def planted(self, image_tile, tile_product):
+        put(self, image_tile, tile_product)
+        matched = self._matched[image_tile.number]
+        if matched.image.image_space.reference_view.name == "nadir":
             matched.image.height[patch] += 20.0
-        return matched
 
-    monkeypatch.setattr(per_image, "matched_pixels", planted)
+    monkeypatch.setattr(CheckedTiles, "_put", planted)
     run(images("plane").inputs, tmp_path / "out", crs="EPSG:32632", heights=HEIGHTS)
     height, quality = (read(tmp_path / "out" / f"nadir_{what}.tif") for what in ("height", "quality"))
     assert np.isnan(height[patch]).all()
@@ -228,8 +235,8 @@ def test_matching_back_removes_a_planted_wrong_patch(images, tmp_path, monkeypat
 
 def test_levels_are_left_out_where_no_block_fits(images, tmp_path, monkeypatch):
     offered = iter([None, 16])
-    monkeypatch.setattr(per_image, "MIN_LEVELS", 2)
-    monkeypatch.setattr(per_image, "fitting_block", lambda scenes, block: next(offered))
+    monkeypatch.setattr(image_scenes, "MIN_LEVELS", 2)
+    monkeypatch.setattr(image_scenes, "fitting_block", lambda scenes, block: next(offered))
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS, "references": ("nadir",)}
     result = run(images("plane").inputs, tmp_path / "out", **asked)
     record = json.loads((result.out / "run.json").read_text())
@@ -242,7 +249,7 @@ def test_one_reference_is_kept_unconfirmed(images, tmp_path):
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS, "references": ("fore",)}
     result = run(images("plane").inputs, tmp_path / "out", **asked)
     assert sorted(p.name for p in result.out.iterdir()) == [
-        "cloud.laz", "cloud.ply", "fore_height.tif", "fore_quality.tif", "run.json",
+        "cloud.laz", "cloud.ply", "finished.json", "fore_height.tif", "fore_quality.tif", "run.json",
     ]  # fmt: skip
     assert not (read(result.out / "fore_quality.tif") & Quality.INCONSISTENT).any()
 
@@ -282,6 +289,8 @@ def test_bad_input_is_refused_in_a_sentence(images, rig, tmp_path):
     assert "two images or more" in said([paths[0], *to])
     assert "--fill dem" in said([*paths, *to, "--fill", "dem"])
     assert "--workers 0" in said([*paths, *to, "--workers", "0"])
+    assert "--bounds 3 0 1 5 holds no area" in said([*paths, *to, "--bounds", "3", "0", "1", "5"])
+    assert "--memory 0 is not a size" in said([*paths, *to, "--memory", "0"])
     assert "empty range" in said([*paths, "-o", out, "--heights", "5", "5"])
     assert "--crs" in said([rig[0], *to])
     alone = yaml.safe_load(rig[0].read_text())
@@ -306,13 +315,15 @@ def test_options_reach_the_run(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "zlocus.pipeline.cloud", recorder)
     arguments = ["cloud", "a.tif", "b.tif", "-o", tmp_path / "o", "--reference", "a", "--reference", "b", "--crs",
                  "EPSG:32631", "--heights", -3, 9, "--fill", "interpolate", "--partial", "--workers", 2,
-                 "--overwrite"]  # fmt: skip
+                 "--overwrite", "--bounds", 1, 2, 3, 4, "--area", "area.gpkg", "--memory", 3,
+                 "--no-resume"]  # fmt: skip
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     assert result.exit_code == 0, result.output
     assert "12 points" in result.stdout
     assert recorder.request == CloudRequest(
-        (Path("a.tif"), Path("b.tif")), tmp_path / "o", ("a", "b"), "EPSG:32631", (-3, 9), "interpolate", True, 2, True
-    )
+        (Path("a.tif"), Path("b.tif")), tmp_path / "o", ("a", "b"), "EPSG:32631", (-3, 9), "interpolate", True, 2, True,
+        bounds=(1, 2, 3, 4), area=Path("area.gpkg"), memory_gb=3, resume=False,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

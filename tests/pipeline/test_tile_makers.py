@@ -15,7 +15,8 @@ from zlocus.core.options import RunConfig
 from zlocus.core.requests import DsmRequest
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.orientation.triangulate import Observations
-from zlocus.pipeline.tile_run import Plan, Polygons, tile_job
+from zlocus.pipeline.run_plan import Plan
+from zlocus.pipeline.tile_run import Polygons, tile_job
 
 KIND = "sine"
 # The height of a cell is that of a step, which is about 0.7 m here.

@@ -22,7 +22,7 @@ SIGMA_M, N_IMAGES = np.array([0.25, 1.5, 0.125]), np.array([2, 5, 3], np.uint8)
 
 
 def written(folder, crs=UTM):
-    with PointCloud(folder, 3, crs) as cloud:
+    with PointCloud(folder, crs) as cloud:
         cloud.write(1, XYZ[:2], RGB[:2], SIGMA_M[:2], N_IMAGES[:2])
         cloud.write(7, XYZ[2:], RGB[2:], SIGMA_M[2:], N_IMAGES[2:])
     return folder
@@ -77,7 +77,7 @@ def test_a_local_frame_has_no_crs(tmp_path):
 
 
 def test_no_points_make_an_empty_cloud(tmp_path):
-    with PointCloud(tmp_path, 0, UTM):
+    with PointCloud(tmp_path, UTM):
         pass
     assert len(laspy.read(tmp_path / "cloud.laz")) == 0
     assert len(read_ply(tmp_path / "cloud.ply")[1]) == 0
@@ -85,7 +85,7 @@ def test_no_points_make_an_empty_cloud(tmp_path):
 
 def test_a_failure_leaves_nothing(tmp_path):
     def interrupted():
-        with PointCloud(tmp_path, 3, UTM) as cloud:
+        with PointCloud(tmp_path, UTM) as cloud:
             cloud.write(1, XYZ, RGB, SIGMA_M, N_IMAGES)
             raise KeyboardInterrupt
 
@@ -97,18 +97,18 @@ def test_a_failure_leaves_nothing(tmp_path):
 def test_what_cannot_be_written_is_said(tmp_path):
     with (
         pytest.raises(OutputError, match=r"cloud\.laz cannot be written"),
-        PointCloud(tmp_path / "no", 3, UTM) as cloud,
+        PointCloud(tmp_path / "no", UTM) as cloud,
     ):
         cloud.write(1, XYZ, RGB, SIGMA_M, N_IMAGES)
     far = np.add(XYZ, [[0, 0, 0], [0, 0, 0], [0, 5e6, 0]])
-    with pytest.raises(OutputError, match="narrower --heights"), PointCloud(tmp_path, 3, UTM) as cloud:
+    with pytest.raises(OutputError, match="narrower --heights"), PointCloud(tmp_path, UTM) as cloud:
         cloud.write(1, far, RGB, SIGMA_M, N_IMAGES)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_maps_have_the_rows_and_columns_of_their_image(tmp_path):
     values = np.array([[1.5, np.nan, 3.0], [4.0, 5.0, 6.0]], np.float32)
-    write_map(tmp_path / "a_height.tif", values, "height", "m")
+    write_map(tmp_path / "a_height.tif", values.shape, (values[:1], values[1:]), "height", "m")
     with open_raster(tmp_path / "a_height.tif") as source:
         np.testing.assert_array_equal(source.read(1), values)
         assert np.isnan(source.nodata)

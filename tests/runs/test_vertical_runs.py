@@ -315,7 +315,7 @@ def test_a_geoid_of_another_place_is_refused_before_the_first_tile(images, tmp_p
         raise AssertionError("a tile was begun")
 
     monkeypatch.setattr("zlocus.pipeline.tile_run.match_tile", no_tile)
-    monkeypatch.setattr("zlocus.pipeline.cloud.match_images", no_tile)
+    monkeypatch.setattr("zlocus.pipeline.cloud.matched_tiles", no_tile)
     away = write_geoid(tmp_path / "away.tif", np.zeros((4, 4), np.float32), from_origin(5, 44, 0.25, 0.25))
     for asked in (None, HEIGHTS):
         with pytest.raises(InputError, match=r"away\.tif does not cover 46\d+"):

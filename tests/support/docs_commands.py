@@ -87,6 +87,17 @@ def lay_out_images(folder: Path) -> None:
         file.write(heights, 1)
 
 
+def lay_out_images_and_area(folder: Path) -> None:
+    """The same, and polygons of an area."""
+    lay_out_images(folder)
+    (x, y), side = CENTRE, 15.0
+    ring = [[x, y], [x + side, y], [x + side, y + side], [x, y + side], [x, y]]
+    feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32632"}}
+    area = {"type": "FeatureCollection", "crs": crs, "features": [feature]}
+    (folder / "town.geojson").write_text(json.dumps(area), encoding="utf-8")
+
+
 # A drone 60 m above its ground: pixels of 0.26 m.
 DRONE_FOCAL_PX, DRONE_SHAPE, DRONE_HEIGHT_M, DRONE_TILT_DEG = 230.0, (180, 240), 110.0, 3.0
 DRONE_STATIONS = ((-10.0, -6.0), (0.0, -6.0), (10.0, -6.0), (-10.0, 6.0), (0.0, 6.0), (10.0, 6.0))
@@ -212,7 +223,7 @@ def lay_out_surface(folder: Path) -> None:
 # What a page's commands find in the folder in which they are run.
 LAID_OUT = {
     "README.md": lay_out_readme,
-    "docs/how-to/cloud.md": lay_out_images,
+    "docs/how-to/cloud.md": lay_out_images_and_area,
     "docs/how-to/curves.md": lay_out_images,
     "docs/how-to/doctor.md": lay_out_images,
     "docs/how-to/evaluate.md": lay_out_surfaces,

@@ -83,3 +83,11 @@ def wait_until(condition, seconds=120.0):
 RASTERS = ("dsm", "sigma", "quality", "views", "ortho")
 STOPS_WITHIN_S = 5.0
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def cloud_command(images, out, folder, *more, tile):
+    """The command line of `zlocus cloud` on images, in tiles of so many pixels a side."""
+    options = folder / "options.toml"
+    options.write_text(f"[pyramid]\ntile = {tile}\n")
+    asked = ["--crs", "EPSG:32632", "--heights", *map(str, HEIGHTS), "--config", str(options)]
+    return [sys.executable, "-m", "zlocus", "cloud", *map(str, images.inputs), "-o", str(out), *asked, *more]

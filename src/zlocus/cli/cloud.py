@@ -10,12 +10,16 @@ import typer
 
 from zlocus.cli.commands import config_of
 from zlocus.cli.shared_options import (
+    Area,
+    Bounds,
     ConfigFile,
     Crs,
     Inputs,
+    Memory,
     Overwrite,
     Partial,
     ResultFolder,
+    Resume,
     SearchedHeights,
     Vertical,
     Workers,
@@ -35,11 +39,15 @@ class CloudOptions:
         typer.Option(help="Image whose pixels get heights; may be repeated. Default: all images.", metavar="VIEW"),
     ] = None
     crs: Crs = None
+    bounds: Bounds = None
+    area: Area = None
     heights: SearchedHeights = None
     vertical: Vertical = "ellipsoid"
     fill: Annotated[str, typer.Option(help="Fill gaps of the height maps.", metavar="none|interpolate")] = "none"
     partial: Partial = False
     workers: Workers = 1
+    memory: Memory = None
+    resume: Resume = True
     overwrite: Overwrite = False
     config: ConfigFile = None
 
@@ -48,15 +56,17 @@ def cloud(options: CloudOptions) -> None:
     """Make a coloured point cloud with a height for every pixel."""
     request = CloudRequest(
         inputs=tuple(options.inputs), out=options.out, references=tuple(options.reference or ()), crs=options.crs,
-        heights=options.heights, vertical=options.vertical, fill=options.fill, partial=options.partial,
-        workers=options.workers, overwrite=options.overwrite,
+        bounds=options.bounds, area=options.area, heights=options.heights, vertical=options.vertical,
+        fill=options.fill, partial=options.partial, workers=options.workers, memory_gb=options.memory,
+        overwrite=options.overwrite, resume=options.resume,
     )  # fmt: skip
-    check_output(request.out, request.overwrite)
+    check_output(request.out, request.overwrite, may_be_same=True)
     config = config_of(options.config)
     from zlocus.pipeline.cloud import run_cloud
 
     result = run_cloud(request, config, progress_for(sys.stderr))
+    state = "already finished, " if result.was_finished else ""
     print(
-        f"{result.out}: {result.n_points} points, a height for {100 * result.coverage:.1f} % of the pixels seen by two "
-        "images or more."
+        f"{result.out}: {state}{result.n_points} points, a height for {100 * result.coverage:.1f} % of the pixels "
+        "seen by two images or more."
     )

@@ -12,14 +12,18 @@ import typer
 from zlocus.cli.commands import config_of
 from zlocus.cli.products import PRODUCTS_HELP
 from zlocus.cli.shared_options import (
+    Area,
+    Bounds,
     ConfigFile,
     Crs,
     DemVertical,
     Inputs,
+    Memory,
     Overwrite,
     Partial,
     Resolution,
     ResultFolder,
+    Resume,
     SearchedHeights,
     Vertical,
 )
@@ -42,17 +46,11 @@ class DsmOptions:
     out: ResultFolder
     resolution: Resolution = None
     crs: Crs = None
-    bounds: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(
-            help="Area in the CRS of the grid. Default: ground seen by two images or more.",
-            metavar="XMIN YMIN XMAX YMAX",
-        ),
-    ] = None
+    bounds: Bounds = None
     like: Annotated[
         Path | None, typer.Option(help="Take CRS, transform and shape from a raster.", metavar="RASTER")
     ] = None
-    area: Annotated[Path | None, typer.Option(help="Match only inside these polygons.", metavar="VECTOR")] = None
+    area: Area = None
     mask: Annotated[Path | None, typer.Option(help="Match nothing inside these polygons.", metavar="VECTOR")] = None
     heights: SearchedHeights = None
     dem: Annotated[Path | None, typer.Option(help="Search only near the heights of a raster.", metavar="RASTER")] = None
@@ -101,12 +99,8 @@ class DsmOptions:
     scheduler: Annotated[str | None, typer.Option(help="Dask cluster that matches the tiles.", metavar="ADDRESS")] = (
         None
     )
-    memory: Annotated[
-        float | None, typer.Option(help="Memory limit, GB. Default: 60 % of what is free.", metavar="GB")
-    ] = None
-    resume: Annotated[
-        bool, typer.Option("--resume/--no-resume", help="Resume the same run where it was interrupted.")
-    ] = True
+    memory: Memory = None
+    resume: Resume = True
     maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(DEFAULT_PRODUCTS)
     overwrite: Overwrite = False
     report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.")] = True

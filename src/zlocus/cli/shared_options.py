@@ -13,6 +13,14 @@ Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scen
 ResultFolder = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")]
 Resolution = Annotated[float | None, typer.Option(help="Cell size, m. Default: median ground pixel.", metavar="M")]
 Crs = Annotated[str | None, typer.Option(help="Projected CRS. Default: the scene's UTM zone.", metavar="EPSG:N")]
+Bounds = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option(
+        help="Area in the CRS of the result. Default: ground seen by two images or more.",
+        metavar="XMIN YMIN XMAX YMAX",
+    ),
+]
+Area = Annotated[Path | None, typer.Option(help="Match only inside these polygons.", metavar="VECTOR")]
 DemVertical = Annotated[
     str | None,
     typer.Option(help="Vertical datum of the DEM. Default: what its CRS says.", metavar=VERTICAL_DATUMS),
@@ -35,6 +43,8 @@ SearchedHeights = Annotated[
     typer.Option(help="Height range to search, m. Default: found from tie points.", metavar="ZMIN ZMAX"),
 ]
 Workers = Annotated[int, typer.Option(help="Tiles worked on at a time.", metavar="N")]
+Memory = Annotated[float | None, typer.Option(help="Memory limit, GB. Default: 60 % of what is free.", metavar="GB")]
+Resume = Annotated[bool, typer.Option("--resume/--no-resume", help="Resume the same run where it was interrupted.")]
 Partial = Annotated[
     bool, typer.Option("--partial", help="End with status 0 although the result is incomplete or cameras are doubtful.")
 ]

@@ -192,12 +192,31 @@ def matched_area(grid: Grid, overlap_window: CellWindow) -> Bounds:
     shared = grid.window.within(overlap_window)
     if shared.rows and shared.cols:
         return grid.bounds(shared)
-    west, south, east, north = grid.bounds(overlap_window)
-    requested = grid.geobox.extent.boundingbox
-    raise GeometryError(
-        f"The area asked for (E {requested.left:.0f} to {requested.right:.0f} m, N {requested.bottom:.0f} to "
-        f"{requested.top:.0f} m) lies outside the ground that two images see (E {west:.0f} to {east:.0f} m, N "
-        f"{south:.0f} to {north:.0f} m). Check --bounds, --like and the CRS."
+    raise area_not_seen(grid.geobox.extent.boundingbox.bbox, grid.bounds(overlap_window), "--bounds, --like")
+
+
+def check_bounds_seen(bounds: Bounds, seen: Bounds) -> None:
+    """Refuse bounds of an area that share nothing with the ground that two images see. Both : m, of the scene's frame.
+
+    Raises
+    ------
+    GeometryError
+        They share nothing.
+    """
+    if bounds[0] >= seen[2] or bounds[2] <= seen[0] or bounds[1] >= seen[3] or bounds[3] <= seen[1]:
+        raise area_not_seen(bounds, seen, "--bounds")
+
+
+def overlap_of(one: Bounds, other: Bounds) -> Bounds:
+    """Bounds of what two areas share; its sides are of no or negative length where they share nothing."""
+    return max(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), min(one[3], other[3])
+
+
+def area_not_seen(bounds: Bounds, seen: Bounds, options: str) -> GeometryError:
+    """The error of an area that two images see nothing of. seen : bounds of what they see; options : that gave it."""
+    return GeometryError(
+        f"The area asked for ({_extent(bounds)}) lies outside the ground that two images see ({_extent(seen)}). Check "
+        f"{options} and the CRS."
     )
 
 

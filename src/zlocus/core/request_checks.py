@@ -38,6 +38,16 @@ def check_heights(heights: tuple[float, float] | None) -> None:
         raise ConfigError(f"--heights {zmin:.12g} {zmax:.12g} is an empty range. Give ZMIN ZMAX, the lower first.")
 
 
+def check_bounds(bounds: tuple[float, float, float, float] | None) -> None:
+    """Refuse bounds that hold no area or are not finite."""
+    if bounds is None:
+        return
+    xmin, ymin, xmax, ymax = bounds
+    if not all(map(math.isfinite, bounds)) or xmin >= xmax or ymin >= ymax:
+        numbers = " ".join(f"{value:.12g}" for value in bounds)
+        raise ConfigError(f"--bounds {numbers} holds no area. Give XMIN YMIN XMAX YMAX, the smaller values first.")
+
+
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Refuse a value of --name that is none of the choices."""
     if value not in choices:

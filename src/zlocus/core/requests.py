@@ -11,6 +11,7 @@ from pathlib import Path
 from zlocus.core.errors import ConfigError, OutputError
 from zlocus.core.request_checks import (
     SCENE_SUFFIXES,
+    check_bounds,
     check_choice,
     check_heights,
     check_inputs,
@@ -155,13 +156,7 @@ class DsmRequest:
         extra = [name for name, value in given.items() if value is not None]
         if self.like is not None and extra:
             raise ConfigError(f"--like {self.like} fixes the whole grid already. Leave out {' and '.join(extra)}.")
-        if self.bounds is not None:
-            xmin, ymin, xmax, ymax = self.bounds
-            if not all(map(math.isfinite, self.bounds)) or xmin >= xmax or ymin >= ymax:
-                numbers = " ".join(f"{value:.12g}" for value in self.bounds)
-                raise ConfigError(
-                    f"--bounds {numbers} holds no area. Give XMIN YMIN XMAX YMAX, the smaller values first."
-                )
+        check_bounds(self.bounds)
 
 
 @dataclass(frozen=True)
@@ -198,8 +193,9 @@ class SetupRequest:
 class CloudRequest:
     """A point cloud to be made. `None` means: not given, to be found by the run.
 
-    inputs, crs, heights, vertical, partial, workers, overwrite : as in `DsmRequest`. references : names of the views
-    whose pixels get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
+    inputs, crs, bounds, area, heights, vertical, partial, workers, memory_gb, overwrite, resume : as in `DsmRequest`;
+    the cloud of an area has the points whose place on the ground lies in it. references : names of the views whose
+    pixels get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
 
     Raises
     ------
@@ -219,13 +215,19 @@ class CloudRequest:
     workers: int = 1
     overwrite: bool = False
     vertical: str = "ellipsoid"
+    bounds: tuple[float, float, float, float] | None = None
+    area: Path | None = None
+    memory_gb: float | None = None
+    resume: bool = True
 
     def __post_init__(self) -> None:
         check_inputs(self.inputs)
+        check_bounds(self.bounds)
         check_heights(self.heights)
         check_choice("fill", self.fill, FILLS[:2])
         check_vertical("vertical", self.vertical)
         check_workers(self.workers)
+        check_positive("--memory", self.memory_gb, "GB")
         for name in self.references:
             if self.references.count(name) > 1:
                 raise ConfigError(f"--reference {name} is given twice. Name each view once.")

@@ -14,8 +14,9 @@ from zlocus.io.open_raster import open_raster
 CHANNELS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 
 
-def read_colours(path: Path, row: int, rows: int) -> NDArray[np.float32]:
-    """The colours of whole rows of an image, (rows, c, 3) float32, in the file's own numbers.
+def read_colours(path: Path, row: int, rows: int, col: int = 0, cols: int | None = None) -> NDArray[np.float32]:
+    """The colours of a window of an image, (rows, cols, 3) float32, in the file's own numbers. cols : None takes all up
+    to the last one.
 
     Raises
     ------
@@ -25,5 +26,5 @@ def read_colours(path: Path, row: int, rows: int) -> NDArray[np.float32]:
     with open_raster(path) as source:
         index = {meaning: band for band, meaning in zip(source.indexes, source.colorinterp, strict=True)}
         bands = [index[channel] for channel in CHANNELS] if all(c in index for c in CHANNELS) else [1, 1, 1]
-        values = source.read(bands, window=Window(0, row, source.width, rows), out_dtype=np.float32)
+        values = source.read(bands, window=Window(col, row, cols or source.width - col, rows), out_dtype=np.float32)
     return np.ascontiguousarray(np.moveaxis(values, 0, -1))

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.footprints import ground_sample_distance
-from zlocus.core.grid import cells_of_bounds
+from zlocus.core.grid import CellWindow, cells_of_bounds
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
 from zlocus.core.options.option_fields import with_depth_values
 from zlocus.core.scene import ImageSource, ImageWindow, Scene, View
@@ -390,20 +391,44 @@ def check_cross_consistency(
     agrees with the height of that pixel where the two hypotheses differ by no more than `tolerance_px` of equivalent
     disparity between the two images. Pixels without a height do not count.
     """
+    overlapping_images = images_that_overlap(matched_image, other_matched_images)
+    n_rows, cols = matched_image.height.shape
+    for row in range(0, n_rows, ROWS_AT_ONCE):
+        window = CellWindow(row, 0, min(ROWS_AT_ONCE, n_rows - row), cols)
+        rows = slice(row, row + window.rows)
+        yield rows, cross_consistency(matched_image, window, overlapping_images, tolerance_px)
+
+
+class OverlappingImage(NamedTuple):
+    """An image that shows the ground of another one. px_per_unit : see `MatchedImage.px_per_unit`."""
+
+    matched_image: MatchedImage
+    px_per_unit: float
+
+
+def images_that_overlap(
+    matched_image: MatchedImage, other_matched_images: Sequence[MatchedImage]
+) -> list[OverlappingImage]:
+    """The images among others that show the ground of an image."""
     name = matched_image.image_space.reference_view.name
-    overlapping = [(other, rate) for other in other_matched_images if np.isfinite(rate := other.px_per_unit(name))]
-    for row in range(0, len(matched_image.height), ROWS_AT_ONCE):
-        rows = slice(row, min(row + ROWS_AT_ONCE, len(matched_image.height)))
-        part = matched_image.height[rows]
-        counts, known = np.zeros((3, *part.shape), np.uint8), np.isfinite(part)
-        ground = matched_image.image_space.ground(row, part)[known]
-        for other, px_per_unit in overlapping:
-            differs = hypothesis_differences(other, ground) * px_per_unit
-            for count, where in zip(
-                counts, (np.abs(differs) <= tolerance_px, differs < -tolerance_px, differs > tolerance_px), strict=True
-            ):
-                count[known] += where
-        yield rows, CrossConsistency(counts[0], counts[1], counts[2])
+    rated = (OverlappingImage(other, other.px_per_unit(name)) for other in other_matched_images)
+    return [each for each in rated if np.isfinite(each.px_per_unit)]
+
+
+def cross_consistency(
+    matched_image: MatchedImage, window: CellWindow, overlapping_images: Sequence[OverlappingImage], tolerance_px: float
+) -> CrossConsistency:
+    """The comparison of a window of an image's pixels with other images, see `check_cross_consistency`."""
+    part = matched_image.height[window.row : window.row + window.rows, window.col : window.col + window.cols]
+    counts, known = np.zeros((3, *part.shape), np.uint8), np.isfinite(part)
+    ground = matched_image.image_space.ground(window.row, part, window.col)[known]
+    for other, px_per_unit in overlapping_images:
+        differs = hypothesis_differences(other, ground) * px_per_unit
+        for count, where in zip(
+            counts, (np.abs(differs) <= tolerance_px, differs < -tolerance_px, differs > tolerance_px), strict=True
+        ):
+            count[known] += where
+    return CrossConsistency(counts[0], counts[1], counts[2])
 
 
 def hypothesis_differences(matched_image: MatchedImage, ground: NDArray[np.float64]) -> NDArray[np.float64]:

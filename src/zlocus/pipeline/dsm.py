@@ -32,6 +32,7 @@ from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.open_run import OpenRun, check_polygons, known_ties, may_have_terrain, open_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
 from zlocus.pipeline.required_space import check_room
+from zlocus.pipeline.run_plan import Plan, planned
 from zlocus.pipeline.setup import RunSetup, orient_views, set_up_run
 from zlocus.pipeline.surface_products import (
     has_colours,
@@ -44,7 +45,7 @@ from zlocus.pipeline.surface_products import (
     write_report_inputs,
 )
 from zlocus.pipeline.tile_makers import tile_maker
-from zlocus.pipeline.tile_run import Plan, Tally, TileRun, planned, tile_job, workers_for
+from zlocus.pipeline.tile_run import Tally, TileRun, tile_job, workers_for
 from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD
 

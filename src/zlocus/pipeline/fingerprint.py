@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,14 @@ import numpy as np
 import zlocus
 from zlocus.core.jit import kernels_digest
 from zlocus.core.options import RunConfig
-from zlocus.core.requests import DsmRequest
+from zlocus.core.requests import CloudRequest, DsmRequest
 from zlocus.io.config import config_as_dict
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import versions_record
 from zlocus.matching.match_scene import MatchScene
 from zlocus.orientation.orientation import Orientation
 
+COMMANDS = {DsmRequest: "zlocus dsm", CloudRequest: "zlocus cloud"}
 # Fields of a request that change no tile.
 WITHOUT_EFFECT = (
     "out",
@@ -35,13 +37,14 @@ WITHOUT_EFFECT = (
 )
 
 
-def key_of(request: DsmRequest, config: RunConfig, inputs: InputFiles) -> dict[str, Any]:
-    """Options, versions, kernels and inputs (their size and time of change when the run began), by name.
+def key_of(request: DsmRequest | CloudRequest, config: RunConfig, inputs: InputFiles) -> dict[str, Any]:
+    """Command, options, versions, kernels and inputs (their size and time of change when the run began), by name.
 
     The content of images is not read for it, because that would take as long as matching; `run.json` holds checksums.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in WITHOUT_EFFECT}
     return {
+        "command": COMMANDS[type(request)],
         "versions": versions_record(),
         "kernels": kernels_digest(Path(zlocus.__file__).parent),
         "request": {name: str(value) if isinstance(value, Path) else value for name, value in asked.items()},
@@ -65,3 +68,9 @@ def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:
         if array is not None:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def digest_of_images(match_scenes: Sequence[MatchScene], orientation: Orientation) -> str:
+    """SHA-256 of the run setup of several reference images, see `digest_of`."""
+    digests = [digest_of(match_scene, orientation) for match_scene in match_scenes]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()

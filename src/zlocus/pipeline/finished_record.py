@@ -20,6 +20,9 @@ from zlocus.products.stac_item import PRODUCTS
 
 ITEM = "item.json"
 SCHEMA = 1
+# Products of a cloud, and ends of the names of its maps.
+OF_CLOUD = ("cloud.laz", "cloud.ply", "run.json")
+MAPS_OF_IMAGES = ("_height.tif", "_depth.tif", "_quality.tif")
 # The event log only informs, so it is not checked.
 CHECKED = (*(product.name for product in PRODUCTS if product.name != EVENTS), ITEM)
 
@@ -37,16 +40,16 @@ class Finished:
     shortcoming: str = ""
 
 
-def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "") -> None:
+def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "", names: Iterable[str] = CHECKED) -> None:
     """Say that the run in a folder is finished, with the checksums of all products that are there. key, shortcoming :
-    see `Finished`.
+    see `Finished`; names : of the products, by default those of a surface.
 
     Raises
     ------
     OutputError
         Where the file cannot be written.
     """
-    checksums = {name: checksum(out / name) for name in CHECKED if (out / name).is_file()}
+    checksums = {name: checksum(out / name) for name in names if (out / name).is_file()}
     _write(out, Finished(dict(key), checksums, shortcoming))
 
 
@@ -64,8 +67,17 @@ def read_finished(out: Path) -> Finished | None:
     key, checksums = found.get("key"), found.get("products")
     if not isinstance(key, dict) or not isinstance(checksums, dict):
         return damaged
-    known = {name: str(digest) for name, digest in checksums.items() if name in CHECKED}
+    known = {
+        name: str(digest)
+        for name, digest in checksums.items()
+        if name in (*CHECKED, *OF_CLOUD) or is_map_of_image(name)
+    }
     return Finished(key, known, str(found.get("shortcoming", "")))
+
+
+def is_map_of_image(name: str) -> bool:
+    """Whether a name is that of a map of an image, as a cloud has them, in the folder itself."""
+    return Path(name).name == name and name.endswith(MAPS_OF_IMAGES)
 
 
 def update_finished(out: Path, names: Iterable[str]) -> None:

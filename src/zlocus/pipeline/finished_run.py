@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from zlocus.core.errors import OutputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest, held_files
+from zlocus.core.requests import FINISHED, CloudRequest, DsmRequest, SetupRequest, held_files
 from zlocus.io.run_record import read_record
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint, difference
 from zlocus.pipeline.fingerprint import digest_of
@@ -48,7 +49,7 @@ class Missing:
         return (*self.of_ties, *(FILES[name] for name in self.maps), *ends)
 
 
-def finished_run(request: DsmRequest, checkpoint: TileCheckpoint) -> Finished | None:
+def finished_run(request: DsmRequest | CloudRequest, checkpoint: TileCheckpoint) -> Finished | None:
     """The record of the finished run in a request's folder, if it is the requested one.
 
     None where the folder holds no finished run, or may be overwritten.
@@ -91,7 +92,27 @@ def missing_products(request: DsmRequest, finished: Finished, progress: Progress
     OutputError
         A product is not what the run wrote.
     """
-    out, gone, other = request.out, set[str](), list[str]()
+    out, gone = request.out, files_gone(request.out, finished, progress)
+    shown = {name for name in (REPORT, FOOTPRINTS, CURVES) if not (out / name).is_file()}
+    gone = gone | shown if request.report else gone - shown
+    return Missing(
+        matched=tuple(name for name in MATCHED if name in gone or (name != RANKING and not (out / name).is_file())),
+        of_ties=tuple(name for name in OF_TIES if name in gone),
+        maps=tuple(name for name in FILES if name in request.products and not (out / FILES[name]).is_file()),
+        report=REPORT in gone,
+        item=ITEM in gone,
+    )
+
+
+def files_gone(out: Path, finished: Finished, progress: Progress) -> set[str]:
+    """Names of the products that are missing from a finished run.
+
+    Raises
+    ------
+    OutputError
+        A product is not what the run wrote.
+    """
+    gone, other = set[str](), list[str]()
     with progress.stage("Checking products", len(finished.checksums)) as stage:
         for name, digest in finished.checksums.items():
             if not (out / name).is_file():
@@ -105,15 +126,7 @@ def missing_products(request: DsmRequest, finished: Finished, progress: Progress
             f"{out} holds this run, already finished, but {', '.join(other)} {is_not} what the run wrote. Remove {it} "
             f"to have {it} made again, or add --overwrite to make the whole run anew."
         )
-    shown = {name for name in (REPORT, FOOTPRINTS, CURVES) if not (out / name).is_file()}
-    gone = gone | shown if request.report else gone - shown
-    return Missing(
-        matched=tuple(name for name in MATCHED if name in gone or (name != RANKING and not (out / name).is_file())),
-        of_ties=tuple(name for name in OF_TIES if name in gone),
-        maps=tuple(name for name in FILES if name in request.products and not (out / FILES[name]).is_file()),
-        report=REPORT in gone,
-        item=ITEM in gone,
-    )
+    return gone
 
 
 def whole_again(request: DsmRequest, finished: Finished, missing: Missing, progress: Progress) -> DsmRequest:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from zlocus.core.errors import CoverageError
 from zlocus.core.progress import Progress
 from zlocus.io.grid_inputs import lacks_vertical_datum
 from zlocus.orientation.orientation import Orientation
@@ -49,21 +48,15 @@ def note_doubts(doubts: Sequence[Doubt], progress: Progress) -> None:
         progress.note(f"There are {len(doubts) - MAX_NAMED} more doubts about the cameras: see run.json.")
 
 
-def check_doubts(doubts: Sequence[Doubt], product: Path) -> None:
-    """Refuse to call a run a success whose heights are likely to be wrong.
+def grave_doubt(doubts: Sequence[Doubt], product: Path) -> str:
+    """Why the heights of a run are likely to be wrong: the first of the grave doubts; "" where there is none.
 
     product : file that was written all the same.
-
-    Raises
-    ------
-    CoverageError
-        With the first of the grave doubts.
     """
     grave = [doubt for doubt in doubts if doubt.is_grave]
-    if grave:
-        raise CoverageError(
-            f"The heights in {product} are likely to be wrong. {grave[0].sentence} Accept them with --partial."
-        )
+    if not grave:
+        return ""
+    return f"The heights in {product} are likely to be wrong. {grave[0].sentence} Accept them with --partial."
 
 
 def what_was_applied(orientation: Orientation) -> str:

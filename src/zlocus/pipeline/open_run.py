@@ -1,4 +1,7 @@
-"""Start of `zlocus dsm`: inputs are opened, an earlier run in the folder is recognised, impossible runs are refused."""
+"""Start of `zlocus dsm` and `zlocus cloud`: inputs are opened, an earlier run in the folder is recognised.
+
+Impossible runs are refused.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from pyproj import CRS
 from zlocus.core.errors import GeometryError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import FINISHED, DsmRequest, SetupRequest
+from zlocus.core.requests import FINISHED, CloudRequest, DsmRequest, SetupRequest
 from zlocus.core.scene import Scene
 from zlocus.io.grid_inputs import cells_inside, read_polygons
 from zlocus.io.input_files import InputFiles
@@ -21,7 +24,7 @@ from zlocus.pipeline.fingerprint import key_of
 from zlocus.pipeline.finished_record import Finished
 from zlocus.pipeline.finished_run import finished_run
 from zlocus.pipeline.required_space import check_room_before_ties, check_room_for_pixels
-from zlocus.pipeline.setup import OpenedInputs, RunSetup, open_inputs
+from zlocus.pipeline.setup import OpenedInputs, OverlapCheck, RunSetup, open_inputs
 from zlocus.pipeline.tile_run import Polygons
 from zlocus.products.derived import FILES, check_derived
 
@@ -52,15 +55,34 @@ def open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> Open
     OutputError
         The folder holds another run and may not be overwritten, or there is no room for the surface.
     """
-    before = InputFiles.of(request.inputs)
-    opened_inputs = open_inputs(SetupRequest.of(request), progress)
+    run = _opened(request, config, progress, "always")
+    if run.finished is None:
+        check_derived(request.products, config.products)
+        _check_room_first(request, run.opened_inputs, run.checkpoint)
+    return run
+
+
+def open_cloud_run(request: CloudRequest, config: RunConfig, progress: Progress) -> OpenRun:
+    """Open what the request of a cloud names, and compare it with what an earlier run left in the folder.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError, OutputError
+        See `open_run`; the room on the disk is checked later.
+    """
+    return _opened(request, config, progress, "later")
+
+
+def _opened(
+    request: DsmRequest | CloudRequest, config: RunConfig, progress: Progress, overlap_check: OverlapCheck
+) -> OpenRun:
+    """See `open_run`. overlap_check : see `open_inputs`."""
+    before, setup_request = InputFiles.of(request.inputs), SetupRequest.of(request)
+    opened_inputs = open_inputs(setup_request, progress, overlap_check)
     inputs = InputFiles.of(opened_inputs.files, opened_inputs.scene, before)
     key = key_of(request, config, inputs)
     checkpoint = TileCheckpoint.of(request.out, key, request.resume, request.overwrite, inputs.check)
-    finished, polygons = finished_run(request, checkpoint), _area_polygons(request, opened_inputs.scene.crs)
-    if finished is None:
-        check_derived(request.products, config.products)
-        _check_room_first(request, opened_inputs, checkpoint)
+    finished, polygons = finished_run(request, checkpoint), _area_polygons(setup_request, opened_inputs.scene.crs)
     return OpenRun(opened_inputs, inputs, checkpoint, polygons, finished)
 
 
@@ -69,7 +91,7 @@ def may_have_terrain(request: DsmRequest) -> bool:
     return not request.overwrite and all((request.out / name).exists() for name in (FINISHED, FILES["dtm"]))
 
 
-def _area_polygons(request: DsmRequest, crs: CRS) -> Polygons:
+def _area_polygons(request: SetupRequest, crs: CRS) -> Polygons:
     """Polygons of --area and --mask."""
     area = None if request.area is None else read_polygons(request.area, crs)
     mask = None if request.mask is None else read_polygons(request.mask, crs)

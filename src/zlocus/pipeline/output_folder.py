@@ -40,13 +40,24 @@ def made_folder(folder: Path) -> Iterator[None]:
         raise
 
 
-def remove_earlier_products(out: Path) -> None:
-    """Remove the products of an earlier run, so that old and new products never stand together."""
+def remove_earlier_products(out: Path, has_incomplete: bool = True) -> None:
+    """Remove the products of an earlier run, so that old and new products never stand together.
+
+    has_incomplete : whether incomplete files are those of earlier runs, and removed too.
+    """
     remove_derived(out)
     remove_report(out)
     for name in (FINISHED, "run.json", "ties.gpkg", OBSERVATIONS):
         (out / name).unlink(missing_ok=True)
-    # Incomplete files of runs that were killed. This run has none yet, and no other run writes here at the same time.
+    if has_incomplete:
+        remove_incomplete_files(out)
+
+
+def remove_incomplete_files(out: Path) -> None:
+    """Remove the incomplete files of runs that were killed.
+
+    The caller's run has none yet, and no other run writes to the folder at the same time.
+    """
     for path in out.iterdir():
         if INCOMPLETE_FILE.fullmatch(path.name):
             path.unlink(missing_ok=True)

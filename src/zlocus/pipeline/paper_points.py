@@ -25,7 +25,7 @@ from zlocus.matching.stereo_selection import (
     point_curves_of_paper,
     selection_area,
 )
-from zlocus.pipeline.image_tiles import reference_scene
+from zlocus.pipeline.image_scenes import reference_scene
 from zlocus.pipeline.setup import RunSetup, reference_features, supported_views
 from zlocus.products.paper_figures import ComparedPoint, PaperPoint
 from zlocus.products.point_report import PointReport, loci_through

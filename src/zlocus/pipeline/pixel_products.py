@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from zlocus.core.grid import CellWindow
 from zlocus.core.scene import Scene, View, is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.colour import read_colours
@@ -26,39 +27,45 @@ WHITE_PERCENT = 99.5
 WHITE_ROWS = 16
 
 
-def write_cloud(
-    out: Path, matched: Sequence[MatchedPixels], scene: Scene, vertical_datum: VerticalDatum = ELLIPSOIDAL
-) -> int:
-    """Write all points with their colours, with heights above the vertical datum; returns the number of points."""
-    n_points = sum(int(np.isfinite(m.image.height).sum()) for m in matched)
-    white = white_level(scene.views)
-    number = {view.name: k for k, view in enumerate(scene.views, 1)}
-    with PointCloud(out, n_points, vertical_datum.compound_crs(scene.crs)) as cloud:
-        for matched_pixels in matched:
-            view, height = matched_pixels.image.image_space.reference_view, matched_pixels.image.height
-            for row, rows in strips(len(height)):
-                known = np.isfinite(height[row : row + rows])
-                if known.any():
-                    part = slice(row, row + rows)
-                    xyz = matched_pixels.image.image_space.ground(row, height[part])[known]
-                    xyz[:, 2] -= vertical_datum.undulation(xyz[:, :2], scene.crs)
-                    share = np.clip(read_colours(view.path, row, rows)[known] / white, 0.0, 1.0)
-                    rgb = np.rint(share * 65535.0).astype(np.uint16)
-                    sigma_m = precision_m(matched_pixels, row, known)
-                    cloud.write(number[view.name], xyz, rgb, sigma_m, matched_pixels.surface.views[part][known])
-    return n_points
+class PointWriter:
+    """Writer of the points of a cloud, tile by tile of the reference images."""
+
+    def __init__(self, cloud: PointCloud, scene: Scene, vertical_datum: VerticalDatum = ELLIPSOIDAL) -> None:
+        """cloud : takes the points; scene : as it was opened, its views number the points; vertical_datum : of their
+        heights."""
+        self._cloud, self._scene, self._datum = cloud, scene, vertical_datum
+        self._white = white_level(scene.views)
+        self._number = {view.name: k for k, view in enumerate(scene.views, 1)}
+
+    def write(self, matched_pixels: MatchedPixels, window: CellWindow) -> None:
+        """Write the points of a window of pixels with their colours, some rows after others."""
+        space, cols = matched_pixels.image.image_space, slice(window.col, window.col + window.cols)
+        view = space.reference_view
+        for first, n_rows in strips(window.rows):
+            row = window.row + first
+            part = slice(row, row + n_rows), cols
+            height = matched_pixels.image.height[part]
+            known = np.isfinite(height)
+            if not known.any():
+                continue
+            xyz = space.ground(row, height, window.col)[known]
+            xyz[:, 2] -= self._datum.undulation(xyz[:, :2], self._scene.crs)
+            colours = read_colours(view.path, row, n_rows, window.col, window.cols)[known]
+            rgb = np.rint(np.clip(colours / self._white, 0.0, 1.0) * 65535.0).astype(np.uint16)
+            sigma_m = precision_m(matched_pixels, CellWindow(row, window.col, n_rows, window.cols), known)
+            self._cloud.write(self._number[view.name], xyz, rgb, sigma_m, matched_pixels.surface.views[part][known])
 
 
-def precision_m(matched_pixels: MatchedPixels, row: int, known: NDArray[np.bool_]) -> FloatArray:
-    """Standard deviations (n,) in metres of the pixels of some rows that have a height.
+def precision_m(matched_pixels: MatchedPixels, window: CellWindow, known: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviations (n,) in metres of the pixels of a window that have a height.
 
-    They are those of the height, or along the ray for cameras that are matched by depth. row : first of the rows; known
-    : (r, c) pixels with a height.
+    They are those of the height, or along the ray for cameras that are matched by depth. known : (r, c) pixels of the
+    window with a height.
     """
     rows, cols = np.nonzero(known)
-    part = slice(row, row + len(known))
+    part = slice(window.row, window.row + window.rows), slice(window.col, window.col + window.cols)
     z, sigma = matched_pixels.image.height[part][known], matched_pixels.surface.sigma[part][known]
-    xy = np.column_stack([cols, rows + row]).astype(float)
+    xy = np.column_stack([cols + window.col, rows + window.row]).astype(float)
     return np.asarray(sigma * matched_pixels.image.image_space.rays.metres_per_unit(xy, z.astype(float)))
 
 
@@ -89,24 +96,38 @@ def write_maps(
     fill: str,
     crs: CRS,
     vertical_datum: VerticalDatum = ELLIPSOIDAL,
-) -> None:
-    """NAME_height.tif, NAME_quality.tif and, for frame cameras, NAME_depth.tif."""
+) -> list[str]:
+    """Write NAME_height.tif, NAME_quality.tif and, for frame cameras, NAME_depth.tif; returns the names of the files.
+
+    Without gaps to be filled, some rows are in memory at a time.
+    """
     space, height, quality = matched_pixels.image.image_space, matched_pixels.image.height, matched_pixels.quality
     if fill == "interpolate":
         beyond = (quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
         whole = filled_from_behind(height, beyond)
         quality = np.where(np.isnan(height) & np.isfinite(whole), quality | np.uint16(Quality.FILLED), quality)
         height = whole
-    z = np.empty(height.shape, np.float32)
-    for row, rows in strips(len(height)):
-        xyz = space.ground(row, height[row : row + rows])
-        known = np.isfinite(xyz).all(axis=-1)
-        xyz[known, 2] -= vertical_datum.undulation(xyz[known, :2], crs)
-        z[row : row + rows] = xyz[..., 2]
+
+    def heights_m() -> Iterator[NDArray[np.float32]]:
+        for row, rows in strips(len(height)):
+            xyz = space.ground(row, height[row : row + rows])
+            known = np.isfinite(xyz).all(axis=-1)
+            xyz[known, 2] -= vertical_datum.undulation(xyz[known, :2], crs)
+            yield xyz[..., 2].astype(np.float32)
+
+    def depths_m(scale: float) -> Iterator[NDArray[np.float32]]:
+        for row, rows in strips(len(height)):
+            part = height[row : row + rows]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                yield np.where(part > 0, np.float32(scale) / part, np.float32(np.nan))
+
     above = "" if is_local(crs) else f" above {vertical_datum.surface_name}"
-    write_map(out / f"{name}_height.tif", z, f"height{above} of what the pixel shows", "m")
+    names = [f"{name}_height.tif"]
+    write_map(out / names[0], height.shape, heights_m(), f"height{above} of what the pixel shows", "m")
     if isinstance(space.rays, DepthRays):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.where(height > 0, np.float32(space.rays.scale) / height, np.float32(np.nan))
-        write_map(out / f"{name}_depth.tif", depth, "depth along the optical axis", "m")
-    write_map(out / f"{name}_quality.tif", quality, "quality bit flags")
+        names.append(f"{name}_depth.tif")
+        write_map(out / names[-1], height.shape, depths_m(space.rays.scale), "depth along the optical axis", "m")
+    names.append(f"{name}_quality.tif")
+    flags = (quality[row : row + rows] for row, rows in strips(len(quality)))
+    write_map(out / names[-1], quality.shape, flags, "quality bit flags")
+    return names

@@ -27,6 +27,9 @@ TILE_CELL_BYTES, TILE_BAND_BYTES = 11, 4
 # Bytes of a cell in the rasters, which are kept on disk until each raster is complete; the ortho-image has a mask, and
 # bands of the images' own data type.
 RASTER_CELL_BYTES = 12
+# Bytes of a pixel of a cloud on disk beside its finished tile: the heights and flags of all images, before and after
+# the check across images.
+CLOUD_PIXEL_BYTES = 21
 # Smaller surfaces are started whatever the space: they take little time, and finished tiles are kept if the disk fills.
 LEAST_REFUSED_BYTES = 1e9
 # Before the tie points are known, a surface is refused only where it needs this many times the free space.
@@ -99,7 +102,7 @@ def check_room_for_pixels(out: Path, scene: Scene, references: Sequence[str]) ->
     OutputError
         They take more than both have free.
     """
-    n_pixels = sum(math.prod(view.image.shape) for view in scene.views if view.name in references)
+    n_pixels = n_pixels_of(scene, references)
     needed, room = float(n_pixels) * (TILE_CELL_BYTES + TILE_BAND_BYTES), DEFAULT_MEMORY_SHARE * free_bytes()
     disk = _disk_of(out)
     if needed < LEAST_REFUSED_BYTES or disk is None or needed <= room + disk.free_bytes:
@@ -108,6 +111,33 @@ def check_room_for_pixels(out: Path, scene: Scene, references: Sequence[str]) ->
         f"To match the {n_pixels:.3g} pixels of {len(references)} images takes at least {needed / 1e9:.0f} GB, and "
         f"memory has {room / 1e9:.0f} GB for it and the disk of {disk.folder} {disk.free_bytes / 1e9:.0f} GB. Name "
         "fewer images with --reference, choose another disk with -o, or make a surface on the ground: zlocus dsm."
+    )
+
+
+def n_pixels_of(scene: Scene, names: Sequence[str]) -> int:
+    """Number of the pixels of some images."""
+    return sum(math.prod(view.image.shape) for view in scene.views if view.name in names)
+
+
+def check_room_for_cloud(out: Path, n_pixels: int, n_images: int) -> None:
+    """Refuse a cloud whose finished tiles and heights the disk of `out` has no room for; memory holds none of them.
+
+    n_pixels : to be matched, of n_images reference images. What an earlier run of the same kept needs no more room.
+
+    Raises
+    ------
+    OutputError
+        They take more than the disk has free.
+    """
+    kept = sum(path.stat().st_size for path in (out / FOLDER).glob("*.npz")) if (out / FOLDER).is_dir() else 0
+    needed = float(n_pixels) * (TILE_CELL_BYTES + TILE_BAND_BYTES + CLOUD_PIXEL_BYTES) - kept
+    disk = _disk_of(out)
+    if needed < LEAST_REFUSED_BYTES or disk is None or needed <= disk.free_bytes:
+        return
+    raise OutputError(
+        f"To match the {n_pixels:.3g} pixels of {n_images} images takes at least {needed / 1e9:.0f} GB on disk, and "
+        f"the disk of {disk.folder} has {disk.free_bytes / 1e9:.0f} GB free. Name fewer images with --reference, give "
+        "a smaller area with --bounds, or choose another disk with -o."
     )
 
 

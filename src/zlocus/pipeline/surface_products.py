@@ -20,7 +20,7 @@ from zlocus.io.run_record import Stopwatch, request_as_dict, utc_now, versions_r
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.orientation.plausibility import Doubt
-from zlocus.pipeline.messages import check_doubts
+from zlocus.pipeline.messages import grave_doubt
 from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import Tally
 from zlocus.products.derived import link_all, write_derived
@@ -166,10 +166,9 @@ def shortcoming_of(tally: Tally, doubts: Sequence[Doubt], out: Path, progress: P
     """Why a complete surface is no success, unless --partial accepts it; "" where it is one."""
     try:
         check_coverage(tally, out, progress)
-        check_doubts(doubts, out / "dsm.tif")
     except CoverageError as error:
         return str(error)
-    return ""
+    return grave_doubt(doubts, out / "dsm.tif")
 
 
 def check_coverage(tally: Tally, out: Path, progress: Progress) -> None:

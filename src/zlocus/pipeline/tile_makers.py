@@ -10,19 +10,18 @@ from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.plan import Tile
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
+from zlocus.pipeline.image_scenes import GroundArea, ImageSetup, reference_scene
 from zlocus.pipeline.image_tiles import (
     GridImages,
-    GroundArea,
     ImageMatching,
-    ImageSetup,
     grid_tile,
     heights_for_grid,
     match_images,
     pixel_heights,
-    reference_scene,
 )
+from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup, supported_views
-from zlocus.pipeline.tile_run import Plan, Tally, TileJob, TileProduct
+from zlocus.pipeline.tile_run import Tally, TileJob, TileProduct
 
 
 def tile_maker(
@@ -84,6 +83,7 @@ def heights_of_reference(setup: RunSetup, matching: ImageMatching, progress: Pro
     No other image is matched, so none can contradict them.
     """
     assert matching.ground_area is not None, "a surface has an area"
+    assert matching.ground_area.z_range is not None, "between two heights"
     (matched,) = match_images([reference_scene(setup, matching.config)], matching, progress)
     heights = pixel_heights(matched, matched, sum(matching.ground_area.z_range) / 2)
     # The flags of its pixels say already where fewer than two images show them. So the reference image stands for the

@@ -1,4 +1,4 @@
-"""The tiles of a run: planned, matched by workers, kept on disk as checkpoints, and assembled into rasters."""
+"""The tiles of a run: matched by workers, kept on disk as checkpoints, and assembled into rasters."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from zlocus.core.errors import ConfigError, StoppedError
+from zlocus.core.errors import StoppedError
 from zlocus.core.grid import CellWindow, Grid
 from zlocus.core.options import RunConfig
-from zlocus.core.progress import Progress, Stage, duration
+from zlocus.core.progress import Progress, Stage
 from zlocus.core.requests import DsmRequest
-from zlocus.core.resources import DEFAULT_MEMORY_SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
-from zlocus.io.decoded_images import DECODED
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
 from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
@@ -29,102 +27,18 @@ from zlocus.matching.quality import Quality
 from zlocus.matching.selected_surface import match_tile_of_paper
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
-from zlocus.matching.view_pixels import PYRAMIDS
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.event_log import NAME, EventLog
-from zlocus.pipeline.execution.plan import Tile, keep_at_most, kept_bytes, tile_needs
+from zlocus.pipeline.execution.plan import Tile, keep_at_most
 from zlocus.pipeline.execution.processes import Processes
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
+from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup, reference_features
 from zlocus.products.rasters import SurfaceRasters
 
-# Processes take about two seconds to start, and so are not worth it for less work than this, s.
-SHORT_S = 15.0
-# Time to match a cell by the selection of the paper, with six images.
-PAPER_CELL_S = 2e-4
 # A message names at most this many failed tiles.
 MAX_NAMED_TILES = 3
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How the tiles of a run are worked on.
-
-    slots : tiles at a time; processes : whether each runs in a process of its own; tile_bytes : memory of the largest
-    tile, with its process; own_bytes : memory of the command itself; allowed_bytes : memory that all may take together;
-    kept_bytes : memory of the images that a process may keep from tile to tile, a part of `tile_bytes`;
-    seconds : estimated time of one worker for all tiles; scheduler : address of the cluster that does the work instead.
-    """
-
-    n_tiles: int
-    slots: int
-    processes: bool
-    tile_bytes: float
-    own_bytes: float
-    allowed_bytes: float
-    kept_bytes: int
-    seconds: float
-    scheduler: str | None = None
-
-    @property
-    def n_bytes(self) -> float:
-        """Memory of the command and all tiles that are worked on at a time."""
-        return self.own_bytes + self.slots * self.tile_bytes
-
-    def __str__(self) -> str:
-        where = "in processes of their own" if self.processes else "in this process"
-        if self.scheduler is not None:
-            need = f"{self.tile_bytes / 1e9:.2g} GB of memory for each of its threads"
-            whole = f"{duration(self.seconds)} of one of them"
-            return f"Plan: {self.n_tiles} tiles by the cluster at {self.scheduler}, about {need}, and {whole}."
-        many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
-        return (
-            f"Plan: {many}, {self.slots} at a time {where}, about {self.n_bytes / 1e9:.2g} GB of memory (of "
-            f"{self.allowed_bytes / 1e9:.2g} GB) and {duration(self.seconds / self.slots)}."
-        )
-
-
-def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, request: DsmRequest) -> Plan:
-    """Decide how many tiles are worked on at a time: as requested, or as many as there are cores and work for.
-
-    Memory limits their number. In image space all tiles stay in one process, because the heights of all pixels are too
-    large to be copied.
-
-    Raises
-    ------
-    ConfigError
-        One tile needs more memory than it may take.
-    """
-    needs, own, memory_gb = tile_needs(match_scene, tiles, config), held_bytes(), request.memory_gb
-    allowed = own + DEFAULT_MEMORY_SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
-    kept = kept_bytes(match_scene)
-    if memory_gb is not None:
-        # Where memory is scarce, images are decoded and reduced again instead of being kept.
-        kept = min(kept, max(int(allowed - own - needs.n_bytes - WORKER_BYTES), 0))
-    here = needs.n_bytes + max(kept - DECODED.held_bytes - PYRAMIDS.held_bytes, 0) + TILE_CODE_BYTES
-    if memory_gb is not None and own + here > allowed:
-        raise ConfigError(
-            f"--memory {memory_gb:g} GB is too little for one tile, which needs about {here / 1e9:.2g} GB beside the "
-            f"{own / 1e9:.2g} GB of the command itself. Allow more, or set a smaller pyramid.tile in --config."
-        )
-    n_worked = sum(1 for tile in tiles if tile.core_window.rows and tile.core_window.cols)
-    seconds = seconds_of_paper(tiles) if request.selection == "paper" else needs.seconds
-    wanted = request.workers or (cores() if seconds > SHORT_S else 1)
-    there = needs.n_bytes + kept + WORKER_BYTES
-    slots = max(min(wanted, int((allowed - own) / there), n_worked), 1)
-    processes = slots > 1 and not request.is_in_image_space
-    each = there if processes or request.scheduler else here
-    if request.method == "gc3-sgm":
-        # The pixels of every image are matched before.
-        seconds *= len(match_scene.views)
-    return Plan(len(tiles), slots, processes, each, own, allowed, kept, seconds, request.scheduler)
-
-
-def seconds_of_paper(tiles: Sequence[Tile]) -> float:
-    """Estimated time of one worker for the selection of the paper, which matches only the kept cells."""
-    kept = [tile.kept_window.within(tile.core_window) for tile in tiles]
-    return PAPER_CELL_S * sum(window.rows * window.cols for window in kept)
 
 
 @dataclass

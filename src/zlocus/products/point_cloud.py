@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -25,7 +25,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from zlocus import __version__
 from zlocus.core.errors import OutputError
 from zlocus.core.scene import is_local
-from zlocus.io.rasters import write_cog
+from zlocus.io.rasters import RasterBands, RasterSink
 
 LAZ_STEP_M = 0.001
 # Extra dimensions of the points. Their descriptions have at most 32 characters.
@@ -33,22 +33,24 @@ SIGMA, VIEWS = "sigma_m", "n_images"
 MAX_LAZ_EXTENT_M = 2**31 * LAZ_STEP_M
 OFFSET_STEP_M = 1000.0
 PLY_POINT = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
+PLY_DIGITS = 19  # of the number of points, at most
 PLY_PROPERTIES = ("double x", "double y", "double z", "uchar red", "uchar green", "uchar blue")
 
 
 class PointCloud:
-    """Writer of cloud.laz and cloud.ply. Both files appear when the context ends without an error.
+    """Writer of cloud.laz and cloud.ply. Points go into files with temporary names at once, so none are kept in memory;
+    the files get their own names when the context ends without an error.
 
-    n_points : number of points that will be written, which the header of PLY states; crs : of the scene.
+    crs : of the scene; n_points : number of the points that were written so far.
     """
 
-    def __init__(self, folder: Path, n_points: int, crs: CRS) -> None:
+    def __init__(self, folder: Path, crs: CRS) -> None:
         self._paths = (folder / "cloud.laz", folder / "cloud.ply")
         self._parts = tuple(path.with_name(f".{path.name}.{os.getpid()}.part") for path in self._paths)
         self._crs = None if is_local(crs) else crs
         self._laz: laspy.LasWriter | None = None
         self._ply: BinaryIO | None = None
-        self._n_points = n_points
+        self.n_points = 0
 
     def write(
         self,
@@ -75,6 +77,7 @@ class PointCloud:
             records = np.empty(len(xyz), PLY_POINT)
             records["xyz"], records["rgb"] = xyz, rgb >> 8
             ply.write(records.tobytes())
+            self.n_points += len(xyz)
         except OverflowError as error:
             raise OutputError(
                 f"{self._paths[0]} cannot hold points that lie further apart than {MAX_LAZ_EXTENT_M / 1000:.0f} km. "
@@ -95,7 +98,7 @@ class PointCloud:
                 add_crs(header, self._crs)
             self._laz = laspy.open(self._parts[0], "w", header=header, do_compress=True)
             self._ply = self._parts[1].open("wb")
-            self._ply.write(ply_header(self._n_points, self._crs).encode("ascii"))
+            self._ply.write(ply_header(0, self._crs).encode("ascii"))
         return self._laz, self._ply
 
     def __enter__(self) -> PointCloud:
@@ -106,7 +109,9 @@ class PointCloud:
     ) -> None:
         try:
             if kind is None:
-                self._files(np.empty((0, 3)))
+                ply = self._files(np.empty((0, 3)))[1]
+                ply.seek(0)
+                ply.write(ply_header(self.n_points, self._crs).encode("ascii"))
             for file in (self._laz, self._ply):
                 if file is not None:
                     file.close()
@@ -140,11 +145,13 @@ def add_crs(header: laspy.LasHeader, crs: CRS) -> None:
 
 
 def ply_header(n_points: int, crs: CRS | None) -> str:
-    """Header of a binary PLY file."""
+    """Header of a binary PLY file. It has the same length for every number of points, because the number is known only
+    after the points were written."""
     lines = ["ply", "format binary_little_endian 1.0", f"comment zlocus {__version__}"]
     if crs is not None:
         lines.append(f"comment crs {_plain(crs)}")
-    lines += [f"element vertex {n_points}", *(f"property {name}" for name in PLY_PROPERTIES), "end_header", ""]
+    filler = "comment" + " " * (PLY_DIGITS - len(str(n_points)))
+    lines += [f"element vertex {n_points}", *(f"property {name}" for name in PLY_PROPERTIES), filler, "end_header", ""]
     return "\n".join(lines)
 
 
@@ -156,13 +163,24 @@ def _plain(crs: CRS) -> str:
     return crs.to_wkt().encode("ascii", "replace").decode("ascii")
 
 
-def write_map(path: Path, values: NDArray[np.generic], description: str, units: str = "") -> None:
-    """Write values (r, c) of an image's pixels as a raster without a place on the ground; NaN in floats is no data."""
-    nodata = float("nan") if values.dtype.kind == "f" else None
+def write_map(
+    path: Path, shape: tuple[int, int], rows: Iterable[NDArray[np.generic]], description: str, units: str = ""
+) -> None:
+    """Write values of an image's pixels as a raster without a place on the ground; NaN in floats is no data.
+
+    shape : of the image; rows : values (r, c) of all its rows, some rows after others, of one type.
+    """
+    parts = iter(rows)
+    first = next(parts)
+    nodata = float("nan") if first.dtype.kind == "f" else None
+    bands = RasterBands(first.dtype, nodata, (description,), units)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        write_cog(path, values, GeoBox(values.shape, Affine.identity(), None), nodata=nodata,
-                  descriptions=(description,), units=units)  # fmt: skip
+        with RasterSink(path, GeoBox(shape, Affine.identity(), None), bands) as sink:
+            row = 0
+            for values in chain([first], parts):
+                sink.write(row, 0, values)
+                row += len(values)
 
 
 def file_names(names: Sequence[str]) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from zlocus.core.footprints import ground_sample_distance
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import PyramidOptions, RunConfig
-from zlocus.core.scene import DecodedSource
+from zlocus.core.scene import DecodedSource, View
 from zlocus.io.decoded_images import DECODED, DECODED_BYTES
 from zlocus.matching.level_records import READ_POINTS_PER_SIDE, level_window
 from zlocus.matching.match_scene import MatchScene
@@ -98,8 +98,16 @@ def tile_needs(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig
 
 def kept_bytes(match_scene: MatchScene) -> int:
     """Memory of the images that a process keeps from tile to tile: decoded ones, and reduced parts of all of them."""
-    decoded = sum(view.image.decoded_bytes for view in match_scene.views if isinstance(view.image, DecodedSource))
-    n_pixels = sum(math.prod(view.image.shape) for view in match_scene.views)
+    return kept_bytes_of(match_scene.views)
+
+
+def kept_bytes_of(views: Sequence[View], n_scenes: int = 1) -> int:
+    """Memory of the images of some views that a process keeps from tile to tile, see `kept_bytes`.
+
+    n_scenes : number of match scenes with these views; each has grey values, and so reduced parts, of its own.
+    """
+    decoded = sum(view.image.decoded_bytes for view in views if isinstance(view.image, DecodedSource))
+    n_pixels = n_scenes * sum(math.prod(view.image.shape) for view in views)
     return min(decoded, DECODED_BYTES) + min(int(n_pixels * REDUCED_BYTES), PYRAMID_BYTES)
 
 

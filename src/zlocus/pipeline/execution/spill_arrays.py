@@ -25,10 +25,12 @@ class SpillArrays:
     Files are mapped: what is read and written of them counts as memory of the process until `rest` is called.
     """
 
-    def __init__(self, beside: Path, room_bytes: float) -> None:
-        """beside : folder on whose disk files are made; room_bytes : memory that all arrays together may take."""
+    def __init__(self, beside: Path, room_bytes: float, least_file_bytes: int = FILE_BYTES) -> None:
+        """beside : folder on whose disk files are made; room_bytes : memory that all arrays together may take;
+        least_file_bytes : size of the smallest file, where less than `FILE_BYTES` is known to be enough."""
         self.folder = next(path for path in (beside, *beside.absolute().parents) if path.is_dir())
         self.room_bytes = room_bytes
+        self.least_file_bytes = min(least_file_bytes, FILE_BYTES)
         self.file_bytes = 0
         self._maps: list[mmap.mmap] = []
         self._used = 0
@@ -76,7 +78,7 @@ class SpillArrays:
         if self._maps and first + n_bytes <= len(self._maps[-1]):
             self._used = first + n_bytes
             return self._maps[-1], first
-        size = max(n_bytes, FILE_BYTES)
+        size = max(n_bytes, self.least_file_bytes)
         try:
             with tempfile.TemporaryFile(dir=self.folder) as file:
                 if hasattr(os, "posix_fallocate"):

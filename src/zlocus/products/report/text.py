@@ -66,7 +66,6 @@ STAGES = {
     "open": "opening images and cameras",
     "orient": "finding tie points and correcting the cameras",
     "setup": "choosing the height range, grid and tiles",
-    "cross-check": "comparing the heights of the images",
     "match": "matching and writing the rasters",
     "points": "writing tie points and ranking",
     "curves": "footprints and match curves for this page",
