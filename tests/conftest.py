@@ -9,6 +9,8 @@ from pathlib import Path
 # whose threads wait for each other in vain where another process has the core.
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# No test depends on the rates that earlier runs of this machine have left, or leaves some.
+os.environ["ZLOCUS_RATES"] = ""
 # Hundreds of processes import the package: where its bytecode is not kept, each of them compiles it for half a second.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

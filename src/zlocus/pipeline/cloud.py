@@ -20,6 +20,7 @@ import numpy as np
 
 from zlocus.core.errors import CoverageError, GeometryError, OutputError, StoppedError
 from zlocus.core.footprints import overlap_of
+from zlocus.core.jit import CACHE
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import CloudRequest, check_output
@@ -59,7 +60,14 @@ from zlocus.pipeline.open_run import OpenRun, known_ties, open_cloud_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products, remove_incomplete_files
 from zlocus.pipeline.pixel_products import PointWriter, write_maps
 from zlocus.pipeline.required_space import CLOUD_PIXEL_BYTES, check_room_for_cloud
-from zlocus.pipeline.run_plan import Plan, SceneTiles, planned_pixels
+from zlocus.pipeline.run_plan import (
+    Plan,
+    SceneTiles,
+    planned_pixels,
+    remember_run,
+    said_before_orientation,
+    timed_stages,
+)
 from zlocus.pipeline.tile_run import MatchMethod
 from zlocus.products.point_cloud import PointCloud, file_names
 from zlocus.sensors.image_rays import DepthRays
@@ -128,6 +136,8 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
         return finished
     scene = run.opened_inputs.scene
     config = depth_options(config) if is_by_depth(scene) else config
+    progress.note(said_before_orientation(scene.views, None))
+    is_compiled, is_whole = CACHE.is_complete, not run.checkpoint.finished
     with watch.stage("orient"), kernels_compiling(progress):
         setup = set_up_images(scene, config, progress, known_ties(run.checkpoint, scene, progress))
         note_orientation(setup.orientation, progress)
@@ -135,7 +145,10 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     with watch.stage("setup"):
         prepared_cloud = prepare_cloud(request, config, run, setup, references)
         progress.note(str(prepared_cloud.plan))
-    return _accepted(request, _made(request, run, prepared_cloud, watch, progress))
+    result = _made(request, run, prepared_cloud, watch, progress)
+    if is_whole:
+        remember_run(prepared_cloud.plan, request, scene.views, timed_stages(watch.stages, is_compiled))
+    return _accepted(request, result)
 
 
 def _made(

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from zlocus.core.errors import CoverageError, OutputError, StoppedError
 from zlocus.core.footprints import matched_area
+from zlocus.core.jit import CACHE
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DsmRequest, SetupRequest, check_output
@@ -32,7 +33,7 @@ from zlocus.pipeline.messages import note_orientation
 from zlocus.pipeline.open_run import OpenRun, check_polygons, known_ties, may_have_terrain, open_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
 from zlocus.pipeline.required_space import check_room
-from zlocus.pipeline.run_plan import Plan, planned
+from zlocus.pipeline.run_plan import Plan, planned, remember_run, said_before_orientation, timed_stages
 from zlocus.pipeline.setup import RunSetup, orient_views, set_up_run
 from zlocus.pipeline.surface_products import (
     has_colours,
@@ -109,6 +110,8 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
             return _already_finished(request, config, run, missing, progress)
         request = whole_again(request, run.finished, missing, progress)
     opened_inputs, inputs, checkpoint, out, tally = run.opened_inputs, run.inputs, run.checkpoint, request.out, Tally()
+    progress.note(said_before_orientation(opened_inputs.scene.views, request.workers))
+    is_compiled, is_whole = CACHE.is_complete, not checkpoint.finished
     with watch.stage("orient"), kernels_compiling(progress):
         ties = known_ties(checkpoint, opened_inputs.scene, progress)
         orientation = orient_views(
@@ -139,6 +142,8 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
             with surface_rasters(request, setup, opened_inputs.vertical_datum) as rasters:
                 tile_run.assemble(failed, rasters, tally, progress)
                 inputs.check(len(checkpoint.finished))  # a terrain model that fills gaps is read again here
+    if is_whole:
+        remember_run(plan, request, opened_inputs.scene.views, timed_stages(watch.stages, is_compiled))
     with watch.stage("points"):
         write_points(out, setup, tally.labelled_ties, opened_inputs.vertical_datum)
     if request.report:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import RunConfig
@@ -17,12 +17,24 @@ from zlocus.io.decoded_images import DECODED
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.view_pixels import PYRAMIDS
 from zlocus.pipeline.execution.plan import MAX_SAMPLED_TILES, Tile, TileNeeds, kept_bytes, kept_bytes_of, tile_needs
+from zlocus.pipeline.execution.rates import (
+    ORIENT_PIXEL_S,
+    TYPICAL,
+    WRITE_CELL_S,
+    WRITE_PIXEL_S,
+    Rate,
+    kind_of,
+    rate_of,
+    remember,
+)
 
+# Parts of a run whose rates are remembered.
+ORIENTATION, WRITING, WRITING_MAPS = "orientation", "writing", "writing maps"
 # Processes take about two seconds to start, and so are not worth it for less work than this, s.
 SHORT_S = 15.0
 # Memory of a cloud beside its tiles: writers of points, and the check of a tile across images. And memory of each pixel
 # of an image whose gaps are filled.
-POINT_CODE_BYTES, FILLED_PIXEL_BYTES = 60e6, 40
+POINT_CODE_BYTES, FILLED_PIXEL_BYTES = 20e6, 40
 # Time to match a cell by the selection of the paper, with six images.
 PAPER_CELL_S = 2e-4
 
@@ -35,7 +47,9 @@ class Plan:
     tile, with its process; own_bytes : memory of the command itself; allowed_bytes : memory that all may take together;
     kept_bytes : memory of the images that a process may keep from tile to tile, a part of `tile_bytes` (of `own_bytes`
     for a cloud); seconds : estimated time of one worker for all tiles; scheduler : address of the cluster that does the
-    work instead; n_images : number of reference images whose tiles they are, 0 for tiles of the ground.
+    work instead; n_images : number of reference images whose tiles they are, 0 for tiles of the ground; write_s :
+    estimated time to write the results; match_rate, write_rate : of this machine, by which both estimates are
+    multiplied.
     """
 
     n_tiles: int
@@ -48,6 +62,14 @@ class Plan:
     seconds: float
     scheduler: str | None = None
     n_images: int = 0
+    write_s: float = 0.0
+    match_rate: Rate = TYPICAL
+    write_rate: Rate = TYPICAL
+
+    @property
+    def match_s(self) -> float:
+        """Estimated wall time of the matching at the typical rate."""
+        return self.seconds / self.slots
 
     @property
     def n_bytes(self) -> float:
@@ -58,14 +80,16 @@ class Plan:
         where = "in processes of their own" if self.processes else "in this process"
         if self.scheduler is not None:
             need = f"{self.tile_bytes / 1e9:.2g} GB of memory for each of its threads"
-            whole = f"{duration(self.seconds)} of one of them"
+            whole = f"{duration(self.seconds)} of one of them at the typical rate"
             return f"Plan: {self.n_tiles} tiles by the cluster at {self.scheduler}, about {need}, and {whole}."
         many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
         if self.n_images:
             many += f" of {self.n_images} image{'s' if self.n_images != 1 else ''}"
+        match_s, write_s = self.match_rate.factor * self.match_s, self.write_rate.factor * self.write_s
+        parts = [self.match_rate.said("matching", self.match_s), self.write_rate.said("writing", self.write_s)]
         return (
             f"Plan: {many}, {self.slots} at a time {where}, about {self.n_bytes / 1e9:.2g} GB of memory (of "
-            f"{self.allowed_bytes / 1e9:.2g} GB) and {duration(self.seconds / self.slots)}."
+            f"{self.allowed_bytes / 1e9:.2g} GB) and {duration(match_s + write_s)}: {', '.join(parts)}."
         )
 
 
@@ -99,13 +123,64 @@ def planned(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig, r
     if request.method == "gc3-sgm":
         # The pixels of every image are matched before.
         seconds *= len(match_scene.views)
-    return Plan(len(tiles), slots, processes, each, own, allowed, kept, seconds, request.scheduler)
+    kind, n_cells = kind_of(match_scene.views), sum(tile.kept_window.rows * tile.kept_window.cols for tile in tiles)
+    return Plan(
+        len(tiles), slots, processes, each, own, allowed, kept, seconds, request.scheduler, 0, n_cells * WRITE_CELL_S,
+        rate_of(matching_of(request), kind), rate_of(WRITING, kind),
+    )  # fmt: skip
 
 
 def seconds_of_paper(tiles: Sequence[Tile]) -> float:
     """Estimated time of one worker for the selection of the paper, which matches only the kept cells."""
     kept = [tile.kept_window.within(tile.core_window) for tile in tiles]
     return PAPER_CELL_S * sum(window.rows * window.cols for window in kept)
+
+
+def matching_of(request: DsmRequest | CloudRequest) -> str:
+    """Name of the matching whose rate a request follows."""
+    return (
+        f"matching by {request.method}, {request.selection}" if isinstance(request, DsmRequest) else "matching pixels"
+    )
+
+
+def said_before_orientation(views: Sequence[View], threads: int | None) -> str:
+    """How long the images take to be read and their tie points to be found, as a sentence. threads : None for all."""
+    rate, seconds = rate_of(ORIENTATION, kind_of(views)), orientation_s(views, threads)
+    return f"{rate.said('Reading the images and finding tie points takes', seconds)}."
+
+
+def orientation_s(views: Sequence[View], threads: int | None) -> float:
+    """Time to read images and to find their tie points at the typical rate. threads : None for all cores."""
+    n_pixels = sum(math.prod(view.image.shape) for view in views)
+    return ORIENT_PIXEL_S * n_pixels / min(threads or cores(), len(views))
+
+
+def remember_run(
+    plan: Plan, request: DsmRequest | CloudRequest, views: Sequence[View], stages: Sequence[Mapping[str, Any]]
+) -> None:
+    """Remember how long the parts of a run took that made all of its tiles on this machine.
+
+    stages : see `timed_stages`.
+    """
+    if plan.scheduler is not None:
+        return
+    took, kind = {stage["name"]: float(stage["wall_s"]) for stage in stages}, kind_of(views)
+    writing = WRITING if isinstance(request, DsmRequest) else WRITING_MAPS
+    threads = request.workers if isinstance(request, DsmRequest) else None
+    for part, stage, typical_s in (
+        (ORIENTATION, "orient", orientation_s(views, threads)),
+        (matching_of(request), "match", plan.match_s),
+        (writing, "write", plan.write_s),
+    ):
+        remember(part, kind, typical_s, took.get(stage, 0.0))
+
+
+def timed_stages(stages: Sequence[Mapping[str, Any]], is_compiled: bool) -> list[Mapping[str, Any]]:
+    """The stages of a run, see `Stopwatch`, whose times show a rate: not the one in which kernels were compiled.
+
+    is_compiled : whether all kernels were there when the run began.
+    """
+    return [stage for stage in stages if is_compiled or stage["name"] != "orient"]
 
 
 class SceneTiles(NamedTuple):
@@ -141,17 +216,11 @@ def planned_pixels(
     if request.fill == "interpolate":
         largest = max(math.prod(scene.match_scene.views[0].image.shape) for scene in scene_tiles)
         filled = max(largest * FILLED_PIXEL_BYTES - slots * needs.n_bytes, 0.0)
+    n_pixels, kind = sum(math.prod(each.match_scene.views[0].image.shape) for each in scene_tiles), kind_of(views)
     return Plan(
-        n_tiles,
-        slots,
-        False,
-        needs.n_bytes,
-        fixed + kept + filled,
-        allowed,
-        kept,
-        needs.seconds,
-        n_images=len(scene_tiles),
-    )
+        n_tiles, slots, False, needs.n_bytes, fixed + kept + filled, allowed, kept, needs.seconds, None,
+        len(scene_tiles), n_pixels * WRITE_PIXEL_S, rate_of(matching_of(request), kind), rate_of(WRITING_MAPS, kind),
+    )  # fmt: skip
 
 
 def needs_of_scenes(scene_tiles: Sequence[SceneTiles], config: RunConfig) -> TileNeeds:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +159,7 @@ class TileRun:
         with progress.stage("Matching", len(worked)) as stage, workers if todo else nullcontext() as ready:
             if not self.n_there:
                 self.log.remove()
-            self.log.add("began", **vars(plan), tiles_there=self.n_there)
+            self.log.add("began", **asdict(plan), tiles_there=self.n_there)
             if len(todo) < len(worked):
                 progress.note(f"{len(worked) - len(todo)} of {len(worked)} tiles are there already.")
                 self.log.add("resumed", tiles_there=len(worked) - len(todo))
