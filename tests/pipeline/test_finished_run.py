@@ -380,7 +380,7 @@ def test_functions_refuse_what_their_commands_refuse(images, out):
         (run_rank, RankRequest(inputs, out)),
         (run_curves, CurvesRequest(inputs, out, at=(0.0, 0.0))),
     ):
-        with pytest.raises(OutputError, match=r"holds another run .*add --overwrite"):
+        with pytest.raises(OutputError, match=r"holds another run[ :].*add --overwrite"):
             run_stage(request, RunConfig(), progress)
     assert changed(before, out) == set()
 
