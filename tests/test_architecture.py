@@ -198,6 +198,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "Polygons": ("polygons", "area"),
     "ProfileSampling": ("sampling",),
     "QuickTies": ("ties",),
+    "RollingShutterEntry": ("rolling_shutter",),
     "RefinedTies": ("ties",),
     "RefusedView": ("refused",),
     "RegularTimes": ("times",),

@@ -71,6 +71,15 @@ FRAME_CAMERA = {
     "kind": "frame", "focal": [850.0, 851.0], "principal_point": [399.0, 301.0], "skew": 0.2,
     "distortion": {"kind": "brown", "k1": -0.05, "k2": 0.01, "p1": 1e-4}, "angles": [1.0, -2.0, 30.0],
 }  # fmt: skip
+# 7 px from the first to the last row.
+MOTION = {"rolling_shutter": {"readout_s": 0.1, "velocity_m_s": [40.0, 15.0, -5.0]}}
+
+
+def calibrated(sensor):
+    """The camera with changes of all that a self-calibration changes."""
+    sensor = replace(sensor, focal=sensor.focal + 3.0, distortion=replace(sensor.distortion, k1=0.02, p2=-2e-4))
+    motion = sensor.rolling_shutter
+    return sensor if motion is None else replace(sensor, rolling_shutter=replace(motion, readout_s=0.07))
 
 
 @pytest.mark.parametrize(
@@ -81,6 +90,9 @@ FRAME_CAMERA = {
         ({"crs": "EPSG:32632"}, {"earth": "flat"}, [462_000.0, 5_247_000.0, 900.0]),
         ({"local": True}, {}, [3.0, 4.0, 500.0]),
         ({"local": True, "up": [0.1, 0.2, 1.0]}, {}, [3.0, 4.0, 500.0]),
+        ({"crs": "EPSG:32632"}, {"crs": "EPSG:32631"} | MOTION, [920_000.0, 5_260_000.0, 900.0]),
+        ({"crs": "EPSG:32632"}, {"earth": "flat"} | MOTION, [462_000.0, 5_247_000.0, 900.0]),
+        ({"local": True, "up": [0.1, 0.2, 1.0]}, MOTION, [3.0, 4.0, 500.0]),
     ],
 )
 def test_frame_cameras(tmp_path, frame, camera, centre):
@@ -95,7 +107,7 @@ def test_frame_cameras(tmp_path, frame, camera, centre):
     scene = open_scene(inputs)
     turn = np.array([1e-3, -2e-3, 5e-3])
     corrected, again, _ = rewritten(
-        scene, tmp_path, inputs, lambda s: replace(s.corrected(np.array([0.3, -0.2, 0.1]), turn), focal=s.focal + 3.0)
+        scene, tmp_path, inputs, lambda s: calibrated(s.corrected(np.array([0.3, -0.2, 0.1]), turn))
     )
     assert_same(corrected, again, (0.0, 100.0))
     assert again.heights == (0.0, 100.0)

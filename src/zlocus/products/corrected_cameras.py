@@ -15,7 +15,7 @@ from zlocus.core.scene import Scene, View, is_local
 from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.camera_kinds import RpcCamera
-from zlocus.io.cameras.frame_camera import FrameCamera
+from zlocus.io.cameras.frame_camera import FrameCamera, distortion_entry, rolling_shutter_entry
 from zlocus.io.cameras.linescan import LineScanCamera
 from zlocus.io.cameras.linescan_files import write_trajectory
 from zlocus.io.cameras.rpc_text import write_rpc_txt
@@ -132,19 +132,21 @@ def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
 
 
 def frame_entry(camera: FrameCamera, sensor: SensorModel, scene: Scene) -> FrameCamera:
-    """Entry of a frame camera in the scene's frame, with its pose relative to the map's axes at its centre."""
+    """Entry of a frame camera in the scene's frame, with pose and motion relative to the map's axes at its centre."""
     while isinstance(sensor, ShiftedModel):
         assert isinstance(sensor.base_sensor, FrameModel), "one shift is laid over a camera"
         sensor = sensor.base_sensor.moved(sensor.column, sensor.row)
     assert isinstance(sensor, FrameModel), "frame cameras stay frame cameras"
-    centre, rows = sensor.centre, sensor.camera_from_ground
+    centre, rows, rolling_shutter = sensor.centre, sensor.camera_from_ground, sensor.rolling_shutter
     if isinstance(sensor.space, EarthSpace):
         on_map = sensor.space.ground_from_cartesian(np.array([centre]))[0]
         _, axes = sensor.space.pose(scene.crs, on_map)
         centre, rows = as_row(on_map), as_rows(sensor.rotation @ axes.T)
+        rolling_shutter = None if rolling_shutter is None else rolling_shutter.turned(axes)
     changed = {
         "focal": (sensor.focal, sensor.focal * sensor.aspect), "principal_point": sensor.principal_point,
         "centre": centre, "rotation": rows, "angles": None, "crs": None,
+        "distortion": distortion_entry(sensor.distortion), "rolling_shutter": rolling_shutter_entry(rolling_shutter),
     }  # fmt: skip
     return camera.model_copy(update=changed)
 

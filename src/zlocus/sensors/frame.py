@@ -1,4 +1,4 @@
-"""Frame camera: one projection centre and a flat image, with or without lens distortion."""
+"""Frame camera: one projection centre and a flat image, with or without lens distortion and rolling shutter."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pyproj import CRS
 from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.distortion import Distortion
 from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace, Space
+from zlocus.sensors.rolling_shutter import RollingShutter
 
 Row = tuple[float, float, float]
 
@@ -22,6 +23,8 @@ class FrameModel:
     rows (to the right), down the columns, and forwards along the optical axis; focal : px, along rows;
     principal_point : (column, row) px where the optical axis meets the image. aspect : focal length down the columns
     over `focal`; skew : px by which columns grow per y (of the plane at depth 1). distortion : None is an ideal lens.
+    rolling_shutter : motion during the read-out, in which `centre` is that of the middle row; None is a camera that
+    takes all rows at once.
 
     space : where rays are straight; centre and camera_from_ground are in its axes, ground points in the scene's frame.
     """
@@ -34,6 +37,7 @@ class FrameModel:
     skew: float = 0.0
     distortion: Distortion | None = None
     space: Space = FRAME_SPACE
+    rolling_shutter: RollingShutter | None = None
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`; NaN behind the camera, and where its distortion is not one to one."""
@@ -43,7 +47,7 @@ class FrameModel:
         """See `SensorModel`; NaN where the ray does not meet that height in front of the camera."""
         ray = self.ray_from_image(xy)
         z = np.broadcast_to(np.asarray(z, float), (len(ray),))
-        return self.space.meet(np.array(self.centre), ray, z)
+        return self.space.meet(np.array(self.centre) + self.displacement(xy), ray, z)
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""
@@ -51,14 +55,33 @@ class FrameModel:
 
     def station_height(self) -> float:
         """See `Stationed`."""
-        return float(self.space.ground_from_cartesian(np.array([self.centre]))[0, 2])
+        centres = np.array([self.centre])
+        if self.rolling_shutter is not None:
+            rows = np.array([0.0, self.rolling_shutter.rows - 1.0])
+            centres = centres + self.rolling_shutter.displacement(rows)
+        return float(self.space.ground_from_cartesian(centres)[:, 2].min())
 
     def ground_at_depth(self, xy: FloatArray, depth: FloatArray) -> FloatArray:
-        """Ground points (n, 3) m that pixels (n, 2) see at depths (n,) m along the optical axis."""
-        return self._along(self.ray_from_image(xy), depth)
+        """Ground points (n, 3) m that pixels (n, 2) see at depths (n,) m along the optical axis; see `depth`."""
+        ray = self.ray_from_image(xy)
+        if self.rolling_shutter is None:
+            return self._along(ray, depth)
+        displacement = self.displacement(xy)
+        depth = np.asarray(depth) - displacement @ self.rotation[2]
+        return self.space.ground_from_cartesian(np.array(self.centre) + displacement + depth[:, None] * ray)
+
+    def displacement(self, xy: FloatArray) -> FloatArray:
+        """Motion of the projection centre from the middle row to the rows of pixels (n, 2): (n, 3) m, or (3,) zeros
+        without a rolling shutter."""
+        if self.rolling_shutter is None:
+            return np.zeros(3)
+        return self.rolling_shutter.displacement(np.asarray(xy, float)[:, 1])
 
     def ray_from_image(self, xy: FloatArray) -> FloatArray:
-        """Rays (n, 3) m from the projection centre to a depth of 1, of pixels (n, 2); NaN where a pixel has no ray."""
+        """Rays (n, 3) m from the projection centre to a depth of 1, of pixels (n, 2); NaN where a pixel has no ray.
+
+        With a rolling shutter they start where the camera is at the row of the pixel, see `displacement`.
+        """
         at = (np.asarray(xy, float) - np.array(self.principal_point)) / [self.focal, self.focal * self.aspect]
         if self.skew:
             at[:, 0] -= self.skew / self.focal * at[:, 1]
@@ -66,8 +89,18 @@ class FrameModel:
             at = self.distortion.undistorted(at)
         return np.column_stack([at, np.ones(len(at))]) @ self.rotation
 
-    def image_from_ray(self, ray: FloatArray) -> FloatArray:
-        """Image positions (n, 2) px of rays (n, 3) from the projection centre, of any length; NaN behind the camera."""
+    def image_from_ray(self, ray: FloatArray, nearness: FloatArray | float = 1.0) -> FloatArray:
+        """Image positions (n, 2) px of rays (n, 3) from the projection centre, of any length; NaN behind the camera.
+
+        nearness : (n,) or one number, the length of the ray over the distance in m to the point that is seen. Only a
+        rolling shutter uses it, whose rays start at the projection centre of the middle row.
+        """
+        if self.rolling_shutter is None:
+            return self._image_at_rest(ray)
+        return self.rolling_shutter.image_in_motion(self._image_at_rest, np.asarray(ray, float), nearness)
+
+    def _image_at_rest(self, ray: FloatArray) -> FloatArray:
+        """Image positions (n, 2) px of rays (n, 3) from the projection centre at which their points are seen."""
         in_camera = np.asarray(ray, float) @ self.rotation.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = in_camera[:, :2] / in_camera[:, 2:]
@@ -80,11 +113,12 @@ class FrameModel:
         return np.asarray(xy)
 
     def depth(self, xyz: FloatArray) -> FloatArray:
-        """Distance (n,) m of ground points (n, 3) along the optical axis; negative behind the camera."""
+        """Distance (n,) m of ground points (n, 3) along the optical axis, from the projection centre of the middle row;
+        negative behind the camera."""
         return np.asarray(self._from_centre(xyz) @ self.rotation[2])
 
     def moved(self, column: float, row: float) -> FrameModel:
-        """The camera with its image positions increased by `column` and `row` pixels."""
+        """The camera with its image positions increased by `column` and `row` pixels; rows keep their time."""
         return replace(self, principal_point=(self.principal_point[0] + column, self.principal_point[1] + row))
 
     def corrected(self, offset: FloatArray, turn: FloatArray) -> FrameModel:
@@ -103,7 +137,9 @@ class FrameModel:
         """The camera in a rotated Cartesian frame. rotation : (3, 3), new frame from old frame."""
         assert self.space == FRAME_SPACE, "the Earth is not turned"
         centre, rows = rotation @ np.array(self.centre), self.rotation @ rotation.T
-        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(rows))
+        return replace(
+            self, centre=as_row(centre), camera_from_ground=as_rows(rows), rolling_shutter=self._motion(rotation)
+        )
 
     def on_earth(self, given: CRS, crs: CRS) -> FrameModel:
         """The camera over the curved Earth, for ground points in `crs`.
@@ -113,7 +149,14 @@ class FrameModel:
         """
         earth = EarthSpace(crs)
         centre, axes = earth.pose(given, np.array(self.centre))
-        return replace(self, centre=as_row(centre), camera_from_ground=as_rows(self.rotation @ axes), space=earth)
+        rows = as_rows(self.rotation @ axes)
+        return replace(
+            self, centre=as_row(centre), camera_from_ground=rows, space=earth, rolling_shutter=self._motion(axes.T)
+        )
+
+    def _motion(self, rotation: FloatArray) -> RollingShutter | None:
+        """The rolling shutter in rotated axes. rotation : (3, 3), new from old axes."""
+        return None if self.rolling_shutter is None else self.rolling_shutter.turned(rotation)
 
     def _from_centre(self, xyz: FloatArray) -> FloatArray:
         """Rays (n, 3) m from the projection centre to ground points (n, 3)."""

@@ -121,7 +121,7 @@ class DepthRays:
 class DepthModel:
     """A frame camera in the image space of disparities, as a `SensorModel`.
 
-    At one disparity the two images, without distortion, are related by a homography, also beyond infinity.
+    At one disparity the two images, without distortion and motion, are related by a homography, also beyond infinity.
     """
 
     rays: DepthRays
@@ -129,20 +129,25 @@ class DepthModel:
 
     def image_from_ground(self, xyz: FloatArray) -> FloatArray:
         """See `SensorModel`. xyz : column, minus row, disparity."""
-        ray = self.rays.sensor.ray_from_image(xyz[:, :2] * [1.0, -1.0])
-        return self.sensor.image_from_ray(ray + xyz[:, 2:] / self.rays.scale * self._base)
+        reference_sensor, xy = self.rays.sensor, xyz[:, :2] * [1.0, -1.0]
+        ray, nearness = reference_sensor.ray_from_image(xy), xyz[:, 2:] / self.rays.scale
+        if reference_sensor.rolling_shutter is not None:
+            # Seen from the projection centre of the reference's middle row, which disparities refer to.
+            displacement = reference_sensor.displacement(xy)
+            ray = ray + nearness * (displacement - (displacement @ reference_sensor.rotation[2])[:, None] * ray)
+        return self.sensor.image_from_ray(ray + nearness * self._base, nearness[:, 0])
 
     def ground_from_image(self, xy: FloatArray, z: FloatArray) -> FloatArray:
         """See `SensorModel`."""
         z = np.broadcast_to(np.asarray(z, float), (len(xy),))
         # The reference's rays end in the plane of depth 1, which the base, scaled to the disparity, shifts.
         towards, axis = self.sensor.ray_from_image(xy), self.rays.sensor.rotation[2]
-        shift = z[:, None] / self.rays.scale * self._base
+        shift = z[:, None] / self.rays.scale * (self._base - self.sensor.displacement(xy))
         with np.errstate(divide="ignore", invalid="ignore"):
             length = (1.0 + shift @ axis) / (towards @ axis)
         ray = length[:, None] * towards - shift
         ray[~(length > 0)] = np.nan
-        return np.column_stack([self.rays.sensor.image_from_ray(ray) * [1.0, -1.0], z])
+        return np.column_stack([self.rays.sensor.image_from_ray(ray, z / self.rays.scale) * [1.0, -1.0], z])
 
     def height_bounds(self) -> tuple[float, float] | None:
         """See `SensorModel`."""

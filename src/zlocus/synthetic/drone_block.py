@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,9 @@ from pyproj import CRS
 from zlocus.core.errors import ConfigError
 from zlocus.core.options.option_fields import Checked, option
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.cameras.frame_camera import FrameCamera
+from zlocus.io.cameras.frame_camera import FrameCamera, distortion_entry, rolling_shutter_entry
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
-from zlocus.sensors.distortion import BrownDistortion, Distortion, FisheyeDistortion
+from zlocus.sensors.distortion import BrownDistortion, Distortion
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.drone_ground import ColouredGround, Settlement, build_settlement
 from zlocus.synthetic.drone_photo import DronePhoto, photographed, write_photo
@@ -302,13 +302,10 @@ def _write_scene_file(
 
 def _entry(exposure: Exposure, sensor: FrameModel) -> ViewEntry:
     """The entry of a frame in the scene file. The map is taken for Cartesian axes, as in the rendering."""
-    lens = sensor.distortion
-    assert isinstance(lens, BrownDistortion | FisheyeDistortion)
-    kind = "brown" if isinstance(lens, BrownDistortion) else "fisheye"
-    coefficients = {each.name: getattr(lens, each.name) for each in fields(lens)}
     camera = FrameCamera.model_validate({
         "kind": "frame", "focal": sensor.focal, "principal_point": sensor.principal_point, "centre": sensor.centre,
-        "rotation": sensor.camera_from_ground, "earth": "flat", "distortion": {"kind": kind, **coefficients},
+        "rotation": sensor.camera_from_ground, "earth": "flat", "distortion": distortion_entry(sensor.distortion),
+        "rolling_shutter": rolling_shutter_entry(sensor.rolling_shutter),
     })  # fmt: skip
     return ViewEntry(name=exposure.view.name, image=photo_name(exposure), camera=camera)
 

@@ -86,7 +86,7 @@ class SplinedRays:
         n_cols = int(np.argmax(xy[:, 1] != xy[0, 1])) or len(xy)
         rows, cols = xy[::n_cols, 1], xy[:n_cols, 0]
         assert len(rows) * len(cols) == len(xy), "positions are a lattice"
-        x, y, height = self.sensor.centre
+        x, y, height = (np.array(self.sensor.centre) + self.sensor.displacement(xy)).T
         east, north = (spline(rows, cols).ravel() for spline in self._splines)
         return np.column_stack([x + (z - height) * east, y + (z - height) * north, z])
 

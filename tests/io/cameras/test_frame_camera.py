@@ -15,11 +15,13 @@ from zlocus.io.scene_file import open_scene, read_scene_file, rotation_to_z, wri
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace
 from zlocus.sensors.frame import rotation_from_angles
+from zlocus.sensors.rolling_shutter import RollingShutter
 
 PIXELS = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60)
 POSE = {"centre": [700_120.0, 4_790_230.0, 1450.0], "angles": [1.0, -2.0, 30.0]}
 CAMERA = {"kind": "frame", "focal": 70.0, "principal_point": [30.0, 19.0], **POSE}
 BROWN = {"kind": "brown", "k1": -0.2, "p2": 1e-3}
+MOTION = {"readout_s": 0.03, "velocity_m_s": [8.0, -1.0, 0.5]}
 
 
 def document(frame=None, **changes):
@@ -46,13 +48,22 @@ def test_every_entry(tmp_path):
     assert scene(tmp_path, document(distortion={"kind": "brown"})).views[0].sensor.distortion is None
 
 
+def test_a_rolling_shutter_has_the_rows_of_the_image(tmp_path):
+    sensor = scene(tmp_path, document(rolling_shutter=MOTION, earth="flat")).views[0].sensor
+    assert sensor.rolling_shutter == RollingShutter(0.03, (8.0, -1.0, 0.5), 40)
+    curved = scene(tmp_path, document(rolling_shutter=MOTION)).views[0].sensor
+    assert np.linalg.norm(curved.rolling_shutter.velocity) == pytest.approx(np.linalg.norm([8.0, -1.0, 0.5]))
+
+
 def test_written_file_reads_back_equal(tmp_path):
-    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(document(distortion=BROWN, focal=[70.0, 71.0], earth="flat")))
+    given = document(distortion=BROWN, focal=[70.0, 71.0], earth="flat", rolling_shutter=MOTION)
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(given))
     here = read_scene_file(tmp_path / "scene.yaml")
     write_scene_file(tmp_path / "again.yaml", here)
     assert read_scene_file(tmp_path / "again.yaml") == here
     camera = yaml.safe_load((tmp_path / "again.yaml").read_text())["views"][0]["camera"]
-    assert camera == CAMERA | {"distortion": BROWN, "focal": [70.0, 71.0], "earth": "flat"}
+    expected = {"distortion": BROWN, "focal": [70.0, 71.0], "earth": "flat", "rolling_shutter": MOTION}
+    assert camera == CAMERA | expected
     assert next(iter(camera)) == "kind"
 
 
@@ -72,6 +83,9 @@ def test_written_file_reads_back_equal(tmp_path):
         ({"angles": None, "rotation": [[1e200, 0, 0], [0, 1, 0], [0, 0, 1]]}, "less than or equal to"),
         ({"earth": "hollow"}, "earth"),
         ({"crs": "EPSG:999999"}, "is no CRS"),
+        ({"rolling_shutter": {"readout_s": 0.03}}, "velocity_m_s is missing"),
+        ({"rolling_shutter": {"readout_s": 30.0, "velocity_m_s": [8.0, 0.0, 0.0]}}, "readout_s"),
+        ({"rolling_shutter": {"readout_s": 0.03, "velocity_m_s": [1e9, 0.0, 0.0]}}, r"velocity_m_s\[0\]"),
     ],
 )
 def test_what_is_refused(tmp_path, changes, says):

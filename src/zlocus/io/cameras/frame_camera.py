@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,11 +23,13 @@ from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.camera_entry import CameraEntry, Vector
 from zlocus.io.crs import checked_crs
+from zlocus.io.open_raster import open_raster
 from zlocus.io.safe_text import quoted
 from zlocus.io.schema import FiniteNumber, StrictModel
-from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
+from zlocus.sensors.distortion import BrownDistortion, Distortion, FisheyeDistortion
 from zlocus.sensors.earth_frame import between
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
+from zlocus.sensors.rolling_shutter import RollingShutter
 
 ORTHONORMAL_TOLERANCE = 1e-4
 # Larger than any camera on or above the Earth needs. A larger number is a sign of damage, and could overflow later.
@@ -35,10 +37,13 @@ MAX_COORDINATE_M = 1e9
 MAX_CAMERA_PX = 1e7
 # A smaller focal length counts as 0.
 MIN_FOCAL_PX = 1e-6
+# No camera reads its rows more slowly, and nothing that carries one flies faster.
+MAX_READOUT_S, MAX_VELOCITY_M_S = 1.0, 1000.0
 
 Coordinate = Annotated[FiniteNumber, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 Pixels = Annotated[FiniteNumber, Field(ge=-MAX_CAMERA_PX, le=MAX_CAMERA_PX)]
 FocalLength = Annotated[FiniteNumber, Field(gt=MIN_FOCAL_PX, le=MAX_CAMERA_PX)]
+Velocity = Annotated[FiniteNumber, Field(ge=-MAX_VELOCITY_M_S, le=MAX_VELOCITY_M_S)]
 
 
 def _pair(value: Any) -> Any:
@@ -98,6 +103,37 @@ class FisheyeEntry(EntryWithoutDefaults):
         return FisheyeDistortion(self.k1, self.k2, self.k3, self.k4)
 
 
+def distortion_entry(distortion: Distortion | None) -> BrownEntry | FisheyeEntry | None:
+    """The entry of a lens distortion; None for an ideal lens."""
+    if distortion is None:
+        return None
+    assert isinstance(distortion, BrownDistortion | FisheyeDistortion), "no other distortion has an entry"
+    entry = BrownEntry if isinstance(distortion, BrownDistortion) else FisheyeEntry
+    return entry(**{each.name: getattr(distortion, each.name) for each in fields(distortion)})
+
+
+class RollingShutterEntry(StrictModel):
+    """Motion of a camera during the read-out of its image; see `RollingShutter`.
+
+    readout_s : s, time in which all rows are read; negative where the last row is read first; velocity_m_s : of the
+    projection centre, in the axes of `rotation` (the map's or the frame's).
+    """
+
+    readout_s: Annotated[FiniteNumber, Field(ge=-MAX_READOUT_S, le=MAX_READOUT_S)]
+    velocity_m_s: tuple[Velocity, Velocity, Velocity]
+
+    def model(self, rows: int) -> RollingShutter:
+        """The motion over an image of so many rows."""
+        return RollingShutter(self.readout_s, self.velocity_m_s, rows)
+
+
+def rolling_shutter_entry(rolling_shutter: RollingShutter | None) -> RollingShutterEntry | None:
+    """The entry of the motion of a camera; None for one that takes all rows at once."""
+    if rolling_shutter is None:
+        return None
+    return RollingShutterEntry(readout_s=rolling_shutter.readout_s, velocity_m_s=rolling_shutter.velocity)
+
+
 class Interior(EntryWithoutDefaults):
     """Interior orientation.
 
@@ -116,6 +152,7 @@ class FrameCamera(CameraEntry, Interior):
 
     crs : of the centre; the default is that of the scene's frame. earth : with `curved`, the default, rays are straight
     in space and the pose is relative to the axes of the map at the centre; with `flat` the map is taken as Cartesian.
+    rolling_shutter : None is a camera that takes all rows at once.
     """
 
     kind: Literal["frame"] = "frame"
@@ -124,6 +161,7 @@ class FrameCamera(CameraEntry, Interior):
     angles: Vector | None = None
     crs: str | None = None
     earth: Literal["curved", "flat"] | None = None
+    rolling_shutter: RollingShutterEntry | None = None
 
     @model_validator(mode="after")
     def _one_rotation(self) -> FrameCamera:
@@ -142,6 +180,9 @@ class FrameCamera(CameraEntry, Interior):
             self.centre, rotation, self.focal[0], self.principal_point, self.focal[1] / self.focal[0], self.skew,
             None if self.distortion is None else self.distortion.model(),
         )  # fmt: skip
+        if self.rolling_shutter is not None:
+            with open_raster(image) as source:
+                model = replace(model, rolling_shutter=self.rolling_shutter.model(source.height))
         return FrameSource(model, image, None if self.crs is None else map_crs(self.crs, image), self.earth != "flat")
 
     def with_default_crs(self, crs: str | None) -> FrameCamera:
