@@ -23,7 +23,7 @@ SLOW = (
     "runs", "docs", "benchmarks", "pipeline", "inspector", "products/report", "cli",
     "core/test_resources.py", "core/test_signals.py", "core/test_startup.py", "core/test_startup_imports.py",
     "evaluation/test_evaluate_coarse_references.py", "io/test_io_damaged_files.py", "io/test_open_raster_remote.py",
-    "matching/test_fusion.py", "orientation/test_parameter_groups.py",
+    "matching/test_fusion.py", "orientation/test_parameter_groups.py", "orientation/test_self_calibration.py",
     "test_api.py",
 )  # fmt: skip
 

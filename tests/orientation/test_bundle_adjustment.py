@@ -123,7 +123,7 @@ def test_the_focal_length_is_found_on_request():
     ground = frame_ground(600, relief_m=400.0)
     fixed, xyz = oriented(exact, wrong, ground, FRAME_SIZE, control=frame_control())
     assert np.nanmax(image_errors(fixed, exact, xyz)) > 0.5
-    options = OrientationOptions(bundle_adjustment=replace(EXACT, sigma_focal_px=20.0))
+    options = OrientationOptions(bundle_adjustment=replace(EXACT, self_calibration=("focal",), sigma_focal_px=20.0))
     found, xyz = oriented(exact, wrong, ground, FRAME_SIZE, options, control=frame_control())
     assert [sensor.focal for sensor in found.sensors] == pytest.approx([6000.0] * 8, abs=0.1)
     assert np.nanmax(image_errors(found, exact, xyz)) < RECOVERED_PX

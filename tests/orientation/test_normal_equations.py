@@ -29,10 +29,14 @@ from zlocus.orientation.bundle_adjustment import problem_of
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.normal_equations import ground_information, linearise, reduced, weights
 from zlocus.orientation.parameter_groups import parameter_groups_of
+from zlocus.orientation.self_calibration import calibration_groups
 from zlocus.orientation.triangulate import project_points
+from zlocus.sensors.rolling_shutter import RollingShutter
 
 OPTIONS = OrientationOptions(
-    bundle_adjustment=BundleAdjustmentOptions(sigma_focal_px=10.0, rpc_correction="affine", drift_knot_interval_s=20.0)
+    bundle_adjustment=BundleAdjustmentOptions(
+        self_calibration=("all",), sigma_focal_px=10.0, rpc_correction="affine", drift_knot_interval_s=20.0
+    )
 )
 # Of the largest derivative: one-sided differences over a twentieth of a sigma.
 DERIVATIVES = 2e-3
@@ -41,13 +45,16 @@ DERIVATIVES = 2e-3
 def problems(kind, n=40, control=None, terrain=None):
     """A small problem of one kind of sensor, with parameters that are not zero."""
     if kind == "frame":
-        sensors, xyz, size = flight_of_frames(1, 3), frame_ground(n), FRAME_SIZE
+        motion = RollingShutter(0.03, (50.0, 0.0, 0.0), FRAME_SIZE[1])
+        sensors = [replace(camera, rolling_shutter=motion) for camera in flight_of_frames(1, 3)]
+        xyz, size = frame_ground(n), FRAME_SIZE
     elif kind == "linescan":
         sensors, xyz, size = strips_of_lines((0.0,)), scan_ground(n), (SCAN_COLUMNS, SCAN_ROWS)
     else:
         sensors, xyz, size = affine_sensors(), random_ground(n), AFFINE_SIZE
     seen, xyz = seen_by(sensors, xyz, size, noise_px=0.3)
-    groups = parameter_groups_of(views_of(sensors, size), OPTIONS)
+    views = views_of(sensors, size)
+    groups = (*parameter_groups_of(views, OPTIONS), *calibration_groups(views, OPTIONS))
     problem = problem_of(tuple(sensors), groups, seen, xyz, OPTIONS, control or GroundControl.none(), terrain)
     parameters = np.random.default_rng(2).normal(0.0, 0.5, problem.n_parameters)
     return problem, parameters, np.concatenate([xyz, problem.control_xyz])

@@ -12,12 +12,36 @@ from zlocus.core.options import OrientationOptions
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import GroundControl, TerrainHeights
+from zlocus.orientation.determinability import parameter_words
 from zlocus.orientation.normal_equations import Problem, Solution, solve
 from zlocus.orientation.parameter_groups import ParameterGroup, corrected_sensors, parameter_groups_of
+from zlocus.orientation.self_calibration import calibration_groups
 from zlocus.orientation.shift_adjustment import Adjustment, renumbered, without_outliers
 from zlocus.orientation.triangulate import Observations, project_points, triangulate
 
 ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class CalibratedParameter:
+    """A parameter of a self-calibration.
+
+    views : numbers of the images that share it; name : with its unit at the end; words : the same in a sentence; value,
+    sigma : what was added and its standard deviation, in that unit; is_held : whether it was held at 0, sigma is NaN
+    then.
+    """
+
+    views: tuple[int, ...]
+    name: str
+    words: str
+    value: float
+    sigma: float
+    is_held: bool
+
+    @property
+    def unit(self) -> str:
+        """The unit with a space before it; empty for coefficients, which have none."""
+        return f" {self.name.rsplit('_', 1)[-1]}" if "_" in self.name else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +63,24 @@ class BundleAdjustment:
     control_residual: FloatArray
     terrain_m: FloatArray
 
+    @property
+    def calibration(self) -> tuple[CalibratedParameter, ...]:
+        """The parameters of the self-calibration."""
+        first, found = 0, []
+        for group in self.groups:
+            part = slice(first, first + len(group))
+            first += len(group)
+            values, sigmas = (
+                group.described(each[part] * group.sigma)
+                for each in (self.solution.parameters, self.solution.parameter_sigma)
+            )
+            for name, is_held in zip(group.names, self.solution.is_held[part], strict=True):
+                if group.is_calibration:
+                    words = parameter_words(group, name)
+                    sigma = float("nan") if is_held else sigmas[name]
+                    found.append(CalibratedParameter(group.views, name, words, values[name], sigma, bool(is_held)))
+        return tuple(found)
+
 
 def adjust_bundle(
     views: Sequence[View],
@@ -53,7 +95,8 @@ def adjust_bundle(
     xyz : (n, 3) m, first ground points of the ties. Observations whose residual exceeds 4 sigma (and `inlier_px`) are
     dropped, then everything is solved again; this is done twice. Check points take no part.
     """
-    sensors, groups = tuple(view.sensor for view in views), parameter_groups_of(views, options)
+    sensors = tuple(view.sensor for view in views)
+    groups = (*parameter_groups_of(views, options), *calibration_groups(views, options))
     control = GroundControl.none() if control is None else control
     numbers = np.arange(len(xyz))
     parameters, corrected = np.zeros(sum(map(len, groups))), sensors

@@ -8,7 +8,8 @@ components*) show which kinds of corrections the ties require.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,18 @@ from scipy import linalg, sparse
 
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import TerrainHeights
+from zlocus.orientation.determinability import (
+    HELD_VARIANCE,
+    BlockHeights,
+    HeldParameter,
+    mean_camera_heights,
+    undetermined_parameters,
+)
 from zlocus.orientation.parameter_groups import ParameterGroup, corrected_sensors
 from zlocus.orientation.shift_adjustment import HUBER_SIGMAS, huber_weight, robust_sigma
 from zlocus.orientation.triangulate import Observations, ground_jacobian, project_points, summed
 
-MAX_ITERATIONS = 40
+MAX_ITERATIONS = 100
 TOLERANCE_PX = 1e-3
 # Variances of corrections are estimated again, with the corrections, until none changes by a larger share.
 VARIANCE_TOLERANCE = 0.1
@@ -147,13 +155,19 @@ class PriorVariance:
     """Prior variances of the parameters, which are estimated together with them.
 
     variance : (p,) in units of their sigma squared; n_rounds : of estimation so far; has_converged : whether it ended;
-    is_held : (p,), see `Solution`.
+    is_held : (p,), see `Solution`; held_parameters : see `Solution`, None before the first estimation.
     """
 
     variance: FloatArray
     n_rounds: int
     has_converged: bool
     is_held: NDArray[np.bool_]
+    held_parameters: tuple[HeldParameter, ...] | None = None
+
+    @property
+    def is_undetermined(self) -> NDArray[np.bool_]:
+        """Which parameters (p,) are held because the block does not determine them."""
+        return np.asarray(np.isin(np.arange(len(self.variance)), [each.index for each in self.held_parameters or ()]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,15 +175,16 @@ class Solution:
     """Result of the normal equations.
 
     parameters : (p,) in units of their sigma; parameter_sigma : (p,), of those found, in the same units; is_held : (p,)
-    which are held at zero because ties and control require none of their kind; xyz : (n, 3) m, ties, then control
-    points; residual : (m, 2) px; sigma0_px : noise of one image coordinate of a tie, from the residuals of all ties
-    kept and their redundancy; n_determined : number of directions of the parameters that the ties determine; n_steps :
-    number of steps.
+    which are held at zero because ties and control require none of their kind or do not determine them; held_parameters
+    : the latter, of a self-calibration; xyz : (n, 3) m, ties, then control points; residual : (m, 2) px; sigma0_px :
+    noise of one image coordinate of a tie, from the residuals of all ties kept and their redundancy; n_determined :
+    number of directions of the parameters that the ties determine; n_steps : number of steps.
     """
 
     parameters: FloatArray
     parameter_sigma: FloatArray
     is_held: NDArray[np.bool_]
+    held_parameters: tuple[HeldParameter, ...]
     xyz: FloatArray
     residual: FloatArray
     sigma0_px: float
@@ -201,6 +216,10 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
         if n_steps == MAX_ITERATIONS or (prior_variance.has_converged and moved_px < TOLERANCE_PX):
             break
         if moved_px < TOLERANCE_PX:
+            if prior_variance.held_parameters is None:
+                heights = block_heights(problem, sensors, full)
+                held = undetermined_parameters(problem.groups, normal / sigma**2, heights, problem.is_controlled)
+                prior_variance = replace(prior_variance, held_parameters=held)
             prior_variance = estimated_variance(problem, prior_variance, parameters, np.diag(covariance))
             covariance = covariance_of(normal, sigma, prior_variance.variance)
         step = covariance @ (pull / sigma**2 - parameters / prior_variance.variance)
@@ -213,9 +232,12 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
     used = of_ties > 0.0
     redundancy = 2 * int(used.sum()) - 3 * len(np.unique(problem.observations.point[used])) - n_determined
     sigma0 = np.sqrt((residual[used] ** 2).sum() / redundancy) if redundancy > 0 else np.nan
+    if redundancy > 0:
+        # Residuals are smaller than the noise, because parameters and ground points follow a part of it.
+        covariance = covariance_of(normal, sigma * np.sqrt(2 * used.sum() / redundancy), prior_variance.variance)
     parameters = np.where(prior_variance.is_held, 0.0, parameters)
-    found = parameters, np.sqrt(np.diag(covariance)), prior_variance.is_held
-    return Solution(*found, xyz, residual, float(sigma0), redundancy, n_determined, n_steps)
+    of_parameters = np.sqrt(np.diag(covariance)), prior_variance.is_held, prior_variance.held_parameters or ()
+    return Solution(parameters, *of_parameters, xyz, residual, float(sigma0), redundancy, n_determined, n_steps)
 
 
 def covariance_of(normal: FloatArray, sigma: float, variance: FloatArray) -> FloatArray:
@@ -241,12 +263,20 @@ def estimated_variance(
     is_shown = n_shown > MIN_DETERMINED_PARAMETERS
     squares = np.bincount(kinds, parameters**2, len(kinds))[kinds]
     new = np.where(is_shown, np.clip(squares / np.where(is_shown, n_shown, 1.0), MIN_VARIANCE, 1.0), variance)
-    n_rounds = prior_variance.n_rounds + 1
+    n_rounds, undetermined = prior_variance.n_rounds + 1, prior_variance.is_undetermined
+    new = np.where(undetermined, HELD_VARIANCE, new)
     changed = np.abs(np.log(new / variance)).max(initial=0.0)
     if changed > VARIANCE_TOLERANCE and n_rounds < VARIANCE_ROUNDS:
-        return PriorVariance(new, n_rounds, False, prior_variance.is_held)
-    is_held = ~is_shown & (variance < 1.0)
-    return PriorVariance(np.where(is_held, new, 1.0), n_rounds, True, is_held)
+        return PriorVariance(new, n_rounds, False, prior_variance.is_held, prior_variance.held_parameters)
+    is_held = undetermined | (~is_shown & (variance < 1.0))
+    return PriorVariance(np.where(is_held, new, 1.0), n_rounds, True, is_held, prior_variance.held_parameters)
+
+
+def block_heights(problem: Problem, sensors: Sequence[SensorModel], equations: ReducedEquations) -> BlockHeights:
+    """How ground and cameras rise with the parameters: the ground points follow the cameras by C^-1 E^T."""
+    mean_height = np.zeros((problem.n_points, 3))
+    mean_height[: problem.n_ties] = equations.covariance[: problem.n_ties, 2] / max(problem.n_ties, 1)
+    return BlockHeights(-(equations.mixed @ mean_height.ravel()), mean_camera_heights(problem.groups, sensors))
 
 
 def weights(problem: Problem, residual: FloatArray, linearised: Linearised) -> tuple[float, FloatArray]:

@@ -16,6 +16,7 @@ from zlocus.orientation.corrections import CameraSolver, excluded_images_of, wit
 from zlocus.orientation.line_adjustment import estimated_line_shifts, no_line_shifts, without_line_shifts
 from zlocus.orientation.parameter_groups import needs_bundle_adjustment
 from zlocus.orientation.plausibility import Doubt, ExcludedImage, doubts_about
+from zlocus.orientation.self_calibration import check_self_calibration
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_points import first_ground_points, with_rough_ties
 from zlocus.orientation.tie_refinement import RefinedTies, refine_ties
@@ -173,9 +174,16 @@ def orient(
 
     Ties are found by SIFT, refined by least squares in the full-resolution images, and adjusted together with their
     ground points (method section 1). The result does not depend on the number of threads.
+
+    Raises
+    ------
+    ConfigError
+        A self-calibration is to correct a parameter that a camera does not have.
     """
     request = OrientationRequest() if request is None else request
     options = _with_model(options, scene)
+    if options.model == "joint":
+        check_self_calibration(scene.views, options)
     refined = request.refined_ties
     if refined is None:
         refined = _measure_ties(scene, options, request.z_range_hint, progress, threads)

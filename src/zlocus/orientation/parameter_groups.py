@@ -4,7 +4,7 @@ deviations."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,7 +30,7 @@ SHIFT_NAMES = ("column_px", "row_px")
 AFFINE_NAMES = ("column_by_column_px", "column_by_row_px", "row_by_column_px", "row_by_row_px")
 POSE_NAMES = ("x_m", "y_m", "z_m", "turn_x_deg", "turn_y_deg", "turn_z_deg")
 # Factors from the units of the parameters to those of the report, by the last word of the parameter's name.
-UNITS = {"deg": 180.0 / np.pi}
+UNITS = {"deg": 180.0 / np.pi, "ms": 1000.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,9 @@ class ParameterGroup:
     """Parameters that correct one image, or several images together.
 
     kind : see above; views : numbers of the images; names : (k,) of the parameters, which end in their unit; sigma :
-    (k,) standard deviations beforehand, about zero, in m, rad and px; observations : see `MIN_INFORMATION_IN_IMAGE`;
+    (k,) standard deviations beforehand, about zero, in m, rad, px and s; observations : see `MIN_INFORMATION_IN_IMAGE`;
     correct : a sensor model of one of the images and values (k,) in the units of `sigma`, to the corrected model.
+    is_calibration : whether they are held unless the block determines them (see `undetermined_parameters`).
     """
 
     kind: str
@@ -48,6 +49,7 @@ class ParameterGroup:
     sigma: FloatArray
     min_information: float
     correct: Correct
+    is_calibration: bool = False
 
     def __len__(self) -> int:
         return len(self.sigma)
@@ -80,10 +82,9 @@ def needs_bundle_adjustment(views: Sequence[View]) -> bool:
 
 
 def parameter_groups_of(views: Sequence[View], options: OrientationOptions) -> tuple[ParameterGroup, ...]:
-    """The parameter groups of a scene.
+    """The parameter groups of a scene, without those of a self-calibration (see `calibration_groups`).
 
-    Each image gets a shift (or an affine map) or a pose. All images of a trajectory share a drift. On request, all
-    images of a camera share a focal length.
+    Each image gets a shift (or an affine map) or a pose. All images of a trajectory share a drift.
     """
     frames = [i for i, view in enumerate(views) if isinstance(view.sensor, FrameModel)]
     scanners = [i for i, view in enumerate(views) if isinstance(view.sensor, Scanner)]
@@ -92,11 +93,6 @@ def parameter_groups_of(views: Sequence[View], options: OrientationOptions) -> t
     groups = [image_group(i, views[i], options) for i in in_image]
     groups += [pose_group(i, options) for i in frames]
     groups += [drift_group(group, views, options) for group in same(scanners, views, same_trajectory)]
-    if options.bundle_adjustment.sigma_focal_px is not None:
-        groups += [
-            focal_group(group, views, options.bundle_adjustment.sigma_focal_px)
-            for group in same(frames, views, same_lens)
-        ]
     return tuple(groups)
 
 
@@ -134,16 +130,6 @@ def pose_group(number: int, options: OrientationOptions) -> ParameterGroup:
         return sensor.corrected(values[:3], values[3:])
 
     return ParameterGroup(POSE, (number,), POSE_NAMES, pose_sigma(options), MIN_INFORMATION_IN_SPACE, correct)
-
-
-def focal_group(numbers: Sequence[int], views: Sequence[View], sigma_px: float) -> ParameterGroup:
-    """The parameter of the focal length that some frame cameras share."""
-
-    def correct(sensor: SensorModel, values: FloatArray) -> SensorModel:
-        assert isinstance(sensor, FrameModel), "groups fit their sensors"
-        return replace(sensor, focal=sensor.focal + float(values[0]))
-
-    return ParameterGroup(FOCAL, tuple(numbers), ("focal_px",), np.array([sigma_px]), MIN_INFORMATION_IN_SPACE, correct)
 
 
 def drift_group(numbers: Sequence[int], views: Sequence[View], options: OrientationOptions) -> ParameterGroup:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from zlocus.core.progress import Progress
 from zlocus.io.grid_inputs import lacks_vertical_datum
+from zlocus.orientation.determinability import images_in_words
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.plausibility import Doubt
 
@@ -31,13 +32,34 @@ def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress) -> 
 
 
 def note_orientation(orientation: Orientation, progress: Progress) -> None:
-    """Say which corrections were applied, which images take no part, and which cameras are doubtful."""
+    """Say which corrections were applied, which parameters of the cameras were calibrated or held, which images take no
+    part, and which cameras are doubtful."""
     progress.note(what_was_applied(orientation))
+    for sentence in self_calibration_sentences(orientation):
+        progress.note(sentence)
     for excluded in orientation.excluded_images[:MAX_NAMED]:
         progress.note(str(excluded))
     if len(orientation.excluded_images) > MAX_NAMED:
         progress.note(f"{len(orientation.excluded_images) - MAX_NAMED} more images take no part: see run.json.")
     note_doubts(orientation.doubts, progress)
+
+
+def self_calibration_sentences(orientation: Orientation) -> list[str]:
+    """What a self-calibration corrected, for each camera in one sentence, and why it held the other parameters."""
+    bundle_adjustment = orientation.bundle_adjustment
+    if bundle_adjustment is None:
+        return []
+    names = [view.name for view in orientation.views]
+    corrections: dict[tuple[int, ...], list[str]] = {}
+    for each in bundle_adjustment.calibration:
+        if not each.is_held:
+            text = f"{each.words} {each.value:+.4g}{each.unit} (standard deviation {each.sigma:.2g}{each.unit})"
+            corrections.setdefault(each.views, []).append(text)
+    found = [
+        f"Self-calibration of {images_in_words(views, names)}: {', '.join(texts)}."
+        for views, texts in corrections.items()
+    ]
+    return [*found, *(held.sentence(names) for held in bundle_adjustment.solution.held_parameters)]
 
 
 def note_doubts(doubts: Sequence[Doubt], progress: Progress) -> None:

@@ -13,7 +13,7 @@ from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.parameter_groups import ParameterGroup
 from zlocus.orientation.tie_residuals import Residuals
 
-DIGITS = 6
+DIGITS, DIGITS_OF_COEFFICIENTS = 6, 9
 
 
 def orientation_record(orientation: Orientation, scene: Scene) -> dict[str, Any]:
@@ -56,7 +56,8 @@ def sensors_record(orientation: Orientation, bundle_adjustment: BundleAdjustment
 
 def corrections_record(bundle_adjustment: BundleAdjustment, names: list[str]) -> list[dict[str, Any]]:
     """Correction of each parameter group, with its standard deviations after and before the adjustment."""
-    record, first = [], 0
+    record: list[dict[str, Any]] = []
+    first, undetermined = 0, bundle_adjustment.solution.held_parameters
     for group in bundle_adjustment.groups:
         part = slice(first, first + len(group))
         first += len(group)
@@ -76,12 +77,16 @@ def corrections_record(bundle_adjustment: BundleAdjustment, names: list[str]) ->
                 "sigma_before": before,
             }
         )
+        reasons = {each.name: each.sentence(names) for each in undetermined if each.group is group}
+        if reasons:
+            record[-1]["held_because"] = reasons
     return record
 
 
 def described(group: ParameterGroup, values: FloatArray) -> dict[str, float | None]:
     """Values (k,) of a parameter group by name, rounded."""
-    return {name: rounded(value) for name, value in group.described(values).items()}
+    digits = DIGITS_OF_COEFFICIENTS if group.is_calibration else DIGITS
+    return {name: rounded(value, digits) for name, value in group.described(values).items()}
 
 
 def control_record(bundle_adjustment: BundleAdjustment) -> dict[str, Any]:
@@ -118,6 +123,6 @@ def terrain_record(off_m: FloatArray) -> dict[str, Any]:
     return {"n": len(known), "median_m": rounded(median), "nmad_m": rounded(nmad)}
 
 
-def rounded(value: float) -> float | None:
+def rounded(value: float, digits: int = DIGITS) -> float | None:
     """A number for JSON; None in place of NaN and infinity."""
-    return round(float(value), DIGITS) if np.isfinite(value) else None
+    return round(float(value), digits) if np.isfinite(value) else None

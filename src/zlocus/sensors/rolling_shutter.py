@@ -14,7 +14,7 @@ from zlocus.core.sensor_model import FloatArray
 MAX_ROW_SHARE = 1.0
 # A row is found when it changes by less from one iteration to the next. An iteration divides the error by the rows that
 # are read while the image moves by one row, which are hundreds for a drone.
-ROW_TOLERANCE_PX = 1e-8
+ROW_TOLERANCE_PX = 1e-7
 MAX_ITERATIONS = 50
 
 

@@ -13,7 +13,7 @@ Options = TypeVar("Options", bound=Any)
 
 def option(default: Any, doc: str, *, low: float | None = None, high: float | None = None,
            choices: tuple[Any, ...] | None = None, unit: str = "") -> Any:  # fmt: skip
-    """A dataclass field with its sentence, unit and allowed range (inclusive)."""
+    """A dataclass field with its sentence, unit and allowed range (inclusive). choices : of each element of a tuple."""
     meta = {"doc": doc, "low": low, "high": high, "choices": choices, "unit": unit}
     return field(default=default, metadata=meta)
 
@@ -61,8 +61,9 @@ class Checked:
                 continue
             low, high, choices = meta.get("low"), meta.get("high"), meta.get("choices")
             where = f"{type(self).__name__}.{f.name}"
-            if choices is not None and value not in choices:
-                raise ConfigError(f"{where} = {value!r} is not one of {', '.join(map(str, choices))}.")
+            for each in value if isinstance(value, tuple) else (value,):
+                if choices is not None and each not in choices:
+                    raise ConfigError(f"{where} = {each!r} is not one of {', '.join(map(str, choices))}.")
             if (low is not None and not value >= low) or (high is not None and not value <= high):
                 allowed = f"{'-inf' if low is None else low} to {'inf' if high is None else high}"
                 raise ConfigError(

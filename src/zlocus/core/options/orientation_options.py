@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from zlocus.core.errors import ConfigError
 from zlocus.core.options.option_fields import Checked, group, option
+
+# Parameters of a self-calibration, in the order in which they are reported.
+ALL_PARAMETERS = ("focal", "principal_point", "k1", "k2", "k3", "p1", "p2", "readout")
 
 
 @dataclass(frozen=True)
@@ -27,9 +31,29 @@ class BundleAdjustmentOptions(Checked):
         0.01, "Standard deviation of the attitude of a frame camera or line scanner, about each axis.", low=1e-7,
         high=45.0, unit="degrees",
     )  # fmt: skip
+    self_calibration: tuple[str, ...] = option(
+        (), "Parameters of frame cameras that are corrected, each shared by the images of a camera (of equal interior "
+        "orientation). Those that the block does not determine are held. Empty: none.",
+        choices=("all", *ALL_PARAMETERS),
+    )  # fmt: skip
     sigma_focal_px: float | None = option(
-        None, "Standard deviation of the focal length, which all images of equal interior orientation share; unset: "
-        "the focal length is not corrected.", low=1e-3, high=1e5, unit="px",
+        None, "Standard deviation of the focal length in a self-calibration. Unset: `sigma_focal_share`.", low=1e-3,
+        high=1e5, unit="px",
+    )  # fmt: skip
+    sigma_focal_share: float = option(
+        0.01, "Standard deviation of the focal length in a self-calibration, as a share of it.", low=1e-6, high=1.0
+    )
+    sigma_principal_point_px: float = option(
+        10.0, "Standard deviation of each coordinate of the principal point in a self-calibration.", low=1e-3, high=1e5,
+        unit="px",
+    )  # fmt: skip
+    sigma_distortion_px: float = option(
+        10.0, "Standard deviation of each coefficient of the distortion in a self-calibration, as the movement of the "
+        "farthest corner of the image.", low=1e-3, high=1e5, unit="px",
+    )  # fmt: skip
+    sigma_readout_ms: float = option(
+        10.0, "Standard deviation of the read-out time of a rolling shutter in a self-calibration.", low=1e-3, high=1e3,
+        unit="ms",
     )  # fmt: skip
     drift_knot_interval_s: float = option(
         10.0, "Time between two knots of the spline that corrects a trajectory.", low=1e-3, high=1e5, unit="s"
@@ -43,6 +67,14 @@ class BundleAdjustmentOptions(Checked):
     sigma_dem_m: float = option(
         5.0, "Standard deviation of the heights of a DEM given as height control.", low=1e-3, high=1e4, unit="m"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sigma_focal_px is not None and not {"all", "focal"} & set(self.self_calibration):
+            raise ConfigError(
+                f"BundleAdjustmentOptions.sigma_focal_px = {self.sigma_focal_px!r} has no effect, because the focal "
+                'length is not corrected. Add "focal" to self_calibration, or leave sigma_focal_px out.'
+            )
 
 
 @dataclass(frozen=True)
