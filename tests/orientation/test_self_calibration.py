@@ -128,7 +128,9 @@ def test_a_readout_time_that_is_hardly_better_known_afterwards_is_held():
     found = calibrated(exact, exact, block_ground(150), options_with("readout", sigma_readout_ms=1.0))
     (held,) = found.solution.held_parameters
     assert held.name == "readout_ms"
-    assert held.sentence(["a"] * 12).startswith("The read-out time of 12 images (a to a) is held: the tie points")
+    sentence = held.sentence(["a"] * 12)
+    assert sentence.startswith("The read-out time of 12 images (a to a) is held: the tie points")
+    assert "standard deviation. It correlates most with the " in sentence
 
 
 def test_parameters_without_errors_stay_as_delivered():

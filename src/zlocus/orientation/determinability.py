@@ -18,7 +18,7 @@ MAX_SIGMA_SHARE = 0.3
 # over flat ground: the focal length reaches 0.98 with nadir images that are tilted by 1 degree, 0.87 with 3 degrees,
 # 0.89 with two flying heights, and 0.4 with oblique images.
 MAX_HEIGHT_CORRELATION = 0.85
-# From this correlation on, the reason names the partner.
+# From this correlation on, the reason is that the parameter cannot be told from its partner.
 CLEAR_CORRELATION = 0.8
 # The question is asked with attitudes that are free: standard deviations so many times larger. What they are known to
 # beforehand are errors of single images, while those of a mounting are the same in all images, and would be taken for
@@ -62,7 +62,7 @@ class HeldParameter:
             f"tie points (and control) leave {100 * self.sigma_share:.0f} % of its standard deviation"
         )
         if abs(self.correlation) < CLEAR_CORRELATION:
-            return f"{held}."
+            return f"{held}. It correlates most with {self.partner} ({self.correlation:.2f})."
         return f"{held}, and they do not tell it from {self.partner} (correlation {self.correlation:.2f})."
 
 
@@ -89,14 +89,26 @@ class BlockHeights:
     cameras: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class BlockInformation:
+    """What a block tells about its parameters, in units of their sigmas and without what is known beforehand.
+
+    used : (p, p), with which the adjustment is solved; whole : (p, p), with that of the ties in the directions that
+    they hardly determine, which shows what correlates; is_controlled : whether control points or a terrain hold the
+    heights.
+    """
+
+    used: FloatArray
+    whole: FloatArray
+    is_controlled: bool
+
+
 def undetermined_parameters(
-    groups: Sequence[ParameterGroup], information: FloatArray, heights: BlockHeights, is_controlled: bool
+    groups: Sequence[ParameterGroup], block_information: BlockInformation, heights: BlockHeights
 ) -> tuple[HeldParameter, ...]:
     """The parameters of the self-calibration that are held, the least determined first.
 
-    information : (p, p) of ties and control, in units of the sigmas of the parameters, without what is known
-    beforehand; is_controlled : whether control points or a terrain hold the heights. One parameter is held after the
-    other, because each may free those that it correlates with.
+    One parameter is held after the other, because each may free those that it correlates with.
 
     Source of the rule: parameters without a significant reduction, or with high correlations, are to be removed (Fraser
     1997, Digital camera self-calibration, ISPRS Journal 52 (4), 149-159, sections on parameter correlation).
@@ -106,12 +118,12 @@ def undetermined_parameters(
     if not judged.any():
         return ()
     is_attitude = np.array([group.kind == POSE and name.endswith("_deg") for group, name in names])
-    variance, held = np.where(is_attitude, FREE_ATTITUDE**2, 1.0), []
+    deviation, held = np.where(is_attitude, FREE_ATTITUDE, 1.0), []
     while judged.any():
-        covariance = linalg.inv(information + np.diag(1.0 / variance))
-        share = np.sqrt(np.diag(covariance))
+        share = np.sqrt(np.diag(covariance_from(block_information.used, deviation)))
+        covariance = covariance_from(block_information.whole, deviation)
         is_weak = judged & (share > MAX_SIGMA_SHARE)
-        if not is_controlled:
+        if not block_information.is_controlled:
             above_ground = heights.cameras - heights.ground
             correlations = [
                 correlation_with(covariance, i, above_ground) if judged[i] else 0.0 for i in range(len(names))
@@ -123,8 +135,15 @@ def undetermined_parameters(
         group, name = names[worst]
         partner, correlation = closest_partner(groups, worst, covariance, judged, heights)
         held.append(HeldParameter(group, name, worst, float(share[worst]), partner, correlation))
-        judged[worst], variance[worst] = False, HELD_VARIANCE
+        judged[worst], deviation[worst] = False, 0.0
     return tuple(held)
+
+
+def covariance_from(information: FloatArray, deviation: FloatArray) -> FloatArray:
+    """Covariance matrix (p, p) of parameters from information (p, p) and standard deviations beforehand (p,), which may
+    be 0: (N + S^-2)^-1 = S (S N S + 1)^-1 S."""
+    scaled = deviation[:, None] * information * deviation + np.eye(len(deviation))
+    return np.asarray(deviation[:, None] * linalg.inv(scaled) * deviation)
 
 
 def closest_partner(

@@ -21,6 +21,7 @@ from zlocus.orientation.control import TerrainHeights
 from zlocus.orientation.determinability import (
     HELD_VARIANCE,
     BlockHeights,
+    BlockInformation,
     HeldParameter,
     mean_camera_heights,
     undetermined_parameters,
@@ -218,7 +219,8 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
         if moved_px < TOLERANCE_PX:
             if prior_variance.held_parameters is None:
                 heights = block_heights(problem, sensors, full)
-                held = undetermined_parameters(problem.groups, normal / sigma**2, heights, problem.is_controlled)
+                known = BlockInformation(normal / sigma**2, full.normal / sigma**2, problem.is_controlled)
+                held = undetermined_parameters(problem.groups, known, heights)
                 prior_variance = replace(prior_variance, held_parameters=held)
             prior_variance = estimated_variance(problem, prior_variance, parameters, np.diag(covariance))
             covariance = covariance_of(normal, sigma, prior_variance.variance)
