@@ -343,7 +343,8 @@ def spline_case() -> Case:
 def ortho_case(side: int = SIDE) -> Case:
     """Ortho-image of one view on a surface, bilinear."""
     surface, arrays, out = rolling(side), ViewArrays(*views(1, side), BLOCK), np.empty((side, side), np.float32)
-    return Case(lambda: tile_ortho(arrays, surface, 0, out), out.size, "cell")
+    is_wanted = np.ones(np.subtract(arrays.nodes.shape[1:3], 1), np.bool_)
+    return Case(lambda: tile_ortho(arrays, surface, 0, is_wanted, out), out.size, "cell")
 
 
 def test_resample(benchmark):

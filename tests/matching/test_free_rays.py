@@ -14,6 +14,7 @@ from zlocus.matching.free_rays import PairAgreement, add_costs_of_rays, agreemen
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.occlusion import covered_heights
 from zlocus.matching.slope_surface import SlopeSurface
+from zlocus.matching.view_directions import cells_along_rays
 
 HEIGHT_TOLERANCE_STEPS = 1e-3
 
@@ -39,7 +40,7 @@ def test_a_part_of_a_tile_has_the_rays_that_it_has_in_the_whole(direction):
     supported, highest = rng.random(surface.shape) < 0.3, 25.0
     whole, part = np.empty_like(surface), (slice(32, 64), slice(64, 96))
     lowest_free_ray(surface, supported, *direction, whole)
-    around, inside = stage._where_rays_come_from(part, direction, highest - float(surface.min()), surface.shape)
+    around, inside = cells_along_rays(part, direction, highest - float(surface.min()), surface.shape)
     found = np.empty(surface[around].shape, np.float32)
     lowest_free_ray(np.ascontiguousarray(surface[around]), np.ascontiguousarray(supported[around]), *direction, found)
     matters = whole[part] <= highest
@@ -137,3 +138,22 @@ def test_rays_cost_more_where_many_views_cover_the_cells():
     assert stage.costs_of_ray(1, 2.0) == (stage.COARSER_RAY_COST, stage.MAX_RAY_COST)
     assert stage.costs_of_ray(0, 13.0) == (stage.RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)
     assert stage.costs_of_ray(2, 19.0) == (stage.COARSER_RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)
+
+
+def test_images_that_show_parts_agree_as_if_all_were_compared_everywhere():
+    rng = np.random.default_rng(8)
+    ground, shape = gaussian_filter(rng.normal(size=(40, 50)), 1.5), (40, 50)
+    grey = np.stack([3 * ground + rng.normal(0, 0.05, shape) for _ in range(4)]).astype(np.float32)
+    covering = np.zeros(grey.shape, bool)
+    for view, part in enumerate((np.s_[:, :30], np.s_[10:35, 12:], np.s_[5:20, 5:45])):
+        covering[view][part] = True
+    found = pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
+    boxes, stage_box = stage._box_around, lambda mask: (slice(0, shape[0]), slice(0, shape[1]))
+    try:
+        stage._box_around = stage_box
+        expected = pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
+    finally:
+        stage._box_around = boxes
+    assert expected.textured.max() == 2
+    np.testing.assert_array_equal(found.textured, expected.textured)
+    np.testing.assert_array_equal(found.untextured, expected.untextured)

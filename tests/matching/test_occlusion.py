@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from affine import Affine
 
 from rendered_scenes import CENTRE
+from zlocus.matching import occlusion
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, VisibleHeights
 from zlocus.matching.occlusion import (
@@ -178,6 +181,41 @@ def test_a_tower_occludes_the_ground_behind_it():
     shown = covered_heights(views, FLAT, lattice)
     mark_occlusions(shown, views, surface, LEVEL, 100.0)
     assert (shown.lowest_unoccluded < 0).all()
+
+
+@pytest.mark.parametrize("across", [-45.0, 30.0])
+def test_occlusions_of_parts_are_those_of_the_whole_tile(across, monkeypatch):
+    views, lattice, _ = tile([sensor(), sensor(35.0, across)])
+    surface = (10 + 20 * np.random.default_rng(2).random(SHAPE)).astype(np.float32)
+    whole, parts = covered_heights(views, FLAT, lattice), covered_heights(views, FLAT, lattice)
+    mark_occlusions(whole, views, surface, LEVEL, 0.0)
+    quarters = [(rows, cols) for rows in (slice(0, 16), slice(16, 32)) for cols in (slice(0, 32), slice(32, 64))]
+    monkeypatch.setattr(occlusion, "parts_of_one_direction", lambda tile_views, view: quarters)
+    monkeypatch.setattr(occlusion, "cells_per_step", lambda tile_views, view, part=None: cells_per_step(views, view))
+    mark_occlusions(parts, views, surface, LEVEL, 0.0)
+    assert (whole.lowest_unoccluded[1] > 0).mean() > 0.5
+    for height in range(N_STEPS):
+        at = np.full((2, *SHAPE), float(height))
+        np.testing.assert_array_equal(sees(parts, at), sees(whole, at))
+
+
+@pytest.mark.parametrize("beside", [(20.0, 0.0), (-25.0, 18.0), (0.0, -30.0)])
+def test_blocks_that_a_view_does_not_show_are_left_out(beside):
+    """They are found without losing any cell that the view covers."""
+    aside = SatelliteCamera((CENTRE[0] + beside[0], CENTRE[1] + beside[1], 50.0), (60.0, 50.0), 0.5, 50.0, 0.0)
+    views, lattice, _ = tile([sensor(), aside])
+    everywhere = replace(views, is_projected=np.ones_like(views.is_projected))
+    found, expected = covered_heights(views, FLAT, lattice), covered_heights(everywhere, FLAT, lattice)
+    np.testing.assert_array_equal(found.lowest_covered, expected.lowest_covered)
+    np.testing.assert_array_equal(found.highest_covered, expected.highest_covered)
+    assert covers(found)[1].any()
+
+
+def test_a_view_far_beside_a_tile_is_projected_nowhere():
+    far = SatelliteCamera((CENTRE[0] + 300.0, CENTRE[1], 50.0), (60.0, 50.0), 0.5, 0.0, 0.0)
+    views, _, _ = tile([sensor(), far])
+    assert views.is_projected[0].all()
+    assert not views.is_projected[1].any()
 
 
 def test_occluded_heights_are_counted_from_the_support_surface():

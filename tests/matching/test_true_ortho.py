@@ -200,6 +200,19 @@ def test_grey_values_are_those_of_the_image():
     np.testing.assert_allclose(ortho_image(views, flat, 1), -3.0, rtol=0, atol=1e-6)
 
 
+def test_only_blocks_that_are_wanted_and_shown_are_resampled():
+    views, _ = tile([sensor(), sensor(along=20.0)], greys=(0.25, -3.0))
+    where, flat = np.zeros(SHAPE, bool), np.full(SHAPE, LOW, np.float32)
+    where[20, 40] = True
+    found = ortho_image(views, flat, 1, where)
+    in_block = np.zeros(SHAPE, bool)
+    in_block[16:32, 32:48] = True
+    np.testing.assert_allclose(found[in_block], -3.0, rtol=0, atol=1e-6)
+    assert (found[~in_block] == 0).all()
+    nowhere = replace(views, is_projected=np.zeros_like(views.is_projected))
+    assert (ortho_image(nowhere, flat, 1) == 0).all()
+
+
 def test_grey_values_are_levelled_to_those_of_one_image():
     """0.25 of 40 above 500 is 0.25 of 8 above 100; a trend is taken off."""
     flat = np.full(SHAPE, LOW, np.float32)

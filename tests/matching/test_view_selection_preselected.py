@@ -12,7 +12,7 @@ import pytest
 from rendered_scenes import CENTRE
 from zlocus.core.options import SelectionOptions
 from zlocus.core.scene import View
-from zlocus.matching.view_selection import preselected
+from zlocus.matching.view_selection import IMAGES_OF_HALO, candidates_of_points, preselected
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
 
@@ -71,3 +71,29 @@ def test_directions_are_those_at_the_patch():
 def test_the_reference_shows_the_whole_ground():
     names = chosen([view("beside", east=100.0), view("nadir", 1.0), view("fore", 20.0)], 2)
     assert names == ["nadir", "fore"]
+
+
+def test_points_want_a_number_of_images_each():
+    inside = np.array([[1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 1, 0], [1, 1, 1, 0], [0, 0, 0, 1]], bool)
+    best_first = np.array([3, 1, 2, 0, 4])
+    assert candidates_of_points(best_first, inside, np.full(4, 1)).tolist() == [3, 4]
+    assert candidates_of_points(best_first, inside, np.full(4, 2)).tolist() == [3, 1, 2, 4]
+    assert candidates_of_points(best_first, inside, np.array([2, 2, 2, 0])).tolist() == [3, 1, 2]
+    assert candidates_of_points(best_first, inside, np.full(4, 9)).tolist() == best_first.tolist()
+
+
+def test_close_cameras_are_chosen_for_each_point_of_a_tile():
+    """A strip of forty images of a drone, 40 m wide each, over a tile of 100 m: points get six others, where there are
+    so many, and those around the core three."""
+    turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    easts = np.arange(-80, 80, 4.0)
+    sensors = [FrameModel((CENTRE[0] + e, CENTRE[1], Z + 30.0), turn, 90.0, (60.0, 50.0)) for e in easts]
+    views = [View(f"v{e:g}", Path("x"), Blank(), one) for e, one in zip(easts, sensors, strict=True)]
+    east, north = (a.ravel() for a in np.meshgrid(np.linspace(-50, 50, 21), np.linspace(-6, 6, 5)))
+    ground, is_core = np.column_stack([CENTRE[0] + east, CENTRE[1] + north]), np.abs(east) < 30
+    options = SelectionOptions()
+    chosen_views = [easts[i] for i in preselected(views, ground, Z, options, is_core)]
+    n_showing = np.array([sum(abs(at - e) < 20 for at in chosen_views) for e in east])
+    assert n_showing[is_core].min() >= options.max_images_of_point
+    assert n_showing[~is_core].min() >= IMAGES_OF_HALO
+    assert len(chosen_views) < len(views) * 0.7

@@ -7,7 +7,6 @@ show the surface behind it, and there other images agree with them.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -18,12 +17,12 @@ from numpy.typing import NDArray
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.shared_records import VisibleHeights
-from zlocus.matching.local_contrast import ALL
+from zlocus.matching.local_contrast import ALL, Part
 from zlocus.matching.occlusion import MANY_VIEWS, covers_at, usual_number
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.true_ortho import ortho_image
-from zlocus.matching.view_directions import cells_per_step, parts_of_one_direction
+from zlocus.matching.view_directions import cells_along_rays, cells_per_step, parts_of_one_direction
 
 # Two images agree on a cell where their correlation in a window of this many cells is larger than MIN_NCC and their
 # grey values differ by less than MAX_GREY_DIFFERENCE, as a share of the standard deviation of an image's grey values.
@@ -88,21 +87,49 @@ def pair_agreement(grey: NDArray[np.float32], covering: NDArray[np.bool_]) -> Pa
     grey : (i, r, c) float32, the images resampled on a surface, in units of their standard deviations; covering :
     (i, r, c) bool, where an image covers that surface.
     """
-    mean = np.stack([_mean(image) for image in grey])
-    variance = np.stack([_mean(image * image) for image in grey]) - mean * mean
-    inverse = 1.0 / np.sqrt(np.maximum(variance, np.float32(MIN_VARIANCE)))
-    is_plain = (variance < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE**2)) & covering
+    boxes = [_box_around(shows) for shows in covering]
+    mean, inverse = np.zeros_like(grey), np.zeros_like(grey)
+    is_plain = np.zeros(grey.shape, np.bool_)
+    for i, box in enumerate(boxes):
+        image = grey[i][box]
+        if not image.size:
+            continue
+        mean[i][box] = _mean(image)
+        variance = _mean(image * image) - mean[i][box] * mean[i][box]
+        inverse[i][box] = 1.0 / np.sqrt(np.maximum(variance, np.float32(MIN_VARIANCE)))
+        is_plain[i][box] = (variance < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE**2)) & covering[i][box]
     textured, untextured = np.zeros(grey.shape, np.uint8), np.zeros(grey.shape, np.uint8)
     for i, j in combinations(range(len(grey)), 2):
-        apart = np.abs(grey[i] - grey[j])
-        ncc = (_mean(grey[i] * grey[j]) - mean[i] * mean[j]) * (inverse[i] * inverse[j])
+        box = _shared(boxes[i], boxes[j])
+        (grey_i, mean_i, inverse_i), (grey_j, mean_j, inverse_j) = (
+            (grey[k][box], mean[k][box], inverse[k][box]) for k in (i, j)
+        )
+        if not grey_i.size:
+            continue
+        apart = np.abs(grey_i - grey_j)
+        ncc = (_mean(grey_i * grey_j) - mean_i * mean_j) * (inverse_i * inverse_j)
         is_alike = (ncc > np.float32(MIN_NCC)) & (apart < np.float32(MAX_GREY_DIFFERENCE))
-        agree = is_alike & covering[i] & covering[j]
-        both_plain = is_plain[i] & is_plain[j] & (apart < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE))
+        agree = is_alike & covering[i][box] & covering[j][box]
+        both_plain = is_plain[i][box] & is_plain[j][box] & (apart < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE))
         for view in (i, j):
-            textured[view] += agree
-            untextured[view] += both_plain
+            textured[view][box] += agree
+            untextured[view][box] += both_plain
     return PairAgreement(textured, untextured, covering.sum(axis=0))
+
+
+def _box_around(mask: NDArray[np.bool_]) -> Part:
+    """Rows and columns that hold all cells of a mask (r, c) with the windows around them."""
+    half, found = WINDOW_CELLS // 2, []
+    for axis in (1, 0):
+        place = np.flatnonzero(mask.any(axis=axis))
+        found.append(slice(max(int(place[0]) - half, 0), int(place[-1]) + half + 1) if len(place) else slice(0, 0))
+    return found[0], found[1]
+
+
+def _shared(box: Part, other: Part) -> Part:
+    """Rows and columns that two boxes share."""
+    rows, cols = (slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(box, other, strict=True))
+    return rows, cols
 
 
 def agreement_on(tile_views: TileViews, surface: NDArray[np.float32], covering: NDArray[np.bool_]) -> PairAgreement:
@@ -111,7 +138,7 @@ def agreement_on(tile_views: TileViews, surface: NDArray[np.float32], covering: 
     tile_views : projections of level indices; surface : (r, c) float32, level indices; covering : (i, r, c) bool, where
     a view covers it.
     """
-    grey = np.stack([ortho_image(tile_views, surface, view) for view in range(len(covering))])
+    grey = np.stack([ortho_image(tile_views, surface, view, shows) for view, shows in enumerate(covering)])
     return pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
 
 
@@ -129,7 +156,7 @@ def free_rays(
     for i in range(len(covering)):
         for part in parts_of_one_direction(tile_views, i):
             by_cell = cells_per_step(tile_views, i, part)
-            around, inside = _where_rays_come_from(part, by_cell, span, surface.shape)
+            around, inside = cells_along_rays(part, by_cell, span, surface.shape)
             lowest = np.empty(surface[around].shape, np.float32)
             lowest_free_ray(
                 np.ascontiguousarray(surface[around]), np.ascontiguousarray(clearly_seen[i][around]), *by_cell, lowest
@@ -137,24 +164,6 @@ def free_rays(
             rays[i][part] = lowest[inside]
     rays[height_is_seen] = np.inf
     return rays
-
-
-def _where_rays_come_from(
-    part: tuple[slice, slice], by_cell: tuple[float, float], span: float, shape: tuple[int, int]
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Rows and columns of the cells whose rays may pass above a part of a tile, and where the part lies in them.
-
-    by_cell : cells (columns, rows) that the point seen by a fixed pixel moves per height step; span : steps by which a
-    ray can rise before it no longer matters.
-    """
-    around, inside = [], []
-    for cells, speed, size in zip(part, by_cell[::-1], shape, strict=True):
-        start, stop, _ = cells.indices(size)
-        distance = math.ceil(abs(speed) * span) + 1
-        first, end = max(start - (distance if speed > 0 else 1), 0), min(stop + (distance if speed < 0 else 1), size)
-        around.append(slice(first, end))
-        inside.append(slice(start - first, stop - first))
-    return (around[0], around[1]), (inside[0], inside[1])
 
 
 def add_costs_of_rays(

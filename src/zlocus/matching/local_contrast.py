@@ -60,7 +60,7 @@ def agreement(
     at some of the heights searched. NaN for a view that shares too few cells with each other view.
     """
     shown = covering[:, *core].reshape(len(covering), -1)
-    grey = np.stack([ortho_image(tile_views, surface, view)[core].ravel() for view in range(len(covering))])
+    grey = np.stack([ortho_image(tile_views, surface, i, shows)[core].ravel() for i, shows in enumerate(covering)])
     grey, count = np.where(shown, grey, np.float32(0.0)).astype(np.float64), shown.astype(np.float64)
     n = np.maximum(count @ count.T, 1.0)
     mean = (grey @ count.T) / n
@@ -99,4 +99,4 @@ def edge_image(
     trusted = agreeing_views(agrees)
     shown = covering[:, *core].sum(axis=(1, 2))
     view = int(np.flatnonzero(trusted & (shown >= shown[trusted].max() / 2))[0])
-    return np.where(covering[view], ortho_image(tile_views, surface, view), np.float32(np.nan))
+    return np.where(covering[view], ortho_image(tile_views, surface, view, covering[view]), np.float32(np.nan))

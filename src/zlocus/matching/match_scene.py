@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 from affine import Affine
@@ -30,8 +29,8 @@ from zlocus.matching.view_pixels import MARGIN_PX
 MIN_LEVELS = 3
 # The height range has at least this many steps.
 MIN_STEPS = 4
-# Places along each side at which two views are compared: of the overlap of a pair, and of the ground of all views.
-PAIR_SAMPLES_PER_SIDE, GROUND_SAMPLES_PER_SIDE = 9, 65
+# Places along each side of the ground of all views at which two of them are compared.
+GROUND_SAMPLES_PER_SIDE = 65
 # Points along each side of a window of cells whose projections say which images, and which of their pixels, it needs.
 WINDOW_POINTS_PER_SIDE = 5
 # Parallax rates are differences over this height above and below a point: at the middle of an image, and elsewhere.
@@ -122,6 +121,11 @@ class MatchScene:
         across, down = (np.linspace(0, n, per_side) for n in (window.cols, window.rows))
         return np.array([transform * (c, r) for c in across for r in down])
 
+    def are_in(self, window: CellWindow, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points of the ground (n, 2) m lie in a window of finest cells, (n,) bool."""
+        col, row = ~self.transform(window, 0) * xy.T
+        return np.asarray((col >= 0) & (col <= window.cols) & (row >= 0) & (row <= window.rows))
+
     @property
     def overlap_bounds(self) -> tuple[float, float, float, float]:
         """Bounds (xmin, ymin, xmax, ymax), m, of `overlap_window`."""
@@ -166,7 +170,8 @@ def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: 
 
     Equivalent disparity (method section 2): |v_i - v_0| dz / g, with the parallax rates v and with g the larger of the
     image's ground pixel and the cell, because nothing finer is compared. Frame cameras have no reference image for the
-    whole scene: there all pairs count. views : the reference image first; z : m, a height of the ground.
+    whole scene: there each place has its own, the most nadir one. views : the reference image first; z : m, a height of
+    the ground.
 
     Raises
     ------
@@ -176,7 +181,7 @@ def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: 
     if all(isinstance(bare(view.sensor), Scanning) for view in views):
         rates = _rates_against_first(views, z, cell_m) + _rates_against_nadir(views, z, cell_m)
     elif all(view.sensor.height_bounds() is None for view in views):
-        rates = _rates_where_shared(views, z, cell_m)
+        rates = _rates_against_nadir(views, z, cell_m)
     else:
         rates = _rates_against_first(views, z, cell_m)
     if not max(rates, default=0.0) > MIN_PARALLAX_RATE_PX:
@@ -202,7 +207,8 @@ def _rates_against_nadir(views: tuple[View, ...], z: float, cell_m: float) -> li
     ground at a height.
 
     For line scanners that all look straight down in the middle of their strips. The reference image alone would show no
-    parallax there, but the ground between two strips is seen from two sides.
+    parallax there, but the ground between two strips is seen from two sides. For frame cameras, too: of all pairs of a
+    block those count little that share a sliver of ground, although these would ask for the smallest steps.
     """
     outlines = np.concatenate([outline for outline in (footprint(view, z) for view in views) if len(outline)])
     low, high = outlines.min(axis=0), outlines.max(axis=0)
@@ -215,28 +221,6 @@ def _rates_against_nadir(views: tuple[View, ...], z: float, cell_m: float) -> li
     rates = difference / np.maximum(np.maximum(pixels, pixels[nadir, place]), cell_m)
     rates[nadir, place] = np.nan
     return [float(np.nanmedian(rate)) for rate in rates if np.isfinite(rate).any()]
-
-
-def _rates_where_shared(views: tuple[View, ...], z: float, cell_m: float) -> list[float]:
-    """Equivalent disparity per metre, px, of all pairs of views; median over the ground they share at a height.
-
-    Satellites look the same way all over an image, cameras close to the ground do not: two that look straight down see
-    a place between them from two sides.
-    """
-    outlines = [footprint(view, z) for view in views]
-    rates = []
-    for i, j in combinations(range(len(views)), 2):
-        if min(len(outlines[i]), len(outlines[j])) < 3:
-            continue
-        low = np.maximum(outlines[i].min(axis=0), outlines[j].min(axis=0))
-        high = np.minimum(outlines[i].max(axis=0), outlines[j].max(axis=0))
-        x, y = np.meshgrid(*(np.linspace(a, b, PAIR_SAMPLES_PER_SIDE) for a, b in zip(low, high, strict=True)))
-        xyz = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
-        (rate_i, pixel_i), (rate_j, pixel_j) = (_parallax_rates(views[k], xyz) for k in (i, j))
-        rate = np.hypot(*(rate_i - rate_j).T) / np.maximum(np.maximum(pixel_i, pixel_j), cell_m)
-        if (high > low).all() and np.isfinite(rate).any():
-            rates.append(float(np.nanmedian(rate)))
-    return rates
 
 
 def _parallax_rates(view: View, xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -14,7 +14,7 @@ from zlocus.matching.kernels.occlusion import count_seeing, lowest_visible, writ
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, CellBox, VisibleHeights
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
-from zlocus.matching.view_directions import cells_per_step, parts_of_one_direction
+from zlocus.matching.view_directions import cells_along_rays, cells_per_step, parts_of_one_direction
 
 # Pixels along the edge of every image that are not used.
 EDGE_PX = 3.0
@@ -74,14 +74,26 @@ def mark_occlusions(
     the indices of `visible` are counted from; margin_steps : a view counts as occluded this far below the lowest
     visible height; first : row and column of the tile's first cell in `occluder`.
     """
-    lowest, begin = np.empty(occluder.shape, np.float32), np.array(first)
+    highest, covered = float(occluder.max()), covers(visible)
     for i in range(len(tile_views.layout)):
         for part in parts_of_one_direction(tile_views, i):
-            lowest_visible(occluder, *cells_per_step(tile_views, i, part), lowest)
+            if not covered[i][part].any():
+                continue
+            lowest_searched = float((visible.lowest_covered[i][part] + slope_cells[part])[covered[i][part]].min())
+            by_cell = cells_per_step(tile_views, i, part)
             (r0, r1), (c0, c1) = (span.indices(n)[:2] for span, n in zip(part, slope_cells.shape, strict=True))
+            of_occluder = slice(first[0] + r0, first[0] + r1), slice(first[1] + c0, first[1] + c1)
+            # What occludes a cell stands where its ray rises to, against the direction in which rays reach it.
+            (rows, cols), _ = cells_along_rays(
+                of_occluder, (-by_cell[0], -by_cell[1]), max(highest - lowest_searched, 0.0), occluder.shape
+            )
+            occluding = np.ascontiguousarray(occluder[rows, cols])
+            lowest = np.empty(occluding.shape, np.float32)
+            lowest_visible(occluding, *by_cell, lowest)
             write_lowest_unoccluded(
-                lowest, begin, slope_cells, np.float32(margin_steps), np.float32(NEVER_OCCLUDED),
-                CellBox(r0, r1, c0, c1), visible.lowest_unoccluded[i],
+                lowest, np.array([first[0] - rows.start, first[1] - cols.start]), slope_cells,
+                np.float32(margin_steps), np.float32(NEVER_OCCLUDED), CellBox(r0, r1, c0, c1),
+                visible.lowest_unoccluded[i],
             )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
+from zlocus.core.sensor_model import lowest_station
 from zlocus.matching.cost_volume import CountedPairs, cost_volume
 from zlocus.matching.edge_penalties import penalties_at_edges
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
@@ -160,12 +161,30 @@ def tile_inputs(
 ) -> TileInputs:
     """The views that may see a tile; with `preselect`, of many views only the best candidates."""
     ground_xy, windows = windows_of(match_scene, core_window, config)
-    numbers, options = list(windows), config.selection
-    if preselect and len(numbers) > options.max_candidates + 1:
-        views = [match_scene.views[n] for n in numbers]
-        rows = preselected(views, ground_xy, match_scene.ground_height, options)
-        numbers = [numbers[row] for row in rows]
+    numbers = list(windows)
+    if preselect:
+        numbers = candidates_of_tile(match_scene, core_window, ground_xy, numbers, config)
     return TileInputs(match_scene, core_window, config, numbers, method, choose_images)
+
+
+def candidates_of_tile(
+    match_scene: MatchScene,
+    core_window: CellWindow,
+    ground_xy: NDArray[np.float64],
+    numbers: list[int],
+    config: RunConfig,
+) -> list[int]:
+    """The best candidates of the views with some numbers, ascending, see `preselected`; all where they are not many.
+
+    ground_xy : (n, 2) m, points all over the tile with its halo.
+    """
+    views, is_core, most = [match_scene.views[n] for n in numbers], None, config.selection.max_candidates
+    if lowest_station(view.sensor for view in views) is not None:
+        is_core, most = match_scene.are_in(core_window, ground_xy), config.selection.max_images_of_point
+    if len(views) <= most + 1:
+        return numbers
+    rows = preselected(views, ground_xy, match_scene.ground_height, config.selection, is_core)
+    return [numbers[row] for row in rows]
 
 
 def windows_of(

@@ -41,6 +41,9 @@ SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
 # Blocks whose positions are bent are at most so large: over more cells the speed with which points move with height
 # changes too much for one relief (see `pixel_positions`).
 LARGEST_BENT_BLOCK = 16
+# Heights at which it is found out whether a view shows a block. The image may lie so many pixels beside what it shows
+# then, and this share of the extent of that.
+HEIGHTS_LOOKED_AT, MARGIN_PX, MARGIN_SHARE = 5, 16.0, 0.25
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
 
@@ -128,6 +131,7 @@ def tile_views(
     station = lowest_station(view.sensor for view in view_pixels)
     z_ranges = capped(z_range, station, CLEARANCE), capped(z_needed or z_range, station, CLEARANCE)
     tables, block = _fitting_tables(view_pixels, tile_grid, z_ranges)
+    is_projected = []
     for view, table in zip(view_pixels, tables, strict=True):
         assert view.level == level, "the pixels are those of the level"
         layout.append((offset, *view.pixels.shape))
@@ -137,6 +141,7 @@ def tile_views(
         scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0]
         nodes.append(scaled)
         bends.append(table.bends / scale)
+        is_projected.append(table.holds & _may_show(scaled, table.ends, view.pixels.shape, half))
         unusable.append(None if view.valid.all() else _grown(~view.valid, half))
     t_of_index = np.array(
         [(tile_grid.height_origin - tables[0].z_mid) / tables[0].z_half, tile_grid.height_step / tables[0].z_half]
@@ -154,13 +159,35 @@ def tile_views(
         layout=np.array(layout, np.int64),
         nodes=np.ascontiguousarray(np.stack(nodes)),
         bends=np.ascontiguousarray(np.stack(bends)),
-        is_projected=np.stack([table.holds for table in tables]),
+        is_projected=np.stack(is_projected),
         is_excluded=np.stack([table.lost for table in tables]),
         t_of_index=t_of_index,
         index_range=(np.stack([table.ends for table in tables]) - t_of_index[0]) / t_of_index[1],
         block=block,
         view_pixels=tuple(replace(view, pixels=part) for view, part in zip(view_pixels, parts, strict=True)),
     )
+
+
+def _may_show(
+    nodes: NDArray[np.float64], ends: NDArray[np.float64], shape: tuple[int, int], half: int
+) -> NDArray[np.bool_]:
+    """Blocks (b, d) that pixels (rows, columns) of a view may show. All other arguments are those of that view.
+
+    A tile of close cameras is seen by many views of which each shows a small part of it. half : half width of the
+    largest window, cells.
+    """
+    # Tables are made over -1 to 1; some hold beyond.
+    low, high = np.moveaxis(np.clip(ends, -1.0, 1.0), -1, 0)[..., None]
+    t = low + np.linspace(0.0, 1.0, HEIGHTS_LOOKED_AT) * (high - low)
+    powers = t[..., None] ** np.arange(nodes.shape[-1])
+    corners = np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]], axis=2)
+    places = np.einsum("bdkxn,bdtn->bdktx", corners, powers)
+    low, high = places.min(axis=(2, 3)), places.max(axis=(2, 3))
+    # What lies between the corners and heights looked at, and the windows of cells at the border of the block.
+    margin = MARGIN_PX + half + MARGIN_SHARE * (high - low)
+    size = np.array(shape[::-1])
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((high + margin > 0) & (low - margin < size)).all(axis=-1))
 
 
 def _grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:

@@ -29,14 +29,28 @@ WIDENED_SHAPE = np.ones((3, 3), np.uint8)
 MEDIAN_CELLS = 3
 
 
-def ortho_image(tile_views: TileViews, surface: NDArray[np.float32], view: int = 0) -> NDArray[np.float32]:
+def ortho_image(
+    tile_views: TileViews,
+    surface: NDArray[np.float32],
+    view: int = 0,
+    where: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
     """Grey values of one view on a surface, (r, c) float32, as `tile_views` has its pixels.
 
-    surface : (r, c) float32 level indices; view : by default the reference image.
+    surface : (r, c) float32 level indices; view : by default the reference image; where : (r, c), cells whose values
+    are wanted, None: all. The values of other cells may be anything, and are 0 in blocks that the view does not show.
     """
-    out = np.empty(surface.shape, np.float32)
-    tile_ortho(tile_views.arrays, surface, view, out)
+    out, is_wanted = np.empty(surface.shape, np.float32), tile_views.is_projected[view]
+    if where is not None:
+        is_wanted = is_wanted & _any_of_blocks(where, tile_views.block)
+    tile_ortho(tile_views.arrays, surface, view, is_wanted, out)
     return out
+
+
+def _any_of_blocks(mask: NDArray[np.bool_], block: int) -> NDArray[np.bool_]:
+    """Blocks (b, d) in which a mask (r, c) is true somewhere."""
+    rows, cols = (np.arange(0, size, block) for size in mask.shape)
+    return np.asarray(np.logical_or.reduceat(np.logical_or.reduceat(mask, rows, axis=0), cols, axis=1))
 
 
 @dataclass(frozen=True)
@@ -128,14 +142,14 @@ def true_ortho(
             trend = None if scale is None else view.trend
             for k, channel in enumerate(coloured[i].colours(*view.window)):
                 plain = channel if trend is None else channel - trend
-                values = _ortho_of(tile_views, i, plain, surface)[shown]
+                values = _ortho_of(tile_views, i, plain, surface, shown)[shown]
                 out[shown, k] = values * np.float32(gain) + np.float32(offset)
             continue
         own = view.scale
-        grey = ortho_image(tile_views, surface, i)[shown] * np.float32(own.contrast) + np.float32(own.mean)
+        grey = ortho_image(tile_views, surface, i, shown)[shown] * np.float32(own.contrast) + np.float32(own.mean)
         trend = view.trend if scale is None else None
         if trend is not None:
-            grey += _ortho_of(tile_views, i, trend, surface)[shown]
+            grey += _ortho_of(tile_views, i, trend, surface, shown)[shown]
         out[shown] = grey if scale is None else grey * np.float32(gain) + np.float32(offset)
     return out
 
@@ -184,9 +198,14 @@ def pixels_per_cell(tile_views: TileViews) -> NDArray[np.float64]:
 
 
 def _ortho_of(
-    tile_views: TileViews, view: int, pixels: NDArray[np.float32], surface: NDArray[np.float32]
+    tile_views: TileViews,
+    view: int,
+    pixels: NDArray[np.float32],
+    surface: NDArray[np.float32],
+    where: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """Ortho-image of other pixels (r, c) in place of those of a view."""
+    """Ortho-image of other pixels (r, c) in place of those of a view. where : see `ortho_image`."""
     layout = tile_views.layout.copy()
     layout[view, 0] = 0
-    return ortho_image(replace(tile_views, pixels=np.ascontiguousarray(pixels).ravel(), layout=layout), surface, view)
+    of_view = replace(tile_views, pixels=np.ascontiguousarray(pixels).ravel(), layout=layout)
+    return ortho_image(of_view, surface, view, where)

@@ -90,3 +90,21 @@ def cells_per_step(tile_views: TileViews, view: int, part: tuple[slice, slice] |
     of_block = nodes[None, b : b + 2, d : d + 2], tile_views.index_range[view : view + 1, b : b + 1, d : d + 1]
     col, row = _directions(tile_views, *of_block)[0, 0, 0]
     return float(col), float(row)
+
+
+def cells_along_rays(
+    part: tuple[slice, slice], by_cell: tuple[float, float], span: float, shape: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Rows and columns of the cells from which rays reach a part of a tile, and where the part lies in them.
+
+    by_cell : cells (columns, rows) that the rays move for each height step; span : height steps over which they are
+    followed; shape : rows and columns of the tile.
+    """
+    around, inside = [], []
+    for cells, speed, size in zip(part, by_cell[::-1], shape, strict=True):
+        start, stop, _ = cells.indices(size)
+        distance = math.ceil(abs(speed) * span) + 1
+        first, end = max(start - (distance if speed > 0 else 1), 0), min(stop + (distance if speed < 0 else 1), size)
+        around.append(slice(first, end))
+        inside.append(slice(start - first, stop - first))
+    return (around[0], around[1]), (inside[0], inside[1])

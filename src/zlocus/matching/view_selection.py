@@ -12,7 +12,7 @@ Heights are slope indices, except in the match curves of the coarser level (see 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,10 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 # A reference image shows at least this share of a block.
 MIN_SHARE_OF_REFERENCE = 0.95
+# Points around the core of a tile of close cameras want so many search images: their heights are dropped.
+IMAGES_OF_HALO = 3
+# Numbers of views are counted in a byte.
+MAX_VIEWS = 254
 # Sampled cells along the side of a block.
 SAMPLES_PER_SIDE = 3
 # Every so many cells, along rows and columns, it is checked that enough of the chosen views cover a cell.
@@ -129,22 +133,51 @@ def cells_one_level_up(cells: IntArray, window: CellWindow, coarser_window: Cell
     return np.asarray(np.clip(coarser_cells - np.array([coarser_window.row, coarser_window.col]), 0, last), np.int64)
 
 
-def preselected(views: Sequence[View], ground_xy: FloatArray, z: float, options: SelectionOptions) -> list[int]:
+def preselected(
+    views: Sequence[View],
+    ground_xy: FloatArray,
+    z: float,
+    options: SelectionOptions,
+    is_core: NDArray[np.bool_] | None = None,
+) -> list[int]:
     """Numbers of the views to read for a patch of ground, ascending: a reference image and its best candidates.
 
     views : in the order in which they may be the reference; ground_xy : (n, 2) m, a grid of points over the patch; z :
     m. Of a scene of hundreds of images few see the patch, and fewer are worth a comparison; see `candidate_images`.
+    is_core : (n,), points of the core of a tile. Given for close cameras, each of which shows a part of the patch: not
+    the patch has a number of candidates then but each of its points, see `candidates_of_points`.
     """
     xyz = np.column_stack([ground_xy, np.full(len(ground_xy), z)])
-    inside = [_inside(view, xyz) for view in views]
-    overlap = np.array([is_inside.mean() for is_inside in inside])
+    inside = np.array([_inside(view, xyz) for view in views])
+    overlap = inside.mean(axis=1)
     shows_all = overlap >= MIN_SHARE_OF_REFERENCE
     reference = int(np.argmax(shows_all)) if shows_all.any() else int(overlap.argmax())
     rates = np.array([_parallax_rate_at(view, xyz[is_in], z) for view, is_in in zip(views, inside, strict=True)])
     angle = np.degrees(np.arctan(np.hypot(*(rates - rates[reference]).T)))
     days = np.array([_days_between(view, views[reference]) for view in views])
     overlap[reference] = 0.0
-    return sorted([reference, *candidate_images(SearchGeometry(overlap, angle, days), options).tolist()])
+    search_geometry = SearchGeometry(overlap, angle, days)
+    if is_core is None:
+        candidates = candidate_images(search_geometry, options)
+    else:
+        best_first = candidate_images(search_geometry, replace(options, max_candidates=len(views)))
+        n_wanted = np.where(is_core, options.max_images_of_point, min(options.max_images_of_point, IMAGES_OF_HALO))
+        candidates = candidates_of_points(best_first, inside, n_wanted)[:MAX_VIEWS]
+    return sorted([reference, *candidates.tolist()])
+
+
+def candidates_of_points(best_first: IntArray, inside: NDArray[np.bool_], n_wanted: IntArray) -> IntArray:
+    """The images that some point needs, best first: one of whose points are all shown by enough better ones is not.
+
+    best_first : (j,) int64 numbers of images; inside : (i, n) bool, points that each image shows; n_wanted : (n,)
+    images that each point wants.
+    """
+    n_showing, taken = np.zeros(inside.shape[1], np.int64), []
+    for number in best_first:
+        if (inside[number] & (n_showing < n_wanted)).any():
+            taken.append(number)
+            n_showing += inside[number]
+    return np.array(taken, np.int64)
 
 
 def _parallax_rate_at(view: View, xyz: FloatArray, z: float) -> FloatArray:

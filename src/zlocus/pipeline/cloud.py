@@ -259,7 +259,7 @@ def match_cloud(
     request: CloudRequest, prepared_cloud: PreparedCloud, run: OpenRun, cloud: PointCloud, progress: Progress
 ) -> list[MatchedPixels]:
     """Match all tiles; the points of each go to the cloud as soon as they are final."""
-    keep_at_most(prepared_cloud.plan.kept_bytes)
+    keep_at_most(prepared_cloud.plan.kept_bytes, prepared_cloud.setup.scene.views)
     scenes = prepared_cloud.image_scenes
     n_pixels = sum(pixels_of(one).rows * pixels_of(one).cols for one in scenes)
     # Memory takes none of them, so that it does not grow with the number of pixels.

@@ -204,7 +204,8 @@ def planned_pixels(
     """
     needs, own, memory_gb = needs_of_scenes(scene_tiles, config), held_bytes(), request.memory_gb
     allowed = own + DEFAULT_MEMORY_SHARE * free_bytes() if memory_gb is None else memory_gb * 1e9
-    kept = max(kept_bytes_of(views, len(scene_tiles)) - DECODED.held_bytes - PYRAMIDS.held_bytes, 0)
+    held = DECODED.held_bytes + PYRAMIDS.held_bytes
+    kept = max(kept_bytes_of(views, len(scene_tiles)) - held, 0)
     fixed = own + TILE_CODE_BYTES + POINT_CODE_BYTES
     if memory_gb is not None:
         kept = min(kept, max(int(allowed - fixed - needs.n_bytes), 0))
@@ -218,7 +219,7 @@ def planned_pixels(
         filled = max(largest * FILLED_PIXEL_BYTES - slots * needs.n_bytes, 0.0)
     n_pixels, kind = sum(math.prod(each.match_scene.views[0].image.shape) for each in scene_tiles), kind_of(views)
     return Plan(
-        n_tiles, slots, False, needs.n_bytes, fixed + kept + filled, allowed, kept, needs.seconds, None,
+        n_tiles, slots, False, needs.n_bytes, fixed + kept + filled, allowed, held + kept, needs.seconds, None,
         len(scene_tiles), n_pixels * WRITE_PIXEL_S, rate_of(matching_of(request), kind), rate_of(WRITING_MAPS, kind),
     )  # fmt: skip
 

@@ -395,7 +395,7 @@ class TileJob:
 
     def __call__(self, tile: Tile) -> TileProduct:
         """The product of a tile."""
-        keep_at_most(self.kept_bytes)
+        keep_at_most(self.kept_bytes, self.match_scene.views)
         return self.product(tile, self.method.match(self.match_scene, tile, self.config, self.fill))
 
     def product(self, tile: Tile, result: TileResult) -> TileProduct:

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from zlocus.core.sensor_model import FloatArray
+from zlocus.sensors.frame_kernel import LensNumbers
 
 # Largest angle from the optical axis.
 MAX_ANGLE_FROM_AXIS_DEG = 89.5
@@ -112,6 +113,14 @@ class BrownDistortion:
         gap = np.abs(self._mapped(ideal, r2, self._radial(r2)[0]) - at)
         ideal[~(gap <= MAX_ERROR * (1.0 + far[:, None])).all(axis=1)] = np.nan
         return ideal
+
+    @cached_property
+    def numbers(self) -> LensNumbers:
+        """The distortion as `image_of_rays` takes it."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = map(
+            float, (self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6)
+        )  # fmt: skip
+        return LensNumbers(k1, k2, p1, p2, k3, k4, k5, k6, self._disc.radius**2)
 
     @cached_property
     def _disc(self) -> _Disc:

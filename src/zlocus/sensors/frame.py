@@ -8,11 +8,13 @@ import numpy as np
 from pyproj import CRS
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.sensors.distortion import Distortion
+from zlocus.sensors.distortion import BrownDistortion, Distortion
 from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace, Space
+from zlocus.sensors.frame_kernel import CameraNumbers, LensNumbers, image_of_rays
 from zlocus.sensors.rolling_shutter import RollingShutter
 
 Row = tuple[float, float, float]
+IDEAL_LENS = LensNumbers(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf)
 
 
 @dataclass(frozen=True)
@@ -101,12 +103,18 @@ class FrameModel:
 
     def _image_at_rest(self, ray: FloatArray) -> FloatArray:
         """Image positions (n, 2) px of rays (n, 3) from the projection centre at which their points are seen."""
+        if isinstance(self.distortion, BrownDistortion | None):
+            lens = IDEAL_LENS if self.distortion is None else self.distortion.numbers
+            focal, aspect, column, row, skew = map(float, (self.focal, self.aspect, *self.principal_point, self.skew))
+            camera = CameraNumbers(self.rotation, focal, aspect, column, row, skew)
+            xy = np.empty((len(ray), 2))
+            image_of_rays(np.ascontiguousarray(ray, np.float64), camera, lens, xy)
+            return xy
         in_camera = np.asarray(ray, float) @ self.rotation.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = in_camera[:, :2] / in_camera[:, 2:]
         at[~(in_camera[:, 2] > 0)] = np.nan
-        if self.distortion is not None:
-            at = self.distortion.distorted(at)
+        at = self.distortion.distorted(at)
         xy = at * [self.focal, self.focal * self.aspect] + np.array(self.principal_point)
         if self.skew:
             xy[:, 0] += self.skew * at[:, 1]

@@ -10,7 +10,9 @@ bend the rows and columns of a block; a table of bent blocks holds for blocks ma
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import product
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -195,7 +197,7 @@ def projection_table_where_shown(
     nodes = _fitted_nodes(sensor, request, np.stack([t[first], t[last]], axis=-1))
     fine = np.linspace(-1.0, 1.0, 2 * N_SAMPLED_HEIGHTS - 1)
     corners, bends = _corners_and_bends(nodes, request)
-    gaps = _gaps_at_heights(corners, bends, sensor, request, fine)
+    gaps = _gaps_where_shown(corners, bends, sensor, request, fine, shown.around)
     begins, stops = (2 * f([k[node] for node in nodes_of_blocks], axis=0) for f, k in ((np.max, first), (np.min, last)))
     at = np.arange(len(fine))
     holds = _with_midpoints(shown.around) & (at >= begins[..., None]) & (at <= stops[..., None])
@@ -270,6 +272,26 @@ def _gaps_at_heights(
     return worst
 
 
+def _gaps_where_shown(
+    nodes: FloatArray, bends: FloatArray, sensor: SensorModel, request: TableRequest, t: FloatArray, shown: BoolArray
+) -> FloatArray:
+    """The same (b, d, s), found only in the rows and columns of blocks that are shown at some height, infinite in the
+    others. shown : (b, d, k)."""
+    gaps = np.full((*shown.shape[:2], len(t)), np.inf)
+    if not shown.any():
+        return gaps
+    (b, b_end), (d, d_end) = (
+        (int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(shown.any(axis=axes)) for axes in ((1, 2), (0, 2)))
+    )
+    origin = request.transform @ Affine.translation(d * request.block, b * request.block)
+    shape = (b_end - b) * request.block, (d_end - d) * request.block
+    part = replace(request, transform=origin, shape=shape)
+    gaps[b:b_end, d:d_end] = _gaps_at_heights(
+        nodes[b : b_end + 1, d : d_end + 1], bends[b:b_end, d:d_end], sensor, part, t
+    )
+    return gaps
+
+
 def _shows_any(positions: FloatArray, window: ImagePart) -> BoolArray:
     """Corners (b, d) of which any of the n positions (b, d, 2, n) px lies in a window."""
     row, col, n_rows, n_cols = window
@@ -313,16 +335,23 @@ def shown_blocks(positions: FloatArray, window: ImagePart, nodes_of_blocks: Node
     row, col, n_rows, n_cols = window
     known = np.asarray(np.isfinite(positions).all(axis=2))
     here = known[:, :, None]
-    low = np.min([np.where(here, positions, np.inf)[node] for node in nodes_of_blocks], axis=0)
-    high = np.max([np.where(here, positions, -np.inf)[node] for node in nodes_of_blocks], axis=0)
+    low = _over_nodes(np.minimum, np.where(here, positions, np.inf), nodes_of_blocks)
+    high = _over_nodes(np.maximum, np.where(here, positions, -np.inf), nodes_of_blocks)
     first, last = np.array([col, row])[:, None], np.array([col + n_cols - 1, row + n_rows - 1])[:, None]
     meets = ((high >= first) & (low <= last)).all(axis=2)
-    whole = np.logical_and.reduce([known[node] for node in nodes_of_blocks])
+    whole = _over_nodes(np.logical_and, known, nodes_of_blocks)
     near = meets & whole
     around = near.copy()
     around[..., 1:] |= near[..., :-1]
     around[..., :-1] |= near[..., 1:]
     return ShownBlocks(near, around & whole, meets & ~whole)
+
+
+def _over_nodes(reduced: np.ufunc, values: NDArray[Any], nodes_of_blocks: NodeSlices) -> NDArray[Any]:
+    """Values (p, q, ...) of nodes reduced over the nodes of each block, (b, d, ...): along rows, then along columns."""
+    rows, cols = ({(at.start, at.stop, at.step) for at in along} for along in zip(*nodes_of_blocks, strict=True))
+    of_rows = reduce(reduced, (values[slice(*part)] for part in rows))
+    return np.asarray(reduce(reduced, (of_rows[:, slice(*part)] for part in cols)))
 
 
 def _with_midpoints(flags: BoolArray) -> BoolArray:
@@ -377,7 +406,7 @@ def _fitted_nodes(sensor: SensorModel, request: TableRequest, ends: FloatArray) 
     z = request.z_mid + request.z_half * (middle[:, None] + half[:, None] * s)
     xyz = np.column_stack([np.repeat(x, len(s)), np.repeat(y, len(s)), z.ravel()])
     values = sensor.image_from_ground(xyz).reshape(-1, len(s), 2)
-    waves = np.linalg.solve(chebyshev.chebvander(s, degree), values)
+    waves = np.linalg.inv(chebyshev.chebvander(s, degree)) @ values
     tail = np.cumsum(np.abs(waves)[:, ::-1], axis=1)[:, ::-1].max(axis=2)
     waves[tail < NEGLIGIBLE_SHARE * request.tolerance_px] = 0.0
     local = np.einsum("cnx,np->cxp", waves, _powers_from_chebyshev(degree))

@@ -106,7 +106,8 @@ def test_ortho_image():
     for view in range(3):
         nodes = scene.nodes.copy()
         nodes[..., 3] = 0.0  # three grids stand for a quadratic exactly
-        tile_ortho(scene.arrays._replace(nodes=nodes), surface, view, out)
+        wanted = np.ones(np.subtract(nodes.shape[1:3], 1), np.bool_)
+        tile_ortho(scene.arrays._replace(nodes=nodes), surface, view, wanted, out)
         for b, d, rows, cols in scene.blocks():
             t = scene.heights[0] + surface[rows, cols].astype(float) * scene.heights[1]
             xy = positions(nodes[view, b : b + 2, d : d + 2], t, t.shape, scene.block)

@@ -132,6 +132,11 @@ def test_images_that_are_kept_take_no_more_than_is_allowed():
         for n_bytes in (0, 1_000_000, 10**12):
             keep_at_most(n_bytes)
             assert DECODED.n_bytes + PYRAMIDS.n_bytes == min(n_bytes, DECODED_BYTES + PYRAMID_BYTES)
+        # Where all that is needed may be kept, all of it fits.
+        for one in (scene, drone):
+            keep_at_most(kept_bytes(one), one.views)
+            decoded = sum(getattr(view.image, "decoded_bytes", 0) for view in one.views)
+            assert (DECODED.n_bytes, PYRAMIDS.n_bytes) == (decoded, kept_bytes(one) - decoded)
     finally:
         keep_at_most()
     assert (DECODED.n_bytes, PYRAMIDS.n_bytes) == (DECODED_BYTES, PYRAMID_BYTES)

@@ -89,6 +89,10 @@ class SelectionOptions(Checked):
     max_candidates: int = option(
         24, "Largest number of search images that are considered for a tile.", low=1, high=254
     )  # fmt: skip
+    max_images_of_point: int = option(
+        6, "Largest number of search images of close cameras that are considered for a point of the ground. Each shows "
+        "a part of a tile, so that `max_candidates` does not count for them.", low=1, high=254,
+    )  # fmt: skip
     min_overlap: float = option(
         0.2, "Images that see a smaller share of a tile are considered last.", low=0.0, high=1.0
     )

@@ -263,10 +263,14 @@ def tile_profile(views, surface, sampling, visible, out):
             )  # fmt: skip
 
 
-# ViewArrays, (r,c) f4, i8, (r,c) f4 -> None
+# ViewArrays, (r,c) f4, i8, (b,d) b1, (r,c) f4 -> None
 @kernel
-def tile_ortho(views, surface, view, out):
-    """Write the image of one view on a surface, bilinear. surface : (r, c) float32 height indices; out : (r, c)."""
+def tile_ortho(views, surface, view, is_wanted, out):
+    """Write the image of one view on a surface, bilinear.
+
+    surface : (r, c) float32 height indices; is_wanted : (b, d), blocks whose image is wanted; out : (r, c), 0 in the
+    other blocks.
+    """
     (n_rows, n_cols), heights, block, image = surface.shape, views.heights, views.block, image_of(views, view)
     level, grey = np.empty(block * block, np.float32), np.empty(block * block, np.float32)
     cells, last_width = flat_cells(block, block), block
@@ -274,6 +278,9 @@ def tile_ortho(views, surface, view, out):
         r0, r1 = br * block, min((br + 1) * block, n_rows)
         for bc in range((n_cols + block - 1) // block):
             c0, c1 = bc * block, min((bc + 1) * block, n_cols)
+            if not is_wanted[br, bc]:
+                out[r0:r1, c0:c1] = 0.0
+                continue
             of_block = surface[r0:r1, c0:c1]
             low, high = heights[0] + of_block.min() * heights[1], heights[0] + of_block.max() * heights[1]
             middle, span = 0.5 * (low + high), max(0.5 * abs(high - low), MIN_SPAN)

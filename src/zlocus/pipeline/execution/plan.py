@@ -16,7 +16,7 @@ from zlocus.core.scene import DecodedSource, View
 from zlocus.io.decoded_images import DECODED, DECODED_BYTES
 from zlocus.matching.level_records import READ_POINTS_PER_SIDE, level_window
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.tile import windows_of
+from zlocus.matching.tile import candidates_of_tile, windows_of
 from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, PYRAMIDS, window_showing
 
 # Time to match a cell of a core, and in addition for each view that may show it
@@ -106,19 +106,26 @@ def kept_bytes_of(views: Sequence[View], n_scenes: int = 1) -> int:
 
     n_scenes : number of match scenes with these views; each has grey values, and so reduced parts, of its own.
     """
-    decoded = sum(view.image.decoded_bytes for view in views if isinstance(view.image, DecodedSource))
-    n_pixels = n_scenes * sum(math.prod(view.image.shape) for view in views)
-    return min(decoded, DECODED_BYTES) + min(int(n_pixels * REDUCED_BYTES), PYRAMID_BYTES)
+    return sum(_needed_bytes(views, n_scenes))
 
 
-def keep_at_most(n_bytes: int = DECODED_BYTES + PYRAMID_BYTES) -> None:
+def keep_at_most(n_bytes: int = DECODED_BYTES + PYRAMID_BYTES, views: Sequence[View] = ()) -> None:
     """Limit the memory of the images that this process keeps from tile to tile, see `kept_bytes`.
 
-    n_bytes : by default as much as any scene may take.
+    n_bytes : by default as much as any scene may take. It is divided as the images of the views need it.
     """
-    reduced = min(n_bytes // 4, PYRAMID_BYTES)
-    PYRAMIDS.limit(reduced)
-    DECODED.limit(min(n_bytes - reduced, DECODED_BYTES))
+    decoded, reduced = _needed_bytes(views)
+    share = reduced / (decoded + reduced) if views else PYRAMID_BYTES / (DECODED_BYTES + PYRAMID_BYTES)
+    of_reduced = min(math.ceil(n_bytes * share), PYRAMID_BYTES)
+    PYRAMIDS.limit(of_reduced)
+    DECODED.limit(min(n_bytes - of_reduced, DECODED_BYTES))
+
+
+def _needed_bytes(views: Sequence[View], n_scenes: int = 1) -> tuple[int, int]:
+    """Memory that a process may use for decoded images, and for reduced parts, see `kept_bytes_of`."""
+    decoded = sum(view.image.decoded_bytes for view in views if isinstance(view.image, DecodedSource))
+    n_pixels = n_scenes * sum(math.prod(view.image.shape) for view in views)
+    return min(decoded, DECODED_BYTES), min(int(n_pixels * REDUCED_BYTES), PYRAMID_BYTES)
 
 
 class ShownPixels(NamedTuple):
@@ -131,16 +138,16 @@ class ShownPixels(NamedTuple):
 def _shown_pixels(
     match_scene: MatchScene, core_window: CellWindow, fine_window: CellWindow, config: RunConfig
 ) -> ShownPixels:
-    """Pixels of the finest level that the views of a tile show of it, those that show most of it first."""
+    """Pixels of the finest level that the views of a tile show of it."""
     ground, z_range = match_scene.points_of(fine_window, 0, READ_POINTS_PER_SIDE), match_scene.expected_range
     pixels, cells = [], []
-    for number in windows_of(match_scene, core_window, config)[1]:
+    around, windows = windows_of(match_scene, core_window, config)
+    for number in candidates_of_tile(match_scene, core_window, around, list(windows), config):
         view = match_scene.views[number]
         part = window_showing(view, ground, z_range or match_scene.z_range)
         if part is not None:
             pixel_cells = ground_sample_distance(view, match_scene.ground_height) / match_scene.cell_size
             pixels.append(part.rows * part.cols)
             cells.append(pixels[-1] * pixel_cells**2)
-    most = np.argsort(pixels)[::-1][: config.selection.max_candidates + 1]
-    shares = np.minimum(np.array(cells)[most] / (fine_window.rows * fine_window.cols), 1.0)
-    return ShownPixels([pixels[k] for k in most], float(np.nansum(shares)))
+    shares = np.minimum(np.array(cells) / (fine_window.rows * fine_window.cols), 1.0)
+    return ShownPixels(pixels, float(np.nansum(shares)))

@@ -131,6 +131,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     from zlocus.orientation.tie_refinement import refine_ties
     from zlocus.orientation.ties import MAX_DESCRIPTOR_RATIO, match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
+    from zlocus.sensors.frame import FrameModel
     from zlocus.sensors.rpc_kernel import ground_positions, positions
 
     sensors, options = [view.sensor for view in match_scene.views], RunConfig().orientation
@@ -145,6 +146,8 @@ def warm_orientation(match_scene: MatchScene) -> None:
     coefficients, one, found = np.ones((20, 4)), np.zeros(1), np.empty((1, 2))
     positions(coefficients, one, one, one, found)
     ground_positions(coefficients, np.ones((2, 10, 4)), found, one, np.ones(2), found)
+    above = FrameModel((0.0, 0.0, 10.0), ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)), 10.0, (4.0, 4.0))
+    above.image_from_ray(np.zeros((1, 3)))
 
 
 def warm(group: str) -> None:
