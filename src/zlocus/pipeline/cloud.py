@@ -59,7 +59,7 @@ from zlocus.pipeline.messages import grave_doubt, note_orientation
 from zlocus.pipeline.open_run import OpenRun, known_ties, open_cloud_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products, remove_incomplete_files
 from zlocus.pipeline.pixel_products import PointWriter, write_maps
-from zlocus.pipeline.required_space import CLOUD_PIXEL_BYTES, check_room_for_cloud
+from zlocus.pipeline.required_space import CLOUD_PIXEL_BYTES, check_room_for_cloud, n_pixels_of
 from zlocus.pipeline.run_plan import (
     Plan,
     SceneTiles,
@@ -135,6 +135,9 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     if finished is not None:
         return finished
     scene = run.opened_inputs.scene
+    if request.bounds is None and request.area is None:
+        # All pixels are matched: what has no room is refused before tie points are measured.
+        check_room_for_cloud(request.out, n_pixels_of(scene, references), len(references))
     config = depth_options(config) if is_by_depth(scene) else config
     progress.note(said_before_orientation(scene.views, None))
     is_compiled, is_whole = CACHE.is_complete, not run.checkpoint.finished
