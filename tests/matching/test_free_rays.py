@@ -140,7 +140,7 @@ def test_rays_cost_more_where_many_views_cover_the_cells():
     assert stage.costs_of_ray(2, 19.0) == (stage.COARSER_RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)
 
 
-def test_images_that_show_parts_agree_as_if_all_were_compared_everywhere():
+def test_images_that_show_parts_agree_as_if_all_were_compared_everywhere(monkeypatch):
     rng = np.random.default_rng(8)
     ground, shape = gaussian_filter(rng.normal(size=(40, 50)), 1.5), (40, 50)
     grey = np.stack([3 * ground + rng.normal(0, 0.05, shape) for _ in range(4)]).astype(np.float32)
@@ -148,12 +148,8 @@ def test_images_that_show_parts_agree_as_if_all_were_compared_everywhere():
     for view, part in enumerate((np.s_[:, :30], np.s_[10:35, 12:], np.s_[5:20, 5:45])):
         covering[view][part] = True
     found = pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
-    boxes, stage_box = stage._box_around, lambda mask: (slice(0, shape[0]), slice(0, shape[1]))
-    try:
-        stage._box_around = stage_box
-        expected = pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
-    finally:
-        stage._box_around = boxes
+    monkeypatch.setattr(stage, "_box_around", lambda mask: (slice(0, shape[0]), slice(0, shape[1])))
+    expected = pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
     assert expected.textured.max() == 2
     np.testing.assert_array_equal(found.textured, expected.textured)
     np.testing.assert_array_equal(found.untextured, expected.untextured)

@@ -97,12 +97,17 @@ def test_an_interrupt_says_what_is_kept(images, straight, tmp_path, monkeypatch)
     assert_same(out, straight)
 
 
-def test_a_resumed_run_has_the_same_settings(images, tmp_path, monkeypatch):
-    out = tmp_path / "out"
+def interrupted(images, out, monkeypatch):
+    """The folder of a run that was interrupted after five tiles."""
     stop_after(monkeypatch, 5, KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         made(images, out)
     monkeypatch.undo()
+    return out
+
+
+def test_a_resumed_run_has_the_same_settings(images, tmp_path, monkeypatch):
+    out = interrupted(images, tmp_path / "out", monkeypatch)
     with pytest.raises(OutputError, match=r"holds 5 finished tiles of another run: request\.bounds was null there"):
         made(images, out, bounds=PART)
     other = replace(CONFIG, pyramid=replace(CONFIG.pyramid, halo=8))
@@ -114,11 +119,7 @@ def test_a_resumed_run_has_the_same_settings(images, tmp_path, monkeypatch):
 
 
 def test_no_resume_starts_anew(images, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    stop_after(monkeypatch, 5, KeyboardInterrupt)
-    with pytest.raises(KeyboardInterrupt):
-        made(images, out)
-    monkeypatch.undo()
+    out = interrupted(images, tmp_path / "out", monkeypatch)
     assert "there already" not in made(images, out, resume=False)[1]
 
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.core.mask_box import box_of
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.shared_records import VisibleHeights
@@ -119,11 +120,11 @@ def pair_agreement(grey: NDArray[np.float32], covering: NDArray[np.bool_]) -> Pa
 
 def _box_around(mask: NDArray[np.bool_]) -> Part:
     """Rows and columns that hold all cells of a mask (r, c) with the windows around them."""
-    half, found = WINDOW_CELLS // 2, []
-    for axis in (1, 0):
-        place = np.flatnonzero(mask.any(axis=axis))
-        found.append(slice(max(int(place[0]) - half, 0), int(place[-1]) + half + 1) if len(place) else slice(0, 0))
-    return found[0], found[1]
+    half = WINDOW_CELLS // 2
+    if not mask.any():
+        return slice(0, 0), slice(0, 0)
+    rows, cols = (slice(max(along.start - half, 0), along.stop + half) for along in box_of(mask))
+    return rows, cols
 
 
 def _shared(box: Part, other: Part) -> Part:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow, on_cells
+from zlocus.core.mask_box import box_of
 from zlocus.matching.free_rays import agreement_on
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.shared_records import VisibleHeights
@@ -246,9 +247,9 @@ def find_overlap_window(
     surface : (r, c) float32, height indices; ground : (r, c) bool, see `covered_ground`.
     """
     seeing = (n_seeing(visible, surface) >= PAIR) & ground
-    rows, cols = np.flatnonzero(seeing.any(axis=1)), np.flatnonzero(seeing.any(axis=0))
-    if not len(rows):
+    if not seeing.any():
         return CellWindow(window.row, window.col, 0, 0)
-    row, col = window.row + int(rows[0]) - MARGIN_CELLS, window.col + int(cols[0]) - MARGIN_CELLS
-    n_rows, n_cols = int(rows[-1] - rows[0]) + 1, int(cols[-1] - cols[0]) + 1
+    rows, cols = box_of(seeing)
+    row, col = window.row + rows.start - MARGIN_CELLS, window.col + cols.start - MARGIN_CELLS
+    n_rows, n_cols = rows.stop - rows.start, cols.stop - cols.start
     return CellWindow(row, col, n_rows + 2 * MARGIN_CELLS, n_cols + 2 * MARGIN_CELLS)

@@ -21,6 +21,7 @@ from zlocus.sensors.projection_table import (
     UNSTEADY_DEGREE,
     ProjectionTable,
     TableRequest,
+    may_show,
     projection_table,
     projection_table_where_shown,
 )
@@ -41,9 +42,9 @@ SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
 # Blocks whose positions are bent are at most so large: over more cells the speed with which points move with height
 # changes too much for one relief (see `pixel_positions`).
 LARGEST_BENT_BLOCK = 16
-# Heights at which it is found out whether a view shows a block. The image may lie so many pixels beside what it shows
-# then, and this share of the extent of that.
-HEIGHTS_LOOKED_AT, MARGIN_PX, MARGIN_SHARE = 5, 16.0, 0.25
+# A view shows no block whose box of corners and middles lies so far beside it, pixels of the level and cells, beyond
+# the windows of the cells at its border: what lies between the places and heights looked at is not farther away.
+BESIDE_PX, BESIDE_CELLS = 16.0, 4
 # Tables end at this share of the depth below the lowest camera: nothing is projected from beside it.
 CLEARANCE = 0.1
 
@@ -141,7 +142,8 @@ def tile_views(
         scaled[..., 1, 0] += 0.5 / scale - 0.5 - view.origin[0]
         nodes.append(scaled)
         bends.append(table.bends / scale)
-        is_projected.append(table.holds & _may_show(scaled, table.ends, view.pixels.shape, half))
+        shown_part = view.window.at_finest(level)
+        is_projected.append(table.holds & may_show(table, shown_part, block, BESIDE_PX * scale, half + BESIDE_CELLS))
         unusable.append(None if view.valid.all() else _grown(~view.valid, half))
     t_of_index = np.array(
         [(tile_grid.height_origin - tables[0].z_mid) / tables[0].z_half, tile_grid.height_step / tables[0].z_half]
@@ -166,28 +168,6 @@ def tile_views(
         block=block,
         view_pixels=tuple(replace(view, pixels=part) for view, part in zip(view_pixels, parts, strict=True)),
     )
-
-
-def _may_show(
-    nodes: NDArray[np.float64], ends: NDArray[np.float64], shape: tuple[int, int], half: int
-) -> NDArray[np.bool_]:
-    """Blocks (b, d) that pixels (rows, columns) of a view may show. All other arguments are those of that view.
-
-    A tile of close cameras is seen by many views of which each shows a small part of it. half : half width of the
-    largest window, cells.
-    """
-    # Tables are made over -1 to 1; some hold beyond.
-    low, high = np.moveaxis(np.clip(ends, -1.0, 1.0), -1, 0)[..., None]
-    t = low + np.linspace(0.0, 1.0, HEIGHTS_LOOKED_AT) * (high - low)
-    powers = t[..., None] ** np.arange(nodes.shape[-1])
-    corners = np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]], axis=2)
-    places = np.einsum("bdkxn,bdtn->bdktx", corners, powers)
-    low, high = places.min(axis=(2, 3)), places.max(axis=(2, 3))
-    # What lies between the corners and heights looked at, and the windows of cells at the border of the block.
-    margin = MARGIN_PX + half + MARGIN_SHARE * (high - low)
-    size = np.array(shape[::-1])
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((high + margin > 0) & (low - margin < size)).all(axis=-1))
 
 
 def _grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:

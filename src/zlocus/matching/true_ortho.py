@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
 from zlocus.core.scene import ColourSource
+from zlocus.matching.height_lattice import by_block
 from zlocus.matching.kernels.occlusion import finest_view
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.kernels.subpixel import tile_ortho
@@ -42,15 +43,9 @@ def ortho_image(
     """
     out, is_wanted = np.empty(surface.shape, np.float32), tile_views.is_projected[view]
     if where is not None:
-        is_wanted = is_wanted & _any_of_blocks(where, tile_views.block)
+        is_wanted = is_wanted & by_block(where, tile_views.block, np.logical_or)
     tile_ortho(tile_views.arrays, surface, view, is_wanted, out)
     return out
-
-
-def _any_of_blocks(mask: NDArray[np.bool_], block: int) -> NDArray[np.bool_]:
-    """Blocks (b, d) in which a mask (r, c) is true somewhere."""
-    rows, cols = (np.arange(0, size, block) for size in mask.shape)
-    return np.asarray(np.logical_or.reduceat(np.logical_or.reduceat(mask, rows, axis=0), cols, axis=1))
 
 
 @dataclass(frozen=True)

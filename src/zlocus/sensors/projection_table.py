@@ -20,6 +20,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError
+from zlocus.core.mask_box import box_of
 from zlocus.core.sensor_model import FloatArray, SensorModel
 
 BoolArray = NDArray[np.bool_]
@@ -39,6 +40,8 @@ UNSTEADY_DEGREE = 31
 NOWHERE_PX = -1e9
 # Heights t at which a table over all heights is compared with the exact model.
 CHECKED_T = (-1.0, -0.7, 0.0, 0.7, 1.0)
+# Heights of a block at which it is found out whether an image may show it.
+HEIGHTS_LOOKED_AT = 5
 # Number of heights at which the visibility of blocks is sampled. At these and between them a table is compared with the
 # exact model.
 N_SAMPLED_HEIGHTS = 33
@@ -161,15 +164,15 @@ def projection_table(
     known = np.asarray(np.isfinite(positions).all(axis=(2, 3)))
     nodes = positions @ fit.T
     nodes[~known] = NOWHERE_PX * (np.arange(degree + 1) == 0)
-    whole = np.logical_and.reduce([known[node] for node in nodes_of_blocks])
-    shows = np.logical_or.reduce([shown[node] for node in nodes_of_blocks])
+    whole = _over_nodes(np.logical_and, known, nodes_of_blocks)
+    shows = _over_nodes(np.logical_or, shown, nodes_of_blocks)
     ends = np.broadcast_to((-np.inf, np.inf), (*whole.shape, 2))
     table = ProjectionTable(*_corners_and_bends(nodes, request), z_mid, z_half, whole, ~whole & shows, ends)
     gaps = _gaps_at_heights(table.nodes, table.bends, sensor, request, np.array(CHECKED_T)).max(axis=-1)
     unmapped = (~whole | np.isnan(gaps)) & shows
     bad = table.holds & (gaps > request.tolerance_px)
     if bad.any() and window is not None:
-        bad &= _may_show(table, gaps, window, request.block)
+        bad &= may_show(table, window, request.block, gaps[..., None])
     if bad.sum() > max_lost_share * bad.size:
         raise request.error(float(gaps[bad].max()))
     return replace(table, holds=table.holds & (gaps <= request.tolerance_px), lost=bad | unmapped)
@@ -275,20 +278,21 @@ def _gaps_at_heights(
 def _gaps_where_shown(
     nodes: FloatArray, bends: FloatArray, sensor: SensorModel, request: TableRequest, t: FloatArray, shown: BoolArray
 ) -> FloatArray:
-    """The same (b, d, s), found only in the rows and columns of blocks that are shown at some height, infinite in the
-    others. shown : (b, d, k)."""
+    """`_gaps_at_heights` (b, d, s), found only in the rows and columns of blocks that are shown at some height.
+
+    They are infinite in the others. shown : (b, d, k).
+    """
     gaps = np.full((*shown.shape[:2], len(t)), np.inf)
     if not shown.any():
         return gaps
-    (b, b_end), (d, d_end) = (
-        (int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(shown.any(axis=axes)) for axes in ((1, 2), (0, 2)))
+    rows, cols = box_of(np.asarray(shown.any(axis=-1)))
+    part = replace(
+        request,
+        transform=request.transform @ Affine.translation(cols.start * request.block, rows.start * request.block),
+        shape=((rows.stop - rows.start) * request.block, (cols.stop - cols.start) * request.block),
     )
-    origin = request.transform @ Affine.translation(d * request.block, b * request.block)
-    shape = (b_end - b) * request.block, (d_end - d) * request.block
-    part = replace(request, transform=origin, shape=shape)
-    gaps[b:b_end, d:d_end] = _gaps_at_heights(
-        nodes[b : b_end + 1, d : d_end + 1], bends[b:b_end, d:d_end], sensor, part, t
-    )
+    corners = nodes[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
+    gaps[rows, cols] = _gaps_at_heights(corners, bends[rows, cols], sensor, part, t)
     return gaps
 
 
@@ -300,17 +304,28 @@ def _shows_any(positions: FloatArray, window: ImagePart) -> BoolArray:
     return np.asarray(inside.any(axis=-1))
 
 
-def _may_show(table: ProjectionTable, gaps: FloatArray, window: ImagePart, block: int) -> BoolArray:
-    """Blocks (b, d) that a window may show: the box around their corners and middles at all heights, widened by the
-    gaps (b, d) px, meets the window."""
+def may_show(
+    table: ProjectionTable, window: ImagePart, block: int, margin_px: FloatArray | float, margin_cells: float = 0.0
+) -> BoolArray:
+    """Blocks (b, d) that a window may show.
+
+    The box around their corners and middles, at the heights at which the table holds, meets the window. margin_px,
+    margin_cells : by which the box is widened on each side, px (of any shape that fits (b, d, 2)) and cells.
+    """
     places = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0), (0.5, 0.5))
-    at = np.stack([
-        polynomials_at(table.nodes, table.bends, block, place) @ t ** np.arange(table.nodes.shape[-1])
-        for t in CHECKED_T for place in places
-    ])  # fmt: skip
-    low, high = at.min(axis=0) - gaps[..., None], at.max(axis=0) + gaps[..., None]
+    # Tables are made over -1 to 1; some hold beyond.
+    first, last = np.moveaxis(np.clip(table.ends, -1.0, 1.0), -1, 0)[..., None]
+    t = first + np.linspace(0.0, 1.0, HEIGHTS_LOOKED_AT) * (last - first)
+    powers = t[..., None] ** np.arange(table.nodes.shape[-1])
+    at = [
+        np.einsum("bdxn,bdtn->bdxt", polynomials_at(table.nodes, table.bends, block, place), powers) for place in places
+    ]
+    low, high = np.min(at, axis=(0, -1)), np.max(at, axis=(0, -1))
+    margin = margin_px + margin_cells / block * (high - low)
     row, col, n_rows, n_cols = window
-    return np.asarray(((high >= (col, row)) & (low <= (col + n_cols - 1, row + n_rows - 1))).all(axis=-1))
+    with np.errstate(invalid="ignore"):
+        meets = (high + margin >= (col, row)) & (low - margin <= (col + n_cols - 1, row + n_rows - 1))
+    return np.asarray(meets.all(axis=-1))
 
 
 @dataclass(frozen=True)

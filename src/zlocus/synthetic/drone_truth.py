@@ -12,6 +12,7 @@ from rasterio.transform import from_origin
 from rasterio.windows import Window
 
 from zlocus.core.errors import ConfigError
+from zlocus.core.mask_box import box_of
 from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.scenes import Exposure
 from zlocus.synthetic.terrain import SyntheticGround
@@ -38,9 +39,8 @@ def write_drone_truth(ground: SyntheticGround, exposures: Sequence[Exposure], ep
     known = n_frames_showing(ground, exposures) >= 2
     if not known.any():
         raise ConfigError("No ground is shown by two frames of the block: choose larger overlaps or more frames.")
-    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    top, left = int(rows[0]), int(cols[0])
-    height, width = int(rows[-1]) + 1 - top, int(cols[-1]) + 1 - left
+    rows, cols = box_of(known)
+    top, left, height, width = rows.start, cols.start, rows.stop - rows.start, cols.stop - cols.start
     west, north = ground.x0 + left * ground.step, ground.y0 - top * ground.step
     profile = {
         "driver": "GTiff", "height": height, "width": width, "count": 1, "compress": "deflate", "tiled": True,

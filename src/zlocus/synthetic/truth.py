@@ -11,6 +11,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.transform import from_origin
 
+from zlocus.core.mask_box import box_of
 from zlocus.core.sensor_model import FloatArray
 from zlocus.synthetic.scenes import Exposure, SceneSpec
 from zlocus.synthetic.terrain import WATER, SyntheticGround
@@ -31,8 +32,7 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Ex
     known: NDArray[np.bool_] | None = None
     if spec.whole_truth:
         known = n_images_showing(ground, exposures) >= 2
-        rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-        cells = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+        cells = box_of(known)
     else:
         n_cells = round(spec.size * spec.gsd_m / spec.step_m)
         cells = ground.cells(spec.west_m, spec.north_m, (n_cells, n_cells))
