@@ -90,18 +90,22 @@ def tuniu(workplace: Workplace) -> list[Figure]:
 
 def ground_where_two_see(folder: Path, reference: Path) -> np.ndarray:
     """Centres and heights (n, 3) m of those cells of a reference that lie inside at least two images of a scene."""
-    opened = open_scene([folder / "scene.yaml"])
     with rasterio.open(reference) as source:
         z, transform = source.read(1, masked=True).astype(float).filled(np.nan), source.transform
     col, row = np.meshgrid(np.arange(z.shape[1]) + 0.5, np.arange(z.shape[0]) + 0.5)
     x, y = transform * (col, row)
     xyz = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    n_seeing = np.zeros(len(xyz), int)
-    for view in opened.views:
+    return xyz[n_images_around(folder, xyz) >= 2]
+
+
+def n_images_around(folder: Path, xyz: np.ndarray) -> np.ndarray:
+    """Number of images of a scene inside which ground points (n, 3) m lie, (n,); occluded ones are counted too."""
+    n_images = np.zeros(len(xyz), int)
+    for view in open_scene([folder / "scene.yaml"]).views:
         xy = view.sensor.image_from_ground(xyz)
-        n_seeing += ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
-    return xyz[n_seeing >= 2]
+        n_images += ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
+    return n_images
 
 
 def errors_at(folder: Path, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.coverage import BlockLimits, ViewMasks, tile_coverage
-from zlocus.matching.kernels.occlusion import count_seeing, lowest_visible, write_lowest_unoccluded
+from zlocus.matching.kernels.occlusion import (
+    count_seeing,
+    forget_most_occlusions,
+    lowest_visible,
+    write_lowest_unoccluded,
+)
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, CellBox, VisibleHeights
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
@@ -24,8 +29,6 @@ PAIR = 2
 # would exclude just those that see the ground beside it. There the best of the pairs count, which are those without
 # occluded views anyway.
 MANY_VIEWS = 13
-# Where more views cover a cell, at least so many count as unoccluded.
-MIN_UNOCCLUDED = 3
 
 
 def covered_heights(
@@ -101,18 +104,12 @@ def keep_enough_views(visible: VisibleHeights) -> None:
     """Remove occlusions from cells that would keep too few views; changes `visible`.
 
     A height that is wrong occludes as much as one that is right. Of two views neither counts as occluded, because no
-    comparison would be left to correct the error. Of four or more, the `MIN_UNOCCLUDED` that are seen lowest do not:
+    comparison would be left to correct the error. Of four or more, the three that are seen lowest do not:
     in a forest, or beside a false tower, most views would be lost, and those that are left would hold too little
     evidence. Of three views every one may be occluded: beside a wall only one may see the ground, and comparing it with
     views of the roof gives false heights.
     """
-    covered = covers(visible)
-    n_covering = covered.sum(axis=0)
-    visible.lowest_unoccluded[:, n_covering <= PAIR] = NEVER_OCCLUDED
-    if len(covered) > MIN_UNOCCLUDED:
-        of_covering = np.where(covered, visible.lowest_unoccluded, np.iinfo(np.int32).max)
-        limit = np.partition(of_covering, MIN_UNOCCLUDED - 1, axis=0)[MIN_UNOCCLUDED - 1]
-        visible.lowest_unoccluded[(of_covering <= limit) & (n_covering > MIN_UNOCCLUDED)] = NEVER_OCCLUDED
+    forget_most_occlusions(visible, np.int32(NEVER_OCCLUDED))
 
 
 def sees(visible: VisibleHeights, height: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -326,7 +326,7 @@ def match_level(
     over this level, or of the coarser one, from which the evidence is learned. None: costs are those of correlation.
     """
     config = tile.config
-    search = search_along_slope(tile, level, prior)
+    search = search_along_slope(tile, level, prior, earlier_result)
     visible = visible_heights(tile, level, search, prior)
     chosen = _chosen_views(tile, level, search, visible, prior, pair_labels)
     taught_heights, known_costs = None, None
@@ -362,17 +362,19 @@ def match_level(
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
 
-def search_along_slope(tile: TileInputs, level: PyramidLevel, prior: SearchPrior) -> LevelSearch:
-    """Slanted support surface, search range and projections of a level."""
-    config = tile.config
-    views = _project(tile, level, prior)
-    smooth = None if prior.surface is None else smoothed(prior.surface, config.refine.jump_steps)
+def search_along_slope(
+    tile: TileInputs, level: PyramidLevel, prior: SearchPrior, earlier_result: LevelResult | None = None
+) -> LevelSearch:
+    """Slanted support surface, search range and projections of a level; those of an earlier pass over it are kept."""
+    earlier_pass = earlier_result if earlier_result is not None and earlier_result.level is level else None
+    views = _project(tile, level, prior) if earlier_pass is None else earlier_pass.tile_views
+    smooth = None if prior.surface is None else smoothed(prior.surface, tile.config.refine.jump_steps)
     if smooth is None:
         slope_surface = SlopeSurface.flat(level.shape, views.block)
     else:
         slope_surface = SlopeSurface.from_surface(smooth, views.block, prior.coarser_slope(level.window))
     low, high = slope_surface.slope_index(prior.low), slope_surface.slope_index(prior.high)
-    lattice = search_lattice(low, high, level.height_origin, level.height_step, config.pyramid, views.block)
+    lattice = search_lattice(low, high, level.height_origin, level.height_step, tile.config.pyramid, views.block)
     return LevelSearch(views, smooth, slope_surface, slope_surface.along(views), lattice)
 
 

@@ -187,6 +187,7 @@ def _made(
             "images": {name: image_record(m) for name, m in zip(prepared_cloud.references, matched, strict=True)},
             "points": cloud.n_points,
             "coverage": round(coverage, 6),
+            "plan": prepared_cloud.plan.as_dict(),
         }
         write_record(out / RECORD, record)
         write_finished(out, checkpoint.key, shortcoming, names)

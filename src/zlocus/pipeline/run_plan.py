@@ -76,6 +76,22 @@ class Plan:
         """Memory of the command and all tiles that are worked on at a time."""
         return self.own_bytes + self.slots * self.tile_bytes
 
+    @property
+    def process_bytes(self) -> float:
+        """Memory of the process that takes most."""
+        return max(self.own_bytes, self.tile_bytes) if self.processes else self.n_bytes
+
+    def as_dict(self) -> dict[str, float]:
+        """The plan as run.json holds it, beside the stages of the run: memory in MB, times in s."""
+        return {
+            "tiles": self.n_tiles,
+            "slots": self.slots,
+            "memory_mb": round(self.n_bytes / 1e6, 1),
+            "process_mb": round(self.process_bytes / 1e6, 1),
+            "match_s": round(self.match_rate.factor * self.match_s, 3),
+            "write_s": round(self.write_rate.factor * self.write_s, 3),
+        }
+
     def __str__(self) -> str:
         where = "in processes of their own" if self.processes else "in this process"
         if self.scheduler is not None:

@@ -44,7 +44,7 @@ CHECKED_T = (-1.0, -0.7, 0.0, 0.7, 1.0)
 HEIGHTS_LOOKED_AT = 5
 # Number of heights at which the visibility of blocks is sampled. At these and between them a table is compared with the
 # exact model.
-N_SAMPLED_HEIGHTS = 33
+N_SAMPLED_HEIGHTS = 17
 # Chebyshev coefficients below this share of the tolerance are set to zero: as polynomials over a short part of the
 # heights they would be large numbers that cancel.
 NEGLIGIBLE_SHARE = 0.02

@@ -7,7 +7,13 @@ import pytest
 
 from kernel_scene import rough_surface
 from reference import surfaces
-from zlocus.matching.kernels.occlusion import count_seeing, finest_view, lowest_visible, write_lowest_unoccluded
+from zlocus.matching.kernels.occlusion import (
+    count_seeing,
+    finest_view,
+    forget_most_occlusions,
+    lowest_visible,
+    write_lowest_unoccluded,
+)
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, CellBox, VisibleHeights
 
 
@@ -95,3 +101,20 @@ def test_lowest_height_indices_at_which_nothing_occludes_a_cell():
     expected[1:6, 2:10] = np.floor(np.maximum(lowest[3:8, 5:13] - base[1:6, 2:10] - 1.5, least))
     np.testing.assert_array_equal(out, expected)
     assert out[2, 2] == NEVER_OCCLUDED
+
+
+@pytest.mark.parametrize("n_views", [2, 3, 4, 7])
+def test_the_three_views_that_are_seen_lowest_are_not_occluded(n_views):
+    """Against sorted heights, cell by cell. Equal heights are treated alike."""
+    visible, _ = any_visible(n_views, (13, 17), seed=n_views)
+    expected = visible.lowest_unoccluded.copy()
+    for row, col in np.ndindex(expected.shape[1:]):
+        covering = np.flatnonzero((visible.lowest_covered <= visible.highest_covered)[:, row, col])
+        of_cell = expected[:, row, col]
+        if len(covering) <= 2:
+            of_cell[:] = NEVER_OCCLUDED
+        elif len(covering) > 3:
+            third = sorted(of_cell[covering])[2]
+            of_cell[[view for view in covering if of_cell[view] <= third]] = NEVER_OCCLUDED
+    forget_most_occlusions(visible, np.int32(NEVER_OCCLUDED))
+    np.testing.assert_array_equal(visible.lowest_unoccluded, expected)

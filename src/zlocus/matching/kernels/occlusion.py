@@ -101,6 +101,38 @@ def count_seeing(visible, surface, out):
                 n[c] += np.int32((low[c] <= at[c]) & (at[c] <= high[c]) & (free_from[c] <= at[c]))
 
 
+# VisibleHeights, i4 -> None
+@kernel
+def forget_most_occlusions(visible, never_occluded):
+    """Remove occlusions from cells that would keep too few views, see `zlocus.matching.occlusion.keep_enough_views`.
+
+    visible : whose `lowest_unoccluded` is changed; never_occluded : its value for a view that nothing occludes.
+    """
+    highest = np.int32(np.iinfo(np.int32).max)
+    n_views, n_rows, n_cols = visible.lowest_covered.shape
+    # The three lowest of each cell, in ascending order.
+    first, second, third = np.empty(n_cols, np.int32), np.empty(n_cols, np.int32), np.empty(n_cols, np.int32)
+    n_covering = np.empty(n_cols, np.int32)
+    for r in range(n_rows):
+        first[:], second[:], third[:], n_covering[:] = highest, highest, highest, 0
+        for i in range(n_views):
+            low, high = visible.lowest_covered[i, r], visible.highest_covered[i, r]
+            free_from = visible.lowest_unoccluded[i, r]
+            for c in range(n_cols):
+                covers = low[c] <= high[c]
+                n_covering[c] += np.int32(covers)
+                of_view = free_from[c] if covers else highest
+                third[c] = min(third[c], max(second[c], of_view))
+                second[c] = min(second[c], max(first[c], of_view))
+                first[c] = min(first[c], of_view)
+        for i in range(n_views):
+            low, high = visible.lowest_covered[i, r], visible.highest_covered[i, r]
+            free_from = visible.lowest_unoccluded[i, r]
+            for c in range(n_cols):
+                is_lowest = (low[c] <= high[c]) & (free_from[c] <= third[c]) & (n_covering[c] > 3)
+                free_from[c] = never_occluded if is_lowest | (n_covering[c] <= 2) else free_from[c]
+
+
 # (i,b,d) f8, VisibleHeights, (r,c) f4, i8, (r,c) i4 -> None
 @kernel
 def finest_view(size, visible, surface, block, best):

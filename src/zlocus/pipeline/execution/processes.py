@@ -20,6 +20,7 @@ from typing import Any
 
 from zlocus.core.jit import CACHE
 from zlocus.core.signals import ENDING
+from zlocus.core.startup import reuse_memory
 from zlocus.pipeline.execution.tasks import Cause, Failure, Outcome, attempted
 
 # Each worker uses one core. Without these variables the libraries in n workers would start n times as many threads.
@@ -171,6 +172,7 @@ def work(connection: Connection, function: bytes, name: str) -> None:
     """Work on tasks until the connection is closed; the main function of a worker process."""
     _set_signals()
     one_thread()
+    reuse_memory()
     call = pickle.loads(function)
     cpu_s = 0.0  # the CPU time of the start is counted with the first task
     # The main process, and with it the connection, may end at any time.
